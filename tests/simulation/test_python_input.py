@@ -78,6 +78,66 @@ def test_what_a_simulation_does_not_take(body, use, said, folder):
     assert not list(folder.iterdir())
 
 
+#: No argument below may be one of these.
+NOTHING = [
+    "x",
+    object(),
+    float("nan"),
+    10**400,
+    1j,
+    [[1, 2], [3]],
+    np.zeros((2, 2, 2)),
+    np.array(["a", "b"]),
+    {"a": 1},
+    b"abc",
+]
+VOXELS = np.pad(np.ones((2, 2, 2), int), 1)
+#: Calls with right arguments, of which one is exchanged at a time.
+CALLS = [
+    (wc.TetForest.box, {"cells": (1, 1, 1), "cell_size": 1.0, "level": 0, "origin": (0.0, 0.0, 0.0), "up_axis": "Z"}),
+    (wc.TetMesh, {"points": np.eye(4, 3, k=-1), "tets": [[0, 1, 2, 3]], "scale": 1.0, "up_axis": "Z", "labels": [0]}),
+    (wc.TetMesh, {"points": np.eye(4, 3, k=-1), "tets": [[0, 1, 2, 3]], "label_names": ["a"]}),
+    (wc.Domain.sphere, {"radius": 1.0, "centre": (0.0, 0.0, 0.0), "up_axis": "Z", "device": "cpu"}),
+    (wc.Domain.torus, {"major": 1.0, "minor": 0.2, "axis": "Z"}),
+    (wc.Domain.from_function, {"function": lambda x: x[:, 0], "bounds": [[-1] * 3, [1] * 3], "lipschitz": 1.0}),
+    (wc.Domain.from_labels, {"volume": VOXELS, "spacing": (1, 1, 1), "origin": (0, 0, 0), "smoothing": 0.0}),
+    (wc.Domain.from_labels, {"volume": VOXELS, "affine": np.eye(4), "labels": {"a": 1}, "unit": "cm"}),
+    (wc.polar_rotation, {"F": np.eye(3), "method": "byers-xu", "iterations": 4, "device": "cpu"}),
+    (wc.SymplecticEuler, {"dt": 1.0, "damping": 0.0, "viscosity": 0.0}),
+    (wc.BackwardEuler, {"dt": 1.0, "damping": 0.0, "viscosity": 0.0, "tolerance": 1e-3, "preconditioner": "diagonal"}),
+    (wc.Corotated, {"rotation_level": 1, "rotation": "svd", "stiffness": "sparse", "dilatation": "auto"}),
+    (wc.Corotated, {"iterations": 4, "subtrees": True}),
+    (wc.EdgeStVK, {"springs": "quadratic", "dilatation": "element"}),
+    (wc.Ogden, {"mu": 1.0, "alpha": 2.0}),
+    (wc.Prony, {"g": 1.0, "tau": 1.0, "model": wc.Linear()}),
+    (wc.OnlineRemesh, {"refine_above": 1.3, "simplify_below": 1.1, "min_level": 1, "max_level": 2, "every": 3}),
+    (wc.SignedDistance, {"distance": np.pad([[[-1.0]]], 1, constant_values=1.0), "lower": (0, 0, 0), "spacing": 1.0}),
+    (wc.Contact, {"friction": 0.3, "self_contact": False}),
+]
+
+
+@pytest.mark.parametrize(
+    ("call", "right", "name"),
+    [
+        pytest.param(call, right, name, id=f"{call.__qualname__}-{name}")
+        for call, right in CALLS
+        for name in right
+        if name != "affine"
+    ],
+)
+def test_what_no_argument_is(call, right, name):
+    """An InputError, or, where a part of it is meant, a result; no error of NumPy's or Warp's."""
+    call(**right)
+    said = []
+    for wrong in NOTHING:
+        try:
+            call(**{**right, name: wrong})
+        except wc.InputError as error:
+            said.append(str(error))
+    assert len(said) >= len(NOTHING) - 2
+    assert all("\n" not in each and len(each) < 300 for each in said)
+
+
 class TestNodesByPlace:
     """``fix`` and similar calls take an expression or a function of the rest position, like materials."""
 

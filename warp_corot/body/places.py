@@ -15,6 +15,7 @@ import warp as wp
 
 from warp_corot.discretization.elements import Mesh
 from warp_corot.errors import InputError
+from warp_corot.inputs.checks import FLOAT32, shown
 from warp_corot.inputs.device_arrays import vectors_on_device
 from warp_corot.inputs.indices import checked_indices
 from warp_corot.inputs.selection import CONSTANTS, FUNCTIONS, REGIONS, select_nodes
@@ -110,7 +111,7 @@ class ChosenNodes:
         try:
             values = np.asarray(given, dtype=np.float64)
         except (TypeError, ValueError):
-            raise InputError(f"{name} is {given!r}; it must be finite numbers") from None
+            raise InputError(f"{name} is {shown(given)}; it must be finite numbers") from None
         count = len(self.indices)
         shapes: list[tuple[int, ...]] = [(3,), (count, 3)]
         if self.each is not None:
@@ -118,13 +119,18 @@ class ChosenNodes:
         if values.shape not in shapes or not np.isfinite(values).all():
             allowed = " or ".join(str(list(shape)) for shape in dict.fromkeys(shapes))
             raise InputError(f"{name} has shape {values.shape}; it must be finite, {allowed}")
+        if (np.abs(values) > FLOAT32.max).any():
+            raise InputError(f"{name} is {shown(given)}; it must be within the range of float32")
         if self.each is None or values.shape in ((3,), (count, 3)):
             return values
         return np.broadcast_to(values, (self.worlds, self.each, 3)).reshape(count, 3)
 
     def keyframes(self, given: npt.ArrayLike) -> npt.ArrayLike:
         """Keyframes of the nodes of one world, [K, n, 3], repeated for each world; other keyframes unchanged."""
-        shape = np.shape(given)
+        try:
+            shape = np.shape(given)
+        except ValueError:  # rows of several lengths: an error when they are read
+            return given
         if self.each is None or len(shape) != 3 or shape[1] != self.each:
             return given
         return np.tile(given, (1, self.worlds, 1))

@@ -135,11 +135,11 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
             InputError: There is no world with this index.
         """
         try:
-            number = -1 if isinstance(index, bool) else int(index)
+            number = -1 if isinstance(index, bool) or index != int(index) else int(index)
         except (TypeError, ValueError, OverflowError):
             number = -1
-        if number != index or not 0 <= number < self.worlds:
-            raise InputError(f"world is {index!r}; it must be a whole number from 0 to {self.worlds - 1}")
+        if not 0 <= number < self.worlds:
+            raise InputError(f"world is {shown(index)}; it must be a whole number from 0 to {self.worlds - 1}")
         return World(self, number)
 
     @property

@@ -5,10 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
-
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_number
+from warp_corot.inputs.checks import checked_flag, checked_number
 
 
 @dataclass(frozen=True)
@@ -28,8 +26,7 @@ class Contact:
 
     def __post_init__(self) -> None:
         checked_friction(self.friction)
-        if not isinstance(self.self_contact, bool | np.bool_):
-            raise InputError(f"self_contact is {self.self_contact!r}; it must be True or False")
+        checked_flag(self.self_contact, "self_contact")
 
 
 def checked_friction(given: float) -> float:

@@ -96,7 +96,8 @@ class SignedDistance(Shape):
             if spacing is None or upper is not None:
                 raise InputError("samples need spacing, and no upper")
             values = checked_numbers(distance, "distance", "[nx, ny, nz]")
-            step = checked_vector(np.broadcast_to(np.asarray(spacing, float), 3), "spacing")
+            steps = checked_numbers(spacing, "spacing", "one or three distances [m]")
+            step = checked_vector(np.full(3, steps) if steps.shape == () else steps, "spacing")
         if values.ndim != 3 or min(values.shape) < 2 or not np.isfinite(values).all() or not (step > 0.0).all():
             raise InputError(f"distance has shape {values.shape}; it must be finite, [nx, ny, nz], at least two each")
         inner = tuple(slice(1, -1) for _ in range(3))

@@ -11,7 +11,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_number, checked_numbers
+from warp_corot.inputs.checks import checked_length, checked_number, checked_numbers, checked_vector
 from warp_corot.kernels.contact import shapes as kernels
 
 from .options import checked_friction
@@ -169,18 +169,6 @@ class Box(Shape):
         self.size, self.thickness, self.reach = (x, y, z), min(x, y, z), math.hypot(x, y, z)
 
 
-def checked_vector(given: Any, name: str) -> npt.NDArray[np.float64]:
-    """Three finite numbers.
-
-    Raises:
-        InputError: They are not three finite numbers.
-    """
-    vector = checked_numbers(given, name, "[3]")
-    if vector.shape != (3,) or not np.isfinite(vector).all():
-        raise InputError(f"{name} is {np.asarray(given).tolist()}; it must be three finite numbers")
-    return vector
-
-
 def checked_quaternion(given: Any) -> npt.NDArray[np.float64]:
     """A unit quaternion, (x, y, z, w).
 
@@ -192,17 +180,6 @@ def checked_quaternion(given: Any) -> npt.NDArray[np.float64]:
     if not 0.0 < length < math.inf:
         raise InputError(f"quaternion is {np.asarray(given).tolist()}; it must be four finite numbers (x, y, z, w)")
     return q / length
-
-
-def checked_length(given: Any, name: str) -> float:
-    """A positive length [m].
-
-    Raises:
-        InputError: It is not.
-    """
-    if not 0.0 < checked_number(given, name, "m") < math.inf:
-        raise InputError(f"{name} is {given}; it must be a positive length [m]")
-    return float(given)
 
 
 def turn_from_z(n: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_count
+from warp_corot.inputs.checks import checked_count, shown
 
 from .journal import Journal, Row, key_of
 from .tables import write_tables
@@ -67,7 +67,7 @@ def sweep(
     runs = combinations(parameters)
     checked_count(retries, "retries", least=0)
     if not callable(function):
-        raise InputError(f"function is {function!r}; it must be a function of the parameters")
+        raise InputError(f"function is {shown(function)}; it must be a function of the parameters")
     size = 1 if together is None else checked_count(together, "together", least=1)
     window = worker_count(workers, -(-len(runs) // size), executor)
     journal = Journal(None if folder is None else Path(folder))

@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 
 from warp_corot.errors import InputError
+from warp_corot.inputs.checks import shown
 from warp_corot.kernels.meshing import domain as kernels
 
 from .signed import SignedFunction
@@ -115,7 +116,7 @@ class NamedDomain(SignedFunction):
 
     def __init__(self, body: SignedFunction, name: str):
         if not (isinstance(name, str) and name):
-            raise InputError(f"the label name is {name!r}; it must be a word")
+            raise InputError(f"the label name is {shown(name)}; it must be a word")
         super().__init__(body.bounds, body.lipschitz, up_axis=body.up_axis, label_names=(name,), device=body.device)
         self.body = body
 

@@ -10,6 +10,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_number, checked_numbers, shown
 from warp_corot.kernels.meshing import domain as kernels
 
 from .signed import SignedFunction
@@ -28,13 +29,15 @@ class FunctionDomain(SignedFunction):
     """See `Domain.from_function`."""
 
     def __init__(self, function: Function, bounds: npt.ArrayLike, lipschitz: float, **options: Any):
-        box = np.asarray(bounds, dtype=np.float64)
+        box = checked_numbers(bounds, "bounds", "[2, 3]")
         if box.shape != (2, 3) or not np.isfinite(box).all() or not (box[0] < box[1]).all():
             raise InputError(
                 f"bounds are {box.tolist()}; they must be the lowest and the highest corner of a box [2, 3]"
             )
-        if not (np.isfinite(lipschitz) and lipschitz > 0.0):
-            raise InputError(f"lipschitz is {lipschitz!r}; it must be a positive number")
+        if not 0.0 < checked_number(lipschitz, "lipschitz") < np.inf:
+            raise InputError(f"lipschitz is {shown(lipschitz)}; it must be a positive number")
+        if not callable(function):
+            raise InputError(f"function is {shown(function)}; it must be a function of points [n, 3], or a wp.Function")
         super().__init__(box, lipschitz, **options)
         self.function = function
         self._kernel = kernels.sampler(function) if isinstance(function, wp.Function) else None

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_number, checked_numbers, shown
 from warp_corot.io.read.volumes import LoadedVolume, affine_of, load_volume
 
 from .units import metres_per_unit
@@ -56,18 +57,25 @@ def placed_grid(scan: Volume, spacing: Any, origin: Any, affine: Any, unit: str 
         unit = (loaded.unit or "m") if unit is None else unit
         given = _replaced(given, spacing, origin)
     else:
-        values, source, unit = np.asarray(scan), "", "m" if unit is None else unit
+        values, source, unit = _checked_values(scan), "", "m" if unit is None else unit
         if spacing is None and affine is None:
             raise InputError("the volume has no spacing; give spacing=(dx, dy, dz), the distance of its voxel centres")
         given = np.eye(4) if spacing is None else affine_of(spacing, origin)
     if affine is not None:
-        given = np.asarray(affine, dtype=np.float64)
+        given = checked_numbers(affine, "affine", "[4, 4]")
     if not notes or not notes[-1].startswith("unit"):
         notes.append(f"unit {unit}")
     metres = metres_per_unit(unit)
     if values.ndim != 3 or min(values.shape) == 0:
         raise InputError(f"{source}the volume has shape {values.shape}; it must be [nx, ny, nz] and not empty")
     return Grid(values, _checked_affine(given, source, notes, metres), metres, unit, notes)
+
+
+def _checked_values(scan: Any) -> np.ndarray:
+    try:
+        return np.asarray(scan)
+    except ValueError:
+        raise InputError("the volume has rows of several lengths; it must be [nx, ny, nz]") from None
 
 
 def _replaced(affine: np.ndarray, spacing: Any, origin: Any) -> np.ndarray:
@@ -116,7 +124,7 @@ def numbered_labels(
     if not isinstance(labels, Mapping) or not labels:
         known = ", ".join(map(str, there[:40]))
         raise InputError(
-            f"labels is {labels!r}; it must give numbers by name, such as {{'liver': 3}}; there are {known}"
+            f"labels is {shown(labels)}; it must give numbers by name, such as {{'liver': 3}}; there are {known}"
         )
     if len(labels) > MOST_LABELS:
         raise InputError(f"there are {len(labels)} labels; it must be at most {MOST_LABELS}")
@@ -183,7 +191,7 @@ def labels_from_probabilities(maps: Mapping[str, npt.ArrayLike], *, certain: flo
     """
     if not maps:
         raise InputError("maps is empty; it must give at least one volume by label name")
-    if not (np.isfinite(certain) and certain > 0.0):
+    if not 0.0 < checked_number(certain, "certain") < np.inf:
         raise InputError(f"certain is {certain!r}; it must be the value that means probability one")
     arrays = {name: np.asarray(values) for name, values in maps.items()}
     first_name, first = next(iter(arrays.items()))

@@ -11,6 +11,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_number
 from warp_corot.kernels.meshing import domain as kernels
 
 from .grid import Grid, Volume, labels_from_probabilities, numbered_labels, placed_grid
@@ -183,7 +184,7 @@ def probability_domain(
 def _domain(
     grid: Grid, numbers: np.ndarray, names: Sequence[str], smoothing: float, up_axis: str, device: Any
 ) -> SignedFunction:
-    if not (np.isfinite(smoothing) and smoothing >= 0.0):
+    if not 0.0 <= checked_number(smoothing, "smoothing", "m") < np.inf:
         raise InputError(f"smoothing is {smoothing!r}; it must be a length [m], 0 for none")
     domain = LabelDomain(numbers, grid.affine, names, smoothing, grid.notes, up_axis=up_axis, device=device)
     doubt = unlikely_size(float(np.ptp(domain.bounds, axis=0).max()), grid.metres)

@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_axis, checked_length, checked_vector
 from warp_corot.kernels.meshing import domain as kernels
 
 from .signed import SignedFunction
@@ -37,7 +38,7 @@ class Sphere(Shape):
     """See `Domain.sphere`."""
 
     def __init__(self, radius: float, centre: Sequence[float], **options: Any):
-        r, c = checked_radius(radius, "radius"), checked_point(centre, "centre")
+        r, c = checked_length(radius, "radius"), checked_vector(centre, "centre")
         super().__init__(kernels.evaluate_sphere, [wp.vec3(*c), r], [c - r, c + r], **options)
 
 
@@ -45,7 +46,7 @@ class Box(Shape):
     """See `Domain.box`."""
 
     def __init__(self, lower: Sequence[float], upper: Sequence[float], **options: Any):
-        low, high = checked_point(lower, "lower"), checked_point(upper, "upper")
+        low, high = checked_vector(lower, "lower"), checked_vector(upper, "upper")
         if not (low < high).all():
             raise InputError(f"the box from {low.tolist()} to {high.tolist()} is empty; lower must be below upper")
         super().__init__(kernels.evaluate_box, [wp.vec3(*low), wp.vec3(*high)], [low, high], **options)
@@ -55,12 +56,10 @@ class Torus(Shape):
     """See `Domain.torus`."""
 
     def __init__(self, major: float, minor: float, centre: Sequence[float], axis: str, **options: Any):
-        ring, tube = checked_radius(major, "major"), checked_radius(minor, "minor")
+        ring, tube = checked_length(major, "major"), checked_length(minor, "minor")
         if tube >= ring:
             raise InputError(f"the torus has minor {tube:g} m and major {ring:g} m; minor must be smaller")
-        if axis not in ("X", "Y", "Z"):
-            raise InputError(f"axis is {axis!r}; it must be 'X', 'Y' or 'Z'")
-        c, along = checked_point(centre, "centre"), np.eye(3)["XYZ".index(axis)]
+        c, along = checked_vector(centre, "centre"), np.eye(3)["XYZ".index(checked_axis(axis, "axis"))]
         reach = (ring + tube) * (1.0 - along) + tube * along
         numbers = [wp.vec3(*c), wp.vec3(*along), ring, tube]
         super().__init__(kernels.evaluate_torus, numbers, [c - reach, c + reach], **options)
@@ -70,34 +69,8 @@ class Capsule(Shape):
     """See `Domain.capsule`."""
 
     def __init__(self, start: Sequence[float], end: Sequence[float], radius: float, **options: Any):
-        a, b, r = checked_point(start, "start"), checked_point(end, "end"), checked_radius(radius, "radius")
+        a, b, r = checked_vector(start, "start"), checked_vector(end, "end"), checked_length(radius, "radius")
         if np.linalg.norm(b - a) <= 1e-6 * r:
             raise InputError(f"the capsule begins and ends at {a.tolist()}; its ends must differ (or take a sphere)")
         bounds = [np.minimum(a, b) - r, np.maximum(a, b) + r]
         super().__init__(kernels.evaluate_capsule, [wp.vec3(*a), wp.vec3(*b), r], bounds, **options)
-
-
-def checked_point(given: Sequence[float], name: str) -> np.ndarray:
-    """Three finite numbers.
-
-    Raises:
-        InputError: They are not.
-    """
-    try:
-        point = np.array(given, dtype=np.float64)
-    except (TypeError, ValueError):
-        point = np.empty(0)
-    if point.shape != (3,) or not np.isfinite(point).all():
-        raise InputError(f"{name} is {given!r}; it must be three finite numbers [m]")
-    return point
-
-
-def checked_radius(given: float, name: str) -> float:
-    """A positive number.
-
-    Raises:
-        InputError: It is not.
-    """
-    if isinstance(given, bool | str) or not (np.ndim(given) == 0 and np.isfinite(given) and given > 0.0):
-        raise InputError(f"{name} is {given!r}; it must be a positive number [m]")
-    return float(given)

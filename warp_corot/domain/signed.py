@@ -10,6 +10,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_axis, checked_length, checked_numbers, checked_strings, shown
 from warp_corot.inputs.device import checked_device
 from warp_corot.kernels.meshing import domain as kernels
 
@@ -32,13 +33,12 @@ class SignedFunction:
         label_names: Sequence[str] = (),
         device: str | wp.Device | None = None,
     ):
-        if up_axis not in ("X", "Y", "Z"):
-            raise InputError(f"up_axis is {up_axis!r}; it must be 'X', 'Y' or 'Z'")
+        checked_axis(up_axis)
         self.bounds = np.array(bounds, dtype=np.float64)
         check_float32(self.bounds)
         self.lipschitz = float(lipschitz)
         self.up_axis = up_axis
-        self.label_names = tuple(label_names)
+        self.label_names = checked_strings(label_names, "label_names")
         self.device = checked_device(device)
 
     def phi(self, points: Any) -> Any:
@@ -54,7 +54,7 @@ class SignedFunction:
             InputError: NumPy points have another shape, or are not finite.
         """
         if isinstance(points, wp.array):
-            return self._phi(points)
+            return self._phi(_checked_vec3(points))
         return self._phi(self._on_device(points)).numpy()
 
     def labels_at(self, points: Any, *, nearest: bool = False) -> Any:
@@ -67,7 +67,7 @@ class SignedFunction:
         Returns:
             int32 [n], as for `phi`: the label's place in ``label_names`` plus one; 0 outside any.
         """
-        given = points if isinstance(points, wp.array) else self._on_device(points)
+        given = _checked_vec3(points) if isinstance(points, wp.array) else self._on_device(points)
         if self.label_names:
             labels = self._labels(given)
             if not nearest:
@@ -101,8 +101,10 @@ class SignedFunction:
             float64 [n] [m].
         """
         side = -1.0 if outside else 1.0
-        given, directions = self._on_device(points), self._on_device(side * np.asarray(inward))
-        return self._thickness(given, directions, float(reach), side).astype(np.float64)
+        given, directions = self._on_device(points), self._on_device(side * checked_numbers(inward, "inward", "[n, 3]"))
+        if len(given) != len(directions):
+            raise InputError(f"inward has {len(directions)} vectors; there must be one for each of {len(given)} points")
+        return self._thickness(given, directions, checked_length(reach, "reach"), side).astype(np.float64)
 
     def exits(self, starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """Where segments from inside to outside leave the body, by its triangles; None if it has none.
@@ -127,7 +129,7 @@ class SignedFunction:
             InputError: The domain has no label of this name; the message lists its labels.
         """
         there = ", ".join(self.label_names) or "none"
-        raise InputError(f"there is no label {name!r} in this domain; its labels: {there}")
+        raise InputError(f"there is no label {shown(name)} in this domain; its labels: {there}")
 
     def report(self) -> list[str]:
         """A summary, line by line: size, unit, openness, pieces, labels."""
@@ -174,10 +176,17 @@ class SignedFunction:
         return []
 
     def _on_device(self, points: npt.ArrayLike) -> wp.array:
-        given = np.asarray(points)
-        if given.ndim != 2 or given.shape[1] != 3 or given.dtype.kind not in "fiu":
-            raise InputError(f"points have shape {given.shape} and dtype {given.dtype}; they must be numbers [n, 3]")
+        given = checked_numbers(points, "points", "[n, 3]")
+        if given.ndim != 2 or given.shape[1] != 3:
+            raise InputError(f"points has shape {given.shape}; it must be [n, 3]")
         bad = np.flatnonzero(~np.isfinite(given).all(axis=1))
         if len(bad):
             raise InputError(f"point {bad[0]} is {given[bad[0]].tolist()}; its coordinates must be finite")
         return wp.array(np.ascontiguousarray(given, dtype=np.float32), dtype=wp.vec3, device=self.device)
+
+
+def _checked_vec3(points: wp.array) -> wp.array:
+    if points.dtype != wp.vec3 or points.ndim != 1:
+        found = f"{wp.types.type_repr(points.dtype)} {list(points.shape)}"
+        raise InputError(f"points is a Warp array of {found}; it must be of vec3 [n]")
+    return points

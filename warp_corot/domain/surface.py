@@ -257,7 +257,7 @@ def _given(
         if not isinstance(surface, tuple | list) or len(surface) != 2:
             raise InputError(f"the surface is a {type(surface).__name__}; it must be a file or (points, triangles)")
         unit = "m" if unit is None else unit
-        return *surface, metres_per_unit(unit), up_axis or "Y", "", [f"unit {unit}"]
+        return *surface, metres_per_unit(unit), "Y" if up_axis is None else up_axis, "", [f"unit {unit}"]
     loaded = surface if isinstance(surface, LoadedSurface) else load_surface(surface)
     notes = list(loaded.notes)
     if unit is not None:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_number, shown
 from warp_corot.inputs.likely import meant
 
 #: Units that a user may have meant.
@@ -31,7 +32,9 @@ USUAL = (
     "m/s^2",
     "1/s",
 )
-#: Metres in a unit.
+#: Metres in a unit, at least and at most.
+LEAST_UNIT, MOST_UNIT = 1.0e-18, 1.0e18
+#: Metres in common units.
 UNITS = {"m": 1.0, "cm": 1.0e-2, "mm": 1.0e-3}
 #: What a number looks like at the beginning of a quantity.
 _NUMBER = re.compile(r"\s*[-+]?(?:(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|inf(?![a-z])|nan(?![a-z]))")
@@ -62,8 +65,8 @@ def metres_per_unit(unit: str | float) -> float:
         metres = in_units(f"1 {unit}" if isinstance(unit, str) and unit and not _NUMBER.match(unit) else unit, "m")
     except InputError:
         metres = math.nan
-    if not (math.isfinite(metres) and metres > 0.0):
-        raise InputError(f"unit is {unit!r}; it must be a length such as 'mm', 'cm', 'm', 'inch' or '3.2cm'")
+    if not LEAST_UNIT <= metres <= MOST_UNIT:
+        raise InputError(f"unit is {shown(unit)}; it must be a length such as 'mm', 'cm', 'm', 'inch' or '3.2cm'")
     return metres
 
 
@@ -78,7 +81,7 @@ def in_units(given: str | float, unit: str) -> float:
         InputError: No number, or a unit that is not known or of another kind.
     """
     if isinstance(given, int | float | np.number) and not isinstance(given, bool):
-        return float(given)
+        return checked_number(given, "the quantity", unit)
     if not isinstance(given, str):
         raise InputError(f"{given!r} is not a number, with or without a unit")
     match = _NUMBER.match(given)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from warp_corot.discretization.discretization import discretization_of
-from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_choice
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, stvk_cauchy, stvk_stress
 from warp_corot.kernels.elements.forces import element_von_mises, law_stress, law_value
 from warp_corot.kernels.elements.spring_stiffness import edge_stvk_differential
@@ -33,8 +33,7 @@ class EdgeStVK(Model):
     dilatation: str = ELEMENT
 
     def __post_init__(self) -> None:
-        if self.springs not in ("biquadratic", "quadratic"):
-            raise InputError(f"springs is {self.springs!r}; it must be 'biquadratic' or 'quadratic'")
+        checked_choice(self.springs, "springs", ("biquadratic", "quadratic"))
         refuse_shared(self.dilatation, "EdgeStVK")
 
     def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:

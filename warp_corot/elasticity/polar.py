@@ -9,6 +9,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_choice, checked_count, checked_numbers
 from warp_corot.inputs.device import checked_device
 from warp_corot.kernels.math.polar import rotate_all, turn_all
 from warp_corot.kernels.math.rotation import byers_xu, byers_xu_fixed, mcadams_svd
@@ -27,12 +28,10 @@ def rotation_function(method: str, iterations: int | None = None) -> wp.Function
     if iterations is not None:
         if method != "byers-xu":
             raise InputError(f"iterations is {iterations}; it must be None for the method {method!r}")
-        if isinstance(iterations, bool) or iterations != int(iterations) or not 2 <= iterations <= MAX_ITERATIONS:
+        if checked_count(iterations, "iterations", 2) > MAX_ITERATIONS:
             raise InputError(f"iterations is {iterations}; it must be None or an integer from 2 to {MAX_ITERATIONS}")
         return byers_xu_fixed(int(iterations))
     functions = {"byers-xu": byers_xu, "svd": mcadams_svd}
-    if method not in functions:
-        raise InputError(f"rotation method is {method!r}; it must be one of {', '.join(METHODS)}")
     return functions[method]
 
 
@@ -64,7 +63,10 @@ def polar_rotation(
     Raises:
         InputError: Wrong shape, unknown method, options of another method, or no such device.
     """
-    matrices = np.asarray(F)
+    checked_choice(method, "rotation method", METHODS)
+    if iterations is not None:
+        iterations = checked_count(iterations, "iterations", 2)
+    matrices = checked_numbers(F, "F", "[n, 3, 3]")
     if matrices.shape[-2:] != (3, 3) or matrices.ndim not in (2, 3):
         raise InputError(f"F has shape {matrices.shape}; it must be [n, 3, 3]")
     if guess is not None and method != "warm":
@@ -76,7 +78,7 @@ def polar_rotation(
     inputs = [wp.array(flat, dtype=wp.mat33, device=where)]
     if method == "warm":
         rotation_function("byers-xu" if iterations is None else method, iterations)
-        given = np.asarray(np.eye(3) if guess is None else guess, dtype=np.float32)
+        given = checked_numbers(np.eye(3) if guess is None else guess, "guess", "[n, 3, 3]").astype(np.float32)
         if given.shape not in ((3, 3), flat.shape):
             raise InputError(f"guess has shape {given.shape}; it must be [{len(flat)}, 3, 3]")
         start = np.broadcast_to(given, flat.shape)

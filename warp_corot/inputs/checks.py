@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from os import PathLike
 from pathlib import Path
 from types import UnionType
@@ -15,6 +15,8 @@ import warp as wp
 from warp_corot.errors import InputError
 
 FLOAT32 = np.finfo(np.float32)
+#: Counts beyond this are mistakes.
+MOST = 2**63 - 1
 
 
 def checked_count(given: Any, name: str, least: int) -> int:
@@ -25,10 +27,11 @@ def checked_count(given: Any, name: str, least: int) -> int:
     """
     try:
         count = int(given)
-    except (TypeError, ValueError, OverflowError):
-        count = least - 1
-    if count < least or count != given or isinstance(given, bool):
-        raise InputError(f"{name} is {given!r}; it must be a whole number, at least {least}")
+        whole = bool(count == given) and not isinstance(given, bool)
+    except (TypeError, ValueError, OverflowError):  # OverflowError: infinity
+        count, whole = least - 1, False
+    if not whole or not least <= count <= MOST:
+        raise InputError(f"{name} is {shown(given)}; it must be a whole number, at least {least}")
     return count
 
 
@@ -45,8 +48,23 @@ def checked_numbers(given: npt.ArrayLike | wp.array, name: str, wanted: str) -> 
     """
     try:
         return np.asarray(given.numpy() if isinstance(given, wp.array) else given, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):  # OverflowError: a whole number beyond float64
         raise InputError(f"{name} is {shown(given)}; it must be numbers, {wanted}") from None
+
+
+def checked_vector(given: npt.ArrayLike, name: str, unit: str = "m") -> npt.NDArray[np.float64]:
+    """Three finite numbers, float64 [3].
+
+    Raises:
+        InputError: They are something else.
+    """
+    try:
+        vector = checked_numbers(given, name, "[3]").copy()
+    except InputError:
+        vector = np.empty(0)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise InputError(f"{name} is {shown(given)}; it must be three finite numbers{f' [{unit}]' if unit else ''}")
+    return vector
 
 
 def checked_number(given: Any, name: str, unit: str = "") -> float:
@@ -59,9 +77,64 @@ def checked_number(given: Any, name: str, unit: str = "") -> float:
         number = np.asarray(given)
         if number.shape == () and (np.issubdtype(number.dtype, np.integer) or np.issubdtype(number.dtype, np.floating)):
             return float(number)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         pass
     raise InputError(f"{name} is {shown(given)}; it must be a number{f' [{unit}]' if unit else ''}")
+
+
+def checked_length(given: Any, name: str) -> float:
+    """A positive, finite length [m].
+
+    Raises:
+        InputError: It is something else.
+    """
+    if isinstance(given, bool) or not 0.0 < checked_number(given, name, "m") < np.inf:
+        raise InputError(f"{name} is {shown(given)}; it must be a positive length [m]")
+    return float(given)
+
+
+def checked_choice(given: Any, name: str, choices: Collection[str]) -> str:
+    """One of several words.
+
+    Raises:
+        InputError: It is something else.
+    """
+    if not isinstance(given, str) or given not in choices:  # an array is not compared with words
+        *others, last = (repr(each) for each in choices)
+        raise InputError(f"{name} is {shown(given)}; it must be {' or '.join(filter(None, [', '.join(others), last]))}")
+    return given
+
+
+def checked_axis(given: Any, name: str = "up_axis") -> str:
+    """The name of an axis.
+
+    Raises:
+        InputError: It is something else.
+    """
+    return checked_choice(given, name, ("X", "Y", "Z"))
+
+
+def checked_flag(given: Any, name: str) -> bool:
+    """True or False.
+
+    Raises:
+        InputError: It is something else.
+    """
+    if not isinstance(given, bool | np.bool_):
+        raise InputError(f"{name} is {shown(given)}; it must be True or False")
+    return bool(given)
+
+
+def checked_strings(given: Any, name: str) -> tuple[str, ...]:
+    """Names as a tuple.
+
+    Raises:
+        InputError: They are something else.
+    """
+    names = tuple(given) if isinstance(given, Iterable) and not isinstance(given, str | bytes | wp.array) else None
+    if names is None or not all(isinstance(each, str) for each in names):
+        raise InputError(f"{name} is {shown(given)}; it must be a list of names")
+    return names
 
 
 def checked_path(given: Any, name: str) -> Path:

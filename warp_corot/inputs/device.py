@@ -6,6 +6,8 @@ import warp as wp
 
 from warp_corot.errors import InputError
 
+from .checks import shown
+
 
 def checked_device(device: str | wp.Device | None) -> wp.Device:
     """The device with this name; Warp's default for None.
@@ -20,5 +22,5 @@ def checked_device(device: str | wp.Device | None) -> wp.Device:
         found = None
     if found is None:
         there = ", ".join(str(d) for d in wp.get_devices())
-        raise InputError(f"there is no device {str(device)!r} here; there is: {there}")
+        raise InputError(f"there is no device {shown(str(device))} here; there is: {there}")
     return found

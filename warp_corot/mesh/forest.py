@@ -15,7 +15,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_numbers, shown
+from warp_corot.inputs.checks import checked_axis, checked_numbers, shown
 from warp_corot.inputs.indices import checked_indices
 
 from .forest_arrays import ForestArrays
@@ -60,6 +60,9 @@ class TetForest(ForestArrays):
         detail: The body's surface where it was resolved more finely than the mesh; None: nowhere.
     """
 
+    def __repr__(self) -> str:
+        return f"<TetForest of {len(self.levels)} tetrahedra and {self.node_count} nodes>"
+
     @classmethod
     def box(
         cls,
@@ -83,11 +86,10 @@ class TetForest(ForestArrays):
             InputError: An argument is out of its range, or the mesh would have 2**31 tetrahedra or more.
         """
         cells, cell_size, level = checked_cells(cells), checked_cell_size(cell_size), checked_level(level, "level")
-        if up_axis not in ("X", "Y", "Z"):
-            raise InputError(f"up_axis is {up_axis!r}; it must be 'X', 'Y' or 'Z'")
+        checked_axis(up_axis)
         corners = checked_numbers(origin, "origin", "[3]")
         if corners.shape != (3,) or not np.isfinite(corners).all():
-            raise InputError(f"origin is {origin}; it must be three finite coordinates in metres")
+            raise InputError(f"origin is {shown(origin)}; it must be three finite coordinates in metres")
         count = 6 * math.prod(cells) << level
         if count > MAX_LEAVES:
             raise InputError(f"level is {level}, which gives {count} tetrahedra; there must be at most {MAX_LEAVES}")
@@ -200,7 +202,7 @@ class TetForest(ForestArrays):
         Raises:
             InputError: The points are not [n, 3], or not finite.
         """
-        return embed(self, np.asarray(points))
+        return embed(self, points)
 
     def bind(self, points: npt.ArrayLike, triangles: npt.ArrayLike | None = None) -> BoundPoints:
         """Bind your own points, or with triangles [F, 3] a surface, to the mesh, so that they follow it.

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warp_corot.errors import InputError
+from warp_corot.inputs.checks import shown
 
-from .lattice import LATTICE_BITS, volume_shares
+from .lattice import LATTICE_BITS, checked_level, volume_shares
 from .tree import Tree, UniformTree
 
 if TYPE_CHECKING:
@@ -72,6 +73,7 @@ class ForestArrays:
     def ancestors(self, level: int) -> np.ndarray:
         """For each leaf, the highest ancestor (or the leaf itself) that is not above ``level`` and whose corners are
         nodes; indices into the tree, int32 [T]. Except at the border of a body, it is the ancestor at ``level``."""
+        level = checked_level(level, "level")
         if self.node_count == len(self.lattice):
             return self.tree.ancestors(self.tree.leaves, level)
         tree, found = self.tree, self.tree.leaves.copy()
@@ -93,7 +95,7 @@ class ForestArrays:
             InputError: The mesh has no label of this name.
         """
         if label not in self.label_names or self.labels is None:
-            raise InputError(f"there is no label {label!r}; there are: {', '.join(self.label_names) or 'none'}")
+            raise InputError(f"there is no label {shown(label)}; there are: {', '.join(self.label_names) or 'none'}")
         return np.equal(self.labels, self.label_names.index(label) + 1)
 
     def nodes_of(self, label: str) -> np.ndarray:

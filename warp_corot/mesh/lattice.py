@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_number
+from warp_corot.inputs.checks import checked_number, shown
 from warp_corot.kernels.tables.shapes import VOLUME
 
 #: A root cube has 2**LATTICE_BITS lattice intervals a side, so levels go up to 3 * LATTICE_BITS.
@@ -30,10 +30,11 @@ def checked_level(level: Any, name: str) -> int:
     """
     try:
         found = int(level)
+        whole = bool(found == level) and not isinstance(level, bool)
     except (TypeError, ValueError, OverflowError):
-        found = -1
-    if isinstance(level, bool) or found != level or not 0 <= found <= MAX_LEVEL:
-        raise InputError(f"{name} is {level!r}; it must be a whole number from 0 to {MAX_LEVEL}")
+        found, whole = -1, False
+    if not whole or not 0 <= found <= MAX_LEVEL:
+        raise InputError(f"{name} is {shown(level)}; it must be a whole number from 0 to {MAX_LEVEL}")
     return found
 
 
@@ -55,10 +56,13 @@ def checked_cells(cells: Any) -> tuple[int, int, int]:
     Raises:
         InputError: They are not three numbers for which the lattice has room.
     """
-    counts = np.asarray(cells)
+    try:
+        counts = np.asarray(cells)
+    except ValueError:  # rows of several lengths
+        counts = np.empty(0)
     whole = counts.shape == (3,) and np.issubdtype(counts.dtype, np.integer)
     if not (whole and counts.min() >= 1 and counts.max() <= MAX_CELLS):
-        raise InputError(f"cells is {cells}; it must be three whole numbers from 1 to {MAX_CELLS}")
+        raise InputError(f"cells is {shown(cells)}; it must be three whole numbers from 1 to {MAX_CELLS}")
     x, y, z = (int(c) for c in counts)
     return x, y, z
 

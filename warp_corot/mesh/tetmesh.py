@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from warp_corot.domain.units import check_float32
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_number, checked_numbers
+from warp_corot.inputs.checks import checked_axis, checked_number, checked_numbers, checked_strings, shown
 from warp_corot.inputs.indices import checked_indices
 from warp_corot.kernels.tables.shapes import EDGES
 
@@ -74,10 +74,9 @@ class TetMesh:
             raise InputError(f"tets has shape {given.shape}; it must be [T, 4] with at least one tetrahedron")
         if not np.issubdtype(given.dtype, np.integer):
             raise InputError(f"tets has dtype {given.dtype}; node indices must be integers")
-        if up_axis not in ("X", "Y", "Z"):
-            raise InputError(f"up_axis is {up_axis!r}; it must be 'X', 'Y' or 'Z'")
+        checked_axis(up_axis)
         if not 0 < checked_number(scale, "scale") < np.inf:
-            raise InputError(f"scale is {scale}; it must be a positive number")
+            raise InputError(f"scale is {shown(scale)}; it must be a positive number")
         bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
         if len(bad):
             raise InputError(f"node {bad[0]} has the coordinates {points[bad[0]].tolist()}; they must be finite")
@@ -101,9 +100,14 @@ class TetMesh:
         turned = volumes < 0
         self.tets[turned] = self.tets[turned][:, [0, 1, 3, 2]]
         self.repaired = int(turned.sum())
-        self.label_names = tuple(label_names)
+        self.label_names = checked_strings(label_names, "label_names")
         self.labels = None if labels is None else _checked_labels(labels, len(self.tets), len(self.label_names))
+        if not (node_sets is None or isinstance(node_sets, Mapping)):
+            raise InputError(f"node_sets is {shown(node_sets)}; it must give nodes by name: {{'tip': [0, 1]}}")
         self.node_sets = {name: _mask(nodes, len(points)) for name, nodes in (node_sets or {}).items()}
+
+    def __repr__(self) -> str:
+        return f"<TetMesh of {len(self.tets)} tetrahedra and {len(self.points)} nodes>"
 
     @classmethod
     def load(
@@ -159,7 +163,7 @@ class TetMesh:
             InputError: The mesh has no region of this name.
         """
         if label not in self.label_names or self.labels is None:
-            raise InputError(f"there is no label {label!r}; there are: {', '.join(self.label_names) or 'none'}")
+            raise InputError(f"there is no label {shown(label)}; there are: {', '.join(self.label_names) or 'none'}")
         return np.equal(self.labels, self.label_names.index(label) + 1)
 
     def nodes_of(self, label: str) -> np.ndarray:
@@ -204,7 +208,10 @@ def _mask(nodes: npt.ArrayLike, count: int) -> npt.NDArray[np.bool_]:
 
 
 def _checked_labels(given: np.ndarray, count: int, names: int) -> np.ndarray:
-    labels = np.asarray(given)
+    try:
+        labels = np.asarray(given)
+    except ValueError:
+        raise InputError(f"labels has rows of several lengths; it must be integers [{count}]") from None
     if labels.shape != (count,) or labels.dtype.kind not in "iu":
         raise InputError(f"labels have shape {labels.shape} and dtype {labels.dtype}; they must be integers [{count}]")
     if len(labels) and not 0 <= labels.min() <= labels.max() <= names:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from warp_corot.errors import CapacityWarning, InputError, depth_of_user
+from warp_corot.inputs.checks import shown
 
 from .online import OnlineRemesh
 
@@ -45,7 +46,7 @@ class Remeshing:
         if any(body.changing is not None for body in bodies):
             raise InputError("a body that one simulation remeshes cannot be in another; make a SoftBody of its mesh")
         options = _one_each(asked, len(bodies))
-        self.every = math.gcd(*(each.every for each in options if each is not None))
+        self.every = math.gcd(*(int(each.every) for each in options if each is not None))
         self.changing: tuple[Changing | None, ...] = (None,) * len(bodies)
         if not self.every:
             return
@@ -105,5 +106,7 @@ def _one_each(
         return (asked,) * count
     given = tuple(asked) if isinstance(asked, Sequence) else ()
     if len(given) != count or not all(isinstance(each, OnlineRemesh | None) for each in given):
-        raise InputError(f"remesh is {asked!r}; it must be an OnlineRemesh, or one or None for each of {count} bodies")
+        raise InputError(
+            f"remesh is {shown(asked)}; it must be an OnlineRemesh, or one or None for each of {count} bodies"
+        )
     return given

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_count
+from warp_corot.inputs.checks import checked_count, shown
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Hooks:
             InputError: ``every`` is not a positive whole number, or the callback is not callable.
         """
         if not callable(callback):
-            raise InputError(f"callback is {callback!r}; it must be a function of the simulation")
+            raise InputError(f"callback is {shown(callback)}; it must be a function of the simulation")
         self._hooks.append(_Hook(callback, checked_count(every, "every", least=1)))
 
     def call(self, sim: Any) -> None:

@@ -67,7 +67,7 @@ def checked_integrator(given: Any) -> Integrator:
         InputError: It is something else.
     """
     if not isinstance(given, Integrator):
-        raise InputError(f"integrator is {given!r}; it must be an integrator such as SymplecticEuler()")
+        raise InputError(f"integrator is {shown(given)}; it must be an integrator such as SymplecticEuler()")
     return given
 
 
@@ -137,7 +137,7 @@ def checked_gravity(gravity: npt.ArrayLike | None, up_axis: str) -> tuple[float,
         except (TypeError, ValueError):
             down = np.empty(0)
         if down.shape != (3,) or not np.isfinite(down).all():
-            raise InputError(f"gravity is {gravity!r}; it must be three finite accelerations in m/s^2")
+            raise InputError(f"gravity is {shown(gravity)}; it must be three finite accelerations in m/s^2")
     x, y, z = (float(a) for a in down)
     return x, y, z
 

@@ -20,7 +20,7 @@ from warp_corot.contact.tool import Obstacle
 from warp_corot.discretization.nodal import vec3_view
 from warp_corot.elasticity import Corotated, Model
 from warp_corot.errors import InputError, StabilityWarning, depth_of_user
-from warp_corot.inputs.checks import checked_count, checked_number, refuse_tape
+from warp_corot.inputs.checks import checked_count, checked_flag, checked_number, refuse_tape
 from warp_corot.remesh.online import OnlineRemesh
 from warp_corot.remesh.remeshing import Remeshing
 from warp_corot.solvers import Integrator, SymplecticEuler, largest_frequency
@@ -103,7 +103,7 @@ class Simulation(Clock):
     ):
         self.bodies = checked_bodies(bodies, self.ranks)
         self.device, self.worlds = self.bodies[0].device, self.bodies[0].worlds
-        self.deterministic = bool(deterministic)
+        self.deterministic = checked_flag(deterministic, "deterministic")
         self.models = checked_models(Corotated() if model is None else model, len(self.bodies))
         self.integrator = checked_integrator(SymplecticEuler() if integrator is None else integrator)
         self.gravity = checked_gravity(gravity, self.bodies[0].mesh.up_axis)
@@ -394,6 +394,6 @@ class Simulation(Clock):
     def _index(self, body: SoftBody | None) -> int:
         if body is None:
             return 0
-        if body not in self.bodies:
+        if not isinstance(body, SoftBody) or body not in self.bodies:
             raise InputError("the body is not one of this simulation's")
         return self.bodies.index(body)

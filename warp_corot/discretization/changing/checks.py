@@ -13,7 +13,7 @@ from typing import Any
 import warp as wp
 
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_number
+from warp_corot.inputs.checks import checked_number, shown
 from warp_corot.kernels.remesh.criteria import PARAMETER_COUNTS
 
 
@@ -52,7 +52,7 @@ def checked_criterion(criterion: Any) -> Any:
         InputError: It is something else, or takes another number of arguments.
     """
     if not isinstance(criterion, wp.Function) or criterion.func is None:
-        raise InputError(f"criterion is {criterion!r}; it must be a Warp function (@wp.func) of an ElementState")
+        raise InputError(f"criterion is {shown(criterion)}; it must be a Warp function (@wp.func) of an ElementState")
     count = len(inspect.signature(criterion.func).parameters)
     if count != 2:
         raise InputError(
@@ -74,7 +74,7 @@ def checked_parameters(parameters: Any, criterion: Any) -> wp.array | None:
     """
     is_array = isinstance(parameters, wp.array) and parameters.dtype == wp.float32 and parameters.ndim == 1
     if parameters is not None and not (is_array and len(parameters) > 0):
-        raise InputError(f"parameters is {parameters!r}; it must be a Warp array of float32, [n], not empty")
+        raise InputError(f"parameters is {shown(parameters)}; it must be a Warp array of float32, [n], not empty")
     given, needed = 0 if parameters is None else len(parameters), PARAMETER_COUNTS.get(criterion, 0)
     if given < needed:
         name = criterion.func.__name__

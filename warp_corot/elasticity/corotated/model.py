@@ -13,6 +13,7 @@ from warp_corot.elasticity.model import ForceField, Model
 from warp_corot.elasticity.paths.general import CorotatedGeneralField
 from warp_corot.elasticity.polar import METHODS, rotation_function
 from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_choice, checked_count, checked_flag, shown
 from warp_corot.kernels.elements.dilatation import VOLUME
 from warp_corot.kernels.math.rotation import byers_xu, quick_rotation
 from warp_corot.materials.anisotropic import Anisotropic
@@ -78,12 +79,11 @@ class Corotated(Model):
     def __post_init__(self) -> None:
         check_dilatation(self.dilatation)
         _check_level(self.rotation_level)
-        if self.rotation not in METHODS:
-            raise InputError(f"rotation is {self.rotation!r}; it must be one of {', '.join(METHODS)}")
+        checked_choice(self.rotation, "rotation", METHODS)
         if self.iterations is not None:
-            rotation_function(self.rotation, self.iterations)
-        if self.stiffness not in STIFFNESSES:
-            raise InputError(f"stiffness is {self.stiffness!r}; it must be one of {', '.join(STIFFNESSES)}")
+            rotation_function(self.rotation, checked_count(self.iterations, "iterations", 2))
+        checked_choice(self.stiffness, "stiffness", STIFFNESSES)
+        checked_flag(self.subtrees, "subtrees")
 
     @property
     def level(self) -> int | None:
@@ -156,13 +156,13 @@ def _check_level(level: int | float | str | None) -> None:
     Raises:
         InputError: It is no rotation level.
     """
-    if level is None or level == "auto":
+    if level is None or (isinstance(level, str) and level == "auto"):
         return
     if isinstance(level, Integral) and not isinstance(level, bool) and 0 <= level <= MAX_LEVEL:
         return
     if isinstance(level, float) and 0.0 < level <= 0.5:
         return
     raise InputError(
-        f"rotation_level is {level!r}; it must be None, a whole number from 0 to {MAX_LEVEL}, "
+        f"rotation_level is {shown(level)}; it must be None, a whole number from 0 to {MAX_LEVEL}, "
         'a tolerance above 0 and up to 0.5 rad, or "auto"'
     )

@@ -10,7 +10,7 @@ import numpy as np
 from warp_corot.discretization.discretization import Discretization, discretization_of
 from warp_corot.elasticity.model import ForceField
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import shown
+from warp_corot.inputs.checks import checked_choice, shown
 from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.materials.anisotropic import Anisotropic
 
@@ -31,8 +31,7 @@ def check_dilatation(dilatation: str) -> None:
     Raises:
         InputError: It is none of the values.
     """
-    if dilatation not in (AUTO, ELEMENT, SHARED):
-        raise InputError(f"dilatation is {shown(dilatation)}; it must be {AUTO!r}, {ELEMENT!r} or {SHARED!r}")
+    checked_choice(dilatation, "dilatation", (AUTO, ELEMENT, SHARED))
 
 
 def refuse_shared(dilatation: str, model: str) -> None:
@@ -41,7 +40,7 @@ def refuse_shared(dilatation: str, model: str) -> None:
     Raises:
         InputError: It is not "element".
     """
-    if dilatation != ELEMENT:
+    if not isinstance(dilatation, str) or dilatation != ELEMENT:
         raise InputError(f"dilatation is {shown(dilatation)}; for {model}, which has springs, it must be {ELEMENT!r}")
 
 

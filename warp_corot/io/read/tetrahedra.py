@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_path
+from warp_corot.inputs.checks import checked_number, checked_path
 
 from .assets import find_asset
 from .filemesh import FileMesh
@@ -93,7 +93,7 @@ def load_tets(
         InputError: The file does not exist, is not a mesh, has no tetrahedra, coordinates that are not finite or
             indices out of range, the scale is not positive, or there is no such array or unit; one line says which.
     """
-    if not (np.isfinite(scale) and scale > 0.0):
+    if not 0.0 < checked_number(scale, "scale") < np.inf:
         raise InputError(f"scale is {scale}; it must be a positive number")
     asset = find_asset(path)
     source = asset.path if asset else checked_path(path, "path")

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_numbers, checked_vector, shown
 from warp_corot.io.files.isolated import read_isolated
 from warp_corot.io.files.quiet import bounded, quietly
 
@@ -202,12 +203,10 @@ def affine_of(spacing: Any, origin: Any) -> NDArray[np.float64]:
     Raises:
         InputError: Spacing is not three positive numbers, or origin is not three finite ones.
     """
-    steps = np.asarray(spacing, dtype=np.float64)
+    steps = checked_numbers(spacing, "spacing", "[3]")
     if steps.shape != (3,) or not all(math.isfinite(s) and s > 0.0 for s in steps):
-        raise InputError(f"spacing is {spacing!r}; it must be three positive numbers, one an axis")
-    start = np.zeros(3) if origin is None else np.asarray(origin, dtype=np.float64)
-    if start.shape != (3,) or not np.isfinite(start).all():
-        raise InputError(f"origin is {origin!r}; it must be three finite numbers")
+        raise InputError(f"spacing is {shown(spacing)}; it must be three positive numbers, one an axis")
+    start = np.zeros(3) if origin is None else checked_vector(origin, "origin")
     affine = np.diag([*steps, 1.0])
     affine[:3, 3] = start
     return affine

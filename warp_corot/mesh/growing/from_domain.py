@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_count
+from warp_corot.inputs.checks import checked_count, checked_number, shown
 from warp_corot.inputs.device import checked_device
 from warp_corot.mesh.forest import TetForest
 from warp_corot.mesh.lattice import MAX_LEVEL, check_levels, checked_cell_size, checked_level
@@ -58,7 +58,11 @@ def mesh_domain(
     device: str | wp.Device | None,
 ) -> TetForest:
     """See `TetForest.from_domain`."""
+    for name, function in (("refine_where", refine_where), ("field", field)):
+        if function is not None and not callable(function):
+            raise InputError(f"{name} is {shown(function)}; it must be a function of points [n, 3], or None")
     where = checked_device(domain.device if device is None else device)
+    checked_level(min_level, "min_level")
     _check(cell_size, min_level, max_level, surface_error, field_tolerance, target_elements, min_layers, detail, sliver)
     error = 0.0 if surface_error is None else float(surface_error)
     wishes = Wishes(error, min_level, MAX_LEVEL, refine_where, field, float(field_tolerance))
@@ -113,17 +117,17 @@ def _check(cell_size, min_level, max_level, surface_error, field_tolerance, targ
         checked_cell_size(cell_size)
     check_levels(min_level, max_level)
     checked_level(detail, "detail")
-    if not (np.isfinite(min_layers) and min_layers >= 0):
+    if not 0 <= checked_number(min_layers, "min_layers") < np.inf:
         raise InputError(f"min_layers is {min_layers}; it must be a number of elements, 0 for no care")
-    if surface_error is not None and not (np.isfinite(surface_error) and surface_error > 0):
+    if surface_error is not None and not 0 < checked_number(surface_error, "surface_error", "m") < np.inf:
         raise InputError(f"surface_error is {surface_error}; it must be a positive length in metres, or None")
-    if not field_tolerance >= 0:
+    if not checked_number(field_tolerance, "field_tolerance") >= 0:
         raise InputError(f"field_tolerance is {field_tolerance}; it must not be negative")
     if target is not None:
         checked_count(target, "target_elements", 1)
         if target > MOST_ELEMENTS:
             raise InputError(f"target_elements is {target}; it must be at most {MOST_ELEMENTS}")
-    if not 0 <= sliver < 1:
+    if not 0 <= checked_number(sliver, "sliver") < 1:
         raise InputError(f"sliver is {sliver}; it must be a share of an element's volume, from 0 to below 1")
 
 

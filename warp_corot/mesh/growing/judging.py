@@ -244,7 +244,7 @@ class Judge:
     def judge_fields(self, first: int, states: wp.array) -> None:
         """Bisect where labels or the user's fields ask for it, seen at corners and centroids."""
         wishes, domain = self.wishes, self.domain
-        if not (domain.label_names or wishes.refine_where or wishes.field):
+        if not (domain.label_names or wishes.refine_where is not None or wishes.field is not None):
             return
         growth = self.growth
         state = states.numpy()
@@ -284,6 +284,8 @@ class Judge:
 
 def _checked(function: Callable[[np.ndarray], Any], points: np.ndarray) -> np.ndarray:
     found = np.asarray(function(points))
+    if found.dtype.kind not in "biuf":
+        raise InputError(f"a field gave {found.dtype} for {len(points)} points; it must give numbers [{len(points)}]")
     if found.shape != (len(points),):
         raise InputError(f"a field gave the shape {found.shape} for {len(points)} points; it must give [{len(points)}]")
     if not np.isfinite(found).all():

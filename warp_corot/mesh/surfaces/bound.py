@@ -11,11 +11,14 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_numbers
 from warp_corot.inputs.indices import checked_indices
 from warp_corot.kernels.meshing import embedding as kernels
 
+from .locating import checked_points
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class BoundPoints:
     """Points that follow the deformation of a mesh.
 
@@ -29,9 +32,15 @@ class BoundPoints:
     nodes: np.ndarray
     weights: np.ndarray
 
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} of {len(self.points)} points>"
+
     def moved(self, displacements: npt.ArrayLike) -> np.ndarray:
         """Positions [m], float64 [V, 3], after displacements [N, 3] of the mesh's nodes [m]."""
-        u = np.asarray(displacements, dtype=np.float64)
+        u = checked_numbers(displacements, "displacements", "[N, 3]")
+        least = int(self.nodes.max(initial=-1)) + 1
+        if u.ndim != 2 or u.shape[1] != 3 or len(u) < least:
+            raise InputError(f"displacements has shape {u.shape}; it must be [N, 3] for the mesh's N nodes")
         return self.points + np.einsum("vn,vnc->vc", self.weights, u[self.nodes])
 
     def on_device(self, device: str | wp.Device | None = None) -> DeviceBinding:
@@ -39,7 +48,7 @@ class BoundPoints:
         return DeviceBinding(self, wp.get_device(device))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class SurfaceMesh(BoundPoints):
     """A triangle surface that follows the deformation of a mesh.
 
@@ -160,10 +169,13 @@ def bound(points: np.ndarray, nodes: np.ndarray, weights: np.ndarray, triangles:
     Raises:
         InputError: The triangles have another shape, or name points that do not exist.
     """
-    rest = np.array(points, dtype=np.float64)
+    rest = checked_points(points).copy()
     if triangles is None:
         return BoundPoints(rest, nodes, weights)
-    faces = np.asarray(triangles)
+    try:
+        faces = np.asarray(triangles)
+    except ValueError:
+        raise InputError("triangles has rows of several lengths; it must be [F, 3]") from None
     if faces.ndim != 2 or faces.shape[1] != 3:
         raise InputError(f"triangles has shape {faces.shape}; it must be [F, 3]")
     checked_indices(faces.ravel(), len(rest), "point")

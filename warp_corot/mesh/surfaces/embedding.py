@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 import warp as wp
 
 from warp_corot.kernels.meshing import embedding as kernels
@@ -17,7 +18,7 @@ from .locating import FARTHEST, checked_points, nearest_faces
 _WALKS = np.array([[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]])
 
 
-def embed(forest: ForestArrays, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def embed(forest: ForestArrays, points: npt.ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """See `TetForest.embed`."""
     points = checked_points(points)
     elements = _descended(forest, points)

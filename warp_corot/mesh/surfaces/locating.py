@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_numbers
 from warp_corot.kernels.meshing import embedding as kernels
 
 from .boundary import boundary_faces
@@ -14,13 +16,13 @@ from .boundary import boundary_faces
 FARTHEST = 1.0e3
 
 
-def checked_points(points: np.ndarray) -> np.ndarray:
+def checked_points(points: npt.ArrayLike) -> np.ndarray:
     """Points float64 [n, 3].
 
     Raises:
         InputError: They have another shape, or are not finite.
     """
-    points = np.asarray(points, dtype=np.float64)
+    points = checked_numbers(points, "points", "[n, 3]")
     if points.ndim != 2 or points.shape[1] != 3:
         raise InputError(f"points has shape {points.shape}; it must be [n, 3]")
     bad = np.flatnonzero(~np.isfinite(points).all(axis=1))

@@ -56,7 +56,7 @@ class SymplecticEuler(Integrator):
         if not 0 <= checked_number(self.damping, "damping", "1/s") < math.inf:
             raise InputError(f"damping is {self.damping}; it must be zero or a positive rate in 1/s")
 
-        if not (math.isfinite(self.viscosity) and self.viscosity >= 0):
+        if not 0 <= checked_number(self.viscosity, "viscosity", "s") < math.inf:
             raise InputError(f"viscosity is {self.viscosity}; it must be zero or a positive time in seconds")
 
     def stable_step(self, frequency: float) -> float:

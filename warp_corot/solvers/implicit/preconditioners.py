@@ -66,6 +66,6 @@ def check_preconditioner(name: Any) -> None:
     Raises:
         InputError: There is no preconditioner of this name.
     """
-    if name is not None and name not in PRECONDITIONERS:
+    if name is not None and not (isinstance(name, str) and name in PRECONDITIONERS):
         names = ", ".join(map(repr, PRECONDITIONERS))
         raise InputError(f"preconditioner is {shown(name)}; it must be None or one of {names}")

@@ -9,6 +9,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.elasticity.model import SmallForces
+from warp_corot.errors import InputError
 from warp_corot.kernels.stepping import lanczos
 from warp_corot.solvers.ranks import ALONE, Ranks
 
@@ -80,8 +81,14 @@ def largest_eigenvalue(
 
 def _largest_value(diagonal: npt.NDArray[np.float64], off: npt.NDArray[np.float64]) -> float:
     """The largest Ritz value plus its residual, the smallest of the last few steps: rounding produces copies of values
-    that were already found, with meaningless residuals."""
+    that were already found, with meaningless residuals.
+
+    Raises:
+        InputError: The forces are not finite.
+    """
     bounds = []
+    if not (np.isfinite(diagonal).all() and np.isfinite(off).all()):
+        raise InputError("forces of small motions are not finite; moduli must be within the range of float32")
     for size in range(max(len(diagonal) - LAST_STEPS, 0) + 1, len(diagonal) + 1):
         tridiagonal = np.diag(diagonal[:size]) + np.diag(off[1:size], 1) + np.diag(off[1:size], -1)
         values, vectors = np.linalg.eigh(tridiagonal)
