@@ -1,1 +1,1 @@
-"""Contact: distances to obstacles, forces that keep surfaces out of one another, friction, and what users read."""
+"""Contact: distances to obstacles, forces that keep surfaces apart, friction, and the sums that users read."""

@@ -1,9 +1,9 @@
-"""Nodes held by obstacles in an implicit step: which, along which directions, and with what forces.
+"""Nodes held by obstacles in an implicit step: which nodes, in which directions, and with what forces.
 
-Where a node touches, its motion d in the step is given along the obstacle's normal, and where it sticks in all
-directions: d = S d + g with a projector S and g in the directions that it leaves out. The step is solved for with
-these held (Baraff and Witkin 1998); the force of contact is what is left of the balance of forces there. A node that is
-pulled is let go, one that would pass is held, and one that friction cannot hold slips, until nothing changes.
+A node that touches has a given motion along the obstacle's normal, and in all directions if it sticks: d = S d + g,
+where the projector S removes the given directions and g lies in them. The step is solved with these directions held
+(Baraff and Witkin 1998); the contact force is the residual there. Then a node that is pulled is released, a node that
+would pass is held, and a node that friction cannot hold slips. This repeats until nothing changes.
 """
 
 import warp as wp
@@ -18,24 +18,24 @@ from .vertices import across
 
 wp.set_module_options({"enable_backward": False})
 
-#: How a node is with an obstacle. One that slips has a force against its way; one that is dragged has a drag instead,
-#: which cannot turn it round.
+#: State of a node at an obstacle. A slipping node has a force against its motion; a dragged node has a drag instead,
+#: which cannot reverse the motion.
 APART, SLIPS, STICKS, DRAGGED = (wp.constant(k) for k in range(4))
-#: Of which obstacles bounds are found.
+#: The obstacles whose bounds are found.
 THOSE_APART, THOSE_TOUCHED = wp.constant(0), wp.constant(1)
-#: Rounds after which nodes are only held and not let go any more, and rounds at most.
+#: Number of rounds after which no node is released any more, and maximum number of rounds.
 LATE, ROUNDS = wp.constant(8), wp.constant(16)
-#: Change of a friction force, as a share of its bound, that is worth another round.
+#: A friction force that changes by more than this fraction of its bound causes another round.
 SETTLED = wp.constant(1.0e-3)
-#: How often a node is let go in a step.
+#: How often a node may be released in a step.
 RELEASED = wp.constant(3)
-#: How many times the least slip is that of a drag.
+#: Least slip with which a drag is computed, in multiples of the least slip of a friction force.
 LOOSE = wp.constant(100.0)
-#: How often friction turns a node round in a step before it is dragged to the end.
+#: How often friction may reverse a node's motion in a step; after that the node is dragged until the end.
 CAUGHT = wp.constant(4)
-#: Share of half of an obstacle's thickness up to which a node's motion is looked at where it ends.
+#: A motion of up to this fraction of half the obstacle's thickness is checked at its end.
 NEAR_END = wp.constant(0.5)
-#: Sine between normals of obstacles that hold a node in different directions.
+#: Sine of the angle beyond which the normals of two obstacles hold a node in different directions.
 DIFFERENT = wp.constant(0.05)
 #: A bound that no motion violates [m].
 NO_BOUND = wp.constant(-1.0e30)
@@ -68,7 +68,7 @@ def begin_places(
     surface: Surface,
     holding: Holding,
 ):
-    """Where a body's surface nodes are."""
+    """Copy the positions of a body's surface nodes."""
     s = start + wp.tid()
     i = surface.node[s]
     surface.f[s] = wp.vec3()
@@ -102,9 +102,9 @@ def find_bounds(
     # Out
     holding: Holding,
 ):
-    """The plane of each obstacle that a node must stay beyond: where the node begins, or where it would end.
+    """Find the plane of each obstacle that a node must not pass, at the beginning or at the end of the node's motion.
 
-    Of those that it does not touch, or of those that it does.
+    The obstacles are those that the node does not touch, or those that it touches.
     """
     s = start + wp.tid()
     if surface.yielding[s] == 0.0:
@@ -145,7 +145,7 @@ def hold_places(
     # Out
     holding: Holding,
 ):
-    """The projector of each node, and its motion in the directions that are left out."""
+    """Find the projector of each node and its motion in the held directions."""
     s = start + wp.tid()
     holding.touched[s] = 0
     if surface.yielding[s] == 0.0:
@@ -195,7 +195,9 @@ def impose(start: int, surface: Surface, holding: Holding, d: wp.array[wp.vec4])
 
 @wp.func
 def drag_of(o: int, s: int, holding: Holding, x: wp.vec3):
-    """D x: across the way of a node that slips, since its force turns with the way; all of it where it is dragged."""
+    """D x: the part across the motion of a slipping node, because its force turns with the motion; all of it for a
+    dragged node.
+    """
     n = holding.normals[o, s]
     sideways = across(x, n)
     if holding.kinds[o, s] == SLIPS:
@@ -259,9 +261,9 @@ def release(o: int, s: int, holding: Holding):
 def judge_single(
     o: int, s: int, force: wp.vec3, slip: wp.vec3, friction: float, least_slip: float, is_late: bool, holding: Holding
 ) -> bool:
-    """A node that touches one obstacle: its force, and whether it changes.
+    """Find the force on a node that touches one obstacle, and whether its state changes.
 
-    A node that friction turns round sticks for once; the next times it is dragged for a round.
+    When friction first reverses a node's motion, the node sticks; later it is dragged for a round.
     """
     n = holding.normals[o, s]
     normal_force = wp.dot(force, n)
@@ -336,7 +338,7 @@ def judge_places(
     # Out
     changed: wp.array[wp.int32],
 ):
-    """Forces of contact q - b where nodes are held, q = A d; and which nodes are held from now on."""
+    """Find the contact forces q - b, q = A d, at held nodes, and the nodes that are held from now on."""
     s = start + wp.tid()
     if surface.yielding[s] == 0.0:
         return
@@ -358,7 +360,7 @@ def judge_places(
         slip = step - carried(motions.now[world, first], motions.later[world, first], x)
         changes = judge_single(first, s, force, slip, shapes.friction[first], least_slip, is_late, holding)
     elif touching > 1:
-        # Without friction: the force along each normal, in turn.
+        # Without friction, find the force along each normal in turn.
         for o in range(count):
             holding.forces[o, s] = wp.vec3()
             holding.drag[o, s] = 0.0
@@ -416,7 +418,7 @@ def end_places(
     surface: Surface,
     contact_forces: wp.array[wp.vec4],
 ):
-    """What has come of the step: motions and forces."""
+    """Write the motions and forces of the step."""
     s = start + wp.tid()
     i = surface.node[s]
     if i < 0:

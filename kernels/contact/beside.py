@@ -1,4 +1,4 @@
-"""Which surface nodes and triangles obstacles are near."""
+"""Surface nodes and triangles that are near obstacles."""
 
 import warp as wp
 
@@ -25,7 +25,7 @@ def find_nodes_beside(
     forces: wp.array2d[wp.vec3],
     anchors: wp.array2d[wp.vec4],
 ):
-    """Mark nodes that may touch an obstacle before the next search; others have no forces of obstacles."""
+    """Mark nodes that may touch an obstacle before the next search. Obstacles exert no forces on other nodes."""
     s = wp.tid()
     if watch.due[0] == 0:
         return
@@ -55,7 +55,9 @@ def find_triangles_beside(
     near: Near,
     touches: Touches,
 ):
-    """List triangles that may touch an obstacle before the next search; others have no forces of obstacles."""
+    """List triangles that may touch an obstacle before the next search. Obstacles exert no forces on other
+    triangles.
+    """
     o, t = wp.tid()
     if watch.due[0] == 0:
         return
@@ -68,7 +70,7 @@ def find_triangles_beside(
         middle = (a + b + c) / 3.0
         size = wp.max(wp.length(a - middle), wp.max(wp.length(b - middle), wp.length(c - middle)))
         reach = wp.max(watch.reach[corners[0]], wp.max(watch.reach[corners[1]], watch.reach[corners[2]]))
-        # The middle moves, and so do the corners about it.
+        # The centre moves, and the corners move relative to it.
         far = size + 3.0 * reach + watch.reach_of[world, o] + law.tolerance
         gap, _normal = distance_to(shapes, o, motions.now[world, o], middle, far)
         if gap <= far:

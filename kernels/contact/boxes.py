@@ -1,4 +1,4 @@
-"""Boxes about triangles and edges, as far as these may reach before the next search."""
+"""Boxes around triangles and edges that contain all their positions until the next search."""
 
 import warp as wp
 
@@ -8,7 +8,7 @@ from .watch import Watch
 
 wp.set_module_options({"enable_backward": False})
 
-#: Where boxes of nothing are [m].
+#: Coordinate of empty boxes [m].
 NOWHERE = wp.constant(1.0e6)
 
 
@@ -63,7 +63,7 @@ def box_edges(surface: Surface, meeting: Meeting, lower: wp.array[wp.vec3], uppe
 
 @wp.func
 def place_of(i: int, of_edges: int, meeting: Meeting):
-    """A node of a triangle or an edge; -1 where there is none."""
+    """A node of a triangle or an edge, or -1 if there is none."""
     if of_edges != 0:
         return meeting.edges[i][0]
     return meeting.triangles[i][0]
@@ -71,7 +71,7 @@ def place_of(i: int, of_edges: int, meeting: Meeting):
 
 @wp.kernel(enable_backward=False)
 def clear_bounds(watch: Watch, lower: wp.array2d[wp.vec3], upper: wp.array2d[wp.vec3]):
-    """Bounds of bodies, [worlds, bodies], that hold nothing yet."""
+    """Make the bounds of bodies, [worlds, bodies], empty."""
     world, k = wp.tid()
     if watch.due[0] != 0:
         lower[world, k] = wp.vec3(NOWHERE, NOWHERE, NOWHERE)
@@ -92,7 +92,7 @@ def bound_bodies(
     lower: wp.array2d[wp.vec3],
     upper: wp.array2d[wp.vec3],
 ):
-    """The bounds of all boxes of each body, of its triangles or of its edges."""
+    """Extend the bounds of each body to all boxes of its triangles or edges."""
     i = wp.tid()
     if watch.due[0] == 0:
         return
@@ -106,7 +106,7 @@ def bound_bodies(
     while i < count:
         place = place_of(i, of_edges, meeting)
         if place >= 0:
-            # Bodies lie one after another, so that threads rarely go from one to the next.
+            # Places are sorted by body, so a thread rarely moves on to another body.
             if meeting.body[place] != body or surface.world[place] != world:
                 if body >= 0:
                     wp.atomic_min(lower, world, body, low)
@@ -126,7 +126,9 @@ def bound_bodies(
 
 @wp.func
 def may_reach_others(s: int, low: wp.vec3, high: wp.vec3, surface: Surface, meeting: Meeting):
-    """Whether a box of something at place ``s`` meets the bounds of another body, if a body does not meet itself."""
+    """Whether the box of an item at place ``s`` overlaps the bounds of another body; always true if a body may touch
+    itself.
+    """
     if meeting.meets_itself != 0:
         return True
     world = surface.world[s]

@@ -6,15 +6,16 @@ from .shapes import Shapes, distance_to
 
 wp.set_module_options({"enable_backward": False})
 
-#: Corners that the search for the deepest point of a triangle goes towards, and halvings of the way to each.
+#: In the search for the deepest point of a triangle: number of moves towards a corner, and of halvings of each move.
 TURNS = wp.constant(8)
 HALVINGS = wp.constant(6)
 
 
 @wp.func
 def on_triangle(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
-    """Shares of the corners in the point of a triangle that is closest to p (Ericson, Real-Time Collision Detection,
-    5.1.5)."""
+    """Barycentric coordinates of the point of a triangle that is closest to p (Ericson, Real-Time Collision Detection,
+    5.1.5).
+    """
     ab = b - a
     ac = c - a
     ap = p - a
@@ -50,7 +51,7 @@ def on_triangle(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
 
 @wp.func
 def on_segments(p: wp.vec3, q: wp.vec3, a: wp.vec3, b: wp.vec3):
-    """Shares of q and of b in the points of pq and ab that are closest to one another (Ericson, 5.1.9)."""
+    """Weights of q and b in the closest points of the segments pq and ab (Ericson, 5.1.9)."""
     d1 = q - p
     d2 = b - a
     r = p - a
@@ -84,7 +85,9 @@ def point_of(w: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
 
 @wp.func
 def crossing(p: wp.vec3, q: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
-    """The share of q where pq goes through a triangle, -1 if it does not, and the corners' shares there."""
+    """The weight of q at the point where pq passes through a triangle, or -1, and that point's barycentric
+    coordinates.
+    """
     normal = wp.cross(b - a, c - a)
     area = wp.dot(normal, normal)
     low = wp.dot(p - a, normal)
@@ -105,8 +108,9 @@ def crossing(p: wp.vec3, q: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
 
 @wp.func
 def candidate(k: int, p: wp.vec3, q: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3):
-    """The corners' shares in the point of a triangle closest to the k-th of: p, q, and the segment pq for each edge;
-    and how far it is from pq."""
+    """Barycentric coordinates of the point of a triangle that is closest to candidate k (p, q, or the segment pq for
+    each edge), and the distance of this point from pq.
+    """
     if k == 0:
         w = on_triangle(p, a, b, c)
         return w, wp.length(point_of(w, a, b, c) - p)
@@ -133,10 +137,10 @@ def candidate(k: int, p: wp.vec3, q: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3
 
 @wp.func
 def segment_to_triangle(p: wp.vec3, q: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3, blur: float):
-    """The share of q and those of the corners in the closest points of a segment and a triangle.
+    """The weight of q and the barycentric coordinates of the closest points of a segment and a triangle.
 
-    Where places differ by less than about ``blur`` in their distance [m], as along a segment that is parallel to the
-    triangle, it is between them: the closest one would be another at every step.
+    Points whose distances differ by less than about ``blur`` [m], as on a segment that is parallel to the triangle, are
+    averaged; otherwise the closest point would jump from step to step.
     """
     t, w = crossing(p, q, a, b, c)
     if t >= 0.0:
@@ -145,7 +149,7 @@ def segment_to_triangle(p: wp.vec3, q: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.ve
     w = wp.vec3()
     total = float(0.0)
     k = int(0)
-    # A loop that stays one; what was found before shrinks when something closer is found.
+    # This loop is not unrolled; earlier results lose weight when a closer point is found.
     while k < 5:
         place, far = candidate(k, p, q, a, b, c)
         if far < least:
@@ -168,14 +172,14 @@ def segment_to_triangle(p: wp.vec3, q: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.ve
 
 @wp.func
 def deepest_on_triangle(shapes: Shapes, o: int, pose: wp.transform, most: float, a: wp.vec3, b: wp.vec3, c: wp.vec3):
-    """The corners' shares in the point of a triangle that is deepest in an obstacle, or closest to it.
+    """Barycentric coordinates of the point of a triangle that is deepest in an obstacle, or closest to it.
 
-    Frank and Wolfe's method: towards the corner that the distance falls to most steeply, as far as it falls. Exact in
-    the end for convex obstacles; often that corner is the end.
+    This is Frank and Wolfe's method: move towards the corner in whose direction the distance falls most steeply, as far
+    as it falls. It converges for convex obstacles, and often ends at that corner.
     """
     w = wp.vec3(1.0, 1.0, 1.0) / 3.0
     corners = wp.matrix_from_rows(a, b, c)
-    # Loops that stay loops: unrolled, they would hold the distance 64 times, and take minutes to compile.
+    # These loops are not unrolled: they would contain the distance function 64 times, which takes minutes to compile.
     turns = int(0)
     while turns < TURNS:
         turns += 1
@@ -191,7 +195,7 @@ def deepest_on_triangle(shapes: Shapes, o: int, pose: wp.transform, most: float,
         way = corner - w
         low = float(0.0)
         high = float(1.0)
-        # The corner itself is looked at first.
+        # Try the corner itself first.
         middle = float(1.0)
         halvings = int(0)
         if w[k] == 1.0:

@@ -1,4 +1,4 @@
-"""Elements that are turned inside out: more than a body bears."""
+"""Inverted elements: signs of loads that a body cannot carry."""
 
 import functools
 from typing import Any
@@ -13,7 +13,7 @@ from .watch import Watch
 
 wp.set_module_options({"enable_backward": False})
 
-#: Of elements with less of their volume a body's surface does not touch itself.
+#: The surface of elements below this volume ratio ignores contact with its own body.
 FLAT = wp.constant(0.05)
 
 
@@ -26,7 +26,7 @@ def volume_ratio(elements: Any, t: int, u: wp.array[wp.vec4]):
 
 @functools.cache
 def count_crushed(Elements: type) -> wp.Kernel:
-    """Count elements with det F < 0: all of them, or those that are nonzero in ``counted``."""
+    """Count elements with det F < 0 among all elements, or among those that are nonzero in ``counted``."""
 
     @unique_kernel()
     def count_crushed(elements: Elements, u: wp.array[wp.vec4], counted: wp.array[wp.int32], count: wp.array[wp.int32]):
@@ -41,7 +41,7 @@ def count_crushed(Elements: type) -> wp.Kernel:
 
 @functools.cache
 def mark_crushed(Elements: type) -> wp.Kernel:
-    """Mark the surface nodes of elements that are turned inside out, or nearly so, where ``places`` says [nodes]."""
+    """Mark the surface nodes of elements that are inverted or nearly so; ``places`` maps nodes to places, [nodes]."""
 
     @unique_kernel()
     def mark_crushed(watch: Watch, elements: Elements, u: wp.array[wp.vec4], places: wp.array[wp.int32], near: Near):

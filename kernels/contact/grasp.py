@@ -1,7 +1,7 @@
-"""Nodes that a tool holds: each at its place in the tool's frame, rigidly or by a spring.
+"""Nodes that a tool holds at fixed places in its frame, rigidly or by springs.
 
-In implicit steps both are springs to where the tool is at the end of the step. The rigid one is stiffer than the body,
-and has the force of the last step as a multiplier, so that what holds still is where it must be.
+In implicit steps both are springs to the tool's pose at the end of the step. The rigid one is stiffer than the body and
+has the force of the last step as a multiplier, so a node at rest has no offset.
 """
 
 from typing import Any
@@ -31,7 +31,7 @@ def take_hold(
     # Out
     places: wp.array[wp.vec3],
 ):
-    """Where nodes are in the tool's frame."""
+    """Record the positions of nodes in the tool's frame."""
     k = wp.tid()
     i = nodes[k]
     pose = motions.later[k / per_world, o]
@@ -64,8 +64,9 @@ def hold_in_tool(
     # Out
     forces: wp.array[wp.vec3],
 ):
-    """What takes nodes along with the tool by the end of the step; or pulls them there by so many newtons a metre,
-    implicitly, if ``stiffness`` is positive."""
+    """Find the forces that move nodes with the tool by the end of the step. If ``stiffness`` [N/m] is positive,
+    implicit springs pull the nodes there instead.
+    """
     k = wp.tid()
     i = nodes[k]
     forces[k] = wp.vec3()
@@ -116,7 +117,7 @@ def pull_to_tool(
     # Out
     forces: wp.array[wp.vec3],
 ):
-    """Add the springs' forces in a state of the body, with the tool at the end of the step."""
+    """Add the springs' forces in the body's state, with the tool in its pose at the end of the step."""
     k = wp.tid()
     i = nodes[k]
     force = wp.vec3()
@@ -157,7 +158,7 @@ def sum_held(
     # Out
     wrenches: wp.array[wp.spatial_vector],
 ):
-    """What the nodes do to the tool about its origin, in one order."""
+    """Sum the wrench of the nodes on the tool, about its origin, in a fixed order."""
     world = wp.tid()
     force = wp.vec3d()
     torque = wp.vec3d()

@@ -1,9 +1,9 @@
-"""How far two things that touch may come nearer in a step, and what holds them back across it.
+"""The contact law: how far two touching surfaces may approach each other in a step, and the bound on friction.
 
-A contact force is what it takes for the step to end with the surfaces side by side: it follows from where the nodes
-would go without it and from their lumped masses. So it has no stiffness, adds nothing to the largest frequency, and
-nothing passes, however fast it comes, as long as the step ends before the other side is reached. Position is followed
-slowly, velocity at once: what rounding leaves of positions would otherwise be felt as force.
+A contact force is the force with which the step ends with the surfaces side by side. It follows from the nodes' motion
+without contact and from their lumped masses. So it has no stiffness and does not change the highest frequency, and no
+surface passes another at any speed, provided that the step ends before it reaches the far side. Velocities are
+corrected at once and positions slowly, because rounding errors of positions would otherwise act as forces.
 
 After Carpenter, Taylor and Katona, Lagrange constraints for transient finite element surface contact (1991).
 """
@@ -12,20 +12,20 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-#: Share of what is left of a gap, or of a way to an anchor, that is closed in a step.
+#: Fraction of the remaining gap, or of the distance to an anchor, that closes in a step.
 SETTLING = wp.constant(0.1)
 
 
 @wp.struct
 class Law:
-    tolerance: float  # gaps that rounding leaves [m]
-    recovery: float  # speed at which things that overlap are pushed apart [m/s]
-    grain: float  # forces on nodes are added up in multiples of this, so that no order matters [N]
+    tolerance: float  # gaps of the size of rounding errors [m]
+    recovery: float  # speed at which overlapping surfaces are pushed apart [m/s]
+    grain: float  # forces on nodes are summed in multiples of this, so that the order does not matter [N]
 
 
 @wp.func
 def least_motion(gap: float, law: Law, dt: float):
-    """How far a contact must open in this step; negative: how far it may close [m]."""
+    """How far a contact must open in this step [m]; if negative, how far it may close."""
     if gap > law.tolerance:
         return -(gap - (1.0 - SETTLING) * law.tolerance)
     return wp.min(-SETTLING * gap, law.recovery * dt)

@@ -1,4 +1,4 @@
-"""Where nodes are at triangles, and edges at edges."""
+"""The closest points of nodes and triangles, and of edges and edges."""
 
 import warp as wp
 
@@ -8,9 +8,10 @@ from .rows import BAND, BAND_AT_REST, Meeting, Rows, triangle_normal
 
 wp.set_module_options({"enable_backward": False})
 
-#: So far from a triangle's border, as a share of its size, a node still is at the triangle.
+#: A node this far outside a triangle's border, relative to the triangle's size, still counts as being at the triangle.
 BORDER = wp.constant(0.02)
-#: The ends of edges where nodes are looked at instead, as a share; and the sine between edges that are not parallel.
+#: Fraction of an edge at each end that is left to its nodes; and the least sine of the angle between edges that are not
+#: parallel.
 ENDS = wp.constant(1.0e-3)
 PARALLEL = wp.constant(0.05)
 
@@ -80,7 +81,7 @@ def locate_edge(row: int, first: int, second: int, surface: Surface, meeting: Me
     out_of_second = edge_normal(surface, meeting, second)
     if wp.dot(n, out_of_second - out_of_first) < 0.0:
         n = -n
-    # Out of the second, into the first: others face one another somewhere else.
+    # The normal points out of the second body and into the first; other pairs face each other elsewhere.
     if wp.dot(n, out_of_second) < 0.1 or wp.dot(n, out_of_first) > -0.1:
         return False
     gap = wp.dot(n, p + s * (q - p) - a - t * (b - a))

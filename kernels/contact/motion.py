@@ -1,4 +1,4 @@
-"""What contact needs of a step before it is made: where nodes would go without it, and where obstacles go."""
+"""The input of contact for a step: the motion of nodes without contact, and the motion of obstacles."""
 
 from typing import Any
 
@@ -10,30 +10,30 @@ from warp_corot.kernels.stepping.pace import DT, Pace, length_before, time_after
 
 wp.set_module_options({"enable_backward": False})
 
-#: How an obstacle moves: not at all, along keyframes, or towards a place at no more than some speed.
+#: How an obstacle moves: not at all, along keyframes, or towards a target at limited speed.
 FIXED, KEYED, SENT = (wp.constant(k) for k in range(3))
 
 
 @wp.struct
 class Surface:
-    """The surface nodes of all bodies in all worlds, a place each; places that are not in use have node -1."""
+    """The surface nodes of all bodies in all worlds, one place each; unused places have node -1."""
 
-    node: wp.array[wp.int32]  # [S] among the nodes of all worlds of its body
+    node: wp.array[wp.int32]  # [S] index among the nodes of all worlds of its body
     world: wp.array[wp.int32]  # [S]
-    rest: wp.array[wp.vec3]  # [S] where it is at rest [m]
+    rest: wp.array[wp.vec3]  # [S] rest position [m]
     x: wp.array[wp.vec3]  # [S] where it is [m]
-    d: wp.array[wp.vec3]  # [S] how far it goes in this step [m]
-    yielding: wp.array[wp.float32]  # [S] how much farther for each newton [m/N]; zero for held nodes
-    f: wp.array[wp.vec3]  # [S] forces of contact [N]
+    d: wp.array[wp.vec3]  # [S] its motion in this step [m]
+    yielding: wp.array[wp.float32]  # [S] additional motion per force [m/N]; zero for held nodes
+    f: wp.array[wp.vec3]  # [S] contact force [N]
 
 
 @wp.struct
 class Motions:
-    """How obstacles move, [O], or [W, O] for each world."""
+    """The motion of obstacles, [O], or [W, O] with a row for each world."""
 
     mode: wp.array[wp.int32]
     speed: wp.array[wp.float32]  # SENT: at most [m/s]
-    reach: wp.array[wp.float32]  # how far its points are from its origin [m], for turning
+    reach: wp.array[wp.float32]  # largest distance of its points from its origin [m], for rotations
     first: wp.array[wp.int32]  # KEYED: the first key
     keys: wp.array[wp.int32]  # how many
     times: wp.array[wp.float64]
@@ -61,7 +61,9 @@ def predict_motion(
     # Out
     surface: Surface,
 ):
-    """Where a body's surface nodes are, and how far they go in this step without contact; as the step itself has it."""
+    """Find the positions of a body's surface nodes and their motion in this step without contact, as the step computes
+    it.
+    """
     s = start + wp.tid()
     i = surface.node[s]
     surface.f[s] = wp.vec3()
@@ -97,7 +99,7 @@ def add_contact_forces(
     # Out
     contact_forces: wp.array[wp.vec4],
 ):
-    """Add what was found to a body's forces."""
+    """Add the contact forces to a body's forces."""
     s = start + wp.tid()
     i = surface.node[s]
     if i < 0:
@@ -110,7 +112,7 @@ def add_contact_forces(
 
 @wp.func
 def between(a: wp.transform, b: wp.transform, share: float):
-    """From one pose to another on a straight line, turning evenly by the shorter way."""
+    """Interpolate between two poses: a straight line, with a uniform rotation the shorter way."""
     p = wp.transform_get_translation(a)
     q = wp.transform_get_rotation(a)
     r = wp.transform_get_rotation(b)
@@ -122,11 +124,11 @@ def between(a: wp.transform, b: wp.transform, share: float):
 
 @wp.func
 def distance_between(a: wp.transform, b: wp.transform, reach: float):
-    """How far apart a point of an obstacle is in two poses, at most [m]."""
+    """An upper bound on the distance between the places of an obstacle's point in two poses [m]."""
     far = wp.length(wp.transform_get_translation(b) - wp.transform_get_translation(a))
     p = wp.transform_get_rotation(a)
     q = wp.transform_get_rotation(b)
-    # What rounding would leave of no turn counts a lot for what is large.
+    # For a large obstacle the rounding error of a zero rotation would be a large distance.
     if p[0] == q[0] and p[1] == q[1] and p[2] == q[2] and p[3] == q[3]:
         return far
     turn = wp.quat_inverse(p) * q
@@ -136,7 +138,7 @@ def distance_between(a: wp.transform, b: wp.transform, reach: float):
 
 @wp.func
 def sent(now: wp.transform, target: wp.transform, most: float, reach: float):
-    """Towards a place, no point of the obstacle by more than ``most`` [m]."""
+    """Move towards a target so that no point of the obstacle moves by more than ``most`` [m]."""
     far = distance_between(now, target, reach)
     if far <= most:
         return target
@@ -145,14 +147,16 @@ def sent(now: wp.transform, target: wp.transform, most: float, reach: float):
 
 @wp.kernel(enable_backward=False)
 def move_obstacles(motions: Motions, pace: Pace, world_starts: wp.array[wp.float64], offset: int):
-    """The pose of every obstacle now is the one that the last step has ended with; find that of this step."""
+    """Take each obstacle's pose at the end of the last step as its current one, and find its pose at the end of this
+    step.
+    """
     world, o = wp.tid()
     now = motions.later[world, o]
     motions.now[world, o] = now
     mode = motions.mode[o]
     if mode == KEYED:
         t = time_after(pace, offset + 1) - world_starts[world]
-        # The last key that is not after t, of all but the last one; the first one before them.
+        # The last key that is not after t, excluding the final key; the first key if t is before all of them.
         key = motions.first[o]
         beyond = key + motions.keys[o] - 1
         while beyond - key > 1:
@@ -171,20 +175,20 @@ def move_obstacles(motions: Motions, pace: Pace, world_starts: wp.array[wp.float
 
 @wp.kernel(enable_backward=False)
 def take_targets(given: wp.array[wp.transform], o: int, target: wp.array2d[wp.transform]):
-    """Where somebody wants a tool to be: in each world, or in all alike. A pose that is not one is skipped."""
+    """Copy the targets of tools, for each world or one for all. Invalid poses are skipped."""
     world = wp.tid()
     pose = given[wp.min(world, given.shape[0] - 1)]
     p = wp.transform_get_translation(pose)
     q = wp.transform_get_rotation(pose)
     length = wp.length(q)
-    # False where anything is NaN or infinite.
+    # False if a number is NaN or infinite.
     if wp.abs(p[0]) + wp.abs(p[1]) + wp.abs(p[2]) <= 3.0e38 and length > 0.0 and length <= 3.0e38:
         target[world, o] = wp.transformation(p, q / length)
 
 
 @wp.kernel(enable_backward=False)
 def reset_obstacles(chosen: wp.array[wp.int32], initial: wp.array2d[wp.transform], motions: Motions):
-    """Put obstacles back to where they were first, in the worlds that are reset."""
+    """Put obstacles back to their first poses in the worlds that are reset."""
     world, o = wp.tid()
     if chosen[world] != 0:
         motions.now[world, o] = initial[world, o]
@@ -196,7 +200,7 @@ def reset_obstacles(chosen: wp.array[wp.int32], initial: wp.array2d[wp.transform
 def measure_rates(
     start: int, node: wp.array[wp.int32], v: wp.array[wp.vec4], thinnest: float, rates: wp.array[wp.float32]
 ):
-    """How often in a second the fastest node passes the thinnest obstacle [1/s]."""
+    """Find how many times a second the fastest node could pass through the thinnest obstacle [1/s]."""
     i = node[start + wp.tid()]
     if i >= 0:
         rate = wp.length(load_node(v, i)) / thinnest

@@ -1,4 +1,4 @@
-"""The surface nodes that something is near: steps visit these alone."""
+"""The surface nodes near other surfaces or obstacles: steps visit only these."""
 
 import warp as wp
 
@@ -7,20 +7,20 @@ from .watch import Watch, reserved
 
 wp.set_module_options({"enable_backward": False})
 
-#: What is near a node: another soft surface, an obstacle, or an obstacle at a triangle around it.
+#: Flags for what is near a node: another soft surface, an obstacle, or an obstacle at an adjacent triangle.
 PAIRED, BESIDE, AROUND = wp.constant(1), wp.constant(2), wp.constant(4)
-#: Any of these; and that the node is of an element that is turned inside out.
+#: Any of these flags; and a flag for nodes of inverted elements.
 SOMETHING, CRUSHED = wp.constant(7), wp.constant(8)
 
 
 @wp.struct
 class Near:
-    """What the last search has found."""
+    """The result of the last search."""
 
     flags: wp.array[wp.int32]  # [S] what is
     nodes: wp.array[wp.int32]  # [S]
     count: wp.array[wp.int32]  # [1]
-    touches: wp.array[wp.int32]  # [O T] obstacles at triangles: o T + t
+    touches: wp.array[wp.int32]  # [O T] pairs of an obstacle and a triangle: o T + t
     touch_count: wp.array[wp.int32]  # [1]
 
 
@@ -32,7 +32,7 @@ def mark(near: Near, s: int, flag: int):
 
 @wp.kernel(enable_backward=False)
 def reserve_nodes(surface: Surface, watch: Watch, near: Near):
-    """Begin a search: note where nodes are, and how far they may go from there."""
+    """Begin a search: record the positions of nodes and how far they may move from there."""
     s = wp.tid()
     if watch.due[0] == 0:
         return

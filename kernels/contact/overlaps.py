@@ -1,4 +1,4 @@
-"""How far points are from obstacles, before anything has moved."""
+"""Distances of points from obstacles at the start."""
 
 import warp as wp
 
@@ -18,8 +18,9 @@ def find_gaps(
     # Out
     gaps: wp.array2d[wp.float32],
 ):
-    """Distances [O, n] of points from the obstacles of the first world, negative inside; some that is more beyond
-    ``most`` [m]."""
+    """Find distances [O, n] of points from the obstacles of the first world [m], negative inside. Distances beyond
+    ``most`` are only known to be larger than it.
+    """
     o, i = wp.tid()
     gap, _normal = distance_to(shapes, o, motions.later[0, o], points[i], most)
     gaps[o, i] = gap

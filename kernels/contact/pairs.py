@@ -1,7 +1,7 @@
-"""Soft surfaces against one another: nodes against triangles, and edges against edges.
+"""Contact between soft surfaces: nodes with triangles, and edges with edges.
 
-Rows are solved as ``triangles`` does it. What they add to nodes is added up as whole numbers, so that the order of
-threads does not matter.
+Rows are solved as in ``triangles``. Their contributions to nodes are summed as integers, so the order of threads does
+not matter.
 """
 
 import warp as wp
@@ -17,13 +17,13 @@ from .vertices import across
 
 wp.set_module_options({"enable_backward": False})
 
-#: Shares are added up in multiples of one over this.
+#: Weights are summed in multiples of one over this.
 SHARES = wp.constant(1048576.0)
 
 
 @wp.func
 def opened(row: int, surface: Surface, rows: Rows):
-    """How much farther the two are apart at the end of the step [m]."""
+    """How much the gap grows until the end of the step [m]."""
     p = rows.places[row]
     w = rows.shares[row]
     d = w[0] * surface.d[p[0]] + w[1] * surface.d[p[1]]
@@ -57,7 +57,8 @@ def locate_row(row: int, law: Law, surface: Surface, meeting: Meeting, rows: Row
         rows.shares[row] = wp.vec4()
         return
     n = rows.normal[row]
-    # The whole of it: if a part were lost in each step, surfaces would sink in by what brings it back, and creep.
+    # Keep all of it: if each step lost a part, surfaces would sink in until the overlap replaces that part, and would
+    # creep.
     normal_force = wp.max(wp.dot(was, n), 0.0)
     if normal_force > 0.0:
         force = normal_force * n + held_back(across(was, n), normal_force, meeting.friction)

@@ -1,7 +1,7 @@
-"""What may meet of soft surfaces, and the pairs of it that are near.
+"""Soft surfaces that may touch, and their pairs that are near each other.
 
-A row is a pair of a node and a triangle, or of two edges: four nodes with a share each, positive on the one side and
-negative on the other, so that the sum of shares times places is the way from the second side to the first.
+A row is a pair of a node and a triangle, or of two edges: four nodes with weights, positive on the first side and
+negative on the second, so that the sum of weights times positions is the vector from the second side to the first.
 """
 
 import warp as wp
@@ -10,23 +10,23 @@ from .motion import Surface
 
 wp.set_module_options({"enable_backward": False})
 
-#: Overlaps up to this share of a triangle's or an edge's size are pushed apart; what is deeper is another part of the
-#: body. Of a body with itself also this share of the way between the two at rest: neighbours that have passed one
-#: another must get back.
+#: Overlaps up to this fraction of a triangle's or an edge's size are pushed apart; a deeper one belongs to another part
+#: of the body. In self-contact the limit is also at most this fraction of the distance between the two at rest, so
+#: that neighbours that have passed each other get back.
 BAND, BAND_AT_REST = wp.constant(0.25), wp.constant(0.1)
 
 
 @wp.struct
 class Meeting:
-    """What may meet: triangles and edges of the surface, and which body they are of."""
+    """Items that may touch: triangles and edges of the surface, and the body of each."""
 
     body: wp.array[wp.int32]  # [S]
     triangles: wp.array[wp.vec3i]  # [T]
     opposite: wp.array[wp.int32]  # [T] the fourth nodes of their tetrahedra, -1 inside the body
     edges: wp.array[wp.vec2i]  # [E] places, -1 where there is none
     sides: wp.array[wp.vec2i]  # [E] their two triangles
-    reach: wp.array[wp.float32]  # [S] how far a node may go until pairs are looked for again [m]
-    lower: wp.array2d[wp.vec3]  # [worlds, bodies] bounds of all that a body may reach [m]
+    reach: wp.array[wp.float32]  # [S] how far a node may move until the next search for pairs [m]
+    lower: wp.array2d[wp.vec3]  # [worlds, bodies] bounds of the places that a body may reach [m]
     upper: wp.array2d[wp.vec3]
     meets_itself: int
     friction: float
@@ -34,7 +34,7 @@ class Meeting:
 
 @wp.struct
 class Rows:
-    """Pairs that are near, [P], sorted by the first of the two, a node or an edge of S + E, and then by the other."""
+    """Near pairs, [P], sorted by the first item, a node or an edge of S + E, and then by the second."""
 
     total: wp.array[wp.int32]  # [1] how many there are, or were if there were room
     starts: wp.array[wp.int32]  # [S + E]

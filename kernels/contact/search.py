@@ -1,4 +1,4 @@
-"""Which nodes and triangles, and which edges, come near one another before it is looked at again."""
+"""The search for nodes and triangles, and for edges, that may come near each other before the next search."""
 
 import warp as wp
 
@@ -11,13 +11,13 @@ from .watch import Watch
 
 wp.set_module_options({"enable_backward": False})
 
-#: The sine of the angle from which on an edge is sharp.
+#: Edges with a larger sine of the bend are sharp.
 SHARP = wp.constant(0.15)
 
 
 @wp.struct
 class OldRows:
-    """What is kept of rows while others are found; see ``Rows``."""
+    """The former rows' data that a search keeps; see ``Rows``."""
 
     starts: wp.array[wp.int32]  # [S + E]
     counts: wp.array[wp.int32]  # [S + E]
@@ -27,7 +27,7 @@ class OldRows:
 
 @wp.func
 def bend(surface: Surface, meeting: Meeting, k: int):
-    """The sine by which the surface turns at an edge: positive where it stands out."""
+    """The sine of the angle by which the surface bends at an edge, positive if the edge is convex."""
     sides = meeting.sides[k]
     first = triangle_normal(surface, meeting.triangles[sides[0]])
     second = triangle_normal(surface, meeting.triangles[sides[1]])
@@ -44,7 +44,7 @@ def bend(surface: Surface, meeting: Meeting, k: int):
 
 @wp.func
 def may_meet(s: int, r: int, flags: int, surface: Surface, meeting: Meeting):
-    """Whether two places may. What is turned inside out has passed through the body it is of, and has to get back."""
+    """Whether two places may touch. Inverted elements have passed through their own body and have to get back."""
     if surface.world[s] != surface.world[r]:
         return False
     return meeting.body[s] != meeting.body[r] or (meeting.meets_itself != 0 and (flags & CRUSHED) == 0)
@@ -104,13 +104,13 @@ def edge_is_near(k: int, m: int, surface: Surface, meeting: Meeting, near: Near)
     if not (far <= edge_reach(meeting, e) + edge_reach(meeting, f) + band):
         return False
     other = bend(surface, meeting, m)
-    # Two sharp edges are found by the first of them.
+    # The first of two sharp edges finds the pair.
     return not (other < -SHARP or (other > SHARP and m < k))
 
 
 @wp.func
 def add_other(start: int, count: int, other: int, rows: Rows):
-    """Put one more behind a start, in order."""
+    """Insert one more entry after a start, in order."""
     row = start + count
     while row > start and rows.other[row - 1] > other:
         rows.other[row] = rows.other[row - 1]
@@ -120,7 +120,7 @@ def add_other(start: int, count: int, other: int, rows: Rows):
 
 @wp.func
 def near_node(i: int, start: int, of_triangles: wp.uint64, surface: Surface, meeting: Meeting, near: Near, rows: Rows):
-    """Count the triangles near a node; write them if there is a start."""
+    """Count the triangles near a node, and write them if a start is given."""
     count = int(0)
     reach = meeting.reach[i]
     beyond = wp.vec3(reach, reach, reach)
@@ -138,7 +138,7 @@ def near_node(i: int, start: int, of_triangles: wp.uint64, surface: Surface, mee
 
 @wp.func
 def near_edge(k: int, start: int, of_edges: wp.uint64, surface: Surface, meeting: Meeting, near: Near, rows: Rows):
-    """Count the edges near a sharp one; write them if there is a start."""
+    """Count the edges near a sharp one, and write them if a start is given."""
     count = int(0)
     e = meeting.edges[k]
     a = surface.x[e[0]]
@@ -210,7 +210,7 @@ def find_pairs(
     rows: Rows,
     near: Near,
 ):
-    """Find the pairs of each node and edge, each with the force that it had before."""
+    """Find the pairs of each node and edge, with their former forces."""
     i = wp.tid()
     if watch.due[0] == 0:
         return
@@ -222,7 +222,7 @@ def find_pairs(
         start = wp.atomic_add(rows.total, 0, count)
     rows.starts[i] = start
     if start + count > room:
-        # The run is made again with more room.
+        # The host repeats the run with larger arrays.
         for row in range(start, room):
             rows.owner[row] = -1
         return
@@ -246,7 +246,7 @@ def find_pairs(
 
 @wp.kernel(enable_backward=False)
 def keep_rows(watch: Watch, rows: Rows, old: OldRows):
-    """Keep the rows that there are beside those that are to come."""
+    """Copy the present rows, because the search overwrites them."""
     i = wp.tid()
     if watch.due[0] == 0:
         return

@@ -1,7 +1,7 @@
 """Signed distances of obstacles, negative inside, with their gradients, which point away from the obstacle.
 
-Each obstacle lies in a frame of its own: a half-space is below z = 0, capsules and cylinders lie along z about the
-origin, boxes and spheres about the origin. A pose takes the frame to the world.
+Each obstacle has its own frame: a half-space is the region below z = 0, the axes of capsules and cylinders are z, and
+all finite shapes are centred at the origin. A pose maps the frame to the world.
 """
 
 import warp as wp
@@ -10,18 +10,18 @@ wp.set_module_options({"enable_backward": False})
 
 GROUND, SPHERE, CAPSULE, BOX, CYLINDER, MESH, GRID = (wp.constant(k) for k in range(7))
 
-#: Lengths below which a direction means nothing, as a share of the obstacle's size.
+#: A vector shorter than this fraction of the obstacle's size has no reliable direction.
 TINY = wp.constant(1e-9)
-#: Radius of the edges of boxes and cylinders, as a share of half of the smallest way through: next to a sharp edge the
-#: way out would be another at every step.
+#: Radius of the edges of boxes and cylinders, as a fraction of half their smallest thickness: near a sharp edge the way
+#: out would change from step to step.
 ROUNDING = wp.constant(0.05)
-#: Meshes are rounded by a skin about them, so thick for their depth.
+#: Meshes are rounded by a skin of this thickness, relative to their depth.
 SKIN = wp.constant(0.02)
 
 
 @wp.struct
 class Shapes:
-    """The obstacles of a simulation, one place each."""
+    """The obstacles of a simulation, one entry each."""
 
     kind: wp.array[wp.int32]
     # Sphere: radius; capsule, cylinder: radius and half the length; box: half the edges; mesh: how deep inside
@@ -34,7 +34,7 @@ class Shapes:
     lower: wp.array[wp.vec3]
     values: wp.array[wp.float32]
     friction: wp.array[wp.float32]
-    thickness: wp.array[wp.float32]  # half of the smallest way through [m]
+    thickness: wp.array[wp.float32]  # half the smallest thickness [m]
 
 
 @wp.func
@@ -54,7 +54,7 @@ def box_distance(p: wp.vec3, half: wp.vec3):
 
 @wp.func
 def round_distance(d: wp.vec3, radius: float):
-    """From d away from the centre of something round."""
+    """Distance and gradient at offset d from the centre of a round shape."""
     length = wp.length(d)
     normal = wp.vec3(0.0, 0.0, 1.0)
     if length > TINY * radius:
@@ -89,7 +89,7 @@ def mesh_distance(mesh: wp.uint64, p: wp.vec3, depth: float, farthest: float):
     d = p - wp.mesh_eval_position(mesh, query.face, query.u, query.v)
     length = wp.length(d)
     normal = wp.mesh_eval_face_normal(mesh, query.face)
-    # Close by, what rounding leaves of d has no direction.
+    # Very near the centre, rounding errors dominate the direction of d.
     if length > 1.0e-3 * depth:
         normal = query.sign * d / length
     return query.sign * length, normal
@@ -102,7 +102,9 @@ def grid_value(shapes: Shapes, first: int, count: wp.vec3i, i: int, j: int, k: i
 
 @wp.func
 def grid_distance(shapes: Shapes, o: int, p: wp.vec3):
-    """Trilinear between the samples; beyond them as far as the nearest place among them, and as far as that is."""
+    """Trilinear interpolation between the samples; outside the grid, the value at the nearest point of the grid plus
+    the distance to it.
+    """
     first = shapes.first[o]
     count = shapes.count[o]
     spacing = shapes.size[o]
@@ -143,7 +145,9 @@ def grid_distance(shapes: Shapes, o: int, p: wp.vec3):
 
 @wp.func
 def local_distance(shapes: Shapes, o: int, p: wp.vec3, most: float):
-    """Distance [m] and its gradient at a point in the obstacle's frame; beyond ``most`` some distance that is more."""
+    """Distance [m] and its gradient at a point in the obstacle's frame. A distance beyond ``most`` is only known to be
+    larger than it.
+    """
     kind = shapes.kind[o]
     size = shapes.size[o]
     if kind == GROUND:
@@ -172,7 +176,7 @@ def local_distance(shapes: Shapes, o: int, p: wp.vec3, most: float):
 
 @wp.func
 def distance_to(shapes: Shapes, o: int, pose: wp.transform, x: wp.vec3, most: float):
-    """The same at a point in the world."""
+    """Distance [m] and its gradient at a point in the world."""
     p = wp.quat_rotate_inv(wp.transform_get_rotation(pose), x - wp.transform_get_translation(pose))
     distance, normal = local_distance(shapes, o, p, most)
     return distance, wp.quat_rotate(wp.transform_get_rotation(pose), normal)
@@ -180,7 +184,7 @@ def distance_to(shapes: Shapes, o: int, pose: wp.transform, x: wp.vec3, most: fl
 
 @wp.func
 def carried(now: wp.transform, later: wp.transform, x: wp.vec3):
-    """How far a pose that changes takes a point along; exactly nowhere if it does not change."""
+    """The motion of a point that is carried along by a change of pose; exactly zero if the pose stays the same."""
     arm = x - wp.transform_get_translation(now)
     before = wp.transform_get_rotation(now)
     turned = wp.quat_rotate(wp.transform_get_rotation(later), wp.quat_rotate_inv(before, arm))

@@ -1,4 +1,4 @@
-"""What users read of contact: wrenches on obstacles, and pressure on the bodies' triangles."""
+"""Contact results for users: wrenches on obstacles, and pressure on the bodies' triangles."""
 
 import warp as wp
 
@@ -23,10 +23,10 @@ def sum_wrenches(
     # In and out
     parts: wp.array3d[wp.spatial_vectord],
 ):
-    """Add what a body's nodes do to obstacles, in one order: [O, W, parts] of ``lanes`` threads each.
+    """Add the wrenches of a body's nodes on obstacles in a fixed order: [O, W, parts], with ``lanes`` threads for each.
 
     Args:
-        count: Places of the body in each world, from ``start`` on.
+        count: Number of the body's places in each world, from ``start`` on.
     """
     o, world, thread = wp.tid()
     origin = wp.transform_get_translation(motions.later[world, o])
@@ -49,7 +49,7 @@ def sum_wrenches(
 
 @wp.kernel(enable_backward=False)
 def fold_wrenches(parts: wp.array3d[wp.spatial_vectord], wrenches: wp.array2d[wp.spatial_vector]):
-    """Add the parts up, which are zero then."""
+    """Sum the parts, and set them to zero."""
     o, world = wp.tid()
     sums = wp.spatial_vectord()
     for k in range(parts.shape[2]):
@@ -63,7 +63,7 @@ def fold_wrenches(parts: wp.array3d[wp.spatial_vectord], wrenches: wp.array2d[wp
 
 @wp.func
 def area_vector(surface: Surface, corners: wp.vec3i):
-    """Half the cross product of two edges: outwards, as long as the area [m^2]."""
+    """Half the cross product of two edges: it points outwards, and its length is the area [m^2]."""
     a = surface.x[corners[0]]
     return 0.5 * wp.cross(surface.x[corners[1]] - a, surface.x[corners[2]] - a)
 
@@ -78,8 +78,9 @@ def node_pressures(
     # Out
     pressures: wp.array[wp.vec3],
 ):
-    """The force into the body at each node over a third of the area around it that it pushes on [Pa], along the mean
-    normal of that area."""
+    """Find the pressure at each node [Pa]: the force into the body, along the mean normal of the loaded triangles
+    around the node, over a third of their area.
+    """
     s = wp.tid()
     pressures[s] = wp.vec3()
     force = surface.f[s]
@@ -107,7 +108,7 @@ def triangle_pressures(
     pressures: wp.array[wp.vec3],
     found: wp.array[wp.float32],
 ):
-    """The mean over each triangle of a body, so that pressure times area adds up to the normal forces."""
+    """Average the pressure over each triangle of a body, so that pressure times area adds up to the normal forces."""
     t = wp.tid()
     c = triangles[first + t]
     pressure = float(0.0)
@@ -129,7 +130,7 @@ def describe_touches(
     gaps: wp.array2d[wp.float32],
     normals: wp.array2d[wp.vec3],
 ):
-    """Gap and normal of the nodes that obstacles push, at the beginning of the last step."""
+    """Find the gap and the normal of the nodes that obstacles push, at the beginning of the last step."""
     o, s = wp.tid()
     force = forces[o, s]
     if wp.dot(force, force) > 0.0:
@@ -140,7 +141,7 @@ def describe_touches(
 
 @wp.kernel(enable_backward=False)
 def find_depths(shapes: Shapes, motions: Motions, surface: Surface, depths: wp.array[wp.float32]):
-    """How deep each node is inside obstacles [m]; zero outside."""
+    """Find the depth of each node inside obstacles [m], zero outside."""
     s = wp.tid()
     if surface.node[s] < 0 or surface.yielding[s] == 0.0:
         return

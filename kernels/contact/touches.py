@@ -1,4 +1,4 @@
-"""Where obstacles touch the edges and the insides of triangles."""
+"""Contacts of obstacles with the edges and the interiors of triangles."""
 
 import warp as wp
 
@@ -11,15 +11,16 @@ from .vertices import across
 
 wp.set_module_options({"enable_backward": False})
 
-#: A point with so large a share of one corner is that corner, which is looked after.
+#: A point with a corner's weight above this counts as the corner, which has its own contact.
 CORNER = wp.constant(0.999)
-#: Places along a capsule whose gaps differ by so small a share of its radius are touched between them.
+#: Points of a capsule whose gaps differ by less than this fraction of its radius are averaged.
 BLUR = wp.constant(1.0e-3)
 
-#: Triangles that are deeper in an obstacle than this share of its thickness are skewered and slide off frictionless.
+#: Triangles deeper in an obstacle than this fraction of its thickness are skewered and slide off without friction.
 SKEWERED = wp.constant(0.25)
-#: Share of the last step's push from which rounds begin: with more, nodes around an obstacle are held off by what lies
-#: between them, and bodies seem stiffer. Friction begins with all of it: what slips to bring it back would add up.
+#: Fraction of the last step's normal force with which the rounds begin: with more, triangles hold off the nodes around
+#: an obstacle, and bodies seem stiffer. Friction begins with all of it, because the slip that restores a part would
+#: accumulate.
 WARMTH = wp.constant(0.5)
 
 
@@ -27,18 +28,18 @@ WARMTH = wp.constant(0.5)
 class Touches:
     """Obstacles at triangles, [O, T]."""
 
-    shares: wp.array2d[wp.vec3]  # of the corners in the point that is touched; zero where nothing is near
+    shares: wp.array2d[wp.vec3]  # weights of the corners at the contact point; zero if nothing is near
     normal: wp.array2d[wp.vec3]  # from the obstacle to the triangle
     gap: wp.array2d[wp.float32]
-    moved: wp.array2d[wp.vec3]  # how far the obstacle's point goes in this step [m]
+    moved: wp.array2d[wp.vec3]  # motion of the obstacle's point in this step [m]
     acts: wp.array2d[wp.int32]
     force: wp.array2d[wp.vec3]  # on the triangle [N]
-    more: wp.array2d[wp.vec3]  # what was added to it in this round
+    more: wp.array2d[wp.vec3]  # its change in this round
 
 
 @wp.func
 def nearest(shapes: Shapes, o: int, pose: wp.transform, most: float, a: wp.vec3, b: wp.vec3, c: wp.vec3):
-    """Shares of the corners in the closest point, the gap there, and the way out of the obstacle."""
+    """Weights of the corners at the closest point, the gap there, and the direction out of the obstacle."""
     kind = shapes.kind[o]
     size = shapes.size[o]
     centre = wp.transform_get_translation(pose)
@@ -54,7 +55,7 @@ def nearest(shapes: Shapes, o: int, pose: wp.transform, most: float, a: wp.vec3,
         length = wp.length(d)
         if length > 1.0e-4 * size[0]:
             return w, length - size[0], d / length
-        # The axis goes through: the obstacle came from outside.
+        # The axis passes through the triangle: the obstacle came from outside.
         return w, -size[0], -wp.normalize(wp.cross(b - a, c - a))
     w = deepest_on_triangle(shapes, o, pose, most, a, b, c)
     gap, n = distance_to(shapes, o, pose, point_of(w, a, b, c), most)
@@ -99,7 +100,7 @@ def find_touch(
         return
     w, gap, n = nearest(shapes, o, pose, size + far, a, b, c)
     if wp.dot(was, was) > 0.0 and wp.dot(n, side) < 0.0 and shapes.kind[o] == CAPSULE:
-        # The axis has come through since the last step.
+        # The axis has passed through since the last step.
         n = -n
         gap = -2.0 * shapes.size[o][0] - gap
     if gap > far or wp.max(w) > CORNER:
@@ -130,7 +131,7 @@ def find_touches(
     # In and out
     touches: Touches,
 ):
-    """Where obstacles come close to triangles but not to their corners."""
+    """Find the points where obstacles come close to triangles but not to their corners."""
     k = wp.tid()
     count = near.touch_count[0]
     while k < count:

@@ -1,8 +1,8 @@
-"""Obstacles against the edges and the insides of triangles, where no node is: a needle between the nodes.
+"""Contact of obstacles with the edges and the interiors of triangles, such as a needle between nodes.
 
-What is left after nodes have been kept out is found for all triangles at once, in a few rounds. Contacts that share
-nodes share these: each takes so much of a node as its share there is of all contacts' shares. Then the rounds converge
-and add no energy, however many contacts there are (mass splitting; the bound is the sum of each row of J M^-1 J^T).
+After the nodes' own contacts, the forces on all triangles are found together in a few rounds. Contacts that share a
+node divide its mass in proportion to their weights there. Then the rounds converge and add no energy for any number of
+contacts (mass splitting; the bound is the sum of each row of J M^-1 J^T).
 """
 
 import warp as wp
@@ -21,7 +21,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def approach(touches: Touches, o: int, t: int, surface: Surface, corners: wp.vec3i):
-    """How far the triangle's point moves from the obstacle in this step [m]."""
+    """The motion of the triangle's point relative to the obstacle in this step [m]."""
     w = touches.shares[o, t]
     d = w[0] * surface.d[corners[0]] + w[1] * surface.d[corners[1]] + w[2] * surface.d[corners[2]]
     return d - touches.moved[o, t]
@@ -39,7 +39,7 @@ def judge_touches(
     # In and out
     touches: Touches,
 ):
-    """Which of them act."""
+    """Find the contacts that act."""
     k = wp.tid()
     count = near.touch_count[0]
     dt = float(pace.seconds[DT])
@@ -81,7 +81,7 @@ def crowd_nodes(
     # Out
     crowd: wp.array[wp.float32],
 ):
-    """The shares of all contacts that act at each node."""
+    """Sum the weights of all acting contacts at each node."""
     k = wp.tid()
     count = near.count[0]
     while k < count:
@@ -139,10 +139,10 @@ def solve_touches(
     # In and out
     touches: Touches,
 ):
-    """Correct the force of each that acts.
+    """Correct the force of each acting contact.
 
     Args:
-        corner_yielding: That of the surface, also where another process moves the node.
+        corner_yielding: ``yielding`` of the surface, also for nodes that another process moves.
     """
     k = wp.tid()
     count = near.touch_count[0]
@@ -157,7 +157,7 @@ def solve_touches(
 
 @wp.func
 def added_at(s: int, corner_starts: wp.array[wp.int32], corners: wp.array[wp.int32], touches: Touches):
-    """What was added to the force on a node, summed in one order [N]."""
+    """The change of the force on a node, summed in a fixed order [N]."""
     total = wp.vec3()
     for k in range(corner_starts[s], corner_starts[s + 1]):
         t = corners[k] / 3
@@ -179,7 +179,7 @@ def apply_touches(
     # In and out
     surface: Surface,
 ):
-    """Give each node its share of what was added."""
+    """Give each node its share of the changes."""
     k = wp.tid()
     count = near.count[0]
     while k < count:
@@ -202,7 +202,7 @@ def share_touches(
     # Out
     totals: wp.array2d[wp.vec3],
 ):
-    """The forces of obstacles on nodes themselves, and the nodes' shares of those on triangles [N]."""
+    """Add the forces of obstacles on nodes and the nodes' shares of the forces on triangles [N]."""
     o, s = wp.tid()
     total = forces[o, s]
     for k in range(corner_starts[s], corner_starts[s + 1]):

@@ -1,4 +1,4 @@
-"""Surface nodes against obstacles. Every node has a mass of its own, so that its forces follow at once."""
+"""Contact of surface nodes with obstacles. Every node has its own mass, so its forces follow directly."""
 
 import warp as wp
 
@@ -11,7 +11,7 @@ from .shapes import Shapes, carried, distance_to
 
 wp.set_module_options({"enable_backward": False})
 
-#: Rounds over the obstacles for a node that touches more than one.
+#: Number of rounds over the obstacles for a node that touches more than one.
 ROUNDS = wp.constant(8)
 
 
@@ -32,7 +32,7 @@ def touch(
     surface: Surface,
     forces: wp.array2d[wp.vec3],
 ):
-    """The forces of all obstacles on a node."""
+    """Find the forces of all obstacles on a node."""
     count = forces.shape[0]
     total = wp.vec3()
     for o in range(count):
@@ -96,10 +96,10 @@ def touch_obstacles(
     surface: Surface,
     forces: wp.array2d[wp.vec3],
 ):
-    """Forces [O, S] that keep nodes out of obstacles by the end of the step, with friction; corrected where something
-    else has moved nodes since the first time.
+    """Find the forces [O, S] with which nodes are outside obstacles at the end of the step, with friction; a second
+    call corrects them if other forces have moved nodes since.
 
-    Where a node sticks it is held at an anchor, a point of the obstacle in its frame with 1 as fourth number.
+    A sticking node is held at an anchor, a point in the obstacle's frame whose fourth number is 1.
     """
     k = wp.tid()
     count = near.count[0]
@@ -151,7 +151,9 @@ def keep_anchors(
     # Out
     anchors: wp.array2d[wp.vec4],
 ):
-    """Set anchors where nodes begin to stick, drag them along where nodes slip, and drop them where nothing touches."""
+    """Set anchors for nodes that begin to stick, drag them along with slipping nodes, and remove them from nodes
+    without contact.
+    """
     k = wp.tid()
     count = near.count[0]
     while k < count:

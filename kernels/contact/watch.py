@@ -1,4 +1,4 @@
-"""How far things have gone since it was last looked for what is near, and whether it is time to look again."""
+"""Motion since the last search for near surfaces, and whether a new search is due."""
 
 import warp as wp
 
@@ -6,50 +6,52 @@ from .motion import Motions, Surface, distance_between
 
 wp.set_module_options({"enable_backward": False})
 
-#: How far a thing may go until the next search: so many times as far as it goes in the present step, besides the least.
+#: An item may move this many times its motion in the present step until the next search, besides the minimum.
 AHEAD = wp.constant(16.0)
-#: No farther than a smallest element or, of things that are faster than that, than so many times as far as they go in
-#: a step; and no farther than so many elements, which nothing passes in a stable step.
+#: The limit is the size of the smallest element; for faster items, this many times their motion in a step, and at most
+#: this many elements, more than any stable step covers.
 FAST = wp.constant(2.0)
 FARTHEST = wp.constant(64.0)
-#: What is hit goes as far as what hits it; so many times as far is reserved.
+#: An item that is hit moves as far as the item that hits it; this many times that motion is reserved.
 HIT = wp.constant(2.0)
-#: The share of it after which it is looked again. The rest is for what contact does to a step.
+#: A new search is due after this fraction of the limit. The rest is for the effect of contact on a step.
 SKIN = wp.constant(0.5)
 
 
 @wp.struct
 class Watch:
-    """Where surface nodes and obstacles were at the last search, and how far from there they may go [m]."""
+    """Positions of surface nodes and obstacles at the last search, and how far they may move from there [m]."""
 
     places: wp.array[wp.vec3]  # [S]
     reach: wp.array[wp.float32]  # [S]
     poses: wp.array2d[wp.transform]  # [W, O]
     reach_of: wp.array2d[wp.float32]  # [W, O]
     least: wp.array[wp.float32]  # [1]
-    size: float  # of the smallest element
-    fastest: wp.array[wp.float32]  # [1] how far anything goes in the step of the search
-    due: wp.array[wp.int32]  # [1] whether to look again
-    missed: wp.array[wp.int32]  # [1] how often something went too far
+    size: float  # size of the smallest element [m]
+    fastest: wp.array[wp.float32]  # [1] largest motion in the step of the search
+    due: wp.array[wp.int32]  # [1] whether a search is due
+    missed: wp.array[wp.int32]  # [1] how often an item moved too far
     searches: wp.array[wp.int32]  # [1]
 
 
 @wp.func
 def stays(gone: float, next_step: float, reach: float):
-    """Whether what has gone so far can make another step before it is looked again; false for what is not finite."""
+    """Whether an item that has moved this far can make another step before the next search; false for values that are
+    not finite.
+    """
     return gone + next_step <= SKIN * reach
 
 
 @wp.func
 def reserved(step: float, watch: Watch):
-    """How far something may go that goes so far in the present step."""
+    """How far an item may move, given its motion in the present step."""
     ahead = wp.min(AHEAD * step, wp.max(watch.size, FAST * step)) + HIT * watch.fastest[0]
     return watch.least[0] + wp.min(ahead, FARTHEST * watch.size)
 
 
 @wp.kernel(enable_backward=False)
 def watch_nodes(surface: Surface, watch: Watch):
-    """Before a step: whether nodes have been put elsewhere, or have begun to move faster."""
+    """Check before a step whether nodes have been moved from outside, or have begun to move faster."""
     s = wp.tid()
     if surface.node[s] < 0:
         return
@@ -59,7 +61,7 @@ def watch_nodes(surface: Surface, watch: Watch):
 
 @wp.kernel(enable_backward=False)
 def follow_nodes(surface: Surface, watch: Watch):
-    """After a step: whether the next one could take nodes too far, or this one has."""
+    """Check after a step whether the next one could move nodes too far, or this one has."""
     s = wp.tid()
     if surface.node[s] < 0:
         return
@@ -73,7 +75,7 @@ def follow_nodes(surface: Surface, watch: Watch):
 
 @wp.kernel(enable_backward=False)
 def watch_obstacles(motions: Motions, watch: Watch):
-    """Whether obstacles go too far in this step."""
+    """Check whether obstacles move too far in this step."""
     world, o = wp.tid()
     reach = motions.reach[o]
     later = motions.later[world, o]
@@ -84,7 +86,7 @@ def watch_obstacles(motions: Motions, watch: Watch):
 
 @wp.kernel(enable_backward=False)
 def find_fastest_node(surface: Surface, watch: Watch):
-    """How far the fastest node goes in this step."""
+    """Find the motion of the fastest node in this step."""
     s = wp.tid()
     if watch.due[0] == 0 or surface.node[s] < 0:
         return
@@ -95,7 +97,7 @@ def find_fastest_node(surface: Surface, watch: Watch):
 
 @wp.kernel(enable_backward=False)
 def find_fastest_obstacle(motions: Motions, watch: Watch):
-    """How far the fastest obstacle goes in this step, if that is more."""
+    """Find the motion of the fastest obstacle in this step, if that is larger."""
     world, o = wp.tid()
     if watch.due[0] == 0:
         return
@@ -106,7 +108,7 @@ def find_fastest_obstacle(motions: Motions, watch: Watch):
 
 @wp.kernel(enable_backward=False)
 def reserve_obstacles(motions: Motions, watch: Watch):
-    """Note where obstacles are, and how far they may go from there."""
+    """Record the poses of obstacles and how far they may move from there."""
     world, o = wp.tid()
     if watch.due[0] == 0:
         return
@@ -118,7 +120,7 @@ def reserve_obstacles(motions: Motions, watch: Watch):
 
 @wp.kernel(enable_backward=False)
 def end_search(watch: Watch):
-    """What is near is known."""
+    """End a search."""
     if watch.due[0] != 0:
         watch.due[0] = 0
         watch.fastest[0] = 0.0
@@ -127,7 +129,9 @@ def end_search(watch: Watch):
 
 @wp.kernel(enable_backward=False)
 def report_search(watch: Watch, most: wp.array[wp.int32], report: wp.array[wp.float64]):
-    """Tell the host how many pairs were near at most, how often something went too far, and how often was looked."""
+    """Report to the host the largest number of near pairs, how often an item moved too far, and the number of
+    searches.
+    """
     report[0] = wp.float64(most[0])
     report[1] = wp.float64(watch.missed[0])
     report[2] = wp.float64(watch.searches[0])
