@@ -1,4 +1,4 @@
-"""Preconditioned conjugate gradients, the iterations of all worlds side by side: vectors vec4, scalars float64."""
+"""Preconditioned conjugate gradients; all worlds iterate together. Vectors are vec4, scalars float64."""
 
 import warp as wp
 
@@ -15,7 +15,7 @@ COLUMNS = 4
 #: Places in the scalars of a world: r . z, the factors alpha and beta, and r . r now, b . b, and r . r at the end.
 RZ, ALPHA, BETA, RR, FIRST, END = (wp.constant(k) for k in range(6))
 SCALARS = 6
-#: How a world's solve stands.
+#: State of a world's solve.
 RUNNING, CONVERGED, NEGATIVE, LIMIT, BROKEN = (wp.constant(k) for k in range(5))
 
 
@@ -43,7 +43,7 @@ def measure_guess(
     # Out
     parts: wp.array3d[wp.float64],
 ):
-    """Parts of b . x and x . q, q = A x, of a first guess."""
+    """Find the parts of b . x and x . q, q = A x, for a first guess."""
     world, thread = wp.tid()
     product = wp.float64(0.0)
     curvature = wp.float64(0.0)
@@ -63,7 +63,7 @@ def measure_guess(
 
 @wp.kernel(enable_backward=False)
 def take_guess(parts: wp.array3d[wp.float64], lanes: int, scalars: wp.array2d[wp.float64]):
-    """alpha = b . x / x . q, the share of the guess with the least energy; zero of one that is of no use."""
+    """alpha = b . x / x . q, the factor of the guess with the least energy; zero if the guess does not help."""
     world, lane = wp.tid()
     product = add_up(parts, world, lane, lanes, PRODUCT)
     curvature = add_up(parts, world, lane, lanes, CURVATURE)
@@ -133,7 +133,7 @@ def take_first(
     status: wp.array[wp.int32],
     running: wp.array[wp.int32],
 ):
-    """Scalars before the first iteration; worlds whose residual is small enough already are done."""
+    """Set the scalars before the first iteration; worlds whose residual is already small enough are done."""
     world, lane = wp.tid()
     rr = add_up(parts, world, lane, lanes, SQUARE)
     bb = add_up(parts, world, lane, lanes, RIGHT)
@@ -165,7 +165,7 @@ def take_beta(
     status: wp.array[wp.int32],
     running: wp.array[wp.int32],
 ):
-    """beta = r . z over that of the iteration before; zero in the first one."""
+    """beta = r . z over its former value; zero in the first iteration."""
     world, lane = wp.tid()
     rz = add_up(parts, world, lane, lanes, PRODUCT)
     if lane == 0 and status[world] == RUNNING:
@@ -187,7 +187,7 @@ def take_alpha(
     status: wp.array[wp.int32],
     running: wp.array[wp.int32],
 ):
-    """alpha = r . z / p . q. Where p . q <= 0 the world stops: at its last iterate, or with p = z if it has none."""
+    """alpha = r . z / p . q. If p . q <= 0 the world stops, at its last iterate, or with p = z if there is none."""
     world, lane = wp.tid()
     curvature = add_up(parts, world, lane, lanes, CURVATURE)
     if lane == 0:
@@ -251,7 +251,7 @@ def judge(
     status: wp.array[wp.int32],
     running: wp.array[wp.int32],
 ):
-    """A world stops where r . r is small enough."""
+    """Stop the worlds whose r . r is small enough."""
     world, lane = wp.tid()
     rr = add_up(parts, world, lane, lanes, SQUARE)
     if lane == 0 and status[world] == RUNNING:

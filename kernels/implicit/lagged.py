@@ -1,8 +1,8 @@
-"""When a preconditioner that is kept over many steps is set up again: decisions on the device.
+"""Decisions on the device about when a preconditioner that is kept over many steps is set up again.
 
-A set-up costs as much as some iterations. It is made again when the iterations beyond those just after the last one add
-up to that, which is never more than about twice the least cost. Where a set-up has not helped, the next one waits
-longer.
+A set-up costs as much as some iterations. It is repeated when the additional iterations since the last one add up to
+that cost; the total is then at most about twice the least possible. If a set-up has not helped, the next one comes
+later.
 """
 
 import warp as wp
@@ -11,19 +11,20 @@ from .conjugate_gradients import CONVERGED, RUNNING
 
 wp.set_module_options({"enable_backward": False})
 
-#: Places in the counts: set-ups so far, iterations just after the last one, those beyond since then, how many of these
-#: are worth another, and iterations of the last solve before the set-up; the first is zero before the first set-up.
+#: Places in the counts: set-ups so far (zero before the first), iterations just after the last one, additional
+#: iterations since then, the number of these that is worth a set-up, and iterations of the last solve before the
+#: set-up.
 SETUPS, FIRST, BEYOND, WORTH, BEFORE = (wp.constant(k) for k in range(5))
 COUNTS = 5
-#: What is due: nothing, a set-up for the present state, or the last one over again, after what it made has been lost.
+#: What is due: nothing, a set-up for the present state, or a repetition of the last one whose result has been lost.
 NOTHING, PRESENT, AGAIN = (wp.constant(k) for k in range(3))
-#: Iterations that a set-up is worth at first, and at most.
+#: Number of iterations that a set-up is worth, at first and at most.
 LEAST_WORTH, MOST_WORTH = wp.constant(8), wp.constant(256)
 
 
 @wp.kernel(enable_backward=False)
 def find_held_changes(inverse_mass: wp.array[wp.float32], held: wp.array[wp.uint8], due: wp.array[wp.int32]):
-    """A set-up is due where nodes are held that were free, or the other way round."""
+    """Request a set-up if a free node is now held, or a held one free."""
     i = wp.tid()
     now = wp.where(inverse_mass[i] > 0.0, wp.uint8(0), wp.uint8(1))
     if now != held[i] and due[0] == NOTHING:
@@ -42,7 +43,7 @@ def keep_state(
     kept: wp.array[wp.vec4],
     held: wp.array[wp.uint8],
 ):
-    """Note the state of the set-up, unless it is made over again."""
+    """Record the state of the set-up, unless it is a repetition."""
     i = wp.tid()
     held[i] = wp.where(inverse_mass[i] > 0.0, wp.uint8(0), wp.uint8(1))
     if due[0] != AGAIN or counts[SETUPS] == 0:
@@ -67,7 +68,7 @@ def judge_solve(
     counts: wp.array[wp.int32],
     due: wp.array[wp.int32],
 ):
-    """After a solve: whether the next one is worth a set-up, by the world that needed most."""
+    """Decide after a solve whether the next one is worth a set-up, from the world with the most iterations."""
     most = int(0)
     is_good = bool(True)
     for world in range(iterations.shape[0]):

@@ -1,8 +1,8 @@
-"""The share of a linear solve's answer that contacts allow: the first at which the power along it vanishes.
+"""The fraction of a linear solve's answer that contacts allow: the first one at which the power along it vanishes.
 
 Along a change c from motions d, the power of all forces is g(s) = c . (b - A d) - s c . A c + contacts(s), with A
-without contacts. It falls with s, as everything has an energy that is convex. Worlds in which g(1) is not far below
-zero take all.
+without contacts. It falls with s, because all energies are convex. Worlds in which g(1) is not far below zero take the
+whole change.
 """
 
 import warp as wp
@@ -13,11 +13,11 @@ from .sums import add_up
 
 wp.set_module_options({"enable_backward": False})
 
-#: Columns of a world's search: the share that is tried, the ends of the bracket, and the power at these; the power at
-#: zero without contacts, and what it loses with the share.
+#: Columns of a world's search: the current fraction, the ends of the bracket, and the power at these; the power at zero
+#: without contacts, and its decrease with the fraction.
 TRIED, LOW, HIGH, AT_LOW, AT_HIGH, POWER, LOSS = (wp.constant(k) for k in range(7))
 COLUMNS = 7
-#: Power at the end of the whole change, over that at its beginning, with which it is taken.
+#: The whole change is taken if the power at its end, over that at its beginning, is at most this in magnitude.
 ENOUGH = wp.constant(wp.float64(0.2))
 
 
@@ -31,7 +31,7 @@ def begin_search(
     search: wp.array2d[wp.float64],
     slopes: wp.array[wp.float64],
 ):
-    """Begin with a share of nothing."""
+    """Begin with a fraction of zero."""
     world, lane = wp.tid()
     first = add_up(power, world, lane, lanes, 0)
     second = add_up(loss, world, lane, lanes, 0)
@@ -50,7 +50,7 @@ def take_trial(
     search: wp.array2d[wp.float64],
     slopes: wp.array[wp.float64],
 ):
-    """Take the power at the share that was tried, first 0 and then 1, and choose the next one."""
+    """Read the power at the current fraction, first 0 and then 1, and choose the next fraction."""
     world = wp.tid()
     s = search[world, TRIED]
     g = search[world, POWER] - s * search[world, LOSS] + slopes[world]
@@ -68,7 +68,7 @@ def take_trial(
             search[world, AT_LOW] = wp.float64(0.0)
         search[world, AT_HIGH] = g
     elif g >= wp.float64(0.0):
-        # The power at the end that stays counts half, so that both ends close in.
+        # Halve the power at the end that stays, so that both ends of the bracket move (Illinois rule).
         search[world, LOW] = s
         search[world, AT_LOW] = g
         search[world, AT_HIGH] = wp.float64(0.5) * search[world, AT_HIGH]
@@ -94,7 +94,7 @@ def add_share(
     # In and out
     d: wp.array[wp.vec4],
 ):
-    """d += share of the change."""
+    """d += fraction of the change."""
     k = wp.tid()
     share = float(search[k / count, TRIED])
     store_node(d, k, load_node(d, k) + share * load_node(change, k))

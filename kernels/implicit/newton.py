@@ -1,8 +1,8 @@
-"""Newton's method for the least of Pi(u) = W(u) - (loads and weight) . u + 1/2 a (d - h) . M (d - h), world by world.
+"""Newton's method for the minimum of Pi(u) = W(u) - (loads and weight) . u + 1/2 a (d - h) . M (d - h) in each world.
 
-W is the strain energy, u = base + d with the increment d, and the last term is the inertia of a time step; a static
-answer has none of it. Increments keep the digits of short steps. The residual is r = -dPi/du at free nodes, and zero at
-others. Scalars of each world decide on the device, so that an iteration can be recorded.
+W is the strain energy, u = base + d with the increment d, and the last term is the inertia of a time step; static
+solutions have none. Increments keep the digits of short steps. The residual is r = -dPi/du at free nodes and zero at
+the others. The device decides from each world's scalars, so an iteration can be recorded.
 """
 
 from typing import Any
@@ -22,25 +22,25 @@ wp.set_module_options({"enable_backward": False})
 #: step . M step and strain energies, and of largest values |step|^2 and |u|^2.
 SQUARE, REFERENCE, SLOPE, OUTER, INERTIA, ENERGY, STEP, REACH = (wp.constant(k) for k in range(8))
 COLUMNS = 8
-#: Places in the scalars of a world: the norm of the residual now and before, of what it is compared with, the share of
-#: the step that is taken, the strain energy at its beginning, r . step, the relative correction, and the tolerance of
-#: the linear solve.
+#: Places in the scalars of a world: the norms of the residual now and before, the norm it is compared with, the
+#: fraction of the step that is taken, the strain energy at its beginning, r . step, the relative correction, and the
+#: tolerance of the linear solve.
 RESIDUAL, BEFORE, COMPARED, SHARE, ENERGY_NOW, SLOPE_NOW, CORRECTION, SOLVED_TO = (wp.constant(k) for k in range(8))
 SCALARS = 8
-#: How a world stands.
+#: State of a world.
 RUNNING, CONVERGED, STUCK, LIMIT, BROKEN = (wp.constant(k) for k in range(5))
 
-#: Least decrease, as a share of what the slope promises.
+#: Least decrease, as a fraction of the one that the slope predicts.
 ARMIJO = wp.constant(wp.float64(1e-4))
-#: What float32 leaves uncertain of a strain energy, as a share of it.
+#: Relative rounding error of a strain energy in float32.
 ROUNDING = wp.constant(wp.float64(1e-6))
-#: The shortest share of a step that is tried.
+#: The smallest fraction of a step that is tried.
 SHORTEST = wp.constant(wp.float64(1e-7))
-#: Tolerances of the linear solve: the largest, and the smallest that is asked for.
+#: Largest and smallest tolerance of the linear solve.
 LOOSEST, TIGHTEST = wp.constant(wp.float64(0.1)), wp.constant(wp.float64(1e-5))
-#: The tolerance to which a step is solved for whose size may end the iteration.
+#: Tolerance of the linear solve for a step whose size may end the iteration.
 TRUSTED = wp.constant(wp.float64(1e-3))
-#: Relative size of a whole step after which the next one may be the last, and is solved for well.
+#: After a whole step below this relative size, the next one may be the last and is solved for accurately.
 NEAR = wp.constant(wp.float64(1e-3))
 
 
@@ -69,7 +69,7 @@ def find_residual(
 ):
     """r = f + outer at free nodes, outer = others + external + m (pull - a d).
 
-    Elastic forces f and other ones are zeroed, for the next to add to.
+    Afterwards f and the other forces are zero, ready for the next sums.
     """
     world, thread = wp.tid()
     square = wp.float64(0.0)
@@ -119,7 +119,7 @@ def measure_step(
     # Out
     parts: wp.array3d[wp.float64],
 ):
-    """Parts of r . step, outer . step, step . M step, and the largest |step|^2 and |u|^2."""
+    """Find parts of r . step, outer . step and step . M step, and the largest |step|^2 and |u|^2."""
     world, thread = wp.tid()
     slope = wp.float64(0.0)
     work = wp.float64(0.0)
@@ -154,7 +154,7 @@ def measure_step(
 
 @wp.kernel(enable_backward=False)
 def sum_energies(energies: wp.array[wp.float64], count: int, threads: int, lanes: int, parts: wp.array3d[wp.float64]):
-    """Parts of strain energies, ``count`` of each world."""
+    """Find parts of strain energies, ``count`` for each world."""
     world, thread = wp.tid()
     total = wp.float64(0.0)
     k = thread
@@ -191,7 +191,7 @@ def begin_worlds(
     status: wp.array[wp.int32],
     running: wp.array[wp.int32],
 ):
-    """All worlds run."""
+    """Mark all worlds as running."""
     world = wp.tid()
     for k in range(SCALARS):
         scalars[world, k] = wp.float64(0.0)
@@ -216,10 +216,11 @@ def judge_residual(
     # Out
     solve_tolerance: wp.array[wp.float64],
 ):
-    """Stop where the residual is small; else say how well the step must be solved for (Eisenstat and Walker 1996).
+    """Stop worlds whose residual is small; for the others set the tolerance of the linear solve (Eisenstat and Walker
+    1996).
 
-    It is small against the norm of external and reaction forces. Worlds that have stopped need no step: a tolerance of
-    one.
+    The residual is compared with the norm of external and reaction forces. Worlds that have stopped need no step and
+    get a tolerance of one.
     """
     world, lane = wp.tid()
     square = add_up(parts, world, lane, lanes, SQUARE)
@@ -246,7 +247,7 @@ def judge_residual(
                 if before > wp.float64(0.0):
                     gained = now / before
                     wanted = wp.min(wp.float64(0.9) * gained * gained, LOOSEST)
-                # No better than what ends the iteration.
+                # Not more accurate than the end of the iteration needs.
                 useful = wp.float64(0.3) * tolerance * compared / now
                 wanted = wp.max(wp.max(wanted, wp.min(useful, LOOSEST)), TIGHTEST)
                 if iterations[world] > 0 and scalars[world, CORRECTION] <= NEAR:
@@ -270,7 +271,7 @@ def begin_search(
     # Out
     searching: wp.array[wp.int32],
 ):
-    """Try the whole step in every world that runs; one that does not go down is none."""
+    """Try the whole step in every running world; a step that does not go downhill is dropped."""
     world, lane = wp.tid()
     slope = add_up(parts, world, lane, lanes, SLOPE)
     if lane == 0:
@@ -299,7 +300,7 @@ def try_step(
     # Out
     u: wp.array[wp.vec4],
 ):
-    """u = base + d + share step; to commit is to let d be that increment."""
+    """u = base + d + fraction step; to commit is to set d to that increment."""
     i = wp.tid()
     share = float(scalars[i / count, SHARE])
     d = load_node(increment, i)
@@ -322,10 +323,10 @@ def judge_trial(
     accepted: wp.array[wp.int32],
     searching: wp.array[wp.int32],
 ):
-    """Take the step where Pi is lower by a share of what the slope promises; else try a shorter one.
+    """Take the step if Pi decreases by a fraction of the prediction of its slope; otherwise try a shorter one.
 
-    Pi's change is that of W, and the rest is a polynomial of the share. Shares follow the parabola through Pi's values
-    and its slope.
+    The change of W is measured; the rest of Pi is a polynomial of the fraction. The next fraction comes from the
+    parabola through Pi's values and its slope.
     """
     world, lane = wp.tid()
     energy = add_up(parts, world, lane, lanes, ENERGY)
@@ -366,9 +367,10 @@ def judge_step(
     status: wp.array[wp.int32],
     running: wp.array[wp.int32],
 ):
-    """Stop where a whole step was small against displacements or in energy, or none could be taken.
+    """Stop worlds in which a whole step was small, relative to displacements or in energy, or no step could be taken.
 
-    A step that was solved for roughly may be small because it lacks what is smooth: the next one is solved for well.
+    A step from a rough solve may be small because its smooth part is missing: then the next one is solved for
+    accurately.
     """
     world, lane = wp.tid()
     longest = largest(parts, world, lane, lanes, STEP)

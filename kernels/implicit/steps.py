@@ -1,8 +1,8 @@
-"""Implicit time steps on the nodes: what a step begins with, and the state that it ends with.
+"""Implicit time steps at the nodes: the start values of a step, and the state at its end.
 
-A scheme is a table of coefficients, row by row a sum of the stage's increment d, the velocity v, and two vectors h1 and
-h2 that the step before has left, such as its acceleration. The first row of tables is for a step that goes on from the
-one before, the second for one that begins.
+A scheme is a table of coefficients: each row is a sum of the stage's increment d, the velocity v, and two vectors h1
+and h2 of the step before, such as its acceleration. The first table is for a step that continues the one before, the
+second for a first step.
 """
 
 from typing import Any
@@ -18,8 +18,9 @@ from .tangent import DAMPING, MASS, STIFFNESS
 
 wp.set_module_options({"enable_backward": False})
 
-#: Rows of a scheme: acceleration and velocity of the stage, velocity after the step, what h1 and h2 are then; the last
-#: has the share of the step that the stage is, and the share of v dt that the search for the increment begins with.
+#: Rows of a scheme: acceleration and velocity of the stage, velocity after the step, and the next h1 and h2. The last
+#: row has the fraction of the step at which the stage is, and the fraction of v dt with which the search for the
+#: increment begins.
 ACCELERATION, RATE, VELOCITY, FIRST, SECOND, STAGE = (wp.constant(k) for k in range(6))
 ROWS = 6
 #: Columns: d, v, h1 and h2.
@@ -43,7 +44,9 @@ def find_changes(
     # Out
     begins: wp.array[wp.int32],
 ):
-    """Whether free nodes are where, and as fast as, the step before has left them; else this one begins."""
+    """Check whether free nodes have the positions and velocities of the end of the step before; otherwise this is a
+    first step.
+    """
     i = wp.tid()
     if inverse_mass[i] > 0.0:
         a = load_node(u, i) - load_node(left_u, i)
@@ -62,7 +65,7 @@ def choose_scales(
     scales: wp.array[wp.float32],
     inertia: wp.array[wp.float32],
 ):
-    """The scales of the operator for this step, with damping in proportion to the mass."""
+    """Choose the scales of the operator for this step, including damping proportional to mass."""
     which = begins[0]
     a = table[which, ACCELERATION, 0]
     b = table[which, RATE, 0]
@@ -93,12 +96,11 @@ def begin_step(
     guess: wp.array[wp.vec4],
     drift: wp.array[wp.vec4],
 ):
-    """The base of the increments, their first values, and what inertia and damping pull with.
+    """Find the base of the increments, their first values, and the pull of inertia and damping.
 
-    ``guess`` is what increments would be, beyond their first values, if the velocity went on to change as it has since
-    the step before, ``before``; zero at held nodes. Held nodes move with the velocity they have. ``drift`` is the
-    stage's velocity without its increment's share, one entry where nobody asks for it; h1 and h2 are one entry where a
-    scheme has none.
+    ``guess`` is the increment beyond its first value if the velocity keeps changing as it has since the step before,
+    ``before``; it is zero at held nodes. Held nodes keep their velocity. ``drift`` is the stage's velocity without the
+    increment's part, or one entry if it is not needed; h1 and h2 have one entry in schemes without them.
     """
     i = wp.tid()
     which = begins[0]
@@ -140,7 +142,7 @@ def find_rates(
     drift: wp.array[wp.vec4],
     rates: wp.array[wp.vec4],
 ):
-    """The stage's velocities, of the present increments."""
+    """Find the stage's velocities from the present increments."""
     i = wp.tid()
     store_node(rates, i, scales[DAMPING] * load_node(increment, i) + load_node(drift, i))
 
@@ -154,7 +156,7 @@ def take_step(
     # Out
     u: wp.array[wp.vec4],
 ):
-    """Add a step to the increments, and to the displacements of the stage."""
+    """Add a step to the increments and to the stage's displacements."""
     i = wp.tid()
     s = load_node(step, i)
     store_node(increment, i, load_node(increment, i) + s)
@@ -183,7 +185,9 @@ def end_step(
     left_v: wp.array[wp.vec4],
     bad_step: wp.array[wp.int64],
 ):
-    """The state after the step. One whose forces were not finite has none, and says so."""
+    """Find the state after the step. If the solve has broken down, displacements become NaN, and ``bad_step`` records
+    the step.
+    """
     i = wp.tid()
     which = begins[0]
     d = load_node(increment, i)
@@ -230,7 +234,7 @@ def count_supports(
     reactions: wp.array[wp.vec4],
     support_work: wp.array[wp.float64],
 ):
-    """What supports take after the step, and what moving ones have put in against elastic forces."""
+    """Find the forces of supports after the step, and the work of moving ones against elastic forces."""
     i = wp.tid()
     if inverse_mass[i] == 0.0:
         force = load_node(elastic, i)
@@ -248,7 +252,7 @@ def count_work(
     increment: wp.array[wp.vec4],
     account: wp.array2d[wp.float64],
 ):
-    """Add the work of forces besides elasticity on free nodes to its account."""
+    """Add the work of all but elastic forces on free nodes to its sum."""
     i = wp.tid()
     if inverse_mass[i] > 0.0:
         work = wp.float64(wp.dot(load_node(others, i), load_node(increment, i)))
@@ -266,7 +270,7 @@ def count_solves(
     # Out
     totals: wp.array[wp.int64],
 ):
-    """Count steps, iterations of Newton and of linear solves, of the world that needed most, and unfinished steps."""
+    """Count steps, Newton and linear iterations of the world with the most, and unfinished steps."""
     most = int(0)
     linear = int(0)
     unfinished = int(0)

@@ -1,6 +1,6 @@
-"""Sums over the nodes of each world, float64, in a settled order: parts first, which the next kernel adds up.
+"""Sums over the nodes of each world, in float64 and in a fixed order: first parts, which the next kernel adds up.
 
-A launch has ``threads`` threads a world; ``lanes`` of them, a warp on CUDA and one on a CPU, make a part.
+A launch has ``threads`` threads for each world; ``lanes`` of them, a warp on CUDA and one on a CPU, compute a part.
 """
 
 import warp as wp
@@ -13,7 +13,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def dot64(a: wp.vec3, b: wp.vec3):
-    """a . b, where what fits into float32 need not do so once multiplied."""
+    """a . b in float64, because the products may exceed the range of float32."""
     return wp.dot(wp.vec3d(a), wp.vec3d(b))
 
 

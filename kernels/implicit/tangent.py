@@ -23,8 +23,7 @@ def finish_rows(
     # In and out
     y: wp.array[wp.vec4],
 ):
-    """y = a M x + b D x + c y from y = K x and ``damped`` = -D x, one entry where there is none; y = x where nodes are
-    not free."""
+    """y = a M x + b D x + c y from y = K x and ``damped`` = -D x, one entry without damping; y = x at held nodes."""
     i = wp.tid()
     v = load_node(x, i)
     if inverse_mass[i] > 0.0:
@@ -44,7 +43,7 @@ def finish_blocks(
     # In and out
     blocks: wp.array[wp.mat33],
 ):
-    """The diagonal blocks of A from those of K; viscous damping counts as ``stiffening`` b K."""
+    """Find the diagonal blocks of A from those of K; viscous damping counts as ``stiffening`` b K."""
     i = wp.tid()
     block = wp.identity(3, dtype=wp.float32)
     if inverse_mass[i] > 0.0:
@@ -55,7 +54,7 @@ def finish_blocks(
 
 @wp.kernel(enable_backward=False)
 def invert_blocks(blocks: wp.array[wp.mat33], inverses: wp.array[wp.mat33]):
-    """Inverses of symmetric blocks, positive definite also where a block is not."""
+    """Invert symmetric blocks; an indefinite block is made positive definite first."""
     i = wp.tid()
     block = blocks[i]
     block = 0.5 * (block + wp.transpose(block))

@@ -1,11 +1,11 @@
-"""The cycle: smoothing, transfers, and what goes in and comes out.
+"""The cycle: smoothing, transfers, and the conversion of its input and output.
 
 Smoothing is Chebyshev's iteration with the inverse diagonal blocks. It needs a bound on the largest eigenvalue of
 D^-1 A. The matrix of each element, and of each ancestor, is positive semidefinite and couples four nodes, so it is at
 most four times its own diagonal blocks: 4 is a bound on all levels.
 
-A row of a matrix is one thread's on a CPU. On CUDA it is several lanes': they read neighbouring entries together, and a
-small level takes no longer than its longest sum.
+On a CPU one thread computes a row of a matrix. On CUDA several lanes share it: they read neighbouring entries together,
+and a small level takes no longer than its longest sum.
 """
 
 import warp as wp
@@ -26,8 +26,9 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": COMPILER_
     return part;
 """)
 def sum_over_lanes(part: wp.vec3, lanes: int) -> wp.vec3:
-    """The sum of neighbouring threads' parts, a power of two of them up to 32, all of which get it; on a CPU there is
-    one."""
+    """The sum of the parts of ``lanes`` neighbouring threads, a power of two up to 32; each of them gets the sum. On a
+    CPU there is one.
+    """
     ...
 
 
@@ -71,10 +72,10 @@ def row_product(
     blocks: wp.array[wp.mat33],
     x: wp.array[wp.vec4],
 ) -> wp.vec3:
-    """The product of a row with x, of which each of ``lanes`` neighbouring threads on CUDA has a part.
+    """The product of a row with x; on CUDA each of ``lanes`` neighbouring threads returns a part.
 
-    Entries are transposed, so that on a CPU four lanes of a vector add up columns; of the last one they read a number
-    past its end.
+    Entries are transposed, so that on a CPU four lanes of a vector add columns; for the last column they read one
+    number past its end.
     """
     ...
 
@@ -142,7 +143,9 @@ def row_differences(
     }
 """)
 def pack_entry(packed: wp.array[wp.uint16], entry: int, column: int, block: wp.mat33):
-    """Three columns of four numbers of 16 bits: the block, which is transposed, and its column in the fourth ones."""
+    """Pack an entry as three columns of four 16-bit numbers: the transposed block, and its column index in the fourth
+    numbers.
+    """
     ...
 
 
@@ -155,7 +158,7 @@ def pack_entry(packed: wp.array[wp.uint16], entry: int, column: int, block: wp.m
     return value;
 """)
 def most_over_lanes(value: float, lanes: int) -> float:
-    """The largest value of neighbouring threads, as ``sum_over_lanes``."""
+    """The largest value of neighbouring threads; see ``sum_over_lanes``."""
     ...
 
 
@@ -173,11 +176,12 @@ def pack_rows(
     sums: wp.array[wp.mat33],
     units: wp.array[float],
 ):
-    """Rows as smoothing reads them: blocks in half precision in a unit of the row's, and the sum of the row's blocks.
+    """Write rows in the form for smoothing: blocks in half precision, in a unit for each row, and the sum of the row's
+    blocks.
 
-    (A x)_i = sum of A_ij (x_j - x_i) + (sum of A_ij) x_i. So rounding of blocks meets differences alone, and a
-    translation has no error. Units are powers of two, so that a block and its mirror image are rounded alike. What
-    is not symmetric is the sum of rounding errors on the diagonal, some ten-thousandths of it.
+    (A x)_i = sum of A_ij (x_j - x_i) + (sum of A_ij) x_i. So rounding of blocks acts only on differences, and a
+    translation has no error. Units are powers of two, so a block and its mirror image are rounded alike. Only the sum
+    of rounding errors on the diagonal is not symmetric, some ten-thousandths of it.
     """
     world, thread = wp.tid()
     i, lane = thread / lanes, thread % lanes
@@ -217,7 +221,9 @@ def pack_rows(
 
 @wp.struct
 class Rows:
-    """A level's matrix, one world's pattern; ``packed``, ``sums`` and ``units`` are empty where blocks are read."""
+    """A level's matrix; all worlds share the pattern. ``packed``, ``sums`` and ``units`` are empty if blocks are read
+    instead.
+    """
 
     starts: wp.array[wp.int32]
     columns: wp.array[wp.int32]
@@ -256,7 +262,7 @@ def take_in(
     r: wp.array[wp.vec4],
     z: wp.array[wp.vec4],
 ):
-    """The residual by rank, zero where nodes are held, and the first step from zero."""
+    """Sort the residual by rank, zero at held nodes, and make the first step from zero."""
     world, i = wp.tid()
     node = nodes[i]
     at = world * ranks + i
@@ -279,7 +285,7 @@ def hand_out(
     # Out
     result: wp.array[wp.vec4],
 ):
-    """The result by number; held nodes have the identity."""
+    """Sort the result by node; held nodes have the identity."""
     world, i = wp.tid()
     node = nodes[i]
     if node >= mesh_nodes:
@@ -308,7 +314,9 @@ def smooth(
     # In and out
     other: wp.array[wp.vec4],
 ):
-    """One step: ``other`` has the values before z, which are taken as zero if told so, and gets those after it."""
+    """Make one step: ``other`` has the values before z, or zero if the flag says so, and receives the values after
+    it.
+    """
     world, thread = wp.tid()
     i, lane = thread / lanes, thread % lanes
     at = world * count + i
@@ -363,7 +371,7 @@ def restrict_residual(
     r: wp.array[wp.vec4],
     z: wp.array[wp.vec4],
 ):
-    """P^T of the finer level's residual, zero where nodes are held, and the first step from zero."""
+    """P^T of the finer level's residual, zero at held nodes, and the first step from zero."""
     world, i = wp.tid()
     at = world * coarse + i
     total = wp.vec3()
@@ -387,7 +395,7 @@ def prolongate_correction(
     # In and out
     z: wp.array[wp.vec4],
 ):
-    """z += P of the coarser level's correction, where nodes are free."""
+    """z += P of the coarser level's correction, at free nodes."""
     world, i = wp.tid()
     if free[world * ranks + i] == wp.uint8(0):
         return

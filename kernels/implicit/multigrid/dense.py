@@ -1,4 +1,6 @@
-"""The coarsest level: its inverse, found by one block a world for each linearisation, and applied in one launch."""
+"""The coarsest level: one thread block for each world inverts its matrix once a linearisation, and one launch applies
+the inverse.
+"""
 
 import warp as wp
 
@@ -10,7 +12,7 @@ from .cycle import sum_over_lanes
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": COMPILER_FLAGS})
 
-#: What is added to the diagonal, scaled to one: the inverse stays finite where nothing holds a body.
+#: Added to the diagonal, which is scaled to one: the inverse stays finite for a body that nothing holds.
 SHIFT = wp.constant(wp.float64(1.0e-5))
 
 
@@ -26,7 +28,7 @@ def fill_dense(
     matrix: wp.array3d[wp.float64],
     scale: wp.array2d[wp.float64],
 ):
-    """The matrix with a diagonal of ones; rows without an entry are zero, and their scale is."""
+    """Write the matrix, scaled to a diagonal of ones; rows without an entry are zero and have scale zero."""
     world, i = wp.tid()
     first = world * entries
     own = blocks[first + diagonal[i]]
@@ -65,7 +67,7 @@ def subtract_row(
     lanes: int,
     factor: wp.float64,
 ):
-    """Subtract a multiple of the pivot's row from row i of the lower triangle; its lanes take every so many entries."""
+    """Subtract a multiple of the pivot's row from row i of the lower triangle; ``lanes`` threads share its entries."""
     ...
 
 
@@ -78,8 +80,9 @@ def invert_dense(
     # Out
     rows: wp.array2d[wp.float64],
 ):
-    """Minus the inverse of each world's matrix, in its lower triangle, by symmetric sweeps; one block a world, which
-    keeps the row of each pivot in ``rows``. ``lanes`` of its threads share a row of the matrix."""
+    """Overwrite the lower triangle of each world's matrix with minus its inverse, by symmetric sweeps. Each world has
+    one thread block, which keeps the pivot's row in ``rows``; ``lanes`` of its threads share a row of the matrix.
+    """
     thread = wp.tid()
     threads = wp.block_dim()
     world = thread / threads
@@ -101,7 +104,7 @@ def invert_dense(
             if i != k:
                 factor = rows[world, i] * inverse
                 subtract_row(matrix, rows, world, i, part, lanes, factor)
-                # The pivot's column is the row's own entry k, which is written by the lane that has subtracted from it.
+                # Entry k of the row is in the pivot's column; the lane that has subtracted from it writes it.
                 if i > k and part == k % lanes:
                     matrix[world, i, k] = factor
             else:

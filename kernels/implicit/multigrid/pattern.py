@@ -1,7 +1,8 @@
-"""Which nodes of a level are neighbours, and what each entry of its matrix is the sum of.
+"""Neighbouring nodes of each level, and the contributions to each entry of its matrix.
 
-An entry in the upper triangle, or on the diagonal, is a sum of contributions: of leaves on the finest level, of entries
-of the next finer level on others (Galerkin). Contributions are listed with the pair of ranks as a key, and sorted.
+An entry in the upper triangle, or on the diagonal, is a sum of contributions: of leaves on the finest level, of the
+next finer level's entries on the others (Galerkin). Contributions are listed with their pair of ranks as a key, and
+sorted.
 """
 
 import warp as wp
@@ -21,7 +22,7 @@ def pair_of(key: wp.int64, bits: int):
 
 @wp.func
 def parents(i: int, coarse: int, ends: wp.array[wp.vec2i]):
-    """The node itself and -1 if it is among the ``coarse`` first ones, else the ends of its edge."""
+    """The node itself and -1 if it is among the first ``coarse`` ones; otherwise the ends of its edge."""
     if i < coarse:
         return wp.vec2i(i, -1)
     return ends[i]
@@ -64,8 +65,9 @@ def list_leaf_pairs(
     keys: wp.array[wp.int64],
     codes: wp.array[wp.int32],
 ):
-    """The six pairs of nodes of each leaf; a code is 16 times the leaf, plus 4 times the place of the node with the
-    lower rank in it, plus that of the other."""
+    """List the six pairs of nodes of each leaf; a code is 16 times the leaf, plus 4 times the place in it of the node
+    with the lower rank, plus the other node's place.
+    """
     t = wp.tid()
     at = int(6 * t)
     for m in range(3):
@@ -90,7 +92,7 @@ def list_diagonal(
     keys: wp.array[wp.int64],
     codes: wp.array[wp.int32],
 ):
-    """An entry on the diagonal for each node, whether leaves name it or not, after ``first`` others."""
+    """List a diagonal entry for each node, also for nodes of no leaf, after ``first`` other entries."""
     i = wp.tid()
     keys[first + i] = key_of(i, i, bits)
     codes[first + i] = -1
@@ -105,7 +107,7 @@ def count_products(
     # Out
     counts: wp.array[wp.int32],
 ):
-    """To how many entries of the coarser level's upper triangle each entry contributes."""
+    """Count the entries of the coarser level's upper triangle to which each entry contributes."""
     p = wp.tid()
     first = parents(pairs[p][0], coarse, ends)
     second = parents(pairs[p][1], coarse, ends)
@@ -129,8 +131,9 @@ def list_products(
     keys: wp.array[wp.int64],
     codes: wp.array[wp.int32],
 ):
-    """Each contribution's key, and as its code 4 times the entry plus how often it is halved; ``sums`` are the
-    inclusive sums of the counts."""
+    """List each contribution's key and code: 4 times the entry plus the number of times it is halved. ``sums`` are the
+    inclusive sums of the counts.
+    """
     p = wp.tid()
     first = parents(pairs[p][0], coarse, ends)
     second = parents(pairs[p][1], coarse, ends)
@@ -158,8 +161,9 @@ def name_upper(
     full_keys: wp.array[wp.int64],
     sources: wp.array[wp.int32],
 ):
-    """Each upper entry's pair, and the keys of it and its mirror image; an entry on the diagonal is its own, and gets
-    row ``count``, past all, instead."""
+    """Write each upper entry's pair, and the keys of the entry and its mirror image. A diagonal entry has none; its
+    second key gets row ``count``, past all rows.
+    """
     u = wp.tid()
     pair = pair_of(keys[starts[u]], bits)
     upper[u] = pair
@@ -183,7 +187,7 @@ def name_entries(
     diagonal: wp.array[wp.int32],
     places: wp.array[wp.int32],
 ):
-    """The sorted entries; ``places`` are where each upper entry and its mirror image stand among them."""
+    """Write the sorted entries; ``places`` are the positions of each upper entry and its mirror image among them."""
     p = wp.tid()
     pair = pair_of(keys[p], bits)
     pairs[p] = pair
@@ -203,7 +207,7 @@ def find_row_starts(
     # Out
     starts: wp.array[wp.int32],
 ):
-    """Where each row begins among ``count`` sorted keys, and where the last one ends."""
+    """Find the position among ``count`` sorted keys at which each row begins, and at which the last one ends."""
     row = wp.tid()
     wanted = key_of(row, 0, bits)
     low = int(0)
@@ -227,7 +231,7 @@ def list_midpoints(
     keys: wp.array[wp.int64],
     midpoints: wp.array[wp.int32],
 ):
-    """Each end of the edges of nodes past the ``coarse`` first ones, with that node."""
+    """List the nodes past the first ``coarse`` ones, once with each end of their edge."""
     i = wp.tid()
     node = coarse + i
     for n in range(2):

@@ -1,7 +1,7 @@
-"""The part of the finest matrix that comes from a dilatation that groups of elements share.
+"""The contribution of a dilatation shared by groups of elements to the finest matrix.
 
 A group adds r r^T with r = sqrt(c) g of ``kernels.elements.shared_rows``, so each pair of its nodes contributes to an
-entry. Rows are those of the present state, as lambda may be thousands of times mu.
+entry. Rows belong to the present state, because lambda may be thousands of times mu.
 
 A group of k nodes couples all of them: r r^T may be k times its own diagonal blocks. It is at most 4 times these with
 weights w_n = sum of |r_m| / (4 |r_n|), since (sum of r_n . p_n)^2 <= sum of |r_m| times sum of (r_n . p_n)^2 / |r_n|.
@@ -26,7 +26,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.kernel(enable_backward=False)
 def count_pairs(groups: GroupNodes, counts: wp.array[wp.int32]):
-    """Pairs of a group's nodes, each with itself, too."""
+    """Count the pairs of a group's nodes, including each node with itself."""
     g = wp.tid()
     nodes = groups.ends[g] - first_entry(groups.ends, g)
     counts[g] = nodes * (nodes + 1) / 2
@@ -45,8 +45,9 @@ def list_pairs(
     keys: wp.array[wp.int64],
     codes: wp.array[wp.int32],
 ):
-    """Each pair's places in the rows, that of the lower rank first; its key; and as its code -2 minus its number.
-    ``first`` is how many keys stand before."""
+    """List each pair's places in the rows, that of the lower rank first; its key; and its code, -2 minus its number.
+    ``first`` keys come before.
+    """
     g = wp.tid()
     at = first_entry(sums, g)
     for k in range(first_entry(groups.ends, g), groups.ends[g]):
@@ -76,7 +77,7 @@ def add_row(rows: wp.array[wp.vec4], place: int, part: wp.vec3):
 
 @functools.cache
 def write_rows(of: Dilatation) -> wp.Kernel:
-    """The rows at displacements u, and w - 1 in the fourth lane."""
+    """Write the rows at displacements u, with w - 1 in the fourth lane."""
     measure, curvature_of = of.measure, of.curvature
 
     @unique_kernel()
@@ -143,8 +144,9 @@ def bound_diagonal(
     # Out
     inverses: wp.array[wp.mat33],
 ):
-    """Inverses of diagonal blocks, of which a row's is divided by a quarter of the sum of its |D^-1/2 A D^-1/2|, if
-    that is more than one: A is at most 4 D, since 4 D - A is diagonally dominant."""
+    """Find the inverses of diagonal blocks, and divide each by a quarter of its row's sum of |D^-1/2 A D^-1/2| if that
+    is more than one. Then A is at most 4 D, because 4 D - A is diagonally dominant.
+    """
     world, i = wp.tid()
     first = world * count
     own = given[first + i]

@@ -1,8 +1,8 @@
-"""Smoothing on the CPU: sweeps of Gauss and Seidel over a level's rows, block by block, one thread a world.
+"""Smoothing on the CPU: block Gauss-Seidel sweeps over a level's rows, one thread for each world.
 
-A sweep forward from zero reads the lower half of the matrix, and the residual it leaves the upper one. So one sweep
-before and its mirror image after cost as much as two products, and smooth as well as Chebyshev's iteration of degree 2,
-which takes four.
+A forward sweep from zero reads the lower half of the matrix, and its residual needs only the upper half. So one sweep
+before the coarser level and its mirror image after it cost as much as two products, and smooth as well as Chebyshev's
+iteration of degree 2, which costs four.
 """
 
 import warp as wp
@@ -13,7 +13,7 @@ from .cycle import Rows
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": COMPILER_FLAGS})
 
-#: What is common: the sum of a row's blocks from one entry to another times x, and a vector times an inverse.
+#: Shared code: the sum of a range of a row's blocks times x, and the product of an inverse and a vector.
 _ROWS = """
     const int* starts = rows.starts.data;
     const int* columns = rows.columns.data;
@@ -145,7 +145,7 @@ def sweep(
     # In and out
     z: wp.array[wp.vec4],
 ):
-    """A sweep over all rows, in their order or backward."""
+    """Sweep over all rows, forward or backward."""
     sweep_rows(wp.tid(), count, entries, backward, rows, inverses, r, z, z)
 
 
@@ -163,5 +163,5 @@ def find_rest(
     # In and out
     other: wp.array[wp.vec4],
 ):
-    """r - A z, or that of what ``sweep_from_zero`` has left, of which ``other`` has a part already."""
+    """r - A z; after ``sweep_from_zero``, ``other`` already has a part of it."""
     subtract_rows(wp.tid(), count, entries, is_first, rows, diagonal, inverses, r, z, other)

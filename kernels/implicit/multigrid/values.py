@@ -1,8 +1,8 @@
-"""The values of each level's matrix: of the finest from the leaves, of the others from the next finer one.
+"""The values of each level's matrix: the finest from the leaves, the others from the next finer level.
 
-A leaf has K_mn = V (lambda g_m g_n^T + mu g_n g_m^T + mu (g_m . g_n) I) with the gradients g of its hat functions
-turned by its rotation: the corotated R K R^T, or linear elasticity where nothing is turned. Every entry gathers what it
-is the sum of, so there are no atomic additions and sums have one order.
+A leaf has K_mn = V (lambda g_m g_n^T + mu g_n g_m^T + mu (g_m . g_n) I) with the gradients g of its hat functions,
+turned by its rotation: the corotated R K R^T, or linear elasticity without the rotation. Every entry gathers its
+contributions, so there are no atomic additions and sums have a fixed order.
 
 Entries are stored transposed, as ``cycle.row_product`` takes them. Rows and columns of held nodes are zero; their
 displacements are left out of the cycle.
@@ -28,7 +28,7 @@ from .shared import row_at
 
 wp.set_module_options({"enable_backward": False})
 
-#: Determinant of a block over the cube of a third of its trace, below which the block is not inverted as it is.
+#: A block whose determinant over the cube of a third of its trace is smaller is changed before it is inverted.
 LEAST_DETERMINANT = wp.constant(1.0e-8)
 
 
@@ -42,7 +42,7 @@ def find_free(
     # Out
     free: wp.array[wp.uint8],
 ):
-    """Which nodes are free, by rank; those that no leaf names are."""
+    """Find the free nodes, by rank; nodes of no leaf count as free."""
     world, i = wp.tid()
     node = nodes[i]
     is_free = bool(True)
@@ -110,9 +110,10 @@ def gather_leaves(
     blocks: wp.array[wp.mat33],
     more: wp.array[wp.mat33],
 ):
-    """The entries off the diagonal; ``gradients`` are those of ``tables.shapes``, [shape, node]; viscous damping counts
-    as ``stiffening`` b K, and lambda as ``most_lambda`` mu at most. Pairs and rows are those of ``shared``;
-    ``more`` is what their weights add to the diagonal, by rank; one entry where there are none."""
+    """Find the entries off the diagonal. ``gradients`` come from ``tables.shapes``, [shape, node]; viscous damping
+    counts as ``stiffening`` b K, and lambda as ``most_lambda`` mu at most. Pairs and rows come from ``shared``;
+    ``more`` is the addition of their weights to the diagonal, by rank, or one entry if there are none.
+    """
     world, u = wp.tid()
     scale = scales[2] + scales[1] * stiffening
     if upper[u][0] == upper[u][1]:
@@ -152,8 +153,9 @@ def gather_leaves(
 
 @wp.func
 def inverse_block(a: wp.mat33):
-    """The inverse of a symmetric positive definite block, of one that is nearly singular with something added; zero of
-    zero."""
+    """The inverse of a symmetric positive definite block, regularised if the block is nearly singular; zero for a zero
+    block.
+    """
     third = (a[0, 0] + a[1, 1] + a[2, 2]) / 3.0
     result = wp.mat33()
     if third > 0.0:
@@ -192,8 +194,9 @@ def finish_leaves(
     # Out
     inverses: wp.array[wp.mat33],
 ):
-    """The finest level's diagonal: stiffness does not answer to translation, so that its rows' blocks sum to zero;
-    mass; and blocks of other forces, if there are any. Zeros where nodes are held."""
+    """Find the finest level's diagonal: stiffness, from the row's sum of blocks, which is zero because a translation
+    causes no force; mass; and blocks of other forces, if there are any. Held nodes have zeros.
+    """
     world, i = wp.tid()
     first = world * entries
     own = diagonal[i]
@@ -241,7 +244,7 @@ def gather_products(
     blocks: wp.array[wp.mat33],
     inverses: wp.array[wp.mat33],
 ):
-    """P^T A P of a coarser level, and the inverses of its diagonal blocks."""
+    """Find P^T A P of a coarser level and the inverses of its diagonal blocks."""
     world, u = wp.tid()
     i = upper[u][0]
     j = upper[u][1]
