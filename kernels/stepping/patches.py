@@ -1,21 +1,20 @@
-"""An organ's steps in thread blocks that stay: each block keeps its patch of nodes, and many steps are one launch.
+"""Many steps of an organ in one launch of resident thread blocks, each of which keeps a patch of nodes.
 
-A block computes every element that touches one of its nodes, also those between patches, so that blocks exchange no
-forces and no block waits for all others. They exchange displacements: a block publishes those of its nodes, and waits
-for those of its halo, the other corners of its elements. Each is one word of 16 bytes with the number of its step in
-the last four; a reader that sees the number has the value, without fences or counters. Two buffers take turns: a block
-publishes step n + 1 only when it has seen step n of all its neighbours, who then have read its step n - 1.
+A block computes every element that touches one of its nodes, including those between patches. So blocks exchange no
+forces, and no block waits for all others. Blocks exchange displacements: each publishes those of its nodes and waits
+for those of its halo, the other corners of its elements. A displacement is one word of 16 bytes, of which the last four
+are the step's number; a reader that sees the number has the value, without fences or counters. Two buffers alternate: a
+block publishes step n + 1 only after it has seen step n of all its neighbours, which then have read its step n - 1.
 
-Where elements share their dilatation, a block also measures the other elements of its elements' groups. Each element
-leaves its dilatation in the row of its group; a thread a group adds them up; and a second pass adds the forces of the
-pressure.
+If elements share their dilatation, a block also measures the other elements of its elements' groups. Each element
+writes its dilatation to the row of its group, one thread for each group sums the row, and a second pass adds the forces
+of the pressure.
 
-All blocks of a launch must be on the card at once, one to a multiprocessor. Sums have one order, so runs are
-reproducible bit by bit. CUDA only; ``solvers.patch_layout`` says which block does what.
+All blocks of a launch must be resident at once, one on each multiprocessor. Sums have a fixed order, so runs are
+reproducible bit by bit. CUDA only; ``solvers.explicit.patch_layout`` divides the work among blocks.
 """
 
 import functools
-from dataclasses import dataclass
 
 import warp as wp
 
@@ -27,164 +26,19 @@ from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.tables.shapes import fingerprint
 
 from .block import LOAD, STORE, lowest_bit, number_in, shuffle_down, synchronize_any, synchronize_block
+from .block_memory import numbers_at, vectors_at
+from .exchange import Exchange, await_displacement, publish
 from .integrate import add_support_work, is_finite, symplectic_euler_velocity, vector_at
 from .pace import DONE, DT, Pace, length_before, time_after
+from .patch_body import VOLUME_ROW, Layout, PatchBody
 
 wp.set_module_options({"enable_backward": False})
 
 WARP = 32
-#: How often a block polls for a displacement before it gives up: some seconds.
-MOST_LOOKS = 1 << 22
-#: The layout of a row of ``PatchBody.rest``: the inverse of the rest edges, row by row, then the volume.
-VOLUME_ROW = 9
-#: The data that a thread keeps for an element: the same, with the volume times mu and times lambda.
+#: The data that a thread keeps for an element: the inverse rest edges, and the volume times mu and times lambda.
 CONSTANTS = 11
 
 row = wp.types.vector(length=CONSTANTS, dtype=wp.float32)
-
-
-@dataclass(frozen=True)
-class Layout:
-    """What a kernel is generated for.
-
-    Attributes:
-        threads: Threads a block.
-        elements, halo: Elements that it computes, and nodes of the halo, a thread.
-        lanes: Threads that add up one node.
-        nodes, slots: Room for displacements and for forces in shared memory; one more slot takes what nobody adds up.
-        groups, members: Room for groups that share a dilatation and for the elements of each; none: elements do not.
-        overlaps: Whether a block computes the elements that need no halo before it waits for that.
-    """
-
-    threads: int
-    elements: int
-    halo: int
-    lanes: int
-    nodes: int
-    slots: int
-    groups: int = 0
-    members: int = 0
-    overlaps: bool = True
-
-    @property
-    def vectors(self) -> int:
-        return self.nodes + self.slots + 1
-
-    @property
-    def floats(self) -> int:
-        """The shared memory for all of that, in numbers of four bytes."""
-        return 3 * self.vectors + self.groups * (2 * self.members + 2)
-
-
-@wp.struct
-class PatchBody:
-    """A body by patches; see ``solvers.patch_layout.Patches``."""
-
-    own: wp.array[wp.int32]  # [N]
-    own_start: wp.array[wp.int32]  # [patches + 1], as the other starts
-    halo: wp.array[wp.int32]
-    halo_start: wp.array[wp.int32]
-    elements: wp.array[wp.int32]  # [E]
-    element_start: wp.array[wp.int32]
-    interior: wp.array[wp.int32]  # [patches] how many of a patch's elements need no halo; they come first
-    computed: wp.array[wp.int32]  # [patches] how many it computes; it only measures the others
-    measures: wp.array[wp.int32]  # [E] where an element's dilatation goes: group by group, one row a member
-    corners: wp.array[wp.uint64]  # [E] the four corners' places among the patch's nodes, 16 bits each
-    slots: wp.array[wp.uint64]  # [E] the same of their forces
-    bases: wp.array[wp.int32]
-    base_start: wp.array[wp.int32]
-    rest: wp.array2d[wp.float32]  # [10, E] see ``VOLUME_ROW``
-    # Keyframes of all trajectories, one after another.
-    trajectory: wp.array[wp.int32]  # [N] which one a node follows, -1: none
-    place: wp.array[wp.int32]  # [N] its column there
-    key_start: wp.array[wp.int32]  # [trajectories + 1] into ``times``
-    value_start: wp.array[wp.int32]  # [trajectories] into ``values``, whose rows are of ``columns``
-    columns: wp.array[wp.int32]  # [trajectories]
-    times: wp.array[wp.float64]
-    values: wp.array[wp.vec3]
-
-
-@wp.struct
-class Exchange:
-    """The data that blocks exchange."""
-
-    published: wp.array[wp.vec4]  # [2 N] displacements of even and of odd steps, the step's number in the last bits
-    begun: wp.array[wp.uint32]  # [patches] the number of the next launch's first state
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    const unsigned long long low = ((unsigned long long)__float_as_uint(value[1]) << 32) | __float_as_uint(value[0]);
-    const unsigned long long high = ((unsigned long long)number << 32) | __float_as_uint(value[2]);
-    asm volatile("{ .reg .b128 all; mov.b128 all, {%1, %2}; st.relaxed.gpu.global.b128 [%0], all; }"
-        :: "l"(&wp::index(published, i)), "l"(low), "l"(high) : "memory");
-#endif
-""")
-def publish(published: wp.array[wp.vec4], i: int, value: wp.vec3, number: wp.uint32):
-    """Write a displacement and its number at once."""
-    ...
-
-
-@wp.func_native(f"""
-#if defined(__CUDA_ARCH__)
-    unsigned long long low = 0, high = 0;
-    for (int look = 0; look < {MOST_LOOKS}; ++look) {{
-        asm volatile("{{ .reg .b128 all; ld.relaxed.gpu.global.b128 all, [%2]; mov.b128 {{%0, %1}}, all; }}"
-            : "=l"(low), "=l"(high) : "l"(&wp::index(published, i)) : "memory");
-        if ((unsigned)(high >> 32) == number)
-            return wp::vec_t<4, wp::float32>(__uint_as_float((unsigned)low), __uint_as_float((unsigned)(low >> 32)),
-                                             __uint_as_float((unsigned)high), 0.0f);
-    }}
-#endif
-    return wp::vec_t<4, wp::float32>(0.0f, 0.0f, 0.0f, 1.0f);
-""")
-def await_displacement(published: wp.array[wp.vec4], i: int, number: wp.uint32) -> wp.vec4:
-    """The displacement of this number, and 0; or 1 in the last place if it did not come."""
-    ...
-
-
-def vectors_at(first: int) -> wp.Function:
-    """An array of vectors in the block's dynamic shared memory from the ``first`` one on; see ``block.shared_vectors``.
-
-    The kernel reserves the memory as a tile, with which Warp asks for more than 48 KB where it takes that.
-    """
-    snippet = f"""
-#if defined(__CUDA_ARCH__)
-    extern __shared__ char dynamic_smem_base[];
-    float* at = (float*)dynamic_smem_base + 3 * (i + {first});
-    if (access == {STORE}) {{
-        at[0] = value[0]; at[1] = value[1]; at[2] = value[2];
-        return value;
-    }}
-    return wp::vec_t<3, wp::float32>(at[0], at[1], at[2]);
-#else
-    return value;
-#endif
-"""
-
-    @wp.func_native(snippet)
-    def memory(access: int, i: int, value: wp.vec3) -> wp.vec3: ...
-
-    return memory
-
-
-def numbers_at(first: int) -> wp.Function:
-    """An array of numbers in the same memory, from this number on."""
-    snippet = f"""
-#if defined(__CUDA_ARCH__)
-    extern __shared__ char dynamic_smem_base[];
-    float* at = (float*)dynamic_smem_base + {first} + i;
-    if (access == {STORE}) *at = value;
-    return *at;
-#else
-    return value;
-#endif
-"""
-
-    @wp.func_native(snippet)
-    def memory(access: int, i: int, value: float) -> float: ...
-
-    return memory
 
 
 @wp.func
@@ -194,7 +48,7 @@ def rest_inverse(c: row):
 
 @wp.func
 def key_from(times: wp.array[wp.float64], key: int, last: int, t: wp.float64):
-    """As ``keyframes.key_before``, from an earlier key on, where the last but one is ``last``."""
+    """Like ``keyframes.key_before``, but the search starts at an earlier key; ``last`` is the last key but one."""
     found = key
     while found < last and times[found + 1] <= t:
         found += 1
@@ -204,14 +58,15 @@ def key_from(times: wp.array[wp.float64], key: int, last: int, t: wp.float64):
 
 @functools.cache
 def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
-    """Symplectic Euler steps of the corotated model with own rotations; launch with ``layout.threads`` a patch.
+    """Symplectic Euler steps of the corotated model with own rotations; launch ``layout.threads`` threads for each
+    patch.
 
     Args:
-        load_vectors: What loads are an array of, vec3 or vec4.
+        load_vectors: The element type of the array of loads, vec3 or vec4.
     """
     threads, each, halo_each, lanes = layout.threads, layout.elements, layout.halo, layout.lanes
     slot, displacement = vectors_at(0), vectors_at(layout.slots + 1)
-    # What elements of groups leave, their weights, those of groups, inverted, and the pressures of groups.
+    # Weighted dilatations and weights of elements, inverse weights of groups, and pressures of groups.
     shares, groups, members = layout.groups > 0, layout.groups, layout.members
     first_number = 3 * layout.vectors
     measured = numbers_at(first_number)
@@ -234,12 +89,12 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
 
     @wp.func
     def law_lam(c: row):
-        """What the law by itself has of lambda times the volume."""
+        """The part of lambda times the volume that the element's own law takes."""
         return wp.static(0.0 if shares else 1.0) * c[10]
 
     @wp.func
     def corner_forces(c: row, p: wp.mat33):
-        """Those on the corners but the first."""
+        """The forces on all corners but the first."""
         h = p * wp.transpose(rest_inverse(c))
         return -column(h, 0), -column(h, 1), -column(h, 2)
 
@@ -304,7 +159,7 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
         damped = 1.0 / (1.0 + dt * damping)
         number = exchange.begun[block]
 
-        # The node that the thread adds up, with its neighbours; the first of them moves it.
+        # The node whose forces the thread sums together with its neighbours; the first of them moves the node.
         first_own = body.own_start[block]
         own_count = body.own_start[block + 1] - first_own
         place = thread // wp.static(lanes)
@@ -360,7 +215,7 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                 if wp.static(shares):
                     group_place[k] = body.measures[e]
 
-        # ``slot`` and ``displacement``; places that no corner has are read too, and stay zero.
+        # The memory of ``slot`` and ``displacement``; places without a corner are also read, and stay zero.
         _memory = wp.tile_zeros(shape=wp.static(layout.floats), dtype=wp.float32, storage="shared")
         synchronize_block()
         if moves:
@@ -386,7 +241,7 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
         step = int(0)
         while step < steps:
             buffer = int(number & wp.uint32(1)) * node_count
-            # First the elements between own nodes, while the halo is on its way, then the others.
+            # First the elements between own nodes, while the halo arrives, then the others.
             begin = int(0)
             end = int(interior_count)
             phase = int(wp.static(0 if layout.overlaps else 1))
@@ -421,7 +276,8 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                 phase += 1
             if gave_up != 0:
                 break
-            # Elements that were left out, once a step and in one place: a warp's threads do theirs at the same time.
+            # Compute the elements that were left out once a step and in one place, so that the threads of a warp do it
+            # together.
             while left_out != 0:
                 chosen = lowest_bit(left_out)
                 left_out = left_out & (left_out - 1)
@@ -436,7 +292,7 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                 f = identity3() + displacement_gradient(its_corners, c)
                 store_forces(its_targets, c, turned_stress(f, c[9], law_lam(c)))
             if wp.static(shares):
-                # Elements that are only measured; what is known of them comes from the nearest cache.
+                # Elements that are only measured; their data come from the nearest cache.
                 at = computed_count + thread
                 while at < element_count:
                     e = first_element + at
@@ -481,7 +337,8 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                     value = body.values[at]
                     target = value + share * (body.values[at + columns] - value)
                     towards = (target - x) / dt
-                    # As ``follow_trajectory``: each force counts with half the motion before it and half after.
+                    # As in ``follow_trajectory``, each force does work over half the motion before it and half the
+                    # motion after it.
                     add_support_work(elastic, 0.5 * before * (velocity - towards), support_work)
                     velocity = towards
                 force = elastic + load_here

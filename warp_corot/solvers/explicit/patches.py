@@ -14,7 +14,9 @@ from warp_corot.elasticity.corotated.subtrees import SubtreeField
 from warp_corot.elasticity.dilatation.field import law_of
 from warp_corot.elasticity.paths.general import CorotatedGeneralField
 from warp_corot.kernels.math.rotation import quick_rotation
-from warp_corot.kernels.stepping.patches import Exchange, Layout, PatchBody, step_patches
+from warp_corot.kernels.stepping.exchange import Exchange
+from warp_corot.kernels.stepping.patch_body import Layout, PatchBody
+from warp_corot.kernels.stepping.patches import step_patches
 from warp_corot.materials.directional import Directional
 
 from .patch_layout import NO_SLOT, Patches
@@ -25,15 +27,15 @@ if TYPE_CHECKING:
     from warp_corot.elasticity.corotated.elements import CorotatedField
     from warp_corot.solvers.system import System
 
-#: The sizes of bodies that become faster, in elements: smaller ones need few blocks; patches of larger ones do not fit.
+#: Sizes of bodies that become faster, in elements: smaller ones need few blocks, and patches of larger ones do not fit.
 FEWEST, MOST = 500, 150_000
-#: The fewest elements of a patch: with fewer, the blocks of small bodies mostly wait for one another.
+#: Minimum number of elements in a patch: with fewer, the blocks of small bodies mostly wait for each other.
 PATCH_ELEMENTS = 32
 #: Threads of a block, each for patches that compute at most this many elements; more threads have fewer registers.
 THREADS = ((256, 512), (512, 1024), (384, 1536), (512, 2048))
-#: How many elements a thread measures if there are enough threads, and at most.
+#: Number of elements that a thread measures if there are enough threads, and the maximum.
 SOON_MEASURED, MOST_MEASURED = 3, 8
-#: How many elements' constants a thread keeps in registers, and how many nodes of the halo it waits for.
+#: Largest number of elements whose constants a thread keeps in registers, and of halo nodes that it waits for.
 MOST_ELEMENTS, MOST_HALO = 4, 3
 #: The first architecture whose reads and writes of 16 bytes are atomic.
 LEAST_ARCH = 70
