@@ -214,6 +214,17 @@ def test_hooks_are_called_after_every_nth_step(device):
     assert all_steps == list(range(1, 32))
 
 
+def test_former_names_of_hooks_give_the_same_and_warn():
+    sim = bar("cpu", dt=5e-4)
+    called = []
+    sim.on_step(called.append, every=10)
+    with pytest.warns(DeprecationWarning, match=r"hooks\.intervals"):
+        assert sim.hook_intervals == sim.hooks.intervals == [10]
+    with pytest.warns(DeprecationWarning, match=r"hooks\.call"):
+        sim.call_hooks()
+    assert called == [sim]
+
+
 def test_steps_that_a_hook_makes_count(device):
     sim = bar(device, dt=5e-4)
     seen = []

@@ -33,6 +33,7 @@ from warp_corot.solvers.system import NEVER, Forces, System
 
 from .clock import Clock
 from .energy import Energy, WorldEnergies, find_energies
+from .former import FormerNames
 from .hooks import Hooks
 from .parts import (
     check_constraints,
@@ -49,7 +50,7 @@ from .running import Running
 from .solves import Solves
 
 
-class Simulation(Clock):
+class Simulation(Clock, FormerNames):
     """One or several soft bodies, stepped together.
 
     Args:
