@@ -1,4 +1,4 @@
-"""Fields of an elastic law with other stresses in the same elements beside it."""
+"""Fields of an elastic law with an additional stress in the same elements."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class BesideField(ForceField):
-    """A law's forces, and those of another stress, which all elements have beside it.
+    """The forces of a law and of an additional stress in all elements.
 
     Args:
         discretization: The mesh and the material.
@@ -52,13 +52,13 @@ class BesideField(ForceField):
         kind = discretization.element_kind
         self._forces, self._energies = scatter_forces(kind, Material, stress), add_energies(kind, Material, density)
         self._stiffness = ElementStiffness(discretization, differential, Material)
-        #: Where sums must come out the same every time, the elements' own places for them.
+        #: Separate places for each element's forces, if sums must be reproducible.
         self._slotted = discretization.plan(subtrees=False, deterministic=True) if self.deterministic else None
 
     @property
     @abstractmethod
     def material(self) -> ElementMaterial:
-        """What the other stress reads."""
+        """The struct that the additional stress reads."""
 
     def plan_of(self, discretization: Discretization) -> Plan:
         return self.law.plan
@@ -70,7 +70,7 @@ class BesideField(ForceField):
         self.add_own_forces(u, f)
 
     def add_own_forces(self, u: wp.array, f: wp.array) -> None:
-        """Launch what adds the forces of the other stress alone."""
+        """Launch the kernel that adds the forces of the additional stress alone."""
         if self._slotted is None:
             self.launch(self._forces, self.element_count, [self.elements, self.material, u], [f])
             return
@@ -88,7 +88,7 @@ class BesideField(ForceField):
         self.add_own_stiffness(u, p, y)
 
     def add_own_stiffness(self, u: wp.array, p: wp.array, y: wp.array) -> None:
-        """Launch what adds the other stress's share of ``add_stiffness``."""
+        """Launch the kernel that adds the additional stress's part of ``add_stiffness``."""
         self._stiffness.add_product(self.elements, self.material, u, p, y)
 
     def add_diagonal(self, u: wp.array, blocks: wp.array, **options: Any) -> None:
@@ -96,7 +96,7 @@ class BesideField(ForceField):
         self.add_own_diagonal(u, blocks)
 
     def add_own_diagonal(self, u: wp.array, blocks: wp.array) -> None:
-        """Launch what adds the other stress's share of ``add_diagonal``."""
+        """Launch the kernel that adds the additional stress's part of ``add_diagonal``."""
         self._stiffness.add_diagonal(self.elements, self.material, u, blocks)
 
     def tangent(self, *, exact: bool = False) -> Tangent:
@@ -121,7 +121,7 @@ class BesideField(ForceField):
 
     @contextmanager
     def at_rest(self) -> Iterator[None]:
-        """As ``state_kept``; what is launched inside begins where nothing has happened to the elements."""
+        """Like ``state_kept``, but launches inside begin with elements that have no history."""
         with self.state_kept():
             yield
 
@@ -175,7 +175,8 @@ class BesideField(ForceField):
 
 
 class Stiffest:
-    """The forces of small displacements that bound the step: the stiffest of the law, and those of the other stress.
+    """The forces of small displacements that bound the step: the law's stiffest ones, and those of the additional
+    stress.
 
     Args:
         field: The field.
@@ -191,7 +192,7 @@ class Stiffest:
 
 
 class BesideTangent(Tangent):
-    """K of a field with another stress.
+    """K of a field with an additional stress.
 
     Args:
         field: The field.

@@ -26,7 +26,7 @@ class EdgeStVK(Model):
     Attributes:
         springs: "biquadratic": D = l^2 - L^2, equal to ``StVenantKirchhoff``; "quadratic": D = 2 L (l - L), its
             small-strain form.
-        dilatation: "element": the only choice, of springs.
+        dilatation: "element", the only value for springs.
     """
 
     springs: str = "biquadratic"

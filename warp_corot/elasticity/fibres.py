@@ -37,14 +37,14 @@ class HolzapfelGasserOgden(Model):
     """W = V (W_neo-Hookean + sum over families of k1 / (2 k2) (exp(k2 e^2) - 1)) for tissue with fibres.
 
     The body's material must be ``FibreReinforced``: it has Young's modulus and Poisson's ratio of the matrix, and k1,
-    k2, the dispersion kappa and the directions a of the fibres. e = kappa (tr C - 3) + (1 - 3 kappa) (a . C a - 1),
-    C = F^T F; families with e < 0 bear nothing (Gasser, Ogden and Holzapfel 2006; with the whole C, so that fibres
-    feel changes of volume, as Nolan et al. 2014 recommend). The matrix is that of ``NeoHookean``, which bounds the
-    stiffness of crushed and turned-over elements; that of fibres is bounded at a thousand times k1 by a parabola beyond
-    e = sqrt(4.6 / k2).
+    k2, the dispersion kappa and the directions a of the fibres. e = kappa (tr C - 3) + (1 - 3 kappa) (a . C a - 1), C =
+    F^T F; families with e < 0 carry no stress (Gasser, Ogden and Holzapfel 2006; with the whole C, so that fibres
+    respond to changes of volume, as Nolan et al. 2014 recommend). The matrix is ``NeoHookean``, which bounds the
+    stiffness of crushed and inverted elements; the stiffness of fibres is bounded at a thousand times k1 by a parabola
+    beyond e = sqrt(4.6 / k2).
 
     Attributes:
-        dilatation: Of the matrix: "element", "shared" or "auto", as for ``NeoHookean``.
+        dilatation: Dilatation of the matrix: "element", "shared" or "auto", as for ``NeoHookean``.
     """
 
     dilatation: str = AUTO
@@ -61,7 +61,7 @@ class HolzapfelGasserOgden(Model):
 
 
 class ReinforcedField(ForceField):
-    """Its forces, element by element."""
+    """The forces of ``HolzapfelGasserOgden``, element by element."""
 
     takes_anisotropic: ClassVar[bool] = True
 

@@ -1,6 +1,7 @@
-"""Stresses of isotropic laws and their differentials on the host, for answers with the digits of float64.
+"""Stresses of isotropic laws and their differentials on the host, for results in float64.
 
-As ``kernels.elements.constitutive`` has them, of deformation gradients F [T, 3, 3] and Lamé's parameters [T, 1, 1].
+They are those of ``kernels.elements.constitutive``, for deformation gradients F [T, 3, 3] and Lamé's parameters [T, 1,
+1].
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ class HostLaw(NamedTuple):
 
 
 def host_law(model: Model) -> HostLaw | None:
-    """The law of a model whose elements each have a rotation and a dilatation of their own; None if there is none."""
+    """The law of a model whose elements have own rotations and dilatations; None if there is none."""
     if type(model) is EdgeStVK and model.springs == "biquadratic":
         return LAWS[StVenantKirchhoff]
     return LAWS.get(type(model))

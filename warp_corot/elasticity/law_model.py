@@ -1,4 +1,4 @@
-"""What the models of one constitutive law share: the option ``dilatation`` and the choice of kernels."""
+"""The common part of models of one constitutive law: the option ``dilatation`` and the choice of kernels."""
 
 from __future__ import annotations
 

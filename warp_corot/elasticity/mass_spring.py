@@ -50,7 +50,7 @@ class MassSpring(Model):
 
 class MassSpringField(ForceField):
     def plan_of(self, discretization: Discretization) -> Plan:
-        return discretization.plan(subtrees=False)  # the slots are the edges' own
+        return discretization.plan(subtrees=False)  # the slots belong to edges
 
     def __init__(self, discretization: Discretization, deterministic: bool = False):
         super().__init__(discretization, deterministic)

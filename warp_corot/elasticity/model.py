@@ -1,4 +1,4 @@
-"""Elastic models: a small description each, and the force field that it becomes on a discretization."""
+"""Elastic models: a small description of each, and the force field of a model on a discretization."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ if TYPE_CHECKING:
 
 
 class SmallForces(Protocol):
-    """Forces of small displacements, from any source."""
+    """Forces of small displacements from any source."""
 
     def add_forces(self, u: wp.array, f: wp.array) -> None:
         """Add the forces [N] of displacements u to f; both vec4, one entry for each node."""
         ...
 
     def state_kept(self) -> AbstractContextManager[None]:
-        """Whatever is launched inside leaves no trace in the state that steps go on from."""
+        """Inside, launches do not change the state from which steps continue."""
         ...
 
 
@@ -57,13 +57,12 @@ class ForceField(ABC):
     Methods only launch; they do not wait for the device, except those that return energies or stresses on the host.
 
     Args:
-        body: A body, or its discretization.
-        deterministic: Whether forces must be the same bit by bit every time, even on CUDA, where threads run in any
-            order; kernels then first add them to ``slots``.
+        body: A body, or its discretization. deterministic: Whether forces must be reproducible bit by bit even on CUDA,
+        where threads run in any order; kernels then first write them to ``slots``.
 
     Attributes:
         plan: The units of work of launches.
-        elements: All of its elements.
+        elements: All elements of the plan.
         is_linear: Whether forces are linear in displacements.
         shares_dilatation: Whether elements share their dilatation.
 
@@ -94,7 +93,9 @@ class ForceField(ABC):
 
     @property
     def find_members(self) -> Callable[[int], Members] | None:
-        """Gives the groups, of elements below a number, that share their dilatation; None: there are none."""
+        """A function that returns the groups of elements below a number that share their dilatation; None without
+        groups.
+        """
         return None
 
     def add_forces(self, u: wp.array, f: wp.array) -> None:
@@ -114,9 +115,9 @@ class ForceField(ABC):
     def add_stiffness(self, u: wp.array, p: wp.array, y: wp.array) -> None:
         """Add K(u) p to y [N], K minus the derivative of the elastic forces at displacements u; all vec4 [worlds * N].
 
-        K is symmetric, and may be indefinite. A field whose K is not the exact derivative says so. All laws on all
-        meshes go element by element, and sums are atomic: on CUDA rounding differs from call to call, even if forces
-        are deterministic.
+        K is symmetric, and may be indefinite. The documentation of a field says if its K is not the exact derivative.
+        Products go element by element for all laws and meshes, and sums are atomic: on CUDA rounding differs from call
+        to call, even if forces are deterministic.
 
         Args:
             u: Displacements [m].
@@ -147,16 +148,16 @@ class ForceField(ABC):
         """
 
     def note(self) -> None:  # noqa: B027 (most keep nothing)
-        """Launch that elements carry what is kept of them; called before a pass changes the mesh."""
+        """Launch the update of the data that elements carry; called before a pass changes the mesh."""
 
     def derive(self) -> None:  # noqa: B027 (most need nothing)
-        """Launch the update of what the field keeps of the elements, if the plan has changed; may be recorded.
+        """Launch the update of the field's data of elements, if the plan has changed; may be recorded.
 
         Called if plans change, each time after one is derived.
         """
 
     def take_material(self) -> None:
-        """Copy again what the field keeps of Lamé's parameters, whose values have changed in their arrays."""
+        """Copy Lamé's parameters again, because their values have changed in the arrays."""
         if self._flat_lame is not None:
             leaves, own = self._flat_lame
             for copy, values in zip(own, self._lame, strict=True):
@@ -171,7 +172,7 @@ class ForceField(ABC):
         """
 
     def share_dilatation(self, dilating: Dilating) -> bool:
-        """From now on add the forces of a dilatation that subtrees and groups share, if the field can; returns whether
+        """Add from now on the forces of a dilatation that subtrees and groups share, if the field can; return whether
         it can.
 
         Called again when groups change.
@@ -188,8 +189,9 @@ class ForceField(ABC):
         """Write strain energies whose sum is the body's [J], world after world; float64."""
 
     def write_potentials(self, u: wp.array, energies: wp.array) -> None:
-        """Write the energies [J] whose derivative forces are, as ``write_energies``: these, and of active stress that
-        which it has while it stays as it is."""
+        """Write the energies [J] whose negative gradient is the forces, like ``write_energies``. They include the
+        energy of an active stress that stays constant.
+        """
         self.write_energies(u, energies)
 
     @abstractmethod
@@ -198,38 +200,38 @@ class ForceField(ABC):
 
     @property
     def stress_law(self) -> StressLaw | None:
-        """The law's stress in each element, for derivatives; None where forces are not made of any."""
+        """The law's stress in each element, for derivatives; None if forces do not come from stresses."""
         return None
 
     @property
     def element_count(self) -> int:
-        """How many elements launches go through; elements beyond the body's do nothing."""
+        """Number of elements in launches; elements beyond the body's do nothing."""
         return self.discretization.sizes.launch_elements
 
     @property
     def energy_count(self) -> int:
-        """How many energies ``write_energies`` writes."""
+        """Number of energies that ``write_energies`` writes."""
         return self.element_count
 
     @property
     def state(self) -> dict[str, wp.array]:
-        """Arrays that must be kept so that steps continue the same."""
+        """Arrays that must be saved so that steps continue in the same way."""
         return {}
 
     @property
     def elapsed(self) -> wp.array | None:
-        """Seconds since the state that is kept was known, float32 [1], where forces depend on it; set by steppers."""
+        """Seconds since the time of the stored state, float32 [1], if forces depend on it; steppers set it."""
         return None
 
     def complete_step(self, u: wp.array, pace: Pace) -> None:  # noqa: B027 (most keep nothing)
-        """Launch that a step of the clock's length has ended at displacements u; may be recorded."""
+        """Launch the update at the end of a step of the clock's length, at displacements u; may be recorded."""
 
     def relax_fully(self) -> None:  # noqa: B027 (most keep nothing)
-        """Let forces from now on be those after an infinite time."""
+        """Make forces those after an infinite time, from now on."""
 
     @contextmanager
     def state_kept(self) -> Iterator[None]:
-        """Whatever is launched inside leaves no trace in the state that steps go on from."""
+        """Inside, launches do not change the state from which steps continue."""
         kept = {name: wp.clone(array) for name, array in self.state.items()}
         try:
             yield
@@ -274,8 +276,9 @@ class ForceField(ABC):
 
     @property
     def in_clusters(self) -> tuple[ClusterScatter, Sequence[Batch]] | None:
-        """What adds the forces of elements in clusters, and the subtrees that do not go there; None where there are
-        no clusters, or they change."""
+        """The launch of elements in clusters, and the subtrees outside them; None without clusters, or if clusters
+        change.
+        """
         return None
 
     def launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
@@ -312,8 +315,8 @@ class Model(ABC):
     """The description of an elastic model: a frozen dataclass of plain values.
 
     Class attributes:
-        step_safety: Share of the stable step that is taken by default at small strains.
-        strained_safety: The same for large strains, where stiffness can change before the next measurement.
+        step_safety: Default fraction of the stable step at small strains.
+        strained_safety: Default fraction at large strains, where stiffness can change before the next measurement.
     """
 
     step_safety: ClassVar[float] = 0.9
@@ -332,12 +335,12 @@ class Model(ABC):
 
     @property
     def carried(self) -> tuple[str, ...]:
-        """Names of numbers that a force field keeps of each element, and that elements carry where the mesh changes."""
+        """Names of the force field's numbers for each element, which elements carry when the mesh changes."""
         return ()
 
     @property
     def kept_of_elements(self) -> str | None:
-        """What a force field keeps of its elements, for a message; None if it supports a change of elements.
+        """The data of elements in the force field, for a message; None if the field supports a change of elements.
 
         A body whose elements change cannot have a model that keeps data of them.
         """
@@ -350,7 +353,7 @@ class ElementField(ForceField):
     Args:
         body, deterministic: As for every field.
         forces, energies, von_mises: The kernels.
-        differential: The stress's, a device function of ``kernels.elements.stiffness_products``.
+        differential: The differential of the stress, a device function of ``kernels.elements.stiffness_products``.
         stress: The stress, one of ``kernels.elements.forces``, if the law has one.
     """
 

@@ -20,11 +20,11 @@ from .law_model import LawModel
 class NeoHookean(LawModel):
     """W = V (mu/2 (tr F^T F - 3) - mu ln J + lambda/2 (ln J)^2), P = mu (F - F^-T) + lambda ln J F^-T.
 
-    That is so where J >= 0.5, an element of at least half its volume. Below, the terms in J, U(J) = -mu ln J +
-    lambda/2 (ln J)^2, go on as their Taylor polynomial of second order about 0.5. Energy, force and stiffness are
-    continuous, every F has them, and an inverted element is pushed back. U'' stays at 4 mu + 6.8 lambda, so that the
-    stiffness is bounded: elements whose stretches do not exceed 1 have at most 29 mu + 44 lambda when turned over, and
-    up to 4.5 times that at rest, 2 mu + 3 lambda, when crushed; a body's stable step shrinks by the root of that.
+    This holds for J >= 0.5, an element with at least half its volume. Below, the terms in J, U(J) = -mu ln J + lambda/2
+    (ln J)^2, continue as their second-order Taylor polynomial about 0.5. Energy, force and stiffness are continuous and
+    exist for every F, and an inverted element is pushed back. U'' stays at 4 mu + 6.8 lambda, so that the stiffness is
+    bounded: elements whose stretches do not exceed 1 have at most 29 mu + 44 lambda when turned over, and up to 4.5
+    times that at rest, 2 mu + 3 lambda, when crushed; a body's stable step shrinks by the root of that.
 
     Total-Lagrangian too: with explicit central differences, TLED (Miller et al. 2007).
 

@@ -20,7 +20,7 @@ from .model import ForceField, Model
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretized
 
-#: Exponents outside of this would be out of float32's range where tissue is stretched.
+#: With larger exponents, powers of stretches would exceed the range of float32.
 LARGEST_EXPONENT = 60.0
 
 
@@ -30,13 +30,13 @@ class Ogden(Model):
 
     l1, l2, l3 are the principal stretches and J is their product (Ogden 1972; the compressible form is that of
     ``NeoHookean``, which one term with alpha = 2 is equal to). The sum of all mu_p is the shear modulus of small
-    strains. The body's material gives that and lambda, in each element: ``mu`` says how large the terms are for one
-    another. So material fields, worlds and shared dilatation work as they do for other laws.
+    strains. The body's material gives this modulus and lambda in each element: ``mu`` gives only the ratios of the
+    terms. So material fields, worlds and shared dilatation work as for other laws.
 
-    This is the law where J >= 0.5 and principal stretches are within ``stretch_limits``, where a term would be a
-    thousand times as stiff as at rest. Outside of them the energy continues as a parabola, of J as in ``NeoHookean``
-    and of squared stretches: energy, force and stiffness are continuous, every F has them, and turned-over elements are
-    pushed back. Elements go one by one, which is slower than the subtrees and lanes of ``NeoHookean``.
+    The law holds for J >= 0.5 and principal stretches within ``stretch_limits``, at which a term is a thousand times as
+    stiff as at rest. Beyond, the energy continues as a parabola, in J as for ``NeoHookean`` and in squared stretches:
+    energy, force and stiffness are continuous and exist for every F, and inverted elements are pushed back. Elements
+    are computed one by one, which is slower than the subtrees and lanes of ``NeoHookean``.
 
     Attributes:
         mu: The shear moduli mu_p > 0 of the terms, in any unit; only their ratios count.

@@ -1,4 +1,4 @@
-"""Rotations of many matrices at once, by the methods that the solver uses."""
+"""Rotations of many matrices at once, by the solver's methods."""
 
 from __future__ import annotations
 
@@ -46,16 +46,16 @@ def polar_rotation(
     """The proper rotation R nearest to each matrix, the maximiser of tr(R^T F) with det R = +1.
 
     For det F > 0 this is the rotation of the polar decomposition. Inverted, singular, huge and tiny matrices have one
-    too; a zero or non-finite matrix gives the identity (for "warm": the guess). Worked out in float32.
+    too; a zero or non-finite matrix gives the identity (for "warm": the guess). Computed in float32.
 
     Args:
         F: Matrices [n, 3, 3] (or one, [3, 3]).
         method: "byers-xu": Newton's iteration with the scaling of Byers and Xu (2008), to the paper's tolerance;
-            "svd": U V^T of Warp's 3x3 SVD (McAdams et al. 2011), the baseline, off by up to 0.07 where singular values
-            nearly meet in an inverted F; "warm": iteration on a quaternion (Müller et al. 2016).
+            "svd": U V^T of Warp's 3x3 SVD (McAdams et al. 2011), the baseline, off by up to 0.07 if singular values of
+            an inverted F nearly coincide; "warm": iteration on a quaternion (Müller et al. 2016).
         iterations: For "byers-xu": this many iterations (2 to 12) in place of the tolerance.
         guess: For "warm": rotations to start from [n, 3, 3]; the identity by default.
-        device: Where to work; None for Warp's default.
+        device: The device of the computation; None for Warp's default.
 
     Returns:
         Rotations, float32, of the same shape.

@@ -1,4 +1,4 @@
-"""Bodies that are under stress where they are not deformed."""
+"""Bodies with stress in their undeformed shape."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class Prestressed(Model):
     """A law with an initial stress: W = V (W_law + S : E) with Green's strain E, P = P_law + F S.
 
     S is a second Piola-Kirchhoff stress, which is the Cauchy stress of the body in its rest shape, positive in tension.
-    It turns with the body and does not change. Where S is not in equilibrium the body moves when it is let go: a bar
-    that nothing holds contracts by S / E. The stress that is shown is that of ``model``.
+    It rotates with the body and does not change otherwise. If S is not in equilibrium, the body moves from rest: a free
+    bar contracts by S / E. The stress that is shown is that of ``model``.
 
     Attributes:
         stress: S [Pa], symmetric: [3, 3] or [T, 3, 3], one for each element, the same in all worlds.
@@ -50,7 +50,7 @@ class Prestressed(Model):
             raise InputError("stress is not symmetric; each tensor must be equal to its transpose")
         if not isinstance(self.model, Model) or isinstance(self.model, Prestressed):
             raise InputError(f"model is {shown(self.model)}; it must be an elastic model such as Corotated()")
-        # Plain values, which can be compared and saved.
+        # Plain values can be compared and saved.
         object.__setattr__(self, "stress", _tuples(given.tolist()))
 
     @property

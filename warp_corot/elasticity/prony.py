@@ -32,11 +32,11 @@ class Prony(Model):
 
     mu is the material's, of slow motion; ``model`` is the law of slow motion. Each term is a Maxwell element beside it,
     whose second Piola-Kirchhoff stress 2 g_i mu s_i follows the deviator E of Green's strain by ds_i/dt = dE/dt - s_i /
-    tau_i, so that it turns with the body and does not resist changes of volume. (Series that are relative to the
-    sudden modulus mu_0, of shares a_i, have mu = mu_0 (1 - sum_i a_i) and g_i = a_i mu_0 / mu.) Steps of any length
-    have the exact answer to a strain that grows evenly. ``solve_static`` finds the relaxed state. A body that was moved
-    by hand answers with the sudden modulus. ``Simulation.energy`` counts what Maxwell elements hold; what they
-    dissipate is lost. The stress that is shown is that of ``model``.
+    tau_i, so that it turns with the body and does not resist changes of volume. (Series that are relative to the sudden
+    modulus mu_0, of shares a_i, have mu = mu_0 (1 - sum_i a_i) and g_i = a_i mu_0 / mu.) Steps of any length are exact
+    for a strain that grows linearly in time. ``solve_static`` finds the relaxed state. A body whose positions are set
+    by hand responds with the sudden modulus. ``Simulation.energy`` includes the energy stored in Maxwell elements, but
+    not what they have dissipated. The stress that is shown is that of ``model``.
 
     Attributes:
         g: Shear moduli g_i > 0 over the material's.
@@ -103,7 +103,7 @@ class PronyField(BesideField):
         super().__init__(discretization, law, kernels.PronyMaterial, *functions)
         g, tau = (np.array(values, np.float32) for values in model.terms)
         self._carried, counts = model.carried, self.plan.counts
-        #: There may be more elements later where the mesh changes.
+        #: The number of elements may grow if the mesh changes.
         self._count = discretization.sizes.launch_elements if counts is None else counts.most
         self._g, self._tau = (wp.array(v, dtype=wp.float32, device=self.device) for v in (g, tau))
         self._elapsed = wp.zeros(1, dtype=wp.float32, device=self.device)

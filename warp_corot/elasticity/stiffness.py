@@ -28,10 +28,10 @@ ElementMaterial: TypeAlias = (
 
 @dataclass(frozen=True)
 class ElementStiffness:
-    """The tangent stiffness of a discretization's elements, one thread an element whatever way forces go.
+    """The tangent stiffness of a discretization's elements, one thread for each element on every path of forces.
 
     Attributes:
-        discretization: The elements' kind, and how many there are.
+        discretization: Gives the kind and the number of elements.
         differential: Device function (elements, t, material, u, dg) -> dP.
         Material: The struct that it reads.
     """
@@ -46,7 +46,7 @@ class ElementStiffness:
         self._launch(kernel, 1, [elements, material, u, p], y)
 
     def add_diagonal(self, elements: Elements, material: ElementMaterial, u: wp.array, blocks: wp.array) -> None:
-        """Add the diagonal blocks of K(u), mat33 a node."""
+        """Add the diagonal blocks of K(u), a mat33 for each node."""
         kernel = add_stiffness_diagonal(self.discretization.element_kind, self.Material, self.differential)
         self._launch(kernel, 4, [elements, material, u], blocks)
 

@@ -1,4 +1,4 @@
-"""The device functions of a field's law, for those that differentiate it."""
+"""The device functions of a field's law, for derivatives."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ class StressLaw:
     """First Piola-Kirchhoff stress of a law in each element.
 
     Attributes:
-        stress: Device function (elements, t, material, u) -> P, as ``kernels.elements.forces`` takes it.
+        stress: Device function (elements, t, material, u) -> P, see ``kernels.elements.forces``.
         differential: Its exact derivative (elements, t, material, u, dg) -> dP, as
             ``kernels.elements.stiffness_products`` takes it.
         material: The struct that both read.
-        Material: Its type; where that is ``IsotropicMaterial`` the stress is linear in Lamé's parameters.
+        Material: Its type; for ``IsotropicMaterial`` the stress is linear in Lamé's parameters.
     """
 
     stress: wp.Function

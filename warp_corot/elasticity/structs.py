@@ -1,4 +1,4 @@
-"""Structs that kernels read, kept from launch to launch: to make one takes longer than a launch."""
+"""Structs that kernels read, kept from launch to launch, because making one takes longer than a launch."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ S = TypeVar("S")
 
 
 class Kept(Generic[S]):
-    """The struct of some values, made again where one of these is another object.
+    """The struct of some values, made again if one of these is another object.
 
     Args:
         make: Makes the struct of the values.

@@ -1,4 +1,4 @@
-"""Strain and stress tensors of elements on the host, in float64, for files that others look into."""
+"""Strain and stress tensors of elements on the host, in float64, for files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from .stvk import StVenantKirchhoff
 
 Tensors = npt.NDArray[np.float64]
 
-#: As in ``kernels/elements/constitutive.py``: |J| is kept away from zero.
+#: Keeps |J| away from zero, as in ``kernels/elements/constitutive.py``.
 LEAST_J = 1.0e-3
 
 
@@ -53,8 +53,8 @@ def has_tensor(model: Model, material: object) -> bool:
 def cauchy_stress(model: Model, f: Tensors, young: npt.ArrayLike, poisson: npt.ArrayLike) -> Tensors:
     """Cauchy stress [Pa], [T, 3, 3]; `Simulation.von_mises` is its equivalent stress.
 
-    Of Corotated it is the stress of the law, R (2 mu e + lambda tr(e) I) R^T with e = sym(R^T F) - I, of Linear that of
-    small strains: both without the factor 1 / J.
+    For Corotated it is the stress of the law, R (2 mu e + lambda tr(e) I) R^T with e = sym(R^T F) - I, and for Linear
+    that of small strains, both without the factor 1 / J.
 
     Args:
         model: The elastic law; see `has_tensor`.
@@ -97,7 +97,7 @@ def _neo_hookean(f: Tensors, det: Tensors, mu: Tensors, lam: Tensors) -> Tensors
 
 
 def _ogden_excess(f: Tensors, terms: tuple[tuple[float, float], ...]) -> Tensors:
-    """P F^T / mu of what Ogden's law has besides neo-Hookean; see ``kernels.elements.ogden``."""
+    """P F^T / mu of the part of Ogden's law beyond neo-Hookean; see ``kernels.elements.ogden``."""
     squares, axes = np.linalg.eigh(np.swapaxes(f, 1, 2) @ f)
     slope = np.zeros_like(squares)
     for share, alpha in terms:

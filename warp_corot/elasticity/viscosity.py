@@ -1,4 +1,4 @@
-"""Viscous forces of a body, which take energy out of what changes its shape and leave its motion as a whole alone."""
+"""Viscous forces of a body, which damp changes of shape and leave rigid motion unchanged."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ class Viscosity:
 
     Args:
         body: The body.
-        field: Its elastic forces, whose elements are followed where the mesh changes.
+        field: Its elastic forces; viscosity follows their elements if the mesh changes.
         seconds: Viscosities over Lamé's parameters [s].
-        complete: Returns velocities with those of nodes that other processes move; None: there are no such nodes.
+        complete: A function that adds the velocities of nodes that other processes move; None if there are none.
     """
 
-    #: It takes energy out of the body and never puts any in.
+    #: Viscosity removes energy from the body and never adds any.
     is_dissipative = True
 
     def __init__(
@@ -37,17 +37,17 @@ class Viscosity:
     ):
         self.body, self.field, self.seconds, self._complete = body, field, seconds, complete
         self._kernel = scatter_viscous(body.discretization.element_kind)
-        #: Where sums must come out the same every time, the elements' own places for them.
+        #: Separate places for each element's forces, if sums must be reproducible.
         self._slotted = body.discretization.plan(subtrees=False, deterministic=True) if field.deterministic else None
 
     def add_forces(self) -> None:
-        """Launch what adds the forces of the present displacements and velocities to the body's [N]."""
+        """Launch the kernel that adds the forces of the present displacements and velocities to the body's [N]."""
         state = self.body.state
         velocities = state.velocities if self._complete is None else self._complete(state.velocities)
         self.scatter(state.displacements, velocities, state.forces)
 
     def scatter(self, u: wp.array, v: wp.array, f: wp.array) -> None:
-        """Launch what adds the forces of displacements u and velocities v, in which they are linear, to f [N]."""
+        """Launch the kernel that adds the forces of displacements u and velocities v, linear in v, to f [N]."""
         if self._slotted is None:
             self._launch(self.field.elements, u, v, f)
             return

@@ -33,15 +33,15 @@ class AnisotropicField(ForceField):
     """W = V/2 e : C : e with e = sym(R^T F) - I, R the element's own rotation, C fixed in rest space.
 
     The force is the gradient of W, with the derivative of R, which isotropic materials do not need, and conserves
-    linear and angular momentum. Where F has hardly a definite rotation (inverted, or flattened to a sixth in two
-    directions, as fibres are that stretch 3.4 times; see ``kernels.corotated.anisotropic``), C blends into that of the
+    linear and angular momentum. If the rotation of F is ill-defined (F is inverted, or flattened to a sixth in two
+    directions, as by fibres that stretch 3.4 times; see ``kernels.corotated.anisotropic``), C blends into that of the
     nearest isotropic material, and the force is the gradient of that energy.
 
     The active stress of ``SoftBody.activation`` is added: P = s (F d) d^T along the fibres' direction d. It conserves
     both momenta. It does work, and has no energy.
 
-    The stiffness is exact, with the derivative of R, at the present active stress; it is bounded where F has hardly a
-    definite rotation (``kernels.corotated.tangent``).
+    The stiffness is exact, with the derivative of R, at the present active stress; it is bounded if the rotation of F
+    is ill-defined (``kernels.corotated.tangent``).
 
     Args:
         discretization: A discretization with an ``Anisotropic`` material.

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class GeneralAnisotropicField(AnisotropicField):
-    """Single elements whose sums of forces may have any order.
+    """Single elements whose forces may be summed in any order.
 
     Args:
         discretization: A general mesh, or a forest with few groups of subtrees, with an ``Anisotropic`` material.
@@ -43,7 +43,7 @@ class GeneralAnisotropicField(AnisotropicField):
 
     @property
     def active_material(self) -> ActiveMaterial:
-        """The material with the present active stress, as the kernel takes it."""
+        """The material with the present active stress, in the form that the kernel reads."""
         return active_material(self.material, self._quaternions, *self._activation)
 
 

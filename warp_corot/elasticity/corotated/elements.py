@@ -173,9 +173,8 @@ class CorotatedField(ForceField):
         rotations, which vanishes if the body is not strained.
 
         Args:
-            u, p, y: As for every field.
-            exact: Whether K is the exact derivative, which can be indefinite; only for own rotations. It is bounded
-                where F has hardly a definite rotation (``kernels.corotated.tangent``).
+            u, p, y: As for every field. exact: Whether K is the exact derivative, which can be indefinite; only for own
+            rotations. It is bounded if the rotation of F is ill-defined (``kernels.corotated.tangent``).
 
         Raises:
             InputError: ``exact`` with shared rotations.
@@ -189,7 +188,9 @@ class CorotatedField(ForceField):
         stiffness.add_diagonal(self.elements, material, u, blocks)
 
     def tangent(self, *, exact: bool = False) -> Tangent:
-        """As for every field; rotations are found once. With shared rotations, K is never the exact derivative."""
+        """See ``ForceField.tangent``; rotations are found once. With shared rotations, K is never the exact
+        derivative.
+        """
         if exact and self.model.rotation_level is None:
             rotation = byers_xu if self.model.rotation == "warm" else self.model.own_rotation
             return ExactTangent(self, rotation)
@@ -230,7 +231,7 @@ class CorotatedField(ForceField):
 
     @property
     def stress_law(self) -> StressLaw | None:
-        """As for every field; none with shared rotations."""
+        """See ``ForceField.stress_law``; None with shared rotations."""
         if self.model.rotation_level is not None:
             return None
         rotation = byers_xu if self.model.rotation == "warm" else self.model.own_rotation
@@ -248,7 +249,9 @@ class CorotatedField(ForceField):
         self._launch_with_rotations(self._von_mises, self.isotropic_shown, u, stress)
 
     def _sharing(self) -> Rotations:
-        """The units whose rotations elements use; made on first use, since forces with own rotations do not need it."""
+        """The units whose rotations elements use; made on first use, because forces with own rotations do not need
+        them.
+        """
         if self._shared is None:
             self._shared = Rotations.of(self._units())
         return self._shared

@@ -20,7 +20,8 @@ from warp_corot.kernels.subtrees.repair import (
     repair_listed_shared,
 )
 
-#: Thread blocks for each multiprocessor: as many as fit at once, so that a launch over an empty list ends soon.
+#: Thread blocks for each multiprocessor: as many as fit at the same time, so that a launch over an empty list ends
+#: soon.
 BLOCKS = 6
 
 
@@ -32,7 +33,7 @@ class LeftOutLeaves:
         shared: The batches that share their roots' rotations.
     """
 
-    #: The argument of kernels that make no list.
+    #: The argument of kernels that write no list.
     NONE: ClassVar[LeftOut] = LeftOut()
 
     def __init__(self, own: list[int], shared: list[Batch], device: wp.Device):
@@ -44,14 +45,14 @@ class LeftOutLeaves:
 
     @classmethod
     def of(cls, plan: Plan, device: wp.Device, *, in_warps: bool = False) -> LeftOutLeaves:
-        """The lists of a plan, without those of own rotations where warps do these leaves themselves."""
+        """The lists of a plan; leaves with own rotations have none if warps compute them at once."""
         own = [batch.count for batch in plan.batches if batch.sharing is Sharing.OWN]
         own = [] if in_warps else [*own, len(plan.flat)]
         return cls(own, [batch for batch in plan.batches if batch.sharing is Sharing.ROOT], device)
 
     @staticmethod
     def load(device: wp.Device) -> None:
-        """Compile now the kernels that launches will need."""
+        """Compile the kernels that launches will need."""
         wp.load_module(repair_listed_own.module, device, block_dim=LIST_BLOCK)
 
     def list_of(self, batch: Batch) -> LeftOut:
@@ -80,7 +81,7 @@ class LeftOutLeaves:
 
 
 def _empty_lists(launches: list[int], device: wp.Device) -> LeftOut:
-    """With room for all subtrees of these launches, whose thread blocks take the lists in turn."""
+    """Empty lists with room for all subtrees of these launches, whose thread blocks take the lists in turn."""
     listed = LeftOut()
     listed.counts = wp.zeros((LISTS + 1) * COUNT_STRIDE, dtype=wp.int32, device=device)
     listed.room = BLOCK * sum(-(-count // (BLOCK * LISTS)) for count in launches)

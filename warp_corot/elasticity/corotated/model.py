@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization, Discretized
 
 STIFFNESSES = ("factored", "sparse", "dense")
-#: The tolerance of "auto" [rad]. It moves the end of the paper's beam by 0.24 mm, where it sinks by 87 mm; a tolerance
-#: of 0.05 moves it by 0.04 mm, one of 0.02 by 0.005 mm, and level 3 by 0.47 mm.
+#: The tolerance of "auto" [rad]. The end of the paper's beam, which sinks by 87 mm, then has an error of 0.24 mm; with
+#: a tolerance of 0.05 it is 0.04 mm, with 0.02 0.005 mm, and with level 3 0.47 mm.
 AUTO_TOLERANCE = 0.1
 
 
@@ -59,9 +59,9 @@ class Corotated(Model):
         iterations: For "byers-xu": None iterates to the paper's tolerance 3.85e-5; an int from 2 to 12 is the number.
         stiffness: "factored" (sums and differences), "sparse" (the paper's explicit K_T by type, zeros skipped) or
             "dense" (the same with all 144 products); the last two for forests only. All agree to rounding.
-        subtrees: False: leaf by leaf even where the fast path is possible, as in the paper; for comparison.
+        subtrees: False: leaf by leaf even if the fast path is possible, as in the paper; for comparison.
         dilatation: "element": each element has its own dilatation, tr(R^T F) - 3, as in the paper, and nearly
-            incompressible tissue is too stiff. "shared": elements share their dilatations, J - 1 of each, see
+            incompressible tissue is too stiff. "shared": elements share their dilatations J - 1, see
             ``elasticity.dilatation``; slower. "auto": "shared" if the material is isotropic and Poisson's ratio is 0.45
             or more in any element.
 
@@ -93,7 +93,7 @@ class Corotated(Model):
 
     @property
     def tolerance(self) -> float | None:
-        """How far an ancestor's rotation may be from those of its leaves [rad], or None."""
+        """The largest angle between an ancestor's rotation and those of its leaves [rad], or None."""
         level = self.rotation_level
         if level is None or isinstance(level, Integral):
             return None

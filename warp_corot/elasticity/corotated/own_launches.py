@@ -24,35 +24,35 @@ from warp_corot.kernels.subtrees.cuda import (
 )
 from warp_corot.kernels.subtrees.repair import LeftOut
 
-#: Leaves of a uniform forest from which subtrees have a launch: fewer are sooner done in clusters, above all where some
-#: are turned over (H200: 73,728 take 6.0 us at rest and 6.3 under their weight, by subtrees 9.6 and 14.4).
+#: Number of leaves of a uniform forest from which subtrees have a launch: clusters are faster for fewer leaves, above
+#: all if some are inverted (H200: 73,728 take 6.0 us at rest and 6.3 under their weight; by subtrees 9.6 and 14.4).
 UNIFORM_LEAVES = 1 << 18
 
 
-#: Leaves in subtrees below which each warp does what it leaves out itself. H200, without inverted leaves, with one, and
-#: with some in a twentieth of the subtrees: 26.5, 26.6 and 38.7 us for 1.57 million leaves, by a list 28.8, 33.5 and
-#: 39.7; 166, 166 and 270 for 12.6 million, by a list 162, 168 and 210.
+#: Number of leaves in subtrees below which each warp computes the leaves that it leaves out. H200, without inverted
+#: leaves, with one, and with some in a twentieth of the subtrees: 26.5, 26.6 and 38.7 us for 1.57 million leaves, by a
+#: list 28.8, 33.5 and 39.7; 166, 166 and 270 for 12.6 million, by a list 162, 168 and 210.
 IN_WARPS_LEAVES = 1 << 22
 
 
 def does_in_warps(batches: Sequence[Batch]) -> bool:
-    """Whether warps do what they leave out of these batches themselves."""
+    """Whether warps compute the leaves that they leave out of these batches."""
     return 8 * sum(batch.count for batch in batches) < IN_WARPS_LEAVES
 
 
 class OwnLaunches:
     """The launches of a plan whose leaves all have their own rotations.
 
-    Where the mesh stays as it is, leaves in no subtree, and those of subtrees in no group beside them, go in clusters;
-    where few are in groups, all leaves: one launch then, which leaves out none. Where the mesh changes and many are in
-    groups, one launch of subtrees and of single leaves is all.
+    If the mesh never changes, the leaves outside subtrees and the subtrees outside groups go in clusters. If few
+    subtrees are in groups, all leaves go in clusters: then there is one launch, which leaves out none. If the mesh
+    changes and many subtrees are in groups, one launch computes subtrees and single leaves.
 
     Args:
-        plan: What launches go through.
+        plan: The units of work.
         material: Lamé's parameters.
-        tolerance: How near a subtree root's rotation must be to be used in place of own ones [rad]; None: never.
-        changing: What adds the forces of all leaves in clusters where the mesh changes.
-        awaited: Nodes that come later; None where all are here.
+        tolerance: The largest angle at which a subtree root's rotation replaces own ones [rad]; None: never.
+        changing: Adds the forces of all leaves in clusters if the mesh changes.
+        awaited: Nodes whose values arrive later; None if all are present.
 
     Attributes:
         batches: The subtrees that are launched as subtrees.
@@ -78,26 +78,26 @@ class OwnLaunches:
         elif changing is not None and 8 * sum(batch.count for batch in batches if batch.grouped) < GROUPED_LEAVES:
             batches, self._clusters = [], changing
         self._awaited = awaited
-        #: Batches of one type have a kernel of their own, which is faster.
+        #: Batches of one type have a separate kernel, which is faster.
         self._is_single = self._clusters is not None or not len(plan.flat)
         self._is_single = self._is_single and [batch.grouped for batch in batches] == [True]
         if awaited is not None and self._is_single:
             awaited.is_used = True
             batches = list(awaited.divided(batches[0]))
-        # The structs hold addresses alone: what these stand for must live as long as they do.
+        # The structs hold only addresses: the arrays must live as long as the structs.
         self.batches = tuple(batches)
         flat = None if self._clusters is not None else plan.flat
         self._rows, self._blocks = ([], 0) if self._is_single else _stretches(batches, flat)
         self._stretches = wp.array(self._rows, dtype=Stretch, device=self._device) if self._rows else None
         self._in_warps = self._is_single and does_in_warps(batches)
-        #: Number of subtrees and single leaves of each launch that may leave some out, with gaps.
+        #: Numbers of subtrees and single leaves of each launch that may leave some out, with gaps.
         self.places = [batch.count for batch in batches] if self._is_single else [self._blocks * BLOCK]
         if self._in_warps:
             self.places = []
 
     @property
     def in_clusters(self) -> tuple[ClusterScatter, tuple[Batch, ...]] | None:
-        """The clusters of a mesh that stays as it is, and the subtrees beside them, if those are the plan's."""
+        """The clusters of a mesh that never changes, and the subtrees outside them, if the plan has them."""
         is_divided = self._awaited is not None and self._awaited.is_used
         return (self._clusters, self.batches) if isinstance(self._clusters, ClusterScatter) and not is_divided else None
 
@@ -110,7 +110,7 @@ class OwnLaunches:
 
     @staticmethod
     def load(uniform: bool, tolerance: float | None, device: wp.Device) -> None:
-        """Compile now what launches over a mesh that changes will need."""
+        """Compile the kernels that launches over a changing mesh will need."""
         wp.load_module(scatter_stretches(uniform, tolerance).module, device, block_dim=BLOCK)
 
     def scatter_forces(self, u: wp.array, f: wp.array, left_out: LeftOut) -> None:
@@ -152,12 +152,12 @@ class OwnLaunches:
 
 
 def _fewest_grouped(plan: Plan) -> int:
-    """Leaves in groups from which these have a launch of their own."""
+    """Number of leaves in groups from which these have a separate launch."""
     return UNIFORM_LEAVES if len(plan.batches) == 1 and len(plan.flat) == 0 else GROUPED_LEAVES
 
 
 def _stretches(batches: list[Batch], flat: FlatLeaves | None) -> tuple[list[Stretch], int]:
-    """What neighbouring thread blocks go through, and how many blocks there are."""
+    """The stretches of work of neighbouring thread blocks, and the number of blocks."""
     rows, begin = [], 0
     for batch in batches:
         stretch = Stretch()

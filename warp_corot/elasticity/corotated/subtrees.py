@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
 
 
-#: What kernels of lanes read.
+#: The structs that kernels of lanes read.
 LanesMaterial: TypeAlias = (
     "IsotropicMaterial | RotatedMaterial | subtree_cpu.NearMaterial | subtree_cpu.DilatingMaterial"
 )
@@ -58,7 +58,7 @@ class SubtreeField(CorotatedField):
     def __init__(self, discretization: Discretization, model: CorotatedOptions, deterministic: bool):
         super().__init__(discretization, model, deterministic)
         self._uniform = discretization.material_stride == 0
-        #: What adds the forces of all leaves, whatever they come to be.
+        #: Adds the forces of all leaves, also of those that come later.
         self._clusters: ChangingClusterScatter | None = None
         if self._listed and self.rotation_level is None:
             self._clusters = ChangingClusterScatter.of(discretization, self.plan, isotropic_law(corotated_stress))
@@ -102,7 +102,7 @@ class SubtreeField(CorotatedField):
 
     @property
     def _groups(self) -> GroupedLanes | None:
-        """The leaves in no subtree where these share their dilatation in groups."""
+        """The leaves outside subtrees, if they share their dilatation in groups."""
         return None if self._dilating is None else self._dilating.groups
 
     @property
@@ -112,7 +112,7 @@ class SubtreeField(CorotatedField):
     def follow(self) -> None:
         super().follow()
         plan = self.plan
-        #: Whether warps do what they leave out themselves.
+        #: Whether warps compute the leaves that they leave out.
         self._in_warps = self._listed and plan.counts is None and does_in_warps(plan.batches)
         self._rotations = wp.empty(0, dtype=wp.mat33, device=self.device)
         self._no_unit = wp.empty(0, dtype=wp.int32, device=self.device)
@@ -145,7 +145,7 @@ class SubtreeField(CorotatedField):
 
     @property
     def _listed(self) -> bool:
-        """Whether leaves that are left out stand in a list; the order of its entries is any."""
+        """Whether kernels list the leaves that they leave out, in any order."""
         return self.device.is_cuda and not self.deterministic
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
@@ -202,7 +202,7 @@ class SubtreeField(CorotatedField):
         return subtree_cpu.scatter_subtrees_shared(shape, given)
 
     def _material(self, batch: Batch) -> Callable[[], LanesMaterial]:
-        """What gives the struct that a kernel of lanes reads."""
+        """The function that makes the struct that a kernel of lanes reads."""
         if batch.sharing is not Sharing.OWN:
             rotated, unit = Kept(rotated_material), self._no_unit if batch.unit is None else batch.unit
             return lambda: rotated(self.isotropic, self._rotations, unit)

@@ -59,9 +59,9 @@ class RotatedTangent(Tangent):
 
 
 class KeptTangent(Tangent):
-    """The same on the CPU, of elements with rotations of their own: turned gradients are kept.
+    """The same on the CPU, for elements with own rotations: rotated gradients are kept.
 
-    The diagonal is found with rotations one by one, as solvers with multigrid never ask for it.
+    The diagonal is found with a rotation for each element, because solvers with multigrid never need it.
     """
 
     field: CorotatedField

@@ -20,15 +20,16 @@ BLOCK = 128
 
 
 class ClusteredGroups:
-    """Groups of elements whose forces a ``ClusterScatter`` adds; it adds those of their dilatation, too, from now on.
+    """Groups of elements whose forces a ``ClusterScatter`` adds; from now on it also adds the forces of their
+    dilatation.
 
     Args:
-        scatter: What adds the forces.
+        scatter: Adds the forces.
         elements: All elements of the mesh.
         kind: Their struct.
         batches: Groups as ``kernels.elements.shared_dilatation.share_in_groups`` takes them, and how many; together
             they have all elements that the clusters have.
-        of: What is shared.
+        of: The shared dilatation.
         lam: Gives lambda [Pa] as the elements have it.
     """
 
@@ -61,7 +62,9 @@ class ClusteredGroups:
         )
 
     def find_pressures(self, stride: int, u: wp.array) -> None:
-        """Launch what finds the groups' pressures at displacements u, before the forces; ``stride`` is lambda's."""
+        """Launch the kernel that finds the groups' pressures at displacements u, before the forces; ``stride`` is
+        lambda's.
+        """
         blocks = -(-LANES * len(self._pressures) // BLOCK)
         inputs = [self._starts, self._members, self._elements, stride, self._lam(), u]
         wp.launch(self._kernel, blocks * BLOCK, inputs, [self._pressures], device=self._device, block_dim=BLOCK)
@@ -70,7 +73,7 @@ class ClusteredGroups:
 def _members_of(
     starts: wp.array, members: wp.array, _live: wp.array, count: int
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
-    """The elements of so many groups, group after group, and how many each has."""
+    """The elements of this many groups, group after group, and the number of elements of each."""
     begins = starts.numpy()
     if len(members):
         return members.numpy()[begins[0] : begins[count]], np.diff(begins[: count + 1])

@@ -61,14 +61,14 @@ class DilatationField(ForceField):
         self.of = of
         self._all, self._still = (wp.empty(0, dtype=kind, device=self.device) for kind in (wp.int32, wp.vec4))
         self._others = Others(discretization, self.plan, of)
-        #: Whether the law's own launches add the forces of subtrees and of groups, or those in clusters theirs.
+        #: Whether the law's own launches add the forces of subtrees and groups, and whether clusters add theirs.
         self._joined = False
         self._clustered: ClusteredGroups | None = None
         self.join_launches()
         self._make_room()
 
     def plan_of(self, discretization: Discretization) -> Plan:
-        """The same plan where that has subtrees, and where the mesh changes: one plan is kept up to date there."""
+        """The given plan if it has subtrees, or if the mesh changes, because only one plan is kept up to date."""
         plan = self.shear.plan
         if plan.kinds or plan.counts is not None or not isinstance(discretization.mesh, TetForest):
             return plan
@@ -84,7 +84,7 @@ class DilatationField(ForceField):
         self._clustered = self._join_clusters()
 
     def _join_clusters(self) -> ClusteredGroups | None:
-        """Let the launch of elements in clusters add the forces of what these share, if there is one (CUDA)."""
+        """Let the launch of elements in clusters add the forces of their shared dilatation, if there is one (CUDA)."""
         found = self.shear.in_clusters
         if found is None or self.slots is not None or self._others.are_nodal:
             return None
@@ -96,7 +96,7 @@ class DilatationField(ForceField):
 
     @property
     def _batches(self) -> Sequence[Batch]:
-        """The subtrees for whose dilatation the law's own launches add no forces."""
+        """The subtrees whose forces of the dilatation are not added by the law's own launches."""
         if self._joined:
             return ()
         return self.plan.batches if self._clustered is None else self._kept
@@ -175,9 +175,9 @@ class DilatationField(ForceField):
         """Add K(u) p to y [N].
 
         Args:
-            u, p, y: As for every field.
-            exact: None: the law's own K. Of corotated that is the paper's: without the turning of the rotations, and
-                without the turning of the gradient of J, which is positive semidefinite; True: the derivative.
+            u, p, y: As for every field. exact: None: the law's own K. For the corotated law this is the paper's,
+            without the derivatives of the rotations and of the gradient of J, which is positive semidefinite; True: the
+            exact derivative.
         """
         self._law("add_stiffness", exact)(u, p, y)
         self.add_shared_product(u, p, y, exact)
@@ -190,7 +190,7 @@ class DilatationField(ForceField):
     def add_diagonal(self, u: wp.array, blocks: wp.array, *, exact: bool | None = None) -> None:
         """Add the 3x3 blocks on the diagonal of the same K(u) to those of the nodes [N/m]; see ``add_stiffness``.
 
-        Where dilatations are at nodes the blocks are larger than those of K.
+        If dilatations are at nodes, the blocks are larger than those of K.
         """
         self._law("add_diagonal", exact)(u, blocks)
         self.add_shared_diagonal(u, blocks, exact)
@@ -218,7 +218,7 @@ class DilatationField(ForceField):
 
     @property
     def _has_rotations(self) -> bool:
-        """Whether the law's K is not the exact derivative unless that is asked for."""
+        """Whether the law's K is the exact derivative only on request."""
         return self.of is VOLUME
 
     @property
@@ -226,7 +226,7 @@ class DilatationField(ForceField):
         return Unshared(self)
 
     def unshare(self, u: wp.array, f: wp.array) -> None:
-        """Add to forces f of displacements u what makes each element's dilatation its own."""
+        """Change the forces f of displacements u to those of separate dilatations."""
         shared = self._share(u, self._still)
         self.launch(kernels.unshare(self.kind, self.of), self.element_count, [self.elements, u], [shared])
         inputs = [self.elements, self._all, self._all, self.isotropic, u, shared]
@@ -264,11 +264,11 @@ class DilatationField(ForceField):
         self._others.prepare_sums(len(u))
 
     def _make_room(self) -> None:
-        """Make room for what passes leave to one another of all elements."""
+        """Allocate the arrays of all elements that one pass leaves for the next."""
         self._shared = wp.zeros(self.element_count, dtype=wp.vec4, device=self.device)
 
     def groups(self) -> list[npt.NDArray[np.int32]]:
-        """The elements of each group that shares a dilatation, of all worlds; none where they do at nodes."""
+        """The elements of each group that shares a dilatation, of all worlds; none if dilatations are at nodes."""
         found = []
         for starts, members, _live, count in self.batches_of_groups():
             begins, of_groups = starts.numpy(), members.numpy()
@@ -280,7 +280,7 @@ class DilatationField(ForceField):
         return found
 
     def group_numbers(self) -> npt.NDArray[np.int32] | None:
-        """The number of each element's group, int32 [T] of all worlds; None where elements share it at nodes."""
+        """The number of each element's group, int32 [T] of all worlds; None if dilatations are at nodes."""
         groups = self.groups()
         if sum(map(len, groups)) < self.element_count:
             return None
@@ -289,7 +289,7 @@ class DilatationField(ForceField):
         return numbers
 
     def batches_of_groups(self) -> list[tuple[wp.array, wp.array, wp.array, int]]:
-        """Subtrees and other groups, as ``kernels.share_in_groups`` takes them, and how many."""
+        """Subtrees and other groups in the form of ``kernels.share_in_groups``, and their numbers."""
         return self._of_subtrees(self.plan.batches) + self._others.groups
 
     def _of_subtrees(self, batches: Sequence[Batch]) -> list[tuple[wp.array, wp.array, wp.array, int]]:
@@ -304,12 +304,13 @@ class DilatationField(ForceField):
         return Members.of(self.of, self.batches_of_groups(), self.elements.nodes, below)
 
     def share_weights(self, u: wp.array, p: wp.array) -> wp.array:
-        """What derivatives with respect to elements' weights need of the shared dilatation, vec4 [T]; see
-        ``kernels.elements.shared_dilatation.weight_law_at``."""
+        """Data of the shared dilatation for derivatives with respect to elements' weights, vec4 [T]; see
+        ``kernels.elements.shared_dilatation.weight_law_at``.
+        """
         return self._share(u, p, kernels.weight_law_at(self.of))
 
     def _share(self, u: wp.array, p: wp.array, law: wp.Function | None = None) -> wp.array:
-        """The second pass of ``kernels.elements.shared_dilatation``, of all elements."""
+        """Launch the second pass of ``kernels.elements.shared_dilatation`` for all elements."""
         shared, law = self._shared, law or kernels.law_at(self.of)
         measure = kernels.measure_elements(self.kind, self.of)
         self.launch(measure, self.element_count, [self.elements, self._all, self._all, u, p], [shared])
@@ -321,17 +322,18 @@ class DilatationField(ForceField):
 
 
 def law_of(field: ForceField) -> tuple[ForceField, DilatationField | None]:
-    """The field of the law itself, and the field around it if elements share their dilatation: then the former has no
-    lambda."""
+    """The field of the law itself, and the field around it if elements share their dilatation; then the law's field has
+    no lambda.
+    """
     return (field.shear, field) if isinstance(field, DilatationField) else (field, None)
 
 
 class Unshared:
-    """A law as if every element had a dilatation of its own: at rest it is at least as stiff, and in crushed states the
-    field becomes so, too.
+    """The law with a separate dilatation in every element: at rest it is at least as stiff, and the field approaches it
+    in crushed states.
 
     Args:
-        field: The field that shares it.
+        field: The field with the shared dilatation.
     """
 
     def __init__(self, field: DilatationField):

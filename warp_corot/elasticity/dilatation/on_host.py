@@ -1,4 +1,4 @@
-"""A shared dilatation on the host, in float64; as ``kernels.elements.dilatation`` has it."""
+"""A shared dilatation on the host, in float64; see ``kernels.elements.dilatation``."""
 
 from __future__ import annotations
 
@@ -32,20 +32,20 @@ class Measured(NamedTuple):
 
 
 class HostDilatation:
-    """The shared dilatation of a field, of the elements of one world.
+    """The shared dilatation of a field, for the elements of one world.
 
     Args:
         field: The field.
 
     Attributes:
-        sharing: Who shares: shares of elements, [groups, T].
+        sharing: The weights of elements in groups, [groups, T].
     """
 
     def __init__(self, field: DilatationField):
         self._of, self.sharing = field.of, sharing_of(field)
 
     def measure(self, f: Array) -> Measured:
-        """Of deformation gradients [T, 3, 3]."""
+        """Measure the dilatations of deformation gradients [T, 3, 3]."""
         of = self._of
         if of is kernels.SMALL:
             theta, slope = np.trace(f, axis1=1, axis2=2) - 3.0, np.broadcast_to(np.eye(3), f.shape)
@@ -74,14 +74,15 @@ class HostDilatation:
         return slope[:, 0, 0], curvature[:, 0, 0]
 
     def means(self, weights: Array, values: Array) -> Array:
-        """Means of elements' values over those who share, [groups]; zero where nothing has weight."""
+        """Means of elements' values over groups, [groups]; zero for groups without weight."""
         total = self.sharing @ weights
         return np.asarray((self.sharing @ (weights * values)) / np.where(total != 0.0, total, 1.0))
 
 
 def sharing_of(field: DilatationField) -> Any:
-    """Which elements of one world share a dilatation, sparse [groups, T]: one for each element of a group, or a quarter
-    for each of an element's nodes."""
+    """The elements of one world that share a dilatation, sparse [groups, T]: one for each element of a group, or a
+    quarter for each of an element's nodes.
+    """
     mesh = field.discretization.mesh
     count = len(mesh.tets)
     groups = [group for group in field.groups() if group[0] < count]

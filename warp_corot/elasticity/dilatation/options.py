@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 AUTO, ELEMENT, SHARED = "auto", "element", "shared"
 
-#: Poisson's ratio, of any element, from which "auto" stands for "shared".
+#: Poisson's ratio in any element from which "auto" means "shared".
 SHARED_FROM = 0.45
 
 
@@ -56,7 +56,7 @@ def shares_dilatation(dilatation: str, discretization: Discretization) -> bool:
         raise InputError(f"dilatation is {SHARED!r} and the material is {name}; it must be {AUTO!r} or {ELEMENT!r}")
     if dilatation != AUTO or inseparable:
         return dilatation == SHARED
-    # As float32 has it, too.
+    # The limit as a float32 number counts, too.
     return float(np.max(discretization.material.poisson)) > SHARED_FROM - 1e-6
 
 
@@ -71,7 +71,7 @@ def bind_law(
 
     Args:
         bind: Makes the law's field of a discretization; the other argument is ``deterministic``.
-        of: What is shared.
+        of: The shared dilatation.
         dilatation: The option of the model.
         body, deterministic: As for every field.
 

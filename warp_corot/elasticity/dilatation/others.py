@@ -1,4 +1,4 @@
-"""Elements in no complete subtree, which share their dilatation in groups or at nodes."""
+"""Elements outside complete subtrees, which share their dilatation in groups or at nodes."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from warp_corot.mesh import TetForest
 
 
 class Others:
-    """The elements of a plan that are in no complete subtree.
+    """The elements of a plan that are outside complete subtrees.
 
-    They are in groups, which are found anew where a forest changes. Only in a forest of a plan without subtrees do they
-    have their dilatation at nodes.
+    They are in groups, which are found again whenever a forest changes. Only in a forest whose plan has no subtrees are
+    their dilatations at nodes.
 
     Call ``follow`` before anything is launched, once it is known whether they are joined.
 
     Args:
         discretization: The mesh.
-        plan: What the field goes through.
-        of: What is shared.
+        plan: The field's units of work.
+        of: The shared dilatation.
 
     Attributes:
-        count: How many elements launches go through.
-        grouped: Those in groups on the CPU, for the law's own launches.
-        are_joined: Whether these add their forces.
+        count: Number of elements in launches.
+        grouped: The elements in groups on the CPU, for the law's own launches.
+        are_joined: Whether the law's own launches add their forces.
     """
 
     def __init__(self, discretization: Discretization, plan: Plan, of: Dilatation):
@@ -67,12 +67,12 @@ class Others:
         self.derive()
 
     def derive(self) -> None:
-        """Launch what finds the groups where the mesh changes; may be recorded."""
+        """Launch the search for groups if the mesh changes; may be recorded."""
         if isinstance(self._groups, ChangingGroups):
             self._groups.launch()
 
     def follow(self) -> None:
-        """Take the elements of the plan as it is now."""
+        """Update to the elements of the present plan."""
         plan, flat = self._plan, self._plan.flat
         self._places, live = self._none, None
         if plan.kinds or len(flat):
@@ -90,12 +90,12 @@ class Others:
 
     @property
     def are_nodal(self) -> bool:
-        """Whether they have their dilatation at nodes."""
+        """Whether dilatations are at nodes."""
         return self._groups is None and self.count > 0
 
     @property
     def kernels(self) -> list[wp.Kernel]:
-        """All that forces may launch."""
+        """All kernels that forces may launch."""
         if self.are_joined:
             return []
         if self._device.is_cuda:
@@ -129,7 +129,7 @@ class Others:
 
     @property
     def groups(self) -> list[tuple[wp.array, wp.array, wp.array, int]]:
-        """The groups as ``kernels.share_in_groups`` takes them, and how many; none where there are none."""
+        """The groups in the form of ``kernels.share_in_groups``, and their number; empty without groups."""
         groups = self._groups
         if groups is None or not self.count:
             return []
@@ -138,14 +138,14 @@ class Others:
         return [(groups.starts, groups.members, self._none, len(groups))]
 
     def prepare_sums(self, nodes: int) -> None:
-        """Make room for sums at so many nodes; not while launches are recorded."""
+        """Allocate sums for this many nodes; not while launches are recorded."""
         if self._groups is None and len(self._sums) < nodes:
             self._sums = wp.zeros(nodes, dtype=wp.vec4, device=self._device)
 
     def share_at_nodes(
         self, material: IsotropicMaterial, nodes: int, shared: wp.array, law: wp.Function | None = None
     ) -> None:
-        """The second pass of the elements that are in no group, of a mesh of so many nodes."""
+        """Launch the second pass for the elements outside groups, of a mesh with this many nodes."""
         if self._groups is not None or not self.count:
             return
         self.prepare_sums(nodes)
@@ -164,7 +164,7 @@ class Others:
     def add_nodal_diagonal(
         self, material: IsotropicMaterial, u: wp.array, shared: wp.array, turning: float, blocks: wp.array
     ) -> None:
-        """Add the diagonal blocks of the elements that are in no group."""
+        """Add the diagonal blocks of the elements outside groups."""
         if self._groups is None and self.count:
             inputs = [self._elements, self._places, self._live, material, u, shared, turning]
             self._launch(shared_diagonal.add_diagonal(self._kind, self._of), inputs, [blocks])

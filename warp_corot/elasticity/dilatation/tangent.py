@@ -1,4 +1,4 @@
-"""The stiffness of a law with a shared dilatation at displacements that are kept: a row for each group."""
+"""The stiffness of a law with a shared dilatation at stored displacements: a row for each group."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class SharedTangent(Tangent):
     def __init__(self, field: DilatationField, exact: bool):
         super().__init__(field)
         self.shear, self._exact = field.shear.tangent(exact=exact), exact
-        # The differential of the gradient of a dilatation counts in each element by itself.
+        # The differential of the gradient of a dilatation acts in each element separately.
         self._turns = bool(field.turning(exact)) and field.of is not SMALL
         self._holds = field.of.holding is not not_held
         self._version = -1
@@ -81,7 +81,7 @@ class SharedTangent(Tangent):
 
 
 class NodalTangent(Tangent):
-    """K of a field whose elements have their dilatation at nodes.
+    """K of a field whose dilatations are at nodes.
 
     Args:
         field: The field.

@@ -45,7 +45,7 @@ SUBTREE = 8
 def grouped_and_others(plan: Plan, fewest: int = GROUPED_LEAVES) -> tuple[list[Batch], npt.NDArray[np.int32]]:
     """The batches of a plan whose subtrees are in groups, and all other leaves, int32 [n].
 
-    Fewer leaves in groups than ``fewest`` are not worth launches, and are among the others.
+    If groups have fewer than ``fewest`` leaves, a separate launch does not pay, and these leaves are among the others.
     """
     batches = [batch for batch in plan.batches if batch.grouped]
     if SUBTREE * sum(batch.count for batch in batches) < fewest:
@@ -62,10 +62,11 @@ def others_in_clusters(
     Material: type = IsotropicMaterial,
     layout: PairLayout | None = None,
 ) -> tuple[list[Batch], FlatLeaves | None, ClusterScatter | None]:
-    """Which batches of a plan go as subtrees, which leaves one by one, and what adds the forces of all others.
+    """The batches of a plan that are launched as subtrees, the leaves that are launched one by one, and the launch of
+    all others.
 
-    Clusters of pairs are found on the host, and their sums have any order: so where leaves change, where sums must have
-    one order, and on the CPU, the plan's batches and leaves go as they are.
+    Clusters of pairs are found on the host, and their sums have any order. So the plan's batches and leaves remain as
+    they are if leaves change, if sums must have a fixed order, and on the CPU.
     """
     if not len(plan.flat):
         return list(plan.batches), None, None
@@ -76,20 +77,20 @@ def others_in_clusters(
 
 
 class ClusterScatter:
-    """Adds the forces of elements that stay as they are.
+    """Adds the forces of elements that never change.
 
     Args:
         elements: All elements of a mesh, ``kernels.elements.elements.ForestElements`` or ``GeneralElements``.
         law: A function of ``kernels.clusters.laws``.
         Material: The struct that the law takes.
-        chosen: Which of the elements, int32 [n], as clusters shall take them one after the other; None: all.
-        layout: What the kernel is generated for; None: what suits isotropic laws.
+        chosen: The elements, int32 [n], in the order in which clusters take them; None: all.
+        layout: The layout for which the kernel is generated; None: the one for isotropic laws.
 
     Attributes:
         clusters: ``kernels.clusters.pairs.PairClusters``.
         pairs: ``kernels.clusters.pair_elements.LatticePairs`` or ``GeneralPairs``.
-        count: How many clusters.
-        Pairs, Material, law, layout: What the kernel is generated for.
+        count: Number of clusters.
+        Pairs, Material, law, layout: The types and options for which the kernel is generated.
     """
 
     def __init__(
@@ -120,8 +121,9 @@ class ClusterScatter:
         self._wrapped: Callable[[Any], Any] | None = None
 
     def use_law(self, law: wp.Function, Material: type, wrapped: Callable[[Any], Any]) -> None:
-        """From now on add the forces of a law that takes more registers, whose material is made of that which callers
-        give."""
+        """Add from now on the forces of a law that needs more registers; its material is made of the one that callers
+        give.
+        """
         self.layout = replace(self.layout, resident=self.layout.resident - 1)
         self._kernel, self._wrapped = scatter_pairs(self.Pairs, Material, law, self.layout), wrapped
 
@@ -142,10 +144,8 @@ class ChangingClusterScatter:
     """Adds the forces of all leaves of a forest that changes.
 
     Args:
-        discretization: Whose mesh changes; launches go through its ``launch_elements``.
-        elements: The leaves, with padding.
-        counts: How many there are.
-        law: A function of ``kernels.clusters.laws``, which does not mind which axes its gradients are on.
+        discretization: A forest that changes; launches have its ``launch_elements``. elements: The leaves, with
+        padding. counts: The number of leaves. law: A function of ``kernels.clusters.laws`` that works in any axes.
         layout: What kernels are generated for.
 
     Attributes:
@@ -173,7 +173,7 @@ class ChangingClusterScatter:
 
     @classmethod
     def of(cls, discretization: Discretization, plan: Plan, law: wp.Function) -> ChangingClusterScatter | None:
-        """The clusters of all leaves of a plan whose leaves change, None where they do not."""
+        """The clusters of all leaves of a changing plan; None if leaves never change."""
         return (
             None
             if plan.counts is None
@@ -181,14 +181,14 @@ class ChangingClusterScatter:
         )
 
     def derive(self) -> None:
-        """Launch what finds the clusters, if the plan has just been derived; may be recorded."""
+        """Launch the search for clusters, if the plan has just been derived; may be recorded."""
         leaves, counts = self._leaves, self._counts
         find_tables(self.clusters, self._places, leaves.nodes, counts.goes, self._layout)
         inputs = [counts.goes, counts.now, leaves.code, self._words]
         wp.launch(align_elements, dim=counts.most, inputs=inputs, outputs=[self.elements.shape], device=self._device)
 
     def __call__(self, material: IsotropicMaterial | ActiveMaterial, u: wp.array, f: wp.array) -> None:
-        """As ``ClusterScatter`` does."""
+        """Add the forces of displacements u, like ``ClusterScatter``."""
         threads, count = self._layout.threads, -(-self._discretization.sizes.launch_elements // self._layout.elements)
         wp.launch(
             self._kernel,

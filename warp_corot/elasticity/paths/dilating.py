@@ -1,4 +1,4 @@
-"""A dilatation that elements share, for launches on the CPU that add its forces with a law's."""
+"""A shared dilatation for launches on the CPU that add its forces together with a law's."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from .grouped import GroupedLanes
 
 
 class Dilating:
-    """What elements share, and the structs that kernels read.
+    """The shared dilatation, and the structs that kernels read.
 
     Args:
-        of: What is shared.
+        of: The shared dilatation.
         lam: Gives lambda [Pa] as elements hold it.
-        groups: Leaves in no subtree, where these share it in groups.
+        groups: The leaves outside subtrees, if they share it in groups.
     """
 
     def __init__(self, of: Dilatation, lam: Callable[[], wp.array], groups: GroupedLanes | None):
@@ -32,13 +32,13 @@ class Dilating:
 
         Args:
             isotropic: The material, without lambda.
-            tolerance: Of the corotated law, how near the root's rotation must be to be used [rad]; None: it never is.
+            tolerance: For the corotated law, the largest angle at which the root's rotation is used [rad]; None: never.
         """
         made: DilatingMaterial = self._made(isotropic, self._lam(), tolerance)
         return made
 
     def derive(self, isotropic: IsotropicMaterial) -> None:
-        """Launch what puts the leaves of groups in order; may be recorded."""
+        """Launch the sorting of the groups' leaves; may be recorded."""
         if self.groups is not None:
             self.groups.derive(isotropic, self._lam())
 

@@ -1,4 +1,4 @@
-"""Single elements on CUDA whose forces need no settled order, in clusters; see ``kernels.clusters.single``."""
+"""Single elements on CUDA whose forces may be summed in any order, in clusters; see ``kernels.clusters.single``."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ def clustered(discretization: Discretization) -> np.ndarray:
 
 
 class LawGeneralField(LawField):
-    """A law on single elements whose forces need no settled order.
+    """A law on single elements whose forces may be summed in any order.
 
     Args:
-        discretization: A general mesh's, or of a forest that has few groups of subtrees.
+        discretization: A general mesh, or a forest with few groups of subtrees.
         stress, functions: The law, as for ``LawField``.
-        deterministic: False; slots of elements are not shared, so there is nothing to add up.
+        deterministic: False; slots of elements are not shared, so nothing is summed.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class LawGeneralField(LawField):
 
 
 class CorotatedGeneralField(LeafField):
-    """The corotated law with own rotations on general elements whose forces need no settled order."""
+    """The corotated law with own rotations on general elements whose forces may be summed in any order."""
 
     def __init__(self, discretization: Discretization, model: CorotatedOptions):
         super().__init__(discretization, model, deterministic=False)

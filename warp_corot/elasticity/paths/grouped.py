@@ -1,4 +1,4 @@
-"""Elements in no subtree that share their dilatation in groups, on the CPU: group after group in the lanes."""
+"""Elements outside subtrees that share their dilatation in groups, on the CPU: group after group in the lanes."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ class GroupedLanes:
     """Launches that add the forces of elements in groups under a law, with the dilatation that groups share.
 
     Args:
-        plan: Of whose elements groups are.
-        kind: Of these elements.
-        of: What is shared.
-        starts, members, live: The groups, as ``kernels.elements.shared_dilatation.share_in_groups`` takes them.
+        plan: The plan whose elements are grouped.
+        kind: The struct of these elements.
+        of: The shared dilatation.
+        starts, members, live: The groups in the form of ``kernels.elements.shared_dilatation.share_in_groups``.
 
     Attributes:
-        count: How many groups launches go through.
+        count: Number of groups in launches.
     """
 
     def __init__(self, plan: Plan, kind: type, of: Dilatation, starts: wp.array, members: wp.array, live: wp.array):
@@ -44,11 +44,11 @@ class GroupedLanes:
         self._left_out = wp.zeros(most + 1, dtype=wp.int32, device="cpu")
 
     def derive(self, material: IsotropicMaterial, lam: wp.array) -> None:
-        """Launch what puts elements in order; may be recorded.
+        """Launch the sorting of elements; may be recorded.
 
         Args:
-            material: Of all elements, without lambda.
-            lam: Lambda [Pa], as ``material`` has mu.
+            material: The material of all elements, without lambda.
+            lam: Lambda [Pa], in the same order as ``material``.
         """
         grouped, most = self._material, len(self._members)
         if grouped.lam is None or (material.stride and len(grouped.lam) != most):
@@ -63,7 +63,7 @@ class GroupedLanes:
         wp.launch(self._order, most, inputs, [self._general, grouped], device="cpu")
 
     def kernel(self, law: str) -> wp.Kernel:
-        """What adds the forces under a law."""
+        """The kernel that adds the forces of a law."""
         return scatter_grouped_elements(law, self._of)
 
     def scatter_forces(self, law: str, u: wp.array, f: wp.array, repair: wp.Kernel | None = None) -> None:
@@ -71,7 +71,7 @@ class GroupedLanes:
 
         Args:
             law: A key of ``kernels.elements.law_lanes.LAWS``.
-            repair: Does the elements that the law leaves out, if it does.
+            repair: Computes the elements that the law leaves out, if any.
         """
         if not self.count:
             return

@@ -12,13 +12,13 @@ from warp_corot.kernels.elements.lanes import LANES
 
 
 class Lanes:
-    """Launches that add the forces of elements: eight at a time, then one by one those that were left out.
+    """Launches that add the forces of elements: first eight at a time, then those left out one by one.
 
     Args:
         elements: The elements, of either kind.
-        general: The same as general ones.
-        scatter: Kernel that goes through the general ones eight at a time and lists those that it leaves out.
-        repair: Kernel that does the listed ones among ``elements``; None where none are left out or listed.
+        general: The same elements as general ones.
+        scatter: Kernel that computes the general ones eight at a time and lists those that it leaves out.
+        repair: Kernel that computes the listed ones among ``elements``; None if none are left out or listed.
     """
 
     def __init__(self, elements: Elements, general: Elements, *, scatter: wp.Kernel, repair: wp.Kernel | None = None):

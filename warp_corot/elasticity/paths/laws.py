@@ -1,4 +1,4 @@
-"""Which kernels a constitutive law runs on."""
+"""The choice of kernels for a constitutive law."""
 
 from __future__ import annotations
 

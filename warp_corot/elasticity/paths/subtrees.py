@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 
 
 class LawSubtreeField(LawField):
-    """Complete subtrees in batches; the leaves that are in none one by one, under the same law. Where the mesh stays as
-    it is these go in clusters, and with them the subtrees that are in no group.
+    """Complete subtrees in batches, and other leaves one by one, under the same law. If the mesh never changes, the
+    other leaves and the subtrees outside groups go in clusters.
 
     Args:
-        discretization: A forest's, on CUDA.
+        discretization: A forest on CUDA.
         stress, functions: The law, as for ``LawField``.
         deterministic: As for every field.
     """
