@@ -15,11 +15,13 @@ class Layout:
     """The numbers for which a kernel is generated.
 
     Attributes:
-        threads: Threads of a block. elements, halo: Number of elements that a thread computes, and of halo nodes that
-        it waits for. lanes: Threads that sum the forces on one node. nodes, slots: Room for displacements and for
-        forces in shared memory; one more slot takes forces that are not used. groups, members: Room for groups that
-        share a dilatation and for the elements of each; zero if none do. overlaps: Whether a block computes the
-        elements that need no halo before it waits for the halo.
+        threads: Threads of a block.
+        elements, halo: Number of elements that a thread computes, and of halo nodes that it waits for.
+        lanes: Threads that sum the forces on one node.
+        nodes, slots: Room for displacements and for forces in shared memory; one more slot takes forces that are not
+            used.
+        groups, members: Room for groups that share a dilatation and for the elements of each; zero if none do.
+        overlaps: Whether a block computes the elements that need no halo before it waits for the halo.
     """
 
     threads: int

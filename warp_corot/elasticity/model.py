@@ -57,8 +57,9 @@ class ForceField(ABC):
     Methods only launch; they do not wait for the device, except those that return energies or stresses on the host.
 
     Args:
-        body: A body, or its discretization. deterministic: Whether forces must be reproducible bit by bit even on CUDA,
-        where threads run in any order; kernels then first write them to ``slots``.
+        body: A body, or its discretization.
+        deterministic: Whether forces must be reproducible bit by bit even on CUDA, where threads run in any order;
+            kernels then first write them to ``slots``.
 
     Attributes:
         plan: The units of work of launches.

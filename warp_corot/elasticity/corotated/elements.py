@@ -173,8 +173,9 @@ class CorotatedField(ForceField):
         rotations, which vanishes if the body is not strained.
 
         Args:
-            u, p, y: As for every field. exact: Whether K is the exact derivative, which can be indefinite; only for own
-            rotations. It is bounded if the rotation of F is ill-defined (``kernels.corotated.tangent``).
+            u, p, y: As for every field.
+            exact: Whether K is the exact derivative, which can be indefinite; only for own rotations. It is bounded if
+                the rotation of F is ill-defined (``kernels.corotated.tangent``).
 
         Raises:
             InputError: ``exact`` with shared rotations.

@@ -175,9 +175,9 @@ class DilatationField(ForceField):
         """Add K(u) p to y [N].
 
         Args:
-            u, p, y: As for every field. exact: None: the law's own K. For the corotated law this is the paper's,
-            without the derivatives of the rotations and of the gradient of J, which is positive semidefinite; True: the
-            exact derivative.
+            u, p, y: As for every field.
+            exact: None: the law's own K. For the corotated law this is the paper's, without the derivatives of the
+                rotations and of the gradient of J, which is positive semidefinite; True: the exact derivative.
         """
         self._law("add_stiffness", exact)(u, p, y)
         self.add_shared_product(u, p, y, exact)

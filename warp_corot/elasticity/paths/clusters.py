@@ -144,8 +144,10 @@ class ChangingClusterScatter:
     """Adds the forces of all leaves of a forest that changes.
 
     Args:
-        discretization: A forest that changes; launches have its ``launch_elements``. elements: The leaves, with
-        padding. counts: The number of leaves. law: A function of ``kernels.clusters.laws`` that works in any axes.
+        discretization: A forest that changes; launches have its ``launch_elements``.
+        elements: The leaves, with padding.
+        counts: The number of leaves.
+        law: A function of ``kernels.clusters.laws`` that works in any axes.
         layout: What kernels are generated for.
 
     Attributes:
