@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import resource
 import shutil
 import statistics
 import subprocess
@@ -43,11 +44,11 @@ def measured(cubes: int, level: int, device: str) -> dict[str, Any]:
     import warp_corot as wc
     import warp_corot.distributed as wd
 
-    mesh = wc.TetForest.box((1, 1, cubes), 0.1, level=level)
+    began = time.perf_counter()
+    mesh = wd.box((1, 1, cubes), 0.1, level=level)
     body = wc.SoftBody(mesh, wc.Isotropic(5e3, 0.4, 1000.0), device=device)
     edge = 0.1 * 0.5 ** (level // 3)
     body.displacements = np.random.default_rng(20130705).uniform(-0.05 * edge, 0.05 * edge, mesh.points.shape)
-    began = time.perf_counter()
     sim = wd.Simulation(body, integrator=wc.SymplecticEuler(dt=SHORT_STEP), gravity=(0, 0, 0))
     ready = time.perf_counter() - began
 
@@ -72,10 +73,11 @@ def measured(cubes: int, level: int, device: str) -> dict[str, Any]:
         "spread": (max(seconds) - min(seconds)) / statistics.median(seconds),
         "exchange_us": 1e6 * sim.exchange_seconds(EXCHANGES),
         "sent_bytes": sim.sent_bytes,
-        "elements": len(mesh.tets),
+        "elements": mesh.element_count,
         "computed": computed,
         "copied": copied,
         "ready_s": ready,
+        "memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "device": sim.device.name,
         "rank": sim.rank,
         "ranks": sim.size,
@@ -99,7 +101,7 @@ def on_ranks(ranks: int, cubes: int, level: int, device: str) -> dict[str, Any]:
     if done.returncode or len(rows) != ranks:
         raise RuntimeError(f"{ranks} ranks, level {level}: {done.stderr.strip()[-2000:]}")
     slowest = max(rows, key=lambda row: row["step_us"])
-    return slowest | {"level": level, "computed": max(row["computed"] for row in rows)}
+    return slowest | {"level": level, **{name: max(row[name] for row in rows) for name in ("computed", "memory_mb")}}
 
 
 def fitted(rows: list[dict[str, Any]]) -> dict[str, float]:
@@ -171,7 +173,8 @@ def main() -> int:
     counts = [int(n) for n in options.ranks.split(",")]
     rows: list[dict[str, Any]] = []
     print(
-        "scaling  level  ranks    elements    computed  copied      step     spread  exchange  efficiency", flush=True
+        "scaling  level  ranks    elements    computed  copied      step     spread  exchange  efficiency    memory",
+        flush=True,
     )
     for kind, levels in (("weak", options.weak), ("strong", options.strong)):
         for level in (int(n) for n in levels.split(",") if n):
@@ -183,7 +186,8 @@ def main() -> int:
                 rows.append(row | {"scaling": kind, "efficiency": share})
                 print(
                     f"{kind:7} {level:6} {ranks:6} {row['elements']:11} {row['computed']:11} {row['copied']:7} "
-                    f"{row['step_us']:9.1f} us {row['spread']:6.1%} {row['exchange_us']:6.1f} us {share:10.1%}",
+                    f"{row['step_us']:9.1f} us {row['spread']:6.1%} {row['exchange_us']:6.1f} us {share:10.1%} "
+                    f"{row['memory_mb']:6.0f} MB",
                     flush=True,
                 )
     model = fitted(rows)

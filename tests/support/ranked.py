@@ -1,4 +1,7 @@
-"""Small runs on several ranks, for ``tests/distributed``: ``mpirun -n 3 python ranked.py results.npz forest,tets``."""
+"""Small runs on several ranks, for ``tests/distributed``: ``mpirun -n 3 python ranked.py results forest,tets``.
+
+Three ranks make the runs of one rank, two and three, one after another: every process takes seconds to start.
+"""
 
 import sys
 from pathlib import Path
@@ -87,10 +90,26 @@ def saved_and_loaded(results: Path, before: list[str], case: str) -> dict[str, n
     return {f"{case}.{key}": value for key, value in found.items()}
 
 
-def main() -> None:
+def in_parts() -> np.ndarray | None:
+    """The run "worlds" of a mesh that no rank holds whole; the positions of all nodes on rank 0."""
     import warp_corot.distributed as wd
 
-    results, names, *before = sys.argv[1:]
+    body = body_of(wd.box((1, 1, 3), 0.064, level=4), 0.3, worlds=2)
+    sim = wd.Simulation(body, deterministic=True, integrator=INTEGRATORS["worlds"]())
+    sim.advance(0.03)
+    body.load("z > 0.09 and z < 0.1", [0.0, 0.0, 0.0])
+    sim.advance(0.01)
+    sim.collect()
+    # Copies of other ranks' nodes are where these have them.
+    whole = sim.comm.bcast(wd.gather(body.positions), root=0)
+    np.testing.assert_array_equal(body.positions.numpy(), whole[body.mesh.numbers.in_worlds(2)])
+    return whole if sim.rank == 0 else None
+
+
+def make_all(results: str, names: str, before: list[str]) -> None:
+    """Make runs on the ranks that there are, and write what they find."""
+    import warp_corot.distributed as wd
+
     found = {}
     for name in names.split(","):
         make = CASES[name]
@@ -111,10 +130,31 @@ def main() -> None:
     for name in ("forest", "touched"):
         if name in names:
             found |= saved_and_loaded(Path(results), before, name)
+    if "worlds" in names:
+        found["parts.x"] = in_parts()
     if sim.rank == 0:
         np.savez(results, **found)
     else:
         assert all(value is None for key, value in found.items() if key.endswith((".x", ".v")))
+
+
+def main() -> None:
+    from warp_corot.distributed import mpi
+    from warp_corot.distributed.patience import Patient, patience
+
+    folder, names = Path(sys.argv[1]), sys.argv[2]
+    everybody = mpi.world()
+    if everybody.size != 3:
+        make_all(str(folder / f"{everybody.size}.npz"), names, [])
+        return
+    # Two ranks and one beside them, and then all three, which go on from the checkpoint of the one.
+    alone = everybody.rank == 2
+    some = Patient(mpi.library().COMM_WORLD.Split(int(alone)), patience())
+    mpi.world = lambda: some  # type: ignore[assignment]
+    make_all(str(folder / f"{some.size}.npz"), names if alone else "forest", [])
+    everybody.Barrier()
+    mpi.world = lambda: everybody  # type: ignore[assignment]
+    make_all(str(folder / "3.npz"), names, [str(folder / "1.npz")])
 
 
 if __name__ == "__main__":

@@ -64,9 +64,7 @@ def nodes_at(nodes: Nodes, mesh_of: Callable[[], Mesh]) -> Any:
         return nodes
     mesh = mesh_of()
     if isinstance(nodes, str):
-        used = mesh.points[np.unique(mesh.tets)]
-        bounds = [used.min(axis=0), used.max(axis=0)]
-        return select_nodes(nodes, mesh.points, bounds=bounds, named=named_nodes(mesh))
+        return select_nodes(nodes, mesh.points, bounds=_bounds(mesh, nodes), named=named_nodes(mesh))
     count = len(mesh.points)
     try:
         found = np.asarray(nodes(mesh.points.copy()))
@@ -78,6 +76,15 @@ def nodes_at(nodes: Nodes, mesh_of: Callable[[], Mesh]) -> Any:
             f"[{count}, 3]; it must give true or false for each, bool [{count}], like lambda x: x[:, 2] < 0.01"
         )
     return found
+
+
+def _bounds(mesh: Mesh, expression: str) -> npt.NDArray[np.float64]:
+    """The lowest and the highest coordinates of nodes of elements [m], [2, 3]; of the whole mesh, if this is a part."""
+    if (given := getattr(mesh, "bounds", None)) is not None:
+        mesh.check_expression(expression)  # type: ignore[union-attr]
+        return given
+    used = mesh.points[np.unique(mesh.tets)]
+    return np.stack([used.min(axis=0), used.max(axis=0)])
 
 
 @dataclass(frozen=True)

@@ -72,7 +72,7 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
         _check_made_of(mesh, material)
         self.worlds = checked_count(worlds, "worlds", least=1)
         self.device = checked_device(device)
-        self.discretization: Discretization = FixedMesh(mesh, material, self.worlds, self.device)
+        self.discretization: Discretization = self._discretized(mesh, material)
         self.sizes = self.discretization.sizes
         #: The remeshing that changes the mesh, or None.
         self.changing: MeshChanges | None = None
@@ -84,6 +84,9 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
         self.bindings: list[FollowingBinding] = []
 
     # --- parts -----------------------------------------------------------------------------------------------------
+
+    def _discretized(self, mesh: Mesh, material: Material) -> Discretization:
+        return FixedMesh(mesh, material, self.worlds, self.device)
 
     @property
     def mesh(self) -> Mesh:

@@ -235,7 +235,7 @@ class Contacts:
         return smallest_size([body.discretization.smallest_volume for body in self.system.bodies])
 
     def _law(self, stable_dt: float) -> Law:
-        points = [np.abs(self.system.ranks.whole(body).mesh.points).max() for body in self.system.bodies]
+        points = [np.abs(self.system.ranks.bounds(body)).max() for body in self.system.bodies]
         law = Law()
         law.tolerance = ROUNDINGS * 2.0**-24 * max(*points, 1e-3)
         law.recovery = RECOVERY * self.smallest / stable_dt if np.isfinite(stable_dt) else 0.1

@@ -5,10 +5,11 @@
 """
 
 from . import mpi
+from .boxes import box
 from .gathering import gather
 from .simulation import Simulation
 from .sweeping import sweep
 
-__all__ = ["Simulation", "gather", "sweep"]
+__all__ = ["Simulation", "box", "gather", "sweep"]
 
 mpi.choose_device()

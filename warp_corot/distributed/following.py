@@ -12,8 +12,11 @@ from warp_corot.body.soft_body import SoftBody
 from warp_corot.body.trajectory import NodeKeyframes, Trajectory
 from warp_corot.errors import InputError
 
-from .parts import Part
+from .parts import ForestPart, Part
 from .places import Places
+
+#: What is known of each node after a step.
+STATE = ("displacements", "velocities", "reactions")
 
 
 class Following:
@@ -31,21 +34,35 @@ class Following:
         self.whole, self.part, self._comm = whole, part, comm
         n, count, worlds = len(part.numbers.nodes), whole.world_node_count, whole.worlds
         shift = np.arange(worlds, dtype=np.int32)[:, None]
-        everywhere = (part.numbers.nodes + count * shift).ravel()
+        everywhere = (part.numbers.places + count * shift).ravel()
         own = np.tile(part.numbers.owner == comm.rank, worlds)
         #: This rank's nodes among those of all worlds of the whole body, int32, and of its part.
         self.own_nodes = everywhere[own]
         devices = whole.device, part.device
         self._all = Places(everywhere, np.arange(worlds * n, dtype=np.int32), *devices)
         self._own = Places(self.own_nodes, np.flatnonzero(own).astype(np.int32), *devices)
-        elements = (part.numbers.elements + whole.world_element_count * shift).ravel()
+        elements = (part.numbers.element_places + whole.world_element_count * shift).ravel()
         self._elements = Places(elements, np.arange(len(elements), dtype=np.int32), *devices)
+        #: The numbers of this rank's nodes among all of the whole mesh, int64; and how many there are.
+        self._everywhere = part.numbers.in_worlds(worlds)[own]
+        self._total = worlds * part.numbers.node_count
         #: The number in the part of each node that this rank moves, -1 for others.
         self._number = np.full(worlds * count, -1, np.int32)
         self._number[self.own_nodes] = np.flatnonzero(own)
         self._trajectories: list[Trajectory] = []
         #: Triangles of the surface around this rank's nodes; None before anything can be touched.
         self._triangles: Places | None = None
+
+    @property
+    def is_in_parts(self) -> bool:
+        """Whether no rank holds the whole mesh."""
+        return isinstance(self.whole.mesh, ForestPart)
+
+    def take_ghosts(self) -> None:
+        """Copy the state of all nodes of the part, with those that other ranks move, to the body."""
+        for name in STATE:
+            self._all.to_whole(getattr(self.part.state, name), getattr(self.whole.state, name))
+        self.whole.state.publish_positions()
 
     def take_over(self) -> None:
         """Copy users' changes to the part: the state, supports, loads and keyframes."""
@@ -64,7 +81,7 @@ class Following:
     def publish(self) -> None:
         """Copy the state of the nodes that this rank moves to the whole body."""
         whole, part = self.whole, self.part
-        for name in ("displacements", "velocities", "reactions"):
+        for name in STATE:
             self._own.to_whole(getattr(part.state, name), getattr(whole.state, name))
         whole.state.publish_positions()
         whole.conditions.world_starts.assign(part.conditions.world_starts)
@@ -119,10 +136,10 @@ class Following:
         elsewhere.
         """
         values = array.numpy()
-        given = self._comm.gather((self.own_nodes, values[self.own_nodes]), root=0)
+        given = self._comm.gather((self._everywhere, values[self.own_nodes]), root=0)
         if given is None:
             return None
-        found = values.copy()
+        found = np.zeros((self._total, *values.shape[1:]), values.dtype) if self.is_in_parts else values.copy()
         for nodes, own in given:
             found[nodes] = own
         return found

@@ -9,8 +9,6 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from .parts import Numbers
-
 Ints = npt.NDArray[np.int32]
 #: A buffer for each neighbour.
 Room = dict[int, npt.NDArray[Any]]
@@ -29,29 +27,30 @@ class Halo:
     received: dict[int, Ints]
 
     @classmethod
-    def of(cls, numbers: Numbers, worlds: int, comm: Any) -> Halo:
+    def of(cls, nodes: npt.NDArray[np.integer], owner: Ints, worlds: int, comm: Any) -> Halo:
         """Make the lists; all ranks must call.
 
         Args:
-            numbers: The numbers of the part.
+            nodes: The numbers of the part's nodes in the whole mesh, [n].
+            owner: The rank that moves each of them, int32 [n].
             worlds: Copies of the body.
             comm: The ranks.
         """
-        wanted: list[Ints] = []
+        wanted: list[npt.NDArray[np.integer]] = []
         received = {}
         for rank in range(comm.size):
-            ghosts = np.flatnonzero(numbers.owner == rank).astype(np.int32)
+            ghosts = np.flatnonzero(owner == rank).astype(np.int32)
             # Both sides have them in the order of the whole mesh's numbers.
-            ghosts = ghosts[np.argsort(numbers.nodes[ghosts])] if rank != comm.rank else ghosts[:0]
-            wanted.append(numbers.nodes[ghosts])
+            ghosts = ghosts[np.argsort(nodes[ghosts])] if rank != comm.rank else ghosts[:0]
+            wanted.append(nodes[ghosts])
             if len(ghosts):
-                received[rank] = _in_worlds(ghosts, worlds, len(numbers.nodes))
-        place = np.argsort(numbers.nodes)
+                received[rank] = _in_worlds(ghosts, worlds, len(nodes))
+        place = np.argsort(nodes)
         sent = {}
-        for rank, nodes in enumerate(comm.alltoall(wanted)):
-            if len(nodes):
-                own = place[np.searchsorted(numbers.nodes[place], nodes)].astype(np.int32)
-                sent[rank] = _in_worlds(own, worlds, len(numbers.nodes))
+        for rank, asked in enumerate(comm.alltoall(wanted)):
+            if len(asked):
+                own = place[np.searchsorted(nodes[place], asked)].astype(np.int32)
+                sent[rank] = _in_worlds(own, worlds, len(nodes))
         return cls(sent, received)
 
     @property

@@ -26,7 +26,7 @@ from warp_corot.simulation.energy import WorldEnergies
 
 from . import mpi
 from .partition import Partition
-from .parts import Part
+from .parts import ForestPart, Part
 from .ranks import MpiRanks
 
 #: Parts of so many elements are tried by one rank first; larger ones take longer than several ranks' compiling.
@@ -72,7 +72,15 @@ class SimulationOfParts(on_one.Simulation):
 
 
 def part_of(body: SoftBody, model: Model, comm: Any, costs: npt.ArrayLike | None, device: wp.Device | None) -> Part:
-    """This rank's part of a body, on a device; None: where the body is."""
+    """This rank's part of a body, on a device; None: where the body is.
+
+    Raises:
+        InputError: As ``Partition.of``, or costs of a body that is in parts already.
+    """
+    if isinstance(body.mesh, ForestPart):
+        if costs is not None:
+            raise InputError("the mesh is divided already; give costs to warp_corot.distributed.box")
+        return Part(body, None, comm.rank, device)
     grouped = getattr(model, "dilatation", ELEMENT) == SHARED
     return Part(body, Partition.of(body.mesh, comm.size, costs, grouped=grouped), comm.rank, device)
 
@@ -103,9 +111,9 @@ def of_their_own(obstacles: Obstacle | Sequence[Obstacle]) -> list[Obstacle]:
     return [each.released() if isinstance(each, Tool) else copy.copy(each) for each in given]
 
 
-def settled_model(model: Model, body: SoftBody) -> Model:
+def settled_model(model: Model, body: SoftBody, comm: Any) -> Model:
     """The model with the meaning of "auto" for the whole body, because a part may have other materials."""
     if not hasattr(model, "dilatation"):
         return model
-    shares = shares_dilatation(model.dilatation, body.discretization)
+    shares = any(comm.allgather(shares_dilatation(model.dilatation, body.discretization)))
     return dataclasses.replace(model, dilatation=SHARED if shares else ELEMENT)  # type: ignore[type-var]

@@ -51,7 +51,7 @@ class Partition:
         Raises:
             InputError: Fewer groups than ranks, or costs that are not positive.
         """
-        shares = _shares(ranks, costs)
+        shares = checked_shares(ranks, costs)
         groups = _groups(mesh, grouped)
         order, sizes = _ordered(groups)
         if len(sizes) < ranks:
@@ -81,7 +81,12 @@ class Partition:
         return in_groups[self.groups] | (self.rank_of_element == rank)
 
 
-def _shares(ranks: int, costs: npt.ArrayLike | None) -> npt.NDArray[np.float64]:
+def checked_shares(ranks: int, costs: npt.ArrayLike | None) -> npt.NDArray[np.float64]:
+    """The share of the elements that each rank gets, [ranks].
+
+    Raises:
+        InputError: Costs that are not positive numbers, one for each rank.
+    """
     given = np.ones(ranks) if costs is None else np.asarray(costs, float)
     if given.shape != (ranks,) or not (np.isfinite(given) & (given > 0.0)).all():
         raise InputError(f"costs is {costs!r}; it must be {ranks} positive numbers, one for each rank")

@@ -12,7 +12,9 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
+from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.elements import Mesh
+from warp_corot.errors import InputError
 from warp_corot.materials.isotropic import Material
 from warp_corot.mesh import TetForest, TetMesh
 from warp_corot.mesh.numbering import in_order_of_leaves, live_or_void, renumbered, with_virtual
@@ -28,15 +30,64 @@ class Numbers:
     """The numbers that a part's nodes and elements have in the whole mesh.
 
     Attributes:
-        nodes, elements: int32 [n] and [t] of one world; elements ascend.
+        nodes, elements: int32 or int64 [n] and [t] of one world; elements ascend.
         owner: The rank that moves each of the nodes, int32 [n].
         counted: Whether this rank counts the element's energy, bool [t].
+        node_count: Number of nodes of the whole mesh.
+        places, element_places: Where the nodes and elements are in the body that this rank holds: the same numbers, or
+            those of its own part if no rank holds the whole mesh, int32 [n] and [t].
     """
 
-    nodes: Ints
-    elements: Ints
+    nodes: npt.NDArray[np.integer]
+    elements: npt.NDArray[np.integer]
     owner: Ints
     counted: npt.NDArray[np.bool_]
+    node_count: int
+    places: Ints
+    element_places: Ints
+
+    def in_worlds(self, worlds: int) -> npt.NDArray[np.int64]:
+        """The numbers of the nodes among those of all worlds of the whole mesh, int64 [worlds * n]."""
+        return (self.nodes + self.node_count * np.arange(worlds, dtype=np.int64)[:, None]).ravel()
+
+
+class ForestPart(TetForest):
+    """A rank's part of a forest that no rank holds whole: the leaves around the nodes that the rank moves.
+
+    Leaves and nodes are those of this part; some are copies of other ranks' leaves, and the nodes of these.
+
+    Attributes:
+        numbers: Their numbers in the whole forest.
+        element_count: Number of leaves of the whole forest.
+        bounds: Lowest and highest coordinates of the whole forest [m], float64 [2, 3].
+    """
+
+    def __init__(
+        self, *arrays: Any, numbers: Numbers, element_count: int, bounds: npt.NDArray[np.float64], **others: Any
+    ):
+        super().__init__(*arrays, **others)
+        self.__dict__.update(numbers=numbers, element_count=element_count, bounds=bounds)
+
+    numbers: Numbers
+    element_count: int
+    bounds: npt.NDArray[np.float64]
+
+    def refine(self, leaves: npt.ArrayLike) -> TetForest:
+        """Not in parts.
+
+        Raises:
+            InputError: Always: ranks would bisect without their neighbours.
+        """
+        raise InputError("a forest in parts cannot be refined; make it with another level")
+
+    def check_expression(self, expression: str) -> None:
+        """Check that an expression can be evaluated at the nodes of one part.
+
+        Raises:
+            InputError: It asks for nearest nodes.
+        """
+        if "nearest" in expression:
+            raise InputError("nearest needs the whole mesh, and this rank holds a part; take sphere or box")
 
 
 class Part(SoftBody):
@@ -44,23 +95,31 @@ class Part(SoftBody):
 
     Args:
         whole: The body.
-        partition: The division of its mesh.
+        partition: The division of its mesh; None if this rank holds only its part.
         rank: The rank of the part.
         device: Where it is computed; None: where the body is.
     """
 
-    def __init__(self, whole: SoftBody, partition: Partition, rank: int, device: wp.Device | None = None):
-        kept = partition.needed(whole.mesh, rank)
-        mesh, nodes = part_of_mesh(whole.mesh, kept, partition)
-        elements = np.flatnonzero(kept).astype(np.int32)
-        self.numbers = Numbers(
-            nodes, elements, partition.rank_of_node[nodes], partition.rank_of_element[elements] == rank
-        )
+    def __init__(self, whole: SoftBody, partition: Partition | None, rank: int, device: wp.Device | None = None):
         self._whole = whole
+        mesh, material = whole.mesh, whole.material
+        if isinstance(mesh, ForestPart):
+            self.numbers = mesh.numbers
+        else:
+            assert partition is not None
+            kept = partition.needed(mesh, rank)
+            mesh, nodes = part_of_mesh(mesh, kept, partition)
+            elements = np.flatnonzero(kept).astype(np.int32)
+            owner, counted = partition.rank_of_node[nodes], partition.rank_of_element[elements] == rank
+            self.numbers = Numbers(nodes, elements, owner, counted, whole.world_node_count, nodes, elements)
+            material = part_of_material(material, elements, len(whole.mesh.tets))
         self.is_own = np.tile(self.numbers.owner == rank, whole.worlds)
-        material = part_of_material(whole.material, elements, len(whole.mesh.tets))
         super().__init__(mesh, material, worlds=whole.worlds, device=device or whole.device)
         self.discretization.smallest_volume = whole.discretization.smallest_volume
+
+    def _discretized(self, mesh: Mesh, material: Material) -> Discretization:
+        shared = mesh is self._whole.mesh and self.device == self._whole.device
+        return self._whole.discretization if shared else super()._discretized(mesh, material)
 
     @property
     def masses(self) -> npt.NDArray[np.float64]:
@@ -83,10 +142,10 @@ class Part(SoftBody):
         triangles, parents = self._whole.surface_faces
         number = np.full(self._whole.world_node_count, -1, np.int32)
         own = self.is_own[: len(self.numbers.nodes)]
-        number[self.numbers.nodes[own]] = 1
+        number[self.numbers.places[own]] = 1
         here = np.flatnonzero((number[triangles] >= 0).any(axis=1)).astype(np.int32)
-        number[self.numbers.nodes] = np.arange(len(self.numbers.nodes), dtype=np.int32)
-        elements = np.searchsorted(self.numbers.elements, parents[here]).astype(np.int32)
+        number[self.numbers.places] = np.arange(len(self.numbers.nodes), dtype=np.int32)
+        elements = np.searchsorted(self.numbers.element_places, parents[here]).astype(np.int32)
         return here, number[triangles[here]], elements
 
 

@@ -22,12 +22,22 @@ from warp_corot.solvers.ranks import Floats, Ranks
 from .cards import CardExchange, add_up, take_most
 from .directions import normal_numbers
 from .halo import Halo, HostExchange
-from .parts import Part
+from .parts import ForestPart, Part
 from .settled import settled_sums
 from .surfaces import SurfacePlaces
 
 #: How often exchanges in a row are timed.
 TIMED = 5
+
+
+class Together(Ranks):
+    """The processes of an MPI communicator before they have parts."""
+
+    def __init__(self, comm: Any):
+        self._comm = comm
+
+    def most(self, value: float) -> float:
+        return max(self._comm.allgather(value))
 
 
 class MpiRanks(Ranks):
@@ -50,7 +60,8 @@ class MpiRanks(Ranks):
         self.can_record = self.device.is_cuda and records
         self._wholes = dict(zip(parts, wholes, strict=True))
         self._parts = parts
-        self.halos = halos = [Halo.of(part.numbers, part.worlds, comm) for part in parts]
+        self._bulks: dict[SoftBody, tuple[float, float]] = {part: self._bulk(part) for part in parts}
+        self.halos = halos = [Halo.of(part.numbers.nodes, part.numbers.owner, part.worlds, comm) for part in parts]
         self._exchanges = [self._exchange_of(halo, k) for k, halo in enumerate(halos)]
         for part, exchange in zip(parts, self._exchanges, strict=True):
             if isinstance(exchange, CardExchange) and comm.size > 1:
@@ -160,7 +171,7 @@ class MpiRanks(Ranks):
     # --- contact ---------------------------------------------------------------------------------------------------
 
     def take_surface(self, nodes: wp.array, places: Sequence[slice]) -> None:
-        sizes = [self._wholes[part].node_count for part in self._parts]
+        sizes = [part.worlds * part.numbers.node_count for part in self._parts]
         starts = [int(start) for start in np.cumsum([0, *sizes[:-1]])]
         numbers = [self._numbers(k) for k in range(len(self._parts))]
         self._places = SurfacePlaces(nodes, places, self._parts, starts, numbers, self.comm)
@@ -240,11 +251,30 @@ class MpiRanks(Ranks):
             times.append(time.perf_counter() - began)
         return sorted(times)[TIMED // 2] / count
 
+    def bounds(self, body: SoftBody) -> Floats:
+        mesh = self.whole(body).mesh
+        return mesh.bounds if isinstance(mesh, ForestPart) else super().bounds(self.whole(body))
+
+    def bulk(self, body: SoftBody) -> tuple[float, float]:
+        return self._bulks[body]
+
+    def _bulk(self, part: Part) -> tuple[float, float]:
+        """See ``bulk``; all ranks must call."""
+        mesh = self._wholes[part].mesh
+        if not isinstance(mesh, ForestPart):
+            return super().bulk(self._wholes[part])
+        own = part.numbers.counted
+        moduli = (2.0 * part.discretization.mu.numpy() + part.discretization.lam.numpy()).astype(np.float64)
+        if part.discretization.material_stride:
+            moduli = moduli.reshape(part.worlds, -1)[:, own]
+        here = (float(moduli.sum()), moduli.size, float(np.sum(mesh.volumes[own])))
+        stiffness, count, volume = np.sum(self.comm.allgather(here), axis=0)
+        return float(stiffness / count), float(volume)
+
     def whole(self, body: SoftBody) -> SoftBody:
         return self._wholes[body]  # type: ignore[index]
 
     def _numbers(self, k: int) -> npt.NDArray[np.int64]:
         """The numbers of a part's nodes among those of all worlds of the whole body, int64 [worlds * n]."""
         part = self._parts[k]
-        count = self._wholes[part].world_node_count
-        return (part.numbers.nodes + count * np.arange(part.worlds, dtype=np.int64)[:, None]).ravel()
+        return part.numbers.in_worlds(part.worlds)

@@ -26,10 +26,10 @@ from warp_corot.solvers import Integrator, SymplecticEuler
 from warp_corot.solvers.implicit.schemes import ImplicitIntegrator
 
 from . import checkpoint, mpi
-from .following import Following
+from .following import STATE, Following
 from .gathering import register
 from .of_parts import SimulationOfParts, compile_once, of_their_own, part_of, settled_model
-from .ranks import MpiRanks
+from .ranks import MpiRanks, Together
 from .refusals import DIAGONAL, check_supported
 
 
@@ -73,7 +73,7 @@ class Simulation:
     ):
         self._comm = self.comm = comm = mpi.world()
         self.rank, self.size = comm.rank, comm.size
-        self.bodies = checked_bodies(bodies)
+        self.bodies = checked_bodies(bodies, Together(comm))
         models = checked_models(Corotated() if model is None else model, len(self.bodies))
         integrator = checked_integrator(SymplecticEuler() if integrator is None else integrator)
         here = None if device is None else checked_device(device)
@@ -81,7 +81,7 @@ class Simulation:
         check_supported(self.bodies, models, integrator, others, cards)
         if isinstance(integrator, ImplicitIntegrator):
             integrator = dataclasses.replace(integrator, preconditioner=DIAGONAL)
-        models = tuple(settled_model(m, body) for m, body in zip(models, self.bodies, strict=True))
+        models = tuple(settled_model(m, body, comm) for m, body in zip(models, self.bodies, strict=True))
         self.gravity = checked_gravity(gravity, self.bodies[0].mesh.up_axis)
         parts = [part_of(body, m, comm, costs, here) for body, m in zip(self.bodies, models, strict=True)]
         self._following = [Following(body, part, comm) for body, part in zip(self.bodies, parts, strict=True)]
@@ -244,13 +244,26 @@ class Simulation:
         return WorldEnergies(*np.sum(self._comm.allgather(np.array(own)), axis=0))
 
     def collect(self) -> None:
-        """Bring the state of all nodes into the bodies of all ranks; all ranks must call."""
-        for each in self._following:
+        """Bring the state of all nodes into the bodies of all ranks; all ranks must call.
+
+        Of a body in parts, the nodes of this rank's part.
+        """
+        for k, each in enumerate(self._following):
+            if each.is_in_parts:
+                self._collect_ghosts(k)
+                continue
             state = each.whole.state
             for array in (state.displacements, state.velocities, state.reactions):
                 array.assign(self._comm.bcast(each.gather(array), root=0))
             state.publish_positions()
             each.collect_touch()
+
+    def _collect_ghosts(self, k: int) -> None:
+        """Bring the state of the nodes of this rank's elements up to date."""
+        each = self._following[k]
+        for name in STATE:
+            self._parts.ranks.complete(k, getattr(each.part.state, name))
+        each.take_ghosts()
 
     @property
     def solves(self) -> Solves | None:
@@ -277,6 +290,8 @@ class Simulation:
         Raises:
             InputError: On all ranks, if rank 0 cannot write to the folder.
         """
+        if any(each.is_in_parts for each in self._following):
+            raise InputError("checkpoints of bodies in parts do not work yet")
         self._take_over()
         self.collect()
         checkpoint.save(path, self.bodies, self._parts, self._following, self._comm)

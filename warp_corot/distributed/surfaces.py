@@ -10,7 +10,7 @@ import numpy.typing as npt
 import warp as wp
 
 from .halo import Halo
-from .parts import Numbers, Part
+from .parts import Part
 
 
 class SurfacePlaces:
@@ -50,6 +50,6 @@ class SurfacePlaces:
             own = own[node[own] >= 0]
             number[own] = starts[k] + numbers[k][node[own]]
             owner[own] = np.tile(part.numbers.owner, part.worlds)[node[own]]
-        self.halo = Halo.of(Numbers(number, number[:0], owner, owner[:0] > 0), 1, comm)  # type: ignore[arg-type]
+        self.halo = Halo.of(number, owner.astype(np.int32), 1, comm)
         ghosts = np.flatnonzero(owner != comm.rank).astype(np.int32)
         self.ghosts = wp.array(ghosts, dtype=wp.int32, device=nodes.device)

@@ -15,12 +15,12 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_axis, checked_numbers, shown
+from warp_corot.inputs.checks import shown
 from warp_corot.inputs.indices import checked_indices
 
 from .forest_arrays import ForestArrays
 from .growing.refined import refined
-from .lattice import LATTICE_BITS, checked_cell_size, checked_cells, checked_level
+from .lattice import LATTICE_BITS, checked_box
 from .lattice import MAX_LEVEL as MAX_LEVEL
 from .pieces import pieces_of
 from .surfaces.bodies import largest_piece, separating_surface, summary, surface
@@ -85,18 +85,13 @@ class TetForest(ForestArrays):
         Raises:
             InputError: An argument is out of its range, or the mesh would have 2**31 tetrahedra or more.
         """
-        cells, cell_size, level = checked_cells(cells), checked_cell_size(cell_size), checked_level(level, "level")
-        checked_axis(up_axis)
-        corners = checked_numbers(origin, "origin", "[3]")
-        if corners.shape != (3,) or not np.isfinite(corners).all():
-            raise InputError(f"origin is {shown(origin)}; it must be three finite coordinates in metres")
+        cells, cell_size, level, origin = checked_box(cells, cell_size, level, origin, up_axis)
         count = 6 * math.prod(cells) << level
         if count > MAX_LEAVES:
             raise InputError(f"level is {level}, which gives {count} tetrahedra; there must be at most {MAX_LEAVES}")
         lattice, ends, tets = uniform_leaves(cells, level)
         lattice <<= LATTICE_BITS - halvings(level)
-        x, y, z = (float(c) for c in corners)
-        return cls(cells, cell_size, (x, y, z), lattice, ends, UniformTree(tets, level), up_axis)
+        return cls(cells, cell_size, origin, lattice, ends, UniformTree(tets, level), up_axis)
 
     @classmethod
     def from_domain(

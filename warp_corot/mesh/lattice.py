@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_number, shown
+from warp_corot.inputs.checks import checked_axis, checked_number, checked_numbers, shown
 from warp_corot.kernels.tables.shapes import VOLUME
 
 #: A root cube has 2**LATTICE_BITS lattice intervals a side, so levels go up to 3 * LATTICE_BITS.
@@ -65,6 +65,23 @@ def checked_cells(cells: Any) -> tuple[int, int, int]:
         raise InputError(f"cells is {shown(cells)}; it must be three whole numbers from 1 to {MAX_CELLS}")
     x, y, z = (int(c) for c in counts)
     return x, y, z
+
+
+def checked_box(
+    cells: Any, cell_size: float, level: Any, origin: Any, up_axis: str
+) -> tuple[tuple[int, int, int], float, int, tuple[float, float, float]]:
+    """The arguments of ``TetForest.box`` but for the axis, as numbers.
+
+    Raises:
+        InputError: One of them is out of its range.
+    """
+    counts, size, depth = checked_cells(cells), checked_cell_size(cell_size), checked_level(level, "level")
+    checked_axis(up_axis)
+    corner = checked_numbers(origin, "origin", "[3]")
+    if corner.shape != (3,) or not np.isfinite(corner).all():
+        raise InputError(f"origin is {shown(origin)}; it must be three finite coordinates in metres")
+    x, y, z = (float(c) for c in corner)
+    return counts, size, depth, (x, y, z)
 
 
 def checked_cell_size(cell_size: float) -> float:

@@ -44,7 +44,7 @@ def uniform_leaves(cells: tuple[int, int, int], level: int) -> tuple[IntArray, I
         patches.append((table, table.lattice_points(tets)))
         at += depth
     last, places = patches[-1]
-    number, place_of = _numbered(places.ravel(), math.prod(grid))
+    number, place_of = numbered(places.ravel(), math.prod(grid))
     ends = np.full((len(place_of), 2), -1, np.int32)
     for table, points in patches:
         for start in range(0, len(points), CHUNK):
@@ -57,7 +57,7 @@ def uniform_leaves(cells: tuple[int, int, int], level: int) -> tuple[IntArray, I
     return coordinates, ends, last.leaves_of(number[places])
 
 
-def _numbered(touched: IntArray, place_count: int) -> tuple[IntArray, IntArray]:
+def numbered(touched: IntArray, place_count: int) -> tuple[IntArray, IntArray]:
     """Places numbered in the order in which they are first named.
 
     Returns:

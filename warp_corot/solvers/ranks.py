@@ -138,8 +138,18 @@ class Ranks:
         return totals
 
     def whole(self, body: SoftBody) -> SoftBody:
-        """The body of which another is this rank's part."""
+        """The body, as far as this rank holds it, of which another is this rank's part."""
         return body
+
+    def bounds(self, body: SoftBody) -> Floats:
+        """The lowest and the highest rest coordinates of the whole body [m], float64 [2, 3]."""
+        points = body.mesh.points
+        return np.stack([points.min(axis=0), points.max(axis=0)])
+
+    def bulk(self, body: SoftBody) -> tuple[float, float]:
+        """The mean of 2 mu + lambda over the elements of the whole body [Pa], and its volume [m^3]."""
+        stiffness = 2.0 * float(body.discretization.mu.numpy().mean()) + float(body.discretization.lam.numpy().mean())
+        return stiffness, float(np.sum(body.mesh.volumes))
 
 
 #: A process that holds everything.

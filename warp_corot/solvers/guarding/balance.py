@@ -189,11 +189,8 @@ class Balance:
     def rounding(self) -> Floats:
         """Energies that float32 cannot distinguish from zero, for each world [J]: those of strains of about 4e-4."""
         found = np.zeros(self.worlds)
-        for body in map(self._ranks.whole, self.bodies):
-            stiffness = 2.0 * float(body.discretization.mu.numpy().mean()) + float(
-                body.discretization.lam.numpy().mean()
-            )
-            found += 1e-7 * stiffness * float(np.sum(body.mesh.volumes))
+        for stiffness, volume in map(self._ranks.bulk, self.bodies):
+            found += 1e-7 * stiffness * volume
         return found
 
     def _add_elastic(self, k: int, body: SoftBody, field: ForceField, u: wp.array) -> None:

@@ -73,8 +73,8 @@ class Guard:
     def __init__(self, system: System):
         self.system, self.bodies, self.worlds = system, system.bodies, system.worlds
         self._ranks = system.ranks
-        wholes = map(self._ranks.whole, system.bodies)
-        self._size = max(float(np.ptp(body.mesh.points, axis=0).max()) for body in wholes)
+        bounds = map(self._ranks.bounds, system.bodies)
+        self._size = max(float((high - low).max()) for low, high in bounds)
         self._copies = Copies(system)
         self._balance = Balance(system, self._copies)
         self._reference: Energies | None = None

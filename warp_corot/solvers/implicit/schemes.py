@@ -245,7 +245,7 @@ class QuasiStatic(ImplicitIntegrator):
 
     def bind(self, system: System) -> Stepper:
         for body in system.bodies:
-            held = system.ranks.whole(body).conditions.held_mask()
-            if not held.reshape(body.worlds, -1).any(axis=1).all():
+            held = system.ranks.whole(body).conditions.held_mask().reshape(body.worlds, -1)
+            if not system.ranks.anywhere(np.asarray(held.any(axis=1))).all():
                 raise InputError("no node of the body is held; QuasiStatic needs some in each world")
         return super().bind(system)

@@ -1,0 +1,108 @@
+"""Parts of a box that are made without the whole are those that are cut out of it. One process is enough."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import warp_corot as wc
+from warp_corot.distributed.boxes import numbered_nodes
+from warp_corot.distributed.cutting import cut_box
+from warp_corot.distributed.partition import Partition
+from warp_corot.distributed.parts import part_of_mesh
+from warp_corot.mesh.lattice import LATTICE_BITS
+from warp_corot.mesh.tree import Tree
+from warp_corot.mesh.uniform import halvings
+
+
+@pytest.mark.parametrize(
+    ("cells", "level", "ranks", "costs"),
+    [
+        ((1, 1, 1), 3, 5, None),
+        ((2, 1, 3), 4, 3, None),
+        ((3, 2, 1), 5, 7, None),
+        ((1, 1, 1), 9, 1, None),
+        ((1, 1, 2), 9, 3, [1.0, 3.0, 2.0]),
+        ((1, 2, 2), 8, 7, None),
+        ((1, 1, 1), 11, 4, None),
+    ],
+)
+def test_parts_are_those_of_the_whole(cells, level, ranks, costs):
+    mesh = wc.TetForest.box(cells, 0.1, level)
+    dealt, first = Partition.of(mesh, ranks, costs), 0
+    for rank in range(ranks):
+        kept = dealt.needed(mesh, rank)
+        part, nodes = part_of_mesh(mesh, kept, dealt)
+        cut = cut_box(cells, level, ranks, rank, costs)
+        np.testing.assert_array_equal(cut.elements, np.flatnonzero(kept))
+        np.testing.assert_array_equal(cut.counted, dealt.rank_of_element[kept] == rank)
+        np.testing.assert_array_equal(cut.tree.leaf_tets, part.tets)
+        np.testing.assert_array_equal(cut.owner, dealt.rank_of_node[nodes])
+        lattice = cut.lattice << (LATTICE_BITS - halvings(level))
+        np.testing.assert_array_equal(lattice[: len(nodes)], part.lattice[: len(nodes)])
+        # Nodes are the middles of the same edges.
+        ends, theirs = cut.ends[: len(nodes)], part.node_ends[: len(nodes)]
+        np.testing.assert_array_equal(ends < 0, theirs < 0)
+        inner = ends[:, 0] >= 0
+        np.testing.assert_array_equal(
+            lattice[ends[inner]].sum(axis=1), part.lattice[theirs[inner]].sum(axis=1, dtype=np.int32)
+        )
+        # Numbers of nodes follow one another from rank to rank.
+        own = nodes[cut.owner == rank]
+        np.testing.assert_array_equal(own, first + np.arange(len(own)))
+        first += len(own)
+    assert first == len(mesh.points)
+
+
+def test_the_tree_of_a_part_is_a_tree():
+    cut = cut_box((1, 2, 1), 7, 3, 1)
+    tree = cut.tree
+    plain = Tree(tree.tets, tree.level, tree.parent, tree.first_child)
+    for name in ("leaves", "leaf_tets", "leaf_levels"):
+        np.testing.assert_array_equal(getattr(tree, name), getattr(plain, name))
+    inner = np.flatnonzero(tree.first_child >= 0)
+    for child in (tree.first_child[inner], tree.first_child[inner] + 1):
+        np.testing.assert_array_equal(tree.parent[child], inner)
+        np.testing.assert_array_equal(tree.level[child], tree.level[inner] + 1)
+    # Both halves of an element fill it.
+    volume = np.abs(np.linalg.det(np.diff(cut.lattice[tree.tets].astype(float), axis=1)))
+    child = tree.first_child[inner]
+    np.testing.assert_allclose(volume[child] + volume[child + 1], volume[inner])
+
+
+def test_a_large_box_is_cut_without_the_whole():
+    """A rank's part of a box of 100 million elements."""
+    cells, level, ranks = (1, 1, 1), 24, 20000
+    cut = cut_box(cells, level, ranks, 12345)
+    assert np.count_nonzero(cut.counted) == pytest.approx(6 * 2**level / ranks, rel=0.01)
+    assert len(cut.elements) < 3 * np.count_nonzero(cut.counted)
+
+
+def test_copies_learn_their_numbers_from_those_who_move_them():
+    """Three ranks in one process, one after another."""
+    cuts = [cut_box((1, 1, 2), 6, 3, rank) for rank in range(3)]
+    mesh = wc.TetForest.box((1, 1, 2), 1.0, 6)
+    dealt = Partition.of(mesh, 3)
+    counts = [int((cut.owner == rank).sum()) for rank, cut in enumerate(cuts)]
+
+    def told(rank, keys):
+        """The numbers of nodes that a rank moves."""
+        own = np.flatnonzero(cuts[rank].owner == rank)
+        first = sum(counts[:rank])
+        number = dict(zip(cuts[rank].keys[own].tolist(), range(first, first + len(own)), strict=True))
+        return np.array([number[key] for key in keys.tolist()], np.int64)
+
+    for rank, cut in enumerate(cuts):
+        sent = []
+
+        def alltoall(values, sent=sent):
+            sent.append(values)
+            # First what others ask for, nothing here; then what they answer.
+            none = [np.zeros(0, np.int64)] * 3
+            return none if len(sent) == 1 else [told(k, keys) for k, keys in enumerate(sent[0])]
+
+        comm = SimpleNamespace(rank=rank, size=3, allgather=lambda _: counts, alltoall=alltoall)
+        numbers, count = numbered_nodes(cut, comm)
+        _, nodes = part_of_mesh(mesh, dealt.needed(mesh, rank), dealt)
+        np.testing.assert_array_equal(numbers, nodes)
+        assert count == len(mesh.points)

@@ -1,0 +1,99 @@
+"""Uniformly bisected boxes in parts: every rank makes its own, and no rank the whole."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_corot.errors import InputError
+from warp_corot.mesh.lattice import LATTICE_BITS, checked_box
+from warp_corot.mesh.uniform import halvings
+from warp_corot.mesh.uniform_part import SUBTREE_DEPTH
+
+from . import mpi
+from .cutting import Cut, cut_box
+from .parts import ForestPart, Numbers
+
+Longs = npt.NDArray[np.int64]
+
+#: Elements and grid points of the whole box are numbered in 64 bits.
+MOST_ELEMENTS = 2**58
+
+
+def box(
+    cells: tuple[int, int, int] = (1, 1, 1),
+    cell_size: float = 1.0,
+    level: int = 3,
+    *,
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    up_axis: str = "Y",
+    costs: npt.ArrayLike | None = None,
+) -> ForestPart:
+    """This rank's part of the mesh that ``TetForest.box`` makes; all ranks must call.
+
+    A rank makes only the leaves that it computes: its share along the tree's order, and those around the nodes that it
+    moves. ``SoftBody`` and ``Simulation`` take the part as they take a whole mesh, and a run has the same results, with
+    ``deterministic=True`` bit for bit. Nodes and elements of the body are those of the part; ``gather`` puts nodal
+    arrays together on rank 0 in the order of the whole mesh. In expressions, ``zmin`` and the other bounds are those of
+    the whole box.
+
+    Args:
+        cells, cell_size, origin, up_axis: As for ``TetForest.box``.
+        level: As there, but at least 3.
+        costs: The cost of an element on each rank, in any unit, [ranks]; None: the same everywhere.
+
+    Raises:
+        InputError: MPI is not there, an argument is out of its range, a part has too many elements, or there are fewer
+            groups of eight elements than ranks.
+    """
+    comm = mpi.world()
+    cells, cell_size, level, origin = checked_box(cells, cell_size, level, origin, up_axis)
+    if level < SUBTREE_DEPTH:
+        raise InputError(f"level is {level}; a box in parts needs at least {SUBTREE_DEPTH}: TetForest.box makes others")
+    count = 6 * math.prod(cells) << level
+    if count > MOST_ELEMENTS:
+        raise InputError(f"level is {level}, which gives {count} tetrahedra; there must be at most {MOST_ELEMENTS}")
+    cut = cut_box(cells, level, comm.size, comm.rank, costs)
+    nodes, node_count = numbered_nodes(cut, comm)
+    here = tuple(np.arange(n, dtype=np.int32) for n in (len(nodes), len(cut.elements)))
+    numbers = Numbers(nodes, cut.elements, cut.owner, cut.counted, node_count, *here)
+    highest = (np.array(cells) << LATTICE_BITS) * (cell_size / 2**LATTICE_BITS)
+    return ForestPart(
+        cells,
+        cell_size,
+        origin,
+        cut.lattice << (LATTICE_BITS - halvings(level)),
+        cut.ends,
+        cut.tree,
+        up_axis,
+        leaf_groups=(here[1] >> SUBTREE_DEPTH).astype(np.int32),
+        numbers=numbers,
+        element_count=count,
+        bounds=np.array([origin, np.asarray(origin) + highest]),
+    )
+
+
+def numbered_nodes(cut: Cut, comm: Any) -> tuple[Longs, int]:
+    """The numbers that a part's nodes have in the whole box, int64 [n], and how many nodes this has.
+
+    The whole box's nodes are in the order in which its leaves first name them. So those that a rank moves have numbers
+    one after another; it tells them to the ranks that hold copies. All ranks must call.
+
+    Args:
+        cut: This rank's part.
+        comm: The ranks.
+    """
+    own = np.flatnonzero(cut.owner == comm.rank)
+    counts = comm.allgather(len(own))
+    found = np.full(len(cut.owner), -1, np.int64)
+    found[own] = sum(counts[: comm.rank]) + np.arange(len(own))
+    ghosts = [np.flatnonzero((cut.owner == rank) & (found < 0)) for rank in range(comm.size)]
+    asked = comm.alltoall([cut.keys[nodes] for nodes in ghosts])
+    order = own[np.argsort(cut.keys[own])]
+    told = [found[order[np.searchsorted(cut.keys[order], keys)]] for keys in asked]
+    for nodes, numbers in zip(ghosts, comm.alltoall(told), strict=True):
+        found[nodes] = numbers
+    return found, sum(counts)

@@ -1,0 +1,126 @@
+"""The subtrees of a uniformly bisected box around given lattice points, without the mesh.
+
+A point's barycentric weights in a root are whole numbers. Bisection at the middle of the edge between the corners of
+weights a and b turns them into a - b and 2 b, in the child that keeps the first corner if a >= b, and the other way
+round. So a descent needs sums and comparisons of whole numbers alone.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+
+import numpy as np
+import numpy.typing as npt
+
+from .bisection import far_end
+
+Ints = npt.NDArray[np.int32]
+Longs = npt.NDArray[np.int64]
+
+#: Points that descend at a time.
+CHUNK = 1 << 20
+
+
+def subtrees_around(
+    points: Ints, cells: tuple[int, int, int], intervals: int, depth: int, left_out: tuple[int, int]
+) -> tuple[Longs, Longs]:
+    """All pairs of a point and a subtree that holds it, but for subtrees in one range.
+
+    Args:
+        points: Vertices of the mesh, with ``intervals`` grid intervals along a cube's edge, int32 [n, 3].
+        cells: Number of cubes along x, y, z.
+        intervals: A power of two.
+        depth: The level of the subtrees' roots; the i-th is the i-th element of that level in tree order.
+        left_out: The first of the subtrees that do not count, and the one after the last.
+
+    Returns:
+        Places in ``points``, and numbers of subtrees, int64 [m] both.
+    """
+    found = [(np.zeros(0, np.int64), np.zeros(0, np.int64))]
+    for start in range(0, len(points), CHUNK):
+        for node, root, weights in _in_roots(points[start : start + CHUNK], cells, intervals):
+            pairs = _below((node, root, weights), depth, left_out)
+            found.append((pairs[0] + start, pairs[1]))
+    nodes, subtrees = (np.concatenate(each) for each in zip(*found, strict=True))
+    return nodes, subtrees
+
+
+def first_subtree(points: Ints, cells: tuple[int, int, int], intervals: int, depth: int) -> Longs:
+    """The first subtree in tree order that holds each point, int64 [n]; arguments as for ``subtrees_around``."""
+    found = np.empty(len(points), np.int64)
+    for start in range(0, len(points), CHUNK):
+        part = points[start : start + CHUNK]
+        # The lowest cube around a point comes first.
+        cube = np.maximum((part - 1) // intervals, 0)
+        element = 6 * (cube @ np.array([cells[1] * cells[2], cells[2], 1], np.int64))
+        weights, left = np.empty((len(part), 4), np.int32), np.ones(len(part), bool)
+        for walk, axes in enumerate(itertools.permutations(range(3))):
+            own = _weights(part - intervals * cube, axes, intervals)
+            here = left & (own >= 0).all(axis=1)
+            element[here] += walk
+            weights[here] = own[here]
+            left &= ~here
+        for level in range(depth):
+            k = far_end(level % 3)
+            in_second = weights[:, 0] < weights[:, k]
+            second = _second(weights[in_second], k)
+            weights = _first(weights, k)
+            weights[in_second] = second
+            element = 2 * element + in_second
+        found[start : start + CHUNK] = element
+    return found
+
+
+def _in_roots(points: Ints, cells: tuple[int, int, int], intervals: int) -> Iterator[tuple[Longs, Longs, Ints]]:
+    """Points in all roots that hold them: their places, the roots, and their weights there."""
+    strides = np.array([cells[1] * cells[2], cells[2], 1], np.int64)
+    for below in itertools.product((0, 1), repeat=3):
+        cube = points // intervals - np.array(below, np.int32)
+        is_there = (cube >= 0).all(axis=1) & (cube < cells).all(axis=1)
+        is_there &= ((points % intervals == 0) | (np.array(below) == 0)).all(axis=1)
+        node = np.flatnonzero(is_there)
+        inside, first = points[node] - intervals * cube[node], 6 * (cube[node] @ strides)
+        for walk, axes in enumerate(itertools.permutations(range(3))):
+            weights = _weights(inside, axes, intervals)
+            held = np.flatnonzero((weights >= 0).all(axis=1))
+            yield node[held], first[held] + walk, weights[held]
+
+
+def _weights(inside: Ints, axes: tuple[int, ...], intervals: int) -> Ints:
+    """Barycentric weights, times ``intervals``, in the path tetrahedron that goes along these axes; [n, 4]."""
+    first, second, third = (inside[:, axis] for axis in axes)
+    return np.stack([intervals - first, first - second, second - third, third], axis=1).astype(np.int32)
+
+
+def _below(given: tuple[Longs, Longs, Ints], depth: int, left_out: tuple[int, int]) -> tuple[Longs, Longs]:
+    node, element, weights = given
+    for level in range(depth + 1):
+        above = depth - level
+        outside = (element << above < left_out[0]) | ((element + 1) << above > left_out[1])
+        node, element, weights = node[outside], element[outside], weights[outside]
+        if level == depth or not len(node):
+            break
+        k = far_end(level % 3)
+        first = np.flatnonzero(weights[:, 0] >= weights[:, k])
+        second = np.flatnonzero(weights[:, k] >= weights[:, 0])
+        node = np.concatenate([node[first], node[second]])
+        element = np.concatenate([2 * element[first], 2 * element[second] + 1])
+        weights = np.concatenate([_first(weights[first], k), _second(weights[second], k)])
+    return node, element
+
+
+def _first(weights: Ints, k: int) -> Ints:
+    """The weights in the first child, which keeps the corner before the edge's midpoint."""
+    made = weights.copy()
+    made[:, 0] -= weights[:, k]
+    made[:, k] *= 2
+    return made
+
+
+def _second(weights: Ints, k: int) -> Ints:
+    made = weights.copy()
+    made[:, : k - 1] = weights[:, 1:k]
+    made[:, k - 1] = weights[:, k] - weights[:, 0]
+    made[:, k] = 2 * weights[:, 0]
+    return made
