@@ -6,6 +6,7 @@ import os
 import resource
 import subprocess
 import sys
+import warnings
 
 import numpy as np
 import pytest
@@ -74,6 +75,28 @@ def test_a_resumed_run_is_the_uninterrupted_one(device, tmp_path, make, model):
             np.testing.assert_array_equal(a, b, err_msg=name)
         # Float atomics add in any order on CUDA; 150 undamped steps amplify that.
         np.testing.assert_allclose(a, b, rtol=0, atol=5e-3 * np.abs(a).max(), err_msg=name)
+
+
+@pytest.mark.parametrize(("saved", "level", "pull"), [(0.03, 4, [0, 0, 0.06]), (0.05, 5, [0.06, 0, 0])])
+def test_a_run_that_went_back_resumes(tmp_path, saved, level, pull):
+    """An end of very soft tissue is pulled fast: the run goes back to shorter steps, after the checkpoint or before and
+    after it. Each step follows from what was counted before."""
+    body = wc.SoftBody(wc.TetForest.box((1, 1, 3), 0.064, level), wc.Isotropic(300.0, 0.49, 1000.0), device="cpu")
+    body.fix("z == zmin")
+    body.prescribe("z == zmax", times=[0.0, 0.05], displacements=[[0, 0, 0], pull])
+    whole = wc.Simulation(body)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", wc.StabilityWarning)
+        whole.advance(saved)
+        whole.save(tmp_path / "state.npz")
+        resumed = wc.Simulation.load(tmp_path / "state.npz")
+        # A copy that was only loaded and saved is the same checkpoint.
+        resumed.save(tmp_path / "copy.npz")
+        resumed = wc.Simulation.load(tmp_path / "copy.npz")
+        for sim in (whole, resumed):
+            sim.advance(0.04)
+    assert (resumed.steps, resumed.dt) == (whole.steps, whole.dt)
+    np.testing.assert_array_equal(resumed.body.positions.numpy(), whole.body.positions.numpy())
 
 
 def test_several_bodies_are_kept(tmp_path):

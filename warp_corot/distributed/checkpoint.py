@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
 #: How the names of kept nodal arrays begin; other kept arrays are the same on all ranks.
 DIRECTIONS, VELOCITIES, HISTORY = "directions", "velocities.", "history."
-GUARD = ("scale", "drift", "lately", "counted")
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +73,7 @@ def save(
             bodies=bodies,
             kept=kept,
             guard=SimpleNamespace(state=guard),
+            running=parts.running,
             contact=contact,
             grasps=(),
         )
@@ -97,12 +97,11 @@ def body_of(name: str, parts: Simulation) -> int | None:
     return None
 
 
-def resume(path: str | PathLike[str], loaded: Simulation, parts: SimulationOfParts, following: list[Following]) -> None:
+def resume(loaded: Simulation, parts: SimulationOfParts, following: list[Following]) -> None:
     """Resume a simulation of parts from a saved one.
 
     Args:
-        path: The checkpoint.
-        loaded: The simulation that one process loads from it.
+        loaded: The simulation that one process loads from the checkpoint.
         parts: This rank's simulation of parts of the same bodies.
         following: Of each body.
     """
@@ -116,6 +115,6 @@ def resume(path: str | PathLike[str], loaded: Simulation, parts: SimulationOfPar
     parts.stable_dt = loaded.stable_dt
     if loaded.contact is not None:
         resume_contact(loaded.contact, parts, following[0])
-    with np.load(path, allow_pickle=False) as archive:
-        parts.guard.resume(**{name: archive[f"guard.{name}"] for name in GUARD})
+    parts.guard.resume(**loaded.guard.state)
+    parts.running.resume(**loaded.running.state)
     wp.synchronize_device(parts.device)

@@ -322,7 +322,7 @@ class Simulation:
             deterministic=loaded.deterministic,
             **touching,
         )
-        checkpoint.resume(path, loaded, made._parts, made._following)
+        checkpoint.resume(loaded, made._parts, made._following)
         return made
 
     # --- pieces ----------------------------------------------------------------------------------------------------

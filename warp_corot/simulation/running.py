@@ -80,6 +80,16 @@ class Running:
             self._shortened = False
         recorded.replay(segment)
 
+    @property
+    def state(self) -> dict[str, float]:
+        """What a run needs besides the guard's state to continue."""
+        until = self._wrong_until if self._returns else 0.0
+        return {"returns": self._returns, "wrong_until": until, "judged": self._judged}
+
+    def resume(self, *, returns: float, wrong_until: float, judged: float) -> None:
+        """Continue from what ``state`` gave."""
+        self._returns, self._wrong_until, self._judged = int(returns), float(wrong_until), int(judged)
+
     def make(self, count: int) -> None:
         """Make a number of steps, with hooks and passes."""
         sim = self._sim

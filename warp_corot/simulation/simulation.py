@@ -138,7 +138,8 @@ class Simulation(Clock, FormerNames):
         self.stepper = self.integrator.bind(self.system)
         check_constraints(self.system, self.stepper, self.integrator)
         self.recorded = RecordedSteps(self.system, self.stepper, self.guard, self.safe_step)
-        self._running = Running(self)
+        #: Makes the steps.
+        self.running = Running(self)
 
     # --- stepping --------------------------------------------------------------------------------------------------
 
@@ -184,9 +185,9 @@ class Simulation(Clock, FormerNames):
             self.pace.is_shared = True
             self.recorded.launch(Segment(1, adopts=True, publishes=True))
             return
-        self._running.step()
+        self.running.step()
         if self.device.is_cpu or self.hooks.intervals or self.remeshing.every:
-            self._running.look()
+            self.running.look()
             if self.remeshing.every:
                 self.follow_motion()
             self.hooks.call(self)
@@ -217,14 +218,14 @@ class Simulation(Clock, FormerNames):
         if not checked_number(total_time, "total_time", "s") < math.inf:
             raise InputError(f"cannot advance until {total_time} s; it must be a finite time")
         if self.safe_step is not None:
-            self._running.make_until(total_time)
+            self.running.make_until(total_time)
         else:
-            self._running.make(max(round((total_time - self.total_time) / self.dt), 0))
+            self.running.make(max(round((total_time - self.total_time) / self.dt), 0))
 
     def advance_steps(self, count: int) -> None:
         """Advance by ``count`` time steps, like ``advance``. Steps that a hook makes count."""
         refuse_tape()
-        self._running.make(checked_count(count, "count", least=0))
+        self.running.make(checked_count(count, "count", least=0))
 
     def on_step(self, callback: Callable[[Simulation], None], every: int = 1) -> None:
         """Call ``callback(sim)`` after every ``every``-th step, counted from the beginning of the simulation.

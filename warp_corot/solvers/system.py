@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
+import numpy.typing as npt
 import warp as wp
 
 from warp_corot.elasticity import ForceField
@@ -228,9 +229,9 @@ class System:
         state = self.bodies[k].state
         return state.contact_forces if state.is_touched else None
 
-    def restart_work(self) -> None:
-        """Count the work of supports and constraints from here on."""
-        self.pace.restart_work()
+    def restart_work(self, work: npt.NDArray[np.float64] | None = None) -> None:
+        """Count the work of supports and constraints from here on; that of supports on from what was counted before."""
+        self.pace.restart_work(work)
         for account in self.accounts:
             account.zero_()
 

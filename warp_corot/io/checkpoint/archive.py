@@ -39,8 +39,11 @@ Remesh = OnlineRemesh | Sequence[OnlineRemesh | None] | None
 FORMAT = "warp-corot checkpoint"
 #: 2: worlds, deterministic runs. 3: anisotropic materials, activation, forests made from domains. 4: meshes that
 #: change, steps of changing length. 5: a step that follows the state, starts of worlds in seconds. 6: the step at the
-#: last check. 7: contact. All are read.
-VERSION = 7
+#: last check. 7: contact. 8: how a run that went back continues. All are read.
+VERSION = 8
+
+#: What the guard continues from.
+GUARDED = ("scale", "drift", "lately", "counted", "work")
 
 MATERIALS = {kind.__name__: kind for kind in (Isotropic, TransverselyIsotropic, Orthotropic, FibreReinforced)}
 
@@ -71,6 +74,7 @@ def save_checkpoint(sim: Simulation, path: str | PathLike[str]) -> None:
         "worlds": sim.worlds,
         "bodies": [],
         "kept": sorted(sim.kept),
+        "running": sim.running.state,
     }
     for name, array in sim.kept.items():
         arrays[f"kept.{name}"] = array.numpy()
@@ -203,6 +207,9 @@ def _upgrade(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
     if header["version"] < 7:
         header["contact"] = None
         arrays["guard.counted"] = np.vstack([arrays["guard.counted"], np.zeros((1, header["worlds"]))])
+    if header["version"] < 8:
+        header["running"] = {"returns": 0, "wrong_until": 0.0, "judged": 0}
+        arrays["guard.work"] = np.zeros(2)
 
 
 def _upgrade_steps(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
@@ -255,7 +262,8 @@ def _rebuilt_simulation(
     for name in header["kept"]:
         sim.kept[name].assign(arrays[f"kept.{name}"])
     unpack_contact(sim.contact, header["contact"], arrays)
-    sim.guard.resume(**{name: arrays[f"guard.{name}"] for name in ("scale", "drift", "lately", "counted")})
+    sim.guard.resume(**{name: arrays[f"guard.{name}"] for name in GUARDED})
+    sim.running.resume(**header["running"])
     return sim
 
 

@@ -43,6 +43,7 @@ class Energies:
         loads: Work of loads since the last good state [J].
         supports: Work of all moving supports, and of the world's constraints, since the beginning [J].
         supports_absolute: The sum of its absolute values [J].
+        worked, worked_absolute: The part of the constraints in these [J].
         reach: The largest displacement [m].
     """
 
@@ -54,6 +55,8 @@ class Energies:
     loads: Floats
     supports: Floats
     supports_absolute: Floats
+    worked: Floats
+    worked_absolute: Floats
     reach: Floats
 
 
@@ -167,7 +170,8 @@ class Balance:
         ranks = self._ranks
         total = ranks.totals(total, None if self._addends is None else self._addends.numpy())
         kinetic, ahead, elastic = (total[:, int(c)] for c in (kernels.KINETIC, kernels.AHEAD, kernels.ELASTIC))
-        done = numbers[int(kernels.WORK)] + total[:, int(kernels.SUPPORTS)].sum() + total[:, int(kernels.WORKED)]
+        worked, worked_absolute = total[:, int(kernels.WORKED)], total[:, int(kernels.WORKED_ABSOLUTE)]
+        done = numbers[int(kernels.WORK)] + total[:, int(kernels.SUPPORTS)].sum() + worked
         energies = Energies(
             kinetic=kinetic,
             gravitational=total[:, int(kernels.GRAVITATIONAL)],
@@ -176,7 +180,9 @@ class Balance:
             untimely=total[:, int(kernels.UNTIMELY)],
             loads=total[:, int(kernels.LOADS)],
             supports=done,
-            supports_absolute=numbers[int(kernels.WORK_ABSOLUTE)] + total[:, int(kernels.WORKED_ABSOLUTE)],
+            supports_absolute=numbers[int(kernels.WORK_ABSOLUTE)] + worked_absolute,
+            worked=worked,
+            worked_absolute=worked_absolute,
             reach=total[:, int(kernels.REACH)],
         )
         bad_step = ranks.least(min(int(numbers[int(kernels.BAD_STEP)]), NEVER))

@@ -100,6 +100,7 @@ class Guard:
         self._height, self._loads_since = np.zeros(self.worlds), np.zeros(self.worlds)
         self._absolute_base = np.zeros(self.worlds)
         self._counted: Floats | None = None
+        self._work = np.zeros(2)
         self.gain = self.surplus = self.untimely = np.inf
         self._floor: Floats | None = None
 
@@ -148,7 +149,7 @@ class Guard:
             self.prepare()
             given = self._counted is None
             self._absolute_base = np.zeros(self.worlds)
-            self.system.restart_work()
+            self.system.restart_work(None if self._counted is None else self._work)
             self._copies.take()
             self._begin_from(self._find(whole=True))
         self._good = self.system.pace.known
@@ -217,25 +218,27 @@ class Guard:
     @property
     def state(self) -> dict[str, Floats]:
         """What a run needs besides the present state to continue."""
-        counted = np.full((8, self.worlds), np.nan)
+        counted = np.full((8, self.worlds), np.nan) if self._counted is None else self._counted
         before = self._reference
         if before is not None and not self._has_changed():
             now = self._find(whole=False)
-            supports = before.supports - now.supports
+            # The accounts of constraints begin again at zero, the work of supports does not.
+            supports = before.supports - now.worked
             counted[:6] = before.exact, before.gravitational, supports, self._loads_since, self._height, self._loads
-            counted[6:] = before.untimely, now.supports_absolute - self._absolute_base
+            counted[6:] = before.untimely, now.worked_absolute - self._absolute_base
         times = np.broadcast_to([[self._counted_at], [self._window_at]], (2, self.worlds))
         lately = np.array([self._lately, self._lately_before, *times])
-        return {"scale": self._scale, "drift": self._drift, "lately": lately, "counted": counted}
+        work = np.array(self.system.pace.known.work) if self._counted is None else self._work
+        return {"scale": self._scale, "drift": self._drift, "lately": lately, "counted": counted, "work": work}
 
-    def resume(self, *, scale: Floats, drift: Floats, lately: Floats, counted: Floats) -> None:
+    def resume(self, *, scale: Floats, drift: Floats, lately: Floats, counted: Floats, work: Floats) -> None:
         """Continue from what ``state`` gave."""
         self._scale, self._drift = np.array(scale, float), np.array(drift, float)
         self._lately, self._lately_before = np.array(lately[0], float), np.array(lately[1], float)
         self._counted_at, self._window_at = float(lately[2, 0]), float(lately[3, 0])
         self.system.pace.forget()
         if np.isfinite(counted).all():
-            self._counted = np.array(counted, float)
+            self._counted, self._work = np.array(counted, float), np.array(work, float)
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
@@ -248,9 +251,9 @@ class Guard:
         else:
             self._loads, self._height = np.zeros(self.worlds), found.gravitational
             self._loads_since = np.zeros(self.worlds)
-        # A user may correct a bad world later.
-        known = np.where(np.isfinite(found.exact), np.abs(found.exact), 0.0)
-        self._scale = np.maximum(self._scale, known)
+            # A user may correct a bad world later.
+            known = np.where(np.isfinite(found.exact), np.abs(found.exact), 0.0)
+            self._scale = np.maximum(self._scale, known)
         self._counted = None
         self._reference = found
 
@@ -328,27 +331,32 @@ class Guard:
     def _from_nowhere(self, found: Energies, whole: bool, leave: float, lenient: bool) -> Fault | None:
         if not self._balance.is_closed:
             return None
-        if self._floor is None:
-            self._floor = self._balance.rounding()
+        floor = self._rounding()
         given, scale, _ = self._given(found)
         # Elastic energies are never negative.
         gain = found.kinetic - given
-        bad = ~(gain <= (MOTION if whole else LITTLE) * self._leave * scale + self._floor)
+        bad = ~(gain <= (MOTION if whole else LITTLE) * self._leave * scale + floor)
         if whole:
             drift = np.maximum(self._drift + found.exact - given, 0.0)
             gain = np.maximum(np.maximum(gain, found.exact - given), drift)
-            bad |= ~(found.exact - given <= GAIN * leave * scale + self._floor)
+            bad |= ~(found.exact - given <= GAIN * leave * scale + floor)
             if leave < self._leave:
-                bad |= ~(found.untimely <= RINGING * self._leave * scale + self._floor)
+                bad |= ~(found.untimely <= RINGING * self._leave * scale + floor)
             if not lenient:
-                bad |= ~(drift <= DRIFT * self._leave * scale + 10.0 * self._floor)
+                bad |= ~(drift <= DRIFT * self._leave * scale + 10.0 * floor)
         if not bad.any():
             return None
         worlds = np.flatnonzero(bad)
         worst = worlds[np.argmax(gain[worlds])]
         most = f"gravity, loads and supports have moved {scale[worst]:.3g} J at most"
-        is_slight = bool((gain[worlds] <= GAIN * self._leave * scale[worlds] + self._floor).all())
+        is_slight = bool((gain[worlds] <= GAIN * self._leave * scale[worlds] + floor).all())
         return Fault(f"{gain[worst]:.3g} J of energy came from nowhere ({most})", worlds, is_slight=is_slight)
+
+    def _rounding(self) -> Floats:
+        """Energies that rounding cannot tell from zero, for each world [J]; found once."""
+        if self._floor is None:
+            self._floor = self._balance.rounding()
+        return self._floor
 
     def _count(self, found: Energies, *, whole: bool) -> None:
         """Continue from a good state, and from its total energies if these count."""
@@ -357,7 +365,8 @@ class Guard:
         assert before is not None
         if not whole:
             return
-        if self._balance.is_closed and self._floor is not None:
+        if self._balance.is_closed:
+            floor = self._rounding()
             now = self.system.pace.time
             left = math.exp(min(self._counted_at - now, 0.0) / MEMORY)
             self._counted_at = now
@@ -366,15 +375,15 @@ class Guard:
             # may come back.
             more = found.exact + found.untimely - given - before.untimely
             self._lately = np.where(self._lately > 0.0, left, 1.0) * self._lately + more
-            known = 1.0 / np.maximum(self._scale, 1e-300) / self._leave
-            self.gain = float(np.max(np.maximum(found.exact - given - self._floor, 0.0) * known))
-            shares = np.maximum(self._lately - 10.0 * self._floor, 0.0) * known
+            known = 1.0 / np.maximum(self._scale, 1e-200) / self._leave
+            self.gain = float(np.max(np.maximum(found.exact - given - floor, 0.0) * known))
+            shares = np.maximum(self._lately - 10.0 * floor, 0.0) * known
             most = int(np.argmax(shares))
             self.surplus, self.trend = float(shares[most]), None
             if not 0.0 <= now - self._window_at < WINDOW:
                 self.trend = float((self._lately - self._lately_before)[most] * known[most])
                 self._window_at, self._lately_before = now, self._lately
-            self.untimely = float(np.max(np.maximum(found.untimely - self._floor, 0.0) * known))
+            self.untimely = float(np.max(np.maximum(found.untimely - floor, 0.0) * known))
         else:
             self.gain = self.surplus = self.untimely = 0.0
             self.trend = None

@@ -143,11 +143,12 @@ class Pace:
         wp.launch(kernels.set_time, dim=1, inputs=[wp.float64(0.0), self.arrays], device=self.device)
         self.forget()
 
-    def restart_work(self) -> None:
-        """Count the work of supports from here on."""
-        self.support_work.zero_()
+    def restart_work(self, work: npt.NDArray[np.float64] | None = None) -> None:
+        """Count the work of supports from here on, or on from what was counted before."""
+        done = np.zeros(2) if work is None else work
+        self.support_work.assign(done)
         if self._known is not None:
-            self._known = replace(self._known, work=(0.0, 0.0))
+            self._known = replace(self._known, work=(float(done[0]), float(done[1])))
 
     def advance(self, steps: int) -> None:
         """Launch the advance of the clock by a number of steps."""
