@@ -21,6 +21,7 @@ from warp_corot.solvers.ranks import Floats, Ranks
 
 from .cards import CardExchange, add_up, take_most
 from .directions import normal_numbers
+from .graphs import keep_priorities
 from .halo import Halo, HostExchange
 from .parts import ForestPart, Part
 from .settled import settled_sums
@@ -85,6 +86,10 @@ class MpiRanks(Ranks):
         return wp.array(np.flatnonzero(~own).astype(np.int32), dtype=wp.int32, device=self.device)
 
     # --- launches --------------------------------------------------------------------------------------------------
+
+    def take_graph(self, graph: wp.Graph) -> None:
+        if self.device.is_cuda and self.comm.size > 1:
+            keep_priorities(graph)
 
     def complete(self, k: int, vectors: wp.array) -> None:
         self._exchanges[k].launch(vectors)

@@ -37,6 +37,9 @@ class Ranks:
 
     # --- launches --------------------------------------------------------------------------------------------------
 
+    def take_graph(self, graph: wp.Graph) -> None:
+        """Prepare a graph of steps that was just recorded."""
+
     def complete(self, k: int, vectors: wp.array) -> None:
         """Launch that ghosts of the k-th body get their values, in a nodal array vec4."""
 

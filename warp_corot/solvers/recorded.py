@@ -202,6 +202,7 @@ class RecordedSteps:
                 self._graphs.clear()
             with wp.ScopedCapture(device=self._pace.device) as capture:
                 self.launch(segment)
+            self._system.ranks.take_graph(capture.graph)
             self._graphs[segment] = capture.graph
         wp.capture_launch(self._graphs[segment])
         self._pace.forget()
