@@ -1,8 +1,11 @@
 """Inside and outside of surfaces that cross, overlap or coincide, against winding numbers in float64."""
 
+from pathlib import Path
+
 import numpy as np
 import trimesh
 import warp as wp
+import warp.examples
 
 import warp_corot as wc
 from warp_corot.domain.surface import lines_through, surface_mesh, windings_of
@@ -111,3 +114,12 @@ def test_segments_leave_the_body_where_it_ends(device):
     step = 1e-3 * along[steep] / np.linalg.norm(along[steep], axis=1, keepdims=True)
     signs = np.stack([domain.phi(x[steep] - step) < 0.0, domain.phi(x[steep] + step) > 0.0])
     assert signs.mean() > 0.98
+
+
+def test_a_needle_turned_over_by_rounding_leaves_signs_right(device):
+    """Warp's rocks have a triangle 60 mm long and 3 um high. Its normal is noise, and made signs wrong 0.9 m away."""
+    path = Path(wp.examples.get_asset_directory()) / "rocks.usd"
+    domain = wc.Domain.from_surface(path, device=device)
+    below = np.array([-5.27155, 1.67255, 10.06171])
+    points = below + np.random.default_rng(0).normal(scale=1e-3, size=(200, 3))
+    assert np.allclose(domain.phi(points), -0.9031, atol=0.01)

@@ -20,6 +20,8 @@ ASIDE, LEAST_ASIDE = 1.0e-3, 2.0e-6
 MESSY = 0.1
 #: Two triangles whose unit normals add up to less nearly coincide.
 FOLDED = 0.05
+#: A triangle whose height is below this share of its longest edge, or ``LEAST_ASIDE``, has an uncertain normal.
+NEEDLE = 1.0e-4
 #: Winding numbers are computed for at most this many patches; more are not worth the time.
 MOST_PATCHES = 20_000
 #: Normals of two triangles that differ by more than this make a sharp edge [°].
@@ -56,7 +58,8 @@ def sides_of(points: np.ndarray, triangles: np.ndarray, mesh: wp.Mesh, lines: Li
     """Find what is on the two sides of each triangle.
 
     If the triangles of a patch meet others only along common edges, all of them have the same sides, and two winding
-    numbers decide. Triangles that cross others are unsure, and so are those around edges that are not shared by two.
+    numbers decide. Triangles that cross others are unsure, and so are those around edges that are not shared by two
+    and around needles.
     Finally, signs are compared at random points near the surface; if any is wrong, or if the surface crosses itself in
     many places, no triangle is sure.
 
@@ -101,6 +104,7 @@ def sides_of(points: np.ndarray, triangles: np.ndarray, mesh: wp.Mesh, lines: Li
     doubtful[touched[touched >= 0]] = True
     folded = np.linalg.norm(normal[a] + normal[b], axis=1) < FOLDED
     doubtful[a[folded]] = doubtful[b[folded]] = True
+    doubtful |= _needles(corners, double_area, LEAST_ASIDE * float(np.ptp(points, axis=0).max()))
     doubtful |= np.isin(triangles, _pinched(triangles, one, other)).any(axis=1)
     # And their neighbours, because in float32 a crossing does not end at a triangle's edge.
     doubtful |= np.isin(triangles, triangles[doubtful]).any(axis=1)
@@ -126,6 +130,18 @@ def sides_of(points: np.ndarray, triangles: np.ndarray, mesh: wp.Mesh, lines: Li
     noise = 1e-6 * float(np.ptp(points, axis=0).max())
     differ = ((quick < 0.0) != (slow < 0.0)) & (np.abs(slow) >= noise)
     return with_sides(unknown if differ.any() else known)
+
+
+def _needles(corners: np.ndarray, double_area: np.ndarray, least: float) -> np.ndarray:
+    """Triangles so thin that rounding may turn them over, bool [T].
+
+    Args:
+        corners: [T, 3, 3] [m].
+        double_area: Twice their areas [T] [m^2].
+        least: Height below which a triangle counts as one [m].
+    """
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    return double_area < np.maximum(least, NEEDLE * longest) * longest
 
 
 def _corner_normals(corners: np.ndarray, triangles: np.ndarray, normal: np.ndarray, count: int) -> np.ndarray:

@@ -176,9 +176,11 @@ class Growing:
             error = max(error * min(max(share, STEEPEST), FLATTEST), least)
             self.lower(error)
 
-    def run_finer(self, share: float) -> None:
-        """Lower the surface error once more, for the surface's sake, to a share of itself."""
+    def run_finer(self, share: float, thin_share: float) -> None:
+        """Lower the surface error once more, for the surface's sake, to a share of itself; what thin parts may be off
+        by to another."""
         error, least = float(self.judge.tolerances.max()), float(self.judge.closest[0])
+        self.judge.thin_tolerance = thin_share * error
         if error > least and share < 1.0:
             self.lower(max(share * error, least))
 

@@ -28,16 +28,18 @@ NEAR, NEAR_ENOUGH = 0.985, 0.905
 MOST_CUBES = 4
 #: Along flat sides nothing is bisected; more sizes are tried then, which takes little time.
 MOST_CUBES_OF_BOXES = 7
-#: With between so many elements a size of cubes is given up early that comes to between these shares of them.
-SEEN, MISSED = (5_000, 300_000), (0.6, 0.85)
+#: Where many elements need bisection alike, so that there are meshes of too few and of too many, the farther ones along
+#: the longest side need it more, by up to this share; a mesh with less than that share of the elements asked for gets
+#: other cubes first.
+FARTHER_FIRST, FEW = 0.05, 0.6
 #: What an element counts as being off by between such pieces, as a share of its edge.
 GAP_NEED = 0.5
 #: The thinner of two parts is bisected first: what it needs is larger by up to this share, which is what elements lose
 #: of their length in a bisection; thicknesses are told apart in so many steps, so that what is equally thin remains so.
 THINNEST_FIRST, THIN_STEPS = 0.26, 16
 #: The surface that is drawn is this much closer to the body's than the mesh's threshold, for which the forest must be
-#: finer still; of many elements it is the mesh's own.
-FINER_SURFACE, FINER_FOREST = 0.3, 0.2
+#: finer still; of many elements it is the mesh's own. Thin parts have no finer elements than the mesh may need.
+FINER_SURFACE, FINER_FOREST, FINER_THIN = 0.3, 0.2, 0.4
 #: Cubes are as large as gives this share of the elements when none is bisected: about six in a cube inside, four at the
 #: surface. Of more elements the surface needs fewer, so that the share goes up, between two numbers of elements.
 UNBISECTED, UNBISECTED_OF_MANY = 1.0 / 6.0, 0.5
@@ -87,11 +89,10 @@ class Meshes:
         resolved: The forest.
         count: Elements of the present mesh that hold something worth counting.
         child: The present mesh, see `Coarsening`.
-        looked_closely: Whether what elements hold is known closely.
     """
 
-    def __init__(self, resolved: Resolved, needs: np.ndarray, least: float, sliver: float, *, looked_closely: bool):
-        self.resolved, self.looked_closely = resolved, looked_closely
+    def __init__(self, resolved: Resolved, needs: np.ndarray, least: float, sliver: float):
+        self.resolved = resolved
         self._needs, self._least, self._sliver = needs, least, sliver
         self._coarsening = Coarsening(resolved, needs, sliver)
         self.count, self.threshold = 0, 0.0
@@ -103,6 +104,18 @@ class Meshes:
         self.count, self.child = self._coarsening.mesh(self.threshold)
         return self.count
 
+    def told_apart(self, target: int) -> Meshes:
+        """The meshes in the same forest if no two elements need bisection alike: more so the farther along the body's
+        longest side; the present one is the mesh of at most so many elements."""
+        grown = self.resolved.grown
+        axis = int(np.argmax(grown.cells))
+        along = grown.lattice[grown.tree.tets, axis].mean(axis=1)
+        needs = self._needs * (1.0 + FARTHER_FIRST * along / along.max())
+        needs = self.resolved.largest(needs).astype(np.float32)
+        found = Meshes(self.resolved, needs, self._least, self._sliver)
+        found.choose(target)
+        return found
+
     @property
     def has_more(self) -> bool:
         """Whether there are meshes of more elements than the present one."""
@@ -110,8 +123,11 @@ class Meshes:
 
     def surface(self, threshold: float) -> np.ndarray:
         """A mesh of the same forest, finer than that of a threshold, whose surface is to be drawn; as `child`."""
-        resolved = self.resolved
-        needs = np.maximum(np.where(resolved.held > 0.0, resolved.grown.need, 0.0), self._needs)
+        resolved, need = self.resolved, self.resolved.grown.need
+        # Thin parts that are flat need no finer surface.
+        curved = (resolved.held > 0.0) & ~np.isclose(need, THIN_NEED * resolved.lengths, rtol=1.0e-5)
+        needs = resolved.largest(np.where(curved, need, 0.0)).astype(np.float32)
+        needs = np.maximum(needs, np.where(self._needs > threshold, self._needs, 0.0))
         return Coarsening(resolved, needs, self._sliver).mesh(FINER_SURFACE * threshold)[1]
 
 
@@ -123,12 +139,14 @@ def chosen_meshes(domain: Domain, budget: Budget, sliver: float, device: wp.Devi
     best: Meshes | None = None
     largest = 1.001 * float(np.ptp(domain.bounds, axis=0).max())
     suits = min(predicted_cell_size(domain, budget.target), largest)
-    size, given_up = budget.cell_size or suits, False
+    size = budget.cell_size or suits
     for trial in range(MOST_CUBES_OF_BOXES):
         last = trial >= MOST_CUBES - 1
-        meshes = _of_cubes(domain, budget, size, suits, sliver, device, first=trial == 0, spread=last)
-        count, given_up = meshes.count, given_up or not meshes.looked_closely
-        if count <= budget.target and meshes.looked_closely and (best is None or count > best.count):
+        meshes = _of_cubes(domain, budget, size, suits, sliver, device)
+        if meshes.has_more and (last or FEW * budget.target <= meshes.count < NEAR_ENOUGH * budget.target):
+            meshes = meshes.told_apart(int(NEAR * budget.target))
+        count = meshes.count
+        if count <= budget.target and (best is None or count > best.count):
             best = meshes
         if budget.cell_size or NEAR_ENOUGH * budget.target <= count <= budget.target:
             break
@@ -141,8 +159,6 @@ def chosen_meshes(domain: Domain, budget: Budget, sliver: float, device: wp.Devi
         factor = (ratio / AMPLE) ** (1.0 / SLOW) if exhausted else ratio ** (1.0 / 2.5)
         # Cubes larger than the body would be the whole of it.
         size = min(size * float(np.clip(factor, 0.5, 2.0)), largest)
-    if best is None and given_up:
-        best = _of_cubes(domain, budget, suits, suits, sliver, device)
     return best
 
 
@@ -172,16 +188,9 @@ def _of_cubes(
     suits: float,
     sliver: float,
     device: wp.Device,
-    *,
-    first: bool = False,
-    spread: bool = False,
 ) -> Meshes:
     """The meshes of one size of cubes, and of them the one of as many elements as there may be; where cubes are larger
-    than what suits the number, of so many levels more.
-
-    Thin parts are bisected all at once, and then no mesh may have nearly so many elements. With the ``first`` size that
-    is seen before the body is looked at closely.
-    """
+    than what suits the number, of so many levels more."""
     target, wishes = budget.target, budget.wishes
     more = max(math.ceil(3.0 * math.log2(size / suits) - 0.5), 0)
     most = more + MAX_LEVEL + (target > MANY) if budget.max_level is None else budget.max_level
@@ -201,23 +210,15 @@ def _of_cubes(
     growing = Growing(domain, size, looking, device)
     growing.run_until(Enough(target, FIRST_ERROR * min(size, suits)))
 
-    def meshes(asked: Domain | None, spread: bool) -> Meshes:
-        resolved = Resolved(growing.grown(), size, asked)
-        needs = needs_of(resolved, domain, budget.min_layers, most, deepest)
-        needs = _told_apart(resolved, needs) if spread else needs
-        found = Meshes(resolved, needs, budget.surface_error, sliver, looked_closely=asked is not None)
-        found.choose(int(NEAR * target))
-        return found
-
-    if first and not budget.cell_size and SEEN[0] <= target <= SEEN[1]:
-        found = meshes(None, False)
-        if found.has_more and MISSED[0] * target <= found.count <= MISSED[1] * target:
-            return found
-    growing.run_finer(FINER_FOREST if target <= MANY else 1.0)
+    growing.run_finer(FINER_FOREST if target <= MANY else 1.0, FINER_THIN)
     room = (CLOSE_ELEMENTS if target <= MANY else CLOSE_ELEMENTS_OF_MANY) * target + 40_000
     if growing.growth.element_count + LEAST_CLOSER < room:
         growing.look_closer(Closer(CLOSER_LEVELS, CLOSER_ERROR, room))
-    return meshes(domain, spread)
+    resolved = Resolved(growing.grown(), size, domain)
+    needs = needs_of(resolved, domain, budget.min_layers, most, deepest)
+    found = Meshes(resolved, needs, budget.surface_error, sliver)
+    found.choose(int(NEAR * target))
+    return found
 
 
 def needs_of(resolved: Resolved, domain: Domain, layers: float, most: int, deepest: int) -> np.ndarray:
@@ -244,11 +245,3 @@ def needs_of(resolved: Resolved, domain: Domain, layers: float, most: int, deepe
         close = (GAP_ELEMENTS * length > gaps) & (gaps > GAP_ELEMENTS * finest) & (level < deepest)
         needs[close] = np.maximum(needs[close], GAP_NEED * length[close])
     return resolved.largest(np.where(resolved.held > 0.0, needs, 0.0)).astype(np.float32)
-
-
-def _told_apart(resolved: Resolved, needs: np.ndarray) -> np.ndarray:
-    """Needs that are never the same: the more so the farther along the body's longest side."""
-    grown = resolved.grown
-    axis = int(np.argmax(grown.cells))
-    along = grown.lattice[grown.tree.tets, axis].mean(axis=1)
-    return resolved.largest(needs * (1.0 + 0.05 * along / along.max())).astype(np.float32)

@@ -74,6 +74,7 @@ class Judge:
         max_level: Below which nothing is bisected.
         limited: Whether the number of elements is limited, so that only what is off by more than the tolerances counts.
         closer: Whether the body is looked at more closely than the mesh is to follow it.
+        thin_tolerance: Thin parts need no more bisection once their elements are off by less than this [m].
     """
 
     def __init__(self, domain: Domain, growth: Growth, cells: Any, origin: Any, cell_size: float, wishes: Wishes):
@@ -96,6 +97,7 @@ class Judge:
         self.lengths = h
         self.max_level = wishes.max_level
         self.limited = self.closer = False
+        self.thin_tolerance = 0.0
 
     def evaluate(self) -> None:
         """Values at the nodes that are new."""
@@ -226,8 +228,10 @@ class Judge:
         length = self.lengths[0] * 0.5 ** (level[chosen] / 3.0)
         reach = FARTHER * wishes.layers * float(length.max())
         thin = known & (wishes.layers * length > domain.thickness(x, inward, reach))
+        thin &= THIN_NEED * length > self.thin_tolerance
         need = np.where(thin, THIN_NEED * length, 0.0)
-        wanted = THIN_NEED * length > (self.tolerances[level[chosen]] if self.limited else 0.0)
+        limits = np.maximum(self.tolerances[level[chosen]], self.thin_tolerance) if self.limited else 0.0
+        wanted = THIN_NEED * length > limits
         split = thin & wanted
         if domain.has_pieces:
             # Whether it is a gap between pieces is known later; the need of it is counted then.
