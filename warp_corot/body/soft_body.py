@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from os import PathLike
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,7 @@ from warp_corot.discretization.nodal import vec3_view
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_count, checked_numbers, shown
 from warp_corot.inputs.device import checked_device
+from warp_corot.inputs.turns import TURN, in_turn
 from warp_corot.kernels.stepping.integrate import RESET_NODES
 from warp_corot.materials.isotropic import Material
 from warp_corot.mesh import TetForest
@@ -69,24 +70,31 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
     """
 
     def __init__(self, mesh: Mesh, material: Material, *, worlds: int = 1, device: str | wp.Device | None = None):
-        _check_made_of(mesh, material)
-        self.worlds = checked_count(worlds, "worlds", least=1)
-        self.device = checked_device(device)
-        self.discretization: Discretization = self._discretized(mesh, material)
-        self.sizes = self.discretization.sizes
-        #: The remeshing that changes the mesh, or None.
-        self.changing: MeshChanges | None = None
-        self.state = State(self.sizes, self.rest_positions, self.device)
-        mass = wp.array(self.masses, dtype=wp.float32, device=self.device)
-        self.conditions = Conditions(self.discretization, self.state, mass)
-        self._views = Views()
-        #: Points that follow the body.
-        self.bindings: list[FollowingBinding] = []
+        with TURN:
+            _check_made_of(mesh, material)
+            self.worlds = checked_count(worlds, "worlds", least=1)
+            self.device = checked_device(device)
+            self.discretization: Discretization = self._discretized(mesh, material)
+            self.sizes = self.discretization.sizes
+            #: The remeshing that changes the mesh, or None.
+            self.changing: MeshChanges | None = None
+            self.state = State(self.sizes, self.rest_positions, self.device)
+            mass = wp.array(self.masses, dtype=wp.float32, device=self.device)
+            self.conditions = Conditions(self.discretization, self.state, mass)
+            self._views = Views()
+            #: Points that follow the body.
+            self.bindings: list[FollowingBinding] = []
 
     # --- parts -----------------------------------------------------------------------------------------------------
 
     def _discretized(self, mesh: Mesh, material: Material) -> Discretization:
         return FixedMesh(mesh, material, self.worlds, self.device)
+
+    def __reduce_ex__(self, protocol: object) -> NoReturn:
+        raise InputError(
+            "a SoftBody lives on a device and can be neither copied nor pickled; "
+            "SoftBody(body.mesh, body.material) makes another at rest"
+        )
 
     @property
     def mesh(self) -> Mesh:
@@ -152,17 +160,20 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
         return self.nodal_view(self.state.positions)
 
     @positions.setter
+    @in_turn
     def positions(self, values: npt.ArrayLike) -> None:
         # In float64 and through displacements, so that no digit is lost.
         self.state.set_displacements(self._checked_vectors(values, "positions") - self.rest_positions)
 
     @property
+    @in_turn
     def displacements(self) -> wp.array:
         """Nodal displacements from rest [m], vec3 [worlds * N]: a copy; set the property to change them."""
         self.state.adopt_positions()
         return wp.clone(vec3_view(self.state.displacements[: self.node_count]))
 
     @displacements.setter
+    @in_turn
     def displacements(self, values: npt.ArrayLike) -> None:
         self.state.set_displacements(self._checked_vectors(values, "displacements"))
 
@@ -172,10 +183,12 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
         return self.nodal_view(self.state.velocities)
 
     @velocities.setter
+    @in_turn
     def velocities(self, values: npt.ArrayLike) -> None:
         self.state.set_velocities(self._checked_vectors(values, "velocities"))
 
     @property
+    @in_turn
     def reactions(self) -> wp.array:
         """Forces of the supports on fixed and prescribed nodes in the last step [N], vec3 [worlds * N]; zero elsewhere.
 
@@ -249,6 +262,7 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
         self.bindings.append(binding)
         return binding
 
+    @in_turn
     def set_initial_state(self) -> None:
         """Let ``Simulation.reset`` restore the current state; by default it restores rest."""
         if self.changing is not None:

@@ -16,6 +16,7 @@ from warp_corot.discretization.nodal import padded
 from warp_corot.elasticity import Corotated, ForceField, Model
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.checks import checked_count, refuse_tape, shown
+from warp_corot.inputs.turns import in_turn
 from warp_corot.simulation.parts import checked_gravity, checked_models
 from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import QuasiStatic, SymplecticEuler
@@ -69,6 +70,7 @@ class RunGradient:
         return getattr(self, name)
 
 
+@in_turn
 def run_gradient(
     body: SoftBody,
     objective: Objective,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,6 +14,7 @@ from warp_corot.body.soft_body import SoftBody
 from warp_corot.elasticity import Model
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import shown
+from warp_corot.inputs.turns import in_turn
 from warp_corot.simulation.static import StaticReport
 
 from . import parameters
@@ -63,6 +64,7 @@ class StaticGradient:
         return getattr(self, name)
 
 
+@in_turn
 def static_gradient(
     body: SoftBody,
     objective: Objective,
@@ -130,10 +132,11 @@ def checked_names(wrt: str | Sequence[str]) -> tuple[str, ...]:
     Raises:
         InputError: One is none.
     """
-    names = (wrt,) if isinstance(wrt, str) else tuple(wrt)
+    given = (wrt,) if isinstance(wrt, str) or not isinstance(wrt, Iterable) else tuple(wrt)
+    names = tuple(each for place, each in enumerate(given) if each not in given[:place])
     wanted = ", ".join(map(repr, parameters.NEEDS))
     for name in names:
-        if name not in parameters.NEEDS:
+        if not isinstance(name, str) or name not in parameters.NEEDS:
             raise InputError(f"wrt has {shown(name)}; it must be one or several of {wanted}")
     if not names:
         raise InputError(f"wrt is empty; it must be one or several of {wanted}")

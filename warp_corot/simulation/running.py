@@ -15,6 +15,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from warp_corot.errors import StabilityWarning, UnstableError, depth_of_user
+from warp_corot.inputs.turns import TURN
 from warp_corot.kernels.stepping.pace import GROWTH
 from warp_corot.solvers.guarding.energy_control import EnergyControl
 from warp_corot.solvers.guarding.guard import Fault
@@ -134,6 +135,19 @@ class Running:
     def _run(self, most: int, end: float | None) -> bool:
         """Make steps until something is due, and do that; returns whether the end is reached."""
         sim = self._sim
+        with TURN:
+            reached, now = self._run_alone(most, end)
+        TURN.pass_on()
+        if reached is None:
+            return False
+        if any(now % every == 0 for every in sim.hooks.intervals) and sim.total_steps > self._steps_called:
+            self._steps_called = sim.total_steps
+            sim.hooks.call(sim)
+        return reached
+
+    def _run_alone(self, most: int, end: float | None) -> tuple[bool | None, int]:
+        """``_run`` without hooks: whether the end is reached, None if the state went wrong; and the steps done."""
+        sim = self._sim
         if not sim.guard.has_begun and sim.contact is not None:
             sim.contact.check_start()
         if sim.guard.begin() and sim.safe_step is not None:
@@ -155,15 +169,12 @@ class Running:
         if whole or not passed:
             self._energies.choose_intervals(checked=passed)
         if not passed:
-            return False
+            return None, now
         reached = end is not None and sim.time >= end
         if sim.remeshing.is_due(now):
             sim.follow_motion()
             sim.guard.forget()
-        if any(now % every == 0 for every in sim.hooks.intervals) and sim.total_steps > self._steps_called:
-            self._steps_called = sim.total_steps
-            sim.hooks.call(sim)
-        return reached
+        return reached, now
 
     def _is_to_be_judged(self, steps: int) -> bool:
         """Whether to check elastic energies after these steps, only to see whether the state is good."""

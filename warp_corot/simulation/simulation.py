@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from os import PathLike
+from typing import NoReturn
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +22,7 @@ from warp_corot.discretization.nodal import vec3_view
 from warp_corot.elasticity import Corotated, Model
 from warp_corot.errors import InputError, StabilityWarning, depth_of_user
 from warp_corot.inputs.checks import checked_count, checked_flag, checked_number, refuse_tape
+from warp_corot.inputs.turns import TURN, in_turn
 from warp_corot.remesh.online import OnlineRemesh
 from warp_corot.remesh.remeshing import Remeshing
 from warp_corot.solvers import Integrator, SymplecticEuler, largest_frequency
@@ -102,46 +104,53 @@ class Simulation(Clock, FormerNames):
         obstacles: Obstacle | Sequence[Obstacle] = (),
         contact: Contact | None = None,
     ):
-        self.bodies = checked_bodies(bodies, self.ranks)
-        self.device, self.worlds = self.bodies[0].device, self.bodies[0].worlds
-        self.deterministic = checked_flag(deterministic, "deterministic")
-        self.models = checked_models(Corotated() if model is None else model, len(self.bodies))
-        self.integrator = checked_integrator(SymplecticEuler() if integrator is None else integrator)
-        self.gravity = checked_gravity(gravity, self.bodies[0].mesh.up_axis)
-        touching = checked_contact(obstacles, contact)
-        ordered = self.deterministic and self.device.is_cuda
-        check_implicit(
-            self.integrator,
-            touches=touching is not None,
-            remeshes=remesh is not None,
-            ordered=ordered,
-        )
+        with TURN:
+            self.bodies = checked_bodies(bodies, self.ranks)
+            self.device, self.worlds = self.bodies[0].device, self.bodies[0].worlds
+            self.deterministic = checked_flag(deterministic, "deterministic")
+            self.models = checked_models(Corotated() if model is None else model, len(self.bodies))
+            self.integrator = checked_integrator(SymplecticEuler() if integrator is None else integrator)
+            self.gravity = checked_gravity(gravity, self.bodies[0].mesh.up_axis)
+            touching = checked_contact(obstacles, contact)
+            ordered = self.deterministic and self.device.is_cuda
+            check_implicit(
+                self.integrator,
+                touches=touching is not None,
+                remeshes=remesh is not None,
+                ordered=ordered,
+            )
 
-        self.remeshing = Remeshing(self.bodies, self.models, remesh, deterministic=self.deterministic)
-        bound = zip(self.models, self.bodies, strict=True)
-        self.fields = tuple(m.bind(body, deterministic=self.deterministic) for m, body in bound)
-        self.remeshing.serve(self.fields)
-        #: Functions that are called after steps.
-        self.hooks = Hooks()
-        given = self.integrator.dt
-        self.pace = Pace(ANY_STEP if given is None else float(given), self.device)
-        self.system = System(self.bodies, self.fields, self.pace, self.gravity, self.ranks)
-        stable = self._find_stable_steps()
-        #: Keeps bodies out of obstacles and out of one another; None without contact.
-        self.contact: Contacts | None = None
-        if touching is not None:
-            self.contact = Contacts(self.system, *touching, stable_dt=self.stable_dt, dt=given)
-            self.system.constraints.append(self.contact)
-        #: Chooses the step, if none was given.
-        self.safe_step = SafeStep(self.system, self.models, stable) if given is None else None
-        self.guard = Guard(self.system)
-        self.stepper = self.integrator.bind(self.system)
-        check_constraints(self.system, self.stepper, self.integrator)
-        self.recorded = RecordedSteps(self.system, self.stepper, self.guard, self.safe_step)
-        #: Makes the steps.
-        self.running = Running(self)
+            self.remeshing = Remeshing(self.bodies, self.models, remesh, deterministic=self.deterministic)
+            bound = zip(self.models, self.bodies, strict=True)
+            self.fields = tuple(m.bind(body, deterministic=self.deterministic) for m, body in bound)
+            self.remeshing.serve(self.fields)
+            #: Functions that are called after steps.
+            self.hooks = Hooks()
+            given = self.integrator.dt
+            self.pace = Pace(ANY_STEP if given is None else float(given), self.device)
+            self.system = System(self.bodies, self.fields, self.pace, self.gravity, self.ranks)
+            stable = self._find_stable_steps()
+            #: Keeps bodies out of obstacles and out of one another; None without contact.
+            self.contact: Contacts | None = None
+            if touching is not None:
+                self.contact = Contacts(self.system, *touching, stable_dt=self.stable_dt, dt=given)
+                self.system.constraints.append(self.contact)
+            #: Chooses the step, if none was given.
+            self.safe_step = SafeStep(self.system, self.models, stable) if given is None else None
+            self.guard = Guard(self.system)
+            self.stepper = self.integrator.bind(self.system)
+            check_constraints(self.system, self.stepper, self.integrator)
+            self.recorded = RecordedSteps(self.system, self.stepper, self.guard, self.safe_step)
+            #: Makes the steps.
+            self.running = Running(self)
 
     # --- stepping --------------------------------------------------------------------------------------------------
+
+    def __reduce_ex__(self, protocol: object) -> NoReturn:
+        raise InputError(
+            "a Simulation lives on a device and can be neither copied nor pickled; "
+            "sim.save(path) and Simulation.load(path) make another in the same state"
+        )
 
     @property
     def body(self) -> SoftBody:
@@ -178,18 +187,23 @@ class Simulation(Clock, FormerNames):
                 every few hundred steps. Unlike ``advance``, this call repeats no step and checks no energies, because
                 users may write to the state between steps.
         """
-        refuse_tape()
-        if self.device.is_capturing:
-            if self.remeshing.every:
-                raise InputError("a simulation with remesh cannot be recorded by others: launches change with the mesh")
-            self.pace.is_shared = True
-            self.recorded.launch(Segment(1, adopts=True, publishes=True))
-            return
-        self.running.step()
-        if self.device.is_cpu or self.hooks.intervals or self.remeshing.every:
-            self.running.look()
-            if self.remeshing.every:
-                self.follow_motion()
+        with TURN:
+            refuse_tape()
+            if self.device.is_capturing:
+                if self.remeshing.every:
+                    raise InputError(
+                        "a simulation with remesh cannot be recorded by others: launches change with the mesh"
+                    )
+                self.pace.is_shared = True
+                self.recorded.launch(Segment(1, adopts=True, publishes=True))
+                return
+            self.running.step()
+            looks = self.device.is_cpu or bool(self.hooks.intervals) or bool(self.remeshing.every)
+            if looks:
+                self.running.look()
+                if self.remeshing.every:
+                    self.follow_motion()
+        if looks:
             self.hooks.call(self)
 
     def advance(self, seconds: float) -> None:
@@ -208,13 +222,15 @@ class Simulation(Clock, FormerNames):
         """
         if not 0 <= checked_number(seconds, "seconds", "s") < math.inf:
             raise InputError(f"cannot advance by {seconds} s; it must be zero or a positive time")
-        if self.device.is_capturing:
-            raise InputError("advance cannot be called while its device is capturing; call step, which records")
+        with TURN:
+            if self.device.is_capturing:
+                raise InputError("advance cannot be called while its device is capturing; call step, which records")
         self.advance_until(self.total_time + seconds)
 
     def advance_until(self, total_time: float) -> None:
         """Advance until ``total_time`` [s], like ``advance``; do nothing if that time is past."""
-        refuse_tape()
+        with TURN:
+            refuse_tape()
         if not checked_number(total_time, "total_time", "s") < math.inf:
             raise InputError(f"cannot advance until {total_time} s; it must be a finite time")
         if self.safe_step is not None:
@@ -224,7 +240,8 @@ class Simulation(Clock, FormerNames):
 
     def advance_steps(self, count: int) -> None:
         """Advance by ``count`` time steps, like ``advance``. Steps that a hook makes count."""
-        refuse_tape()
+        with TURN:
+            refuse_tape()
         self.running.make(checked_count(count, "count", least=0))
 
     def on_step(self, callback: Callable[[Simulation], None], every: int = 1) -> None:
@@ -235,6 +252,7 @@ class Simulation(Clock, FormerNames):
         """
         self.hooks.add(callback, every)
 
+    @in_turn
     def reset(self, worlds: npt.ArrayLike | wp.array | None = None) -> None:
         """Put worlds back to their initial state: rest, or the state at ``SoftBody.set_initial_state``.
 
@@ -266,14 +284,17 @@ class Simulation(Clock, FormerNames):
 
     # --- looking ---------------------------------------------------------------------------------------------------
 
+    @in_turn
     def energy(self) -> Energy:
         """Kinetic, elastic and gravitational energy of all bodies in the present state [J]."""
         return self.world_energies().together
 
+    @in_turn
     def world_energies(self) -> WorldEnergies:
         """The energies of each world [J], float64 [worlds]."""
         return find_energies(self.bodies, self.fields, self.gravity)
 
+    @in_turn
     def forces(self, body: SoftBody | None = None) -> wp.array:
         """Elastic nodal forces in the present state [N], vec3 [worlds * N], of the first or the given body."""
         chosen = self._index(body)
@@ -281,6 +302,7 @@ class Simulation(Clock, FormerNames):
         forces = self.fields[chosen].elastic_forces(self.bodies[chosen].state.displacements)
         return vec3_view(forces[: self.bodies[chosen].node_count])
 
+    @in_turn
     def von_mises(self, body: SoftBody | None = None) -> npt.NDArray[np.float32]:
         """Von Mises stress of each element in the present state [Pa], float32 [worlds * T]."""
         chosen = self._index(body)
@@ -303,6 +325,7 @@ class Simulation(Clock, FormerNames):
 
     # --- keeping ---------------------------------------------------------------------------------------------------
 
+    @in_turn
     def save(self, path: str | PathLike[str]) -> None:
         """Write everything needed to continue to one file (.npz, no pickle), whole or not at all; hooks are not saved.
 

@@ -16,6 +16,7 @@ from warp_corot.contact.shapes import Shape
 from warp_corot.elasticity import Corotated, ForceField, Model
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_count, checked_number, refuse_tape, shown
+from warp_corot.inputs.turns import in_turn
 from warp_corot.solvers.implicit.preconditioners import check_preconditioner
 from warp_corot.solvers.implicit.static import StaticSolver, status_words
 
@@ -56,6 +57,7 @@ class StaticReport:
     world_converged: npt.NDArray[np.bool_]
 
 
+@in_turn
 def solve_static(
     body: SoftBody,
     *,

@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, checked_path, shown
+from warp_corot.inputs.turns import in_turn
 from warp_corot.simulation.progress import hidden, is_shown
 from warp_corot.simulation.simulation import Simulation
 
@@ -255,6 +256,7 @@ def _bar(count: int, *, wanted: bool) -> Iterator[Progress]:
         yield lambda frame, _: bar.update(frame - bar.n)
 
 
+@in_turn
 def _write_frame(writer: UsdWriter, sim: Simulation, joined: _Joined, done: Recording) -> None:
     positions = [w.positions.numpy() for w in joined.worlds]
     velocities = [w.velocities.numpy() for w in joined.worlds]

@@ -383,7 +383,8 @@ class Guard:
             if not 0.0 <= now - self._window_at < WINDOW:
                 self.trend = float((self._lately - self._lately_before)[most] * known[most])
                 self._window_at, self._lately_before = now, self._lately
-            self.untimely = float(np.max(np.maximum(found.untimely - floor, 0.0) * known))
+            with np.errstate(over="ignore"):  # of a body that flies off, where infinity is as wrong
+                self.untimely = float(np.max(np.maximum(found.untimely - floor, 0.0) * known))
         else:
             self.gain = self.surplus = self.untimely = 0.0
             self.trend = None
