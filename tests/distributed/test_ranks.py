@@ -26,6 +26,7 @@ def runs(tmp_path_factory):
     for size in SIZES:
         with np.load(folder / f"{size}.npz") as archive:
             found[size] = dict(archive)
+    found["folder"] = folder
     return found
 
 
@@ -54,6 +55,31 @@ def test_all_cases_are_the_same_on_seven_ranks(runs, tmp_path):
 def test_a_mesh_that_no_rank_holds_whole_gives_the_same_run(runs):
     for size in (1, 3):
         np.testing.assert_array_equal(runs[size]["parts.x"], runs[size]["worlds.True.x"])
+
+
+@pytest.mark.parametrize("size", [1, 3])
+def test_ranks_write_pieces_of_one_stage(runs, size):
+    from pxr import Usd, UsdGeom
+
+    folder = runs["folder"]
+    stage = Usd.Stage.Open(str(folder / f"{size}.usda"))
+    assert stage.GetEndTimeCode() == 2.0
+    meshes = [UsdGeom.Mesh(prim) for prim in stage.Traverse() if prim.GetTypeName() == "Mesh"]
+    assert len(meshes) == size
+    area, tets, shown = 0.0, 0, []
+    for mesh in meshes:
+        x = np.array(mesh.GetPointsAttr().Get(0.0))[np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 3)]
+        area += 0.5 * np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1).sum()
+        shown.append(np.array(mesh.GetPointsAttr().Get(2.0)))
+        tetrahedra = UsdGeom.TetMesh(stage.GetPrimAtPath(mesh.GetPath().GetParentPath().AppendChild("tetrahedra")))
+        tets += len(tetrahedra.GetTetVertexIndicesAttr().Get())
+    # The surface is closed, and ranks draw no faces between them.
+    np.testing.assert_allclose(area, 14 * 0.064**2, rtol=1e-6)
+    assert tets == 3 * 6 * 2**4
+    there = np.concatenate([np.load(folder / f"{size}.{rank}.npy") for rank in range(size)])
+    apart = np.abs(np.concatenate(shown)[:, None] - there).max(axis=2).min(axis=1)
+    assert apart.max() < 1e-7
+    assert f"rank {size - 1} of {size}" in str(runs[size]["recorded"])
 
 
 def test_any_run_is_the_same_to_rounding(runs):

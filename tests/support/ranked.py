@@ -3,6 +3,7 @@
 Three ranks make the runs of one rank, two and three, one after another: every process takes seconds to start.
 """
 
+import resource
 import sys
 from pathlib import Path
 
@@ -106,6 +107,26 @@ def in_parts() -> np.ndarray | None:
     return whole if sim.rank == 0 else None
 
 
+def recorded(stage: Path) -> str:
+    """Record a run of a mesh that no rank holds whole, and once more with no room on the last rank; what is raised."""
+    import warp_corot.distributed as wd
+
+    body = body_of(wd.box((1, 1, 3), 0.064, level=4), 0.3)
+    sim = wd.Simulation(body, deterministic=True)
+    wd.record(sim, stage, duration=0.02, fps=100)
+    np.save(stage.with_suffix(f".{sim.rank}.npy"), body.positions.numpy()[: len(body.mesh.points)])
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    if sim.rank == sim.size - 1:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (2000, hard))
+    try:
+        wd.record(sim, stage.with_name(f"full-{stage.name}"), duration=0.02, fps=100)
+    except OSError as error:
+        return str(error)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    return ""
+
+
 def make_all(results: str, names: str, before: list[str]) -> None:
     """Make runs on the ranks that there are, and write what they find."""
     import warp_corot.distributed as wd
@@ -132,6 +153,7 @@ def make_all(results: str, names: str, before: list[str]) -> None:
             found |= saved_and_loaded(Path(results), before, name)
     if "worlds" in names:
         found["parts.x"] = in_parts()
+        found["recorded"] = np.array(recorded(Path(results).with_suffix(".usda")))
     if sim.rank == 0:
         np.savez(results, **found)
     else:
@@ -152,7 +174,7 @@ def main() -> None:
     some = Patient(mpi.library().COMM_WORLD.Split(int(alone)), patience())
     mpi.world = lambda: some  # type: ignore[assignment]
     make_all(str(folder / f"{some.size}.npz"), names if alone else "forest", [])
-    everybody.Barrier()
+    mpi.meet(everybody)
     mpi.world = lambda: everybody  # type: ignore[assignment]
     make_all(str(folder / "3.npz"), names, [str(folder / "1.npz")])
 

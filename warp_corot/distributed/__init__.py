@@ -7,9 +7,10 @@
 from . import mpi
 from .boxes import box
 from .gathering import gather
+from .recording import record
 from .simulation import Simulation
 from .sweeping import sweep
 
-__all__ = ["Simulation", "box", "gather", "sweep"]
+__all__ = ["Simulation", "box", "gather", "record", "sweep"]
 
 mpi.choose_device()

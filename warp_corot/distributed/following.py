@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -58,10 +59,14 @@ class Following:
         """Whether no rank holds the whole mesh."""
         return isinstance(self.whole.mesh, ForestPart)
 
-    def take_ghosts(self) -> None:
-        """Copy the state of all nodes of the part, with those that other ranks move, to the body."""
+    def take_ghosts(self, completed: Callable[[str], wp.array]) -> None:
+        """Copy the state of all nodes of the part, with those that other ranks move, to the body.
+
+        Args:
+            completed: Gives an array of the part's state, by its name, with the values of other ranks' nodes.
+        """
         for name in STATE:
-            self._all.to_whole(getattr(self.part.state, name), getattr(self.whole.state, name))
+            self._all.to_whole(completed(name), getattr(self.whole.state, name))
         self.whole.state.publish_positions()
 
     def take_over(self) -> None:

@@ -17,6 +17,7 @@ from warp_corot.discretization.elements import Mesh
 from warp_corot.errors import InputError
 from warp_corot.materials.isotropic import Material
 from warp_corot.mesh import TetForest, TetMesh
+from warp_corot.mesh.lattice import LATTICE_BITS
 from warp_corot.mesh.numbering import in_order_of_leaves, live_or_void, renumbered, with_virtual
 
 from .partition import Partition
@@ -79,6 +80,12 @@ class ForestPart(TetForest):
             InputError: Always: ranks would bisect without their neighbours.
         """
         raise InputError("a forest in parts cannot be refined; make it with another level")
+
+    def are_outer(self, triangles: Ints) -> npt.NDArray[np.bool_]:
+        """Which triangles, int32 [F, 3], lie on the surface of the whole box; others are faces to leaves elsewhere."""
+        corners = self.lattice[triangles]
+        ends = np.array([np.zeros(3, np.int64), np.array(self.cells) << LATTICE_BITS])
+        return np.any([(corners == end).all(axis=1).any(axis=1) for end in ends], axis=0)
 
     def check_expression(self, expression: str) -> None:
         """Check that an expression can be evaluated at the nodes of one part.

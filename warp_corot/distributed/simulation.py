@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from os import PathLike
 from typing import Any
@@ -26,7 +27,7 @@ from warp_corot.solvers import Integrator, SymplecticEuler
 from warp_corot.solvers.implicit.schemes import ImplicitIntegrator
 
 from . import checkpoint, mpi
-from .following import STATE, Following
+from .following import Following
 from .gathering import register
 from .of_parts import SimulationOfParts, compile_once, of_their_own, part_of, settled_model
 from .ranks import MpiRanks, Together
@@ -250,7 +251,7 @@ class Simulation:
         """
         for k, each in enumerate(self._following):
             if each.is_in_parts:
-                self._collect_ghosts(k)
+                each.take_ghosts(functools.partial(self.completed, k))
                 continue
             state = each.whole.state
             for array in (state.displacements, state.velocities, state.reactions):
@@ -258,12 +259,20 @@ class Simulation:
             state.publish_positions()
             each.collect_touch()
 
-    def _collect_ghosts(self, k: int) -> None:
-        """Bring the state of the nodes of this rank's elements up to date."""
-        each = self._following[k]
-        for name in STATE:
-            self._parts.ranks.complete(k, getattr(each.part.state, name))
-        each.take_ghosts()
+    def completed(self, k: int, name: str) -> wp.array:
+        """A nodal array of the state of this rank's part of the k-th body, with the values of other ranks' nodes; until
+        the next call. All ranks must call."""
+        return self._parts.ranks.completed(k, getattr(self._following[k].part.state, name))
+
+    @property
+    def following(self) -> list[Following]:
+        """The bodies, each with this rank's part of it."""
+        return self._following
+
+    def von_mises(self) -> list[npt.NDArray[np.float32]]:
+        """Von Mises stress of each element of this rank's part of each body [Pa], float32 [worlds * t]."""
+        self._take_over()
+        return [self._parts.von_mises(each.part) for each in self._following]
 
     @property
     def solves(self) -> Solves | None:

@@ -143,6 +143,18 @@ class UsdWriter:
         """Stresses [Pa] at the two ends of the colour map so far."""
         return self._stress_range
 
+    def widen_range(self, top: float) -> None:
+        """Let the colour range reach this stress [Pa], unless it was given."""
+        if not self._range_given and top > self._stress_range[1]:
+            self._stress_range = (0.0, top)
+
+    def range_for(self, stress: NDArray[np.float32]) -> float:
+        """The end of the colour range that a frame with these stresses of its tetrahedra needs [Pa]."""
+        if len(stress) == 0:
+            return 0.0
+        rank = min(len(stress) - 1, int(0.99 * len(stress)))
+        return round_limit(float(np.partition(stress, rank)[rank]))
+
     def change_mesh(
         self, mesh: Mesh, *, fixed: ArrayLike | None = None, material: Any = None, skins: Sequence[Skin] = ()
     ) -> None:
@@ -195,7 +207,7 @@ class UsdWriter:
         if von_mises is not None:
             stress = floats(von_mises, (len(self._present.tets),), "von_mises")
             nodal = self._present.average(stress)
-            self._widen_range(stress)
+            self.widen_range(self.range_for(stress))
             self._ranges_used.add(self._stress_range)
             self._store.custom_data["stressColors"] = self._color_legend()
         self._store.layer_data = {KEY: self.about} if self.about else {}
@@ -239,14 +251,6 @@ class UsdWriter:
             if kind is None:
                 raise
             logging.getLogger(__name__).warning("%s", error)  # the first error is the one to raise
-
-    def _widen_range(self, stress: NDArray[np.float32]) -> None:
-        if self._range_given or len(stress) == 0:
-            return
-        rank = min(len(stress) - 1, int(0.99 * len(stress)))
-        top = round_limit(float(np.partition(stress, rank)[rank]))
-        if top > self._stress_range[1]:
-            self._stress_range = (0.0, top)
 
     def _color_legend(self) -> dict[str, Any]:
         lowest, highest = self._stress_range

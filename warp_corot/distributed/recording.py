@@ -1,0 +1,179 @@
+"""Recording on several ranks: each writes the frames of its piece, and one small stage joins the pieces."""
+
+from __future__ import annotations
+
+import time
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_path
+from warp_corot.io.files.whole import written_whole
+from warp_corot.io.write.animate import Recording, frame_count
+
+from .pieces import Piece
+from .simulation import Simulation
+
+
+def record(
+    sim: Simulation,
+    path: str | PathLike[str],
+    *,
+    duration: float,
+    fps: float = 24.0,
+    world: int | None = None,
+    tets: bool = True,
+) -> Recording:
+    """Advance a simulation and write ``fps`` frames a second, the current state first; all ranks must call.
+
+    ``beam.usd`` becomes a small stage that refers to ``beam.ranks/rank-0000.usdc`` and so on: every rank writes the
+    elements that it counts and their faces on the surface, and no rank gathers the whole. All pieces have one range
+    of colours. Bodies made from a domain are drawn by their tetrahedra. If the run is interrupted, the frames up to
+    seconds before stay.
+
+    Args:
+        sim: The simulation; it continues from its current state.
+        path: A .usd, .usdc or .usda file in a folder that all ranks see.
+        duration: Simulated time [s], rounded to whole frames.
+        fps: Frames per second of simulated time.
+        world: The world that is drawn; must be given if there are several.
+        tets: Whether to write the tetrahedra; without them the surface alone.
+
+    Returns:
+        The progress at the end, of all ranks.
+
+    Raises:
+        InputError: A path that cannot be written to, a duration or frame rate out of range, or no such world.
+        UnstableError: The state is no longer finite; the frames before are kept.
+        OSError: On all ranks, if one cannot write, for example because its disk is full; former frames are kept.
+    """
+    if not isinstance(sim, Simulation):
+        raise InputError("sim must be a Simulation of warp_corot.distributed; warp_corot.record takes others")
+    checked_path(path, "path")
+    count = frame_count(duration, fps)
+    if world is None and sim.worlds > 1:
+        raise InputError(f"the simulation has {sim.worlds} worlds; say which one to draw, for example world=0")
+    if not 0 <= (world or 0) < sim.worlds:
+        raise InputError(f"world is {world!r}; it must be a whole number from 0 to {sim.worlds - 1}")
+    return _Pieces(sim, Path(path), fps, world or 0, tets).record(count)
+
+
+class _Pieces:
+    """The stage of a rank's piece, and on rank 0 the one that joins all."""
+
+    def __init__(self, sim: Simulation, path: Path, fps: float, world: int, tets: bool):
+        from warp_corot.io.write.usd.writer import UsdWriter
+
+        self._sim, self._path, self._fps = sim, path, fps
+        self._folder = path.with_name(f"{path.stem}.ranks")
+        self._comm = sim.comm
+        self._piece = Piece(sim.following, world)
+        self.done = Recording(path)
+
+        def made() -> Any:
+            self._folder.mkdir(exist_ok=True)
+            return UsdWriter(
+                self._folder / _name(sim.rank),
+                self._piece,
+                fps=fps,
+                fixed=self._piece.fixed,
+                material=self._piece,
+                skins=[self._piece.skin],
+                tets=tets,
+                gravity=sim.gravity if sim.rank == 0 else None,
+            )
+
+        self._writer = self._together(made)
+
+    def record(self, count: int) -> Recording:
+        """Write the present frame and so many more."""
+        sim, done, writer = self._sim, self.done, self._writer
+        first_step, first_time = sim.total_steps, sim.total_time
+        try:
+            for frame in range(count + 1):
+                started = time.perf_counter()
+                sim.advance_until(first_time + frame / self._fps)
+                stepped = time.perf_counter()
+                self._write_frame()
+                if frame == 0:
+                    # From now on the joining stage shows what there is.
+                    self._together(writer.flush)
+                    self._together(lambda: self._join(count + 1))
+                done.stepping += stepped - started
+                done.writing += time.perf_counter() - stepped
+                done.frames = frame + 1
+                done.steps, done.simulated = sim.total_steps - first_step, sim.total_time - first_time
+        except BaseException as error:
+            # Frames that wait are written; the first error is the one to raise.
+            writer.__exit__(type(error), error, error.__traceback__)
+            raise
+        self._together(writer.close)
+        self._together(lambda: self._join(done.frames))
+        return done
+
+    def _write_frame(self) -> None:
+        sim, piece, done = self._sim, self._piece, self.done
+        displacements, velocities = (piece.state(name, sim.completed) for name in ("displacements", "velocities"))
+        positions = (piece.points + displacements).astype(np.float32)
+        stress = piece.of_elements(sim.von_mises())
+        self._writer.widen_range(max(self._comm.allgather(self._writer.range_for(stress))))
+        self._together(lambda: self._writer.write(positions, velocities=velocities, von_mises=stress))
+        lengths = np.linalg.norm(positions.astype(np.float64) - piece.points, axis=1)
+        done.final_displacement = max(self._comm.allgather(float(lengths.max(initial=0.0))))
+        done.largest_displacement = max(done.largest_displacement, done.final_displacement)
+        done.elements.append(sum(self._comm.allgather(len(piece.tets))))
+
+    def _together(self, act: Any) -> Any:
+        """Call on every rank; if one fails, all raise its error."""
+        found, failed = None, None
+        try:
+            found = act()
+        except (OSError, InputError) as error:
+            failed = error
+        everybody = self._comm.allgather(None if failed is None else (type(failed) is not InputError, str(failed)))
+        for rank, told in enumerate(everybody):
+            if told is not None:
+                is_of_system, said = told
+                raise (OSError if is_of_system else InputError)(f"rank {rank} of {self._comm.size}: {said}") from failed
+        return found
+
+    def _join(self, frames: int) -> None:
+        """Write the stage that refers to all pieces, on rank 0."""
+        if self._sim.rank != 0:
+            return
+        from pxr import Kind, Sdf, Usd, UsdGeom
+
+        layer = Sdf.Layer.CreateAnonymous(self._path.suffix)
+        stage = Usd.Stage.Open(layer)
+        UsdGeom.SetStageUpAxis(stage, self._piece.up_axis)
+        UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+        stage.SetTimeCodesPerSecond(self._fps)
+        stage.SetFramesPerSecond(self._fps)
+        stage.SetStartTimeCode(0.0)
+        stage.SetEndTimeCode(float(frames - 1))
+        root = UsdGeom.Xform.Define(stage, "/SoftBody").GetPrim()
+        stage.SetDefaultPrim(root)
+        Usd.ModelAPI(root).SetKind(Kind.Tokens.assembly)
+        # An open stage would look for the pieces beside a layer that has no place yet.
+        del root, stage
+        for rank in range(self._comm.size):
+            prim = Sdf.CreatePrimInLayer(layer, f"/SoftBody/rank_{rank:04d}")
+            prim.specifier = Sdf.SpecifierDef
+            prim.referenceList.Prepend(Sdf.Reference(f"./{self._folder.name}/{_name(rank)}"))
+        layer.customLayerData = {"warp_corot": {"ranks": self._comm.size}}
+        with written_whole(self._path) as part:
+            # OpenUSD knows formats by their endings.
+            aside = part.with_name(part.name + self._path.suffix)
+            try:
+                if not layer.Export(str(aside)):
+                    raise OSError(f"{self._path}: cannot be written")
+                aside.replace(part)
+            finally:
+                aside.unlink(missing_ok=True)
+
+
+def _name(rank: int) -> str:
+    return f"rank-{rank:04d}.usdc"
