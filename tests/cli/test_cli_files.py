@@ -188,7 +188,7 @@ def test_frames_for_paraview(folder, capsys):
         assert "points" not in numbers["frame00002"]
 
 
-@pytest.mark.parametrize("suffix", [".glb", ".obj"])
+@pytest.mark.parametrize("suffix", [".glb", pytest.param(".obj", marks=pytest.mark.slow)])
 def test_objects_of_a_file_are_bodies_or_one(folder, suffix, capsys):
     """Two balls with a gap of 2 mm, which one mesh would close; the larger one gets more elements. A surface
     in two open halves is one body."""

@@ -152,16 +152,16 @@ def test_a_kernel_cache_that_cannot_be_made_is_one_line(tmp_path):
 def test_compiling_is_said_when_kernels_are_compiled_and_only_then(tmp_path):
     """The message comes once, on stderr, in a separate line; stdout does not depend on the cache.
 
-    The cache has all kernels that were compiled before except those of the springs.
+    The cache has all kernels that were compiled before except those of the clock.
     """
     known = Path(wp.config.kernel_cache_dir)
     folder = tmp_path / "cache" / known.name
     folder.mkdir(parents=True)
     for module in known.iterdir():
-        if "springs" not in module.name:
+        if "stepping.pace" not in module.name:
             (folder / module.name).symlink_to(module)
     cache = os.environ | {"WARP_CACHE_PATH": str(tmp_path / "cache")}
-    ran = [started(tmp_path, *BOX, "--model", "mass-spring", env=cache).communicate(timeout=120) for _ in range(2)]
+    ran = [started(tmp_path, *BOX, env=cache).communicate(timeout=120) for _ in range(2)]
     (first, cold), (again, warm) = ran
     assert re.fullmatch(r"warp-corot: compiling kernels for cpu, once: .*\n", cold), cold
     assert warm == ""

@@ -119,7 +119,7 @@ def test_options_of_the_mesh_reach_it(folder, capsys):
     [
         ("soft=3kPa:0.45,hard=30kPa:0.4:1060", True),
         ("hard@7=0.03MPa:0.4:1060,soft@2=3000", False),
-        ("2=3 kPa,7=30kPa:0.4:1.06e3", False),
+        pytest.param("2=3 kPa,7=30kPa:0.4:1.06e3", False, marks=pytest.mark.slow),
     ],
 )
 def test_material_follows_the_labels(folder, labels, noted, capsys):

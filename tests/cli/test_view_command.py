@@ -80,7 +80,10 @@ def test_without_viser_one_line_says_what_to_install(monkeypatch, capsys):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals are others there")
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "status"),
+    [(signal.SIGINT, 0), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow)],
+)
 def test_ctrl_c_ends_it_quietly(number, status, tmp_path):
     pytest.importorskip("viser")
     command = [sys.executable, "-m", "warp_corot", "view", "box", "--port", "0", "--device", "cpu"]

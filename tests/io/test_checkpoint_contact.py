@@ -49,7 +49,7 @@ def remeshed(device):
     return wc.Simulation(body, obstacles=[probe], gravity=(0, 0, 0), remesh=options)
 
 
-@pytest.mark.parametrize("make", [pressed, remeshed])
+@pytest.mark.parametrize("make", [pytest.param(pressed, marks=pytest.mark.slow), remeshed])
 def test_a_resumed_run_is_the_uninterrupted_one(tmp_path, make):
     whole, parted = make("cpu"), make("cpu")
     whole.advance(0.03)

@@ -248,7 +248,13 @@ def test_second_order_cells_are_said(tmp_path):
     assert loaded.notes == ["second-order cells (tetra) are taken by their corners, with straight edges"]
 
 
-@pytest.mark.parametrize("suffix", [".vtk", ".vtu", ".vtp", ".vtm", ".msh", ".inp", ".node", ".vol", ".mesh", ".unv"])
+@pytest.mark.parametrize(
+    "suffix",
+    [
+        *(".vtk", ".vtu", ".msh", ".inp", ".node", ".vol", ".mesh"),
+        *(pytest.param(suffix, marks=pytest.mark.slow) for suffix in (".vtp", ".vtm", ".unv")),
+    ],
+)
 def test_garbage_is_refused_with_the_readers_own_reason(tmp_path, suffix):
     path = tmp_path / f"bad{suffix}"
     for content in (b"words and words", bytes(range(256)) * 40, b"<VTKFile type='X'>" * 3, b"\n\n\n"):

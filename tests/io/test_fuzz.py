@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 SCRIPT = Path(fuzzing.__file__)
-FEW, MANY = 25, 10_000
+FEW, MANY = 10, 10_000
 #: Formats whose reader is tested by another format in the short run.
 LONG_ONLY = {
     *("ply-text", "off", "stl-text", "usdz", "usda-tets", "scene", "nii", "mgh", "nrrd-gz", "mhd", "checkpoint"),
@@ -39,7 +39,7 @@ def cases(folder: Path, forms: list[str], count: int) -> list[dict]:
 
 
 def check(folder: Path, forms: list[str], count: int) -> None:
-    """No case failed; many were refused, and some accepted."""
+    """No case failed; many were refused, a hundredth of each format's at least."""
     said = cases(folder, forms, count)
     wrong = [f"{each['form']} {each['case']}: {each['wrong']}" for each in said if "wrong" in each]
     assert not wrong, "\n".join(wrong[:5])
@@ -47,7 +47,8 @@ def check(folder: Path, forms: list[str], count: int) -> None:
         done = [each for each in said if each["form"] == form and "seconds" in each]
         ended = [each for each in said if each["form"] == form and "ended" in each]
         assert len(done) + len(ended) == count
-        assert sum(not each["taken"] for each in done) > count // 100
+        assert sum(not each["taken"] for each in done) >= count // 100
+    assert sum(not each.get("taken", True) for each in said) > len(forms)
 
 
 @pytest.mark.parametrize("part", range(PARTS))

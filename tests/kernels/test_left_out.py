@@ -32,7 +32,10 @@ def expected(forest, u, young):
     return forces, sound
 
 
-@pytest.mark.parametrize("uniform", [True, False], ids=["one material", "material per element"])
+@pytest.mark.parametrize(
+    "uniform",
+    [pytest.param(True, id="one material", marks=pytest.mark.slow), pytest.param(False, id="material per element")],
+)
 @pytest.mark.parametrize("share", [0.0, 0.1, 1.0])
 def test_listed_leaves_get_their_forces(share, uniform, device, rng):
     """None, a tenth, or all nodes displaced by an edge: subtrees and single leaves; the list is empty afterwards."""

@@ -37,7 +37,9 @@ SHAPES = {
 }
 
 
-@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize(
+    "shape", [pytest.param(shape, marks=pytest.mark.slow) if shape == "tube" else shape for shape in SHAPES]
+)
 def test_all_of_a_body_is_in_as_many_elements_as_asked_for(shape):
     domain = SHAPES[shape]()
     mesh = wc.TetForest.from_domain(domain, target_elements=3000)

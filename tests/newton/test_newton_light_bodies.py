@@ -19,7 +19,10 @@ def light_box(device, density):
 class TestLightBodies:
     @pytest.mark.parametrize(
         ("density", "ke", "kd"),
-        [pytest.param(5.0, 1e5, 1e3, marks=pytest.mark.slow), (5.0, None, None), (200.0, None, None)],
+        [
+            *(pytest.param(5.0, *springs, marks=pytest.mark.slow) for springs in ((1e5, 1e3), (None, None))),
+            (200.0, None, None),
+        ],
     )
     def test_come_to_rest(self, device, density, ke, kd):
         """At half the safe step a box far lighter than the body below does not rise above its initial height.
@@ -147,13 +150,13 @@ def throw(model, duration, dt=None, contacts=True):
 
 
 class TestEnergy:
-    @pytest.mark.parametrize("ke", [1e4, 1e6])
+    @pytest.mark.parametrize("ke", [pytest.param(1e4, marks=pytest.mark.slow), 1e6])
     @pytest.mark.parametrize(
         ("shape", "mass", "aside", "cell"),
         [
             ("box", 0.01, 0.0, 0.05),  # its edges are at particles
-            ("box", 0.05, 0.013, 0.05),
-            ("box", 0.1, 0.0, 0.05),
+            pytest.param("box", 0.05, 0.013, 0.05, marks=pytest.mark.slow),
+            pytest.param("box", 0.1, 0.0, 0.05, marks=pytest.mark.slow),
             ("box", 0.1, 0.0, 0.025),  # many contacts
             ("sphere", 0.01, 0.013, 0.05),
             ("capsule", 0.05, 0.0, 0.05),

@@ -32,7 +32,7 @@ def gift(device, height=0.2, around=36, across=3):
     return model, first
 
 
-@pytest.mark.parametrize("frames", [10, pytest.param(15, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("frames", [5, pytest.param(15, marks=pytest.mark.slow)])
 def test_a_gift_falls_and_stays_tied(frames, device):
     """Blocks stay stacked within their straps, and no more energy is there than the fall gave."""
     model, first = gift(device)
@@ -53,7 +53,8 @@ def test_a_gift_falls_and_stays_tied(frames, device):
         kinetic = 0.5 * float(mass @ (v * v).sum(axis=1))
         assert kinetic < 1.05 * max(lost, 0.0) + 20.0
         falls = max(falls, lost)
-    assert falls > 0.9 * 9.81 * 0.1 * mass.sum()
+    free = min(0.5 * 9.81 * (frames / 60.0) ** 2, 0.1)
+    assert falls > 0.9 * 9.81 * free * mass.sum()
     assert np.linalg.norm(np.ptp(x, axis=0)) < 7.0
     assert x[:, 2].min() > -0.1
     heights = [x[18 * k : 18 * (k + 1), 2].mean() for k in range(4)]

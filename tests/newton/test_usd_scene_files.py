@@ -292,7 +292,11 @@ def test_a_state_that_is_not_finite_leaves_the_frames_before(tmp_path, monkeypat
 @pytest.mark.skipif(os.name != "posix", reason="POSIX signals")
 @pytest.mark.parametrize(
     ("number", "status"),
-    [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow), (signal.SIGKILL, -9)],
+    [
+        pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow),
+        pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow),
+        (signal.SIGKILL, -9),
+    ],
 )
 def test_whatever_ends_a_run_the_stage_opens(tmp_path, number, status):
     """Even after a kill, when the pieces play: with the looks of the stage below, and our motion."""

@@ -326,8 +326,9 @@ def test_preconditioners_are_compared(run, tmp_path):
 
 @needs_mpi
 @pytest.mark.parametrize("strong", ["", pytest.param("6", marks=pytest.mark.slow)])
-def test_scaling(strong, run, tmp_path):
+def test_scaling(strong, run, monkeypatch, tmp_path):
     """Weak scaling and its predictions; strong scaling takes as many processes again."""
+    monkeypatch.setenv("OMPI_MCA_mpi_yield_when_idle", "1")  # ranks that wait leave the cores to other tests
     path = tmp_path / "scaling.json"
     done = run("scaling.py", "--ranks", "1,2", "--weak", "6", "--strong", strong, "--json", path)
     assert done.returncode == 0, done.stderr

@@ -12,7 +12,7 @@ from warp_corot.discretization.changing.pools import DeviceForest
 from warp_corot.experiments.remeshing import CELL, SCENES, TISSUE, run, table
 from warp_corot.kernels.remesh.criteria import nearness, strain, von_mises_stress
 
-CASES = [("bar", "elongation"), ("bar", "strain"), ("slab", "nearness")]
+CASES = [pytest.param("bar", "elongation", marks=pytest.mark.slow), ("bar", "strain"), ("slab", "nearness")]
 LEVELS = [9, pytest.param(10, marks=pytest.mark.slow), pytest.param(11, marks=pytest.mark.slow)]
 
 

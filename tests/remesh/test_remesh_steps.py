@@ -35,7 +35,9 @@ MODELS = [
 
 
 @pytest.mark.parametrize("model", MODELS, ids=repr)
-@pytest.mark.parametrize("varied", [False, True], ids=["uniform", "varied"])
+@pytest.mark.parametrize(
+    "varied", [pytest.param(False, id="uniform", marks=pytest.mark.slow), pytest.param(True, id="varied")]
+)
 def test_steps_go_on_as_on_a_mesh_made_that_way(model, varied, device):
     mesh = wc.TetForest.box((4, 1, 1), 0.05, 6)
     young = (lambda x: 2e4 + 4e5 * x[:, 0]) if varied else 3e4

@@ -154,7 +154,12 @@ def test_one_body_of_one_pascal_and_one_gigapascal(device):
 
 
 @pytest.mark.parametrize(
-    ("start", "dilatation"), [("turned over", "element"), *((s, d) for s in ("flat", "far away") for d in SHARING)]
+    ("start", "dilatation"),
+    [
+        *(("turned over", "element"), ("far away", "element")),
+        *(("flat", d) for d in SHARING),
+        pytest.param("far away", "shared", marks=pytest.mark.slow),
+    ],
 )
 def test_any_start_leads_to_rest(start, dilatation, device):
     """From a beam that is crushed into a plane, turned inside out or blown up: the state that rest leads to.

@@ -61,7 +61,7 @@ def test_order_on_a_vibration(name, slowest, device):
     assert errors[1] < {1: 0.05, 2: 2e-3}[order]
 
 
-@pytest.mark.parametrize("tolerance", [None, 1e-6])
+@pytest.mark.parametrize("tolerance", [None, pytest.param(1e-6, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", SCHEMES)
 def test_order_on_a_large_motion(name, tolerance, device):
     """A beam that falls until it bends by half its length: differences between runs with steps halved twice."""
