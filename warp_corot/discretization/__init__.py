@@ -1,1 +1,1 @@
-"""What a device holds of a mesh: elements, complete subtrees, the force plan, slots for reproducible sums."""
+"""The device's data of a mesh: elements, complete subtrees, the force plan, slots for reproducible sums."""

@@ -1,4 +1,4 @@
-"""Nodes whose displacements come from elsewhere while a step has begun: what needs them is launched apart."""
+"""Nodes whose displacements arrive from other processes during a step: launches that need them are separate."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class Awaited:
     """Nodes that other processes move.
 
     Attributes:
-        nodes: Which nodes of all worlds these are, bool [worlds * N].
-        later: Launches within this context have their displacements, and run beside what is launched outside of it.
-        is_used: Whether forces are launched apart, so that they may be computed before the nodes have come.
+        nodes: Mask of these nodes among those of all worlds, bool [worlds * N].
+        later: Launches within this context see their displacements, and run beside launches outside of it.
+        is_used: Whether forces have separate launches, so that some are computed before the nodes arrive.
     """
 
     nodes: npt.NDArray[np.bool_]
@@ -30,7 +30,7 @@ class Awaited:
     is_used: bool = False
 
     def divided(self, batch: Batch) -> tuple[Batch, Batch]:
-        """Subtrees in groups of eight: those that need none of the nodes, and the others."""
+        """Divide groups of eight subtrees into those that need none of the nodes, and the others."""
         nodes = batch.subtrees.nodes.numpy()
         late = (self.nodes[np.maximum(nodes, 0)] & (nodes >= 0)).any(axis=1)
         first, second = (_those(batch, nodes, np.flatnonzero(late == wanted)) for wanted in (False, True))

@@ -1,4 +1,4 @@
-"""The clock of a simulation, as lower rooms read it."""
+"""The clock of a simulation, in the form that lower folders read."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ class Clock(Protocol):
     """Steps and seconds of a simulation; ``solvers.pace.Pace`` is one.
 
     Attributes:
-        arrays: ``kernels.stepping.pace.Pace``, what kernels read.
+        arrays: ``kernels.stepping.pace.Pace`` for kernels.
     """
 
     @property

@@ -1,4 +1,4 @@
-"""What forces read of a body: its mesh, which may change, and its material, on a device."""
+"""The data of a body for forces: its mesh, which may change, and its material, on a device."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ MOST_ELEMENTS = 2**31 - 1
 
 
 class Discretization(ABC):
-    """A mesh on a device, with its material: all that forces read of a body, except the positions of its nodes.
+    """A mesh on a device, with its material: all data of a body that forces read, except the positions of its nodes.
 
     Attributes:
         worlds, device: The number of copies of the body, and their device.
-        sizes: How many nodes and elements there are.
+        sizes: Numbers of nodes and elements.
         element_kind: The struct of the elements, ``ForestElements`` or ``GeneralElements``.
         elements: The elements, world after world.
-        fill: The share of each element that is inside the body, [T] in the original mesh; None: all of it.
+        fill: The fraction of each element inside the body, [T] in the original mesh; None: all of it.
         lame: Lamé's parameters of the material [Pa], and their stride, 0 or 1: for stresses.
-        mu, lam, material_stride: The same, multiplied by the filled share: for forces and energies.
+        mu, lam, material_stride: The same, multiplied by the filled fraction: for forces and energies.
         activation: Active stress of elements [Pa], float32; one entry until a stress is set.
         has_activation: Whether an active stress was set.
         smallest_volume: The volume of the smallest element [m^3].
@@ -78,7 +78,7 @@ class Discretization(ABC):
     @property
     @abstractmethod
     def masses(self) -> npt.NDArray[np.float64]:
-        """Lumped nodal masses [kg], float64 [worlds * N]; zero at nodes that no element names."""
+        """Lumped nodal masses [kg], float64 [worlds * N]; zero at nodes of no element."""
 
     @property
     @abstractmethod
@@ -89,12 +89,12 @@ class Discretization(ABC):
     def plan(self, rotation_level: int | None = None, *, subtrees: bool = True, deterministic: bool = False) -> Plan:
         """The units of work of a force field.
 
-        Where the mesh changes, the field is told by ``ForceField.derive`` and ``follow``.
+        If the mesh changes, ``ForceField.derive`` and ``follow`` update the field.
 
         Args:
             rotation_level: Level of the tree at which rotations are shared; None: not shared.
-            subtrees: Whether complete subtrees are units; False: the field goes leaf by leaf.
-            deterministic: Whether every unit has slots of its own for its forces.
+            subtrees: Whether complete subtrees are units; False: the field computes leaf by leaf.
+            deterministic: Whether every unit has separate slots for its forces.
         """
 
     def levels(self) -> Levels:
@@ -113,10 +113,10 @@ class Discretization(ABC):
 
     @abstractmethod
     def anisotropic_material(self) -> OrthotropicMaterial:
-        """The anisotropic material as kernels read it, world after world where it is not uniform."""
+        """The anisotropic material for kernels, world after world if it is not uniform."""
 
     def lame_of_flat(self, flat: FlatLeaves) -> tuple[wp.array, wp.array] | None:
-        """Lamé's parameters for the forces of leaves that are in no subtree, where the plan keeps them, else None."""
+        """Lamé's parameters for the forces of leaves outside subtrees, if the plan keeps them, else None."""
         return flat.material
 
     @property
@@ -132,7 +132,7 @@ class Discretization(ABC):
         return self.fill is None and all(not shape or shape[-1] == 1 for shape in shapes)
 
     def make_activation(self) -> bool:
-        """Make an active stress for every element if there is none; returns whether there was none."""
+        """Make an active stress for every element if there is none; return whether there was none."""
         if self.has_activation:
             return False
         if len(self.activation) < self.sizes.elements:
@@ -142,13 +142,13 @@ class Discretization(ABC):
 
 
 class MeshChanges(Protocol):
-    """What changes the mesh of a body, as the body calls it; arrays have the present nodes."""
+    """The owner of a changing mesh, for calls by the body; arrays have the present nodes."""
 
     def remember(self) -> None:
-        """Keep the present mesh and state for ``reset``."""
+        """Save the present mesh and state for ``reset``."""
 
     def reset(self, chosen: wp.array, clock: Clock) -> None:
-        """Return to the state that was kept, if the world is chosen, int32 [1]."""
+        """Return to the saved state, if the world is chosen, int32 [1]."""
 
 
 class Discretized(Protocol):
@@ -164,12 +164,12 @@ def discretization_of(body: Discretized | Discretization) -> Discretization:
 
 
 class FixedMesh(Discretization):
-    """A mesh that stays as it is.
+    """A mesh that never changes.
 
     Args:
         mesh: The mesh.
         material: The material; functions of the rest position are evaluated at the elements' centroids.
-        worlds: How many copies of the body there are.
+        worlds: Number of copies of the body.
         device: The device.
 
     Raises:
@@ -192,7 +192,7 @@ class FixedMesh(Discretization):
 
     @classmethod
     def of_lame(cls, mesh: Mesh, mu: npt.ArrayLike, lam: npt.ArrayLike, worlds: int, device: wp.Device) -> FixedMesh:
-        """A mesh with Lamé's parameters [Pa] in place of a material, numbers or [worlds, T]: enough for forces."""
+        """A mesh with Lamé's parameters [Pa] in place of a material, numbers or [worlds, T]; forces need no more."""
         made = cls.__new__(cls)
         made._material = None
         made._fill_in(mesh, mu, lam, worlds, device)
@@ -266,7 +266,7 @@ class FixedMesh(Discretization):
         return material
 
     def _of_elements(self, values: npt.NDArray[np.float64], rank: int, dtype: type) -> tuple[wp.array, int]:
-        """One value, or one for each element of each world; and the stride by which to go through them."""
+        """One value, or one for each element of each world; and their stride."""
         head, tail = values.shape[: values.ndim - rank], values.shape[values.ndim - rank :]
         if np.prod(head, dtype=int) == 1:
             return wp.array(values.reshape(1, *tail), dtype=dtype, device=self.device), 0

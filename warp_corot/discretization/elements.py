@@ -1,4 +1,4 @@
-"""From a mesh to what the kernels read: flat arrays on the device."""
+"""The arrays of a mesh on the device, in the form that kernels read."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ def in_worlds(indices: np.ndarray, worlds: int, count: int) -> np.ndarray:
 
     Args:
         indices: int32 [n, …].
-        worlds: How many worlds.
-        count: Number of things in one world that the indices refer to.
+        worlds: Number of worlds.
+        count: Number of items in one world that the indices refer to.
 
     Returns:
         int32 [worlds * n, …].
@@ -80,7 +80,7 @@ def copied(struct: S) -> S:
 
 
 class Assigned(Protocol):
-    """What every Warp struct can do."""
+    """The common members of Warp structs."""
 
     def assign(self, other: object) -> None: ...
 

@@ -1,4 +1,4 @@
-"""All local frames that tetrahedra of a forest can have, and the frames of their children and parents."""
+"""All possible local frames of a forest's tetrahedra, and the frames of their children and parents."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class FrameTable(NamedTuple):
     """Attributes:
 
     frames: Proper frames Q, float64 [n_frames, 3, 3].
-    bits: What is in a shape code besides the level, by key of the frame (``elements.frame_keys``), int32.
+    bits: The part of a shape code besides the level, by key of the frame (``elements.frame_keys``), int32.
     of_children: The same of both children of an element, by its frame and type, int32 [n_frames, 3, 2].
     of_parents: The same of its parent, by its frame and type, and whether it is the first or second child, int32
         [n_frames, 3, 2].

@@ -1,8 +1,8 @@
 """Groups of leaves that share a dilatation, in a forest whose leaves are not all in complete subtrees.
 
-Groups are found from the bottom of the tree upwards. As soon as eight or more leaves below an element are in no group
-yet (there are at most 14), they make one. So a complete subtree of three levels is always a group. Fewer than eight
-leaves of a root remain: four or more make a group; fewer join the rest of the other roots of their cube.
+Groups are found from the bottom of the tree upwards. When eight or more leaves below an element are in no group yet
+(there are at most 14), they form one. So a complete subtree of three levels is always a group. Fewer than eight leaves
+of a root remain: four or more form a group; fewer join the remaining leaves of the other roots of their cube.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from warp_corot.mesh import TetForest, TetMesh
 
 from .matching import neighbour_groups
 
-#: How many leaves make a group below an element of the tree, and among the remaining leaves of a root.
+#: Least number of leaves in a group below an element of the tree, and among the remaining leaves of a root.
 LEAST, LEAST_OF_ROOT = 8, 4
 #: Lattice intervals of a cube's edge are two to this power.
 CUBE_BITS = 16
@@ -28,7 +28,7 @@ class Groups:
     """Groups of a mesh's elements on the device, world after world.
 
     Attributes:
-        starts: Where in ``members`` each group begins, and where the last one ends, int32 [count + 1].
+        starts: The place in ``members`` at which each group begins, and at which the last one ends, int32 [count + 1].
         members: The elements, group after group, int32.
     """
 
@@ -59,7 +59,7 @@ class Groups:
         device: wp.Device,
         worlds: int,
     ) -> Groups:
-        """The groups of elements, int [n] both, of which there are so many in a world."""
+        """The groups from the elements and their group numbers, both int [n], of a world with this many elements."""
         order = np.argsort(group, kind="stable")
         sizes = np.tile(np.bincount(group), worlds)
         members = elements[order] + in_world * np.arange(worlds)[:, None]

@@ -30,14 +30,14 @@ LEVEL_BITS = MAX_LEVEL.bit_length()
 
 @dataclass(frozen=True, eq=False)
 class TreeNodes:
-    """The nodes of a forest as the mesh numbers them: leaves name the nodes 0 … N - 1.
+    """The nodes of a forest in the mesh's numbering: nodes of leaves are 0 … N - 1.
 
     Attributes:
         lattice: Lattice points, vec3i.
         ends: The two ends of the edge whose midpoint each node is, vec2i; -1, -1 for corners of roots.
         mesh_nodes: N.
-        first_other: The first node that no leaf names.
-        other_count: How many nodes no leaf names.
+        first_other: The first node of no leaf.
+        other_count: Number of nodes of no leaf.
     """
 
     lattice: wp.array
@@ -61,23 +61,23 @@ class TreeNodes:
 
 
 class Levels:
-    """Nodes by level with the ends of their edges, one world's, in arrays on the device.
+    """The nodes of one world by level with the ends of their edges, in arrays on the device.
 
-    The mesh's nodes keep their numbers 0 … N - 1. Where parts of the forest are void, ancestors of leaves may have
-    corners that no leaf names: these follow, and are unknowns of coarse levels only.
+    The mesh's nodes keep their numbers 0 … N - 1. If parts of the forest are void, ancestors of leaves may have corners
+    that belong to no leaf: these follow, and are unknowns of coarse levels only.
 
-    A multigrid cycle over some levels, all or every third, keeps values of a level's nodes apart from those of finer
-    levels: ``nodes[: starts[level + 1]]`` are the nodes up to a level.
+    A multigrid cycle over all levels or every third needs the nodes of each level: ``nodes[: starts[level + 1]]`` are
+    the nodes up to a level.
 
     Args:
         tree: The nodes.
         elements: The leaves as ``kernels.elements.elements.ForestElements``, the first world's first.
-        sizes: How many leaves there are in one world, and how many worlds.
+        sizes: Numbers of leaves in one world, and of worlds.
 
     Attributes:
         version: ``sizes.version`` of the mesh whose levels these are.
         worlds, device: The number of copies of the mesh in nodal arrays, and their device.
-        mesh_nodes: N, the nodes that leaves name.
+        mesh_nodes: N, the number of nodes of leaves.
         node_count: All nodes, M.
         depth: The finest level of a node.
         others: Where the nodes N … M - 1 stand in the mesh's own numbering, among ``TetForest.lattice_points`` or in
@@ -112,7 +112,7 @@ class Levels:
         return f"Levels({self.node_count} nodes of levels 0 to {self.depth} on {self.device})"
 
     def prolongate(self, x: wp.array, coarse: int = 0, fine: int | None = None) -> None:
-        """Continue a function linearly from the nodes up to a level: a finer node gets the mean of its edge's ends.
+        """Extend a function linearly from the nodes up to a level: a finer node gets the mean of its edge's ends.
 
         May be recorded.
 
@@ -158,8 +158,9 @@ class Levels:
         return range(coarse + 1, fine + 1)
 
     def _find_others(self, tree: TreeNodes) -> tuple[wp.array, wp.array]:
-        """Places of the nodes that are ends of others but that no leaf names, and the inclusive sum of flags that say
-        of each place whether it is one of them."""
+        """Places of the nodes that are ends of others but belong to no leaf, and the inclusive sum of flags of these
+        places.
+        """
         flags, sums = self._ints(tree.other_count), self._ints(tree.other_count)
         if tree.other_count == 0:
             return flags, sums
@@ -174,8 +175,9 @@ class Levels:
         return places, sums
 
     def _sort_nodes(self, tree: TreeNodes) -> tuple[wp.array, wp.array]:
-        """Find the order of the nodes and where levels begin. Returns their levels in that order, and the beginnings of
-        all possible levels."""
+        """Find the order of the nodes and the beginnings of levels. Return the nodes' levels in that order, and the
+        beginnings of all possible levels.
+        """
         count = self.node_count
         # Sorting needs twice the room.
         level, nodes = self._ints(2 * count), self._ints(2 * count)
@@ -191,7 +193,7 @@ class Levels:
         return level, starts
 
     def _sort_ends(self, tree: TreeNodes, level: wp.array, numbers: wp.array) -> wp.array:
-        """Find the ends, and the midpoints by level and end. Returns the level and end of each midpoint as a key."""
+        """Find the ends, and the midpoints by level and end. Return the level and end of each midpoint as a key."""
         count, roots = self.node_count, self.starts[1]
         pairs = 2 * (count - roots)
         self.ends = wp.empty(count, dtype=wp.vec2i, device=self.device)

@@ -1,9 +1,8 @@
 """Groups of neighbouring elements of any mesh, by matching.
 
-Three times, each group joins one of those that it shares a face with: the one whose centre is nearest. Two groups join
-where each is the other's nearest, and those that are left look again among themselves. So groups have eight elements
-where the mesh has enough of them, and what lies together is together. Groups that stay small then join a neighbour
-that has room.
+Three times, each group joins the group with the nearest centre among those with which it shares a face. Two groups join
+if each is the other's nearest, and the remaining ones search again among themselves. So groups have eight neighbouring
+elements if the mesh has enough of them. Groups that stay small then join a neighbour that has room.
 """
 
 from __future__ import annotations
@@ -16,9 +15,9 @@ import numpy.typing as npt
 Integers = npt.NDArray[np.integer[Any]]
 Numbers = npt.NDArray[np.floating[Any]]
 
-#: How often groups join in twos, and how often those that are left look for another.
+#: Number of times that groups join in twos, and of searches of the remaining groups each time.
 DOUBLINGS, LOOKS = 3, 8
-#: Groups of fewer elements join a neighbour, which has at most so many then.
+#: Groups of fewer elements join a neighbour, which then has at most this many.
 SMALL, MOST = 6, 14
 
 
@@ -62,11 +61,11 @@ def face_pairs(tets: Integers) -> npt.NDArray[np.int64]:
 
 
 def mutual_neighbours(pairs: Integers, centre: Numbers) -> tuple[Integers, Integers]:
-    """Of pairs of groups, those in which each is the other's nearest by its centre: the first and the second ones."""
+    """The pairs of groups in which each is the other's nearest by its centre: the first and the second groups."""
     far = np.linalg.norm(centre[pairs[:, 0]] - centre[pairs[:, 1]], axis=1)
     both = pairs[np.argsort(-far, kind="stable")]
     nearest = np.full(len(centre), -1)
-    # Of what is written to one place the last stays, the nearest.
+    # The last value written to a place stays: the nearest one.
     nearest[both.ravel()] = both[:, ::-1].ravel()
     first = np.flatnonzero(nearest >= 0)
     first = first[(nearest[nearest[first]] == first) & (first < nearest[first])]
@@ -76,7 +75,7 @@ def mutual_neighbours(pairs: Integers, centre: Numbers) -> tuple[Integers, Integ
 def _joined(
     joined: Integers, group: Integers, centre: Numbers, size: Numbers, pairs: Integers
 ) -> tuple[Integers, Numbers, Numbers, Integers]:
-    """Groups of elements, their centres and sizes and pairs of neighbours, after some have joined others."""
+    """Groups of elements, with centres, sizes and pairs of neighbours, after some groups have joined."""
     kept, number = np.unique(joined, return_inverse=True)
     sizes = np.bincount(number, size).astype(np.float64)
     centres: Numbers = np.stack([np.bincount(number, size * x) for x in centre.T], axis=1) / sizes[:, None]

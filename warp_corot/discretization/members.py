@@ -10,8 +10,8 @@ import warp as wp
 from warp_corot.kernels.elements import shared_rows as kernels
 from warp_corot.kernels.elements.dilatation import Dilatation
 
-#: Starts, members, how many there are if launches go through more, and how many launches go through: as
-#: ``kernels.elements.shared_dilatation.share_in_groups`` takes groups.
+#: Groups in the form of ``kernels.elements.shared_dilatation.share_in_groups``: starts, members, the number of groups
+#: if launches cover more, and the number in launches.
 Batch = tuple[wp.array, wp.array, wp.array, int]
 
 
@@ -20,10 +20,10 @@ class Members:
     """Groups, their elements and their nodes.
 
     Attributes:
-        count: How many groups launches go through; some may be empty.
-        entries: How many nodes all have together.
-        arrays: On the device.
-        law: What is shared.
+        count: Number of groups in launches; some may be empty.
+        entries: Total number of nodes of all groups.
+        arrays: The arrays on the device.
+        law: The shared dilatation.
     """
 
     count: int
@@ -33,16 +33,16 @@ class Members:
 
     @classmethod
     def of(cls, law: Dilatation, batches: list[Batch], nodes: wp.array, below: int | None = None) -> Members:
-        """Of the present mesh; waits for the device.
+        """The members of the present mesh; waits for the device.
 
         Args:
-            law: What is shared.
+            law: The shared dilatation.
             batches: Groups.
-            nodes: Of all elements, vec4i.
+            nodes: The nodes of all elements, vec4i.
             below: Groups of elements from this number on are left empty; None: all count.
         """
         device = nodes.device
-        # Subtrees name their first leaf alone.
+        # Subtrees store only their first leaf.
         places = [len(members) or 8 * groups for _, members, _, groups in batches]
         count, room = sum(groups for *_, groups in batches), sum(places)
         found = kernels.GroupNodes()

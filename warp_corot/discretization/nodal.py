@@ -1,4 +1,4 @@
-"""Nodal vectors as the device keeps them: four floats a node, the last one unused."""
+"""Nodal vectors on the device: four floats for each node, the last one unused."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import warp as wp
 
 
 def padded(vectors: np.ndarray) -> npt.NDArray[np.float32]:
-    """[N, 3] as the float32 [N, 4] that nodal arrays hold."""
+    """[N, 3] as float32 [N, 4], the form of nodal arrays."""
     padded = np.zeros((len(vectors), 4), np.float32)
     padded[:, :3] = vectors
     return padded
@@ -20,5 +20,5 @@ def vec3_view(a: wp.array) -> wp.array:
 
 
 def same_array(a: wp.array, b: wp.array) -> bool:
-    """Whether launches with one are launches with the other."""
+    """Whether two arrays are the same memory for launches."""
     return (a.ptr, a.dtype, a.strides) == (b.ptr, b.dtype, b.strides)

@@ -26,8 +26,8 @@ class Units:
     """Tetrahedra, leaves or ancestors of leaves, whose rotations are computed.
 
     Attributes:
-        elements: ``kernels.elements.elements.ForestElements``, or general ones where there is no tree.
-        count: How many one launch goes through.
+        elements: ``kernels.elements.elements.ForestElements``, or general ones without a tree.
+        count: Number of units in one launch.
         unit: The unit whose rotation each of the mesh's elements uses, int32 [T].
     """
 
@@ -43,15 +43,15 @@ class Units:
 
 @dataclass(frozen=True)
 class FlatLeaves:
-    """Leaves that are in no subtree, as elements of their own, world after world.
+    """Leaves outside subtrees, as single elements, world after world.
 
     Attributes:
-        leaves: Their numbers among the mesh's elements, int32 [n]; ``len`` is how many one launch goes through.
+        leaves: Their numbers among the mesh's elements, int32 [n]; ``len`` is the number in one launch.
         elements: ``kernels.elements.elements.ForestElements``.
         unit: The one of ``Units`` that each uses if rotations are shared, int32 [n], else None.
         general: The same leaves as general elements, if these exist, else None.
         material: Their Lamé parameters mu and lambda [Pa] if these vary and are kept, float32 [n] each, else None.
-        live: How many there are, if launches go through more, int32 [1] on the device, else None.
+        live: The number of leaves, if launches cover more, int32 [1] on the device, else None.
     """
 
     leaves: wp.array
@@ -67,7 +67,7 @@ class FlatLeaves:
 
 @dataclass(frozen=True)
 class LeafCounts:
-    """The number of leaves of a changing mesh, for launches that derive something for each leaf.
+    """The number of leaves of a changing mesh, for launches that derive data for each leaf.
 
     Attributes:
         most: The largest possible number, with padding.
@@ -89,9 +89,9 @@ class Plan(Protocol):
     Attributes:
         elements: All leaves, ``ForestElements`` or, of a general mesh, ``GeneralElements`` of ``kernels.elements``;
             their forces go to the slots if there are any.
-        batches: Subtrees by type, grouped or not, and sharing; none if the field goes leaf by leaf.
+        batches: Subtrees by type, grouped or not, and sharing; none if the field computes leaf by leaf.
         flat: The other leaves.
-        slots: Where kernels first add forces if sums must have a fixed order, else None.
+        slots: The places to which kernels first add forces if sums must have a fixed order, else None.
         counts: The number of leaves, if it changes, else None.
     """
 

@@ -17,7 +17,7 @@ from .plan import FlatLeaves, Plan
 
 
 class ShearOnly(Discretization):
-    """Another discretization with zero in place of lambda. All else is shared and follows its changes.
+    """Another discretization with zero in place of lambda. All other data are shared and follow its changes.
 
     Args:
         whole: The other discretization.

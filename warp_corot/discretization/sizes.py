@@ -1,4 +1,4 @@
-"""How many nodes and elements a body has, and how many its launches go through."""
+"""Numbers of nodes and elements of a body, and of its launches."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ class Sizes:
 
     Attributes:
         worlds: Copies of the body.
-        world_nodes, world_elements: In one copy.
-        launch_nodes, launch_elements: How many launches go through; those beyond the counts do nothing.
+        world_nodes, world_elements: Numbers in one copy.
+        launch_nodes, launch_elements: Sizes of launches; items beyond the counts do nothing.
         version: A counter of changes of the mesh.
         revision: A counter of changes of the arrays, or the sizes, of launches.
     """
@@ -41,16 +41,16 @@ class Sizes:
         return self.worlds * self.world_elements
 
     def mesh_changed(self, nodes: int, elements: int) -> None:
-        """Note that the mesh has changed, with its new numbers of nodes and elements."""
+        """Record that the mesh has changed, with its new numbers of nodes and elements."""
         self.world_nodes, self.world_elements = nodes, elements
         self.version += 1
 
     def set_launches(self, nodes: int, elements: int) -> bool:
-        """Set how many nodes and elements launches go through; returns whether the numbers changed."""
+        """Set the sizes of launches; return whether they changed."""
         before = self.launch_nodes, self.launch_elements
         self.launch_nodes, self.launch_elements = nodes, elements
         return before != (nodes, elements)
 
     def relaunch(self) -> None:
-        """Note that the launches of a step have changed."""
+        """Record that the launches of a step have changed."""
         self.revision += 1

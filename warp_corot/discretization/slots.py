@@ -23,8 +23,8 @@ class Slots:
     """Slots of all units of work, unit after unit, so that each writes to one stretch of memory.
 
     Attributes:
-        starts: Where each node's entries in ``order`` begin, and where the last one's end, int32 [worlds * N + 1].
-        order: The slots that each node adds up, int32.
+        starts: The beginning of each node's entries in ``order``, and the end of the last, int32 [worlds * N + 1].
+        order: The slots that each node sums, int32.
         values: Forces, vec4 [worlds * per_world].
         per_world: How many slots there are in a world.
     """
@@ -42,7 +42,7 @@ class Slots:
             nodes: Nodes of the slots of one world, ``node_count`` for unused slots, and as many further places, int32
                 [2 * per_world]. It is overwritten.
             per_world: How many slots there are in a world.
-            used: How many slots are used.
+            used: Number of used slots.
             node_count: Number of nodes of one world.
         """
         device = nodes.device
@@ -80,7 +80,7 @@ class Slots:
         return slots, in_worlds(numbers, worlds, units.size)
 
     def gather(self, f: wp.array, values: wp.array | None = None) -> None:
-        """Add each node's slots to its force, vec4 [worlds * N]; ``values`` are others in the place of the slots'."""
+        """Add each node's slots to its force, vec4 [worlds * N]; ``values``, if given, replace those of the slots."""
         inputs = [self.starts, self.order, self.values if values is None else values]
         wp.launch(gather_slots, dim=len(f), inputs=inputs, outputs=[f], device=f.device)
 

@@ -1,7 +1,7 @@
-"""Complete subtrees of a forest, the units of work of the fast force path, in batches.
+"""Batches of complete subtrees of a forest, the units of work of the fast force path.
 
-In an adaptive forest, every stretch of equal levels benefits: eight leaves under one ancestor three levels up make a
-subtree, and eight of these subtrees under one ancestor make a group (CUDA). Other leaves go one by one.
+In an adaptive forest, every stretch of equal levels benefits: eight leaves under one ancestor three levels up form a
+subtree, and eight of these subtrees under one ancestor form a group (CUDA). Other leaves are computed one by one.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ GROUPED_LEAVES = 1 << 16
 
 
 class Sharing(Enum):
-    """Whose rotation the leaves of a subtree use."""
+    """The owner of the rotation that the leaves of a subtree use."""
 
     OWN = "own"
     ROOT = "the subtree root's"
@@ -27,19 +27,19 @@ class Sharing(Enum):
 
 @dataclass(frozen=True)
 class Batch:
-    """Subtrees of one type that one launch goes through, world after world.
+    """Subtrees of one type in one launch, world after world.
 
     Attributes:
         shape: Their type, 0, 1 or 2.
         grouped: Whether they come in groups of eight (CUDA).
-        count: How many.
-        sharing: Whose rotation their leaves use.
+        count: Number of subtrees.
+        sharing: The owner of the rotation that their leaves use.
         subtrees: ``kernels.elements.elements.Subtrees``.
-        roots: Their roots as forest elements where leaves share the root's rotation, else None.
+        roots: Their roots as forest elements if leaves share the root's rotation, else None.
         unit: The one of ``Units`` that each uses if leaves share a rotation from further up, int32 [count], else None.
         flagged: Set by the kernel: bit k of a subtree's byte if its leaf k, in tree order, was left out; uint8
             [count, rounded up to eights].
-        live: How many there are, if launches go through more, int32 [1] on the device, else None.
+        live: The number of subtrees, if launches cover more, int32 [1] on the device, else None.
     """
 
     shape: int

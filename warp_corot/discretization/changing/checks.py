@@ -1,4 +1,4 @@
-"""What users ask of remeshing, checked: thresholds, levels, capacity, criterion and its numbers.
+"""Checks of the options of remeshing: thresholds, levels, capacity, criterion and its numbers.
 
 All messages have one form, NAME is VALUE; it must be …, with Python's names. ``cli.remesh`` puts the options' names in
 their place.
@@ -35,7 +35,7 @@ def checked_thresholds(refine_above: Any, simplify_below: Any) -> tuple[float, f
 
 
 def checked_capacity(capacity: int, count: int) -> int:
-    """How many elements there may be, of a mesh that has ``count`` to begin with.
+    """The largest number of elements, for a mesh that begins with ``count``.
 
     Raises:
         InputError: Fewer than that.
@@ -67,7 +67,7 @@ def checked_parameters(parameters: Any, criterion: Any) -> wp.array | None:
 
     Args:
         parameters: The numbers.
-        criterion: Its length is checked for the criteria that are in the package.
+        criterion: The criterion; the length is checked for the package's own criteria.
 
     Raises:
         InputError: They are something else, or too few.

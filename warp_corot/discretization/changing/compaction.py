@@ -36,12 +36,12 @@ def compact(forest: DeviceForest) -> None:
         _rename(array, node_number)
     for array in (pools.parent, pools.first_child, pools.leaves[:leaves], pools.void_leaves):
         _rename(array, element_number)
-    # The free places are now the last ones; the lowest of them are used first.
+    # The free places are now the last ones; the lowest are used first.
     free_pairs = forest.free_leaves
     if free_pairs:
         first = forest.tree_capacity - 2 * free_pairs
         pools.free_pairs[:free_pairs].assign(np.arange(free_pairs, dtype=np.int32)[::-1] * 2 + first)
-    # A round compares with the round in which a node was last touched; after a pass these numbers mean nothing.
+    # A round compares with the round in which a node was last touched; after a pass these numbers have no meaning.
     pools.touched.zero_()
 
 

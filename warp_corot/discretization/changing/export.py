@@ -60,7 +60,7 @@ def _without_doubles(order: np.ndarray, lattice: np.ndarray, real: np.ndarray) -
 
 
 def _same_points(points: np.ndarray, among: np.ndarray) -> np.ndarray:
-    """Where each lattice point is found among others, -1 where it is not."""
+    """The place of each lattice point among others, -1 if it is not there."""
     both, number = np.unique(np.concatenate([among, points]), axis=0, return_inverse=True)
     place = np.full(len(both), -1, np.int64)
     number = number.ravel()

@@ -1,11 +1,11 @@
-"""Which arrays of the pools and of what is carried belong to nodes and which to tetrahedra; what unused places hold."""
+"""The arrays of the pools and of carried data, by nodes and tetrahedra, and the contents of unused places."""
 
 import numpy as np
 import numpy.typing as npt
 
 from warp_corot.kernels.remesh.pools import SINKS
 
-#: Arrays of ``kernels.remesh.pools.Pools``, without those that mean nothing after a pass.
+#: Arrays of ``kernels.remesh.pools.Pools``, without those that have no meaning after a pass.
 OF_NODES: tuple[str, ...] = ("lattice", "ends", "valence")
 OF_TETRAHEDRA: tuple[str, ...] = ("tets", "level", "parent", "first_child", "code")
 
@@ -26,7 +26,7 @@ CARRIED_BY_TETRAHEDRA: tuple[str, ...] = ("density", "label", "values", "numbers
 
 
 def padding(start: int, stop: int, sink: int) -> npt.NDArray[np.int32]:
-    """What ``Pools.leaf_tets`` holds in these places if there are no leaves, int32 [stop - start, 4].
+    """The contents of ``Pools.leaf_tets`` in places without leaves, int32 [stop - start, 4].
 
     Args:
         start, stop: The places.

@@ -11,16 +11,17 @@ from warp_corot.kernels.remesh.pools import Pools
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.surfaces.bound import BoundPoints, DeviceBinding
 
-#: Before a point follows a child of its element, it is moved this share of the way from the element's border inwards.
+#: Before a point is bound to a child of its element, it moves this fraction of the way from the element's border
+#: inwards.
 INWARD = 1e-3
 
 
 class FollowingBinding(DeviceBinding):
-    """Points bound to a mesh that may change: each pass binds them to the elements that hold them afterwards.
+    """Points bound to a mesh that may change: each pass binds them to the elements that contain them afterwards.
 
     Args:
         bound: Bound to the nodes of ``mesh``.
-        mesh: As it is now.
+        mesh: The present mesh.
         leaves: The leaf that each point is bound to, int32 [V].
         device: The body's device.
     """

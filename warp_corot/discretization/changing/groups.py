@@ -1,4 +1,4 @@
-"""Groups of the leaves in no subtree, found again on the device whenever the mesh has changed; see ``groups``."""
+"""Groups of the leaves outside subtrees, found again on the device whenever the mesh has changed; see ``groups``."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from .plan import DevicePlan
 
 
 class ChangingGroups:
-    """Groups of the leaves that a plan has in no subtree.
+    """Groups of a plan's leaves outside subtrees.
 
     Args:
         plan: The plan; launch ``launch`` after it.
 
     Attributes:
-        starts, members: As in ``groups.Groups``, with room for as many as there may ever be.
-        live: How many groups there are, int32 [1] on the device.
+        starts, members: As in ``groups.Groups``, with room for the largest possible number.
+        live: Number of groups, int32 [1] on the device.
     """
 
     def __init__(self, plan: DevicePlan):
@@ -42,7 +42,7 @@ class ChangingGroups:
         self.starts, self.members, self.live = groups.starts, groups.members, groups.count
 
     def launch(self) -> None:
-        """Launch what finds the groups if the plan has just been derived; may be recorded."""
+        """Launch the search for groups if the plan has just been derived; may be recorded."""
         pools, plan, groups = self._pools, self._plan, self._groups
         most, tetrahedra, cubes = len(groups.filled), len(groups.tally), len(groups.cube_tally)
         self._launch(kernels.begin_groups, max(most, tetrahedra, cubes), pools, plan)

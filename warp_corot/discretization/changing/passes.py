@@ -1,4 +1,4 @@
-"""One pass over a changing forest: mark, refine, simplify, put the leaves in order. Nothing comes back to the host."""
+"""One pass over a changing forest: mark, refine, simplify, sort the leaves. The host reads nothing."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ from .pools import DeviceForest
 class RemeshPass:
     """A criterion and two thresholds, turned into launches that can be recorded.
 
-    A leaf is bisected where the criterion is above one threshold, and merged with its sibling where it is below the
-    other. Between the two it stays. A pass bisects a leaf once; conformity may bisect larger neighbours too.
+    A leaf is bisected if the criterion is above one threshold, and merged with its sibling if it is below the other.
+    Between the two it stays. A pass bisects a leaf once; conformity may bisect larger neighbours too.
 
     Args:
-        forest: What to change.
+        forest: The forest to change.
         criterion: A Warp function of a ``kernels.remesh.mark.ElementState`` and an array of numbers; the elongation of
             the longest edge, deformed over rest, if none is given.
         refine_above, simplify_below: Thresholds, in the criterion's unit; the first is the larger one.
         min_level, max_level: Leaves of these levels are not simplified and not refined.
         parameters: Numbers for the criterion, float32 [n] on the device, which may change between passes.
-        lame: Lamé's parameters for the criterion [Pa], or what elements carry them as.
+        lame: Lamé's parameters for the criterion [Pa], or the names under which elements carry them.
 
     Raises:
         InputError: The thresholds contradict each other, or the levels are out of order or beyond the lattice's depth.
@@ -160,7 +160,7 @@ class RemeshPass:
         wp.launch(kernel, dim=1, inputs=list(arguments), device=self.device)
 
     def _many(self, kernel: wp.Kernel, *arguments: Any) -> None:
-        """Launch a kernel in which each thread goes through a stretch of the things that there are."""
+        """Launch a kernel in which each thread loops over a stretch of the items."""
         threads = self.forest.threads
         wp.launch(kernel, dim=threads, inputs=[threads, *arguments], device=self.device)
 

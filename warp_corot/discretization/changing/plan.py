@@ -30,18 +30,18 @@ from .sizes import launch_size
 class DevicePlan:
     """The ``plan.Plan`` of a forest that changes, derived from its leaves by launches.
 
-    All arrays have room for the largest mesh and are padded, so that launches may go through more than there is now.
+    All arrays have room for the largest mesh and are padded, so that launches may cover more items than there are.
     The order of sums of forces is not fixed.
 
     Args:
         forest: The pools.
         rotation_level: Level of the tree at which rotations are shared; None: not shared.
-        subtrees: False: all leaves go one by one, for models without subtree kernels.
-        grouped: Whether complete subtrees go in groups where they can; None: only on CUDA.
+        subtrees: False: all leaves are computed one by one, for models without subtree kernels.
+        grouped: Whether complete subtrees form groups where possible; None: only on CUDA.
 
     Attributes:
         elements: The leaves as ``kernels.elements.elements.ForestElements``.
-        values: What leaves carry by name, float32 [capacity + LEAF_PADDING] each; zero beyond the leaves.
+        values: The leaves' carried values by name, float32 [capacity + LEAF_PADDING] each; zero beyond the leaves.
         class_counts: The counts that ``refresh`` takes, int32 on the device.
         batches, flat, units, counts: As in ``plan.Plan``.
         slots: None.
@@ -86,7 +86,7 @@ class DevicePlan:
         self.derive()
 
     def launch(self) -> None:
-        """Launch what derives the plan if the last pass has changed the mesh; may be recorded."""
+        """Launch the derivation of the plan if the last pass has changed the mesh; may be recorded."""
         forest, plan, planner = self.forest, self._plan, self._planner
         wp.launch(kernels.begin_plan, 1, [forest.pools, plan], device=self.device)
         inputs = [forest.threads, forest.pools, self._made.tree, forest.carriage.arrays.values, plan]
@@ -174,7 +174,7 @@ class DevicePlan:
         self.flat = replace(self._made.flat(sizes[classes]), live=self._live(classes))
 
     def _live(self, row: int) -> wp.array:
-        """How many subtrees of a class there are, or leaves in no subtree."""
+        """The number of subtrees of a class, or of leaves outside subtrees."""
         return self._plan.counts[row : row + 1]
 
     # --- pieces ------------------------------------------------------------------------------------------------------
@@ -188,7 +188,9 @@ class DevicePlan:
         return elements
 
     def _fill_in(self, most_leaves: int) -> None:
-        """Fill in what only a changing plan has. Counts begin as if all places were used, so all become padding."""
+        """Fill in the data that only a changing plan has. Counts begin as if all places were used, so all become
+        padding.
+        """
         plan, leaves, names = self._plan, self._made.leaves, self.forest.carriage.names
         plan.first_unit = 1
         plan.stale, plan.goes = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(2))
@@ -218,7 +220,7 @@ class DevicePlan:
 
 
 def tree_of(forest: DeviceForest) -> Tree:
-    """What the planner's kernels read of pools."""
+    """The data of pools for the planner's kernels."""
     pools, tree = forest.pools, Tree()
     tree.leaf_count, tree.node_count = (pools.counts[row : row + 1] for row in (int(LEAVES), int(NODE_TOP)))
     tree.named = int(pools.node_limit == pools.sink)

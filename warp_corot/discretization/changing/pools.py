@@ -27,9 +27,9 @@ class PassCounts(NamedTuple):
     """The counts that the host reads after a pass.
 
     Attributes:
-        leaves, nodes: How many there are; nodes that only void tetrahedra name are not counted.
+        leaves, nodes: Numbers of leaves and nodes; nodes of only void tetrahedra are not counted.
         added, removed: Nodes made and removed in the last pass. If both are zero, the mesh did not change.
-        full: Whether a refinement was ever left out because the pools were full.
+        full: Whether a refinement was ever skipped because the pools were full.
     """
 
     leaves: int
@@ -189,18 +189,19 @@ class DeviceForest:
     def compact(self) -> None:
         """Renumber nodes and tetrahedra in the order of the leaves, which are in tree order after every pass.
 
-        This helps when memory has become scattered. Arrays stay the same; node numbers kept elsewhere become invalid.
+        This helps when neighbours have become scattered in memory. Arrays stay the same; node numbers stored elsewhere
+        become invalid.
         """
         from .compaction import compact
 
         compact(self)
 
     def remember(self) -> None:
-        """Keep the present mesh and all that it carries for ``restart``. The constructor does this once."""
+        """Save the present mesh and all that it carries for ``restart``. The constructor does this once."""
         self.remembered = Snapshot.of(self.pools, self.carriage.arrays)
 
     def restart(self) -> None:
-        """Return to the state kept last. Arrays stay the same, so that recorded passes and steps stay valid."""
+        """Return to the state that was saved last. Arrays stay the same, so recorded passes and steps stay valid."""
         self.remembered.restore(self.pools, self.carriage.arrays)
 
     # --- pieces ----------------------------------------------------------------------------------------------------
@@ -249,7 +250,7 @@ class DeviceForest:
         return pools
 
     def _numbers(self) -> npt.NDArray[np.int32]:
-        """Places of the source's nodes: those that leaves name first, the others at the end."""
+        """Places of the source's nodes: first the nodes of leaves, then the others at the end."""
         real = self.source.node_count
         number = np.arange(len(self.source.lattice), dtype=np.int32)
         number[real:] += self.node_capacity - len(number)

@@ -1,21 +1,21 @@
-"""How many things a recorded launch goes through, where their number changes."""
+"""Sizes of recorded launches over items whose number changes."""
 
 from __future__ import annotations
 
-#: A launch keeps its size down to this share of it.
+#: A launch keeps its size until it needs less than this fraction of it.
 SLACK = 0.8
 
 
 def launch_size(count: int, present: int, granule: int = 1, limit: int | None = None) -> int:
-    """A size for launches over ``count`` things and some padding, seldom another one than the present.
+    """A size for launches over ``count`` items and some padding, rarely different from the present one.
 
     A new size is too large by at most a sixteenth or one granule.
 
     Args:
-        count: How many things there are.
+        count: Number of items.
         present: The present size, or 0.
         granule: A power of two; the size is a multiple of it.
-        limit: How many places there are; a multiple of the granule where that matters.
+        limit: Number of places; a multiple of the granule if that matters.
 
     Returns:
         At least ``count``; 0 if that is 0.

@@ -17,7 +17,7 @@ from warp_corot.kernels.tables.shapes import FRAME_SHIFT
 
 from .fields import CARRIED_BY_NODES, CARRIED_BY_TETRAHEDRA, OF_NODES, OF_TETRAHEDRA, padding
 
-#: What unused places hold, if it is not zero.
+#: The contents of unused places, if they are not zero.
 _UNUSED = {"level": int(kernels.UNUSED), "row": int(NO_ROW)}
 
 _CARRIED = (*CARRIED_BY_NODES, *CARRIED_BY_TETRAHEDRA, "impulse")
@@ -33,7 +33,7 @@ class Piece(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """A copy of what is in use of all arrays, on the device.
+    """A copy of the used parts of all arrays, on the device.
 
     Attributes:
         counts: ``Pools.counts``, int32.
@@ -76,9 +76,9 @@ def check_places(
     """Check that the stretches lie within the arrays.
 
     Args:
-        pools, carried: Where the stretches are to go.
+        pools, carried: The destination of the stretches.
         counts: ``Pools.counts``.
-        pieces: Values, by the name of their array and, after a dot, where the stretch begins.
+        pieces: Values, by the name of their array and, after a dot, the beginning of the stretch.
 
     Raises:
         ValueError: A stretch goes beyond an array; in one line.
@@ -108,7 +108,7 @@ def array_of(pools: kernels.Pools, carried: Carried, name: str) -> wp.array:
 
 
 def _in_use(pools: kernels.Pools, carried: Carried, counts: npt.NDArray[np.int32]) -> Iterator[tuple[str, int, int]]:
-    """The stretches in use: names of arrays, where each stretch begins, and how long it is."""
+    """The stretches in use: names of arrays, and the beginning and length of each stretch."""
     used = int(np.flatnonzero(pools.level.numpy() != kernels.UNUSED)[-1]) + 1
     for name in (*OF_TETRAHEDRA, *CARRIED_BY_TETRAHEDRA):
         if array_of(pools, carried, name).size:

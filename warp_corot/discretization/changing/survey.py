@@ -1,4 +1,4 @@
-"""When the stable step of a changing mesh must be found again."""
+"""The decision when the stable step of a changing mesh must be found again."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from warp_corot.kernels.remesh import survey as kernels
 
 from .pools import DeviceForest
 
-#: A longer step is sought only after the stiffest element has been softer for this many passes.
+#: A longer step is searched for only after the stiffest element has been softer for this many passes.
 PATIENCE = 10
-#: Growth of the number of finest elements, and passes with changes, after which the step is found again in any case. An
-#: element among equal ones vibrates up to half again as fast as one among larger ones.
+#: Growth of the number of finest elements, and number of passes with changes, after which the step is always found
+#: again. An element among equal ones vibrates up to 1.5 times as fast as one among larger ones.
 GROWTH = 1.5
 MOST_CHANGES = 50
-#: Stiffnesses that differ by less than this share count as equal.
+#: Stiffnesses with a smaller relative difference count as equal.
 ALIKE = 1e-3
 
 
@@ -29,7 +29,7 @@ class Findings:
 
     Attributes:
         stiffness: Of the stiffest element, (2 mu + lambda) / (density volume^(2/3)) [1/s^2].
-        finest: How many elements have the finest level.
+        finest: Number of elements of the finest level.
         softer_for: Passes in which the stiffest element was softer.
         changes: Passes that changed something.
     """
@@ -41,14 +41,14 @@ class Findings:
 
 
 class Survey:
-    """Looks at the elements after each pass.
+    """Measures the elements after each pass.
 
     Args:
         forest: The pools.
         modulus: 2 mu + lambda [Pa], if all elements have the same; else elements carry "mu" and "lam".
 
     Attributes:
-        found: What launches have found, int32, for ``read``.
+        found: The launches' results, int32, for ``read``.
         last: The mesh when its step was found last.
         finest_level: The finest level of the present mesh.
     """
@@ -63,7 +63,7 @@ class Survey:
         self._stiffness, self._finest = 0.0, 0
 
     def launch(self, goes: wp.array) -> None:
-        """Look at the elements if ``goes`` [1] is not zero; may be recorded."""
+        """Launch the measurement of the elements if ``goes`` [1] is not zero; may be recorded."""
         forest = self._forest
         device, threads = forest.device, forest.threads
         wp.launch(begin_counts, dim=kernels.PLACES, inputs=[goes], outputs=[self.found], device=device)
@@ -92,5 +92,5 @@ class Survey:
         return True
 
     def settle(self) -> None:
-        """Note that the step has been found for the present mesh."""
+        """Record that the step has been found for the present mesh."""
         self.last = Findings(self._stiffness, self._finest)

@@ -40,10 +40,10 @@ class Carriage:
     lumped, a quarter of each leaf's at its nodes, and carries its momentum along; momentum that a held node cannot take
     up is counted in ``support_impulse``. A node between two held ones is held. Loads stay where they are; half of a
     removed node's load goes to each end of its edge. Children have their parent's density and values; a parent has its
-    children's mean, or what a ``Column`` says.
+    children's mean, or the value by the rule of its ``Column``.
 
     Args:
-        source: The forest to begin with.
+        source: The first forest.
         nodes, elements: Places for nodes and for tetrahedra of all levels.
         density: Mass per rest volume [kg/m^3], a number or one for each leaf [T].
         values: Other quantities of leaves by name.
@@ -123,8 +123,9 @@ class Carriage:
 
         Args:
             displacements, velocities, loads: [n, 3] [m], [m/s], [N].
-            held: Which are fixed or prescribed, bool [n].
-            rows: Which row of keyframes held nodes follow, -1 for none, int32 [n]. A node that is made between two held
+            held: Mask of fixed and prescribed nodes, bool [n].
+            rows: The row of keyframes that each held node follows, -1 for none, int32 [n]. A node that is made between
+                two held
                 ones has the row of both; -2 if they follow different ones.
             nodes: Places in the pool [n]; None: the nodes of the original forest, before any pass.
 

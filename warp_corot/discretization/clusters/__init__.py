@@ -1,1 +1,1 @@
-"""Elements in clusters whose forces meet in a thread block's shared memory."""
+"""Clusters of elements whose forces are summed in a thread block's shared memory."""

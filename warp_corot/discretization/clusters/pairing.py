@@ -16,7 +16,7 @@ from warp_corot.kernels.clusters.pair_elements import (
     vec4u,
 )
 
-#: Elements are paired if they are no farther apart in the list of those without a partner.
+#: Elements are paired if they are at most this far apart in the list of those without a partner.
 REACH = 6
 #: The four nodes in an order that begins with a face's three, for each node opposite the face.
 _OPPOSITE = np.array([[1, 2, 3, 0], [0, 2, 3, 1], [0, 1, 3, 2], [0, 1, 2, 3]])
@@ -29,7 +29,7 @@ def paired(tets: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
         tets: Nodes of elements, int32 [T, 4].
 
     Returns:
-        Places in the list, ordered by the first of each pair, int32 [pairs, 2]; the second is -1 where there is none.
+        Places in the list, ordered by the first of each pair, int32 [pairs, 2]; the second is -1 if there is none.
     """
     left = np.arange(len(tets), dtype=np.int32)
     found = [np.empty((0, 2), np.int32)]
@@ -73,7 +73,7 @@ def roles_of(
     """Nodes a, b, c of the face, d and e of pairs, int32 [pairs, 5], and which of its four nodes an element has in the
     roles a, b, c and d, or e: [pairs, 2, 4].
 
-    Without a second element e is a, and its roles mean nothing.
+    Without a second element e is a, and its roles have no meaning.
     """
     first, second = tets[pairs[:, 0]], tets[pairs[:, 1]]
     shared = (first[:, :, None] == second[:, None, :]).any(axis=2)
@@ -92,7 +92,7 @@ def roles_of(
 def gradients_of(
     rest_inverse: npt.NDArray[np.float32], pairs: npt.NDArray[np.int32], roles: npt.NDArray[np.int64]
 ) -> npt.NDArray[np.float32]:
-    """B of both elements of each pair, zero where there is none: [pairs, 2, 3, 3].
+    """B of both elements of each pair, zero if there is none: [pairs, 2, 3, 3].
 
     Args:
         rest_inverse: Inverse rest edges from each element's first node, [T, 3, 3].
@@ -114,9 +114,9 @@ def device_pairs(
     """Pairs as the kernels read them.
 
     Args:
-        corners: Where nodes a to e stand in bytes, [pairs, 5].
+        corners: Places of nodes a to e in bytes, [pairs, 5].
         gradients: B of both elements, [pairs, 2, 3, 3].
-        volumes: Volumes of both, zero where there is no second, [pairs, 2].
+        volumes: Volumes of both, zero without a second, [pairs, 2].
         cell: Edge length of a forest's root cubes; None for a general mesh.
     """
     count, words = len(corners), GENERAL_WORDS if cell is None else LATTICE_WORDS

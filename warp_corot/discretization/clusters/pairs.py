@@ -34,11 +34,11 @@ def pairs_in_clusters(
         nodes: Nodes of all elements, int32 [T, 4].
         general: All of them as ``kernels.elements.elements.GeneralElements``.
         cell: Edge length of a forest's root cubes [m]; None for a general mesh.
-        layout: What the kernel is generated for.
+        layout: The layout for which the kernel is generated.
 
     Returns:
         ``PairClusters`` of ``kernels.clusters.pairs``; ``LatticePairs`` or ``GeneralPairs`` of
-        ``kernels.clusters.pair_elements``; and how many clusters there are.
+        ``kernels.clusters.pair_elements``; and the number of clusters.
     """
     device, tets = general.nodes.device, nodes[chosen]
     pairs = paired(tets)
@@ -64,7 +64,7 @@ def pairs_in_clusters(
 
 
 def _cut(of_pairs: npt.NDArray[np.int32], threads: int) -> npt.NDArray[np.int32]:
-    """Where each cluster begins and the last one ends; no cluster has more pairs or tasks than threads."""
+    """The beginning of each cluster and the end of the last; no cluster has more pairs or tasks than threads."""
     nodes = int(of_pairs.max(initial=0)) + 1
     cluster_of, degree = wp.full(nodes, -1, dtype=wp.int32, device="cpu"), wp.zeros(nodes, dtype=wp.int32, device="cpu")
     begins, count = (wp.zeros(n, dtype=wp.int32, device="cpu") for n in (len(of_pairs), 1))
@@ -89,7 +89,7 @@ def _tasks(
         cluster, thread: The place of each pair, [pairs].
     """
     key = (cluster[:, None] * (int(of_pairs.max(initial=0)) + 1) + of_pairs).ravel()
-    # In ``order`` the corners on one node of a cluster follow one another.
+    # In ``order`` the corners on one node of a cluster are consecutive.
     order = np.argsort(key, kind="stable")
     starts = np.flatnonzero(np.diff(key[order], prepend=-1))
     degree = np.diff(starts, append=len(key))

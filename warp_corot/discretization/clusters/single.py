@@ -14,15 +14,15 @@ from warp_corot.kernels.tables.shapes import SQRT2
 
 
 def changing_clusters(most: int, count: wp.array, layout: ClusterLayout = DEFAULT_LAYOUT) -> tuple[Clusters, int]:
-    """Room for clusters of all elements of a mesh that changes, for ``find_tables`` to fill in.
+    """Allocate clusters of all elements of a changing mesh; ``find_tables`` fills them in.
 
     Args:
-        most: How many elements there may be.
-        count: How many there are, int32 [1] on the device.
-        layout: What kernels are generated for.
+        most: The largest possible number of elements.
+        count: The number of elements, int32 [1] on the device.
+        layout: The layout for which kernels are generated.
 
     Returns:
-        ``kernels.clusters.single.Clusters``, and how many there may be.
+        ``kernels.clusters.single.Clusters``, and the largest possible number of clusters.
     """
     device = count.device
     clusters, places = Clusters(), -(-most // layout.elements)
@@ -56,7 +56,7 @@ def find_tables(
 def order_in_clusters(
     points: npt.NDArray[np.float64], tets: npt.NDArray[np.int32], layout: ClusterLayout = DEFAULT_LAYOUT
 ) -> npt.NDArray[np.int32]:
-    """An order of a mesh's elements in which neighbours follow one another, int32 [T]; the given one if it does.
+    """An order of a mesh's elements in which neighbours are close, int32 [T]; the given one if it is good enough.
 
     Args:
         points: Rest positions, [N, 3].
@@ -64,7 +64,7 @@ def order_in_clusters(
     """
     given = np.arange(len(tets), dtype=np.int32)
     along_curve = np.argsort(_morton(points[tets].mean(axis=1)), kind="stable").astype(np.int32)
-    # The fewer nodes clusters have, the less is read and added up.
+    # The fewer nodes clusters have, the less they read and sum.
     counts = [_node_count(tets[order], layout) for order in (given, along_curve)]
     return given if counts[0] <= counts[1] else along_curve
 
@@ -85,7 +85,7 @@ def _morton(x: npt.NDArray[np.float64]) -> npt.NDArray[np.uint64]:
 
 
 def _node_count(tets: npt.NDArray[np.int32], layout: ClusterLayout) -> int:
-    """How many nodes all clusters have together if the elements have this order."""
+    """Total number of clusters' nodes for elements in this order."""
     whole = len(tets) // layout.elements * layout.elements
     if whole == 0:
         return 0
@@ -97,7 +97,7 @@ def axis_words(frames: npt.NDArray[np.float64]) -> npt.NDArray[np.int32]:
     """The integers of elements without their halvings, by frame, mirrored or not, and type: int32 [n, 2, 3].
 
     Args:
-        frames: Proper local frames, [n, 3, 3]; where a frame does not occur with a type, its integer has no meaning.
+        frames: Proper local frames, [n, 3, 3]; if a frame does not occur with a type, its integer has no meaning.
     """
     words = np.zeros((len(frames), 2, 3), np.int32)
     orders = _orders()
@@ -108,7 +108,7 @@ def axis_words(frames: npt.NDArray[np.float64]) -> npt.NDArray[np.int32]:
         for shape in range(3):
             axes = np.round(halves if shape == 2 else columns).astype(int)
             for k, (entries, order) in enumerate(zip(axes, np.abs(axes).argmax(axis=1), strict=True)):
-                # Axis i points along component order[i], backwards where its entry is negative.
+                # Axis i points along component order[i], backwards if its entry is negative.
                 swaps = orders.get((int(order[0]), int(order[1]), int(order[2])), 0)
                 backwards = sum(bit for i, bit in enumerate(BACKWARDS) if entries[order[i], i] < 0)
                 words[k, mirrored, shape] = shape | swaps | backwards

@@ -1,4 +1,4 @@
-"""The arrays of a plan, and the parts of them that launches of forces read."""
+"""The arrays of a plan, and the parts that launches of forces read."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Room:
 
     Attributes:
         subtrees: For subtrees of each class.
-        flat: For leaves in no subtree.
+        flat: For leaves outside subtrees.
         units: For units; 0 if they are not listed.
         leaves: For leaves.
     """
@@ -43,18 +43,18 @@ class Room:
 
 
 class PlanArrays:
-    """The arrays of a plan, without values to begin with.
+    """The arrays of a plan, at first without values.
 
     Args:
         tree: The tree that the plan is derived from.
         elements: The leaves, in one world or more. Other elements have the same frames and edge lengths.
         rotation_level: Level of the tree at which rotations are shared; None: not shared.
-        subtrees: False: all leaves go one by one.
-        grouped: Whether complete subtrees go in groups where they can.
+        subtrees: False: all leaves are computed one by one.
+        grouped: Whether complete subtrees form groups where possible.
 
     Attributes:
-        kinds: Sharing and shape of subtrees that one launch goes through, grouped or not.
-        tree: As given.
+        kinds: Sharing and shape of the subtrees of one launch, grouped or not.
+        tree: The argument.
         plan, batches, leaves: ``kernels.plan.plan.Plan``, ``kernels.plan.batches.Batches`` and ``FlatLeaves``.
     """
 
@@ -124,7 +124,7 @@ class PlanArrays:
         """The first subtrees of a class.
 
         Args:
-            targets: Where their forces are added, as ``batches.nodes``; None: to the nodes.
+            targets: The places to which their forces are added, in the layout of ``batches.nodes``; None: the nodes.
         """
         arrays, begin = self.batches, self._begin[row]
         sharing, shape = self.kinds[row // self.plan.members]
@@ -143,7 +143,7 @@ class PlanArrays:
         return Batch(shape, self.is_grouped(row), count, sharing, subtrees, roots, unit, flagged)
 
     def flat(self, count: int, targets: wp.array | None = None) -> FlatLeaves:
-        """The first leaves in no subtree; ``targets`` as for ``batch``."""
+        """The first leaves outside subtrees; ``targets`` as for ``batch``."""
         leaves, general = self.leaves, None
         if leaves.volume is not None:
             general = GeneralElements()
@@ -190,7 +190,7 @@ def _rounded(count: int) -> int:
 
 
 def _places(values: Sequence[int]) -> Any:
-    """As a vector that kernels read."""
+    """Three numbers as a vector for kernels."""
     return places_t(*values[:16], *[0] * (16 - len(values)))
 
 

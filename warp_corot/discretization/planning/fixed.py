@@ -29,7 +29,7 @@ class ForcePlan:
     """The ``Plan`` of a mesh that never changes.
 
     Attributes:
-        find_units: Makes ``all_units`` for a forest whose rotations are shared.
+        find_units: A function that makes ``all_units`` for a forest with shared rotations.
     """
 
     elements: Elements
@@ -53,7 +53,7 @@ class ForcePlan:
     def leaf_by_leaf(
         cls, elements: Elements, slots: Slots | None = None, find_units: Callable[[], Units] | None = None
     ) -> ForcePlan:
-        """The plan of a field that goes through the elements of a mesh one by one."""
+        """The plan of a field that computes the elements of a mesh one by one."""
         none = wp.empty(0, dtype=wp.int32, device=elements.nodes.device)
         return cls(elements, (), FlatLeaves(none, elements), slots=slots, find_units=find_units)
 
@@ -73,10 +73,10 @@ class ForcePlan:
 
         Args:
             rotation_level: Level of the tree at which rotations are shared; None: not shared.
-            worlds: How many copies of the body there are.
+            worlds: Number of copies of the body.
             elements: All leaves, if they are on the device already.
-            grouped: Whether complete subtrees go in groups where they can; None: only on CUDA.
-            deterministic: Whether every unit of work has slots of its own for its forces.
+            grouped: Whether complete subtrees form groups where possible; None: only on CUDA.
+            deterministic: Whether every unit of work has separate slots for its forces.
 
         Raises:
             InputError: There are more slots, or nodes of subtrees, than can be numbered.
@@ -120,7 +120,9 @@ def pays_in_groups(forest: TetForest, elements: Elements, worlds: int) -> bool:
 
 
 class _Found:
-    """A world's numbers of subtrees of each class, leaves in no subtree, and units; and the arrays with all of them."""
+    """A world's numbers of subtrees of each class, of leaves outside subtrees, and of units; and the arrays of all of
+    them.
+    """
 
     def __init__(
         self,
@@ -150,7 +152,7 @@ class _Found:
         return any(count for (sharing, _), count in rows if sharing is Sharing.ABOVE)
 
     def made(self, *, with_units: bool, with_lists: bool = True) -> PlanArrays:
-        """The arrays: of subtrees and of leaves in none, of units, or of both."""
+        """The arrays of subtrees and of leaves outside them, of units, or of both."""
         made, plan, planner = self._arrays, self._arrays.plan, self._planner
         worlds, leaves = plan.worlds, plan.worlds * plan.world_leaves
         plan.world_units = self.units

@@ -17,7 +17,7 @@ THREADS_PER_PROCESSOR = 1024
 
 
 def threads_on(device: wp.Device) -> int:
-    """Threads of a launch in which each goes through a stretch of leaves."""
+    """Number of threads of a launch in which each loops over a stretch of leaves."""
     return 1 if device.is_cpu else device.sm_count * THREADS_PER_PROCESSOR
 
 
@@ -47,13 +47,13 @@ class Planner:
         self._launch(lists.list_leaves, threads, threads, made.tree, self._ends, made.plan)
 
     def fill_batches(self) -> None:
-        """Write what launches read of subtrees."""
+        """Write the data of subtrees for launches."""
         made, threads = self._arrays, self._threads
         inputs = (threads, made.tree, made.plan, made.batches)
         self._launch(batch_kernels.fill_batches, (made.plan.classes, threads), *inputs)
 
     def fill_flat(self) -> None:
-        """Write what launches read of leaves in no subtree."""
+        """Write the data of leaves outside subtrees for launches."""
         made, threads = self._arrays, self._threads
         self._launch(batch_kernels.fill_flat, threads, threads, made.tree, made.plan, made.leaves)
 

@@ -22,14 +22,14 @@ class SubtreeTargets:
 
     Args:
         made: The plan's arrays, filled.
-        subtrees, flat: How many subtrees of each class a world has, and how many leaves in none.
+        subtrees, flat: Numbers of a world's subtrees of each class, and of its leaves outside subtrees.
         elements: The leaves, in all worlds.
 
     Attributes:
         slots: The slots.
-        of_subtrees: Where forces of subtrees are added, as ``made.batches.nodes``.
-        of_leaves: Where forces of all leaves are added, vec4i [worlds * T].
-        of_flat: The same for leaves in no subtree.
+        of_subtrees: The places to which forces of subtrees are added, in the layout of ``made.batches.nodes``.
+        of_leaves: The places to which forces of all leaves are added, vec4i [worlds * T].
+        of_flat: The same for leaves outside subtrees.
 
     Raises:
         InputError: There are more slots than can be numbered.

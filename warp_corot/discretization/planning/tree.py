@@ -1,4 +1,4 @@
-"""What the planner's kernels read of a forest, and the tables that they share."""
+"""The data of a forest for the planner's kernels, and the tables that they share."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from warp_corot.mesh.tree import UniformTree
 
 
 def tree_of(forest: TetForest, elements: ForestElements, rotation_level: int | None) -> Tree:
-    """A forest that never changes, read in place as far as the device can.
+    """A forest that never changes, read in place if the device can.
 
     Args:
         elements: Its leaves on the device, in one world or more.
@@ -48,7 +48,7 @@ def tree_of(forest: TetForest, elements: ForestElements, rotation_level: int | N
 
 
 class Places(NamedTuple):
-    """Which node of which leaf stands at which place, by shape; see ``kernels.tables.subtree``.
+    """The leaf and the local node at each place, by shape; see ``kernels.tables.subtree``.
 
     Attributes:
         subtree, group: Leaf and its node for each node of a subtree or group, negative past the last, vec2i [3, 10] and
@@ -85,6 +85,6 @@ def subtree_nodes(shape: int) -> list[tuple[int, int]]:
 
 
 def _read(values: npt.NDArray[np.integer], dtype: type, device: wp.Device) -> wp.array:
-    """Integers that launches only read; on the CPU they share the array's memory."""
+    """An array of integers for launches that only read it; on the CPU it shares the given array's memory."""
     values = np.ascontiguousarray(values, dtype=np.int32)
     return wp.array(values, dtype=dtype, device=device, copy=not values.flags.writeable)
