@@ -1,1 +1,1 @@
-"""Forests grown from bodies: how fine, how large, and what the surface cuts."""
+"""Forests grown from bodies: the choice of sizes and levels, and elements cut by the surface."""

@@ -1,4 +1,6 @@
-"""From a domain to the forest that follows its surface: bisect where it is not flat enough, until nothing hangs."""
+"""The forest that follows a domain's surface: bisect elements in which the surface is not flat enough, until the mesh
+is conforming.
+"""
 
 from __future__ import annotations
 
@@ -19,20 +21,21 @@ from .judging import Judge, Wishes
 if TYPE_CHECKING:
     from warp_corot.domain import Domain
 
-#: A surface error is lowered to no less than ``STEEPEST`` and no more than ``FLATTEST`` of itself at a time.
+#: Each time a surface error is lowered to at least ``STEEPEST`` and at most ``FLATTEST`` of itself.
 STEEPEST, FLATTEST = 0.2, 0.7
-#: This share of the elements may be left as conformity made them.
+#: This fraction of the elements may remain as conformity made them.
 LEFT_OVER = 2.0e-3
 
 
 @dataclass(frozen=True)
 class Closer:
-    """How much closer a body is looked at than its mesh is to follow it.
+    """How much more finely a body is sampled than its mesh follows it.
 
     Attributes:
-        levels: To how many levels below the mesh's deepest.
-        error: How far the surface may be from the domain's then, as a share of an element's edge there.
-        most_elements: About so many tetrahedra, of all levels, are enough: the neediest of a level are bisected then.
+        levels: Number of levels below the mesh's deepest.
+        error: The largest distance of the sampled surface from the domain's, as a fraction of an element's edge there.
+        most_elements: The approximate largest number of tetrahedra of all levels: beyond it only the neediest of a
+            level are bisected.
     """
 
     levels: int
@@ -42,11 +45,11 @@ class Closer:
 
 @dataclass(frozen=True)
 class Enough:
-    """When a forest is fine enough for a mesh of a number of elements.
+    """The state in which a forest is fine enough for a mesh with a number of elements.
 
     Attributes:
-        elements: So many leaves that hold something.
-        first_error: The surface error to begin with [m].
+        elements: The number of leaves that contain a part of the body.
+        first_error: The first surface error [m].
     """
 
     elements: int
@@ -55,17 +58,17 @@ class Enough:
 
 @dataclass(frozen=True)
 class Grown:
-    """A forest as it was grown: all lattice points that were looked at, and what was found there.
+    """A grown forest: all lattice points that were evaluated, and the results.
 
     Attributes:
         cells, origin: The grid.
-        lattice, ends, phi: Of the lattice points.
-        tree: Of all that was bisected.
-        need: How far off an element's piece of the surface would be, were it not bisected [m], float32 [M].
-        wished: The mesh in it, as the first child of each tetrahedron there was before the body was looked at more
-            closely, int32 [m]; it is all of the tree where it was not.
-        growth: On the device.
-        deepest: From which level on elements were not compared with the surface.
+        lattice, ends, phi: Coordinates, edge ends and signed function of the lattice points.
+        tree: The tree of all bisections.
+        need: The error of an element's piece of the surface if the element were not bisected [m], float32 [M].
+        wished: The mesh before the body was sampled more finely, as the first child of each tetrahedron, int32 [m];
+            without finer sampling it is the whole tree.
+        growth: The same on the device.
+        deepest: The level from which elements were not compared with the surface.
     """
 
     cells: tuple[int, int, int]
@@ -101,14 +104,15 @@ def grow(
     device: wp.Device,
     closer: Closer | None = None,
 ) -> Grown:
-    """Bisect the grid around a domain as wished, and as conformity asks for; then, if asked, look at it closely.
+    """Bisect the grid around a domain by the wishes and for conformity; then, if requested, sample the body more
+    finely.
 
     Args:
         domain: The body.
         cell_size: Edge of a root cube [m].
-        wishes: How fine it is to be at most.
-        device: Where to work.
-        closer: How closely to look at it then.
+        wishes: The required fineness.
+        device: The device of the computation.
+        closer: How finely to sample the body afterwards.
     """
     growing = Growing(domain, cell_size, wishes, device)
     growing.run()
@@ -119,13 +123,13 @@ def grow(
 
 
 class Growing:
-    """A forest that grows after a domain.
+    """A forest that grows to follow a domain.
 
     Args:
         domain: The body.
         cell_size: Edge of a root cube [m].
-        wishes: How fine it is to be at most.
-        device: Where to work.
+        wishes: The required fineness.
+        device: The device of the computation.
     """
 
     def __init__(self, domain: Domain, cell_size: float, wishes: Wishes, device: wp.Device):
@@ -142,10 +146,10 @@ class Growing:
         self.room: int | None = None
 
     def run(self, first: int = 0) -> None:
-        """Bisect elements from ``first`` on as wished, and what conformity asks for then.
+        """Bisect elements from ``first`` on by the wishes, then for conformity.
 
-        Where the number of elements is limited, what conformity made may be off by more than it may: little of it can
-        stay so, as following it to its end would take a round for every few elements.
+        If the number of elements is limited, a few of the elements that conformity made may remain too coarse, because
+        refining all of them would take a round for every few elements.
         """
         growth, judge = self.growth, self.judge
         while True:
@@ -157,7 +161,7 @@ class Growing:
         judge.evaluate()
 
     def run_down(self, first: int) -> None:
-        """First from the top down, each level from the one above alone, then what conformity asks for."""
+        """Bisect from the top down, each level from only the one above, then for conformity."""
         growth, start = self.growth, first
         while first < growth.element_count:
             wished = self.chosen(self.judge.wished(first))
@@ -177,22 +181,23 @@ class Growing:
             self.lower(error)
 
     def run_finer(self, share: float, thin_share: float) -> None:
-        """Lower the surface error once more, for the surface's sake, to a share of itself; what thin parts may be off
-        by to another."""
+        """Lower the surface error once more, to a fraction of itself, for the drawn surface, and the error of thin
+        parts to another.
+        """
         error, least = float(self.judge.tolerances.max()), float(self.judge.closest[0])
         self.judge.thin_tolerance = thin_share * error
         if error > least and share < 1.0:
             self.lower(max(share * error, least))
 
     def lower(self, error: float) -> None:
-        """Bisect what is off by more than a smaller error than before, and what comes of it."""
+        """Bisect elements whose error exceeds a smaller limit than before, and then their children."""
         self.judge.tolerances = np.full(MAX_LEVEL + 1, error, np.float32)
         first = self.growth.element_count
         self.growth.bisect(self.judge.off())
         self.run(first)
 
     def look_closer(self, closer: Closer) -> None:
-        """Go on where the surface is not what its elements say."""
+        """Continue in elements that do not represent the surface well."""
         growth, judge = self.growth, self.judge
         self.room = closer.most_elements
         first = growth.element_count
@@ -200,10 +205,10 @@ class Growing:
         self.run(first)
 
     def grown(self, wished: np.ndarray | None = None) -> Grown:
-        """The forest as it is now.
+        """The present forest.
 
         Args:
-            wished: See `Grown`; None: all of it.
+            wished: See `Grown`; None: the whole tree.
         """
         growth, judge = self.growth, self.judge
         lattice, ends = growth.nodes()
@@ -213,7 +218,7 @@ class Growing:
         return Grown(self.cells, self.origin, lattice, ends, tree, phi, need, wished, growth, judge.max_level)
 
     def chosen(self, wished: wp.array) -> wp.array:
-        """The elements that need bisection most, as many as there is room for."""
+        """The elements with the largest need, as many as there is room for."""
         growth, judge = self.growth, self.judge
         if self.room is None:
             return wished

@@ -1,9 +1,9 @@
-"""A mesh of so many tetrahedra: how large its cubes are and how often each is bisected, chosen together.
+"""A mesh with a given number of tetrahedra: the size of its cubes and the number of bisections are chosen together.
 
-The body is looked at once, in a forest that is finer than the mesh. There every tetrahedron of every level has a need:
-how far off its piece of the surface would be, were it not bisected [m]; where the body is thinner than a few elements a
-tenth of its edge. All whose need is above a threshold are bisected. The mesh is that of the threshold that gives the
-number asked for, which takes no more looking at the body.
+The body is sampled once, in a forest that is finer than the mesh. There every tetrahedron of every level has a need:
+the error of its piece of the surface if it were not bisected [m], or a tenth of its edge if the body is thinner than a
+few elements. All tetrahedra with a need above a threshold are bisected. The threshold is chosen to give the requested
+number, without another evaluation of the body.
 """
 
 from __future__ import annotations
@@ -23,53 +23,56 @@ if TYPE_CHECKING:
 
     from warp_corot.domain import Domain
 
-#: What share of the number asked for is aimed at and is enough; after how many sizes of cubes any is.
+#: The fractions of the requested number that are aimed at and that are enough; and the number of sizes of cubes after
+#: which any is enough.
 NEAR, NEAR_ENOUGH = 0.985, 0.905
 MOST_CUBES = 4
-#: Along flat sides nothing is bisected; more sizes are tried then, which takes little time.
+#: Along flat sides nothing is bisected; then more sizes are tried, which takes little time.
 MOST_CUBES_OF_BOXES = 7
 #: Where many elements need bisection alike, so that there are meshes of too few and of too many, the farther ones along
 #: the longest side need it more, by up to this share; a mesh with less than that share of the elements asked for gets
 #: other cubes first.
 FARTHER_FIRST, FEW = 0.05, 0.6
-#: What an element counts as being off by between such pieces, as a share of its edge.
+#: The assumed error of an element between such pieces, as a fraction of its edge.
 GAP_NEED = 0.5
-#: The thinner of two parts is bisected first: what it needs is larger by up to this share, which is what elements lose
-#: of their length in a bisection; thicknesses are told apart in so many steps, so that what is equally thin remains so.
+#: The thinner of two parts is bisected first: its need is larger by up to this fraction, by which a bisection shortens
+#: elements. Thicknesses are rounded to this many steps, so that equally thin parts stay equal.
 THINNEST_FIRST, THIN_STEPS = 0.26, 16
-#: The surface that is drawn is this much closer to the body's than the mesh's threshold, for which the forest must be
-#: finer still; of many elements it is the mesh's own. Thin parts have no finer elements than the mesh may need.
+#: The drawn surface is closer to the body's than the mesh's threshold by this factor, for which the forest must be
+#: finer still; with many elements it is the mesh's own. Thin parts have no finer elements than the mesh may need.
 FINER_SURFACE, FINER_FOREST, FINER_THIN = 0.3, 0.2, 0.4
-#: Cubes are as large as gives this share of the elements when none is bisected: about six in a cube inside, four at the
-#: surface. Of more elements the surface needs fewer, so that the share goes up, between two numbers of elements.
+#: The size of cubes gives this fraction of the elements when none is bisected: about six in a cube inside, four at the
+#: surface. With more elements the surface needs a smaller fraction, so the fraction rises between two numbers of
+#: elements.
 UNBISECTED, UNBISECTED_OF_MANY = 1.0 / 6.0, 0.5
 FEWER, MORE = 50_000, 1_000_000
-#: Where nothing in the forest is left to bisect of many elements, smaller cubes are to give so many times the elements
-#: asked for; there are hardly four times as many at half the size.
+#: If a forest of many elements has nothing left to bisect, smaller cubes should give this many times the requested
+#: elements; half the size gives less than four times as many.
 AMPLE, SLOW = 1.3, 2.0
-#: How often cubes are bisected for the surface's sake. Where it is most curved elements are a fifth of a cube long;
-#: finer ones would bring the rest of the surface little, and make the time step smaller. From so many elements on
-#: there are too few at the surface for that. Thin parts may have finer ones.
+#: How often cubes are bisected for the surface. Elements at the largest curvature are a fifth of a cube long; finer
+#: ones would improve the rest of the surface little and shorten the time step. From this many elements on, too few are
+#: at the surface for that. Thin parts may have finer ones.
 MAX_LEVEL, MANY, MAX_LEVEL_THIN = 7, 300_000, 13
-#: How closely the body is looked at: from which surface error over a cube's edge to which, and to how many
-#: tetrahedra of all levels for each one asked for, or a fixed number if that is more.
+#: How finely the body is sampled: the first and the last surface error over a cube's edge, and the number of tetrahedra
+#: of all levels for each requested one, or a fixed number if that is larger.
 FIRST_ERROR, CLOSE_ERROR, CLOSE_LEVEL = 0.25, 0.01, 8
 CLOSER_LEVELS, CLOSER_ERROR = 6, 0.2
 CLOSE_ELEMENTS, CLOSE_ELEMENTS_OF_MANY = 5, 2
-#: Where there is room for fewer more than this, the body is not looked at closely: to see where would take long.
+#: If there is room for fewer more elements than this, the body is not sampled finely, because the choice of places
+#: would take too long.
 LEAST_CLOSER = 1000
 
 
 @dataclass(frozen=True)
 class Budget:
-    """What a mesh of a certain number of elements may be like.
+    """The limits of a mesh with a given number of elements.
 
     Attributes:
-        target: At most so many elements.
-        cell_size: Edge of a cube [m]; None: as suits.
-        min_level, max_level: Between which levels; a greatest level of None: as suits.
-        surface_error: How far the surface need not be followed any more [m], 0: as far as the number goes.
-        min_layers: So many elements through the thickness, where the number allows.
+        target: The largest number of elements.
+        cell_size: Edge of a cube [m]; None: chosen.
+        min_level, max_level: The range of levels; a largest level of None is chosen.
+        surface_error: The error below which the surface is not followed more closely [m]; 0: as the number allows.
+        min_layers: Number of elements through the thickness, if the total number allows.
         wishes: The user's functions.
     """
 
@@ -83,11 +86,11 @@ class Budget:
 
 
 class Meshes:
-    """The meshes in one forest, by how many elements they have.
+    """The meshes in one forest, ordered by number of elements.
 
     Attributes:
         resolved: The forest.
-        count: Elements of the present mesh that hold something worth counting.
+        count: Number of elements of the present mesh that contain enough of the body.
         child: The present mesh, see `Coarsening`.
     """
 
@@ -99,7 +102,9 @@ class Meshes:
         self.child = np.empty(0, np.int32)
 
     def choose(self, target: int) -> int:
-        """Make the present mesh the one of at most so many elements; how many it has, more where the coarsest has."""
+        """Make the present mesh the largest one with at most this many elements, or the coarsest; return its number of
+        elements.
+        """
         self.threshold = self._coarsening.threshold(target, self._least)
         self.count, self.child = self._coarsening.mesh(self.threshold)
         return self.count
@@ -118,11 +123,11 @@ class Meshes:
 
     @property
     def has_more(self) -> bool:
-        """Whether there are meshes of more elements than the present one."""
+        """Whether there are meshes with more elements than the present one."""
         return self.threshold > self._least
 
     def surface(self, threshold: float) -> np.ndarray:
-        """A mesh of the same forest, finer than that of a threshold, whose surface is to be drawn; as `child`."""
+        """A mesh of the same forest, finer than that of a threshold, for the drawn surface; in the form of `child`."""
         resolved, need = self.resolved, self.resolved.grown.need
         # Thin parts that are flat need no finer surface.
         curved = (resolved.held > 0.0) & ~np.isclose(need, THIN_NEED * resolved.lengths, rtol=1.0e-5)
@@ -132,7 +137,7 @@ class Meshes:
 
 
 def chosen_meshes(domain: Domain, budget: Budget, sliver: float, device: wp.Device) -> Meshes | None:
-    """The forest in which there is a mesh of as many elements as there may be, or nearly, and that mesh in it.
+    """The forest that contains a mesh with nearly the allowed number of elements, and this mesh.
 
     None if the coarsest has more.
     """
@@ -157,7 +162,7 @@ def chosen_meshes(domain: Domain, budget: Budget, sliver: float, device: wp.Devi
         ratio = count / (NEAR * budget.target)
         exhausted = budget.target > MANY and not meshes.has_more
         factor = (ratio / AMPLE) ** (1.0 / SLOW) if exhausted else ratio ** (1.0 / 2.5)
-        # Cubes larger than the body would be the whole of it.
+        # A cube larger than the body would contain all of it.
         size = min(size * float(np.clip(factor, 0.5, 2.0)), largest)
     return best
 
@@ -189,8 +194,9 @@ def _of_cubes(
     sliver: float,
     device: wp.Device,
 ) -> Meshes:
-    """The meshes of one size of cubes, and of them the one of as many elements as there may be; where cubes are larger
-    than what suits the number, of so many levels more."""
+    """The meshes of one size of cubes, with the largest allowed one chosen; if cubes are larger than the number needs,
+    they have this many more levels.
+    """
     target, wishes = budget.target, budget.wishes
     more = max(math.ceil(3.0 * math.log2(size / suits) - 0.5), 0)
     most = more + MAX_LEVEL + (target > MANY) if budget.max_level is None else budget.max_level
@@ -222,14 +228,14 @@ def _of_cubes(
 
 
 def needs_of(resolved: Resolved, domain: Domain, layers: float, most: int, deepest: int) -> np.ndarray:
-    """How much each tetrahedron needs to be bisected [m], never less than what is below it; float32 [M].
+    """The need of each tetrahedron to be bisected [m], never less than that of its descendants; float32 [M].
 
     Args:
         resolved: The forest.
         domain: The body.
-        layers: So many elements through the thickness.
-        most: Level below which the surface asks for no more.
-        deepest: And thickness neither.
+        layers: Number of elements through the thickness.
+        most: Level below which the surface needs no more bisections.
+        deepest: Level below which thickness needs none either.
     """
     level, length = resolved.grown.tree.level, resolved.lengths
     needs = np.where(level < most, resolved.grown.need, 0.0)
@@ -240,7 +246,7 @@ def needs_of(resolved: Resolved, domain: Domain, layers: float, most: int, deepe
         needs[thin] = np.maximum(needs[thin], THIN_NEED * length[thin]) * first
     gaps = resolved.gaps()
     if gaps is not None:
-        # Pieces come apart where elements of both, and one between them, have room; where none can have, it is in vain.
+        # Pieces separate if elements of both, and one between them, have room; without room, bisection is in vain.
         finest = resolved.cell_size * 0.5 ** (deepest / 3.0)
         close = (GAP_ELEMENTS * length > gaps) & (gaps > GAP_ELEMENTS * finest) & (level < deepest)
         needs[close] = np.maximum(needs[close], GAP_NEED * length[close])

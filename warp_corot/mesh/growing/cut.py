@@ -1,7 +1,7 @@
-"""Elements that a surface cuts: how much of them is inside, and what becomes of those that hold next to nothing.
+"""Elements cut by a surface: their filled fraction, and the treatment of nearly empty ones.
 
-Everything here is of the linear interpolant of the nodes' values. A node is inside where its value is negative; zero
-counts as outside, so that the surface lies in elements that hold something.
+All quantities belong to the linear interpolant of the nodes' values. A node is inside if its value is negative; zero
+counts as outside, so that the surface lies in elements that contain a part of the body.
 """
 
 from __future__ import annotations
@@ -12,16 +12,17 @@ import numpy as np
 
 Array = np.ndarray
 
-#: A part that would come apart is given up where it is of so few elements and of less than this share of its piece.
+#: A part that would come off is given up if it has at most this many elements and less than this fraction of its piece.
 FEW_ELEMENTS, LITTLE = 4, 1.0e-3
 
-#: Node orders that put the inside nodes first, by which nodes are inside (bit n for node n), and how many those are.
+#: Node orders that put the inside nodes first, by the set of inside nodes (bit n for node n), and the number of inside
+#: nodes.
 _INSIDE_FIRST = np.array([sorted(range(4), key=lambda n: 1 - (code >> n & 1)) for code in range(16)])
 _COUNT = np.array([code.bit_count() for code in range(16)])
 
 
 def codes(inside: Array) -> Array:
-    """Which nodes of elements are inside, bool [n, 4], as a number from 0 to 15."""
+    """The set of inside nodes of elements, bool [n, 4], as a number from 0 to 15."""
     return inside @ np.array([1, 2, 4, 8])
 
 
@@ -30,8 +31,8 @@ def shares(inside: Array, crossing: Callable[[Array, Array], Array]) -> Array:
 
     Args:
         inside: bool [n, 4].
-        crossing: Of a node inside and one outside of each element, int [n] each: where on the edge between them the
-            border is, as a share of the way from the inside, [n].
+        crossing: A function of a node inside and one outside of each element, both int [n]: the fraction of their edge,
+            from the inside node to the border, [n].
     """
     code = codes(inside)
     found = (code == 15).astype(np.float64)
@@ -61,7 +62,7 @@ def _share_of_three(t: Callable[[int, int], Array]) -> Array:
 
 
 def inside_shares(values: Array) -> Array:
-    """Share of each element's volume where the linear interpolant is negative, from its nodes' values [n, 4]."""
+    """Fraction of each element's volume in which the linear interpolant of its nodes' values [n, 4] is negative."""
 
     def crossing(elements: Array, ends: Array) -> Array:
         inner, outer = values[elements[:, None], ends].T.astype(np.float64)
@@ -73,9 +74,9 @@ def inside_shares(values: Array) -> Array:
 def label_shares(values: Array, labels: Array) -> Array:
     """Share of each element's volume that the label of each of its nodes takes, float64 [n, 4].
 
-    The share of a label that several nodes inside have stands at the first of them. Between nodes of two labels the
-    border is halfway, towards the outside it is where the interpolant is zero. Each label is cut out by itself; where
-    three meet those cuts leave a gap, which they share in proportion.
+    If several inside nodes have a label, its fraction is stored at the first of them. Between nodes of two labels the
+    border is halfway; towards the outside it is at the zero of the interpolant. Each label is cut out separately; if
+    three labels meet, these cuts leave a gap, which the labels share in proportion.
 
     Args:
         values: Signed function at the nodes [n, 4].
@@ -98,24 +99,24 @@ def label_shares(values: Array, labels: Array) -> Array:
 
 
 def merged(pairs: Array, held: Array, small: Array) -> tuple[Array, Array]:
-    """Hand what small elements hold to a neighbour across a face, the one that holds most, and so on outwards.
+    """Add the contents of small elements to the fullest neighbour across a face, and so on outwards.
 
-    Where small ones have no other neighbours than small ones, the one that holds most stays.
+    Among small elements that have only small neighbours, the fullest one stays.
 
     Args:
-        pairs: Of elements that share a face [m, 2].
-        held: Volume that each holds [n].
-        small: Which are to be given up, bool [n].
+        pairs: Pairs of elements that share a face [m, 2].
+        held: Volume of the body in each element [n].
+        small: Mask of the elements to be given up, bool [n].
 
     Returns:
-        Volumes after that, and which elements are given up.
+        The new volumes, and the mask of elements that are given up.
     """
     held, small = held.copy(), small.copy()
     pairs = np.concatenate([pairs[small[pairs[:, 0]]], pairs[small[pairs[:, 1]]][:, ::-1]])
     goes_to = np.full(len(held), -1)
     waiting = small.copy()
     while waiting.any():
-        # From each waiting element to settled neighbours; of several to the one that holds most.
+        # From each waiting element to its settled neighbours; of several, to the fullest one.
         usable = pairs[waiting[pairs[:, 0]] & ~waiting[pairs[:, 1]]]
         if not len(usable):
             waiting[_fullest_of_each_piece(pairs, waiting, held)] = False
@@ -133,18 +134,18 @@ def merged(pairs: Array, held: Array, small: Array) -> tuple[Array, Array]:
 
 
 def without_slivers(tets: Array, held: Array, volume: Array, sliver: float) -> tuple[Array, Array]:
-    """Give up elements that hold too little of a body, but none without which a piece of it would come apart.
+    """Give up elements that contain too little of a body, but none that connects parts of a piece.
 
-    Pieces hang together by faces.
+    Pieces are connected through faces.
 
     Args:
         tets: int32 [n, 4].
-        held: Volume that each holds [n].
+        held: Volume of the body in each element [n].
         volume: Of each [n].
-        sliver: Those are small that hold less than this share of themselves.
+        sliver: Elements filled by less than this fraction are small.
 
     Returns:
-        Volumes held after that, and which elements are given up.
+        The new volumes of the body in elements, and the mask of elements that are given up.
     """
     small = held < sliver * volume
     if not small.any():
@@ -168,10 +169,10 @@ def without_slivers(tets: Array, held: Array, volume: Array, sliver: float) -> t
 
 
 def _broken(pairs: Array, piece: Array, kept: Array, volumes: Array) -> tuple[Array, Array]:
-    """What comes apart without the elements that are not kept.
+    """The pieces that break without the elements that are not kept.
 
     Returns:
-        Which elements are of pieces that do, bool [n], and which are of parts of these that are too small to matter.
+        The mask of elements of these pieces, bool [n], and the mask of elements of their negligible parts.
     """
     count = len(piece)
     part = _linked(pairs[kept[pairs].all(axis=1)], count)
@@ -181,7 +182,7 @@ def _broken(pairs: Array, piece: Array, kept: Array, volumes: Array) -> tuple[Ar
     of_part[part] = piece
     minor = (sizes > 0) & (sizes <= FEW_ELEMENTS) & (held < LITTLE * whole[of_part])
     parts = np.bincount(of_part, (sizes > 0) & ~minor, len(whole))
-    # Where all parts are minor nothing is given up for it.
+    # If all parts are negligible, none is given up for this reason.
     minor &= parts[of_part] > 0
     return (parts > 1)[piece], minor[part] & kept
 
@@ -200,7 +201,7 @@ def _ways(pairs: Array, piece: Array, kept: Array, broken: Array) -> Array:
     largest = np.zeros(int(piece.max()) + 1, np.int64)
     by_size = np.argsort(sizes[part], kind="stable")
     largest[piece[by_size]] = part[by_size]
-    # One node more, tied to the largest part of each piece, makes a single search of all pieces.
+    # An additional node, linked to the largest part of each piece, allows one search for all pieces.
     start = np.flatnonzero(kept & (part == largest[piece]))
     rows, columns = np.append(pairs[:, 0], np.full(len(start), count)), np.append(pairs[:, 1], start)
     links = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(count + 1, count + 1)).tocsr()
@@ -218,10 +219,11 @@ def _ways(pairs: Array, piece: Array, kept: Array, broken: Array) -> Array:
 
 
 def _crumbs(tets: Array, piece: Array, small: Array, held: Array) -> tuple[Array, Array]:
-    """Pieces of few elements or small ones alone that hang on to others by nodes, about which they would turn.
+    """Pieces of few or only small elements that are connected to others only through nodes, about which they would
+    rotate.
 
     Returns:
-        Which elements are of such, bool [n], and volumes held once these are handed to what they hang on to.
+        The mask of their elements, bool [n], and the volumes after they are added to the connected elements.
     """
     sizes, volumes = np.bincount(piece), np.bincount(piece, held)
     tiny = (sizes <= FEW_ELEMENTS) & (volumes < LITTLE * volumes.sum()) | (np.bincount(piece, ~small) == 0)
@@ -268,7 +270,7 @@ def _linked(pairs: Array, count: int) -> Array:
 
 
 def connected(tets: Array) -> Array:
-    """Which piece each element is in [n]; those that share a node are connected. Nodes below zero connect nothing."""
+    """The piece of each element [n]; elements that share a node are connected. Negative nodes connect nothing."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 

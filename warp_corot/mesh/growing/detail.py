@@ -1,4 +1,4 @@
-"""A body's surface where it is finer than the mesh: parts of tetrahedra, their values and their labels."""
+"""A body's surface at a finer resolution than the mesh: parts of tetrahedra with their values and labels."""
 
 from __future__ import annotations
 
@@ -18,13 +18,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Detail:
-    """Tetrahedra, conforming, that hold all of a body's surface, each within an element of the mesh or outside of it.
+    """Conforming tetrahedra that contain all of a body's surface, each inside one element of the mesh or outside the
+    mesh.
 
     Attributes:
         points: float64 [n, 3] [m].
         tets: int32 [k, 4].
         phi: The body's signed function at the points [m], float32 [n].
-        labels: Of the points, those outside that of the nearest part, int32 [n]; None: no labels.
+        labels: Labels of the points, for points outside that of the nearest part, int32 [n]; None: no labels.
         sharp_points, sharp_triangles: The body's surface with its edges, float64 [V, 3] [m] and int32 [F, 3]; None: the
             marched one is drawn.
     """

@@ -33,11 +33,11 @@ MAX_LEVEL_BY_DEFAULT = 12
 MOST_ELEMENTS = 100_000_000
 #: With more root cubes in the body's box for each element that is allowed, no body fits.
 CUBES_PER_ELEMENT = 1000
-#: After how many meshes one of nearly so many elements is good enough.
+#: Number of meshes after which one with nearly the requested elements is good enough.
 MOST_MESHES = 4
-#: In how many points of an element its labels are looked at, where few elements have several.
+#: Number of points of an element at which labels are sampled, if few elements have several.
 MOST_POINTS_EACH = 64
-#: How closely a body is looked at below the mesh's levels: surface error over an element's edge, and tetrahedra of all
+#: How finely a body is sampled below the mesh's levels: surface error over an element's edge, and tetrahedra of all
 #: levels.
 CLOSER_ERROR, CLOSER_ELEMENTS = 0.2, 4_000_000
 
@@ -84,7 +84,7 @@ def mesh_domain(
 
 
 def _of_size(domain: Domain, budget: Budget, sliver: float, device: wp.Device) -> TetForest:
-    """The mesh of at most so many elements."""
+    """The mesh with at most the given number of elements."""
     meshes = chosen_meshes(domain, budget, sliver, device)
     best: TetForest | None = None
     counted, threshold = 0, 0.0
@@ -96,7 +96,7 @@ def _of_size(domain: Domain, budget: Budget, sliver: float, device: wp.Device) -
             best, threshold = forest, meshes.threshold
         if NEAR_ENOUGH * budget.target <= found <= budget.target or meshes.count == counted:
             break
-        # Slivers that were kept so that nothing comes apart were not counted, and others may be given up in vain.
+        # Slivers that were kept to connect pieces were not counted, and others may be given up in vain.
         counted = meshes.count
         meshes.choose(int(NEAR * budget.target * counted / found))
     if best is None:
@@ -146,7 +146,7 @@ def _check_cubes(domain: Domain, size: float | None, target: int) -> None:
 
 
 def _finished(resolved: Resolved, child: np.ndarray, domain: Domain, sliver: float) -> TetForest:
-    """A mesh in a grown forest by itself, without what holds nothing or next to nothing."""
+    """A separate mesh from a grown forest, without empty and nearly empty elements."""
     grown, cell_size = resolved.grown, resolved.cell_size
     tree, stays = resolved.tree_of(child)
     tree, kept = pruned(tree, (tree.first_child < 0) & (resolved.held[stays] <= 0.0))
@@ -187,7 +187,9 @@ def _finished(resolved: Resolved, child: np.ndarray, domain: Domain, sliver: flo
 
 
 def _with_lost(forest: TetForest, domain: Domain) -> np.ndarray:
-    """Labels of elements; those that none has, and of which a point is known, have the one that holds it."""
+    """Labels of elements; a label that no element has, but of which a point is known, gets the element that contains
+    the point.
+    """
     assert forest.labels is not None
     labels = forest.labels.copy()
     count = np.bincount(labels, minlength=len(domain.label_names) + 1)
@@ -266,17 +268,18 @@ def _labels(resolved: Resolved, child: np.ndarray, elements: np.ndarray, domain:
 def _sampled_labels(
     resolved: Resolved, elements: np.ndarray, own: np.ndarray, shares: np.ndarray, domain: Domain
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What share of elements each label takes, by random points in them; a little at least of what is at a corner.
+    """The fraction of elements that each label fills, by random points; labels at corners get at least a small
+    fraction.
 
     Args:
         resolved: The forest.
-        elements: Those in which labels vary [n].
+        elements: The elements in which labels vary [n].
         own: Labels of their nodes [n, 4].
-        shares: What they would take, were borders halfway between nodes; see `label_shares` [n, 4].
+        shares: The fractions if borders were halfway between nodes; see `label_shares` [n, 4].
         domain: The body.
 
     Returns:
-        Places in ``elements``, labels and shares, [m] each, without those of no share.
+        Places in ``elements``, labels and fractions, [m] each, without zero fractions.
     """
     rng, stride = np.random.default_rng(0), len(domain.label_names) + 1
     each = int(np.clip(MOST_POINTS // max(len(elements), 1), 1, MOST_POINTS_EACH))

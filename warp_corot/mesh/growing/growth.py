@@ -1,4 +1,4 @@
-"""A forest being grown, on a device: arrays with room to spare, and a hash table from edges to their midpoints."""
+"""A forest while it grows, on a device: arrays with spare room, and a hash table from edges to their midpoints."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ ROOM = 2
 class Growth:
     """Tetrahedra, nodes and the edges whose midpoints the nodes are, bisected in rounds.
 
-    Elements without children are LIVE (-1) or VOID (-2) in ``first_child``; void ones are left alone but
-    where ``bound`` says that they must stay conforming with their neighbours.
+    Elements without children are LIVE (-1) or VOID (-2) in ``first_child``; void ones are not bisected, except those
+    that ``bound`` requires to stay conforming with their neighbours.
 
     Args:
         lattice: int32 [n, 3].
         ends: int32 [n, 2].
-        tree: The tetrahedra there are.
-        device: Where to work.
+        tree: The first tetrahedra.
+        device: The device of the computation.
     """
 
     def __init__(self, lattice: np.ndarray, ends: np.ndarray, tree: Tree, device: wp.Device):
@@ -53,7 +53,7 @@ class Growth:
         """Bisect elements [n]: their children are the last 2n elements, in the same order.
 
         Raises:
-            InputError: One of them is at the deepest level; what was grown is of no use then.
+            InputError: One of them is at the deepest level; the forest is then unusable.
         """
         if not len(elements):
             return
@@ -66,7 +66,9 @@ class Growth:
         self.element_count = count
 
     def insert_edges(self, elements: wp.array, *, of_refinement: bool) -> wp.array:
-        """Have midpoints of the elements' refinement edges, or of all their edges; slots in the table [n] or [6n]."""
+        """Ensure that the elements' refinement edges, or all their edges, have midpoints; return slots in the table [n]
+        or [6n].
+        """
         count = len(elements) * (1 if of_refinement else 6)
         pairs = wp.empty(count, dtype=wp.vec2i, device=self.device)
         if of_refinement:
@@ -76,7 +78,7 @@ class Growth:
         else:
             self.launch(kernels.all_edges, len(elements), [elements, self.tets], [pairs])
         slots = wp.empty(count, dtype=wp.int32, device=self.device)
-        # An edge is shared by five elements or so: a part at a time needs less room than the worst case of all at once.
+        # About five elements share an edge: a part at a time needs less room than the worst case of all together.
         part = max(self.node_count, 1 << 16)
         for start in range(0, count, part):
             stop = min(start + part, count)
@@ -89,18 +91,18 @@ class Growth:
         return slots
 
     def midpoints(self, slots: wp.array) -> list[wp.array]:
-        """What kernels need to read the midpoints of slots."""
+        """The arrays from which kernels read the midpoints of slots."""
         return [slots, self._values]
 
     @property
     def table(self) -> list[wp.array]:
-        """From edges to their midpoints: keys and values of the hash table."""
+        """Keys and values of the hash table from edges to their midpoints."""
         return [self._keys, self._values]
 
     def hanging(self, first_new: int = 0) -> wp.array:
-        """Leaves that must be bisected: wished, or with an active midpoint on an edge; ascending.
+        """Leaves that must be bisected, by a wish or an active midpoint on an edge; ascending.
 
-        Of those before ``first_new`` only such as got an active midpoint since this was last asked.
+        Before ``first_new`` only those whose edges got an active midpoint since the last call.
         """
         flags = wp.empty(self.element_count, dtype=wp.int32, device=self.device)
         own = [self.tets, self.first_child, self.wished, self.bound]
@@ -124,11 +126,11 @@ class Growth:
         return chosen
 
     def close(self, judge: Any = None, first: int = 0) -> None:
-        """Bisect until nothing hangs.
+        """Bisect until the mesh is conforming.
 
         Args:
             judge: Called with the number of the first new element after each round; it may wish for more.
-            first: The first element that is new since nothing hung.
+            first: The first element that is new since the mesh was last conforming.
         """
         while len(broken := self.hanging(first)):
             first = self.element_count
@@ -152,7 +154,7 @@ class Growth:
     # --- room ------------------------------------------------------------------------------------------------------
 
     def _reserve_nodes(self, more: int) -> bool:
-        """Room for more nodes; whether the table's slots are other ones now."""
+        """Reserve room for more nodes; return whether the table's slots have changed."""
         count = self.node_count + more
         self._make_room(count, "lattice", "ends", "active", "touched")
         if ROOM * count <= len(self._keys):
@@ -182,7 +184,7 @@ class Growth:
 
 
 def with_room(array: wp.array, count: int) -> wp.array:
-    """The array, or where it is shorter than ``count`` a longer one that begins with it and goes on with zeros."""
+    """The array, or a longer copy, padded with zeros, if it is shorter than ``count``."""
     if count <= len(array):
         return array
     longer = wp.zeros(max(count, 3 * len(array) // 2), dtype=array.dtype, device=array.device)

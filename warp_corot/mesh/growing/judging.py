@@ -1,4 +1,4 @@
-"""What is to be bisected: where a body's surface, its thickness, its labels or the user's functions ask for it."""
+"""The choice of elements to bisect, by a body's surface, thickness and labels, and the user's functions."""
 
 from __future__ import annotations
 
@@ -26,31 +26,31 @@ if TYPE_CHECKING:
 #: A user's function of points [n, 3] -> [n].
 Field = Callable[[np.ndarray], np.ndarray]
 
-#: What an element counts as being off by where the body is thinner than its layers, as a share of its edge, and so many
-#: elements have room between pieces of the body that are not to grow together.
+#: The assumed error of an element where the body is thinner than its layers, as a fraction of its edge; and the number
+#: of elements that must fit between pieces of the body so that these stay separate.
 THIN_NEED, GAP_ELEMENTS = 0.4, 2.0
-#: Thickness is looked for over this much more than what it is compared with, as what is thicker counts as this thick.
+#: Thickness is searched up to this multiple of the value it is compared with, because larger ones are cut off there.
 FARTHER = 1.01
-#: The need [m] of what is looked at closely for its thickness alone, which counts when the mesh is chosen.
+#: The need [m] of elements that are sampled finely only for thickness; it counts when the mesh is chosen.
 LOOKED = 1.0e-12
-#: Elements that are off by less than this share of their edge need no closer look.
+#: Elements with an error below this fraction of their edge need no finer sampling.
 ROUGH = 0.03
-#: What an element that holds two labels counts as being off by, as a share of its edge.
+#: The assumed error of an element with two labels, as a fraction of its edge.
 LABEL_NEED = 0.05
 
 
 @dataclass(frozen=True)
 class Wishes:
-    """How fine a mesh is to be.
+    """The required fineness of a mesh.
 
     Attributes:
-        surface_error: How far its surface may be from the domain's [m].
-        min_level, max_level: Between which levels.
+        surface_error: The largest distance of its surface from the domain's [m].
+        min_level, max_level: The range of levels.
         refine_where: Function of points [n, 3] -> bool [n]: elements that have such a point are bisected.
         field: Function of points [n, 3] -> numbers [n]: elements in which it varies are bisected ...
         field_tolerance: ... by more than this.
-        layers: Elements at the surface are bisected to level ``thin_level`` where the body is thinner than so many of
-            them, and where pieces of it are nearer to one another.
+        layers: Elements at the surface are bisected to level ``thin_level`` where the body is thinner than this many of
+            them, or where its pieces are closer to each other.
     """
 
     surface_error: float
@@ -64,16 +64,17 @@ class Wishes:
 
 
 class Judge:
-    """Looks at new elements of a forest: which are outside, how far off the others are, and which are to be bisected.
+    """Evaluates new elements of a forest: which are outside, how large the others' errors are, and which must be
+    bisected.
 
     Attributes:
-        phi: Values at the nodes, with room to spare.
-        need: How far off each element would be, were it not bisected [m], with room to spare.
-        tolerances: How far each level may be [m], float32.
-        closest: To what the tolerances may be lowered later on [m], float32.
-        max_level: Below which nothing is bisected.
-        limited: Whether the number of elements is limited, so that only what is off by more than the tolerances counts.
-        closer: Whether the body is looked at more closely than the mesh is to follow it.
+        phi: Values at the nodes, with spare room.
+        need: The error of each element if it were not bisected [m], with spare room.
+        tolerances: The allowed error of each level [m], float32.
+        closest: The values to which the tolerances may be lowered later [m], float32.
+        max_level: The level below which nothing is bisected.
+        limited: Whether the number of elements is limited, so that only errors above the tolerances count.
+        closer: Whether the body is sampled more finely than the mesh follows it.
         thin_tolerance: Thin parts need no more bisection once their elements are off by less than this [m].
     """
 
@@ -86,7 +87,7 @@ class Judge:
         h = cell_size * 0.5 ** (level // 3)
         self.circumradius = wp.array(h * np.array(CIRCUMRADIUS)[level % 3], dtype=wp.float32, device=self.device)
         self.edges = wp.array(h[:, None] * np.array(EDGE_LENGTHS)[level % 3], dtype=wp.float32, device=self.device)
-        #: What float32 coordinates leave open of a value.
+        #: The uncertainty of a value from float32 coordinates.
         reach = float(np.abs(np.asarray(origin)).max() + max(cells) * cell_size)
         self.noise = float(domain.lipschitz) * reach * 2.0**-22
         self.phi = wp.empty(0, dtype=wp.float32, device=self.device)
@@ -100,7 +101,7 @@ class Judge:
         self.thin_tolerance = 0.0
 
     def evaluate(self) -> None:
-        """Values at the nodes that are new."""
+        """Evaluate the function at new nodes."""
         growth, first = self.growth, self.evaluated
         count = growth.node_count - first
         if not count:
@@ -113,7 +114,7 @@ class Judge:
         self.evaluated = growth.node_count
 
     def wished(self, first: int) -> wp.array:
-        """Find out of all elements from ``first`` on whether they are outside, and which are to be bisected."""
+        """Find out which elements from ``first`` on are outside, and which must be bisected."""
         growth, wishes = self.growth, self.wishes
         self.evaluate()
         self.need = with_room(self.need, growth.element_count)
@@ -128,7 +129,7 @@ class Judge:
         return self.of_state(states, kernels.SPLIT, first)
 
     def off(self) -> wp.array:
-        """Leaves that are off by more than they may be now."""
+        """Leaves whose errors exceed the present tolerances."""
         growth = self.growth
         flags = wp.empty(growth.element_count, dtype=wp.int32, device=self.device)
         inputs = [growth.first_child, growth.level, self.need, self._on_device(self.tolerances), self.max_level]
@@ -136,11 +137,12 @@ class Judge:
         return growth.flagged(flags)
 
     def unresolved(self, levels: int, error: float) -> wp.array:
-        """Begin to look closer, to so many levels more: leaves of the deepest level up to now that are to be bisected.
+        """Begin to sample more finely, by this many levels; return the leaves of the present deepest level that must be
+        bisected.
 
         Args:
-            levels: How many.
-            error: How far the surface may be off there at the least, as a share of an element's edge.
+            levels: The number of levels.
+            error: The smallest tolerance of the surface there, as a fraction of an element's edge.
         """
         growth, before = self.growth, self.max_level
         self.limited = self.closer = True
@@ -155,7 +157,7 @@ class Judge:
         return self.of_state(states, kernels.SPLIT, 0)
 
     def holding(self) -> int:
-        """How many leaves have a corner inside."""
+        """Number of leaves with a corner inside."""
         growth = self.growth
         count = wp.zeros(1, dtype=wp.int32, device=self.device)
         inputs = [growth.first_child, growth.tets, self.phi]
@@ -173,7 +175,9 @@ class Judge:
         self.judge_fields(first, states)
 
     def judge_surface(self, first: int, states: wp.array) -> None:
-        """Where corners leave it open: compare with the linear interpolant at midpoints, then at one point more."""
+        """For elements that corners do not decide: compare with the linear interpolant at midpoints, then at one more
+        point.
+        """
         growth, lipschitz = self.growth, float(self.domain.lipschitz)
         limits = [self._on_device(self.tolerances), self._on_device(self.closest)]
         elements = self.of_state(states, kernels.OPEN, first)
@@ -203,17 +207,17 @@ class Judge:
             growth.launch(kernels.judge_by_probes, len(chosen), inputs, [states, self.need])
 
     def judge_thickness(self, first: int, states: wp.array) -> None:
-        """Bisect where the body is thinner than a few elements, or gaps between its pieces are."""
+        """Mark elements where the body, or a gap between its pieces, is thinner than a few elements."""
         wishes, growth, domain = self.wishes, self.growth, self.domain
         if not wishes.layers or not len(states):
             return
         state = states.numpy()
         level = growth.level[first : growth.element_count].numpy()
         leaf = growth.first_child[first : growth.element_count].numpy()
-        # Without a limit to their number elements are no finer for it than the rest.
+        # Without a limit on their number, elements are not finer than the rest for this reason.
         deepest = wishes.thin_level if self.closer else wishes.max_level
         chosen = np.flatnonzero((state == kernels.DONE) & (leaf == LIVE) & (level < deepest))
-        # Thickness is known well where the surface is; gaps are only looked at, so any ray will do.
+        # Thickness is accurate at the surface; gaps are only estimated, so any ray will do.
         known = self.need[first : growth.element_count].numpy()[chosen] <= self.closest[level[chosen]]
         if not domain.has_pieces:
             chosen, known = chosen[known], known[known]
@@ -234,7 +238,7 @@ class Judge:
         wanted = THIN_NEED * length > limits
         split = thin & wanted
         if domain.has_pieces:
-            # Whether it is a gap between pieces is known later; the need of it is counted then.
+            # Whether this is a gap between pieces is known later; then its need counts.
             reach = FARTHER * GAP_ELEMENTS * float(length.max())
             near = GAP_ELEMENTS * length > domain.thickness(x, inward, reach, outside=True)
             need = np.where(near, np.maximum(need, LOOKED), need)
@@ -246,7 +250,7 @@ class Judge:
         self.need.assign(needs)
 
     def judge_fields(self, first: int, states: wp.array) -> None:
-        """Bisect where labels or the user's fields ask for it, seen at corners and centroids."""
+        """Mark elements by labels and the user's fields, evaluated at corners and centroids."""
         wishes, domain = self.wishes, self.domain
         if not (domain.label_names or wishes.refine_where is not None or wishes.field is not None):
             return

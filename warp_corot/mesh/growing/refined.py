@@ -25,7 +25,7 @@ def refined(forest: Forest, leaves: np.ndarray) -> Forest:
     wished[tree.leaves[leaves]] = 1
     growth.wished.assign(wished)
     if forest.phi is not None:
-        # Leaves given up for holding too little still carry a part of the surface.
+        # Leaves that were given up as nearly empty still contain a part of the surface.
         growth.bound.assign((tree.first_child == VOID) & (forest.phi[tree.tets] < 0).any(axis=1))
     growth.close()
     lattice, ends = growth.nodes()
@@ -50,7 +50,7 @@ def refined(forest: Forest, leaves: np.ndarray) -> Forest:
 
 
 def _leaves_before(before: Tree, after: Tree) -> np.ndarray:
-    """For each leaf the one of the tree before that it is or comes from."""
+    """For each leaf, the leaf of the former tree that it is or comes from."""
     found = after.leaves.copy()
     while (new := found >= len(before.level)).any():
         found[new] = after.parent[found[new]]

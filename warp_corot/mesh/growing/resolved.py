@@ -1,4 +1,4 @@
-"""A forest finer than the mesh: what tetrahedra of all levels hold of a body, and meshes that are part of it."""
+"""A forest finer than the mesh: the parts of a body in tetrahedra of all levels, and the meshes in the forest."""
 
 from __future__ import annotations
 
@@ -27,28 +27,28 @@ if TYPE_CHECKING:
 BELOW = -3
 
 
-#: Pieces of less than this share of the body are none, and more of them are crumbs of what is not resolved.
+#: Pieces below this fraction of the body do not count, and more pieces than this are fragments of unresolved parts.
 LEAST_PIECE, MOST_PIECES = 1.0e-4, 16
-#: About so many points in all.
+#: Approximate number of all points.
 MOST_POINTS = 250_000
 #: A leaf with a corner inside the body counts as filled to at least this share.
 LEAST = 1.0e-6
 
 
 class Resolved:
-    """What the tetrahedra of a grown forest hold, from its leaves up.
+    """The parts of a body in the tetrahedra of a grown forest, from its leaves up.
 
     Args:
         grown: The forest.
         cell_size: Edge of a root cube [m].
-        domain: Where it is off too far for its leaves' corners to tell what they hold, the body is asked once more.
+        domain: The body; it is evaluated again in leaves whose corners do not determine their contents.
 
     Attributes:
         grown: The forest.
         held: Share of the body in each tetrahedron, over a root cube's volume, float64 [M].
-        volume: Of each, likewise.
-        leaves: Its leaves that hold something, indices.
-        shares: What share of themselves they hold.
+        volume: Volume of each tetrahedron, in the same unit.
+        leaves: Indices of the leaves that contain a part of the body.
+        shares: The filled fraction of these leaves.
     """
 
     def __init__(self, grown: Grown, cell_size: float, domain: Domain | None = None):
@@ -72,12 +72,13 @@ class Resolved:
 
     @property
     def lengths(self) -> np.ndarray:
-        """Edge of a cube whose eighth levels below is as large, for each tetrahedron [m]: halves in three levels."""
+        """An edge length for each tetrahedron [m]: the cell size, halved every three levels."""
         return self.cell_size * 0.5 ** (self.grown.tree.level / 3.0)
 
     def _rough(self, leaves: np.ndarray) -> np.ndarray:
-        """Which leaves are off too far for their corners to tell what they hold, bool [n]. Where this was not looked
-        at, as nothing is bisected there, it is taken from their parents."""
+        """Mask of leaves whose corners do not determine their contents, bool [n]. Leaves that were not evaluated,
+        because nothing is bisected there, take it from their parents.
+        """
         tree, need, lengths = self.grown.tree, self.grown.need, self.lengths
         parents = np.maximum(tree.parent[leaves], 0)
         unknown = (need[leaves] == 0.0) & (tree.level[leaves] >= self.grown.deepest)
@@ -86,7 +87,7 @@ class Resolved:
         return need[looked_at] > ROUGH * lengths[looked_at]
 
     def summed(self, values: np.ndarray) -> np.ndarray:
-        """Values of leaves added up to all that lies above them."""
+        """Sums of the leaves' values over all their ancestors."""
         return self._upwards(values, np.add)
 
     def largest(self, values: np.ndarray) -> np.ndarray:
@@ -98,7 +99,7 @@ class Resolved:
         return self._upwards(values, np.minimum)
 
     def owners(self, child: np.ndarray) -> np.ndarray:
-        """Which leaf of a mesh in the forest each tetrahedron lies in, -1 above the mesh's leaves; int32 [M].
+        """The leaf of a mesh in the forest that contains each tetrahedron, -1 above the mesh's leaves; int32 [M].
 
         Args:
             child: The mesh, see `Coarsening`.
@@ -111,7 +112,7 @@ class Resolved:
         return owner
 
     def tree_of(self, child: np.ndarray) -> tuple[Tree, np.ndarray]:
-        """A mesh in the forest as a tree of its own, and which of the forest's tetrahedra are in it, ascending."""
+        """A mesh in the forest as a separate tree, and its tetrahedra's numbers in the forest, ascending."""
         tree = self.grown.tree
         there = child != BELOW
         number = np.cumsum(there, dtype=np.int32) - 1
@@ -122,7 +123,7 @@ class Resolved:
         return Tree(tree.tets[stays], tree.level[stays], parent, first), stays
 
     def as_wished(self) -> np.ndarray:
-        """The mesh that was wished for before the body was looked at more closely, as its first children [M]."""
+        """The mesh before the body was sampled more finely, as its first children [M]."""
         wished = self.grown.wished
         child = np.full(len(self.held), BELOW, np.int32)
         child[: len(wished)] = wished
@@ -131,7 +132,7 @@ class Resolved:
         return child
 
     def thin(self, domain: Domain, layers: float) -> np.ndarray:
-        """How thick the body is where each tetrahedron holds some of its surface, the least of it, float64 [M] [m]."""
+        """The smallest thickness of the body at the surface in each tetrahedron, float64 [M] [m]."""
         grown, found = self.grown, np.full(len(self.held), np.inf)
         cut = self.leaves[self.shares < 1.0]
         if len(cut):
@@ -142,8 +143,9 @@ class Resolved:
         return self.smallest(found)
 
     def gaps(self) -> np.ndarray | None:
-        """How far it is, where each tetrahedron holds some of the surface, to the nearest other piece of the body, the
-        least of it, float64 [M] [m]; None where there is one piece, or too many to be true."""
+        """The smallest distance from the surface in each tetrahedron to another piece of the body, float64 [M] [m];
+        None if there is one piece, or implausibly many.
+        """
         grown = self.grown
         tets = grown.tree.tets[self.leaves]
         if not len(tets):
@@ -177,15 +179,15 @@ class Resolved:
 
 
 class Coarsening:
-    """Meshes out of a forest, by how much its tetrahedra need to be bisected.
+    """The meshes in a forest, by the need of its tetrahedra to be bisected.
 
-    A mesh is what stands in place of first children: those of what is bisected, LIVE or VOID at its leaves, BELOW under
-    them.
+    A mesh is an array in place of first children: the first child of bisected tetrahedra, LIVE or VOID at leaves, BELOW
+    under them.
 
     Args:
         resolved: The forest.
-        needs: How much each of its tetrahedra needs to be bisected [m], float32 [M].
-        sliver: Leaves that hold less than this share of themselves are not counted.
+        needs: The need of each of its tetrahedra to be bisected [m], float32 [M].
+        sliver: Leaves filled by less than this fraction are not counted.
     """
 
     def __init__(self, resolved: Resolved, needs: np.ndarray, sliver: float):
@@ -201,12 +203,12 @@ class Coarsening:
             inputs = [chosen, growth.tets, growth.level, self._first_child]
             growth.launch(kernels.gather_needs, len(elements), [*inputs, self._holds], [self._needs, of_node])
             growth.launch(kernels.take_needs, len(elements), [*inputs, of_node], [self._needs])
-        # What has no children cannot be bisected, whatever it needs.
+        # A tetrahedron without children cannot be bisected, whatever its need.
         own = np.where(tree.first_child >= 0, self._needs.numpy(), np.float32(0.0))
         counted = holds & (resolved.held >= sliver * resolved.volume)
         roots = np.count_nonzero(counted & (tree.parent < 0))
         above = tree.parent[counted & (tree.parent >= 0)]
-        # A tetrahedron is a leaf of the meshes of thresholds from what it needs up to what its parent needs.
+        # A tetrahedron is a leaf of meshes with thresholds from its own need up to its parent's.
         begin, end = np.sort(own[counted]), np.sort(own[above[holds[above]]])
         last = np.append(end[1:] != end[:-1], True) if len(end) else np.empty(0, bool)
         self._thresholds = end[last]
@@ -215,7 +217,7 @@ class Coarsening:
         self._counted = counted
 
     def threshold(self, target: int, least: float) -> float:
-        """The threshold, ``least`` or more, that gives the most elements up to a number."""
+        """The threshold, at least ``least``, with the largest number of elements up to a limit."""
         first = int(np.searchsorted(self._thresholds, np.float32(least), side="right"))
         if self.mesh(least)[0] <= target or first == len(self._thresholds):
             return float(least)
@@ -223,7 +225,9 @@ class Coarsening:
         return float(self._thresholds[first + int(np.argmax(counts))])
 
     def mesh(self, least: float) -> tuple[int, np.ndarray]:
-        """Bisect all that needs it by more than ``least``: how many leaves are counted, and the mesh, int32 [M]."""
+        """Bisect all tetrahedra with a need above ``least``; return the number of counted leaves and the mesh, int32
+        [M].
+        """
         child = wp.empty(len(self._needs), dtype=wp.int32, device=self.device)
         inputs = [self._parent, self._first_child, self._needs, float(least), self._holds]
         wp.launch(kernels.cut_off, len(child), inputs, [child], device=self.device)
@@ -232,7 +236,7 @@ class Coarsening:
 
 
 def _near(points: np.ndarray, others: np.ndarray, reach: float) -> np.ndarray:
-    """Which points are within a reach of the box around others, bool [n]."""
+    """Mask of the points within a distance of the box around others, bool [n]."""
     if not len(others):
         return np.zeros(len(points), bool)
     return ((points >= others.min(axis=0) - reach) & (points <= others.max(axis=0) + reach)).all(axis=1)
@@ -264,8 +268,9 @@ def points_within(
 def _sampled_shares(
     grown: Grown, elements: np.ndarray, cell_size: float, domain: Domain, shares: np.ndarray
 ) -> np.ndarray:
-    """What share of elements is inside, by a point in each of their eighths, or in some of these where there are many
-    elements; a little at least where a corner is."""
+    """The filled fraction of elements, by a point in each of their eighths, or in some of these for many elements; at
+    least a small fraction if a corner is inside.
+    """
     rng = np.random.default_rng(0)
     found = np.zeros(len(elements))
     some = int(np.clip(MOST_POINTS // max(len(elements), 1), 1, 8))
