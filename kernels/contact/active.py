@@ -1,38 +1,41 @@
-"""Nodes held by obstacles in an implicit step: which nodes, in which directions, and with what forces.
+"""Nodes that obstacles hold in an implicit step: which, with what forces, and the friction on them.
 
-A node that touches has a given motion along the obstacle's normal, and in all directions if it sticks: d = S d + g,
-where the projector S removes the given directions and g lies in them. The step is solved with these directions held
-(Baraff and Witkin 1998); the contact force is the residual there. Then a node that is pulled is released, a node that
-would pass is held, and a node that friction cannot hold slips. This repeats until nothing changes.
+Where a node touches, its motion d in the step is given along the obstacle's normal: d = S d + g with a projector S and
+g in the direction that it leaves out. The step is solved for with these held (Baraff and Witkin 1998); the push is what
+is left of the balance of forces there. A node that is pulled is let go, and one that would pass is held.
+
+Friction is a spring across the normal with a multiplier l, bounded by Coulomb's law: l - k e after a motion e relative
+to the obstacle, no larger than the coefficient times the push. The spring joins the matrix. After each step its force
+is the multiplier of the next one (augmented Lagrangians, Simo and Laursen 1992), so that what sticks comes to rest on
+the obstacle whatever k is.
 """
 
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
+from warp_corot.kernels.implicit.line_search import TRIED
 from warp_corot.kernels.stepping.pace import DT, Pace
 
-from .law import Law, least_motion
+from .law import Law, held_back, least_motion
 from .motion import Motions, Surface
 from .shapes import Shapes, carried, distance_to
 from .vertices import across
 
 wp.set_module_options({"enable_backward": False})
 
-#: State of a node at an obstacle. A slipping node has a force against its motion; a dragged node has a drag instead,
-#: which cannot reverse the motion.
-APART, SLIPS, STICKS, DRAGGED = (wp.constant(k) for k in range(4))
+#: State of a node at an obstacle.
+APART, TOUCHES = wp.constant(0), wp.constant(1)
 #: The obstacles whose bounds are found.
 THOSE_APART, THOSE_TOUCHED = wp.constant(0), wp.constant(1)
-#: Number of rounds after which no node is released any more, and maximum number of rounds.
-LATE, ROUNDS = wp.constant(8), wp.constant(16)
-#: A friction force that changes by more than this fraction of its bound causes another round.
-SETTLED = wp.constant(1.0e-3)
+#: Number of rounds after which no node is released any more.
+LATE = wp.constant(12)
 #: How often a node may be released in a step.
 RELEASED = wp.constant(3)
-#: Least slip with which a drag is computed, in multiples of the least slip of a friction force.
-LOOSE = wp.constant(100.0)
-#: How often friction may reverse a node's motion in a step; after that the node is dragged until the end.
-CAUGHT = wp.constant(4)
+#: The stiffness of friction over that of the node.
+STIFF = wp.constant(32.0)
+#: What slides has no stiffness in the direction in which it slides. The matrix has this share of the change, because
+#: sliding nodes of a patch start and stop in turns with all of it.
+LOOSE = wp.constant(0.97)
 #: A motion of up to this fraction of half the obstacle's thickness is checked at its end.
 NEAR_END = wp.constant(0.5)
 #: Sine of the angle beyond which the normals of two obstacles hold a node in different directions.
@@ -47,12 +50,14 @@ class Holding:
 
     kinds: wp.array2d[wp.int32]
     released: wp.array2d[wp.int32]  # how often in this step
-    caught: wp.array2d[wp.int32]  # how often friction has turned a node round in this step
-    drag: wp.array2d[wp.float32]  # friction of a node that slips or is dragged over how far it went [N/m]
     forces: wp.array2d[wp.vec3]  # of the obstacle on the node [N]
+    multipliers: wp.array2d[wp.vec3]  # [N]
+    most: wp.array2d[wp.float32]  # of friction [N]
     normals: wp.array2d[wp.vec3]
     least: wp.array2d[wp.float32]  # how far the node must go along the normal beyond the obstacle's own motion [m]
-    touched: wp.array[wp.int32]
+    touched: wp.array[wp.int32]  # by how many obstacles
+    stiffness: wp.array[wp.float32]  # of friction [N/m]
+    drag: wp.array[wp.mat33]  # the derivative of friction [N/m]
     projectors: wp.array[wp.mat33]
     given: wp.array[wp.vec3]  # the motion in directions that are held [m]
 
@@ -64,11 +69,12 @@ def begin_places(
     inverse_mass: wp.array[wp.float32],
     rest: wp.array[wp.vec4],
     u: wp.array[wp.vec4],
+    blocks: wp.array[wp.mat33],
     # Out
     surface: Surface,
     holding: Holding,
 ):
-    """Copy the positions of a body's surface nodes."""
+    """Copy the positions of a body's surface nodes, and the stiffness of their ``blocks`` on the matrix's diagonal."""
     s = start + wp.tid()
     i = surface.node[s]
     surface.f[s] = wp.vec3()
@@ -76,7 +82,8 @@ def begin_places(
     surface.yielding[s] = 0.0
     for o in range(holding.kinds.shape[0]):
         holding.released[o, s] = 0
-        holding.caught[o, s] = 0
+        holding.multipliers[o, s] = holding.forces[o, s]
+        holding.most[o, s] = 0.0
     if i < 0:
         return
     if inverse_mass[i] > 0.0:
@@ -84,6 +91,7 @@ def begin_places(
     home = load_node(rest, i)
     surface.rest[s] = home
     surface.x[s] = home + load_node(u, i)
+    holding.stiffness[s] = STIFF * wp.trace(blocks[i]) / 3.0
 
 
 @wp.kernel(enable_backward=False)
@@ -134,6 +142,8 @@ def find_bounds(
             least = wp.dot(n, relative) + wanted - end_gap
         holding.normals[o, s] = n
         holding.least[o, s] = least
+        if at_end == 0:
+            holding.most[o, s] = shapes.friction[o] * wp.max(wp.dot(holding.forces[o, s], n), 0.0)
 
 
 @wp.kernel(enable_backward=False)
@@ -148,29 +158,26 @@ def hold_places(
     """Find the projector of each node and its motion in the held directions."""
     s = start + wp.tid()
     holding.touched[s] = 0
+    holding.drag[s] = wp.mat33()
     if surface.yielding[s] == 0.0:
         return
     world = surface.world[s]
     x = surface.x[s]
     free = wp.identity(n=3, dtype=float)
     given = wp.vec3()
+    touched = int(0)
     for o in range(holding.kinds.shape[0]):
-        kind = holding.kinds[o, s]
-        if kind != APART:
-            holding.touched[s] = 1
+        if holding.kinds[o, s] != APART:
+            touched += 1
             n = holding.normals[o, s]
-            moved = carried(motions.now[world, o], motions.later[world, o], x)
-            least = holding.least[o, s]
-            if kind == STICKS:
-                given = moved + least * n
-                free = wp.mat33()
-            else:
-                left = free * n
-                size = wp.length(left)
-                if size > DIFFERENT:
-                    e = left / size
-                    given += ((wp.dot(n, moved) + least - wp.dot(n, given)) / wp.dot(n, e)) * e
-                    free -= wp.outer(e, e)
+            left = free * n
+            size = wp.length(left)
+            if size > DIFFERENT:
+                e = left / size
+                moved = carried(motions.now[world, o], motions.later[world, o], x)
+                given += ((wp.dot(n, moved) + holding.least[o, s] - wp.dot(n, given)) / wp.dot(n, e)) * e
+                free -= wp.outer(e, e)
+    holding.touched[s] = touched
     holding.projectors[s] = free
     holding.given[s] = given
 
@@ -185,6 +192,22 @@ def leave_free(start: int, surface: Surface, holding: Holding, v: wp.array[wp.ve
 
 
 @wp.kernel(enable_backward=False)
+def leave_yielding(start: int, surface: Surface, holding: Holding, v: wp.array[wp.vec4]):
+    """v = S T v, where T makes the directions in which friction is stiff as small as that makes them."""
+    s = start + wp.tid()
+    if holding.touched[s] != 0:
+        i = surface.node[s]
+        x = load_node(v, i)
+        drag = holding.drag[s]
+        trace = wp.trace(drag)
+        if trace > 0.0:
+            stiffness = wp.ddot(drag, drag) / trace
+            left = wp.sqrt(1.0 / (1.0 + STIFF * stiffness / holding.stiffness[s]))
+            x -= ((1.0 - left) / stiffness) * (drag * x)
+        store_node(v, i, holding.projectors[s] * x)
+
+
+@wp.kernel(enable_backward=False)
 def impose(start: int, surface: Surface, holding: Holding, d: wp.array[wp.vec4]):
     """d = S d + g."""
     s = start + wp.tid()
@@ -194,18 +217,9 @@ def impose(start: int, surface: Surface, holding: Holding, d: wp.array[wp.vec4])
 
 
 @wp.func
-def drag_of(o: int, s: int, holding: Holding, x: wp.vec3):
-    """D x: the part across the motion of a slipping node, because its force turns with the motion; all of it for a
-    dragged node.
-    """
-    n = holding.normals[o, s]
-    sideways = across(x, n)
-    if holding.kinds[o, s] == SLIPS:
-        along = across(holding.forces[o, s], n)
-        square = wp.dot(along, along)
-        if square > 0.0:
-            sideways -= (wp.dot(sideways, along) / square) * along
-    return holding.drag[o, s] * sideways
+def trial_of(o: int, s: int, relative: wp.vec3, holding: Holding):
+    """Friction without a bound, after a motion relative to the obstacle [N]."""
+    return across(holding.multipliers[o, s] - holding.stiffness[s] * relative, holding.normals[o, s])
 
 
 @wp.kernel(enable_backward=False)
@@ -219,105 +233,134 @@ def add_friction(
     # In and out
     r: wp.array[wp.vec4],
 ):
-    """r = S (r + the friction at the motion d)."""
+    """r = S (r + the friction at the motion d), and the derivative of friction there.
+
+    A node that touches several obstacles has no friction.
+    """
     s = start + wp.tid()
-    if holding.touched[s] != 0:
-        i = surface.node[s]
-        world = surface.world[s]
-        total = load_node(r, i)
+    if holding.touched[s] == 0:
+        return
+    i = surface.node[s]
+    world = surface.world[s]
+    total = load_node(r, i)
+    drag = wp.mat33()
+    if holding.touched[s] == 1:
         for o in range(holding.kinds.shape[0]):
-            kind = holding.kinds[o, s]
-            if kind == SLIPS or kind == DRAGGED:
+            most = holding.most[o, s]
+            if holding.kinds[o, s] != APART and most > 0.0:
+                n = holding.normals[o, s]
                 moved = carried(motions.now[world, o], motions.later[world, o], surface.x[s])
-                total -= drag_of(o, s, holding, load_node(d, i) - moved)
-                if kind == SLIPS:
-                    total += across(holding.forces[o, s], holding.normals[o, s])
-        store_node(r, i, holding.projectors[s] * total)
+                trial = trial_of(o, s, load_node(d, i) - moved, holding)
+                size = wp.length(trial)
+                share = float(1.0)
+                plane = wp.identity(n=3, dtype=float) - wp.outer(n, n)
+                if size > most:
+                    share = most / size
+                    plane -= (LOOSE / (size * size)) * wp.outer(trial, trial)
+                total += share * trial
+                drag = (share * holding.stiffness[s]) * plane
+    holding.drag[s] = drag
+    store_node(r, i, holding.projectors[s] * total)
+
+
+@wp.kernel(enable_backward=False)
+def add_slopes(
+    # In
+    start: int,
+    only_world: int,
+    motions: Motions,
+    surface: Surface,
+    holding: Holding,
+    d: wp.array[wp.vec4],
+    change: wp.array[wp.vec4],
+    search: wp.array2d[wp.float64],
+    # Out
+    slopes: wp.array[wp.float64],
+):
+    """Add the power of friction along a change of motions, at the share that is tried."""
+    k = wp.tid()
+    s = start + k
+    if holding.touched[s] != 1:
+        return
+    world = surface.world[s]
+    at = wp.where(only_world != 0, 0, world)
+    i = surface.node[s]
+    for o in range(holding.kinds.shape[0]):
+        most = holding.most[o, s]
+        if holding.kinds[o, s] != APART and most > 0.0:
+            along = load_node(change, i)
+            moved = carried(motions.now[world, o], motions.later[world, o], surface.x[s])
+            e = load_node(d, i) + float(search[at, TRIED]) * along - moved
+            trial = trial_of(o, s, e, holding)
+            size = wp.length(trial)
+            if size > most:
+                trial *= most / size
+            wp.atomic_add(slopes, at, wp.dot(wp.vec3d(trial), wp.vec3d(along)))
 
 
 @wp.kernel(enable_backward=False)
 def add_drag(start: int, surface: Surface, holding: Holding, x: wp.array[wp.vec4], y: wp.array[wp.vec4]):
-    """y = S (y + D x), x in the range of S."""
+    """y = S (y + D x) with the derivative D of friction, x in the range of S."""
     s = start + wp.tid()
     if holding.touched[s] != 0:
         i = surface.node[s]
-        total = load_node(y, i)
-        for o in range(holding.kinds.shape[0]):
-            kind = holding.kinds[o, s]
-            if kind == SLIPS or kind == DRAGGED:
-                total += drag_of(o, s, holding, load_node(x, i))
-        store_node(y, i, holding.projectors[s] * total)
+        store_node(y, i, holding.projectors[s] * (load_node(y, i) + holding.drag[s] * load_node(x, i)))
 
 
 @wp.func
-def release(o: int, s: int, holding: Holding):
-    holding.kinds[o, s] = APART
+def let_go(o: int, s: int, is_late: bool, holding: Holding) -> bool:
+    """A node that is pulled: whether it is let go."""
     holding.forces[o, s] = wp.vec3()
-    holding.drag[o, s] = 0.0
+    holding.multipliers[o, s] = wp.vec3()
+    holding.most[o, s] = 0.0
+    if is_late or holding.released[o, s] >= RELEASED:
+        return False
+    holding.kinds[o, s] = APART
     holding.released[o, s] = holding.released[o, s] + 1
+    return True
 
 
 @wp.func
 def judge_single(
-    o: int, s: int, force: wp.vec3, slip: wp.vec3, friction: float, least_slip: float, is_late: bool, holding: Holding
+    o: int, s: int, force: wp.vec3, slip: wp.vec3, friction: float, is_late: bool, holding: Holding
 ) -> bool:
-    """Find the force on a node that touches one obstacle, and whether its state changes.
-
-    When friction first reverses a node's motion, the node sticks; later it is dragged for a round.
-    """
+    """A node that touches one obstacle: its force, and whether it changes."""
     n = holding.normals[o, s]
-    normal_force = wp.dot(force, n)
-    if normal_force < 0.0:
+    push = wp.dot(force, n)
+    if push < 0.0:
+        return let_go(o, s, is_late, holding)
+    most = friction * push
+    sideways = wp.vec3()
+    if most > 0.0:
+        sideways = held_back(trial_of(o, s, slip, holding), push, friction)
+    holding.forces[o, s] = push * n + sideways
+    holding.most[o, s] = most
+    return False
+
+
+@wp.func
+def judge_several(s: int, force: wp.vec3, is_late: bool, holding: Holding) -> bool:
+    """A node that touches several obstacles: the force along each normal, in turn, and whether anything changes."""
+    count = holding.kinds.shape[0]
+    for o in range(count):
         holding.forces[o, s] = wp.vec3()
-        holding.drag[o, s] = 0.0
-        if not is_late and holding.released[o, s] < RELEASED:
-            release(o, s, holding)
-            return True
-        was = holding.kinds[o, s]
-        holding.kinds[o, s] = SLIPS
-        return was == STICKS
-    bound = friction * normal_force
-    if holding.kinds[o, s] == STICKS:
-        sideways = across(force, n)
-        size = wp.length(sideways)
-        holding.forces[o, s] = force
-        if size > bound:
-            holding.forces[o, s] = normal_force * n + sideways * (bound / size)
-            holding.kinds[o, s] = SLIPS
-            holding.drag[o, s] = 0.0
-            return True
-        return False
-    way = across(slip, n)
-    length = wp.length(way)
-    used = -drag_of(o, s, holding, slip)
-    if holding.kinds[o, s] == SLIPS:
-        before = across(holding.forces[o, s], n)
-        used += before
-        if bound == 0.0 or (length > least_slip and wp.dot(way, before) < 0.0):
-            holding.drag[o, s] = bound / wp.max(length, least_slip)
-            now = -holding.drag[o, s] * way
-            holding.forces[o, s] = normal_force * n + now
-            return wp.length(now - used) > SETTLED * bound
-        holding.forces[o, s] = normal_force * n + before
-        if is_late:
-            return False
-        if holding.caught[o, s] == 0:
-            holding.kinds[o, s] = STICKS
-            holding.caught[o, s] = 1
-        else:
-            holding.kinds[o, s] = DRAGGED
-            holding.drag[o, s] = bound / wp.max(length, LOOSE * least_slip)
-            holding.caught[o, s] = holding.caught[o, s] + 1
-        return True
-    holding.forces[o, s] = normal_force * n + used
-    drag = bound / wp.max(length, LOOSE * least_slip)
-    off = wp.abs(drag - holding.drag[o, s]) * length
-    holding.drag[o, s] = drag
-    if holding.caught[o, s] < CAUGHT and not is_late:
-        holding.forces[o, s] = normal_force * n - drag * way
-        holding.kinds[o, s] = wp.where(length > least_slip, SLIPS, STICKS)
-        return True
-    return off > SETTLED * bound
+        holding.multipliers[o, s] = wp.vec3()
+        holding.most[o, s] = 0.0
+    for _ in range(16):
+        for o in range(count):
+            if holding.kinds[o, s] != APART:
+                rest = force
+                for other in range(count):
+                    if other != o:
+                        rest -= holding.forces[other, s]
+                n = holding.normals[o, s]
+                holding.forces[o, s] = wp.dot(rest, n) * n
+    changes = bool(False)
+    for o in range(count):
+        is_pulled = wp.dot(holding.forces[o, s], holding.normals[o, s]) < 0.0
+        if holding.kinds[o, s] != APART and is_pulled and let_go(o, s, is_late, holding):
+            changes = True
+    return changes
 
 
 @wp.kernel(enable_backward=False)
@@ -331,7 +374,6 @@ def judge_places(
     b: wp.array[wp.vec4],
     q: wp.array[wp.vec4],
     d: wp.array[wp.vec4],
-    least_slip: float,
     rounds: wp.array[wp.int32],
     # In and out
     holding: Holding,
@@ -358,54 +400,27 @@ def judge_places(
     force = load_node(q, i) - load_node(b, i)
     if touching == 1:
         slip = step - carried(motions.now[world, first], motions.later[world, first], x)
-        changes = judge_single(first, s, force, slip, shapes.friction[first], least_slip, is_late, holding)
+        changes = judge_single(first, s, force, slip, shapes.friction[first], is_late, holding)
     elif touching > 1:
-        # Without friction, find the force along each normal in turn.
-        for o in range(count):
-            holding.forces[o, s] = wp.vec3()
-            holding.drag[o, s] = 0.0
-        for _ in range(16):
-            for o in range(count):
-                if holding.kinds[o, s] != APART:
-                    rest = force
-                    for other in range(count):
-                        if other != o:
-                            rest -= holding.forces[other, s]
-                    n = holding.normals[o, s]
-                    holding.forces[o, s] = wp.dot(rest, n) * n
-        for o in range(count):
-            if holding.kinds[o, s] != APART:
-                if holding.kinds[o, s] == STICKS:
-                    holding.kinds[o, s] = SLIPS
-                    changes = True
-                if wp.dot(holding.forces[o, s], holding.normals[o, s]) < 0.0:
-                    if not is_late and holding.released[o, s] < RELEASED:
-                        release(o, s, holding)
-                        changes = True
-                    else:
-                        holding.forces[o, s] = wp.vec3()
+        changes = judge_several(s, force, is_late, holding)
     for o in range(count):
         least = holding.least[o, s]
         if holding.kinds[o, s] == APART and least > NO_BOUND:
             n = holding.normals[o, s]
             relative = step - carried(motions.now[world, o], motions.later[world, o], x)
             if wp.dot(n, relative) < least - 0.5 * law.tolerance:
-                holding.kinds[o, s] = wp.where(
-                    shapes.friction[o] > 0.0 and touching == 0 and holding.released[o, s] == 0, STICKS, SLIPS
-                )
+                holding.kinds[o, s] = TOUCHES
                 holding.forces[o, s] = wp.vec3()
-                holding.drag[o, s] = 0.0
-                touching += 1
+                holding.multipliers[o, s] = wp.vec3()
+                holding.most[o, s] = 0.0
                 changes = True
     if changes:
         changed[0] = 1
 
 
 @wp.kernel(enable_backward=False)
-def count_round(rounds: wp.array[wp.int32], changed: wp.array[wp.int32]):
+def count_round(rounds: wp.array[wp.int32]):
     rounds[0] = rounds[0] + 1
-    if rounds[0] >= ROUNDS:
-        changed[0] = 0
 
 
 @wp.kernel(enable_backward=False)

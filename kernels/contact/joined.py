@@ -10,6 +10,7 @@ forces of the last step. While a step is solved for, a pair stays what it was lo
 import warp as wp
 
 from warp_corot.kernels.elements.elements import add_force, load_node, store_node
+from warp_corot.kernels.implicit.conjugate_gradients import had_much_to_do
 from warp_corot.kernels.implicit.line_search import TRIED
 from warp_corot.kernels.stepping.pace import DT, Pace
 
@@ -376,10 +377,13 @@ def end_places(
 @wp.kernel(enable_backward=False)
 def judge_round(
     # In
+    scalars: wp.array2d[wp.float64],
     iterations: wp.array[wp.int32],
     changed: wp.array[wp.int32],
     total: wp.array[wp.int32],
     most: int,
+    settled: wp.float64,
+    near: wp.float64,
     # In and out
     locates: wp.array[wp.int32],
     rounds: wp.array[wp.int32],
@@ -391,12 +395,10 @@ def judge_round(
     linear[0] = linear[0] + iterations[0]
     rounds[0] = rounds[0] + 1
     was_located = locates[0] != 0 or total[0] == 0
-    is_settled = iterations[0] <= 1 and changed[0] == 0
+    is_settled = changed[0] == 0 and not had_much_to_do(scalars, 0, settled)
+    locates[0] = wp.where(changed[0] == 0 and not had_much_to_do(scalars, 0, near), 1, 0)
     changed[0] = 0
-    locates[0] = wp.where(is_settled, 1, 0)
-    going[0] = 1
-    if (is_settled and was_located) or rounds[0] >= most:
-        going[0] = 0
+    going[0] = wp.where((is_settled and was_located) or rounds[0] >= most, 0, 1)
 
 
 @wp.kernel(enable_backward=False)

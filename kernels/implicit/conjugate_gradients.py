@@ -12,9 +12,10 @@ wp.set_module_options({"enable_backward": False})
 #: Columns of parts of sums: r . r, r . z, p . q and b . b.
 SQUARE, PRODUCT, CURVATURE, RIGHT = (wp.constant(k) for k in range(4))
 COLUMNS = 4
-#: Places in the scalars of a world: r . z, the factors alpha and beta, and r . r now, b . b, and r . r at the end.
-RZ, ALPHA, BETA, RR, FIRST, END = (wp.constant(k) for k in range(6))
-SCALARS = 6
+#: Places in the scalars of a world: r . z, the factors alpha and beta, and r . r now, b . b, r . r within the
+#: tolerance, where the solve ends, and where it began.
+RZ, ALPHA, BETA, RR, FIRST, WITHIN, END, BEGAN = (wp.constant(k) for k in range(8))
+SCALARS = 8
 #: State of a world's solve.
 RUNNING, CONVERGED, NEGATIVE, LIMIT, BROKEN = (wp.constant(k) for k in range(5))
 
@@ -23,6 +24,12 @@ RUNNING, CONVERGED, NEGATIVE, LIMIT, BROKEN = (wp.constant(k) for k in range(5))
 def is_number(a: wp.float64):
     """False for NaN and infinity."""
     return wp.abs(a) <= wp.float64(1.0e300)
+
+
+@wp.func
+def had_much_to_do(scalars: wp.array2d[wp.float64], world: int, times: wp.float64):
+    """Whether a world's residual began at more than so many times the tolerance."""
+    return scalars[world, BEGAN] > times * times * scalars[world, WITHIN]
 
 
 @wp.func
@@ -127,6 +134,7 @@ def take_first(
     parts: wp.array3d[wp.float64],
     lanes: int,
     tolerance: wp.array[wp.float64],
+    share: wp.float64,
     # Out
     scalars: wp.array2d[wp.float64],
     iterations: wp.array[wp.int32],
@@ -138,17 +146,20 @@ def take_first(
     rr = add_up(parts, world, lane, lanes, SQUARE)
     bb = add_up(parts, world, lane, lanes, RIGHT)
     if lane == 0:
-        end = tolerance[world] * tolerance[world] * bb
+        within = tolerance[world] * tolerance[world] * bb
+        end = wp.max(within, share * share * rr)
         scalars[world, RZ] = wp.float64(0.0)
         scalars[world, BETA] = wp.float64(0.0)
         scalars[world, ALPHA] = wp.float64(0.0)
         scalars[world, RR] = rr
         scalars[world, FIRST] = bb
+        scalars[world, WITHIN] = within
         scalars[world, END] = end
+        scalars[world, BEGAN] = rr
         iterations[world] = 0
         if not (is_number(rr) and is_number(bb)):
             status[world] = BROKEN
-        elif rr <= end:
+        elif rr <= within:
             status[world] = CONVERGED
         else:
             status[world] = RUNNING

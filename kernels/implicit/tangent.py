@@ -4,6 +4,8 @@ import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
 
+from .conjugate_gradients import had_much_to_do
+
 wp.set_module_options({"enable_backward": False})
 
 #: Places in ``scales``: a, b and c.
@@ -101,6 +103,24 @@ def add_vectors(change: wp.array[wp.vec4], d: wp.array[wp.vec4]):
 
 
 @wp.kernel(enable_backward=False)
-def add_counts(more: wp.array[wp.int32], total: wp.array[wp.int32]):
-    i = wp.tid()
-    total[i] = total[i] + more[i]
+def judge_round(
+    # In
+    scalars: wp.array2d[wp.float64],
+    iterations: wp.array[wp.int32],
+    changed: wp.array[wp.int32],
+    settled: wp.float64,
+    most: int,
+    # In and out
+    rounds: wp.array[wp.int32],
+    total: wp.array[wp.int32],
+    # Out
+    going: wp.array[wp.int32],
+):
+    """Count a linear solve with contact; another one follows if contact has changed, or if this one had much to do."""
+    again = int(changed[0])
+    for world in range(iterations.shape[0]):
+        total[world] = total[world] + iterations[world]
+        if had_much_to_do(scalars, world, settled):
+            again = 1
+    rounds[0] = rounds[0] + 1
+    going[0] = wp.where(again != 0 and rounds[0] < most, 1, 0)

@@ -12,8 +12,6 @@ from warp_corot.kernels.contact import active as kernels
 if TYPE_CHECKING:
     from .contacts import Contacts
 
-#: Motion in a step, as a fraction of the smallest element's size, below which friction decreases.
-LEAST_SLIP = 1e-4
 #: Stands for an infinite thickness [m].
 THICK = 1e6
 
@@ -34,38 +32,47 @@ class ActiveSet:
         thickness = np.array([min(shape.thickness, THICK) for shape in shapes], np.float32)
         self._thickness = wp.array(thickness, dtype=wp.float32, device=self.device)
         self._rounds = wp.zeros(1, dtype=wp.int32, device=self.device)
-        #: Whether another round is needed, int32 [1].
+        #: Whether other nodes are held than in the last round, int32 [1].
         self.changed = wp.zeros(1, dtype=wp.int32, device=self.device)
         self.prepare()
 
     def prepare(self) -> None:
         """Update to the present surface; not while launches are recorded."""
         rigid, holding = self._rigid, kernels.Holding()
-        holding.kinds, holding.forces, holding.drag = rigid.kinds, rigid.forces, rigid.drag
+        holding.kinds, holding.forces = rigid.kinds, rigid.forces
         shape, device = rigid.kinds.shape, self.device
-        holding.released, holding.caught = (wp.zeros(shape, dtype=wp.int32, device=device) for _ in range(2))
-        holding.normals = wp.zeros(shape, dtype=wp.vec3, device=device)
-        holding.least = wp.zeros(shape, dtype=wp.float32, device=device)
+        holding.released = wp.zeros(shape, dtype=wp.int32, device=device)
+        holding.normals, holding.multipliers = (wp.zeros(shape, dtype=wp.vec3, device=device) for _ in range(2))
+        holding.least, holding.most = (wp.zeros(shape, dtype=wp.float32, device=device) for _ in range(2))
         holding.touched = wp.zeros(shape[1], dtype=wp.int32, device=device)
-        holding.projectors = wp.zeros(shape[1], dtype=wp.mat33, device=device)
+        holding.stiffness = wp.zeros(shape[1], dtype=wp.float32, device=device)
+        holding.projectors, holding.drag = (wp.zeros(shape[1], dtype=wp.mat33, device=device) for _ in range(2))
         holding.given = wp.zeros(shape[1], dtype=wp.vec3, device=device)
         self._holding = holding
 
     # --- launches ----------------------------------------------------------------------------------------------------
 
-    def launch_begin(self, d: wp.array) -> None:
-        """Launch the begin of a step: nodes are held as at the end of the last one. d is a guess [m], vec4."""
+    def launch_begin(self, d: wp.array, blocks: wp.array) -> None:
+        """Launch the begin of a step: nodes are held as at the end of the last one.
+
+        Args:
+            d: A guess [m], vec4.
+            blocks: The blocks on the diagonal of the matrix, mat33.
+        """
         state, conditions = self.body.state, self.body.conditions
-        inputs = [conditions.inverse_mass, state.rest, state.displacements, self._surface, self._holding]
+        inputs = [conditions.inverse_mass, state.rest, state.displacements, blocks, self._surface, self._holding]
         self._launch(kernels.begin_places, inputs)
         self._rounds.zero_()
-        self.changed.fill_(1)
         self._find_bounds(d, int(kernels.THOSE_TOUCHED), at_end=False)
         self._hold()
 
     def launch_free(self, v: wp.array) -> None:
         """Launch v = S v, without the directions that are held."""
         self._launch(kernels.leave_free, [self._surface, self._holding, v])
+
+    def launch_yielding(self, v: wp.array) -> None:
+        """Launch v = S T v, with directions in which friction is stiff made small."""
+        self._launch(kernels.leave_yielding, [self._surface, self._holding, v])
 
     def launch_imposed(self, d: wp.array) -> None:
         """Launch the assignment of the given motion to d in these directions."""
@@ -80,6 +87,13 @@ class ActiveSet:
         motions = self._contacts.obstacles.motions
         self._launch(kernels.add_friction, [motions, self._surface, self._holding, d, r])
 
+    def add_slopes(self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array) -> None:
+        """Launch the power of friction along a change; see ``solvers.implicit.line_search``. All worlds are one where
+        there is one slope."""
+        motions = self._contacts.obstacles.motions
+        inputs = [int(len(slopes) == 1), motions, self._surface, self._holding, d, change, search]
+        self._launch(kernels.add_slopes, [*inputs, slopes])
+
     def launch_judgement(self, b: wp.array, q: wp.array, d: wp.array) -> None:
         """Launch the decision which nodes are held from now on, and ``changed``.
 
@@ -92,9 +106,8 @@ class ActiveSet:
         self.changed.zero_()
         self._find_bounds(d, int(kernels.THOSE_APART), at_end=True)
         inputs = [contacts.obstacles.shapes, contacts.obstacles.motions, contacts.law, self._surface]
-        slip = LEAST_SLIP * contacts.smallest
-        self._launch(kernels.judge_places, [*inputs, b, q, d, slip, self._rounds, self._holding, self.changed])
-        wp.launch(kernels.count_round, 1, [self._rounds, self.changed], device=self.device)
+        self._launch(kernels.judge_places, [*inputs, b, q, d, self._rounds, self._holding, self.changed])
+        wp.launch(kernels.count_round, 1, [self._rounds], device=self.device)
         self._find_bounds(d, int(kernels.THOSE_TOUCHED), at_end=True)
         self._hold()
 

@@ -29,7 +29,7 @@ class RigidForces:
         forces: The force of each obstacle on each surface node itself in the last step [N], vec3 [O, S].
         totals: The same with the nodes' shares of the forces between them, when they were last published.
         touches: Obstacles at triangles.
-        kinds, drag: The state of each surface node with each obstacle in implicit steps; see
+        kinds: The state of each surface node with each obstacle in implicit steps; see
             ``kernels.contact.active``, [O, S].
         have_edges: Whether any of the obstacles can pass between the nodes.
     """
@@ -59,7 +59,6 @@ class RigidForces:
         self.forces = wp.zeros((obstacles, count), dtype=wp.vec3, device=device)
         self.totals = wp.zeros_like(self.forces)
         self.kinds = wp.zeros((obstacles, count), dtype=wp.int32, device=device)
-        self.drag = wp.zeros((obstacles, count), dtype=wp.float32, device=device)
         self.anchors = wp.zeros((obstacles, count), dtype=wp.vec4, device=device)
         self.touches = touches.Touches()
         shape = (obstacles, self.surface.triangle_count if self.have_edges else 0)

@@ -49,6 +49,7 @@ class ConjugateGradients:
     Attributes:
         tolerance: Norm of the residual over that of b at which a world stops, float64 [worlds] on the device.
         iterations: Number of iterations of the last solve, int32 [worlds] on the device.
+        scalars: Those of the iteration, as there, float64 [worlds, SCALARS] on the device.
         status: How it ended, as in ``kernels.implicit.conjugate_gradients``, int32 [worlds] on the device.
     """
 
@@ -58,7 +59,7 @@ class ConjugateGradients:
         self._r, self._z, self._p, self._q = (wp.zeros(length, dtype=wp.vec4, device=self.device) for _ in range(4))
         self._sums = WorldSums(self.worlds, self._count, kernels.COLUMNS, self.device, ranks)
         shape = (self.worlds, kernels.SCALARS)
-        self._scalars = wp.zeros(shape, dtype=wp.float64, device=self.device)
+        self.scalars = wp.zeros(shape, dtype=wp.float64, device=self.device)
         self.tolerance = wp.full(self.worlds, 1e-6, dtype=wp.float64, device=self.device)
         self.iterations, self.status = (wp.zeros(self.worlds, dtype=wp.int32, device=self.device) for _ in range(2))
         self._running = wp.zeros(1, dtype=wp.int32, device=self.device)
@@ -71,6 +72,7 @@ class ConjugateGradients:
         *,
         guessed: bool = False,
         like: wp.array | None = None,
+        share: float = 0.0,
     ) -> None:
         """Launch a solve, recorded or at once.
 
@@ -81,35 +83,36 @@ class ConjugateGradients:
             guessed: Whether x has a first guess, zero at nodes that are not free; it is scaled so that the energy is
                 least.
             like: The vector with which the residual is compared, vec4 [worlds * nodes]; None: b.
+            share: The solve may end at this share of its first residual, too.
         """
         r, q, sums = self._r, self._q, self._sums
         if guessed:
             self.operator.apply(x, q)
             wp.launch(kernels.measure_guess, sums.shape, [b, x, q, *sums.sizes], [sums.parts], device=self.device)
             sums.take_in(int(kernels.PRODUCT), int(kernels.CURVATURE))
-            sums.launch_scalars(kernels.take_guess, [], [self._scalars])
-        inputs = [b, b if like is None else like, q, self._scalars, int(guessed), *sums.sizes, x]
+            sums.launch_scalars(kernels.take_guess, [], [self.scalars])
+        inputs = [b, b if like is None else like, q, self.scalars, int(guessed), *sums.sizes, x]
         wp.launch(kernels.begin, sums.shape, inputs, [r, sums.parts], device=self.device)
         sums.take_in(int(kernels.SQUARE), int(kernels.RIGHT))
         self._running.zero_()
-        outputs = [self._scalars, self.iterations, self.status, self._running]
-        sums.launch_scalars(kernels.take_first, [self.tolerance], outputs)
+        outputs = [self.scalars, self.iterations, self.status, self._running]
+        sums.launch_scalars(kernels.take_first, [self.tolerance, wp.float64(share)], outputs)
         wp.capture_while(self._running, self._iterate, preconditioner=preconditioner, x=x)
 
     def _iterate(self, preconditioner: Preconditioner, x: wp.array) -> None:
         r, z, p, q, sums = self._r, self._z, self._p, self._q, self._sums
         preconditioner.apply(r, z)
         sums.launch_products(r, z, int(kernels.PRODUCT))
-        sums.launch_scalars(kernels.take_beta, [], [self._scalars, self.status, self._running])
-        self._launch(kernels.take_direction, [z, self._scalars, self._count, p])
+        sums.launch_scalars(kernels.take_beta, [], [self.scalars, self.status, self._running])
+        self._launch(kernels.take_direction, [z, self.scalars, self._count, p])
         self.operator.apply(p, q)
         sums.launch_products(p, q, int(kernels.CURVATURE))
-        outputs = [self._scalars, self.iterations, self.status, self._running]
+        outputs = [self.scalars, self.iterations, self.status, self._running]
         sums.launch_scalars(kernels.take_alpha, [], outputs)
-        inputs = [p, q, self._scalars, *sums.sizes, x, r]
+        inputs = [p, q, self.scalars, *sums.sizes, x, r]
         wp.launch(kernels.advance, sums.shape, inputs, [sums.parts], device=self.device)
         sums.take_in(int(kernels.SQUARE))
-        outputs = [self._scalars, self.status, self._running]
+        outputs = [self.scalars, self.status, self._running]
         sums.launch_scalars(kernels.judge, [self.most, self.iterations], outputs)
 
     def _launch(self, kernel: wp.Kernel, arguments: list) -> None:
@@ -117,7 +120,7 @@ class ConjugateGradients:
 
     def report(self) -> SolveReport:
         """How the last solve ended; waits for the device."""
-        status, scalars = self.status.numpy(), self._scalars.numpy()
+        status, scalars = self.status.numpy(), self.scalars.numpy()
         first = scalars[:, int(kernels.FIRST)]
         share = scalars[:, int(kernels.RR)] / np.where(first > 0.0, first, 1.0)
         return SolveReport(

@@ -13,10 +13,12 @@ from .conjugate_gradients import ConjugateGradients
 from .line_search import LineSearch
 from .newton import Newton
 from .operator import LinearOperator, Preconditioner
-from .touching import Held, Rows
+from .touching import SETTLED, SHARE, FreePreconditioner, Held, Rows
 
 #: Linear solves of a step at most.
 ROUNDS = 40
+#: Pairs are located again once the residual of a solve begins at less than this many times the tolerance.
+NEAR = 100.0
 
 
 class Parts:
@@ -53,11 +55,6 @@ class JoinedOperator:
         self._rows.add_products(x, y)
         self._drag(x, y)
 
-    def apply_apart(self, x: wp.array, y: wp.array) -> None:
-        """Launch y = S (A + D) x."""
-        self._apply_each(x, y)
-        self._drag(x, y)
-
     def apply_freely(self, x: wp.array, y: wp.array) -> None:
         """Launch y = A x."""
         self._apply_each(x, y)
@@ -73,20 +70,23 @@ class JoinedOperator:
 
 
 class JoinedPreconditioner:
-    """S B of each body's own preconditioner B."""
+    """That of each body, S T B T S where obstacles hold it; see ``FreePreconditioner``."""
 
-    def __init__(self, preconditioners: Sequence[Preconditioner], held: Sequence[Held | None], parts: Parts):
-        self._preconditioners, self._held, self._parts = preconditioners, held, parts
+    def __init__(
+        self, preconditioners: Sequence[Preconditioner], held: Sequence[Held | None], like: wp.array, parts: Parts
+    ):
+        self._parts = parts
+        self._each: list[Preconditioner] = [
+            preconditioner if own is None else FreePreconditioner(preconditioner, own, part)
+            for preconditioner, own, part in zip(preconditioners, held, parts.of(like), strict=True)
+        ]
 
     def update(self, operator: LinearOperator) -> None:
         """Bodies' own are kept up to date by ``JoinedSolve``."""
 
     def apply(self, r: wp.array, z: wp.array) -> None:
-        each = zip(self._preconditioners, self._held, self._parts.of(r), self._parts.of(z), strict=True)
-        for preconditioner, held, a, b in each:
+        for preconditioner, a, b in zip(self._each, self._parts.of(r), self._parts.of(z), strict=True):
             preconditioner.apply(a, b)
-            if held is not None:
-                held.launch_free(b)
 
 
 class JoinedSolve:
@@ -123,10 +123,10 @@ class JoinedSolve:
         for newton, step, residual in zip(newtons, parts.of(self._d), parts.of(self._b), strict=True):
             newton.step, newton.residual = step, residual
         self._operator = JoinedOperator([newton.operator for newton in newtons], held, rows, parts)
-        self._preconditioner = JoinedPreconditioner([newton.preconditioner for newton in newtons], held, parts)
+        self._preconditioner = JoinedPreconditioner([newton.preconditioner for newton in newtons], held, self._d, parts)
         self._solver = ConjugateGradients(self._operator, parts.count, most=most)  # type: ignore[arg-type]
         self._solver.tolerance.fill_(tolerance)
-        self._search = LineSearch(1, parts.count, rows, self.device)
+        self._search = LineSearch(1, parts.count, self, self.device)
         self._going, self._rounds, self._linear, self._changed = (
             wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(4)
         )
@@ -135,15 +135,17 @@ class JoinedSolve:
 
     def launch(self, offset: int) -> None:
         """Launch the steps of all bodies, from guesses of them, after their residuals."""
-        rows = self._rows
+        rows, blocks = self._rows, []
         for k, newton in enumerate(self._newtons):
             operator = newton.operator
             operator.take(newton.body.state.displacements)
-            rows.launch_begin(k, self._parts.starts[k], operator.diagonal_blocks(), newton.increment, newton.step)
             newton.preconditioner.update(operator)
+            blocks.append(operator.diagonal_blocks())
+            rows.launch_begin(k, self._parts.starts[k], blocks[k], newton.increment, newton.step)
         rows.launch_search(offset)
-        for held, d in self._each_held(self._d):
-            held.launch_begin(d)
+        for held, d, own in zip(self._held, self._parts.of(self._d), blocks, strict=True):
+            if held is not None:
+                held.launch_begin(d, own)
         rows.locates.fill_(1)
         rows.launch_located(self._d, is_first=True)
         self._rounds.zero_()
@@ -165,16 +167,20 @@ class JoinedSolve:
         rows.update(d)
         self._operator.apply_freely(d, self._q)
         self._launch(find_rest, [self._b, self._q, self._rest])
-        for (held, part), rest in zip(self._each_held(d), self._held_parts(self._rest), strict=True):
-            held.launch_friction(part, rest)
         wp.copy(self._r, self._rest)
         rows.add_forces(self._r)
-        for held, r in self._each_held(self._r):
-            held.launch_free(r)
-        self._solver.launch(self._preconditioner, self._r, self._change, like=self._b)
-        self._operator.apply_apart(self._change, self._q)
+        for (held, part), r in zip(self._each_held(d), self._held_parts(self._r), strict=True):
+            held.launch_friction(part, r)
+        self._solver.launch(self._preconditioner, self._r, self._change, like=self._b, share=SHARE)
+        self._operator.apply_freely(self._change, self._q)
         self._search.launch(self._rest, self._q, self._change, d)
         self._judge()
+
+    def add_slopes(self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array) -> None:
+        """Launch the power of all contacts along a change; see ``line_search``."""
+        self._rows.add_slopes(d, change, search, slopes)
+        for (held, own), part in zip(self._each_held(d), self._held_parts(change), strict=True):
+            held.add_slopes(own, part, search, slopes)
 
     def _judge(self) -> None:
         """Launch which nodes obstacles hold from now on, and whether another round is needed."""
@@ -187,7 +193,7 @@ class JoinedSolve:
         for (held, part), b, q in each:
             held.launch_judgement(b, q, part)
             wp.launch(kernels.gather_change, 1, [held.changed, self._changed], device=self.device)
-        inputs = [self._solver.iterations, self._changed, rows.total, ROUNDS]
+        inputs = [self._solver.scalars, self._solver.iterations, self._changed, rows.total, ROUNDS, SETTLED, NEAR]
         outputs = [rows.locates, self._rounds, self._linear, self._going]
         wp.launch(kernels.judge_round, 1, inputs, outputs, device=self.device)
 

@@ -6,13 +6,21 @@ from typing import TYPE_CHECKING, Protocol
 
 import warp as wp
 
-from warp_corot.kernels.implicit.tangent import add_counts, add_vectors, find_rest
+from warp_corot.kernels.implicit.tangent import find_rest, judge_round
 
+from .line_search import LineSearch
 from .newton import Newton
 from .operator import LinearOperator, Preconditioner
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
+
+#: Linear solves of a step at most.
+ROUNDS = 16
+#: A solve ends at this share of its first residual, because contact may change after it.
+SHARE = 0.05
+#: A step is solved for if the residual of a solve begins at less than this many times the tolerance.
+SETTLED = 10.0
 
 
 class Held(Protocol):
@@ -24,15 +32,19 @@ class Held(Protocol):
 
     def prepare(self) -> None: ...
 
-    def launch_begin(self, d: wp.array) -> None: ...
+    def launch_begin(self, d: wp.array, blocks: wp.array) -> None: ...
 
     def launch_free(self, v: wp.array) -> None: ...
+
+    def launch_yielding(self, v: wp.array) -> None: ...
 
     def launch_imposed(self, d: wp.array) -> None: ...
 
     def launch_drag(self, x: wp.array, y: wp.array) -> None: ...
 
     def launch_friction(self, d: wp.array, r: wp.array) -> None: ...
+
+    def add_slopes(self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array) -> None: ...
 
     def launch_judgement(self, b: wp.array, q: wp.array, d: wp.array) -> None: ...
 
@@ -120,17 +132,19 @@ class FreeOperator:
 
 
 class FreePreconditioner:
-    """S B of a preconditioner B; ``update`` is B's."""
+    """S T B T S of a preconditioner B, where T takes the stiffness of friction into account; ``update`` is B's."""
 
-    def __init__(self, preconditioner: Preconditioner, held: Held):
-        self._preconditioner, self._held = preconditioner, held
+    def __init__(self, preconditioner: Preconditioner, held: Held, like: wp.array):
+        self._preconditioner, self._held, self._r = preconditioner, held, wp.zeros_like(like)
 
     def update(self, operator: LinearOperator) -> None:
         self._preconditioner.update(operator)
 
     def apply(self, r: wp.array, z: wp.array) -> None:
-        self._preconditioner.apply(r, z)
-        self._held.launch_free(z)
+        wp.copy(self._r, r)
+        self._held.launch_yielding(self._r)
+        self._preconditioner.apply(self._r, z)
+        self._held.launch_yielding(z)
 
 
 class TouchingSolve:
@@ -148,10 +162,13 @@ class TouchingSolve:
         self.newton, self.held, self.device = newton, held, newton.device
         self._operator = newton.operator
         newton.solver.operator = FreeOperator(newton.operator, held)  # type: ignore[assignment]
-        self._preconditioner = FreePreconditioner(newton.preconditioner, held)
+        self._preconditioner = FreePreconditioner(newton.preconditioner, held, newton.step)
         like = newton.step
-        self._q, self._r, self._change = (wp.zeros_like(like) for _ in range(3))
+        self._q, self._r, self._rest, self._change = (wp.zeros_like(like) for _ in range(4))
+        worlds = self._operator.worlds
+        self._search = LineSearch(worlds, self._operator.node_count, held, self.device)
         self.iterations = wp.zeros_like(newton.solver.iterations)
+        self._rounds, self._going = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(2))
 
     def launch(self) -> None:
         """Launch ``newton.step``, from a guess of it, after the residual."""
@@ -159,8 +176,10 @@ class TouchingSolve:
         self._operator.take(newton.body.state.displacements)
         self._preconditioner.update(self._operator)
         self.iterations.zero_()
-        held.launch_begin(newton.step)
-        wp.capture_while(held.changed, self._round)
+        self._rounds.zero_()
+        self._going.fill_(1)
+        held.launch_begin(newton.step, self._operator.diagonal_blocks())
+        wp.capture_while(self._going, self._round)
         held.launch_end(newton.step)
 
     def _round(self) -> None:
@@ -168,11 +187,14 @@ class TouchingSolve:
         b = newton.residual
         held.launch_imposed(d)
         self._operator.apply(d, self._q)
-        wp.launch(find_rest, len(d), [b, self._q], [self._r], device=self.device)
+        wp.launch(find_rest, len(d), [b, self._q], [self._rest], device=self.device)
+        wp.copy(self._r, self._rest)
         held.launch_friction(d, self._r)
-        newton.solver.launch(self._preconditioner, self._r, self._change, like=b)
-        wp.launch(add_vectors, len(d), [self._change], [d], device=self.device)
-        inputs = [newton.solver.iterations]
-        wp.launch(add_counts, len(self.iterations), inputs, [self.iterations], device=self.device)
+        newton.solver.launch(self._preconditioner, self._r, self._change, like=b, share=SHARE)
+        self._operator.apply(self._change, self._q)
+        held.launch_free(self._q)
+        self._search.launch(self._rest, self._q, self._change, d)
         self._operator.apply(d, self._q)
         held.launch_judgement(b, self._q, d)
+        inputs = [newton.solver.scalars, newton.solver.iterations, held.changed, SETTLED, ROUNDS]
+        wp.launch(judge_round, 1, inputs, [self._rounds, self.iterations, self._going], device=self.device)
