@@ -9,6 +9,8 @@ limits on time and memory, so that one that hangs or exhausts memory does not en
     python benchmarks/bodies.py --fall                    and each with defaults for 2 s: does it topple?
     python benchmarks/bodies.py -o after.md --json after.json --before before.json
 
+With ``--together`` one process measures all meshes, which saves loading libraries for each; limits on time do not hold.
+
 Falls have 5,000 elements (``--fall-tets``). Numbers already in the ``--json`` file stay there unless a run
 finds them again, so ``--no-mesh --fall`` adds the falls and ``--no-mesh -o table.md`` only writes the table.
 
@@ -65,6 +67,18 @@ def run_one(options: argparse.Namespace) -> int:
     return 0
 
 
+def together(body: Body, options: argparse.Namespace) -> dict[str, Any]:
+    """The results for the mesh of a body from this process."""
+    from body_runs import measured
+
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            path, given = as_input(body, Path(folder))
+            return measured(path, given, options.tets, options.device)
+        except Exception as error:
+            return {"failed": f"{type(error).__name__}: {error}"[:200]}
+
+
 def in_process(body: Body, options: argparse.Namespace) -> dict[str, Any]:
     """The results for a body from a separate process, and how it ended if it failed."""
     command = [sys.executable, __file__, "--one", body.name, "--tets", str(options.tets), "--device", options.device]
@@ -94,7 +108,7 @@ def found_of(body: Body, earlier: dict[str, Any], options: argparse.Namespace) -
     kept = {name: value for name, value in earlier.items() if (not options.fall if name in FALL else options.no_mesh)}
     if options.no_mesh and not (options.fall and {"elements", "tets"} & earlier.keys()):
         return kept
-    return kept | in_process(body, options)
+    return kept | (together if options.together else in_process)(body, options)
 
 
 def main() -> int:
@@ -104,6 +118,7 @@ def main() -> int:
     parser.add_argument("--fall", action="store_true", help="also let each fall with defaults for 2 s")
     parser.add_argument("--fall-tets", type=int, default=FALL_TETS, help=f"elements of falls (default: {FALL_TETS})")
     parser.add_argument("--no-mesh", action="store_true", help="keep the results of meshes in --json")
+    parser.add_argument("--together", action="store_true", help="one process for all meshes, without falls")
     parser.add_argument("--previews", type=Path, help="a folder for pictures of the first and last frame of each fall")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--seconds", type=float, default=SECONDS, help="time limit for a body (default: 300)")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
 import tempfile
 import time
@@ -43,12 +44,13 @@ def measured(path: Path, options: list[str], tets: int, device: str) -> dict[str
         warnings.simplefilter("always")
         try:
             args = make_parser().parse_args(line)
-            wall, cpu = time.perf_counter(), time.process_time()
+            wall, cpu, own = time.perf_counter(), time.process_time(), time.thread_time()
             opened = open_input(str(path))
             if opened.kind == "tets":
                 return {"tets": len(load_tets(path).tets)}
             subjects = [find_organ(part, own) for part, own in bodies_in(opened, args)]
             seconds, cpu_seconds = time.perf_counter() - wall, time.process_time() - cpu
+            own_seconds = time.thread_time() - own
         except InputError as error:
             return {"refused": str(error)}
     size = float(np.ptp(np.concatenate([s.domain.bounds for s in subjects]), axis=0).max())
@@ -58,6 +60,7 @@ def measured(path: Path, options: list[str], tets: int, device: str) -> dict[str
         "size": size,
         "seconds": seconds,
         "cpu_seconds": cpu_seconds,
+        "own_seconds": own_seconds,
         "times": {stage: sum(s.times[stage] for s in subjects) for stage in subjects[0].times},
         "notes": [*(note for s in subjects for note in s.notes), *(str(warning.message) for warning in said)],
         "doubts": [doubt for s in subjects for doubt in s.fidelity.doubts()],
@@ -81,6 +84,7 @@ def together(found: list[Fidelity], size: float, tets: int) -> dict[str, Any]:
     }
 
 
+@functools.cache
 def _load_kernels(device: str) -> None:
     """Mesh a small ball in the same way, to load kernels and libraries."""
     import trimesh
