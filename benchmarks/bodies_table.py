@@ -123,8 +123,8 @@ def totals(rows: list[Row], tets: int) -> str:
         0.5 * (row.found["cpu_seconds"] + row.found.get("own_seconds", row.found["cpu_seconds"])) for row in made
     )
     lines.append(
-        f"Wall time on two free cores, from the processor times of threads: median {alone[len(alone) // 2]:.1f} s, longest "
-        f"{alone[-1]:.1f} s; within 4 s: {sum(s <= 4.0 for s in alone)} of {len(made)}."
+        f"Wall time on two free cores, by the processor times of threads: median {alone[len(alone) // 2]:.1f} s, "
+        f"longest {alone[-1]:.1f} s; within 4 s: {sum(s <= 4.0 for s in alone)} of {len(made)}."
     )
     falls = [row for row in made if "fall" in row.found]
     if falls:
