@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_corot.kernels.elements.elements import load_node, store_node
+from warp_corot.kernels.elements.elements import load_node
 from warp_corot.kernels.stepping.integrate import by_vectors, symplectic_euler_velocity, vector_at
 from warp_corot.kernels.stepping.pace import DT, Pace, length_before, time_after
 
@@ -87,27 +87,6 @@ def predict_motion(
     surface.x[s] = home + load_node(u, i)
     surface.d[s] = dt * velocity
     surface.yielding[s] = dt * kick * w * damped
-
-
-@wp.kernel(enable_backward=False)
-def add_contact_forces(
-    # In
-    start: int,
-    surface: Surface,
-    # In and out
-    f: wp.array[wp.vec4],
-    # Out
-    contact_forces: wp.array[wp.vec4],
-):
-    """Add the contact forces to a body's forces."""
-    s = start + wp.tid()
-    i = surface.node[s]
-    if i < 0:
-        return
-    force = surface.f[s]
-    store_node(contact_forces, i, force)
-    if wp.dot(force, force) > 0.0:
-        store_node(f, i, load_node(f, i) + force)
 
 
 @wp.func

@@ -31,6 +31,7 @@ class Touches:
     shares: wp.array2d[wp.vec3]  # weights of the corners at the contact point; zero if nothing is near
     normal: wp.array2d[wp.vec3]  # from the obstacle to the triangle
     gap: wp.array2d[wp.float32]
+    friction: wp.array2d[wp.float32]
     moved: wp.array2d[wp.vec3]  # motion of the obstacle's point in this step [m]
     acts: wp.array2d[wp.int32]
     force: wp.array2d[wp.vec3]  # on the triangle [N]
@@ -60,11 +61,6 @@ def nearest(shapes: Shapes, o: int, pose: wp.transform, most: float, a: wp.vec3,
     w = deepest_on_triangle(shapes, o, pose, most, a, b, c)
     gap, n = distance_to(shapes, o, pose, point_of(w, a, b, c), most)
     return w, gap, n
-
-
-@wp.func
-def friction_at(gap: float, o: int, shapes: Shapes):
-    return wp.where(gap < -SKEWERED * shapes.thickness[o], 0.0, shapes.friction[o])
 
 
 @wp.func
@@ -105,15 +101,17 @@ def find_touch(
         gap = -2.0 * shapes.size[o][0] - gap
     if gap > far or wp.max(w) > CORNER:
         return
+    friction = wp.where(gap < -SKEWERED * shapes.thickness[o], 0.0, shapes.friction[o])
     touches.shares[o, t] = w
     touches.normal[o, t] = n
     touches.gap[o, t] = gap
+    touches.friction[o, t] = friction
     touches.moved[o, t] = carried(pose, later, point_of(w, a, b, c))
     was_push = wp.max(wp.dot(was, n), 0.0)
     push = WARMTH * was_push
     if push > 0.0:
         touches.acts[o, t] = 1
-        force = push * n + held_back(across(was, n), was_push, friction_at(gap, o, shapes))
+        force = push * n + held_back(across(was, n), was_push, friction)
         touches.force[o, t] = force
         touches.more[o, t] = force
 

@@ -10,13 +10,25 @@ import warp as wp
 from warp_corot.kernels.stepping.pace import DT, Pace
 
 from .law import Law, held_back, least_motion
-from .motion import Surface
-from .near import AROUND, Near
+from .motion import Motions, Surface
+from .near import AROUND, BESIDE, Near
 from .shapes import Shapes
-from .touches import Touches, friction_at
-from .vertices import across
+from .touches import Touches
+from .vertices import across, anchor, touch
 
 wp.set_module_options({"enable_backward": False})
+
+#: The parts of ``push_nodes``.
+ADD, BEGIN, CORRECT, END = (wp.constant(k) for k in (1, 2, 4, 8))
+
+
+@wp.struct
+class Skin:
+    """The triangles of all surfaces, and those around each node: three times the triangle, and which corner."""
+
+    triangles: wp.array[wp.vec3i]
+    corner_starts: wp.array[wp.int32]
+    corners: wp.array[wp.int32]
 
 
 @wp.func
@@ -27,46 +39,28 @@ def approach(touches: Touches, o: int, t: int, surface: Surface, corners: wp.vec
     return d - touches.moved[o, t]
 
 
-@wp.kernel(enable_backward=False)
-def judge_touches(
-    # In
-    threads: int,
-    near: Near,
-    law: Law,
-    pace: Pace,
-    surface: Surface,
-    triangles: wp.array[wp.vec3i],
-    # In and out
-    touches: Touches,
-):
-    """Find the contacts that act."""
-    k = wp.tid()
-    count = near.touch_count[0]
-    dt = float(pace.seconds[DT])
-    while k < count:
-        o = near.touches[k] // triangles.shape[0]
-        t = near.touches[k] % triangles.shape[0]
-        k += threads
-        w = touches.shares[o, t]
-        acts = int(0)
-        if w[0] + w[1] + w[2] > 0.0:
-            d = approach(touches, o, t, surface, triangles[t])
-            n = touches.normal[o, t]
-            wanted = least_motion(touches.gap[o, t], law, dt) - wp.dot(d, n)
-            if wanted > 0.0 or wp.dot(touches.force[o, t], n) > 0.0:
-                acts = 1
-        touches.acts[o, t] = acts
+@wp.func
+def judge_touch(o: int, t: int, law: Law, dt: float, surface: Surface, corners: wp.vec3i, touches: Touches):
+    """Find whether the contact of an obstacle and a triangle acts in this round."""
+    w = touches.shares[o, t]
+    acts = int(0)
+    if w[0] + w[1] + w[2] > 0.0:
+        n = touches.normal[o, t]
+        wanted = least_motion(touches.gap[o, t], law, dt) - wp.dot(approach(touches, o, t, surface, corners), n)
+        if wanted > 0.0 or wp.dot(touches.force[o, t], n) > 0.0:
+            acts = 1
+    touches.acts[o, t] = acts
+    return acts
 
 
 @wp.func
-def crowd_at(s: int, corner_starts: wp.array[wp.int32], corners: wp.array[wp.int32], touches: Touches):
+def crowd_at(s: int, law: Law, dt: float, surface: Surface, skin: Skin, touches: Touches):
     total = float(0.0)
-    for k in range(corner_starts[s], corner_starts[s + 1]):
-        t = corners[k] / 3
-        corner = corners[k] % 3
+    for k in range(skin.corner_starts[s], skin.corner_starts[s + 1]):
+        t = skin.corners[k] / 3
         for o in range(touches.acts.shape[0]):
-            if touches.acts[o, t] != 0:
-                total += touches.shares[o, t][corner]
+            if judge_touch(o, t, law, dt, surface, skin.triangles[t], touches) != 0:
+                total += touches.shares[o, t][skin.corners[k] % 3]
     return total
 
 
@@ -75,27 +69,30 @@ def crowd_nodes(
     # In
     threads: int,
     near: Near,
-    corner_starts: wp.array[wp.int32],
-    corners: wp.array[wp.int32],
+    law: Law,
+    pace: Pace,
+    surface: Surface,
+    skin: Skin,
+    # In and out
     touches: Touches,
     # Out
     crowd: wp.array[wp.float32],
 ):
-    """Sum the weights of all acting contacts at each node."""
+    """Find the contacts that act, and sum their weights at each node. All corners of a triangle find the same."""
     k = wp.tid()
     count = near.count[0]
+    dt = float(pace.seconds[DT])
     while k < count:
         s = near.nodes[k]
         k += threads
         if (near.flags[s] & AROUND) != 0:
-            crowd[s] = crowd_at(s, corner_starts, corners, touches)
+            crowd[s] = crowd_at(s, law, dt, surface, skin, touches)
 
 
 @wp.func
 def solve_touch(
     o: int,
     t: int,
-    shapes: Shapes,
     law: Law,
     dt: float,
     surface: Surface,
@@ -117,8 +114,7 @@ def solve_touch(
     d = approach(touches, o, t, surface, corners)
     wanted = least_motion(touches.gap[o, t], law, dt) - wp.dot(d, n)
     normal_force = wp.max(wp.dot(before, n) + wanted / yielding, 0.0)
-    friction = friction_at(touches.gap[o, t], o, shapes)
-    sideways = held_back(across(before, n) - across(d, n) / yielding, normal_force, friction)
+    sideways = held_back(across(before, n) - across(d, n) / yielding, normal_force, touches.friction[o, t])
     force = normal_force * n + sideways
     touches.force[o, t] = force
     touches.more[o, t] = force - before
@@ -129,7 +125,6 @@ def solve_touches(
     # In
     threads: int,
     near: Near,
-    shapes: Shapes,
     law: Law,
     pace: Pace,
     surface: Surface,
@@ -152,44 +147,61 @@ def solve_touches(
         t = near.touches[k] % triangles.shape[0]
         k += threads
         if touches.acts[o, t] != 0:
-            solve_touch(o, t, shapes, law, dt, surface, triangles[t], crowd, corner_yielding, touches)
+            solve_touch(o, t, law, dt, surface, triangles[t], crowd, corner_yielding, touches)
 
 
 @wp.func
-def added_at(s: int, corner_starts: wp.array[wp.int32], corners: wp.array[wp.int32], touches: Touches):
-    """The change of the force on a node, summed in a fixed order [N]."""
+def add_touches(s: int, skin: Skin, touches: Touches, surface: Surface):
+    """Give a node its share of the changes, summed in a fixed order."""
     total = wp.vec3()
-    for k in range(corner_starts[s], corner_starts[s + 1]):
-        t = corners[k] / 3
-        corner = corners[k] % 3
+    for k in range(skin.corner_starts[s], skin.corner_starts[s + 1]):
+        t = skin.corners[k] / 3
+        corner = skin.corners[k] % 3
         for o in range(touches.acts.shape[0]):
             if touches.acts[o, t] != 0:
                 total += touches.shares[o, t][corner] * touches.more[o, t]
-    return total
+    if wp.dot(total, total) > 0.0:
+        surface.f[s] = surface.f[s] + total
+        surface.d[s] = surface.d[s] + surface.yielding[s] * total
 
 
 @wp.kernel(enable_backward=False)
-def apply_touches(
+def push_nodes(
     # In
     threads: int,
     near: Near,
-    corner_starts: wp.array[wp.int32],
-    corners: wp.array[wp.int32],
+    parts: int,
+    skin: Skin,
+    shapes: Shapes,
+    motions: Motions,
+    law: Law,
+    pace: Pace,
     touches: Touches,
     # In and out
     surface: Surface,
+    forces: wp.array2d[wp.vec3],
+    anchors: wp.array2d[wp.vec4],
 ):
-    """Give each node its share of the changes."""
+    """Do the work on nodes one by one, without their neighbours.
+
+    Args:
+        parts: A sum. ADD: give each node its share of the changes of forces on triangles. BEGIN: find the forces [O, S]
+            with which nodes are outside obstacles at the end of the step, with friction. CORRECT: correct these if
+            other forces have moved nodes since. END: update the anchors of sticking nodes.
+    """
     k = wp.tid()
     count = near.count[0]
+    dt = float(pace.seconds[DT])
     while k < count:
         s = near.nodes[k]
         k += threads
-        if (near.flags[s] & AROUND) != 0:
-            total = added_at(s, corner_starts, corners, touches)
-            if wp.dot(total, total) > 0.0:
-                surface.f[s] = surface.f[s] + total
-                surface.d[s] = surface.d[s] + surface.yielding[s] * total
+        if (parts & ADD) != 0 and (near.flags[s] & AROUND) != 0:
+            add_touches(s, skin, touches, surface)
+        if (near.flags[s] & BESIDE) != 0:
+            if (parts & (BEGIN | CORRECT)) != 0:
+                touch(s, (parts & BEGIN) != 0, shapes, motions, law, dt, anchors, surface, forces)
+            if (parts & END) != 0:
+                anchor(s, shapes, motions, surface, forces, anchors)
 
 
 @wp.kernel(enable_backward=False)

@@ -2,11 +2,8 @@
 
 import warp as wp
 
-from warp_corot.kernels.stepping.pace import DT, Pace
-
 from .law import SETTLING, Law, held_back, least_motion
 from .motion import Motions, Surface
-from .near import BESIDE, Near
 from .shapes import Shapes, carried, distance_to
 
 wp.set_module_options({"enable_backward": False})
@@ -23,7 +20,7 @@ def across(a: wp.vec3, normal: wp.vec3):
 @wp.func
 def touch(
     s: int,
-    is_first: int,
+    is_first: bool,
     shapes: Shapes,
     motions: Motions,
     law: Law,
@@ -32,11 +29,14 @@ def touch(
     surface: Surface,
     forces: wp.array2d[wp.vec3],
 ):
-    """Find the forces of all obstacles on a node."""
+    """Find the forces of all obstacles on a node.
+
+    A sticking node is held at an anchor, a point in the obstacle's frame whose fourth number is 1.
+    """
     count = forces.shape[0]
     total = wp.vec3()
     for o in range(count):
-        if is_first != 0:
+        if is_first:
             forces[o, s] = wp.vec3()
         total -= forces[o, s]
     yielding = surface.yielding[s]
@@ -81,36 +81,6 @@ def touch(
     surface.f[s] = surface.f[s] + total
 
 
-@wp.kernel(enable_backward=False)
-def touch_obstacles(
-    # In
-    threads: int,
-    near: Near,
-    is_first: int,
-    shapes: Shapes,
-    motions: Motions,
-    law: Law,
-    pace: Pace,
-    anchors: wp.array2d[wp.vec4],
-    # In and out
-    surface: Surface,
-    forces: wp.array2d[wp.vec3],
-):
-    """Find the forces [O, S] with which nodes are outside obstacles at the end of the step, with friction; a second
-    call corrects them if other forces have moved nodes since.
-
-    A sticking node is held at an anchor, a point in the obstacle's frame whose fourth number is 1.
-    """
-    k = wp.tid()
-    count = near.count[0]
-    dt = float(pace.seconds[DT])
-    while k < count:
-        s = near.nodes[k]
-        k += threads
-        if (near.flags[s] & BESIDE) != 0:
-            touch(s, is_first, shapes, motions, law, dt, anchors, surface, forces)
-
-
 @wp.func
 def anchor(
     s: int,
@@ -120,6 +90,7 @@ def anchor(
     forces: wp.array2d[wp.vec3],
     anchors: wp.array2d[wp.vec4],
 ):
+    """Set an anchor if the node begins to stick, drag it along with a slipping node, remove it without contact."""
     if surface.yielding[s] == 0.0:
         return
     world = surface.world[s]
@@ -137,27 +108,3 @@ def anchor(
             if slips or anchors[o, s][3] == 0.0:
                 p = wp.quat_rotate_inv(wp.transform_get_rotation(pose), end - wp.transform_get_translation(pose))
                 anchors[o, s] = wp.vec4(p[0], p[1], p[2], 1.0)
-
-
-@wp.kernel(enable_backward=False)
-def keep_anchors(
-    # In
-    threads: int,
-    near: Near,
-    shapes: Shapes,
-    motions: Motions,
-    surface: Surface,
-    forces: wp.array2d[wp.vec3],
-    # Out
-    anchors: wp.array2d[wp.vec4],
-):
-    """Set anchors for nodes that begin to stick, drag them along with slipping nodes, and remove them from nodes
-    without contact.
-    """
-    k = wp.tid()
-    count = near.count[0]
-    while k < count:
-        s = near.nodes[k]
-        k += threads
-        if (near.flags[s] & BESIDE) != 0:
-            anchor(s, shapes, motions, surface, forces, anchors)

@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from warp_corot.kernels.elements.elements import load_node, store_node
+
 from .motion import Motions, Surface, distance_between
 
 wp.set_module_options({"enable_backward": False})
@@ -59,18 +61,48 @@ def watch_nodes(surface: Surface, watch: Watch):
         watch.due[0] = 1
 
 
-@wp.kernel(enable_backward=False)
-def follow_nodes(surface: Surface, watch: Watch):
-    """Check after a step whether the next one could move nodes too far, or this one has."""
-    s = wp.tid()
-    if surface.node[s] < 0:
-        return
+@wp.func
+def follow_node(s: int, surface: Surface, watch: Watch):
+    """Check after a step whether the next one could move the node too far, or this one has."""
     step = surface.d[s]
     gone = wp.length(surface.x[s] + step - watch.places[s])
     if not stays(gone, wp.length(step), watch.reach[s]):
         watch.due[0] = 1
         if gone > watch.reach[s]:
             wp.atomic_add(watch.missed, 0, 1)
+
+
+@wp.kernel(enable_backward=False)
+def follow_nodes(surface: Surface, watch: Watch):
+    """Check the same for all nodes."""
+    s = wp.tid()
+    if surface.node[s] >= 0:
+        follow_node(s, surface, watch)
+
+
+@wp.kernel(enable_backward=False)
+def add_contact_forces(
+    # In
+    start: int,
+    surface: Surface,
+    follows: int,
+    # In and out
+    watch: Watch,
+    f: wp.array[wp.vec4],
+    # Out
+    contact_forces: wp.array[wp.vec4],
+):
+    """Add the contact forces to a body's forces; follow its nodes if there is a search."""
+    s = start + wp.tid()
+    i = surface.node[s]
+    if i < 0:
+        return
+    force = surface.f[s]
+    store_node(contact_forces, i, force)
+    if wp.dot(force, force) > 0.0:
+        store_node(f, i, load_node(f, i) + force)
+    if follows != 0:
+        follow_node(s, surface, watch)
 
 
 @wp.kernel(enable_backward=False)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from warp_corot.kernels.contact import motion, sums
+from warp_corot.kernels.contact import motion, sums, watch
 from warp_corot.kernels.contact.law import Law
 from warp_corot.solvers.system import System
 
@@ -146,12 +146,11 @@ class Contacts:
         self._predict(offset, damping)
         self.search.launch(offset)
         self._solve()
-        self.search.launch_after()
         system.ranks.clear_surface(surface.arrays.f)
         for k, body in enumerate(system.bodies):
-            outputs = [body.state.forces, body.state.contact_forces]
-            inputs = [surface.parts[k].start, surface.arrays]
-            self._launch(motion.add_contact_forces, self._count(k), inputs, outputs)
+            inputs = [surface.parts[k].start, surface.arrays, int(bool(self.search.finders))]
+            outputs = [self.search.watch, body.state.forces, body.state.contact_forces]
+            self._launch(watch.add_contact_forces, self._count(k), inputs, outputs)
 
     def launch_motion(self, offset: int) -> None:
         """Launch the motion of obstacles in an implicit step."""
@@ -260,19 +259,20 @@ class Contacts:
     def _solve(self) -> None:
         """Launch the forces in turn: of obstacles on nodes, of obstacles between these, and of soft surfaces."""
         rigid, pairs = self.rigid, self.pairs
+        rounds = ROUNDS if self.obstacles.have_edges or pairs is not None else 0
         if pairs is not None:
             pairs.launch_begin(self.law)
         if rigid is not None:
-            rigid.launch_begin()
-        for _ in range(ROUNDS if self.obstacles.have_edges or pairs is not None else 0):
+            rigid.launch_begin(is_end=rounds == 0)
+        for number in range(rounds):
             if rigid is not None:
                 rigid.launch_round()
             if pairs is not None:
+                if rigid is not None:
+                    rigid.launch_sum()
                 pairs.launch_round(self.law, self.system.pace.arrays)
             if rigid is not None:
-                rigid.launch_correction()
-        if rigid is not None:
-            rigid.launch_end()
+                rigid.launch_correction(has_summed=pairs is not None, is_end=number == rounds - 1)
 
     def _make_arrays(self) -> None:
         surface, device = self.surface, self.device

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from warp_corot.kernels.contact import beside, touches, triangles, vertices
+from warp_corot.kernels.contact import beside, touches, triangles
 from warp_corot.kernels.contact.law import Law
 from warp_corot.kernels.stepping.pace import Pace
 from warp_corot.solvers.ranks import ALONE, Ranks
@@ -64,9 +64,13 @@ class RigidForces:
         shape = (obstacles, self.surface.triangle_count if self.have_edges else 0)
         for name in ("shares", "normal", "moved", "force", "more"):
             setattr(self.touches, name, wp.zeros(shape, dtype=wp.vec3, device=device))
-        self.touches.gap = wp.zeros(shape, dtype=wp.float32, device=device)
+        for name in ("gap", "friction"):
+            setattr(self.touches, name, wp.zeros(shape, dtype=wp.float32, device=device))
         self.touches.acts = wp.zeros(shape, dtype=wp.int32, device=device)
         self._crowd = wp.zeros(count, dtype=wp.float32, device=device)
+        self._skin = triangles.Skin()
+        self._skin.triangles, self._skin.corners = self.surface.triangles, self.surface.corners
+        self._skin.corner_starts = self.surface.corner_starts
         self._yielding = self.surface.arrays.yielding
 
     def forget(self) -> None:
@@ -84,38 +88,42 @@ class RigidForces:
 
     # --- launches --------------------------------------------------------------------------------------------------
 
-    def launch_begin(self) -> None:
+    def launch_begin(self, *, is_end: bool) -> None:
         """Launch the first forces: those between nodes from the last step, and those on nodes."""
+        parts = triangles.BEGIN
         if self.have_edges:
             self._yielding = self._ranks.completed_yielding(self.surface.arrays.yielding)
             rigid = [self.obstacles.shapes, self.obstacles.motions]
             inputs = [*rigid, self._law, self.surface.arrays, self.surface.triangles, self.touches]
             self._on_touches(touches.find_touches, inputs)
-            self._apply()
-        self._touch_nodes(1)
+            parts |= triangles.ADD
+        self._push(parts, is_end)
 
     def launch_round(self) -> None:
-        """Launch one round of the forces between nodes."""
+        """Launch one round of the forces between nodes; their sums at the nodes follow."""
         if not self.have_edges:
             return
-        step = [self._law, self._pace, self.surface.arrays, self.surface.triangles]
+        step = [self._law, self._pace, self.surface.arrays]
         self._ranks.complete_surface(self.surface.arrays.d)
-        self._on_touches(triangles.judge_touches, [*step, self.touches])
-        inputs = [self.surface.corner_starts, self.surface.corners, self.touches, self._crowd]
-        self._on_nodes(triangles.crowd_nodes, inputs)
+        self._on_nodes(triangles.crowd_nodes, [*step, self._skin, self.touches, self._crowd])
         self._ranks.complete_surface(self._crowd)
-        inputs = [self.obstacles.shapes, *step, self._crowd, self._yielding, self.touches]
+        inputs = [*step, self.surface.triangles, self._crowd, self._yielding, self.touches]
         self._on_touches(triangles.solve_touches, inputs)
-        self._apply()
 
-    def launch_correction(self) -> None:
-        """Launch the forces on nodes again, because other forces have moved them since."""
-        self._touch_nodes(0)
+    def launch_sum(self) -> None:
+        """Launch the sums of a round's forces at the nodes, where other forces have to know of them."""
+        if self.have_edges:
+            self._push(triangles.ADD, is_end=False)
 
-    def launch_end(self) -> None:
-        """Launch the places at which nodes stick from now on."""
-        rigid = [self.obstacles.shapes, self.obstacles.motions]
-        self._on_nodes(vertices.keep_anchors, [*rigid, self.surface.arrays, self.forces, self.anchors])
+    def launch_correction(self, *, has_summed: bool, is_end: bool) -> None:
+        """Launch the forces on nodes again, because other forces have moved them since.
+
+        Args:
+            has_summed: Whether ``launch_sum`` came before.
+            is_end: Whether these are the last forces of the step: nodes stick from now on where they do.
+        """
+        sums = self.have_edges and not has_summed
+        self._push(triangles.CORRECT | (triangles.ADD if sums else 0), is_end)
 
     def launch_totals(self) -> wp.array:
         """Launch the sums of all forces of each obstacle on each node, [O, S]."""
@@ -136,15 +144,12 @@ class RigidForces:
             dim = (self.obstacles.count, self.surface.triangle_count)
             wp.launch(beside.find_triangles_beside, dim, inputs, [near, self.touches], device=self.device)
 
-    def _touch_nodes(self, is_first: int) -> None:
+    def _push(self, parts: int, is_end: bool) -> None:
+        """Launch some of what moves one node at a time."""
+        parts |= triangles.END if is_end else 0
         rigid = [self.obstacles.shapes, self.obstacles.motions]
-        inputs = [is_first, *rigid, self._law, self._pace, self.anchors, self.surface.arrays, self.forces]
-        self._on_nodes(vertices.touch_obstacles, inputs)
-
-    def _apply(self) -> None:
-        """Launch the addition of these forces to the nodes."""
-        inputs = [self.surface.corner_starts, self.surface.corners, self.touches, self.surface.arrays]
-        self._on_nodes(triangles.apply_touches, inputs)
+        inputs = [parts, self._skin, *rigid, self._law, self._pace, self.touches, self.surface.arrays]
+        self._on_nodes(triangles.push_nodes, [*inputs, self.forces, self.anchors])
 
     def _on_nodes(self, kernel: wp.Kernel, inputs: list) -> None:
         among = self.search.at_nodes
