@@ -13,7 +13,7 @@ from warp_corot.discretization.awaited import Awaited
 from warp_corot.discretization.planning.fixed import ForcePlan
 from warp_corot.distributed.directions import normal_numbers
 from warp_corot.distributed.partition import Partition
-from warp_corot.distributed.parts import Part
+from warp_corot.distributed.parts import Part, part_of_mesh
 from warp_corot.distributed.places import Places
 from warp_corot.distributed.refusals import check_supported
 from warp_corot.distributed.settled import settled_sums
@@ -57,6 +57,19 @@ def test_surfaces_of_parts_are_those_of_the_body():
         assert all(set(face) <= set(tet) for face, tet in zip(faces, part.mesh.tets[elements], strict=True))
         found |= set(part.surface_here.tolist())
     assert found == set(range(len(triangles)))
+
+
+@pytest.mark.parametrize("level", [0, 2, 4])
+def test_rotations_are_shared_within_ranks(level):
+    mesh = graded()
+    dealt = Partition.of(mesh, 3, rotation_level=level)
+    above = mesh.ancestors(level)
+    for rank in range(3):
+        needed = dealt.needed(mesh, rank)
+        assert not np.isin(above[needed], above[~needed]).any()
+        assert not np.isin(dealt.sharing[needed], dealt.sharing[~needed]).any()
+        part, _ = part_of_mesh(mesh, needed, dealt)
+        np.testing.assert_array_equal(part.ancestors(level), above[needed])
 
 
 def test_slow_ranks_get_less():
@@ -132,7 +145,6 @@ def test_directions_depend_on_a_nodes_number_alone():
     [
         ([wc.Corotated()], wc.BackwardEuler(0.01, preconditioner="multigrid"), {}, "'multigrid' does not work"),
         ([wc.Corotated()], wc.BackwardEuler(0.01), {"contact": wc.Contact()}, "contact under BackwardEuler"),
-        ([wc.Corotated(rotation_level=2)], wc.SymplecticEuler(), {}, "shared rotations do not work"),
         ([wc.MassSpring()], wc.SymplecticEuler(), {}, "MassSpring does not work"),
         ([wc.Corotated()], wc.SymplecticEuler(), {"remesh": wc.OnlineRemesh()}, "remeshing does not work"),
         (

@@ -104,7 +104,8 @@ def test_energies_are_those_of_all_ranks(runs, case):
 def assert_as_one_process(case, found):
     body = ranked.CASES[case]()
     integrator = ranked.INTEGRATORS.get(case, wc.SymplecticEuler)()
-    sim = wc.Simulation(body, obstacles=ranked.obstacles_of(case), integrator=integrator)
+    model = ranked.MODELS.get(case, wc.Corotated())
+    sim = wc.Simulation(body, model=model, obstacles=ranked.obstacles_of(case), integrator=integrator)
     sim.advance(0.03)
     body.load("z > 0.09 and z < 0.1", [0.0, 0.0, 0.0])
     sim.advance(0.01)

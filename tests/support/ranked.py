@@ -64,11 +64,15 @@ INTEGRATORS = {
     "worlds": lambda: wc.SymplecticEuler(viscosity=2e-3),
 }
 
+#: Models of cases that have another than the default one.
+MODELS = {"shared": wc.Corotated(rotation_level=2)}
+
 CASES = {
     "forest": lambda: body_of(graded(), 0.49),
     "tets": lambda: body_of(jittered(), 0.49),
     "worlds": lambda: body_of(wc.TetForest.box((1, 1, 3), 0.064, level=4), 0.3, worlds=2),
     "touched": touched,
+    "shared": lambda: body_of(graded(), 0.3),
     "implicit": lambda: body_of(graded(), 0.3),
     "newmark": lambda: body_of(jittered(), 0.3),
 }
@@ -137,7 +141,11 @@ def make_all(results: str, names: str, before: list[str]) -> None:
         for deterministic in (True, False) if name == "forest" and names != "forest" else (True,):
             body = make()
             obstacles = obstacles_of(name)
-            options = {"obstacles": obstacles, "integrator": INTEGRATORS.get(name, wc.SymplecticEuler)()}
+            options = {
+                "model": MODELS.get(name),
+                "obstacles": obstacles,
+                "integrator": INTEGRATORS.get(name, wc.SymplecticEuler)(),
+            }
             sim = wd.Simulation(body, deterministic=deterministic, **options)
             sim.advance(0.03)
             body.load("z > 0.09 and z < 0.1", [0.0, 0.0, 0.0])

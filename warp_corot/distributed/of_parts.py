@@ -21,6 +21,8 @@ from warp_corot.contact.tool import Obstacle, Tool
 from warp_corot.elasticity import Model
 from warp_corot.elasticity.dilatation.options import ELEMENT, SHARED, shares_dilatation
 from warp_corot.errors import InputError, UnstableError
+from warp_corot.mesh import TetForest
+from warp_corot.mesh.uniform_part import SUBTREE_DEPTH
 from warp_corot.simulation import simulation as on_one
 from warp_corot.simulation.energy import WorldEnergies
 
@@ -75,14 +77,30 @@ def part_of(body: SoftBody, model: Model, comm: Any, costs: npt.ArrayLike | None
     """This rank's part of a body, on a device; None: where the body is.
 
     Raises:
-        InputError: As ``Partition.of``, or costs of a body that is in parts already.
+        InputError: As ``Partition.of``, costs of a body that is in parts already, or rotations that are shared by
+            elements of several ranks.
     """
+    level = getattr(model, "level", None)
     if isinstance(body.mesh, ForestPart):
         if costs is not None:
             raise InputError("the mesh is divided already; give costs to warp_corot.distributed.box")
+        if level is not None and level < body.mesh.tree.leaf_levels[0] - SUBTREE_DEPTH:
+            raise InputError(
+                f"rotation_level is {level}; of a box in parts it must be at least "
+                f"{body.mesh.tree.leaf_levels[0] - SUBTREE_DEPTH}, {SUBTREE_DEPTH} levels above the elements"
+            )
         return Part(body, None, comm.rank, device)
     grouped = getattr(model, "dilatation", ELEMENT) == SHARED
-    return Part(body, Partition.of(body.mesh, comm.size, costs, grouped=grouped), comm.rank, device)
+    partition = Partition.of(body.mesh, comm.size, costs, grouped=grouped, rotation_level=level)
+    part = Part(body, partition, comm.rank, device)
+    if level is not None and isinstance(part.mesh, TetForest) and isinstance(body.mesh, TetForest):
+        everywhere = body.mesh.ancestors(level)[part.numbers.elements]
+        if any(comm.allgather(not np.array_equal(part.mesh.ancestors(level), everywhere))):
+            raise InputError(
+                f"rotation_level {level} does not work on several ranks where elements above are cut by the surface; "
+                "it must be a tolerance or None"
+            )
+    return part
 
 
 def compile_once(comm: Any, parts: Sequence[Part], **options: Any) -> None:

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from warp_corot.discretization.elements import Mesh
 from warp_corot.discretization.groups import group_numbers
@@ -26,16 +28,26 @@ class Partition:
 
     Attributes:
         groups: The group of each element, int32 [T]; elements of a group are computed together.
+        sharing: The group in which the element may share its dilatation, int32 [T]; groups are one of these or several.
         rank_of_element: The rank that counts the element's energy, int32 [T].
         rank_of_node: The rank that moves the node, int32 [N]; -1 for nodes of no element.
     """
 
     groups: Ints
+    sharing: Ints
     rank_of_element: Ints
     rank_of_node: Ints
 
     @classmethod
-    def of(cls, mesh: Mesh, ranks: int, costs: npt.ArrayLike | None = None, *, grouped: bool = False) -> Partition:
+    def of(
+        cls,
+        mesh: Mesh,
+        ranks: int,
+        costs: npt.ArrayLike | None = None,
+        *,
+        grouped: bool = False,
+        rotation_level: int | None = None,
+    ) -> Partition:
         """Divide a mesh.
 
         Leaves of a forest are divided along the tree's order, which is a space-filling curve, in whole groups; general
@@ -47,12 +59,16 @@ class Partition:
             costs: The cost of an element on each rank, in any unit, [ranks]; None: the same everywhere.
             grouped: Whether elements of a general mesh share their dilatation in groups; for leaves it is always
                 possible.
+            rotation_level: The level of a forest's tree at which rotations are shared: the leaves below an element of
+                this level are in one group.
 
         Raises:
             InputError: Fewer groups than ranks, or costs that are not positive.
         """
         shares = checked_shares(ranks, costs)
-        groups = _groups(mesh, grouped)
+        groups = sharing = _groups(mesh, grouped)
+        if rotation_level is not None and isinstance(mesh, TetForest):
+            groups = _merged(groups, mesh.ancestors(rotation_level))
         order, sizes = _ordered(groups)
         if len(sizes) < ranks:
             raise InputError(f"the body has {len(sizes)} groups of elements for {ranks} ranks; take fewer ranks")
@@ -70,7 +86,7 @@ class Partition:
         owner = np.full(len(mesh.points), ranks, np.int32)
         np.minimum.at(owner, mesh.tets.ravel(), np.repeat(rank, 4))
         owner[owner == ranks] = -1
-        return cls(groups, rank.astype(np.int32), owner)
+        return cls(groups, sharing, rank.astype(np.int32), owner)
 
     def needed(self, mesh: Mesh, rank: int) -> npt.NDArray[np.bool_]:
         """The elements that a rank computes, its own and copies of others', bool [T]: the groups of all elements around
@@ -100,6 +116,14 @@ def _groups(mesh: Mesh, grouped: bool) -> Ints:
     if isinstance(mesh.tree, UniformTree) and mesh.tree.depth >= 3:
         return (np.arange(count, dtype=np.int32) >> 3).astype(np.int32)
     return group_numbers(mesh, np.arange(count))
+
+
+def _merged(groups: Ints, others: npt.NDArray[np.integer]) -> Ints:
+    """The smallest groups that have each of these groups and each of others whole, int32 [T]."""
+    ends = [np.unique(each, return_inverse=True)[1].ravel() for each in (groups, others)]
+    first, count = int(ends[0].max()) + 1, sum(int(each.max()) + 1 for each in ends)
+    links = coo_matrix((np.ones(len(groups), np.int8), (ends[0], first + ends[1])), (count, count))
+    return connected_components(links, directed=False)[1][ends[0]].astype(np.int32)
 
 
 def _ordered(groups: Ints) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:

@@ -159,12 +159,12 @@ class Part(SoftBody):
 def part_of_mesh(mesh: Mesh, kept: npt.NDArray[np.bool_], partition: Partition) -> tuple[Mesh, Ints]:
     """The mesh of some elements, bool [T], in their order; and its nodes' numbers in the whole mesh."""
     if isinstance(mesh, TetForest):
-        return _part_of_forest(mesh, kept, partition.groups[kept])
+        return _part_of_forest(mesh, kept, partition.sharing[kept])
     nodes = np.unique(mesh.tets[kept]).astype(np.int32)
     number = np.full(len(mesh.points), -1, np.int32)
     number[nodes] = np.arange(len(nodes), dtype=np.int32)
     part = TetMesh(mesh.points[nodes], number[mesh.tets[kept]], up_axis=mesh.up_axis)
-    part.element_groups = partition.groups[kept]
+    part.element_groups = partition.sharing[kept]
     return part, nodes
 
 

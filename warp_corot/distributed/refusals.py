@@ -55,8 +55,6 @@ def check_supported(
     for model in models:
         if not isinstance(model, MODELS):
             raise InputError(f"{type(model).__name__} does not work on several ranks yet; take a law of elements")
-        if getattr(model, "rotation_level", None) is not None:
-            raise InputError("shared rotations do not work on several ranks yet; rotation_level must be None")
         if getattr(model, "rotation", None) == "warm":
             raise InputError("rotation 'warm' does not work on several ranks yet; it must be 'byers-xu' or 'svd'")
     in_parts = any(isinstance(body.mesh, ForestPart) for body in bodies)
