@@ -25,6 +25,8 @@ from .resting import checked_obstacles, rest_on
 
 #: Loads on a free body balance if their sum is less than this share of the sum of their magnitudes.
 BALANCED = 1e-5
+#: Rounding of float32 displacements and forces hides what is smaller: Newton's method would stop without an answer.
+LEAST_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,7 @@ def solve_static(
         model: Elastic model; None for ``Corotated()``.
         gravity: [m/s^2]; None for 9.81 down the up axis of the mesh.
         tolerance: A world is at rest where its residual is below this, or the last whole step moves no node by more
-            than this share of the largest displacement.
+            than this share of the largest displacement. Less than 1e-6 counts as 1e-6: float32 hides the rest.
         iterations: The most iterations of Newton's method for each part of the load.
         load_steps: Equal parts in which loads and gravity are added. If there are several states of rest, more parts
             follow the path of a growing load.
@@ -105,6 +107,7 @@ def solve_static(
         raise InputError("the body is remeshed; solve_static needs a mesh that stays as it is")
     if not 0.0 < checked_number(tolerance, "tolerance") < 1.0:
         raise InputError(f"tolerance is {tolerance}; it must be between 0 and 1")
+    tolerance = max(tolerance, LEAST_TOLERANCE)
     most, steps = checked_count(iterations, "iterations", least=1), checked_count(load_steps, "load_steps", least=1)
     check_preconditioner(preconditioner)
     (law,) = checked_models(Corotated() if model is None else model, 1)

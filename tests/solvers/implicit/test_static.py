@@ -195,6 +195,26 @@ def test_a_body_that_nothing_holds(device):
     assert longer > 0.0
 
 
+@pytest.mark.parametrize("model", [wc.Linear(), wc.Corotated()], ids=lambda model: type(model).__name__)
+def test_a_free_bar_under_even_tension(model, device):
+    """It grows by the stress over E and narrows by nu times that, also if more digits are asked for than there are."""
+    young, poisson, stress = 1e5, 0.3, 100.0
+    mesh = wc.TetForest.box((1, 1, 3), CUBE, 3)
+    body = wc.SoftBody(mesh, wc.Isotropic(young, poisson, 1000.0), device=device)
+    corners = mesh.points[body.surface_triangles]
+    areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    forces = np.zeros_like(mesh.points)
+    for height, pull in ((0.0, -stress), (3 * CUBE, stress)):
+        end = np.isclose(corners[:, :, 2], height).all(axis=1)
+        np.add.at(forces[:, 2], body.surface_triangles[end], pull * areas[end, None] / 3.0)
+    body.load(np.arange(body.node_count), forces)
+    report = wc.solve_static(body, model=model, gravity=(0.0, 0.0, 0.0), tolerance=1e-9)
+    assert report.converged, report.message
+    long, wide = (np.ptp(displaced(body)[:, axis]) / np.ptp(mesh.points[:, axis]) for axis in (2, 0))
+    assert long == pytest.approx(stress / young, rel=1e-4)
+    assert wide == pytest.approx(poisson * stress / young, rel=1e-4)
+
+
 def test_what_has_no_answer_keeps_the_last_state_at_rest(device):
     """St. Venant and Kirchhoff's law gives way under a load that presses it flat; the report says how far it went."""
     body = beam(3, device=device)
