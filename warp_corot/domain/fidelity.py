@@ -42,7 +42,7 @@ class Fidelity:
         lost_labels: Names of labels that no element has.
         watertight: Whether every edge of the mesh's surface is used once in each direction.
         smallest_dihedral: The sharpest angle between two faces of an element.
-        elements: How many there are.
+        elements: Number of elements.
     """
 
     volume: float
@@ -74,7 +74,7 @@ class Fidelity:
         ]
 
     def doubts(self) -> list[str]:
-        """What went wrong and what would help, a line each; empty if the mesh is good."""
+        """Defects and their remedies, a line each; empty if the mesh is good."""
         found = []
         if abs(self.volume_error) > LARGEST_VOLUME_ERROR:
             found.append(f"the tetrahedra hold {self.volume_error:+.1%} of the body's volume; more of them would help")
@@ -196,7 +196,7 @@ def _spread(surface: SurfaceMesh, count: int) -> np.ndarray:
 
 
 def _distances(surface: SurfaceMesh, points: np.ndarray, device: wp.Device) -> np.ndarray:
-    """How far points are from a surface [m], float64 [n]."""
+    """Distances of points from a surface [m], float64 [n]."""
     # About the centre of the surface, because float32 keeps few digits far from zero.
     middle = surface.points.mean(axis=0)
     mesh = wp.Mesh(

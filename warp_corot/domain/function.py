@@ -16,7 +16,7 @@ from warp_corot.kernels.meshing import domain as kernels
 from .signed import SignedFunction
 from .units import length
 
-#: A user's function, or a Warp function, whose type type checkers do not know.
+#: A user's function or a Warp function; type checkers do not know the latter's type.
 Function = Callable[[np.ndarray], npt.ArrayLike]
 
 #: Pairs of points at which the slope is measured.
@@ -68,7 +68,7 @@ class FunctionDomain(SignedFunction):
         return values.astype(np.float32)
 
     def _check(self) -> bool:
-        """Check that the function is finite and not too steep; returns whether it is negative at the bounds."""
+        """Check that the function is finite and not too steep; return whether it is negative at the bounds."""
         rng = np.random.default_rng(0)
         size = np.ptp(self.bounds, axis=0)
         points = self.bounds[0] + rng.random((PAIRS, 3)) * size

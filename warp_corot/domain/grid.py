@@ -1,4 +1,4 @@
-"""Voxels as users give them: placed in metres, with numbered labels; probabilities become labels."""
+"""The user's voxels, placed in metres and with numbered labels; probabilities become labels."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from warp_corot.io.read.volumes import LoadedVolume, affine_of, load_volume
 
 from .units import metres_per_unit
 
-#: A file, what ``load_volume`` gives, or an array.
+#: A file, the result of ``load_volume``, or an array.
 Volume = str | PathLike[str] | LoadedVolume | npt.ArrayLike
 
 #: Voxel axes whose directions' inner products are below this are at right angles.

@@ -1,4 +1,4 @@
-"""What a body is before it is meshed: its volume, its pieces, and points spread over its surface."""
+"""Measurements of a body before it is meshed: its volume, its pieces, and points spread over its surface."""
 
 from __future__ import annotations
 
@@ -17,24 +17,25 @@ from .surface import SurfaceDomain
 from .voxels import piece_of_voxels
 from .winding import Parts, edge_parts, linked, part_volumes
 
-#: Points along the longest side at which a function is looked at first, and how often cells at the surface are halved.
+#: Number of points along the longest side at which a function is first evaluated, and of halvings of cells at the
+#: surface.
 CELLS, HALVINGS = 24, 2
-#: Lines through a body by which its volume is measured, and a difference from what its surface says, over that, which
-#: says that it overlaps itself.
+#: Number of lines through a body that measure its volume, and the relative difference from its surface's volume above
+#: which the surface overlaps itself.
 LINES, COUNTED_TWICE = 60_000, 5.0e-3
-#: How far off a triangle it is looked whether a body begins there, over the body's length.
+#: Distance from a triangle at which the body's side is tested, over the body's length.
 ASIDE = 1.0e-5
 
 
 @dataclass(frozen=True)
 class Reference:
-    """A body as it was given.
+    """The given body.
 
     Attributes:
         volume: [m^3].
         points: Points of its surface, evenly spread, float64 [n, 3] [m].
-        piece: Which connected piece each is of, int32 [n].
-        pieces: How many pieces there are.
+        piece: The connected piece of each point, int32 [n].
+        pieces: Number of pieces.
     """
 
     volume: float
@@ -44,11 +45,11 @@ class Reference:
 
 
 def reference_of(domain: SignedFunction, count: int) -> Reference:
-    """What is known of a domain, without meshing it.
+    """The measurements of a domain, without meshing it.
 
     Args:
-        domain: Any. Of a surface and of voxels all is exact; of others volume and pieces come from samples.
-        count: About how many points.
+        domain: Any domain. Results for surfaces and voxels are exact; for others volume and pieces come from samples.
+        count: Approximate number of points.
     """
     kind = domain.kind
     if isinstance(kind, SurfaceDomain):
@@ -64,7 +65,7 @@ def _of_surface(domain: SurfaceDomain, count: int) -> Reference:
     corners = points[triangles]
     areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     rng = np.random.default_rng(0)
-    # One of each piece at least, however small it is.
+    # At least one of each piece, however small it is.
     first = np.unique(piece, return_index=True)[1]
     chosen = np.concatenate([first, rng.choice(len(triangles), count, p=areas / areas.sum())])
     u, v = np.sqrt(rng.random(len(chosen))), rng.random(len(chosen))
@@ -86,7 +87,7 @@ def _of_surface(domain: SurfaceDomain, count: int) -> Reference:
 
 
 def volume_along_lines(domain: SurfaceDomain) -> float:
-    """The volume of the body [m^3], where parts of its surface overlap counted once, by lines through it."""
+    """The volume of the body [m^3] by lines through it; regions where parts of its surface overlap count once."""
     lines, (low, high) = domain.lines, domain.bounds
     across = [(lines.axis + 1) % 3, (lines.axis + 2) % 3]
     size = (high - low)[across]
@@ -99,10 +100,10 @@ def volume_along_lines(domain: SurfaceDomain) -> float:
 
 
 def joined_parts(points: np.ndarray, triangles: np.ndarray, device: wp.Device) -> tuple[int, np.ndarray, bool]:
-    """Pieces of the body that a closed surface encloses: its parts, those that touch, cross or hold one another joined.
+    """Pieces of the body that a closed surface encloses: its parts, joined if they touch, cross or contain one another.
 
     Returns:
-        How many there are, the piece of each triangle [T] (that of a cavity's is its surroundings'), and whether parts
+        The number of pieces, the piece of each triangle [T] (a cavity belongs to its surroundings), and whether parts
         overlap.
     """
     part = edge_parts(triangles)
@@ -115,7 +116,7 @@ def joined_parts(points: np.ndarray, triangles: np.ndarray, device: wp.Device) -
     links = [np.stack([at[:-1][same, 1], at[1:][same, 1]], axis=1)]
     crossings = _crossings(points, triangles, part, device)
     links.append(crossings)
-    # Parts that lie within the body of others: a cavity in its surroundings, or what is buried in it.
+    # Parts inside the body of others: a cavity in its surroundings, or a part buried in it.
     groups, outward = Parts(points, triangles, part), part_volumes(points, triangles, part) > 0.0
     holders = [groups.holders(groups.corners[groups.slices[own]][0, 0], own) for own in range(count)]
     overlap = len(crossings) > 0
@@ -129,8 +130,9 @@ def joined_parts(points: np.ndarray, triangles: np.ndarray, device: wp.Device) -
 
 
 def _bounds_around(own: int, holders: list[np.ndarray], outward: np.ndarray) -> np.ndarray:
-    """The parts that bound the body just outside a part: from the innermost that holds it outwards, as far as the
-    body reaches."""
+    """The parts that bound the body just outside a part: from the innermost one around it outwards, as far as the body
+    reaches.
+    """
     inmost_first = sorted(holders[own], key=lambda holder: -len(holders[holder]))
     depth = np.cumsum([0, *(1 if outward[holder] else -1 for holder in reversed(inmost_first))])[::-1]
     ends = np.flatnonzero(depth <= 0)
@@ -204,7 +206,7 @@ def _sampled(domain: SignedFunction) -> tuple[float, np.ndarray, int]:
         near = np.abs(phi) <= reach
         volume += float((phi[~near] < 0.0).sum()) * float(box.prod())
         if halving == HALVINGS:
-            # Of the last cells as much as points in them say, one in each eighth.
+            # The filled fraction of the last cells comes from points in them, one in each eighth.
             rng = np.random.default_rng(0)
             eighths = (np.indices((2, 2, 2)).reshape(3, -1).T - 1.0)[None] + rng.random((int(near.sum()), 8, 3))
             within = centres[near][:, None] + 0.5 * eighths * box
@@ -229,7 +231,7 @@ def _projected(domain: SignedFunction, points: np.ndarray) -> np.ndarray:
 
 
 def extent_of(domain: SignedFunction) -> tuple[float, float]:
-    """About the volume [m^3] and the area of the surface [m^2] of a domain."""
+    """Approximate volume [m^3] and surface area [m^2] of a domain."""
     kind = domain.kind
     if isinstance(kind, SurfaceDomain):
         corners = kind.closed.points[kind.closed.triangles]
@@ -242,9 +244,9 @@ def extent_of(domain: SignedFunction) -> tuple[float, float]:
         for axis in range(3):
             faces = np.count_nonzero(np.diff(inside, axis=axis))
             area += faces * voxel / float(np.linalg.norm(kind.affine[:3, axis]))
-        # A staircase has half as much again as the slope that it stands for, about.
+        # A staircase has about 1.5 times the area of the slope that it represents.
         return float(inside.sum()) * voxel, area / 1.5
     volume, points, _ = _sampled(domain)
-    # The cells that are near the surface are as wide as their diagonal, on both sides.
+    # The layer of cells near the surface is as thick as their diagonal on both sides.
     cell = float(np.ptp(domain.bounds, axis=0).max()) / CELLS * 0.5**HALVINGS
     return volume, len(points) * cell**3 / (domain.lipschitz * np.sqrt(3.0) * cell)

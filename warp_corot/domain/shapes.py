@@ -1,4 +1,4 @@
-"""Shapes whose distance is a formula."""
+"""Shapes with a formula for the distance."""
 
 from __future__ import annotations
 

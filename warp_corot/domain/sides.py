@@ -46,7 +46,7 @@ class Sides:
     corner_normals: np.ndarray
 
     def arrays(self, device: wp.Device) -> list[wp.array]:
-        """The three on a device."""
+        """The three arrays on a device."""
         return [
             wp.array(self.known, dtype=wp.uint8, device=device),
             wp.array(self.edge_normals, dtype=wp.vec3, device=device),
@@ -58,16 +58,15 @@ def sides_of(points: np.ndarray, triangles: np.ndarray, mesh: wp.Mesh, lines: Li
     """Find what is on the two sides of each triangle.
 
     If the triangles of a patch meet others only along common edges, all of them have the same sides, and two winding
-    numbers decide. Triangles that cross others are unsure, and so are those around edges that are not shared by two
-    and around needles.
-    Finally, signs are compared at random points near the surface; if any is wrong, or if the surface crosses itself in
-    many places, no triangle is sure.
+    numbers decide. Triangles that cross others are unsure, and so are those around edges that are not shared by two and
+    around needles. Finally, signs are compared at random points near the surface. If any is wrong, or if the surface
+    crosses itself in many places, no triangle is sure.
 
     Args:
         points: float64 [N, 3].
         triangles: Closed, int32 [T, 3].
-        mesh: The same.
-        lines: Along which winding numbers are found.
+        mesh: The same surface on the device.
+        lines: The lines along which winding numbers are found.
     """
     triangles = triangles.astype(np.int64)
     count = len(triangles)
@@ -203,7 +202,8 @@ def corner_points(points: np.ndarray, triangles: np.ndarray, bounds: np.ndarray)
     Args:
         points: float64 [N, 3].
         triangles: Closed, int64 [T, 3].
-        bounds: Which have the body on one side and the outside on the other, bool [T]; points of others do not count.
+        bounds: Mask of the triangles with the body on one side and the outside on the other, bool [T]; points of others
+            do not count.
     """
     corners = points[triangles]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

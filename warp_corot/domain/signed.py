@@ -16,7 +16,7 @@ from warp_corot.kernels.meshing import domain as kernels
 
 from .units import check_float32, length
 
-#: The shortest step inwards when a body's thickness is sought, over how far it is sought, and how many there are.
+#: The shortest step inwards in the search for a body's thickness, relative to its range, and the number of steps.
 SPHERE_STEP = 0.04
 SPHERES = 25
 
@@ -48,7 +48,7 @@ class SignedFunction:
             points: Positions [m]: an array [n, 3], or a Warp array of vec3.
 
         Returns:
-            float32 [n]: NumPy's for NumPy's, Warp's on the same device for Warp's.
+            float32 [n]: a NumPy array for NumPy points, a Warp array on the same device for Warp points.
 
         Raises:
             InputError: NumPy points have another shape, or are not finite.
@@ -78,7 +78,7 @@ class SignedFunction:
 
     @property
     def kind(self) -> SignedFunction:
-        """The function itself, whose class is its kind; for a ``Domain``, the function in it."""
+        """The function itself, an object of the class of its kind; for a ``Domain``, the function that it contains."""
         return self
 
     @property
@@ -119,7 +119,7 @@ class SignedFunction:
         return None
 
     def corners(self) -> np.ndarray:
-        """Points where three or more sharp edges of the body meet, as far as they are known, float64 [n, 3] [m]."""
+        """The known points where three or more sharp edges of the body meet, float64 [n, 3] [m]."""
         return np.empty((0, 3))
 
     def part(self, name: str) -> SignedFunction:
@@ -144,7 +144,7 @@ class SignedFunction:
         """A point with a label [m], float64 [3]; None if none is known without a search."""
         return None
 
-    # What a kind of body defines.
+    # Methods that each kind of body defines.
 
     def _phi(self, points: wp.array) -> wp.array:
         """float32 [n] on the points' device."""

@@ -24,7 +24,7 @@ from .units import length, metres_per_unit, unlikely_size, volume
 if TYPE_CHECKING:
     from .closing import ClosedSurface
 
-#: A file, what ``load_surface`` gives, or points and triangles.
+#: A file, the result of ``load_surface``, or points and triangles.
 Surface = str | PathLike[str] | LoadedSurface | tuple[npt.ArrayLike, npt.ArrayLike]
 
 #: Points along each side of the box at which winding numbers are evaluated.
@@ -112,7 +112,7 @@ class SurfaceDomain(SignedFunction):
         return np.minimum(found.numpy() + START * reach, reach)
 
     def lengths_inside(self, starts: np.ndarray) -> np.ndarray:
-        """What length of the lines from points below the body, see `lines`, is inside [m], float64 [n]."""
+        """The length inside the body of the lines from points below it [m], float64 [n]; see `lines`."""
         placed, mesh = self._on_device(starts), self._mesh(self.device)
         lengths = wp.empty(placed.size, wp.float64, device=self.device)
 
@@ -242,7 +242,7 @@ def windings_of(mesh: wp.Mesh, lines: windings.Lines, points: wp.array) -> np.nd
 
 
 def count_windings(mesh: wp.Mesh, points: wp.array, thresholds: Sequence[float]) -> np.ndarray:
-    """How many of the thresholds the winding number of an open surface at each point exceeds, int32 [n]."""
+    """The number of thresholds that the winding number of an open surface exceeds at each point, int32 [n]."""
     above = wp.empty(points.size, wp.int32, device=points.device)
     limits = wp.array(thresholds, dtype=wp.float32, device=points.device)
     wp.launch(kernels.count_windings, points.size, [points, mesh.id, limits], [above], device=points.device)

@@ -36,7 +36,7 @@ USUAL = (
 LEAST_UNIT, MOST_UNIT = 1.0e-18, 1.0e18
 #: Metres in common units.
 UNITS = {"m": 1.0, "cm": 1.0e-2, "mm": 1.0e-3}
-#: What a number looks like at the beginning of a quantity.
+#: The pattern of a number at the beginning of a quantity.
 _NUMBER = re.compile(r"\s*[-+]?(?:(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|inf(?![a-z])|nan(?![a-z]))")
 #: Bodies and scans of this length are assumed to be in mm if no unit is named: organs, limbs, people.
 SMALLEST_IN_MM, SMALLEST_SCAN, LARGEST_IN_MM = 50.0, 10.0, 2500.0
@@ -75,7 +75,7 @@ def in_units(given: str | float, unit: str) -> float:
 
     Args:
         given: A number, in that unit already; or a text such as "5kPa", "1.06 g/cm3" or "500".
-        unit: As Pint writes it, such as "Pa" or "kg/m^3".
+        unit: A unit in Pint's notation, such as "Pa" or "kg/m^3".
 
     Raises:
         InputError: No number, or a unit that is not known or of another kind.
@@ -98,7 +98,7 @@ def _factor(words: str, unit: str, given: str) -> float:
     text = words.replace("³", "^3").replace("²", "^2").replace("·", "*")
     text = f"1{text}" if text.startswith("/") else text
     text = re.sub(r"(?<=[A-Za-zµ])([23])(?![\w.])", r"^\1", text)
-    # Pint evaluates what looks like a formula; names, powers, products and quotients are enough.
+    # Pint evaluates formulas; names, powers, products and quotients are enough.
     if not re.fullmatch(r"(?:1|[A-Za-zµΩ_]+)(?:\^-?[1-4])?(?:\s*[*/ ]\s*[A-Za-zµΩ_]+(?:\^-?[1-4])?)*", text):
         raise InputError(f"{given.strip()!r}: {words!r} is not a unit")
     try:
@@ -117,11 +117,11 @@ def _registry() -> Any:
 
 
 def likely_unit(size: float, scan: bool = False) -> str | None:
-    """The unit in which a body's coordinates are given most likely, None where its size does not tell.
+    """The most likely unit of a body's coordinates; None if its size does not tell.
 
     Args:
         size: Its longest side in that unit.
-        scan: Whether it comes from a scan, whose unit is mm by habit.
+        scan: Whether the body comes from a scan, whose unit is usually mm.
     """
     return "mm" if (SMALLEST_SCAN if scan else SMALLEST_IN_MM) <= size <= LARGEST_IN_MM else None
 
@@ -164,7 +164,7 @@ def check_float32(bounds: np.ndarray) -> None:
 
 
 def unlikely_size(size: float, metres: float) -> str | None:
-    """What to say of a body of an unlikely size, None for a likely one.
+    """A message about a body of an unlikely size; None for a likely one.
 
     Args:
         size: Its longest side [m].

@@ -100,7 +100,7 @@ def pieces(inside: np.ndarray) -> np.ndarray:
 
 
 def piece_of_voxels(inside: np.ndarray) -> np.ndarray:
-    """Which piece each voxel is in, from 1; 0 where it is outside. Voxels that touch, be it in a corner, are of one."""
+    """The piece of each voxel, from 1; 0 outside. Voxels that touch, even in a corner, belong to one piece."""
     return scipy.ndimage.label(inside, np.ones((3, 3, 3)))[0]
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
-#: About how many corners of a part are looked at to see whether it lies within another.
+#: Approximate number of corners of a part that are tested to find whether it lies within another.
 CORNERS = 16
 
 
@@ -38,7 +38,7 @@ def net_edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def edge_pairs(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pairs of triangles that share an edge, chained where more than two do.
+    """Pairs of triangles that share an edge; more than two triangles at an edge form a chain of pairs.
 
     Returns:
         ``pairs`` [P, 2], ``against`` bool [P] (both walk the edge the same way: one must be turned), ``alone`` bool [P]
@@ -55,18 +55,21 @@ def edge_pairs(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 
 def edge_parts(triangles: np.ndarray) -> np.ndarray:
-    """Which connected part each triangle belongs to; those that share an edge are connected."""
+    """The connected part of each triangle; triangles that share an edge are connected."""
     a, b = edge_pairs(triangles)[0].T
     return linked(a, b, len(triangles))[1]
 
 
 def linked(a: np.ndarray, b: np.ndarray, count: int) -> tuple[int, np.ndarray]:
-    """Groups of things, of ``count`` in all, that hang together by links a[i]-b[i]: how many, and which each is in."""
+    """Groups of ``count`` items that are connected by links a[i]-b[i]: the number of groups, and the group of each
+    item.
+    """
     return connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(count, count)), directed=False)
 
 
 def wind_alike(triangles: np.ndarray) -> tuple[np.ndarray, int]:
-    """Turn triangles that walk an edge the same way as the neighbour across it; how many (the fewer of each part).
+    """Reverse triangles that traverse an edge in the same direction as the neighbour across it; return how many (the
+    minority of each part).
 
     Edges of three or more triangles bind nothing. On a surface with one side only, some edges stay as they are.
     """
@@ -107,7 +110,9 @@ def _along(order: np.ndarray, parent: np.ndarray, differs: np.ndarray) -> np.nda
 
 
 def wind_outwards(points: np.ndarray, triangles: np.ndarray, parts: np.ndarray) -> tuple[np.ndarray, int, int]:
-    """Turn what is inside out; how many parts were, and how many are cavities: wound inwards, within another part."""
+    """Reverse parts that are inside out; return their number, and the number of cavities: parts within another that are
+    wound inwards.
+    """
     volumes = part_volumes(points, triangles, parts)
     flip = np.zeros(len(volumes), bool)
     if volumes.sum() < 0.0:
@@ -148,7 +153,7 @@ class Parts:
 
 
 def part_volumes(points: np.ndarray, triangles: np.ndarray, parts: np.ndarray) -> np.ndarray:
-    """Signed volume that each closed part encloses, positive where it is wound outwards."""
+    """Signed volume that each closed part encloses, positive if it is wound outwards."""
     a, b, c = (points - points.mean(axis=0))[triangles].transpose(1, 0, 2)
     return np.bincount(parts, weights=np.einsum("ij,ij->i", a, np.cross(b, c))) / 6.0
 

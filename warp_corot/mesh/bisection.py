@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 IntArray = npt.NDArray[np.int32]
 
-#: Patches that are computed at a time, so that what is read again is still in the cache.
+#: Number of patches that are computed at a time, so that data that are read again are still in the cache.
 CHUNK = 4096
 
 

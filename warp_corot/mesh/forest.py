@@ -55,9 +55,9 @@ class TetForest(ForestArrays):
         fill: Share of each leaf's volume that is inside the body, float64 [T]; None: all of it. It is above one if a
             leaf took over the share of a neighbour that was left out.
         labels: Each leaf's label, its place in ``label_names`` plus one, 0 for none, int32 [T]; None: no labels.
-        node_labels: The same at all lattice points; points outside have the label of the nearest part of the body.
+        node_labels: Labels at all lattice points; points outside have the label of the nearest part of the body.
         label_names: Names of the labels.
-        detail: The body's surface where it was resolved more finely than the mesh; None: nowhere.
+        detail: The parts of the body's surface that were resolved more finely than the mesh; None: there are none.
     """
 
     def __repr__(self) -> str:

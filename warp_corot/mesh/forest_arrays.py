@@ -1,4 +1,4 @@
-"""The arrays of a forest of bisected tetrahedra, and what follows from them without a search."""
+"""The arrays of a forest of bisected tetrahedra, and properties that follow from them without a search."""
 
 from __future__ import annotations
 
@@ -35,7 +35,8 @@ class ForestArrays:
     node_labels: np.ndarray | None = None
     label_names: tuple[str, ...] = ()
     detail: Detail | None = None
-    #: Groups of leaves that share something, int32 [T], if they are those of a larger forest; None: as they are found.
+    #: Groups of leaves that share a dilatation, int32 [T], if a larger forest gives them; None: they are found when
+    #: needed.
     leaf_groups: np.ndarray | None = None
 
     @cached_property

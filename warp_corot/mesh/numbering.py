@@ -12,7 +12,7 @@ def in_order_of_leaves(tree: Tree) -> np.ndarray:
     touched = tree.leaf_tets.ravel()
     turn = np.arange(len(touched), dtype=np.int64)
     first = np.empty(int(touched.max()) + 1, np.int64)
-    # Where a place is written more than once the last write stays: walk backwards to keep the first.
+    # The last write to a place stays: walk backwards to keep the first value.
     first[touched[::-1]] = turn[::-1]
     return touched[first[touched] == turn]
 

@@ -84,7 +84,8 @@ class TetMesh:
         if len(bad):
             raise InputError(f"tetrahedron {bad[0]} names the nodes {given[bad[0]].tolist()}; there are {len(points)}")
         self.points = points * scale
-        #: Groups of elements that share something, int32 [T], if those of a larger mesh; None: as they are found.
+        #: Groups of elements that share a dilatation, int32 [T], if a larger mesh gives them; None: they are found when
+        #: needed.
         self.element_groups: np.ndarray | None = None
         self.tets = np.array(given, dtype=np.int32)
         used = self.points[np.unique(self.tets)]

@@ -100,7 +100,7 @@ class UniformTree(Tree):
         self.__dict__.update(leaf_tets=leaf_tets)
         self.depth = depth
         roots = len(leaf_tets) >> depth
-        #: Where each level starts, and where the last one ends.
+        #: The start of each level, and the end of the last.
         self.starts = roots * (2 ** np.arange(depth + 2, dtype=np.int64) - 1)
         self._index = np.int32 if self.starts[-1] < 2**31 else np.int64
 

@@ -65,7 +65,7 @@ def numbered(touched: IntArray, place_count: int) -> tuple[IntArray, IntArray]:
     """
     number = np.empty(place_count, np.int32)
     turn = np.arange(len(touched), dtype=np.int32)
-    # Where a place is written more than once the last write stays: walk backwards to keep the first.
+    # The last write to a place stays: walk backwards to keep the first value.
     number[touched[::-1]] = turn[::-1]
     place_of = touched[number[touched] == turn]
     number[place_of] = turn[: len(place_of)]

@@ -87,7 +87,7 @@ class CarriedActivation:
             self.serve()
 
     def serve(self) -> None:
-        """Let the body's elements follow the keyframes of the rows that they carry."""
+        """Make the body's elements follow the keyframes of the rows that they carry."""
         rows = self._read(ACTIVATION_ROW).numpy()
         self._made = [made for keys in self.keys if (made := _of_keys(keys, rows, self._body.device))]
         self._body.conditions.set_activations(self._made)

@@ -93,8 +93,8 @@ class Changing:
         )
         self.survey = Survey(self.forest, self.carried_material.modulus)
         self.discretization = ChangingMesh(body.discretization, self.forest, self.carried_material)
-        #: What the host reads after a pass: counts of the pools and of the plan, the survey, and nodes that follow
-        #: keyframes.
+        #: The data that the host reads after a pass: counts of the pools and of the plan, the survey, and nodes that
+        #: follow keyframes.
         self._report: wp.array | None = None
         self._report_parts: list[int] = []
         #: A recorded pass with its consequences; None if the device's graphs have no conditional nodes.
@@ -167,7 +167,7 @@ class Changing:
         return self.discretization.kept
 
     def _give_pools_to(self, body: SoftBody) -> None:
-        """Let the body use the pools' arrays from now on, with their contents."""
+        """Make the body use the pools' arrays from now on, with their contents."""
         arrays, initial = self.forest.carriage.arrays, body.state.initial
         body.state.move_into(arrays.rest, arrays.u, arrays.v, arrays.reaction)
         body.conditions.move_into(arrays.held, arrays.mass32, arrays.inverse_mass, arrays.load)

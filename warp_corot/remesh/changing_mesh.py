@@ -40,7 +40,7 @@ class ChangingMesh(Discretization):
         self.smallest_volume = former.smallest_volume
         self._is_uniform = former.is_uniform
         self.kept: DevicePlan | None = None
-        #: What the host knows of the current mesh, by name.
+        #: The host's data of the current mesh, by name.
         self._known: dict[str, Any] = {}
 
     @property

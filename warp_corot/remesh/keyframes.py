@@ -135,7 +135,7 @@ class Keyframes:
 
 
 def _alike(ones: Sequence[Trajectory], others: Sequence[Trajectory]) -> bool:
-    """Whether trajectories have the same nodes on the same keyframes, in the same order."""
+    """Whether two lists of trajectories have the same nodes on the same keyframes, in the same order."""
     return len(ones) == len(others) and all(
         np.array_equal(a.nodes.numpy(), b.nodes.numpy())
         and np.array_equal(a.times.numpy(), b.times.numpy())

@@ -69,7 +69,7 @@ class Remeshing:
         self._said_full: set[int] = set()
 
     def serve(self, fields: Sequence[ForceField]) -> None:
-        """Let the bodies' force fields, which exist by now, use the pools."""
+        """Connect the bodies' force fields, which now exist, to the pools."""
         for changing, field in zip(self.changing, fields, strict=True):
             if changing is not None:
                 changing.serve(field)

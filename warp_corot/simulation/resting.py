@@ -1,4 +1,4 @@
-"""Where a body comes to rest on obstacles: steps so long that inertia hardly counts, each from rest."""
+"""The state of rest of a body on obstacles: steps so long that inertia hardly matters, each from rest."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LINEAR, BALANCED = 1e-5, 1e-3
 
 
 class Rest(NamedTuple):
-    """How a search ended.
+    """The result of a search.
 
     Attributes:
         converged: Whether forces are in balance, and the last step moved no node by more than the tolerance, bool
@@ -69,19 +69,19 @@ def rest_on(
 ) -> Rest:
     """Move the body to where it rests on obstacles, from its present displacements.
 
-    Where steps do not come to rest, shorter ones are tried from the beginning, which search more carefully. Where these
-    do not either, the body is left where it began.
+    If the steps do not come to rest, shorter ones are tried from the beginning, which search more carefully. If these
+    fail too, the body returns to its first state.
 
     Args:
         body: The body.
         law, field: Its elasticity.
         loads: Loads and weight [N], [worlds * N, 3].
         gravity: [m/s^2].
-        obstacles: What it rests on.
-        contact: How things touch.
-        tolerance: Of the last step: the largest motion over the largest displacement.
-        most: Steps at most.
-        preconditioner: Of the linear solves.
+        obstacles: The obstacles on which it rests.
+        contact: The options of contact.
+        tolerance: For the last step: the largest motion over the largest displacement.
+        most: The maximum number of steps.
+        preconditioner: The preconditioner of the linear solves.
     """
     start = body.displacements.numpy().copy()
     steps = linear = 0
@@ -111,7 +111,7 @@ def rest_on(
 
 
 def _wave_time(body: SoftBody) -> float:
-    """How long a wave takes through the softest part of the body [s]."""
+    """The time of a wave through the softest part of the body [s]."""
     size = float(np.ptp(body.mesh.points, axis=0).max())
     stiffness = float(body.discretization.mu.numpy().min())
     density = float(body.masses.sum()) / (body.worlds * float(np.sum(body.mesh.volumes)))

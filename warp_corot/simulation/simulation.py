@@ -67,9 +67,8 @@ class Simulation(Clock, FormerNames):
             then added up in a fixed order, which takes time and memory (``benchmarks/README.md``).
         remesh: How the bodies' meshes follow their motion; for several bodies also one each, None for meshes that
             never change.
-        obstacles: Rigid things that bodies touch: shapes at rest, such as ``Ground`` and ``Box``, and tools, which
-            move.
-        contact: How things touch; None: ``Contact()`` if there are obstacles, else there is no contact.
+        obstacles: Rigid obstacles of the bodies: shapes at rest, such as ``Ground`` and ``Box``, and tools, which move.
+        contact: The options of contact; None: ``Contact()`` if there are obstacles, else no contact.
 
     Attributes:
         bodies: Tuple of the bodies.
@@ -77,7 +76,7 @@ class Simulation(Clock, FormerNames):
         stable_dt: Largest linearly stable step at rest [s], estimated; infinite where nothing can vibrate, and for
             implicit integrators.
         gravity: Tuple [m/s^2].
-        ranks: Who makes the same steps with other parts of the bodies.
+        ranks: The processes that make the same steps with other parts of the bodies.
 
     Raises:
         InputError: There is no body, one is given twice, bodies have different devices or numbers of worlds, the number
@@ -164,7 +163,7 @@ class Simulation(Clock, FormerNames):
 
     @property
     def solves(self) -> Solves | None:
-        """The cost of an implicit integrator's solves so far; None for others. Waits for the device."""
+        """The total cost of an implicit integrator's solves; None for others. Waits for the device."""
         totals = getattr(self.stepper, "totals", None)
         return None if totals is None else Solves(*(int(total) for total in totals.numpy()))
 
@@ -320,7 +319,7 @@ class Simulation(Clock, FormerNames):
         return tuple(each for each in self.system.constraints if isinstance(each, Grasp))
 
     def contacts(self) -> list[ContactPoint]:
-        """Where bodies touched something in the last step, with normals, gaps and forces; waits for the device."""
+        """The contacts of the last step, with places, normals, gaps and forces; waits for the device."""
         return [] if self.contact is None else contact_points(self.contact)
 
     # --- keeping ---------------------------------------------------------------------------------------------------
@@ -404,7 +403,7 @@ class Simulation(Clock, FormerNames):
                 self.safe_step.find_rest(stable)
 
     def follow_motion(self) -> None:
-        """Remesh where that is due, and adapt the step to the new meshes."""
+        """Remesh the bodies that are due, and adapt the step to the new meshes."""
         if self.remeshing.run(self.steps):
             self._control_step()
 

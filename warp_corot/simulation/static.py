@@ -1,4 +1,4 @@
-"""Static answers: where a body comes to rest under its loads."""
+"""Static solutions: the state in which a body is at rest under its loads."""
 
 from __future__ import annotations
 

@@ -16,15 +16,16 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 
-#: Vertices near a corner whose triangles are tried; of more corners none is met, as they would be noise.
+#: Number of vertices near a corner whose triangles are tried; if there are more corners than this, none is used,
+#: because they would be noise.
 TRIED, MOST = 4, 300
 #: A corner that is nearer to a vertex than this share of the shortest edge there is met already.
 MET = 0.02
 #: A triangle that is nearer to the body's surface than this share of that edge cuts nothing off.
 FAR = 1.0e-3
-#: Around a corner so many edges are looked at, and so many triangles that may cut it off are tried.
+#: Number of edges around a corner that are considered, and of triangles that are tried.
 LOOKS, CUTTING = 24, 4
-#: Where the space between a triangle and the body's surface is sampled: its middle and those of its sides.
+#: Sample points between a triangle and the body's surface: its centre and the midpoints of its sides.
 _WITHIN = np.array([[2, 2, 2], [3, 3, 0], [3, 0, 3], [0, 3, 3]]) / 6.0
 
 
@@ -68,7 +69,7 @@ class _Surface:
             for corner in corners:
                 self.around.setdefault(corner, set()).add(number)
         self.count = self.count_before = len(triangles)
-        #: What the last fan has added and removed: number, corners and whether it was added.
+        #: The changes of the last fan: number, corners and whether the triangle was added.
         self.replaced: list[tuple[int, tuple[int, ...], bool]] = []
 
     def arrays(self) -> tuple[Array, Array]:

@@ -22,10 +22,10 @@ Array = np.ndarray
 
 #: Normals that differ by more than this make a crease [°].
 ANGLE = 30.0
-#: Polygons whose middle is nearer to the surface than this share of their size have no crease.
+#: Polygons whose centre is closer to the surface than this fraction of their size have no crease.
 NEAR = 5.0e-3
-#: Crossings of edges are sought in so many steps, or until they are off by less than this share of the edge; normals
-#: come from differences over this share of a polygon's size.
+#: Crossings of edges are found in this many steps, or until their error is below this fraction of the edge; normals
+#: come from differences over this fraction of a polygon's size.
 STEPS, OFF, APART = 6, 5.0e-5, 0.02
 #: Directions in which planes that meet hardly differ are left alone: singular values below this share of the largest.
 RANK = 0.15
@@ -94,17 +94,18 @@ def _crossings(points: Array, ends: Array, values: Array, domain: Domain) -> tup
 def _apexes(
     x: Array, known: Array, polygons: Array, whole: Array, corners: Array, domain: Domain
 ) -> tuple[Array, Array]:
-    """Polygons through which a crease goes, indices [m], and where the tangent planes at their vertices meet [m, 3].
+    """Polygons that contain a crease, indices [m], and the points where the tangent planes at their vertices meet [m,
+    3].
 
     Args:
         x: Vertices [V, 3].
-        known: Normals there, NaN where they are not known [V, 3].
+        known: Normals at the vertices, NaN if unknown [V, 3].
         polygons: Their vertices [P, 4].
         whole: Which have all of their vertices on edges [P].
         corners: Of their elements [P, 4, 3].
         domain: The body.
     """
-    # What is not known may be bent.
+    # Polygons without known normals may contain a crease.
     bent = np.flatnonzero(whole & ~(_least_cosine(known[polygons]) >= np.cos(np.radians(ANGLE))))
     at = x[polygons[bent]]
     middle = at.mean(axis=1)
@@ -159,7 +160,9 @@ def _slid(points: Array, along: Array, corners: Array) -> tuple[Array, Array]:
 
 
 def _fans(x: Array, polygons: Array, apexes: Array, domain: Domain) -> Array:
-    """Triangles from apexes to the edges of their polygons; edges between two are turned where that is nearer."""
+    """Triangles from apexes to the edges of their polygons; an edge between two apexes is flipped if it is then closer
+    to the surface.
+    """
     after = np.roll(polygons, -1, axis=1)
     fans = np.stack([np.repeat(apexes, polygons.shape[1]), polygons.ravel(), after.ravel()], axis=1)
     fans = fans[fans[:, 1] != fans[:, 2]]

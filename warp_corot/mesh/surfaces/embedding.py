@@ -37,7 +37,7 @@ def barycentric(forest: ForestArrays, elements: np.ndarray, points: np.ndarray) 
 
 
 def _descended(forest: ForestArrays, points: np.ndarray) -> np.ndarray:
-    """The live leaf that holds each point, int32 [n], -1 where none does."""
+    """The live leaf that contains each point, int32 [n], -1 if there is none."""
     cells = np.array(forest.cells)
     scaled = (points - np.asarray(forest.origin)) / forest.cell_size
     within = np.flatnonzero(((scaled >= 0) & (scaled <= cells)).all(axis=1))

@@ -42,7 +42,7 @@ TRIANGLES = _triangles_by_code()
 
 
 def marched(points: Array, tets: Array, values: Array) -> SurfaceMesh:
-    """The surface where the linear interpolant of nodal values is zero.
+    """The zero surface of the linear interpolant of nodal values.
 
     Args:
         points: Positions of the nodes [m], float64 [n, 3].

@@ -28,7 +28,7 @@ def separated(points: Array, tets: Array, values: Array, labels: Array) -> Surfa
         points: Positions of the nodes [m], float64 [n, 3].
         tets: Nodes of the elements, int32 [T, 4].
         values: Signed function at the nodes, negative inside [n].
-        labels: Labels of the nodes, int32 [n]; those of nodes outside do not matter.
+        labels: Labels of the nodes, int32 [n]; labels of nodes outside do not matter.
 
     Returns:
         The surface with ``sides``, the higher label first: a triangle is seen counter-clockwise from the side of the
