@@ -10,7 +10,8 @@ import functools
 import warp as wp
 
 from warp_corot.kernels.modules import unique_kernel
-from warp_corot.kernels.stepping.block import LOAD, STORE, synchronize_block
+from warp_corot.kernels.stepping.block_memory import LOAD, STORE
+from warp_corot.kernels.stepping.threads import synchronize_block
 from warp_corot.kernels.tables.cluster_layout import BANK_GROUPS, QUAD_BYTES, PairLayout
 
 from .elements import number_of

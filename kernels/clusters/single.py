@@ -17,7 +17,8 @@ import warp as wp
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.elements import ADD_FORCE
 from warp_corot.kernels.modules import unique_kernel
-from warp_corot.kernels.stepping.block import LOAD, STORE, number_in, synchronize_block
+from warp_corot.kernels.stepping.block_memory import LOAD, STORE
+from warp_corot.kernels.stepping.threads import number_in, synchronize_block
 from warp_corot.kernels.tables.block_layout import NUMBERS
 from warp_corot.kernels.tables.cluster_layout import DEFAULT_LAYOUT, QUAD_BYTES, ClusterLayout
 

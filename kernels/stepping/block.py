@@ -39,146 +39,32 @@ from warp_corot.kernels.tables.block_layout import (
 from warp_corot.kernels.tables.shapes import VOLUME, fingerprint
 from warp_corot.kernels.tables.subtree import FRAMES, HANDEDNESS, LEAVES, POSITIONS
 
+from .block_memory import (
+    CLEAR,
+    COUNT,
+    LOAD,
+    LOAD_BYTES,
+    READ,
+    RESERVE,
+    STORE,
+    WRITE,
+    shared_list,
+    shared_numbers,
+    shared_vectors,
+)
 from .integrate import add_support_work, is_finite, symplectic_euler_velocity, vector_at
 from .pace import DONE, DT, Pace, length_before
+from .threads import bit_count, lowest_bit, number_in, shuffle_down, synchronize_any, synchronize_block
 
 wp.set_module_options({"enable_backward": False})
 
 #: Threads of a multiprocessor that registers must have room for.
 BUSY_THREADS = 640
 
-LOAD, STORE, LOAD_BYTES = 0, 1, 2
-RESERVE, WRITE, READ, COUNT, CLEAR = 0, 1, 2, 3, 4
 #: What an entry of a block's list is: which thread left it out, and which leaf it is.
 LEAF_SHIFT = 16
 
 vec3u = wp.types.vector(length=NODE_WORDS, dtype=wp.uint64)
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    __syncthreads();
-#endif
-""")
-def synchronize_block(): ...
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    return __syncthreads_or(flag);
-#else
-    return flag;
-#endif
-""")
-def synchronize_any(flag: int) -> int:
-    """Wait for the block's threads; whether any has a flag."""
-    ...
-
-
-@wp.func
-def number_in(word: wp.uint64, k: int):
-    """The k-th of the four 16-bit numbers in a word."""
-    return int((word >> wp.uint64(16 * k)) & wp.uint64(0xFFFF))
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    return __popc(bits);
-#else
-    return __builtin_popcount(bits);
-#endif
-""")
-def bit_count(bits: int) -> int: ...
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    return __ffs(bits) - 1;
-#else
-    return __builtin_ctz(bits);
-#endif
-""")
-def lowest_bit(bits: int) -> int: ...
-
-
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    return wp::vec_t<3, wp::float32>(
-        __shfl_down_sync(0xffffffff, value[0], distance),
-        __shfl_down_sync(0xffffffff, value[1], distance),
-        __shfl_down_sync(0xffffffff, value[2], distance));
-#else
-    return value;
-#endif
-""")
-def shuffle_down(value: wp.vec3, distance: int) -> wp.vec3: ...
-
-
-def shared_list(room: int) -> wp.Function:
-    """A list of integers in shared memory, as one function.
-
-    It makes room for some and returns where, writes or reads one, returns how many there are, or forgets all.
-    """
-    snippet = f"""
-#if defined(__CUDA_ARCH__)
-    __shared__ int count;
-    __shared__ int entries[{room}];
-    if (access == {RESERVE}) return atomicAdd(&count, value);
-    if (access == {WRITE}) entries[i] = value;
-    if (access == {READ}) return entries[i];
-    if (access == {COUNT}) return count < {room} ? count : {room};
-    if (access == {CLEAR}) count = 0;
-#endif
-    return 0;
-"""
-
-    @wp.func_native(snippet)
-    def list_of(access: int, i: int, value: int) -> int: ...
-
-    return list_of
-
-
-def shared_vectors(count: int, tag: str) -> wp.Function:
-    """An array of vectors in shared memory, as one function that reads or writes it; ``LOAD_BYTES`` counts in bytes."""
-
-    snippet = f"""
-#if defined(__CUDA_ARCH__)
-    // {tag}
-    __shared__ float memory[{3 * count}];
-    if (access == {STORE}) {{
-        memory[3 * i] = value[0]; memory[3 * i + 1] = value[1]; memory[3 * i + 2] = value[2];
-        return value;
-    }}
-    const float* at = access == {LOAD_BYTES} ? (const float*)((const char*)memory + i) : memory + 3 * i;
-    return wp::vec_t<3, wp::float32>(at[0], at[1], at[2]);
-#else
-    return value;
-#endif
-"""
-
-    @wp.func_native(snippet)
-    def memory(access: int, i: int, value: wp.vec3) -> wp.vec3: ...
-
-    return memory
-
-
-def shared_numbers(count: int, tag: str) -> wp.Function:
-    """An array of numbers in shared memory, as one function that reads or writes it."""
-    snippet = f"""
-#if defined(__CUDA_ARCH__)
-    // {tag}
-    __shared__ float memory[{count}];
-    if (access == {STORE}) memory[i] = value;
-    return memory[i];
-#else
-    return value;
-#endif
-"""
-
-    @wp.func_native(snippet)
-    def memory(access: int, i: int, value: float) -> float: ...
-
-    return memory
 
 
 @wp.struct

@@ -35,7 +35,8 @@ from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.tables.subtree import GROUP_NODES, SLOT_STRIDE, group_slots, group_sources
 
 from .forces import leaf_stress, mat10, near_forces, shared_forces
-from .repair import WARP, LeftOut, append, is_mostly_left_out, list_of, reserve, scatter_in_warp, scatter_one_by_one
+from .in_warps import is_mostly_left_out, scatter_in_warp, scatter_one_by_one
+from .left_out import WARP, LeftOut, append, list_of, reserve
 
 wp.set_module_options({"enable_backward": False})
 

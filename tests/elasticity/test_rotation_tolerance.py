@@ -13,7 +13,7 @@ from warp_corot.elasticity.corotated.model import AUTO_TOLERANCE
 from warp_corot.elasticity.structs import isotropic_material
 from warp_corot.kernels.subtrees import cpu as subtree_cpu
 from warp_corot.kernels.subtrees import cuda as subtree_cuda
-from warp_corot.kernels.subtrees.repair import LeftOut
+from warp_corot.kernels.subtrees.left_out import LeftOut
 
 MU, LAM = oracle.lame(1e4, 0.4)
 ROUNDING = 1e-5  # of the largest force

@@ -14,7 +14,7 @@ from left_out_launches import Launches
 import warp_corot as wc
 from warp_corot.discretization.planning.fixed import ForcePlan
 from warp_corot.kernels.subtrees.cuda import scatter_subtrees_shared
-from warp_corot.kernels.subtrees.repair import LeftOut
+from warp_corot.kernels.subtrees.left_out import LeftOut
 
 LAME = oracle.lame(1e4, 0.4)
 MATERIAL = {"young": 1e4, "poisson": 0.4, "density": 1000.0}

@@ -15,6 +15,7 @@ from cases import CUBE, jittered, mixed_forest, oracle_mesh, random_displacement
 import warp_corot as wc
 from warp_corot.elasticity.dilatation.field import DilatationField
 from warp_corot.solvers.explicit.block import BlockSteps
+from warp_corot.solvers.recorded import Segment
 
 DEVICES = [str(device) for device in wp.get_cuda_devices()]
 pytestmark = pytest.mark.skipif(not DEVICES, reason="blocks are for CUDA")
@@ -312,9 +313,9 @@ def test_an_unstable_step_is_named(share, up, device):
     step = int(str(caught.value).split("since step ")[1].split(" ")[0])
     assert step > 5
     # Without checks, which would end the run before.
-    sims[1].recorded.replay_many(step - 1)
+    sims[1].recorded.replay(Segment(step - 1))
     assert np.isfinite(sims[1].body.state.displacements.numpy()).all()
-    sims[1].recorded.replay_many(1)
+    sims[1].recorded.replay(Segment(1))
     assert not np.isfinite(sims[1].body.state.displacements.numpy()).all()
 
 

@@ -173,10 +173,6 @@ class RecordedSteps:
         for piece in pieces:
             self._replay_recording(piece)
 
-    def replay_many(self, count: int) -> None:
-        """Replay any number of steps without anything before or after them."""
-        self.replay(Segment(count))
-
     def _follow_bodies(self) -> None:
         """Forget the recordings if the bodies' launches have changed."""
         self._system.prepare()

@@ -116,7 +116,6 @@ class System:
         offset: The number of the step being launched, since the clock was last advanced.
         lag: How far velocities are behind displacements, in half steps: 1 for symplectic Euler.
         is_implicit: Whether steps are implicit.
-        histories: Arrays that a step leaves for the next one besides the state of bodies and fields.
         bad_step: The first step after which something was not finite, int64 [1] on the device.
     """
 
@@ -134,7 +133,6 @@ class System:
         self.constraints: list[Constraint] = []
         self.changes = self.offset = 0
         self.lag, self.is_implicit = 1.0, False
-        self.histories: list[wp.array] = []
         self._work = ForcesWork(self.bodies, pace, self.gravity)
         self.device, self.worlds = bodies[0].device, bodies[0].worlds
         self.motion_rates = wp.zeros(2, dtype=wp.float32, device=self.device)

@@ -6,7 +6,7 @@ that moves a rigid tool needs the same few members.
 
 from __future__ import annotations
 
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -15,35 +15,6 @@ from .shown import Pick, Shown
 from .springs import MOST_POINTS, Patch, Springs
 
 Vector = npt.NDArray[np.float64]
-
-
-class Hand(Protocol):
-    """A way to hold a body.
-
-    Class attributes:
-        stays: Whether it holds on after the mouse is released.
-    """
-
-    stays: ClassVar[bool]
-    pick: Pick
-
-    def move(self, motion: Vector) -> None:
-        """Move to the mouse's present distance from where it was pressed [m], [3]."""
-        ...
-
-    def release(self) -> None:
-        """Let go; a second call does nothing."""
-        ...
-
-    @property
-    def force(self) -> Vector:
-        """The force on the body in the last step [N], float64 [3]."""
-        ...
-
-    @property
-    def ends(self) -> tuple[Vector, Vector]:
-        """The two ends of the spring [m], float64 [3] each."""
-        ...
 
 
 class SpringHand:

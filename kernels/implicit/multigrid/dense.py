@@ -6,7 +6,7 @@ import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
 from warp_corot.kernels.elements.lanes import COMPILER_FLAGS
-from warp_corot.kernels.stepping.block import synchronize_block
+from warp_corot.kernels.stepping.threads import synchronize_block
 
 from .cycle import sum_over_lanes
 

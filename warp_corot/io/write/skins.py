@@ -105,23 +105,6 @@ def has_labels(mesh: Any) -> bool:
     return bool(getattr(mesh, "label_names", ()))
 
 
-def skins_of(
-    meshes: Sequence[Any], surface: Surface | Sequence[Surface | None] | None = None, labels: bool = False
-) -> list[Skin]:
-    """The skins of meshes whose nodes are numbered one mesh after the other; skins with the same name are joined.
-
-    Args:
-        meshes: Forests or tetrahedral meshes.
-        surface: Drawn instead of the mesh's own: a bound surface, or a surface file whose parts are bound; for several
-            meshes one each, None for the mesh's own.
-        labels: Draw each label of a mesh as a separate closed surface.
-
-    Raises:
-        InputError: Surfaces that do not fit, or no mesh has labels.
-    """
-    return BoundSkins(meshes, surface, labels).on(meshes)
-
-
 class BoundSkins:
     """The skins of bodies, bound again when a body's mesh has changed.
 
@@ -129,8 +112,14 @@ class BoundSkins:
     boundary of a mesh becomes that of the current one.
 
     Args:
-        meshes, surface, labels: See `skins_of`.
-        changing: Which meshes may change: surfaces given for them may be bound to an earlier mesh.
+        meshes: Forests or tetrahedral meshes, whose nodes are numbered one mesh after the other.
+        surface: Drawn instead of the mesh's own: a bound surface, or a surface file whose parts are bound; for several
+            meshes one each, None for the mesh's own.
+        labels: Draw each label of a mesh as a separate closed surface.
+        changing: Whether each mesh may change: surfaces given for such a mesh may be bound to an earlier one.
+
+    Raises:
+        InputError: Surfaces that do not fit, or no mesh has labels.
     """
 
     def __init__(
@@ -151,7 +140,7 @@ class BoundSkins:
         ]
 
     def on(self, meshes: Sequence[Any]) -> list[Skin]:
-        """The skins, bound to the nodes of the current meshes, numbered one mesh after the other."""
+        """The skins, bound to the nodes of the current meshes; skins with the same name are joined."""
         found, offset = [], 0
         for index, mesh in enumerate(meshes):
             if mesh is not self._meshes[index]:

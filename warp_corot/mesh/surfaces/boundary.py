@@ -71,14 +71,6 @@ def boundary_faces(tets: ArrayLike, points: ArrayLike | None = None) -> tuple[ND
     return corners[boundary], (boundary // 4).astype(np.int32)
 
 
-def neighbours(tets: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pairs of tetrahedra [T, 4] that share a face, int64 [n] and [n]."""
-    t = np.ascontiguousarray(tets, dtype=np.int32).reshape(-1, 4)
-    order, first = _sort_faces(t[:, FACES_OF_TET].reshape(-1, 3))
-    shared = np.flatnonzero(~first)
-    return order[shared - 1] // 4, order[shared] // 4
-
-
 def _sort_faces(corners: NDArray[np.int32]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
     """An order in which equal faces (as sets of nodes) are neighbours, and where in it a new face begins."""
     low = corners.min(axis=1).astype(np.uint64)

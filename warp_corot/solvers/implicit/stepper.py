@@ -54,7 +54,6 @@ class ImplicitStepper(Stepper):
         self.rows = next((rows for each in self.touching if (rows := each.joined_rows()) is not None), None)
         self._joined: JoinedSolve | None = None
         self._bodies = [BodySteps(self, k) for k in range(len(system.bodies))]
-        system.histories += [array for body in self._bodies for array in body.history]
 
     @property
     def kept(self) -> dict[str, wp.array]:

@@ -101,7 +101,7 @@ class SceneWriter:
         if scene.uses(self.path):
             raise InputError(f"{self.path}: is part of the input {scene.path}; it must be another file")
         self.frames = 0
-        self._scene, self._flatten, self._show_stress = scene, flatten, show_stress
+        self._scene, self._flatten = scene, flatten
         self._layer = _base_layer(scene, fps)
         moving = {*bodies, *scene.animated}
         self._soft = [TetsOver(self._layer, scene, prim, moving, show_stress) for prim in tets]
