@@ -60,6 +60,7 @@ def test_all_cases_are_the_same_on_seven_ranks(tmp_path):
 def test_a_mesh_that_no_rank_holds_whole_gives_the_same_run(runs):
     for size in (1, 3):
         np.testing.assert_array_equal(runs[size]["parts.x"], runs[size]["worlds.True.x"])
+        np.testing.assert_array_equal(runs[size]["parts.touched.x"], runs[size]["touched.True.x"])
 
 
 @pytest.mark.parametrize("size", [1, 3])

@@ -42,9 +42,9 @@ def body_of(mesh: wc.TetForest | wc.TetMesh, poisson: float, worlds: int = 1) ->
     return body
 
 
-def touched() -> wc.SoftBody:
+def touched(mesh: wc.TetForest | None = None) -> wc.SoftBody:
     """A soft block."""
-    mesh = wc.TetForest.box((1, 1, 2), 0.05, level=4)
+    mesh = wc.TetForest.box((1, 1, 2), 0.05, level=4) if mesh is None else mesh
     return wc.SoftBody(mesh, wc.Isotropic(2e3, 0.3, 1000.0), device="cpu")
 
 
@@ -93,6 +93,18 @@ def saved_and_loaded(results: Path, before: list[str], case: str) -> dict[str, n
         again.advance(0.02)
         found |= {f"{name}.x": wd.gather(again.body.positions), f"{name}.numbers": np.array([again.steps, again.time])}
     return {f"{case}.{key}": value for key, value in found.items()}
+
+
+def touched_in_parts() -> np.ndarray | None:
+    """The run "touched" of a mesh that no rank holds whole; the positions of all nodes on rank 0."""
+    import warp_corot.distributed as wd
+
+    body = touched(wd.box((1, 1, 2), 0.05, level=4))
+    sim = wd.Simulation(body, deterministic=True, obstacles=obstacles_of("touched"))
+    sim.advance(0.03)
+    body.load("z > 0.09 and z < 0.1", [0.0, 0.0, 0.0])
+    sim.advance(0.01)
+    return wd.gather(body.positions)
 
 
 def in_parts() -> np.ndarray | None:
@@ -160,7 +172,7 @@ def make_all(results: str, names: str, before: list[str]) -> None:
         if name in names:
             found |= saved_and_loaded(Path(results), before, name)
     if "worlds" in names:
-        found["parts.x"] = in_parts()
+        found |= {"parts.x": in_parts(), "parts.touched.x": touched_in_parts()}
         found["recorded"] = np.array(recorded(Path(results).with_suffix(".usda")))
     if sim.rank == 0:
         np.savez(results, **found)

@@ -10,8 +10,6 @@ from warp_corot.elasticity import Corotated, Linear, Model, NeoHookean, StVenant
 from warp_corot.errors import InputError
 from warp_corot.solvers import Integrator
 
-from .parts import ForestPart
-
 #: Models whose forces need only the elements around a node.
 MODELS = (Corotated, Linear, NeoHookean, StVenantKirchhoff)
 
@@ -57,9 +55,6 @@ def check_supported(
             raise InputError(f"{type(model).__name__} does not work on several ranks yet; take a law of elements")
         if getattr(model, "rotation", None) == "warm":
             raise InputError("rotation 'warm' does not work on several ranks yet; it must be 'byers-xu' or 'svd'")
-    in_parts = any(isinstance(body.mesh, ForestPart) for body in bodies)
-    if in_parts and (contact or others.get("obstacles")):
-        raise InputError("contact of bodies in parts does not work yet; make the mesh with TetForest.box")
     for body in bodies:
         if body.changing is not None:
             raise InputError("a body that is remeshed does not work on several ranks yet")
