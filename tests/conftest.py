@@ -29,6 +29,14 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     return min(cores, MOST_WORKERS)
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """A browser's tests, half a minute each, come before Newton's: no worker waits for them alone at the end."""
+    pages = [item for item in items if item.path.name == "test_page.py"]
+    others = [item for item in items if item.path.name != "test_page.py"]
+    at = next((k for k, item in enumerate(others) if item.path.parent.name == "newton"), 0)
+    items[:] = [*others[:at], *pages, *others[at:]]
+
+
 @pytest.fixture(params=["cpu", *(str(device) for device in wp.get_cuda_devices())])
 def device(request: pytest.FixtureRequest) -> str:
     return request.param
