@@ -199,7 +199,7 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
     @property
     def contact_forces(self) -> wp.array:
         """Contact forces on the nodes in the last step [N], vec3 [worlds * N]: a view of the live array; zero for nodes
-        without contact.
+        without contact. The forces of grasps on the nodes that they hold are among them.
 
         Raises:
             InputError: The body is in no simulation with contact.
