@@ -126,3 +126,14 @@ def test_a_cube_takes_what_it_is_given(tmp_path):
 def test_cubes_far_too_many_for_the_elements_are_refused_before_they_are_made() -> None:
     with pytest.raises(wc.InputError, match=r"cell_size is 0\.001 m, .* 1e\+09 cubes; target_elements=50"):
         wc.TetForest.from_domain(wc.Domain.box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), 0.001, target_elements=50)
+
+
+def test_a_pipe_with_a_wall_thinner_than_its_elements_stays_whole():
+    """A wall of 1 % of the radius, a thirtieth of an element; by random points most elements held nothing of it."""
+    pipe = trimesh.creation.annulus(0.0198, 0.02, 0.3, sections=64)
+    domain = wc.Domain.from_surface((pipe.vertices, pipe.faces))
+    mesh = wc.TetForest.from_domain(domain, target_elements=4000)
+    found = fidelity(mesh, domain)
+    assert found.pieces == 1
+    assert 0.9 * 4000 < len(mesh.tets) <= 4000
+    assert abs(found.volume_error) < 0.03

@@ -17,6 +17,7 @@ from .cut import connected, inside_shares
 from .growth import lattice_spacing
 from .judging import FARTHER, GAP_ELEMENTS, ROUGH
 from .surface_points import surface_points
+from .walls import OF_WALLS, wall_shares
 
 if TYPE_CHECKING:
     from warp_corot.domain import Domain
@@ -61,11 +62,16 @@ class Resolved:
         self._by_level = np.split(inner, np.cumsum(counts)[:-1])
         leaves = np.flatnonzero(tree.first_child == LIVE)
         shares = inside_shares(grown.phi[tree.tets[leaves]])
+        self.volume = volume_shares(tree.level)
         if domain is not None:
             rough = self._rough(leaves)
-            shares[rough] = _sampled_shares(grown, leaves[rough], cell_size, domain, shares[rough])
+            bare = rough & (shares == 0.0)
+            shares[rough], nearest = _sampled_shares(grown, leaves[rough], cell_size, domain, shares[rough])
+            held = shares * self.volume[leaves]
+            if held[bare].sum() > OF_WALLS * held.sum():
+                corners = grown.lattice[tree.tets[leaves[bare]]] * lattice_spacing(cell_size) + np.asarray(grown.origin)
+                shares[bare] = wall_shares(corners, nearest[bare[rough]], shares[bare], domain)
         self.leaves, self.shares = leaves[shares > 0.0], shares[shares > 0.0]
-        self.volume = volume_shares(tree.level)
         held = np.zeros(len(tree.level))
         held[self.leaves] = self.shares * self.volume[self.leaves]
         self.held = self.summed(held)
@@ -267,15 +273,17 @@ def points_within(
 
 def _sampled_shares(
     grown: Grown, elements: np.ndarray, cell_size: float, domain: Domain, shares: np.ndarray
-) -> np.ndarray:
+) -> tuple[np.ndarray, np.ndarray]:
     """The filled fraction of elements, by a point in each of their eighths, or in some of these for many elements; at
-    least a small fraction if a corner is inside.
+    least a small fraction if a corner is inside. Also the point of each element that is nearest to the body, or
+    deepest inside it [n, 3].
     """
     rng = np.random.default_rng(0)
-    found = np.zeros(len(elements))
+    found, nearest = np.zeros(len(elements)), np.zeros((len(elements), 3))
     some = int(np.clip(MOST_POINTS // max(len(elements), 1), 1, 8))
     for part in np.array_split(np.arange(len(elements)), len(elements) // 100_000 + 1):
         within = points_within(grown, elements[part], cell_size, some, rng)
-        inside = np.asarray(domain.phi(within.reshape(-1, 3))) < 0.0
-        found[part] = inside.reshape(-1, some).mean(axis=1)
-    return np.where(shares > 0.0, np.maximum(found, LEAST), found)
+        phi = np.asarray(domain.phi(within.reshape(-1, 3))).reshape(-1, some)
+        found[part] = (phi < 0.0).mean(axis=1)
+        nearest[part] = within[np.arange(len(part)), np.argmin(phi, axis=1)]
+    return np.where(shares > 0.0, np.maximum(found, LEAST), found), nearest
