@@ -1,8 +1,8 @@
 """Walls thinner than the elements that they pass: no corner is inside, and few random points are.
 
-Random points miss the wall in most of these elements, and a mesh without them is full of holes. An element holds a part of
-the wall if the point of the body's surface that is nearest to it lies in it; the wall's thickness there says how much.
-All of them together hold what random points say.
+Random points miss the wall in most of these elements, and a mesh without them is full of holes. An element holds a
+part of the wall if the point of the body's surface that is nearest to it lies in it. The wall's thickness there says
+how much; all of them together hold what random points say.
 """
 
 from __future__ import annotations
