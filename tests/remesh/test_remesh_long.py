@@ -81,7 +81,7 @@ def resident(device):
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads what memory is in use from /proc")
-@pytest.mark.parametrize("seconds", [8, pytest.param(3600, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seconds", [5, pytest.param(3600, marks=pytest.mark.slow)])
 def test_pulled_and_pressed_at_random(seconds, device):
     """The state is finite, or ``advance`` reports it; mass to rounding; balanced pools; volume; constant memory."""
     ordeal = Ordeal(device, seed=5)
