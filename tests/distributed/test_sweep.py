@@ -83,11 +83,26 @@ def test_what_failed_is_said_and_tried_again(folder):
 
 @pytest.mark.parametrize(
     ("given", "said"),
-    [({}, "no parameters"), ({"a": 1}, "a is 1"), ({"a": [1, 1]}, "the same parameters"), ({"a": [np.inf]}, "inf")],
+    [
+        ({}, "no parameters"),
+        ({"a": 1}, "a is 1"),
+        ({"a": [1, 1]}, "the same parameters"),
+        ({"a": [np.inf]}, "inf"),
+        (5, "parameters is 5"),
+    ],
 )
 def test_bad_parameters_are_refused(given, said):
     with pytest.raises(wc.InputError, match=said):
         wd.sweep(swept.failing, given)
+
+
+def test_a_function_that_other_processes_cannot_get_is_refused():
+    with pytest.raises(wc.InputError, match="top of a module"):
+        wd.sweep(lambda a: {"b": a}, {"a": [1]})
+    with pytest.raises(wc.InputError, match="folder is 5"):
+        wd.sweep(swept.failing, {"a": [1]}, folder=5)
+    with ThreadPoolExecutor(1) as engine:
+        assert wd.sweep(lambda a: {"b": 2 * a}, {"a": [1]}, executor=engine)[0]["b"] == 2
 
 
 def test_values_of_options():

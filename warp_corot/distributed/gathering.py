@@ -10,6 +10,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import InputError
+from warp_corot.inputs.checks import shown
 
 from .following import Following
 
@@ -34,6 +35,8 @@ def gather(array: wp.array) -> npt.NDArray[Any] | None:
     Raises:
         InputError: The array belongs to no such body.
     """
+    if not isinstance(array, wp.array):
+        raise InputError(f"array is {shown(array)}; it must be a nodal array of a body, such as body.positions")
     known = [each for each in _all if each.owns(array)]
     if not known:
         # Only the length of a copy, such as body.displacements, tells to which body it belongs.

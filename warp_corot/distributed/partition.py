@@ -13,6 +13,7 @@ from warp_corot.discretization.elements import Mesh
 from warp_corot.discretization.groups import group_numbers
 from warp_corot.discretization.matching import neighbour_groups
 from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_numbers, shown
 from warp_corot.mesh import TetForest, TetMesh
 from warp_corot.mesh.tree import UniformTree
 
@@ -103,9 +104,9 @@ def checked_shares(ranks: int, costs: npt.ArrayLike | None) -> npt.NDArray[np.fl
     Raises:
         InputError: Costs that are not positive numbers, one for each rank.
     """
-    given = np.ones(ranks) if costs is None else np.asarray(costs, float)
+    given = np.ones(ranks) if costs is None else checked_numbers(costs, "costs", "one for each rank")
     if given.shape != (ranks,) or not (np.isfinite(given) & (given > 0.0)).all():
-        raise InputError(f"costs is {costs!r}; it must be {ranks} positive numbers, one for each rank")
+        raise InputError(f"costs is {shown(costs)}; it must be {ranks} positive numbers, one for each rank")
     return (1.0 / given) / np.sum(1.0 / given)
 
 

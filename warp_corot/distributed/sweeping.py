@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import itertools
 import math
+import pickle
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
 from contextlib import contextmanager
 from functools import partial
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_count, shown
+from warp_corot.inputs.checks import checked_count, checked_path, shown
 
 from .journal import Journal, Row, key_of
 from .tables import write_tables
@@ -68,9 +69,11 @@ def sweep(
     checked_count(retries, "retries", least=0)
     if not callable(function):
         raise InputError(f"function is {shown(function)}; it must be a function of the parameters")
+    if executor is None:
+        _check_sent(function)
     size = 1 if together is None else checked_count(together, "together", least=1)
     window = worker_count(workers, -(-len(runs) // size), executor)
-    journal = Journal(None if folder is None else Path(folder))
+    journal = Journal(None if folder is None else checked_path(folder, "folder"))
     left = [run for run in runs if not journal.is_done(run)]
     with _bar(len(runs), progress) as show:
         show(len(runs) - len(left))
@@ -98,7 +101,13 @@ def combinations(parameters: Parameters) -> list[dict[str, Any]]:
         values = [[_plain(value) for value in each] for each in parameters.values()]
         runs = [dict(zip(parameters, each, strict=True)) for each in itertools.product(*values)]
     else:
-        runs = [{name: _plain(value) for name, value in run.items()} for run in parameters]
+        given = list(parameters) if isinstance(parameters, Iterable) else [None]
+        if not all(isinstance(run, Mapping) for run in given):
+            raise InputError(
+                f"parameters is {shown(parameters)}; it must be lists of values by name, {{'young': [1e3, 2e3]}}, "
+                "or a list of dictionaries, one a run"
+            )
+        runs = [{name: _plain(value) for name, value in run.items()} for run in given]
     if not runs or not runs[0]:
         raise InputError("there are no parameters to vary")
     if any(run.keys() != runs[0].keys() for run in runs):
@@ -106,6 +115,21 @@ def combinations(parameters: Parameters) -> list[dict[str, Any]]:
     if len({key_of(run) for run in runs}) < len(runs):
         raise InputError("two runs have the same parameters; each can be made once only")
     return runs
+
+
+def _check_sent(function: Any) -> None:
+    """Check that a function can be sent to other processes.
+
+    Raises:
+        InputError: It cannot.
+    """
+    try:
+        pickle.dumps(function)
+    except Exception as error:  # any error of what the function holds
+        raise InputError(
+            f"function is {shown(function)}, which cannot be sent to other processes ({shown(str(error))}); "
+            "it must be at the top of a module, and hold no arrays of a device"
+        ) from None
 
 
 def _plain(value: Any) -> Any:

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_flag
 from warp_corot.inputs.checks import shown as as_shown
 from warp_corot.simulation.simulation import Simulation
 
@@ -174,6 +175,8 @@ def view(
     Raises:
         InputError: viser is not installed, the port is taken, or an argument is out of its range.
     """
+    if wait is not None:
+        checked_flag(wait, "wait")
     own = None if surface is None else list(surface) if isinstance(surface, Sequence) else [surface]
     if own is not None and len(own) != len(getattr(sim, "bodies", own)):
         raise InputError(f"surface names {len(own)} surfaces; there must be one for each body")
