@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +14,7 @@ from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.options import Contact
 from warp_corot.contact.shapes import Shape
 from warp_corot.elasticity import Corotated, ForceField, Model
-from warp_corot.errors import InputError
+from warp_corot.errors import ConvergenceError, InputError
 from warp_corot.inputs.checks import checked_count, checked_number, refuse_tape, shown
 from warp_corot.inputs.turns import in_turn
 from warp_corot.solvers.implicit.preconditioners import check_preconditioner
@@ -27,6 +27,9 @@ from .resting import checked_obstacles, rest_on
 BALANCED = 1e-5
 #: Rounding of float32 displacements and forces hides what is smaller: Newton's method would stop without an answer.
 LEAST_TOLERANCE = 1e-6
+
+#: Precisions of answers.
+FLOAT32, FLOAT64 = "float32", "float64"
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,7 @@ class StaticReport:
         time: Wall time [s].
         load_share: Share of loads and gravity that the state carries; less than 1 if the solve did not converge.
         world_converged: Whether each world is at rest, bool [worlds].
+        displacements: With ``precision="float64"`` those of the answer [m], float64 [worlds * N, 3]; else None.
     """
 
     converged: bool
@@ -57,6 +61,7 @@ class StaticReport:
     time: float
     load_share: float
     world_converged: npt.NDArray[np.bool_]
+    displacements: npt.NDArray[np.float64] | None = None
 
 
 @in_turn
@@ -71,6 +76,7 @@ def solve_static(
     preconditioner: str | None = None,
     obstacles: Shape | Sequence[Shape] = (),
     contact: Contact | None = None,
+    precision: str = "float32",
 ) -> StaticReport:
     """Find the state in which a body is at rest under gravity and its loads, by Newton's method.
 
@@ -94,10 +100,14 @@ def solve_static(
         obstacles: Shapes at rest on which the body may rest; their ``wrench`` is that of the answer. The search then
             is one of long steps of backward Euler, each from rest, without a line search; ``load_steps`` must be 1.
         contact: Friction; with ``self_contact`` the body may touch itself.
+        precision: "float32"; or "float64", which goes on from the answer of float32 with Newton's method and a direct
+            solver on the host, to the rounding of float64: for isotropic materials of Linear, Corotated,
+            StVenantKirchhoff, NeoHookean and EdgeStVK with biquadratic springs, bodies that are held in each world,
+            and meshes of up to some 50,000 elements.
 
     Raises:
-        InputError: An argument has another type or is out of its range, the model does not support the mesh, the body
-            is remeshed, or all its nodes are held.
+        InputError: An argument has another type or is out of its range, the model does not support the mesh or the
+            precision, the body is remeshed, or all its nodes are held.
     """
     refuse_tape()
     began = time.perf_counter()
@@ -120,6 +130,7 @@ def solve_static(
     field.relax_fully()
     answer = _Answer(body, field, down)
     things = checked_obstacles(obstacles)
+    _check_precision(precision, body, law, touches=bool(things) or contact is not None)
     if things or contact is not None:
         if steps != 1:
             raise InputError(f"load_steps is {steps}; with obstacles or contact it must be 1")
@@ -133,6 +144,8 @@ def solve_static(
     found = solver.solve()
     answer.finish()
     converged = found.converged & (solver.share == 1.0)
+    if precision == FLOAT64 and converged.all():
+        return _precise(answer, law, solver, began)
     return answer.report(
         began,
         "the body is at rest" if converged.all() else _what_stopped(body, solver, status_words(found)),
@@ -143,6 +156,52 @@ def solve_static(
         load_share=solver.share,
         world_converged=converged,
     )
+
+
+def _check_precision(precision: str, body: SoftBody, law: Model, *, touches: bool) -> None:
+    """Check that an answer exists in this precision.
+
+    Raises:
+        InputError: It does not.
+    """
+    if precision not in (FLOAT32, FLOAT64):
+        raise InputError(f"precision is {shown(precision)}; it must be {FLOAT32!r} or {FLOAT64!r}")
+    if precision == FLOAT32:
+        return
+    from warp_corot.solvers.implicit.precise import checked_host_law
+
+    checked_host_law(body, law)
+    if touches:
+        raise InputError("precision is 'float64'; with obstacles or contact it must be 'float32'")
+    if not body.conditions.held_mask().reshape(body.worlds, -1).any(axis=1).all():
+        raise InputError("precision is 'float64'; it needs held nodes in each world")
+
+
+def _precise(answer: _Answer, law: Model, solver: StaticSolver, began: float) -> StaticReport:
+    """The answer in float64, from that in float32."""
+    from warp_corot.solvers.implicit.precise import PreciseRest
+
+    body = answer.body
+    everywhere = np.ones(body.worlds, bool)
+    linear = solver.linear_iterations
+    try:
+        found = PreciseRest(body, answer.field, law, answer.loads)
+    except ConvergenceError as error:
+        message = f"not converged: {error}; the body is at rest in float32"
+        return answer.report(began, message, iterations=solver.iterations, linear_iterations=linear, load_share=1.0)
+    body.state.adopt_positions()
+    answer.finish()
+    report = answer.report(
+        began,
+        "the body is at rest",
+        iterations=solver.iterations + found.iterations,
+        residual=found.residual,
+        correction=found.correction,
+        linear_iterations=linear,
+        load_share=1.0,
+        world_converged=everywhere,
+    )
+    return replace(report, displacements=found.u.reshape(-1, 3))
 
 
 def _rest_on(

@@ -256,3 +256,33 @@ def test_no_body_and_no_free_node():
     body.fix(np.arange(body.node_count))
     with pytest.raises(wc.InputError, match="at least one must be free"):
         wc.solve_static(body)
+
+
+@pytest.mark.parametrize("poisson", [0.3, 0.49], ids=["plain", "shared"])
+def test_answers_in_float64_balance_to_its_rounding(poisson, device):
+    """Far better than float32 can, and near its answer."""
+    ends = {}
+    for precision in ("float32", "float64"):
+        body = wc.SoftBody(wc.TetForest.box((1, 1, 2), 0.064, 3), wc.Isotropic(2e4, poisson, 1000.0), device=device)
+        body.fix("z == zmin")
+        report = wc.solve_static(body, gravity=(0.0, -9.81, 0.0), precision=precision)
+        assert report.converged
+        ends[precision] = body.displacements.numpy().astype(float)
+    assert report.residual < 1e-12
+    assert report.correction < 1e-12
+    assert report.displacements.dtype == np.float64
+    np.testing.assert_allclose(ends["float64"], report.displacements, atol=1e-7 * np.abs(report.displacements).max())
+    np.testing.assert_allclose(ends["float32"], ends["float64"], atol=1e-5 * np.abs(report.displacements).max())
+
+
+def test_what_has_no_answer_in_float64_is_refused():
+    free = wc.SoftBody(wc.TetForest.box((1, 1, 1), 0.064, 0), wc.Isotropic(2e4, 0.3, 1000.0), device="cpu")
+    with pytest.raises(wc.InputError, match="it needs held nodes in each world"):
+        wc.solve_static(free, gravity=(0.0, 0.0, 0.0), precision="float64")
+    free.fix("z == zmin")
+    with pytest.raises(wc.InputError, match="with obstacles or contact it must be 'float32'"):
+        wc.solve_static(free, obstacles=wc.Ground(), precision="float64")
+    with pytest.raises(wc.InputError, match="precision is 'half'"):
+        wc.solve_static(free, precision="half")
+    with pytest.raises(wc.InputError, match="it needs an isotropic material and Linear"):
+        wc.solve_static(free, model=wc.Ogden(mu=(1.0,), alpha=(2.0,)), precision="float64")

@@ -1,0 +1,118 @@
+"""A state of rest in float64, on the host: Newton's method with a direct solver."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse.linalg import SuperLU, splu
+
+from warp_corot.elasticity import ForceField, Model
+from warp_corot.elasticity.dilatation.field import DilatationField
+from warp_corot.elasticity.dilatation.on_host import HostDilatation
+from warp_corot.elasticity.host_laws import HostLaw, host_law
+from warp_corot.errors import ConvergenceError, InputError
+from warp_corot.materials.isotropic import Isotropic
+
+from .precise_elements import PreciseElements
+
+if TYPE_CHECKING:
+    from warp_corot.body.soft_body import SoftBody
+
+Array = npt.NDArray[np.float64]
+
+#: Maximum number of Newton's iterations, and the tolerance of the last one: its largest displacement over the largest
+#: displacement.
+ITERATIONS, SMALL = 20, 1e-13
+
+
+class PreciseRest:
+    """Moves a body from a state of rest in float32 to the one in float64.
+
+    Args:
+        body: The body; some nodes of each world must be held. Its displacements become the answer, rounded.
+        field: Its elastic forces.
+        law: The model.
+        loads: Loads and weight [N], float64 [worlds * N, 3].
+
+    Attributes:
+        elements: Those of each world.
+        u: Displacements [m], float64 [worlds, N, 3].
+        held: Whether nodes are held, bool [worlds, N].
+        free: Free entries of each world's displacements, int64 each.
+        factors: The stiffness and its factors at free entries, of each world.
+        iterations: Newton's iterations of the world that needed most.
+        correction: The largest displacement of the last iteration over the largest displacement.
+        residual: The norm of the unbalanced forces over that of loads and reactions, of the world where it is largest.
+
+    Raises:
+        InputError: The model or the material does not exist in float64.
+        ConvergenceError: Newton's method does not converge from the present state, or the stiffness is singular.
+    """
+
+    def __init__(self, body: SoftBody, field: ForceField, law: Model, loads: Array):
+        of_host = checked_host_law(body, law)
+        shared = HostDilatation(field) if isinstance(field, DilatationField) else None
+        worlds, count = body.worlds, body.sizes.nodes
+        self.elements = [PreciseElements(body, of_host, shared, world) for world in range(worlds)]
+        self._loads = loads.reshape(worlds, -1, 3)
+        self.held = body.conditions.held_mask().reshape(worlds, -1)
+        # Free nodes of no element stay where they are.
+        self.free = [
+            np.flatnonzero(np.repeat(~held & (masses > 0.0), 3))
+            for held, masses in zip(self.held, body.masses.reshape(worlds, -1), strict=True)
+        ]
+        start = body.state.displacements.numpy()[:count, :3].astype(np.float64).reshape(worlds, -1, 3)
+        self.u = np.empty_like(start)
+        self.factors: list[tuple[Any, SuperLU]] = []
+        self.iterations, self.correction, self.residual = 0, 0.0, 0.0
+        for world in range(worlds):
+            self.u[world] = self._solved(world, start[world])
+        body.displacements = self.u.reshape(-1, 3)
+
+    def _solved(self, world: int, u: Array) -> Array:
+        elements, free = self.elements[world], self.free[world]
+        for number in range(ITERATIONS):
+            step = np.zeros(u.size)
+            step[free] = self._factored(world, u).solve(self._unbalanced(world, u).ravel()[free])
+            u = u + step.reshape(u.shape)
+            if not np.abs(step).max() > SMALL * np.abs(u).max():
+                self.factors.append((elements.stiffness(u), self._factored(world, u)))
+                self._measure(world, u, number + 1, np.abs(step).max())
+                return u
+        raise ConvergenceError("Newton's method in float64 does not converge from the answer of float32")
+
+    def _unbalanced(self, world: int, u: Array) -> Array:
+        """Elastic forces and loads [N], [N, 3]; reactions are their opposites."""
+        return self.elements[world].forces(u) + self._loads[world]
+
+    def _measure(self, world: int, u: Array, iterations: int, step: float) -> None:
+        left, size = self._unbalanced(world, u).ravel(), np.abs(u).max()
+        of_free = np.linalg.norm(left[self.free[world]])
+        compared = np.hypot(np.linalg.norm(self._loads[world]), np.linalg.norm(left))
+        self.iterations = max(self.iterations, iterations)
+        self.correction = max(self.correction, float(step / size) if size > 0.0 else 0.0)
+        self.residual = max(self.residual, float(of_free / compared) if compared > 0.0 else 0.0)
+
+    def _factored(self, world: int, u: Array) -> SuperLU:
+        free = self.free[world]
+        try:
+            return splu(self.elements[world].stiffness(u)[free][:, free].tocsc())
+        except RuntimeError:
+            raise ConvergenceError("the stiffness is singular: the state of rest has no gradient") from None
+
+
+def checked_host_law(body: SoftBody, law: Model) -> HostLaw:
+    """The law in float64.
+
+    Raises:
+        InputError: The law does not exist in float64.
+    """
+    found = host_law(law)
+    if found is None or not isinstance(body.material, Isotropic):
+        raise InputError(
+            "precision is 'float64'; it needs an isotropic material and Linear, Corotated, StVenantKirchhoff, "
+            "NeoHookean or EdgeStVK with biquadratic springs"
+        )
+    return found
