@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import warp_corot as wc
+from warp_corot.distributed import boxes
 from warp_corot.distributed.boxes import numbered_nodes
 from warp_corot.distributed.cutting import cut_box
 from warp_corot.distributed.partition import Partition
@@ -106,3 +107,36 @@ def test_copies_learn_their_numbers_from_those_who_move_them():
         _, nodes = part_of_mesh(mesh, dealt.needed(mesh, rank), dealt)
         np.testing.assert_array_equal(numbers, nodes)
         assert count == len(mesh.points)
+
+
+def test_a_part_is_not_taken_for_a_whole_body(monkeypatch):
+    asked = []
+
+    def alltoall(values):
+        asked.append(values)
+        return [np.zeros(0, np.int64)] * 2 if len(asked) == 1 else [np.arange(len(keys)) for keys in asked[0]]
+
+    comm = SimpleNamespace(rank=1, size=2, allgather=lambda value: [value, value], alltoall=alltoall)
+    monkeypatch.setattr(boxes.mpi, "world", lambda: comm)
+    body = wc.SoftBody(boxes.box((1, 1, 2), 0.1, 3), wc.Isotropic(1e3, 0.3, 1000.0), device="cpu")
+    np.testing.assert_allclose(body.mesh.bounds, [[0, 0, 0], [0.1, 0.1, 0.2]])
+    # Bounds are those of the whole box, of which this part has one half.
+    assert len(body.node_indices("z <= zmin")) == 0
+    assert len(body.node_indices("z >= zmax")) > 0
+    for act in (lambda: wc.Simulation(body), lambda: wc.solve_static(body)):
+        with pytest.raises(wc.InputError, match="48 of 96 elements"):
+            act()
+    with pytest.raises(wc.InputError, match="nearest needs the whole mesh"):
+        body.fix("nearest(0, 0, 0)")
+    with pytest.raises(wc.InputError, match="cannot be refined"):
+        body.mesh.refine([0])
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [({"level": 2}, "at least 3"), ({"level": 48, "cells": (9, 9, 9)}, "at most"), ({"level": 3.5}, "whole number")],
+)
+def test_bad_boxes_are_refused(given, said, monkeypatch):
+    monkeypatch.setattr(boxes.mpi, "world", lambda: SimpleNamespace(rank=0, size=1))
+    with pytest.raises(wc.InputError, match=said):
+        boxes.box(**given)

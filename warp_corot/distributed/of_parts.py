@@ -25,6 +25,7 @@ from warp_corot.mesh import TetForest
 from warp_corot.mesh.uniform_part import SUBTREE_DEPTH
 from warp_corot.simulation import simulation as on_one
 from warp_corot.simulation.energy import WorldEnergies
+from warp_corot.solvers.ranks import Ranks
 
 from . import mpi
 from .partition import Partition
@@ -103,6 +104,12 @@ def part_of(body: SoftBody, model: Model, comm: Any, costs: npt.ArrayLike | None
     return part
 
 
+class _Tried(on_one.Simulation):
+    """A rank's parts by themselves."""
+
+    ranks = Ranks()
+
+
 def compile_once(comm: Any, parts: Sequence[Part], **options: Any) -> None:
     """Let one rank of each machine compile the kernels in some steps of its parts; the others wait and then find them
     in the cache.
@@ -114,7 +121,7 @@ def compile_once(comm: Any, parts: Sequence[Part], **options: Any) -> None:
     if here.rank == 0 and free:
         with warnings.catch_warnings(), suppress(UnstableError, InputError):
             warnings.simplefilter("ignore")
-            tried = on_one.Simulation(parts, **(options | {"obstacles": of_their_own(options.get("obstacles", ()))}))
+            tried = _Tried(parts, **(options | {"obstacles": of_their_own(options.get("obstacles", ()))}))
             tried.advance_steps(1 if tried.integrator.is_implicit else TRIED_STEPS)
             tried.energy()
         for part in parts:

@@ -81,6 +81,18 @@ class ForestPart(TetForest):
         """
         raise InputError("a forest in parts cannot be refined; make it with another level")
 
+    def check_whole(self) -> None:
+        """Check that this part is the whole, as on one rank.
+
+        Raises:
+            InputError: It is not.
+        """
+        if len(self.tets) < self.element_count:
+            raise InputError(
+                f"the mesh is a part, {len(self.tets)} of {self.element_count} elements, of a box that several ranks "
+                "hold; only warp_corot.distributed.Simulation can compute it"
+            )
+
     def are_outer(self, triangles: Ints) -> npt.NDArray[np.bool_]:
         """Which triangles, int32 [F, 3], lie on the surface of the whole box; others are faces to leaves elsewhere."""
         corners = self.lattice[triangles]

@@ -28,7 +28,7 @@ def checked_bodies(given: SoftBody | Sequence[SoftBody], ranks: Ranks = ALONE) -
 
     Raises:
         InputError: There is no body, one is given twice, they have different devices or numbers of worlds, one has no
-            free node, or one is something else.
+            free node, one is a part of a body, or one is something else.
     """
     bodies = checked_things(given, SoftBody, "body", "a SoftBody")
     if not bodies:
@@ -37,6 +37,8 @@ def checked_bodies(given: SoftBody | Sequence[SoftBody], ranks: Ranks = ALONE) -
         raise InputError("a body is given twice; each must be given once")
     first = bodies[0]
     for body in bodies:
+        if ranks is ALONE:
+            check_whole(body)
         if body.worlds != first.worlds:
             raise InputError(f"bodies have {first.worlds} and {body.worlds} worlds; all must have the same number")
         if body.device != first.device:
@@ -44,6 +46,16 @@ def checked_bodies(given: SoftBody | Sequence[SoftBody], ranks: Ranks = ALONE) -
         if not ranks.most(float(body.conditions.inverse_mass.numpy().max(initial=0.0))) > 0.0:
             raise InputError(f"all {body.node_count} nodes of the body are held; at least one must be free to move")
     return bodies
+
+
+def check_whole(body: SoftBody) -> None:
+    """Check that this process holds the whole mesh of a body.
+
+    Raises:
+        InputError: It holds a part, and other processes the others.
+    """
+    if (check := getattr(body.mesh, "check_whole", None)) is not None:
+        check()
 
 
 def checked_models(given: Model | Sequence[Model], count: int) -> tuple[Model, ...]:

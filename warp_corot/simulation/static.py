@@ -20,7 +20,7 @@ from warp_corot.inputs.turns import in_turn
 from warp_corot.solvers.implicit.preconditioners import check_preconditioner
 from warp_corot.solvers.implicit.static import StaticSolver, status_words
 
-from .parts import checked_gravity, checked_models
+from .parts import check_whole, checked_gravity, checked_models
 from .resting import checked_obstacles, rest_on
 
 #: Loads on a free body balance if their sum is less than this share of the sum of their magnitudes.
@@ -113,6 +113,7 @@ def solve_static(
     began = time.perf_counter()
     if not isinstance(body, SoftBody):
         raise InputError(f"body is {shown(body)}; it must be a SoftBody")
+    check_whole(body)
     if body.changing is not None:
         raise InputError("the body is remeshed; solve_static needs a mesh that stays as it is")
     if not 0.0 < checked_number(tolerance, "tolerance") < 1.0:
