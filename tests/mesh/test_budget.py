@@ -7,6 +7,7 @@ import trimesh
 import warp_corot as wc
 from warp_corot.domain.fidelity import fidelity
 from warp_corot.mesh.growing.cut import face_pairs, without_slivers
+from warp_corot.mesh.growing.strays import strays
 
 TURN = trimesh.transformations.rotation_matrix(0.4, (1.0, 2.0, 3.0))
 
@@ -137,3 +138,15 @@ def test_a_pipe_with_a_wall_thinner_than_its_elements_stays_whole():
     assert found.pieces == 1
     assert 0.9 * 4000 < len(mesh.tets) <= 4000
     assert abs(found.volume_error) < 0.03
+
+
+def test_tips_that_hang_on_to_nothing_are_left_out_of_a_body_of_one_piece():
+    """A spike that ends in a blob of 4e-6 of the body: the elements of the blob alone are a piece."""
+    tets = np.array([[0, 1, 2, 3], [1, 2, 3, 4], [5, 6, 7, 8]], np.int32)
+    held, none = np.array([1.0, 1.0, 4.0e-6]), np.zeros(3, bool)
+    ball, balls = trimesh.creation.icosphere(2), trimesh.creation.icosphere(2).apply_translation((3.0, 0.0, 0.0))
+    one = wc.Domain.from_surface((ball.vertices, ball.faces))
+    assert strays(tets, held, none, one).tolist() == [False, False, True]
+    assert not strays(tets, held * [1.0, 1.0, 100.0], none, one).any()
+    both = trimesh.util.concatenate([ball, balls])
+    assert not strays(tets, held, none, wc.Domain.from_surface((both.vertices, both.faces))).any()

@@ -151,7 +151,7 @@ def without_slivers(tets: Array, held: Array, volume: Array, sliver: float) -> t
     if not small.any():
         return held, small
     pairs, count = face_pairs(tets), len(tets)
-    piece = _linked(pairs, count)
+    piece = linked(pairs, count)
     crumbs, held = _crumbs(tets, piece, small, held)
     if crumbs.any():
         kept = np.flatnonzero(~crumbs)
@@ -175,7 +175,7 @@ def _broken(pairs: Array, piece: Array, kept: Array, volumes: Array) -> tuple[Ar
         The mask of elements of these pieces, bool [n], and the mask of elements of their negligible parts.
     """
     count = len(piece)
-    part = _linked(pairs[kept[pairs].all(axis=1)], count)
+    part = linked(pairs[kept[pairs].all(axis=1)], count)
     sizes, held = np.bincount(part, kept), np.bincount(part, volumes)
     whole = np.bincount(piece, volumes)
     of_part = np.zeros(len(sizes), np.int64)
@@ -196,7 +196,7 @@ def _ways(pairs: Array, piece: Array, kept: Array, broken: Array) -> Array:
     found = np.zeros(count, bool)
     if not broken.any():
         return found
-    part = _linked(pairs[kept[pairs].all(axis=1)], count)
+    part = linked(pairs[kept[pairs].all(axis=1)], count)
     sizes = np.bincount(part, kept)
     largest = np.zeros(int(piece.max()) + 1, np.int64)
     by_size = np.argsort(sizes[part], kind="stable")
@@ -261,7 +261,7 @@ def face_pairs(tets: Array) -> Array:
     return np.sort(np.stack([order[:-1][same], order[1:][same]], axis=1) % len(tets), axis=1)
 
 
-def _linked(pairs: Array, count: int) -> Array:
+def linked(pairs: Array, count: int) -> Array:
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 

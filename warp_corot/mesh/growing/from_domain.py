@@ -23,6 +23,7 @@ from .detail import Detail
 from .growth import lattice_spacing
 from .judging import Field, Wishes
 from .resolved import LEAST, MOST_POINTS, Resolved, points_within
+from .strays import strays
 
 if TYPE_CHECKING:
     from warp_corot.domain import Domain
@@ -160,6 +161,7 @@ def _finished(resolved: Resolved, child: np.ndarray, domain: Domain, sliver: flo
     held, given_up = without_slivers(
         tree.leaf_tets, resolved.held[stays[leaves]], resolved.volume[stays[leaves]], sliver
     )
+    given_up |= strays(tree.leaf_tets, held, given_up, domain)
     if given_up.any():
         live = np.zeros(len(tree.level), bool)
         live[leaves[~given_up]] = True
