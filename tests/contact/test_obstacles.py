@@ -278,7 +278,7 @@ def test_worlds_have_tools_of_their_own(device):
     tool.move((0.0, 0.0, 2.0))
     tool.use_poses(poses)
     sim = wc.Simulation(body, obstacles=[ground, tool], gravity=DOWN, integrator=CALM)
-    sim.advance(0.4)
+    sim.advance(0.3)
     assert force_on(tool, 1)[2] == 0.0
     assert force_on(tool, 0)[2] > 0.0
     assert force_on(ground, 1)[2] == pytest.approx(-weight(body), rel=1e-3)

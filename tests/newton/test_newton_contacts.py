@@ -79,7 +79,7 @@ class TestGround:
         run(
             wn.SolverCorotated(model),
             model,
-            2000,
+            1200,
             2e-4,
             pipeline=pipeline,
             each=lambda s: lowest.append(float(s.particle_q.numpy()[:, 2].min())),

@@ -121,7 +121,7 @@ def test_a_sensor_reads_what_a_body_feels(device):
     add_grid(made, dims=(2, 2, 2), pos=(0.0, 0.0, 0.1099), damp=200.0)
     model = made.finalize(device=device)
     contact_parameters(model, mu=0.8, kf=1e5)
-    state, contacts, observables = drop(model, 1500, damping=20.0, **FULL)
+    state, contacts, observables = drop(model, 1000, damping=20.0, **FULL)
     mass = float(model.particle_mass.numpy().sum())
     for chosen in ({"sensing_bodies": "pla*"}, {"sensing_shapes": ["top"]}, {"sensing_bodies": [0]}):
         sensor = wn.SensorSoftContact(model, **chosen)
