@@ -305,6 +305,18 @@ class TestNotes:
         assert made.ground is None
 
 
+def test_a_value_of_an_unknown_type_is_refused(tmp_path):
+    made = StageMaker(tmp_path / "in.usda")
+    made.material(made.block(at=(-0.1, -0.1, 0.02)))
+    made.box(at=(0.02, 0.0, 0.5))
+    text = made.save().read_text()
+    assert "float physics:mass" in text
+    damaged = tmp_path / "damaged.usda"
+    damaged.write_text(text.replace("float physics:mass", "oat physics:mass"))
+    with pytest.raises(wc.InputError, match=r"damaged\.usda: Newton cannot read it: must be real number"):
+        parts(damaged)
+
+
 def test_no_file_that_the_input_is_made_of_is_written_over(tmp_path, capsys):
     below = block(tmp_path / "below.usda")
     kept = below.read_bytes()

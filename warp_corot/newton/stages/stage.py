@@ -154,6 +154,8 @@ def _add_usd(builder: newton.ModelBuilder, scene: Scene) -> dict[str, Any]:
             raise InputError("Newton reads stages with newton-usd-schemas: pip install newton-usd-schemas") from None
         except (RuntimeError, ValueError) as error:
             raise InputError(f"{scene.path}: {first_message(str(error))}") from None
+        except Exception as error:  # of a value that Newton does not expect, such as one of an unknown type
+            raise InputError(f"{scene.path}: Newton cannot read it: {first_message(str(error))}") from None
     for message in dict.fromkeys(str(warning.message) for warning in said):
         if not _SEEN_TO.search(message):
             warnings.warn(message, UserWarning, stacklevel=3)
