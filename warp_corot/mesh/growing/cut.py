@@ -147,17 +147,26 @@ def without_slivers(tets: Array, held: Array, volume: Array, sliver: float) -> t
     Returns:
         The new volumes of the body in elements, and the mask of elements that are given up.
     """
-    small = held < sliver * volume
+    least = sliver * volume
+    if (held >= least).all():
+        return held, np.zeros(len(tets), bool)
+    return _without(tets, face_pairs(tets), held, least)
+
+
+def _without(tets: Array, pairs: Array, held: Array, least: Array) -> tuple[Array, Array]:
+    """`without_slivers` by the pairs that share a face [m, 2], with the least volume for each element [n]."""
+    small, count = held < least, len(tets)
     if not small.any():
         return held, small
-    pairs, count = face_pairs(tets), len(tets)
     piece = linked(pairs, count)
     crumbs, held = _crumbs(tets, piece, small, held)
     if crumbs.any():
         kept = np.flatnonzero(~crumbs)
         given_up = crumbs.copy()
         volumes = np.zeros(count)
-        volumes[kept], given_up[kept] = without_slivers(tets[kept], held[kept], volume[kept], sliver)
+        number = np.cumsum(~crumbs) - 1
+        rest = number[pairs[~crumbs[pairs].any(axis=1)]]
+        volumes[kept], given_up[kept] = _without(tets[kept], rest, held[kept], least[kept])
         return volumes, given_up
     volumes, given_up = merged(pairs, held, small)
     broken, small_parts = _broken(pairs, piece, ~given_up, volumes)
