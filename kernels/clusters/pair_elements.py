@@ -186,8 +186,11 @@ def second_scale(pairs: GeneralPairs, record: general_record):
 
 
 @functools.cache
-def pair_forces(law: wp.Function) -> wp.Function:
-    """Forces on the five nodes of the i-th pair from their displacements, by a law of ``laws``."""
+def pair_forces(law: wp.Function, given: bool = False) -> wp.Function:
+    """Forces on the five nodes of the i-th pair from their displacements, by a law of ``laws``.
+
+    If ``given``, the law takes one more number, which the caller has for each element.
+    """
 
     @wp.func
     def pair_forces(
@@ -201,16 +204,24 @@ def pair_forces(law: wp.Function) -> wp.Function:
         uc: wp.vec3,
         ud: wp.vec3,
         ue: wp.vec3,
+        first: float,
+        second: float,
     ):
         e1 = scaled_difference(pairs, ub - ua)
         e2 = scaled_difference(pairs, uc - ua)
         b = first_matrix(record)
         w = wp.matrix_from_cols(e1, e2, scaled_difference(pairs, ud - ua)) * b
-        h = law(material, listed, 2 * i, first_scale(pairs, record), w) * wp.transpose(b)
+        if wp.static(given):
+            h = law(material, listed, 2 * i, first_scale(pairs, record), w, first) * wp.transpose(b)
+        else:
+            h = law(material, listed, 2 * i, first_scale(pairs, record), w) * wp.transpose(b)
         f1, f2, f3 = -column(h, 0), -column(h, 1), -column(h, 2)
         b = second_matrix(record)
         w = wp.matrix_from_cols(e1, e2, scaled_difference(pairs, ue - ua)) * b
-        h = law(material, listed, 2 * i + 1, second_scale(pairs, record), w) * wp.transpose(b)
+        if wp.static(given):
+            h = law(material, listed, 2 * i + 1, second_scale(pairs, record), w, second) * wp.transpose(b)
+        else:
+            h = law(material, listed, 2 * i + 1, second_scale(pairs, record), w) * wp.transpose(b)
         f1 -= column(h, 0)
         f2 -= column(h, 1)
         f4 = -column(h, 2)

@@ -86,18 +86,35 @@ def fetch_number(numbers: wp.array[wp.int32], i: int): ...
 
 
 @functools.cache
-def scatter_pairs(Pairs: type, Material: type, law: wp.Function, layout: PairLayout) -> wp.Kernel:
+def fetch_records(Pairs: type) -> wp.Function:
+    """Fetch the node and the record of the i-th thread, if there is one."""
+    quads = {LatticePairs: LATTICE_WORDS // 4, GeneralPairs: GENERAL_WORDS // 4}[Pairs]
+
+    @wp.func
+    def fetch_records(clusters: PairClusters, pairs: Pairs, i: int):
+        if i < clusters.nodes.shape[0]:
+            fetch_number(clusters.nodes, i)
+            for k in range(wp.static(quads)):
+                fetch_quad(pairs.records, k * pairs.count + i)
+
+    return fetch_records
+
+
+@functools.cache
+def scatter_pairs(
+    Pairs: type, Material: type, law: wp.Function, layout: PairLayout, given: wp.Function | None = None
+) -> wp.Kernel:
     """Add the nodal forces of a law to f; launch with block_dim ``layout.threads`` and whole blocks.
 
     Args:
         Pairs: ``LatticePairs`` or ``GeneralPairs``, in the order of the clusters, one for each thread.
         Material: The material of a law; law: a function of ``laws`` that takes it.
+        given: Looks up a number that the law takes of the i-th element, early.
     """
     threads, zero = layout.threads, layout.zero
-    quads_of = {LatticePairs: LATTICE_WORDS // 4, GeneralPairs: GENERAL_WORDS // 4}
     displacement = shared_quads(threads, "displacements")
     slot = shared_quads(zero + BANK_GROUPS, "forces")
-    forces, sum_of = pair_forces(law), slot_sum(slot, zero)
+    forces, sum_of, fetch = pair_forces(law, given is not None), slot_sum(slot, zero), fetch_records(Pairs)
 
     # Code out of line runs rarely and must not take registers from the rest.
     @unique_kernel(grid_stride=False, launch_bounds=(threads, layout.resident))
@@ -115,13 +132,16 @@ def scatter_pairs(Pairs: type, Material: type, law: wp.Function, layout: PairLay
         node = number_of(clusters.nodes, i)
         record = record_of(pairs, i)
         words = quad_of(clusters.slots, i)
+        first = float(0.0)
+        second = float(0.0)
+        if wp.static(given is not None):
+            first = given(material, 2 * i)
+            second = given(material, 2 * i + 1)
         if wp.static(layout.ahead > 0):
             later = i + wp.static(layout.ahead * threads)
+            fetch(clusters, pairs, later)
             if later < clusters.nodes.shape[0]:
-                fetch_number(clusters.nodes, later)
                 fetch_quad(clusters.slots, later)
-                for k in range(wp.static(quads_of[Pairs])):
-                    fetch_quad(pairs.records, k * pairs.count + later)
         at = wp.static(QUAD_BYTES) * thread
         if node >= 0:
             displacement(wp.static(STORE), at, vector_of(u, node))
@@ -139,6 +159,8 @@ def scatter_pairs(Pairs: type, Material: type, law: wp.Function, layout: PairLay
             displacement(wp.static(LOAD), half_word(record, 2), wp.vec3()),
             displacement(wp.static(LOAD), half_word(record, 3), wp.vec3()),
             displacement(wp.static(LOAD), half_word(record, 4), wp.vec3()),
+            first,
+            second,
         )
         slot(wp.static(STORE), at, fa)
         slot(wp.static(STORE), at + wp.static(QUAD_BYTES * threads), fb)

@@ -6,7 +6,7 @@ import numpy as np
 import oracle
 import pytest
 import warp as wp
-from pairs import add_forces
+from pairs import add_dilatations, add_forces
 
 import warp_corot as wc
 from warp_corot.discretization.clusters.pairing import paired
@@ -172,6 +172,25 @@ def test_pairs_that_have_moved_far_keep_their_digits(ball, moved, of_forest, dev
     add_forces(scatter, material, u, f)
     wanted = wanted_forces(ball, far[:, :3].astype(np.float64), np.ones(len(ball.tets)))
     assert np.abs(f.numpy()[:, :3] - wanted).max() < 2e-6 * np.abs(wanted).max()
+
+
+@pytest.mark.parametrize("of_forest", [True, False])
+@pytest.mark.parametrize("stride", [0, 1])
+def test_pairs_measure_their_groups(ball, moved, of_forest, stride, device, rng):
+    """Means of J - 1, weighted by lambda and volume, of groups whose elements lie anywhere."""
+    mesh = ball if of_forest else wc.TetMesh(ball.points, ball.tets)
+    scatter = ClusterScatter(device_elements(mesh, wp.get_device(device)), isotropic_law(corotated_stress))
+    group_of = rng.permutation(len(ball.tets)) // 9
+    lam = LAM * rng.uniform(0.5, 2.0, len(ball.tets)) if stride else np.full(1, LAM)
+    listed = wp.array(group_of[scatter.clusters.elements.numpy()], dtype=wp.int32, device=device)
+    sums = wp.zeros(int(group_of.max()) + 1, dtype=wp.vec4, device=device)
+    u = wp.array(in_four(moved), dtype=wp.vec4, device=device)
+    add_dilatations(scatter, listed, stride, wp.array(lam, dtype=wp.float32, device=device), u, sums)
+    F = oracle.Mesh(ball.points, ball.tets).deformation_gradients(ball.points + moved)
+    weight = lam * ball.volumes
+    theta = np.bincount(group_of, weight * (np.linalg.det(F) - 1)) / np.bincount(group_of, weight)
+    found = sums.numpy()[:, 0] / sums.numpy()[:, 1]
+    assert np.abs(found - theta).max() < 1e-5 * np.abs(theta).max()
 
 
 @pytest.mark.parametrize("shuffled", [False, True])

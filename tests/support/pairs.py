@@ -7,6 +7,8 @@ import warp as wp
 
 from warp_corot.kernels.clusters.pair_elements import half_word, pair_forces, record_of
 from warp_corot.kernels.clusters.pairs import PairClusters
+from warp_corot.kernels.clusters.sharing import add_pair, measure_pairs, pair_dilatations
+from warp_corot.kernels.elements.dilatation import VOLUME
 from warp_corot.kernels.elements.elements import load_node
 from warp_corot.kernels.tables.cluster_layout import QUAD_BYTES
 
@@ -25,6 +27,49 @@ def add_forces(scatter, material, u, f):
     found = f.numpy()
     np.add.at(found[:, :3], nodes.numpy(), forces.numpy())
     f.assign(found)
+
+
+def add_dilatations(scatter, listed, stride, lam, u, sums):
+    """Add up what groups share; on a CPU as above."""
+    threads = scatter.layout.threads
+    inputs = [scatter.clusters, scatter.pairs, listed, stride, lam, u]
+    kernel = measure_pairs(scatter.Pairs, VOLUME, scatter.layout)
+    if not u.device.is_cuda:
+        inputs.append(threads)
+        kernel = dilatations_of_pairs(scatter.Pairs)
+    wp.launch(kernel, scatter.count * threads, inputs, [sums], device=u.device, block_dim=threads)
+
+
+@functools.cache
+def dilatations_of_pairs(Pairs):
+    dilatations = pair_dilatations(VOLUME)
+
+    @wp.kernel(module="unique")
+    def dilatations_of_pairs(
+        clusters: PairClusters,
+        pairs: Pairs,
+        groups: wp.array[wp.int32],
+        stride: int,
+        lam: wp.array[wp.float32],
+        u: wp.array[wp.vec4],
+        size: int,
+        sums: wp.array[wp.vec4],
+    ):
+        i = wp.tid()
+        record = record_of(pairs, i)
+        begin = i // size * size
+        theta, other = dilatations(
+            pairs,
+            record,
+            load_node(u, clusters.nodes[begin + half_word(record, 0) // wp.static(QUAD_BYTES)]),
+            load_node(u, clusters.nodes[begin + half_word(record, 1) // wp.static(QUAD_BYTES)]),
+            load_node(u, clusters.nodes[begin + half_word(record, 2) // wp.static(QUAD_BYTES)]),
+            load_node(u, clusters.nodes[begin + half_word(record, 3) // wp.static(QUAD_BYTES)]),
+            load_node(u, clusters.nodes[begin + half_word(record, 4) // wp.static(QUAD_BYTES)]),
+        )
+        add_pair(clusters, pairs, record, groups[2 * i], groups[2 * i + 1], stride, lam, i, theta, other, sums)
+
+    return dilatations_of_pairs
 
 
 @functools.cache
@@ -56,6 +101,8 @@ def forces_of_pairs(Pairs, Material, law):
             load_node(u, nodes[i, 2]),
             load_node(u, nodes[i, 3]),
             load_node(u, nodes[i, 4]),
+            0.0,
+            0.0,
         )
         forces[i, 0] = fa
         forces[i, 1] = fb

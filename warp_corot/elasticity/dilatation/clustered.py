@@ -8,15 +8,11 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.discretization.elements import Elements
 from warp_corot.elasticity.paths.clusters import SUBTREE, ClusterScatter
 from warp_corot.elasticity.structs import Kept
-from warp_corot.kernels.clusters.sharing import LANES, SharingMaterial, find_pressures, sharing_law
+from warp_corot.kernels.clusters.sharing import SharingMaterial, measure_pairs, shared_pressure, sharing_law
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import Dilatation
-
-#: Threads of a block that finds pressures.
-BLOCK = 128
 
 
 class ClusteredGroups:
@@ -25,8 +21,7 @@ class ClusteredGroups:
 
     Args:
         scatter: Adds the forces.
-        elements: All elements of the mesh.
-        kind: Their struct.
+        elements: How many elements the mesh has.
         batches: Groups as ``kernels.elements.shared_dilatation.share_in_groups`` takes them, and how many; together
             they have all elements that the clusters have.
         of: The shared dilatation.
@@ -36,38 +31,35 @@ class ClusteredGroups:
     def __init__(
         self,
         scatter: ClusterScatter,
-        elements: Elements,
-        kind: type,
+        elements: int,
         batches: Sequence[tuple[wp.array, wp.array, wp.array, int]],
         of: Dilatation,
         lam: Callable[[], wp.array],
     ):
-        self._elements, self._lam, self._device = elements, lam, elements.nodes.device
+        self._scatter, self._lam, self._device = scatter, lam, scatter.clusters.elements.device
         parts = [_members_of(*batch) for batch in batches]
         members, sizes = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-        group_of = np.zeros(len(elements.nodes), np.int32)
+        group_of = np.zeros(elements, np.int32)
         group_of[members] = np.repeat(np.arange(len(sizes)), sizes)
         listed = group_of[scatter.clusters.elements.numpy()]
-        starts = np.concatenate([[0], np.cumsum(sizes)])
-        self._starts, self._members, self._listed = (
-            wp.array(values, dtype=wp.int32, device=self._device) for values in (starts, members, listed)
-        )
-        self._pressures = wp.zeros(len(sizes), dtype=wp.float32, device=self._device)
-        self._kernel = find_pressures(kind, of)
+        self._listed = wp.array(listed, dtype=wp.int32, device=self._device)
+        self._sums = wp.zeros(len(sizes), dtype=wp.vec4, device=self._device)
+        self._kernel = measure_pairs(scatter.Pairs, of, scatter.layout)
         made = Kept(_sharing_material)
         scatter.use_law(
             sharing_law(scatter.law, of),
             SharingMaterial,
-            lambda isotropic: made(isotropic, lam(), self._listed, self._pressures),
+            shared_pressure(of),
+            lambda isotropic: made(isotropic, lam(), self._listed, self._sums),
         )
 
-    def find_pressures(self, stride: int, u: wp.array) -> None:
-        """Launch the kernel that finds the groups' pressures at displacements u, before the forces; ``stride`` is
-        lambda's.
-        """
-        blocks = -(-LANES * len(self._pressures) // BLOCK)
-        inputs = [self._starts, self._members, self._elements, stride, self._lam(), u]
-        wp.launch(self._kernel, blocks * BLOCK, inputs, [self._pressures], device=self._device, block_dim=BLOCK)
+    def add_up(self, stride: int, u: wp.array) -> None:
+        """Launch the sums of the groups' dilatation at displacements u, before the forces; ``stride`` is lambda's."""
+        scatter, threads = self._scatter, self._scatter.layout.threads
+        self._sums.zero_()
+        inputs = [scatter.clusters, scatter.pairs, self._listed, stride, self._lam(), u]
+        size = scatter.count * threads
+        wp.launch(self._kernel, size, inputs, [self._sums], device=self._device, block_dim=threads)
 
 
 def _members_of(
@@ -80,9 +72,7 @@ def _members_of(
     return (begins[:count, None] + np.arange(SUBTREE, dtype=np.int32)).ravel(), np.full(count, SUBTREE, np.int32)
 
 
-def _sharing_material(
-    isotropic: IsotropicMaterial, lam: wp.array, groups: wp.array, pressures: wp.array
-) -> SharingMaterial:
+def _sharing_material(isotropic: IsotropicMaterial, lam: wp.array, groups: wp.array, sums: wp.array) -> SharingMaterial:
     material = SharingMaterial()
-    material.isotropic, material.lam, material.groups, material.pressures = isotropic, lam, groups, pressures
+    material.isotropic, material.lam, material.groups, material.sums = isotropic, lam, groups, sums
     return material

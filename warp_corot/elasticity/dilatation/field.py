@@ -92,7 +92,7 @@ class DilatationField(ForceField):
         there = [batch for batch in self.plan.batches if not any(batch is other for other in kept)]
         self._kept, self._others.are_joined = kept, True
         batches = self._of_subtrees(there) + self._others.groups
-        return ClusteredGroups(scatter, self.elements, self.kind, batches, self.of, lambda: self.discretization.lam)
+        return ClusteredGroups(scatter, len(self.elements.nodes), batches, self.of, lambda: self.discretization.lam)
 
     @property
     def _batches(self) -> Sequence[Batch]:
@@ -130,7 +130,7 @@ class DilatationField(ForceField):
     # --- forces ------------------------------------------------------------------------------------------------------
 
     def add_forces(self, u: wp.array, f: wp.array) -> None:
-        self._find_pressures(u)
+        self._add_up(u)
         self.shear.add_forces(u, f)
         if self.slots is None:
             self._scatter(u, f)
@@ -140,13 +140,13 @@ class DilatationField(ForceField):
             self.slots.gather(f)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        self._find_pressures(u)
+        self._add_up(u)
         self.shear.scatter_forces(u, f)
         self._scatter(u, f)
 
-    def _find_pressures(self, u: wp.array) -> None:
+    def _add_up(self, u: wp.array) -> None:
         if self._clustered is not None:
-            self._clustered.find_pressures(self.discretization.material_stride, u)
+            self._clustered.add_up(self.discretization.material_stride, u)
 
     def _scatter(self, u: wp.array, f: wp.array) -> None:
         for batch in self._batches:

@@ -120,12 +120,12 @@ class ClusterScatter:
         self._kernel = scatter_pairs(self.Pairs, Material, law, self.layout)
         self._wrapped: Callable[[Any], Any] | None = None
 
-    def use_law(self, law: wp.Function, Material: type, wrapped: Callable[[Any], Any]) -> None:
+    def use_law(self, law: wp.Function, Material: type, given: wp.Function, wrapped: Callable[[Any], Any]) -> None:
         """Add from now on the forces of a law that needs more registers; its material is made of the one that callers
         give.
         """
         self.layout = replace(self.layout, resident=self.layout.resident - 1)
-        self._kernel, self._wrapped = scatter_pairs(self.Pairs, Material, law, self.layout), wrapped
+        self._kernel, self._wrapped = scatter_pairs(self.Pairs, Material, law, self.layout, given), wrapped
 
     def __call__(self, material: IsotropicMaterial | ActiveMaterial, u: wp.array, f: wp.array) -> None:
         """Add the forces [N] of displacements u to f, both vec4 [N]; ``material`` is what the law takes."""
