@@ -158,6 +158,11 @@ def test_a_port_that_is_taken_is_one_clear_line(opened):
         View(block(level=3), port=99999)
     with pytest.raises(wc.InputError, match="it must be an address of this computer"):
         View(block(level=3), host="no.such.host.invalid", token="word", port=0)
+    for wrong, said in (({"port": "a"}, "port is 'a'"), ({"host": 5}, "host is 5"), ({"token": 5}, "token is 5")):
+        with pytest.raises(wc.InputError, match=said):
+            View(block(level=3), **wrong)
+    with pytest.raises(wc.InputError, match="wait is 'x'"):
+        wc.view(block(level=3), wait="x")
 
 
 def test_without_viser_the_page_says_what_to_install(monkeypatch):

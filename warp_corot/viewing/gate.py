@@ -21,6 +21,7 @@ from typing import Any
 from urllib.parse import parse_qs, quote, urlsplit
 
 from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_count, shown
 
 #: Names by which a browser may address its own computer.
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
@@ -31,7 +32,13 @@ _starting = threading.Lock()
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address can be reached only from this computer."""
+    """Whether an address can be reached only from this computer.
+
+    Raises:
+        InputError: It is no text.
+    """
+    if not isinstance(host, str):
+        raise InputError(f"host is {shown(host)}; it must be an address of this computer")
     try:
         return ip_address(host.strip("[]")).is_loopback
     except ValueError:
@@ -55,8 +62,9 @@ class Gate:
     """
 
     def __init__(self, host: str, token: str | None = None):
-        if token is not None and not token.strip():
-            raise InputError("token is empty; it must be a word that only those know who may come in")
+        if token is not None and not (isinstance(token, str) and token.strip()):
+            given = "empty" if isinstance(token, str) else shown(token)
+            raise InputError(f"token is {given}; it must be a word that only those know who may come in")
         if token is None and not is_loopback(host):
             raise InputError(f"host is {host}, which others can reach; it must have a token")
         self.host, self.token = host, token
@@ -162,7 +170,7 @@ def check_port(host: str, port: int) -> None:
     Raises:
         InputError: It is not, or this computer does not have the address.
     """
-    if not 0 <= port <= 65535:
+    if checked_count(port, "port", least=0) > 65535:
         raise InputError(f"port is {port}; it must be 0 to 65535")
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
