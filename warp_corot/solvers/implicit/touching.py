@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 #: Linear solves of a step at most.
 ROUNDS = 16
 #: A solve ends at this share of its first residual, because contact may change after it.
-SHARE = 0.05
+SHARE = 0.15
 #: A step is solved for if the residual of a solve begins at less than this many times the tolerance.
 SETTLED = 10.0
 
