@@ -23,7 +23,7 @@ from warp_corot.kernels.elements.elements import FRAME_SHIFT, LEVEL_MASK, Subtre
 from warp_corot.kernels.math.matrices import column, identity3
 from warp_corot.kernels.math.quaternion import robust_rotation
 from warp_corot.kernels.modules import unique_kernel
-from warp_corot.kernels.subtrees.dilatation import dilatation_sums_of, pressure_forces_of
+from warp_corot.kernels.subtrees.dilatation import dilatation_sums_of, dilating_forces_of, pressure_forces_of
 from warp_corot.kernels.subtrees.forces import columns_of, leaf_forces_of, mat10, near_forces, shared_forces
 from warp_corot.kernels.subtrees.laws import turn_in, turn_out
 from warp_corot.kernels.tables.block_layout import (
@@ -231,6 +231,9 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
     dilating, of = layout.dilating, VOLUME_CHANGE
     slope_of = of.slope
     measure = [dilatation_sums_of(shape, uniform, of, layout.leaves(part)) for part in range(parts)]
+    # All in one pass, after a first one for the sums where two threads have them.
+    at_once = dilating and not shared and layout.tolerance is None
+    dilate = [dilating_forces_of(shape, uniform, layout.leaves(part)) for part in range(parts)]
     press = [pressure_forces_of(shape, uniform, of, layout.leaves(part)) for part in range(parts)]
     sums = shared_numbers(max(layout.sum_count, 1), "sums of dilatations")
     waiting, enlist, do_one, collect = _left_out_of(layout, displacement, slot)
@@ -299,6 +302,23 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
         step = int(0)
         while step < steps:
             left_out = int(0)
+            if wp.static(at_once and parts > 1):
+                if s < body.subtree_count:
+                    for p in range(wp.static(parts)):
+                        if part == p:
+                            x = mat10()
+                            for k in range(10):
+                                if wp.static(needs[p][k]):
+                                    x[k] = displacement(
+                                        wp.static(LOAD_BYTES),
+                                        number_in(words[k // wp.static(NUMBERS)], k % wp.static(NUMBERS)),
+                                        wp.vec3(),
+                                    )
+                            y = turn_in(x, column(q, 0), column(q, 1), column(q, 2) * mirror, 1.0 / h)
+                            sum, weight = wp.static(measure[p])(y, shared_lam, material)
+                            sums(wp.static(STORE), wp.static(2 * p * capacity) + s, sum)
+                            sums(wp.static(STORE), wp.static((2 * p + 1) * capacity) + s, weight)
+                synchronize_block()
             if s < body.subtree_count:
                 for p in range(wp.static(parts)):
                     if part == p:
@@ -310,13 +330,29 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
                                     number_in(words[k // wp.static(NUMBERS)], k % wp.static(NUMBERS)),
                                     wp.vec3(),
                                 )
-                        if wp.static(dilating):
+                        if wp.static(dilating and not at_once):
                             y = turn_in(x, column(q, 0), column(q, 1), column(q, 2) * mirror, 1.0 / h)
                             sum, weight = wp.static(measure[p])(y, shared_lam, material)
                             sums(wp.static(STORE), wp.static(2 * p * capacity) + s, sum)
                             sums(wp.static(STORE), wp.static((2 * p + 1) * capacity) + s, weight)
                         g = mat10()
-                        if wp.static(shared):
+                        if wp.static(at_once):
+                            q0 = column(q, 0)
+                            q1 = column(q, 1)
+                            q2 = column(q, 2) * mirror
+                            y = turn_in(x, q0, q1, q2, 1.0 / h)
+                            sum = float(0.0)
+                            weight = float(0.0)
+                            if wp.static(parts == 1):
+                                sum, weight = wp.static(measure[p])(y, shared_lam, material)
+                            else:
+                                for other in range(wp.static(parts)):
+                                    sum += sums(wp.static(LOAD), wp.static(2 * other * capacity) + s, sum)
+                                    weight += sums(wp.static(LOAD), wp.static((2 * other + 1) * capacity) + s, weight)
+                            pressure = slope_of(mean_of(sum, weight))
+                            g, left_out = wp.static(dilate[p])(y, h, pressure, mu, shared_lam, material)
+                            g = turn_out(g, q0, q1, q2)
+                        elif wp.static(shared):
                             g, left_out = wp.static(turned[p])(x, q, h, mirror, wp.mat33(), mu, lam, material)
                         else:
                             g, left_out = wp.static(own[p])(x, q, h, mirror, mu, lam, material)
@@ -333,7 +369,7 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
                     waiting(wp.static(CLEAR), 0, 0)
                 synchronize_block()
                 listed = enlist(thread, left_out)
-            if wp.static(dilating):
+            if wp.static(dilating and not at_once):
                 if s < body.subtree_count:
                     sum = float(0.0)
                     weight = float(0.0)

@@ -9,7 +9,9 @@ import functools
 
 import warp as wp
 
+from warp_corot.kernels.corotated.algebraic import stretch_stress
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
+from warp_corot.kernels.elements.dilatation import VOLUME as VOLUME_CHANGE
 from warp_corot.kernels.elements.dilatation import Dilatation, mean_of, pressure_stress_of
 from warp_corot.kernels.elements.dilatation_lanes import law_of
 from warp_corot.kernels.elements.elements import FRAME_SHIFT, LEVEL_MASK, Subtrees, mirror_sign
@@ -102,6 +104,53 @@ def pressure_forces_of(shape: int, uniform: bool, of: Dilatation, chosen: range 
         return g
 
     return pressure_forces
+
+
+@functools.cache
+def dilating_forces_of(shape: int, uniform: bool, chosen: range = range(8)) -> wp.Function:
+    """Corotated forces and those of the pressure in one pass; as ``pressure_forces_of``, and which leaves are left out.
+
+    Of these, too, there are the forces of the pressure.
+    """
+    pressure_stress, columns, leaf_forces = pressure_stress_of(VOLUME_CHANGE), columns_of(shape), leaf_forces_of(shape)
+    leaves, volume, begin, end = LEAVES[shape], VOLUME[shape], chosen.start, chosen.stop
+    into_leaf, out_of_leaf = turns_of(shape)
+
+    @wp.func
+    def dilating_forces(
+        y: mat10, h: float, pressure: float, mu: wp.array[wp.float32], lam: wp.array[wp.float32], first: int
+    ):
+        _generated_from = wp.static(fingerprint(leaves, begin, end))
+        # P V / h is the stress times this.
+        area = wp.static(volume) * h * h
+        m = area * mu[first]
+        k = area * lam[first]
+        g = mat10()
+        left_out = int(0)
+        for leaf in range(wp.static(begin), wp.static(end)):
+            if wp.static(not uniform):
+                m = area * mu[first + leaf]
+                k = area * lam[first + leaf]
+            b0, b1, b2 = columns(
+                y[wp.static(leaves[leaf][0])],
+                y[wp.static(leaves[leaf][1])],
+                y[wp.static(leaves[leaf][2])],
+                y[wp.static(leaves[leaf][3])],
+            )
+            a = into_leaf(leaf, wp.matrix_from_cols(b0, b1, b2))
+            sigma, trusted = stretch_stress(a, m, 0.0)
+            if not trusted:
+                sigma = wp.mat33()
+                left_out |= wp.static(1 << leaf)
+            p = out_of_leaf(leaf, sigma + pressure_stress(a, pressure, k))
+            f0, f1, f2, f3 = leaf_forces(column(p, 0), column(p, 1), column(p, 2))
+            g[wp.static(leaves[leaf][0])] += f0
+            g[wp.static(leaves[leaf][1])] += f1
+            g[wp.static(leaves[leaf][2])] += f2
+            g[wp.static(leaves[leaf][3])] += f3
+        return g, left_out
+
+    return dilating_forces
 
 
 @functools.cache
