@@ -35,8 +35,9 @@ from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.tables.subtree import GROUP_NODES, SLOT_STRIDE, group_slots, group_sources
 
 from .forces import leaf_stress, mat10, near_forces, shared_forces
-from .in_warps import is_mostly_left_out, scatter_in_warp, scatter_one_by_one
+from .in_warps import is_mostly_left_out, scatter_one_by_one
 from .left_out import WARP, LeftOut, append, list_of, reserve
+from .pooled import scatter_in_block
 
 wp.set_module_options({"enable_backward": False})
 
@@ -238,8 +239,8 @@ def scatter_subtrees_own(
 
 
 @functools.cache
-def scatter_subtrees_in_warps(shape: int, grouped: bool, uniform: bool, tolerance: float | None = None) -> wp.Kernel:
-    """As ``scatter_subtrees_own``, and each warp does the leaves that it left out itself, a thread a leaf.
+def scatter_subtrees_in_blocks(shape: int, grouped: bool, uniform: bool, tolerance: float | None = None) -> wp.Kernel:
+    """As ``scatter_subtrees_own``, and each block does the leaves that it left out itself, a thread a leaf.
 
     That saves a launch and the list, and pays in bodies of up to some millions of elements. Launch with block_dim
     BLOCK.
@@ -252,7 +253,7 @@ def scatter_subtrees_in_warps(shape: int, grouped: bool, uniform: bool, toleranc
         grid_stride=False,
         launch_bounds=(BLOCK, resident),
     )
-    def scatter_subtrees_in_warps(
+    def scatter_subtrees_in_blocks(
         # In
         elements: ForestElements,
         subtrees: Subtrees,
@@ -277,10 +278,10 @@ def scatter_subtrees_in_warps(shape: int, grouped: bool, uniform: bool, toleranc
             g, mask = forces(x, q, h, mirror, material.mu, material.lam, leaf)
             add(subtrees, s, g, f)
         to_come = subtrees.code.shape[0] - s
-        mask = scatter_in_warp(elements, subtrees.first[s], mask, mostly, to_come, material, u, f)
+        mask = scatter_in_block(elements, subtrees.first[s], mask, mostly, to_come, material, u, f)
         flagged[s] = wp.uint8(mask)
 
-    return scatter_subtrees_in_warps
+    return scatter_subtrees_in_blocks
 
 
 @functools.cache

@@ -15,7 +15,7 @@ import warp_corot as wc
 from warp_corot.discretization.planning.fixed import ForcePlan
 from warp_corot.elasticity.corotated.left_out import LeftOutLeaves
 from warp_corot.elasticity.structs import isotropic_material
-from warp_corot.kernels.subtrees.cuda import BLOCK, scatter_subtrees_in_warps
+from warp_corot.kernels.subtrees.cuda import BLOCK, scatter_subtrees_in_blocks
 from warp_corot.kernels.subtrees.left_out import COUNT_STRIDE, LISTS
 
 TOLERANCE = 1e-5  # of the largest force, as in test_miscompile
@@ -102,7 +102,7 @@ def test_one_bad_leaf_is_left_out_alone(device, rng):
 
 
 @pytest.mark.parametrize("share", [0.1, 1.0])
-def test_leaves_that_a_warp_does_itself(share, device, rng):
+def test_leaves_that_a_block_does_itself(share, device, rng):
     """A body of one type of subtree, in two evaluations: the second knows what the first left out."""
     forest = wc.TetForest.box((2, 1, 1), 0.1, 9)
     body = wc.SoftBody(forest, wc.Isotropic(1e4, 0.4, 1000.0), device=device)
@@ -120,7 +120,7 @@ def test_leaves_that_a_warp_does_itself(share, device, rng):
     for _ in range(2):
         f = wp.zeros_like(body.state.displacements)
         inputs = [own.elements, batch.subtrees, material, body.state.displacements]
-        kernel = scatter_subtrees_in_warps(batch.shape, False, True)
+        kernel = scatter_subtrees_in_blocks(batch.shape, False, True)
         wp.launch(kernel, batch.count, inputs, [f, batch.flagged], device=body.device, block_dim=BLOCK)
         assert np.abs(f.numpy()[:, :3] - forces)[sound].max() < TOLERANCE * np.abs(forces).max()
         assert (batch.flagged.numpy()[: batch.count] != 0).mean() > 0.5 * share

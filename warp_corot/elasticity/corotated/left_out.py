@@ -38,10 +38,10 @@ class LeftOutLeaves:
         self._device = device
 
     @classmethod
-    def of(cls, plan: Plan, device: wp.Device, *, in_warps: bool = False) -> LeftOutLeaves:
+    def of(cls, plan: Plan, device: wp.Device, *, in_blocks: bool = False) -> LeftOutLeaves:
         """The lists of a plan; leaves with own rotations have none if warps compute them at once."""
         own = [batch.count for batch in plan.batches if batch.sharing is Sharing.OWN]
-        own = [] if in_warps else [*own, len(plan.flat)]
+        own = [] if in_blocks else [*own, len(plan.flat)]
         return cls(own, [batch for batch in plan.batches if batch.sharing is Sharing.ROOT], device)
 
     @staticmethod

@@ -19,7 +19,7 @@ from warp_corot.kernels.subtrees.cuda import (
     FLAT,
     Stretch,
     scatter_stretches,
-    scatter_subtrees_in_warps,
+    scatter_subtrees_in_blocks,
     scatter_subtrees_own,
 )
 from warp_corot.kernels.subtrees.left_out import LeftOut
@@ -29,15 +29,15 @@ from warp_corot.kernels.subtrees.left_out import LeftOut
 UNIFORM_LEAVES = 1 << 18
 
 
-#: Number of leaves in subtrees below which each warp computes the leaves that it leaves out. H200, without inverted
+#: Number of leaves in subtrees below which each block computes the leaves that it leaves out. H200, without inverted
 #: leaves, with one, and with some in a twentieth of the subtrees: 26.5, 26.6 and 38.7 us for 1.57 million leaves, by a
 #: list 28.8, 33.5 and 39.7; 166, 166 and 270 for 12.6 million, by a list 162, 168 and 210.
-IN_WARPS_LEAVES = 1 << 22
+IN_BLOCKS_LEAVES = 1 << 22
 
 
-def does_in_warps(batches: Sequence[Batch]) -> bool:
-    """Whether warps compute the leaves that they leave out of these batches."""
-    return 8 * sum(batch.count for batch in batches) < IN_WARPS_LEAVES
+def does_in_blocks(batches: Sequence[Batch]) -> bool:
+    """Whether blocks compute the leaves that they leave out of these batches."""
+    return 8 * sum(batch.count for batch in batches) < IN_BLOCKS_LEAVES
 
 
 class OwnLaunches:
@@ -89,10 +89,10 @@ class OwnLaunches:
         flat = None if self._clusters is not None else plan.flat
         self._rows, self._blocks = ([], 0) if self._is_single else _stretches(batches, flat)
         self._stretches = wp.array(self._rows, dtype=Stretch, device=self._device) if self._rows else None
-        self._in_warps = self._is_single and does_in_warps(batches)
+        self._in_blocks = self._is_single and does_in_blocks(batches)
         #: Numbers of subtrees and single leaves of each launch that may leave some out, with gaps.
         self.places = [batch.count for batch in batches] if self._is_single else [self._blocks * BLOCK]
-        if self._in_warps:
+        if self._in_blocks:
             self.places = []
 
     @property
@@ -143,8 +143,8 @@ class OwnLaunches:
         material = self._material
         uniform = material.stride == 0
         inputs, outputs = [self._elements, batch.subtrees, material, u], [f, batch.flagged]
-        if self._in_warps:
-            kernel = scatter_subtrees_in_warps(batch.shape, True, uniform, self._tolerance)
+        if self._in_blocks:
+            kernel = scatter_subtrees_in_blocks(batch.shape, True, uniform, self._tolerance)
         else:
             kernel = scatter_subtrees_own(batch.shape, True, uniform, True, self._tolerance)
             outputs.append(left_out)
