@@ -41,7 +41,7 @@ def test_every_element_is_counted_once_and_every_node_moved_once(make, ranks):
         assert np.isin(dealt.groups[needed], dealt.groups[~needed]).sum() == 0
 
 
-def test_contact_on_several_cards_is_refused():
+def test_deterministic_contact_on_several_cards_is_refused():
     with pytest.raises(wc.InputError, match="several cards"):
         check_supported([], [], wc.SymplecticEuler(), {"obstacles": [wc.Ground()]}, cards=2)
     check_supported([], [], wc.SymplecticEuler(), {"obstacles": [wc.Ground()]}, cards=1)

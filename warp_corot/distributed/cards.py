@@ -56,18 +56,11 @@ class CardExchange:
 
     def launch(self, nodal: wp.array) -> None:
         """Launch that ghosts get their values, in a nodal array of float32, vec3 or vec4; may be recorded."""
-        self._pack(nodal)
-        self._move(nodal)
-
-    def _pack(self, nodal: wp.array) -> None:
-        nodes, out = self._sent[0], self._rooms[nodal.dtype][0]
-        wp.launch(kernels.GATHER[nodal.dtype], len(nodes), [nodes, nodal], [out], device=self._device)
-
-    def _move(self, nodal: wp.array) -> None:
         import nccl.core as nccl
 
-        stream, (received, by), to = wp.get_stream(self._device), self._received, self._sent[1]
+        stream, (received, by), (nodes, to) = wp.get_stream(self._device), self._received, self._sent
         out, given = self._rooms[nodal.dtype]
+        wp.launch(kernels.GATHER[nodal.dtype], len(nodes), [nodes, nodal], [out], device=self._device)
         with nccl.group():
             for rank, start, end in to:
                 self._nccl.send(_floats(out, start, end), rank, stream=stream)
@@ -77,10 +70,8 @@ class CardExchange:
 
     def begin(self, nodal: wp.array) -> None:
         """Launch the same beside what follows."""
-        # NCCL's blocks are large: they must stand in line before smaller ones fill the card.
-        self._pack(nodal)
         with wp.ScopedStream(self.aside):
-            self._move(nodal)
+            self.launch(nodal)
         self.is_under_way = True
 
     def end(self) -> None:

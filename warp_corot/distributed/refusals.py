@@ -24,7 +24,7 @@ def check_supported(
 
     Args:
         bodies, models, integrator: As for ``Simulation``.
-        cards: How many cards compute.
+        cards: How many cards compute a run that must be the same bit for bit for any number of them; 0 for others.
         others: Its other arguments, by name.
 
     Raises:
@@ -44,7 +44,10 @@ def check_supported(
             f"it must be None or {DIAGONAL!r}"
         )
     if cards > 1 and (contact or others.get("obstacles")):
-        raise InputError("contact does not work on several cards yet; take ranks on the CPU, or one card")
+        raise InputError(
+            "contact on several cards is not the same bit for bit as on one yet; deterministic must be False, or take "
+            "ranks on the CPU, or one card"
+        )
     if integrator.is_implicit and (contact or others.get("obstacles")):
         raise InputError(
             f"contact under {type(integrator).__name__} does not work on several ranks yet; the integrator must be "

@@ -78,7 +78,7 @@ class Simulation:
         models = checked_models(Corotated() if model is None else model, len(self.bodies))
         integrator = checked_integrator(SymplecticEuler() if integrator is None else integrator)
         here = None if device is None else checked_device(device)
-        cards = comm.size if (here or self.bodies[0].device).is_cuda else 0
+        cards = comm.size if deterministic and (here or self.bodies[0].device).is_cuda else 0
         check_supported(self.bodies, models, integrator, others, cards)
         if isinstance(integrator, ImplicitIntegrator):
             integrator = dataclasses.replace(integrator, preconditioner=DIAGONAL)
