@@ -100,7 +100,9 @@ def test_interrupted_before_anything_runs(stage, capsys, monkeypatch):
     assert capsys.readouterr() == ("", "warp-corot: interrupted\n")
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "status"), [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow)]
+)
 def test_signals_wait_for_the_end_of_an_import(number, status, request, tmp_path, monkeypatch):
     """Some modules swallow an exception during their import; after it they do not."""
     # A shell lets its background jobs ignore Ctrl-C.

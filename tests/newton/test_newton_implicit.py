@@ -30,7 +30,7 @@ def block(to, *, z=0.0, radius=0.005, k_damp=20.0, **options):
     return wn.add_forest(to, forest, tissue, pos=(0, 0, z), k_damp=k_damp, particle_radius=radius, **options)
 
 
-@pytest.mark.parametrize("kind", ["mesh", "forest"])
+@pytest.mark.parametrize("kind", [pytest.param("mesh", marks=pytest.mark.slow), "forest"])
 def test_a_beam_comes_to_rest_where_the_static_answer_is(device, kind):
     forest = wc.TetForest.box((3, 1, 1), 0.1, 3, up_axis="Z")
     mesh = forest if kind == "forest" else wc.TetMesh(forest.points, forest.tets, up_axis="Z")

@@ -103,6 +103,7 @@ def test_kernels(run, device, tmp_path):
     assert flops["factored"] < flops["sparse K_T by type"] < flops["dense 12x12"]
 
 
+@pytest.mark.slow
 def test_peers_that_are_not_there_are_left_out(device, tmp_path):
     for name in ("newton", "mujoco"):
         (tmp_path / f"{name}.py").write_text(f"raise ImportError('no {name} here')\n")
