@@ -72,7 +72,7 @@ class ImplicitSteps(Steps):
         self._rounds, self._going = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(2))
         self._iterations = wp.zeros(self._unknowns.worlds, dtype=wp.int32, device=self.device)
 
-    def _launch_forces(self, substep: Step, given: newton.State, share: float) -> None:
+    def _launch_forces(self, substep: Step, given: newton.State, share: float, done: float) -> None:
         model, others, control = self.model, self.others, substep.control
         activation = model.tet_activations
         if control is not None and control.tet_activations is not None:

@@ -102,7 +102,7 @@ class Steps:
                     left = following.count_for(dt - done)
                     each = (dt - done) / left
             substep = step._replace(state_in=now, dt=each)
-            self._launch_forces(substep, state_in, each / dt)
+            self._launch_forces(substep, state_in, each / dt, done)
             fastest = RUNAWAY if following is None else min(RUNAWAY, following.reach / each)
             self._launch_motion(substep, fastest)
             self._launch_undoing(state_out, *before)
@@ -178,13 +178,14 @@ class Steps:
         outputs = [tets.x, tets.u, self._f, *copies, self.report.trouble]
         self._launch(kernels.gather_particles, model.particle_count, inputs, outputs)
 
-    def _launch_forces(self, substep: Step, given: newton.State, share: float) -> None:
+    def _launch_forces(self, substep: Step, given: newton.State, share: float, done: float) -> None:
         """All other forces on particles, and on bodies those of particles.
 
         Args:
             substep: From the present state.
             given: The state that the step began with.
             share: The substep's share of the step.
+            done: Time of the step that has passed [s].
         """
         model, others, control = self.model, self.others, substep.control
         activation = model.tet_activations
@@ -192,7 +193,8 @@ class Steps:
             activation = control.tet_activations
         self.tetrahedra.add_forces(substep.state_in, activation, self._f)
         of_bodies = substep.state_in if others.has_bodies else given
-        self.contacts.add_forces(substep, of_bodies, self._f, self.report.trouble, share)
+        elapsed = 0.0 if others.has_bodies else done
+        self.contacts.add_forces(substep, of_bodies, self._f, self.report.trouble, share, elapsed)
         if others.has_bodies:
             wp.copy(self._body_f, given.body_f)
             self._add_wrenches(1.0, self._body_f)
