@@ -1,9 +1,9 @@
 """Corotated forces of orthotropic materials by complete subtrees on CUDA; one thread a subtree, as in ``laws``.
 
-The law is the one of ``corotated.anisotropic``; here each leaf is computed in its own frame, whose columns are
-differences of displacements, and rotations are found by four unscaled iterations. A leaf for which these find no
-rotation adds nothing and is flagged with a bit; ``repair_leaves`` computes it. So are all leaves whose rotation is
-nearly indefinite: see ``corotated.anisotropic_cpu``.
+The law is that of ``corotated.anisotropic``. Each leaf is computed in its own frame, in which the columns of F - I are
+differences of displacements, and four unscaled iterations find its rotation. A leaf for which these find no rotation
+adds nothing; a bit flags it, and ``repair_leaves`` computes it. Leaves whose rotation is nearly indefinite are flagged,
+too: see ``corotated.anisotropic_cpu``.
 """
 
 import functools
@@ -34,7 +34,7 @@ wp.set_module_options({"enable_backward": False})
 
 @functools.cache
 def anisotropic_forces(shape: int, transverse: bool, one_axes: bool, one_stiffness: bool) -> wp.Function:
-    """Nodal forces of a subtree, in its own frame, from displacements there, and the leaves left out, a bit each.
+    """Nodal forces of a subtree from its displacements, both in the subtree's frame, and a mask of the leaves left out.
 
     ``frame`` is the subtree's, ``h`` a leaf's edge length, ``first`` the first leaf among the mesh's elements.
     """
@@ -164,9 +164,9 @@ def repair_leaves(
     # Out
     f: wp.array[wp.vec4],
 ):
-    """Add the forces of flagged leaves, in a way that is right for every F.
+    """Add the forces of flagged leaves by a method that is right for every F.
 
-    A thread reads 64 bits, one for each leaf: nearly always all are zero. Eight threads share them.
+    Eight threads share a word of 64 bits, one for each leaf of eight subtrees; nearly always all bits are zero.
     """
     i = wp.tid()
     flags = flagged[i // 8] >> wp.uint64(i % 8)

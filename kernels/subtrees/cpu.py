@@ -1,10 +1,10 @@
 """Forces of complete subtrees on the CPU: eight subtrees side by side in the lanes of vector registers.
 
-A CPU core needs vectorisation to be fast. So the ten nodes of eight subtrees of one type are gathered into arrays of
-lanes, a loop computes the eight leaves, and forces are scattered once at the end. The laws are those of
-``elements.law_lanes``; each leaf or subtree that the corotated law leaves out is flagged by a bit.
+A CPU core is fast only with vector instructions. So the ten nodes of eight subtrees of one type are gathered into
+arrays of lanes, a loop computes the eight leaves, and forces are scattered once at the end. The laws are those of
+``elements.law_lanes``. A bit flags each leaf or subtree that the corotated law leaves out.
 
-``elements.lanes`` says why this is native code, and ``lanes`` generates a part of it.
+``elements.lanes`` says why this is native code; ``lanes`` generates a part of it.
 """
 
 import functools
@@ -26,7 +26,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class NearMaterial:
-    """Lamé's parameters, and how near the root's rotation must be to be used [rad]."""
+    """Lamé's parameters [Pa], and the tolerance within which leaves use the root's rotation [rad]."""
 
     isotropic: IsotropicMaterial
     tolerance: float
@@ -34,7 +34,10 @@ class NearMaterial:
 
 @wp.struct
 class DilatingMaterial:
-    """A material whose lambda the leaves of a subtree share: ``isotropic`` has none. And the tolerance as above."""
+    """A material whose leaves share their dilatation; the tolerance is as in ``NearMaterial``.
+
+    ``lam`` [Pa] belongs to the shared dilatation; lambda is zero in ``isotropic``.
+    """
 
     isotropic: IsotropicMaterial
     tolerance: float
@@ -42,7 +45,7 @@ class DilatingMaterial:
 
 
 def joining(law: str, shared: Dilatation | None) -> str:
-    """Native code for the dilatation that the leaves of a law share, if they do."""
+    """Native code that adds the shared dilatation to a law, or the law alone if there is none."""
     if shared is None:
         return native("own_leaves")
     return (
@@ -76,13 +79,13 @@ def scatter_subtrees_shared(shape: int, given: bool) -> wp.Kernel:
 
 @functools.cache
 def scatter_subtrees_near(shape: int, shared: Dilatation | None = None) -> wp.Kernel:
-    """Corotated forces of subtrees; a thread is eight subtrees.
+    """Corotated forces of subtrees, with the root's rotation where it is near those of the leaves; a thread is eight
+    subtrees.
 
-    With their root's rotation where it is near those of the leaves: where the displacement gradient E that it leaves
-    in each has |skew E| <= tolerance [rad] and |sym E| <= 1/2, and the subtree as one element is strained by no more
-    either. The stress is then wrong by no more than ``forces.shared_forces`` says. Elsewhere every leaf has its
-    own rotation, and the forces are those of ``scatter_law_subtrees`` to the bit. With a shared dilatation the material
-    is a ``DilatingMaterial``.
+    It is near if the displacement gradient E that it leaves in each leaf has |skew E| <= tolerance [rad] and
+    |sym E| <= 1/2, and the subtree as one element is strained by no more than 1/2. ``forces.shared_forces`` bounds the
+    error of the stress. Otherwise every leaf has its own rotation, and the forces are bit for bit those of
+    ``scatter_law_subtrees``. With a shared dilatation the material is a ``DilatingMaterial``.
     """
     code = LAWS["corotated"] + native("rotation") + ISOTROPIC_PART + begin(shape) + product(shape) + near_test(shape)
     code += (

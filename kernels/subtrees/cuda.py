@@ -1,14 +1,14 @@
 """Corotated forces of complete subtrees on CUDA: one thread a subtree, eight leaves in registers.
 
 Three things make it fast. Forces are summed over the eight leaves in registers, and over a group of eight subtrees in
-shared memory, by a table that tells each lane which slots to add up, so that nothing is added atomically twice. Sums go
-to global memory as 16-byte vector reductions where the card has them. And the stress comes from a root of one
+shared memory, where a table tells each lane which slots to add up; so each node of a group takes one atomic addition.
+Sums go to global memory as 16-byte vector reductions if the card has them. The stress comes from a root of one
 polynomial (``corotated.algebraic``), in the same way for small strains and large ones.
 
-A leaf that is flat, turned over or far from order one adds nothing. Its bit is set in its subtree's byte, and the
-subtree is put on a list; ``repair`` computes those leaves. If most leaves of a warp were left out before, the warp
-takes all of them one by one instead, and sets their bits again. Bodies with subtrees of one type only have a kernel of
-their own; all others are one launch, in which each thread block looks up its work.
+A leaf that is flat, inverted or strained far beyond order one adds nothing. Its bit is set in its subtree's byte, and
+the subtree is put on a list; ``repair`` computes those leaves. If most leaves of a warp were left out in the last
+evaluation, the warp computes all of them one by one instead, and sets their bits again. A body whose subtrees are all
+of one type has a kernel for that type; any other body is one launch, in which each thread block looks up its work.
 """
 
 import functools
@@ -42,7 +42,7 @@ from .pooled import scatter_in_block
 wp.set_module_options({"enable_backward": False})
 
 BLOCK = 128
-#: Blocks that a multiprocessor's registers must have room for, by type.
+#: The number of blocks for which a multiprocessor's registers must have room, by type.
 RESIDENT = (5, 5, 5)
 #: ``Stretch.shape`` of leaves in no subtree.
 FLAT = 3
@@ -70,7 +70,7 @@ def _table(name: str, rows: list[list[int]]) -> str:
 
 
 def _load_snippet(shapes: tuple[int, ...]) -> str:
-    """Stage a group's displacements in shared memory, each read once, and hand every lane its subtree's ten."""
+    """Read each of a group's displacements once into shared memory, and give every lane the ten of its subtree."""
     slots = [[place for ten in group_slots(shape) for place in ten] for shape in shapes]
     return f"""
 #if defined(__CUDA_ARCH__)
@@ -98,7 +98,7 @@ def _load_snippet(shapes: tuple[int, ...]) -> str:
 
 
 def _merge_snippet(shapes: tuple[int, ...]) -> str:
-    """Sum a group's forces in shared memory and reduce each node's once; a lane sums every eighth node's."""
+    """Sum a group's forces in shared memory and add each node's sum to memory once; a lane sums every eighth node."""
     sources = [group_sources(shape) for shape in shapes]
     empty = 10  # the spare slot of the first subtree, kept zero
     tables: list[list[int]] = [[] for _ in shapes]
@@ -138,7 +138,7 @@ def _merge_snippet(shapes: tuple[int, ...]) -> str:
 
 @functools.cache
 def _group_memory(shapes: tuple[int, ...]) -> tuple[wp.Function, wp.Function]:
-    """How subtrees in groups read displacements and write forces; ``row`` is the shape's place."""
+    """Functions by which subtrees in groups read displacements and write forces; ``row`` is the shape's place."""
 
     @wp.func_native(_load_snippet(shapes))
     def load_group(nodes: wp.array2d[wp.int32], group: int, row: int, u: wp.array[wp.vec4]) -> mat10: ...
@@ -165,7 +165,7 @@ def add_single(subtrees: Subtrees, s: int, g: mat10, f: wp.array[wp.vec4]):
 
 @functools.cache
 def memory_of(shape: int, grouped: bool) -> tuple[wp.Function, wp.Function]:
-    """How a subtree reads displacements and writes forces."""
+    """Functions by which a subtree reads displacements and writes forces."""
     if not grouped:
         return load_single, add_single
     load_group, merge_group = _group_memory((shape,))
@@ -187,9 +187,9 @@ def scatter_subtrees_own(
 ) -> wp.Kernel:
     """Corotated forces of subtrees of one type, every leaf with its own rotation. Launch with block_dim BLOCK.
 
-    If ``listed``, subtrees with leaves that are left out are put on a list, and the former bits in ``flagged`` may
-    choose the way. With a ``tolerance``, leaves use the root's rotation where it is near enough
-    (``forces.shared_forces``).
+    If ``listed``, subtrees with left-out leaves are put on a list, and a warp whose former bits in ``flagged`` say that
+    most of its leaves were left out computes them one by one. With a ``tolerance``, leaves use the root's rotation
+    where it is near enough (``forces.shared_forces``).
     """
     load, add = memory_of(shape, grouped)
     forces = near_forces(shape, uniform, tolerance)
@@ -219,7 +219,7 @@ def scatter_subtrees_own(
         mirror = mirror_sign(code)
         q = subtrees.frames[code >> FRAME_SHIFT]
         x = load(subtrees, s, u)
-        # Tested only here, so that the bits and the displacements are loaded at the same time.
+        # The test stands here so that the bits and the displacements are loaded at the same time.
         if wp.static(listed):  # noqa: SIM102 (what is static decides what is generated)
             if is_mostly_left_out(before):
                 mask = scatter_one_by_one(elements, subtrees.first[s], s % WARP, material, u, f)
@@ -240,9 +240,9 @@ def scatter_subtrees_own(
 
 @functools.cache
 def scatter_subtrees_in_blocks(shape: int, grouped: bool, uniform: bool, tolerance: float | None = None) -> wp.Kernel:
-    """As ``scatter_subtrees_own``, and each block does the leaves that it left out itself, a thread a leaf.
+    """The same as ``scatter_subtrees_own``, but each block also computes the leaves that it left out, a thread a leaf.
 
-    That saves a launch and the list, and pays in bodies of up to some millions of elements. Launch with block_dim
+    That saves a launch and the list, and is faster for bodies of up to some millions of elements. Launch with block_dim
     BLOCK.
     """
     load, add = memory_of(shape, grouped)
@@ -270,7 +270,7 @@ def scatter_subtrees_in_blocks(shape: int, grouped: bool, uniform: bool, toleran
         mirror = mirror_sign(code)
         q = subtrees.frames[code >> FRAME_SHIFT]
         x = load(subtrees, s, u)
-        # Asked only now: the bits and the displacements are on their way at once.
+        # The test stands here so that the bits and the displacements are loaded at the same time.
         mostly = is_mostly_left_out(before)
         mask = int(255)
         if not mostly:

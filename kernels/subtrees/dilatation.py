@@ -1,8 +1,8 @@
-"""Dilatation that the eight leaves of a complete subtree share; see ``elements.dilatation``.
+"""The dilatation that the eight leaves of a complete subtree share; see ``elements.dilatation``.
 
-Forces have two fast kernels: a thread a subtree on CUDA, with ten displacements in and ten forces out, and eight
-subtrees in the lanes of vector registers on the CPU. Everything else is computed leaf by leaf, see
-``elements.shared_dilatation``.
+There are two fast kernels for its forces. On CUDA a thread takes a subtree, with ten displacements in and ten forces
+out; on the CPU the lanes of vector registers take eight subtrees. ``elements.shared_dilatation`` computes everything
+else leaf by leaf.
 """
 
 import functools
@@ -40,9 +40,9 @@ def scatter_in_lanes(shape: int, of: Dilatation) -> wp.Kernel:
 
 @functools.cache
 def dilatation_sums_of(shape: int, uniform: bool, of: Dilatation, chosen: range = range(8)) -> wp.Function:
-    """The sums of lambda theta and of lambda over the chosen leaves, whose volumes are equal.
+    """The sums of lambda theta and of lambda over the chosen leaves, which have equal volumes.
 
-    Displacements are ten, in the frame of ``laws.turn_in``.
+    The ten displacements are in the frame of ``laws.turn_in``.
     """
     measure, columns = of.measure, columns_of(shape)
     leaves, begin, end = LEAVES[shape], chosen.start, chosen.stop
@@ -73,8 +73,8 @@ def dilatation_sums_of(shape: int, uniform: bool, of: Dilatation, chosen: range 
 
 @functools.cache
 def pressure_forces_of(shape: int, uniform: bool, of: Dilatation, chosen: range = range(8)) -> wp.Function:
-    """Forces of the chosen leaves from ten displacements as before, and from the slope of the energy at the dilatation
-    that all eight share."""
+    """Forces of the chosen leaves from ten displacements in the same frame, and from the slope of the energy at the
+    dilatation that all eight leaves share."""
     stress, columns, leaf_forces = pressure_stress_of(of), columns_of(shape), leaf_forces_of(shape)
     leaves, volume, begin, end = LEAVES[shape], VOLUME[shape], chosen.start, chosen.stop
     into_leaf, out_of_leaf = turns_of(shape)
@@ -108,9 +108,10 @@ def pressure_forces_of(shape: int, uniform: bool, of: Dilatation, chosen: range 
 
 @functools.cache
 def dilating_forces_of(shape: int, uniform: bool, chosen: range = range(8)) -> wp.Function:
-    """Corotated forces and those of the pressure in one pass; as ``pressure_forces_of``, and which leaves are left out.
+    """Corotated forces and the forces of the pressure in one pass, and a mask of the leaves left out; otherwise the
+    same as ``pressure_forces_of``.
 
-    Of these, too, there are the forces of the pressure.
+    Leaves that the corotated law leaves out still add the forces of the pressure.
     """
     pressure_stress, columns, leaf_forces = pressure_stress_of(VOLUME_CHANGE), columns_of(shape), leaf_forces_of(shape)
     leaves, volume, begin, end = LEAVES[shape], VOLUME[shape], chosen.start, chosen.stop

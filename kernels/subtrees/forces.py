@@ -1,8 +1,9 @@
 """Corotated forces of one complete subtree in registers: ten displacements in, ten nodal forces out.
 
 Kernels that read and write their nodes in different ways share this code (``cuda``, ``stepping.block``). Stresses are
-computed from displacement gradients, so that small strains keep their digits (``corotated.algebraic.stretch_stress``);
-a leaf that is flat, turned over or far from order one is left out and reported: bit k stands for leaf k in tree order.
+computed from displacement gradients, so that small strains keep their digits (``corotated.algebraic.stretch_stress``).
+A leaf that is flat, inverted or strained far beyond order one is left out and reported: bit k of the mask stands for
+leaf k in tree order.
 """
 
 import functools
@@ -24,7 +25,8 @@ mat10 = wp.types.matrix(shape=(10, 3), dtype=wp.float32)
 
 @functools.cache
 def turns_of(shape: int) -> tuple[wp.Function, wp.Function]:
-    """B^T C and B C for the frame B of a leaf and a matrix C; the compiler must know the leaf's number."""
+    """Functions for B^T C and B C, with the frame B of a leaf and a matrix C; the compiler must know the leaf's
+    number."""
     columns = FRAMES[shape]
     rows = [list(zip(*frame, strict=True)) for frame in columns]
     return _products(columns), _products(rows)
@@ -48,18 +50,18 @@ def _products(matrices: Sequence[Sequence[Sequence[float]]]) -> wp.Function:
 
 @wp.func
 def leaf_stress(g: wp.mat33, q: wp.mat33, mu: float, lam: float):
-    """First Piola-Kirchhoff stress times Q of one leaf with its own rotation, and whether it may be trusted."""
+    """First Piola-Kirchhoff stress of one leaf with its own rotation, times Q, and whether it may be trusted."""
     p, trusted = stretch_stress(wp.transpose(q) * g, mu, lam)
     return q * p, trusted
 
 
 @functools.cache
 def turned_forces_of(shape: int, uniform: bool, chosen: range, stress: wp.Function = stretch_stress) -> wp.Function:
-    """Forces of the chosen leaves, each on its own, and which are left out: in the subtree's Maubach frame, or in one
-    that turns with the subtree.
+    """Forces of the chosen leaves, each on its own, and a mask of those left out; in the subtree's Maubach frame, or in
+    a frame that turns with the subtree.
 
-    ``y`` are ten displacements there, in edge lengths h of a leaf; leaves' frames B are tables. ``stress`` is a law of
-    the displacement gradient and Lamé's parameters, and returns whether its result may be trusted.
+    ``y`` are ten displacements in that frame, in edge lengths h of a leaf; tables hold the leaves' frames B. ``stress``
+    is a law of the displacement gradient and Lamé's parameters; it also returns whether its result may be trusted.
     """
     columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
     leaves, frames = LEAVES[shape], FRAMES[shape]
@@ -104,10 +106,11 @@ def turned_forces_of(shape: int, uniform: bool, chosen: range, stress: wp.Functi
 
 @functools.cache
 def own_forces(shape: int, uniform: bool, chosen: range = range(8)) -> wp.Function:
-    """Forces of the chosen leaves from ten displacements, each leaf with its own rotation, and which are left out.
+    """Forces of the chosen leaves from ten displacements, each leaf with its own rotation, and a mask of those left
+    out.
 
-    ``q`` is the subtree's frame, ``h`` a leaf's edge length, ``first`` where its material stands, and that of the other
-    leaves unless uniform.
+    ``q`` is the subtree's frame, ``h`` a leaf's edge length, ``first`` the place of the first leaf's material; unless
+    ``uniform``, those of the other leaves follow.
     """
     turned_forces = turned_forces_of(shape, uniform, chosen)
 
@@ -140,8 +143,8 @@ def own_forces(shape: int, uniform: bool, chosen: range = range(8)) -> wp.Functi
 def turned_back_of(shape: int) -> wp.Function:
     """Displacements R^T x - x0 in the subtree's Maubach frame q, in edge lengths of a leaf; r = R q.
 
-    They are R^T u + (R^T - I) x0. With D = R - I, which is small for small rotations, sym(R^T - I) = -D^T D / 2 holds
-    for a rotation: so R^T - I keeps the digits of D, and the strain keeps the digits of the displacements.
+    They are R^T u + (R^T - I) x0. Let D = R - I, which is small for small rotations. Because R is a rotation,
+    sym(R^T - I) = -D^T D / 2. So R^T - I keeps the digits of D, and the strain keeps the digits of the displacements.
     """
     at = [[2.0 * c for c in point] for point in POSITIONS[shape]]
 
@@ -179,15 +182,16 @@ def turned_back_of(shape: int) -> wp.Function:
 def shared_forces(
     shape: int, uniform: bool, given: bool, chosen: range = range(8), tolerance: float | None = None
 ) -> wp.Function:
-    """Forces of the chosen leaves from ten displacements, all with one rotation, and which are left out: none or all.
+    """Forces of the chosen leaves from ten displacements, all with one rotation, and a mask of those left out: none or
+    all.
 
-    The rotation is the subtree root's or a given one; ``turn`` is the given one times the subtree's frame ``q``. Ten
-    displacements are turned back once; then the leaves are linear elements in the subtree's own frame.
+    The rotation is that of the subtree's root, or a given one; ``turn`` is the given one times the subtree's frame
+    ``q``. The ten displacements are turned back once; then the leaves are linear elements in the subtree's own frame.
 
-    With a ``tolerance`` [rad] the chosen leaves share the root's rotation only where it is near their own ones: where
-    the remaining displacement gradients E have |skew E| <= tolerance and |sym E| <= 1/2. Then F = I + E = exp(w) U with
-    |w| <= 2 tolerance, and the stress is wrong by at most (2 mu + 3 lambda) (3 |w| |U - I| + |w|^2 |U|). Elsewhere each
-    has its own rotation.
+    With a ``tolerance`` [rad] the chosen leaves share the root's rotation only if the displacement gradients E that it
+    leaves have |skew E| <= tolerance and |sym E| <= 1/2. Then F = I + E = exp(w) U with |w| <= 2 tolerance, and the
+    error of the stress is at most (2 mu + 3 lambda) (3 |w| |U - I| + |w|^2 |U|). Otherwise each leaf has its own
+    rotation.
     """
     columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
     leaves, frames, at = LEAVES[shape], FRAMES[shape], POSITIONS[shape]
@@ -255,7 +259,8 @@ def shared_forces(
             )
             e = into_leaf(leaf, wp.matrix_from_cols(b0, b1, b2))
             if wp.static(adaptive):
-                # Sums with zero: with plain copies the compiler keeps more leaves at once than there are registers for.
+                # A sum with zero, because with a plain copy the compiler keeps more leaves than there are registers
+                # for.
                 e = wp.mat33() + e
                 axial = wp.vec3(e[0, 1] - e[1, 0], e[0, 2] - e[2, 0], e[1, 2] - e[2, 1])
                 # Of the Frobenius norm, |E|^2 = |sym E|^2 + |skew E|^2.
@@ -288,7 +293,7 @@ def shared_forces(
             if left_out == 0 and apart <= 1.0:
                 left_out = 0
             else:
-                # In the frame that is turned along, y is in the place of displacements.
+                # In the frame that turns with the subtree, y takes the place of displacements.
                 g, left_out = turned_forces(y, h, mu, lam, first)
         for n in range(10):
             force = g[n]
@@ -302,7 +307,7 @@ def shared_forces(
 
 @functools.cache
 def near_forces(shape: int, uniform: bool, tolerance: float | None, chosen: range = range(8)) -> wp.Function:
-    """The same as ``own_forces`` without a tolerance; with one, see ``shared_forces``."""
+    """``own_forces`` without a tolerance; with one, the root's rotation where ``shared_forces`` allows it."""
     if tolerance is None:
         return own_forces(shape, uniform, chosen)
     forces = shared_forces(shape, uniform, False, chosen, tolerance)

@@ -19,7 +19,7 @@ from .repair import add_pairs, own_stress
 #endif
 """)
 def is_mostly_left_out(mask: int) -> bool:
-    """Whether most leaves of a warp were left out before, by their masks: then the warp takes its leaves one by one."""
+    """Whether most leaves of a warp were left out in the last evaluation, as their masks say."""
     ...
 
 
@@ -31,7 +31,7 @@ def is_mostly_left_out(mask: int) -> bool:
 #endif
 """)
 def of_lane(value: int, lane: int) -> int:
-    """The value that another thread of a whole warp has."""
+    """The value of another thread of a whole warp."""
     ...
 
 
@@ -66,7 +66,7 @@ def scatter_one_by_one(
         f: Forces [N].
 
     Returns:
-        The leaves of this thread's subtree that the subtree kernels would leave out, a bit each.
+        A mask of the leaves of this thread's subtree that the subtree kernels would leave out.
     """
     mask = int(0)
     each = wp.static(WARP // LEAVES)

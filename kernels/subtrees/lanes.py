@@ -1,6 +1,6 @@
-"""Native code on lanes of subtrees of a type, generated from the tables of ``tables.subtree``.
+"""Native code for eight subtrees of one type in vector lanes, generated from the tables of ``tables.subtree``.
 
-It is text, like the code in ``native`` around it; this file does not use Warp.
+The code is text, like that in ``native`` around it; this file does not use Warp.
 """
 
 import functools
@@ -14,12 +14,16 @@ from warp_corot.kernels.tables.subtree import FRAMES, HANDEDNESS, LEAVES, POSITI
 
 @functools.cache
 def begin(shape: int) -> str:
-    """Code that begins with eight subtrees of a type, and the tables of this type.
+    """Code that reads eight subtrees of a type, with the tables of this type.
 
-    Defines what ``native/subtrees.h`` does; tables of the leaves' nodes, ``nodes_of``, and in the subtree's Maubach
-    frame of the nodes' places ``at``, of the leaves' frames ``frame_of`` and handedness ``hand``; ``leaf_axes``, of
-    which three are the frame of each leaf, by ``axes_of``; and the functions ``columns`` and ``add_leaf`` of ten
-    displacements or forces and four of their numbers.
+    It defines
+
+    - what ``native/subtrees.h`` defines;
+    - the tables ``nodes_of`` (nodes of each leaf) and, in the subtree's Maubach frame, ``at`` (rest positions of the
+      nodes), ``frame_of`` (the leaves' frames) and ``hand`` (their handedness);
+    - ``leaf_axes``, the different columns of the leaves' frames; ``axes_of`` says which three make the frame of a leaf;
+    - the functions ``columns`` and ``add_leaf``, which take ten displacements or forces and the numbers of four of
+      them.
     """
     columns = "".join(f" a[{c}] = {expression};" for c, expression in enumerate(column_sums(shape)))
     forces = "".join(f" add(g, n[{n}], {expression});" for n, expression in enumerate(force_sums(shape)))
@@ -59,15 +63,15 @@ def product(shape: int) -> str:
 
 @functools.cache
 def near_test(shape: int) -> str:
-    """``are_near``: where |skew E| <= tolerance and |sym E| <= 1/2 in every leaf, of displacements y turned back.
+    """``are_near``: whether |skew E| <= tolerance and |sym E| <= 1/2 in every leaf, for displacements y turned back.
 
-    E is C B^T with the columns C that ``columns`` finds and the leaf's frame B.
+    E is C B^T, with the matrix C that ``columns`` finds and the leaf's frame B.
     """
     code = ""
     for nodes, frame in zip(LEAVES[shape], FRAMES[shape], strict=True):
 
         def difference(i: int, j: int, frame: list = frame) -> str:
-            """Of the entries i, j and j, i of C B^T."""
+            """The difference of the entries i, j and j, i of C B^T."""
             terms = [(frame[c][j], f"a[{c}].{'xyz'[i]}") for c in range(3)]
             terms += [(-frame[c][i], f"a[{c}].{'xyz'[j]}") for c in range(3)]
             return " + ".join(f"{weight!r}f * {entry}" for weight, entry in terms if abs(weight) > 1e-9)
@@ -105,7 +109,7 @@ def _tables(shape: int) -> str:
 
 
 def _columns_of_frames(shape: int) -> tuple[list[tuple[float, ...]], list[list[int]]]:
-    """The different columns that frames of leaves have in the subtree's, and which each leaf has."""
+    """The different columns of the leaves' frames, in the subtree's frame, and which three each leaf has."""
     rounded = [[tuple(round(c, 12) + 0.0 for c in column) for column in frame] for frame in FRAMES[shape]]
     different = sorted({column for frame in rounded for column in frame})
     return different, [[different.index(column) for column in frame] for frame in rounded]

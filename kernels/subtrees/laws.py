@@ -1,8 +1,9 @@
 """Forces of complete subtrees on CUDA under laws that need no rotation; one thread a subtree, as in ``cuda``.
 
-A subtree's displacements are turned into its own frame once, and its forces back. In between, a leaf's frame B is a
-constant: the columns of G in leaf columns and subtree rows are sums and differences of displacements, A = B^T G moves
-and negates entries (types 0 and 1; four leaves of type 2 also mix them), and P in subtree rows is B times the law of A.
+A subtree's displacements are turned into its own frame once, and its forces back once. In that frame the frame B of a
+leaf is constant. G, the displacement gradient with rows in the subtree's frame and columns in the leaf's, has sums and
+differences of displacements as columns. A = B^T G moves and negates entries (four leaves of type 2 also mix them), and
+the stress with rows in the subtree's frame is B times the law of A.
 """
 
 import functools

@@ -1,4 +1,4 @@
-"""Lists of subtrees with leaves that their kernels left out, which thread blocks take in turn; see ``repair``."""
+"""Lists of the subtrees with leaves that the subtree kernels left out; see ``repair``."""
 
 import warp as wp
 
@@ -7,22 +7,22 @@ LEAVES = 8
 #: Number of threads in a block that processes a list, and in a warp.
 LIST_BLOCK = 128
 WARP = 32
-#: Lists that a body's thread blocks take in turn.
+#: Number of lists; the thread blocks of a body append to them in turn.
 LISTS = 32
 COUNT_STRIDE = 32
 
 
 @wp.struct
 class LeftOut:
-    """Subtrees with leaves that were left out, in lists which thread blocks take in turn.
+    """Subtrees with left-out leaves, in several lists.
 
-    There are several because atomic additions to one number that return its former value take 5 ns each.
+    One list would be slow: atomic additions to one number that return its former value take 5 ns each.
     """
 
-    # Entries of each list, a cache line apart, then blocks that are done; all zero between evaluations.
+    # The lengths of the lists, a cache line apart, then the number of blocks that are done; zero between evaluations.
     counts: wp.array[wp.int32]  # [(LISTS + 1) COUNT_STRIDE]
-    room: int  # of a list
-    entries: wp.array[wp.vec2i]  # [LISTS room] where its first leaf (own rotations) or it itself stands, and the mask
+    room: int  # capacity of a list
+    entries: wp.array[wp.vec2i]  # [LISTS room] first leaf of the subtree (own rotations) or the subtree, and its mask
 
 
 @wp.func_native(f"""
@@ -38,9 +38,9 @@ class LeftOut:
 #endif
 """)
 def reserve(lists: LeftOut, list: int, is_left_out: bool, to_come: int) -> int:
-    """Make room on a list for those threads of a warp that have left leaves out.
+    """Make room on a list for the threads of a warp that have left leaves out.
 
-    ``to_come`` is the number of threads from this one on. All threads of a warp must call this, and ``append`` as well.
+    ``to_come`` is the number of threads from this one on. All threads of a warp must call this, and then ``append``.
     """
     ...
 
@@ -61,7 +61,7 @@ def reserve(lists: LeftOut, list: int, is_left_out: bool, to_come: int) -> int:
 #endif
 """)
 def append(lists: LeftOut, list: int, reserved: int, place: int, mask: int, to_come: int):
-    """Put a subtree on a list, in the room that was made for it, unless its mask is zero."""
+    """Put a subtree on a list, at the place that ``reserve`` made for it, unless its mask is zero."""
     ...
 
 
@@ -81,7 +81,7 @@ def list_of(block: int):
 #endif
 """)
 def any_left_out(lists: LeftOut) -> bool:
-    """Whether there is any entry; all threads of a block must call this together."""
+    """Whether any list has an entry; all threads of a block must call this together."""
     ...
 
 
@@ -104,7 +104,7 @@ def entry_count(lists: LeftOut, list: int):
 #endif
 """)
 def leave(lists: LeftOut, blocks: int):
-    """Empty the lists once every block is done with them."""
+    """Say that this block is done; the last of all blocks empties the lists."""
     ...
 
 
@@ -143,9 +143,9 @@ def leave(lists: LeftOut, blocks: int):
 #endif
 """)
 def leaves_of_entries(lists: LeftOut, begin: int, entries: int, k: int) -> int:
-    """Write the leaves of up to 32 entries into a list for the threads of a warp and return how many there are; or
+    """For k < 0, list the leaves of up to 32 entries for the threads of a warp and return their number; otherwise
     return the k-th of them.
 
-    So every thread has a leaf even where few leaves of each entry were left out.
+    So every thread gets a leaf even if few leaves of each entry were left out.
     """
     ...

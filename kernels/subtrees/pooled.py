@@ -1,7 +1,6 @@
-"""Leaves that a block of the subtree kernels left out, done by the block itself, a thread a leaf (CUDA).
+"""Forces of the leaves that a block of the subtree kernels left out, by the block itself, a thread a leaf (CUDA).
 
-A warp takes as long for one leaf as for 32, so the leaves of all warps of a block are put together in a list in shared
-memory.
+A warp takes as long for one leaf as for 32, so a list in shared memory collects the leaves of all warps of a block.
 """
 
 import warp as wp
@@ -16,9 +15,9 @@ wp.set_module_options({"enable_backward": False})
 
 #: Threads of a block of the subtree kernels.
 SUBTREE_BLOCK = 128
-#: What ``leaves_of_block`` does.
+#: What ``leaves_of_block`` is asked to do.
 COLLECT, LEAF, FIRST, MARK, MARKED = range(5)
-#: The bit of a leaf in its list if its subtree asks what the subtree kernels would leave out.
+#: Set in a list's entry if its subtree asks which leaves the subtree kernels would leave out.
 ASKS = 1 << 15
 
 
@@ -68,16 +67,20 @@ ASKS = 1 << 15
 #endif
 """)
 def leaves_of_block(what: int, value: int, first: int, to_come: int) -> int:
-    """A block's list of leaves; all threads of the block must collect it together, and then ask what was marked.
+    """A block's list of leaves, as one function. On the CPU a block is one thread.
 
     Args:
-        what: ``COLLECT`` the leaves in the mask ``value`` of each subtree, whose first leaf is ``first``, or its
-            complement if the subtree asks, and get their number. Or get the ``value``-th ``LEAF`` (eight times its
-            thread's place in the block, plus its number, and ``ASKS``), or the ``FIRST`` leaf of a thread's subtree.
-            Or ``MARK`` a leaf, or get what is ``MARKED`` of this thread's subtree.
+        what: What to do:
+            ``COLLECT``: list the leaves of the mask ``value`` of each thread's subtree, and return the number of all.
+            ``first`` is the subtree's first leaf, or its complement if the subtree asks. All threads must call this
+            together.
+            ``LEAF``: return entry ``value`` of the list: eight times its thread's place in the block, plus the leaf's
+            number in its subtree, plus ``ASKS`` if the subtree asks.
+            ``FIRST``: return the first leaf of the subtree of thread ``value``.
+            ``MARK``: mark the leaf of entry ``value``.
+            ``MARKED``: return the mask of marked leaves of this thread's subtree. All threads must call this together.
+        value, first: As ``what`` says.
         to_come: The number of threads from this one on, in all blocks.
-
-    A CPU's block is one thread.
     """
     ...
 
@@ -123,21 +126,21 @@ def scatter_in_block(
     Args:
         elements: All leaves.
         first: First leaf of this thread's subtree.
-        mask: Which of its leaves, a bit each.
-        asks: Whether to find which of them the subtree kernels would leave out; of all leaves.
-        to_come: Threads from this one on.
+        mask: The leaves of this thread's subtree to compute, a bit each.
+        asks: Whether to find out which leaves the subtree kernels would leave out; the mask must then have all leaves.
+        to_come: Number of threads from this one on.
         material, u: As in ``own_stress``.
         f: Forces [N].
 
     Returns:
-        The mask, or what was found.
+        The mask; if the subtree asks, the mask of the leaves that the subtree kernels would leave out.
     """
     found = int(mask)
     total = leaves_of_block(wp.static(COLLECT), mask, wp.where(asks, ~first, first), to_come)
     if total > 0:
         threads = threads_of(to_come)
         k = thread_of()
-        # All threads of a warp stay together, for their neighbours' forces.
+        # All threads of a warp stay together, because ``add_pairs`` sums the forces of neighbours.
         while k - k % WARP < total:
             targets = wp.vec4i(-1, -1, -1, -1)
             t = int(0)

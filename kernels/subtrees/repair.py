@@ -1,9 +1,9 @@
-"""Forces of the leaves that the subtree kernels left out: flat or inverted ones, with the rotation that is right for
-every F.
+"""Forces of the leaves that the subtree kernels left out, mostly flat or inverted ones, with a rotation that is right
+for every F.
 
-A byte for each subtree, with a bit for each leaf, says which these are. On CUDA the subtrees that have any are in a
-list (``LeftOut``), which one launch of a fixed size processes. On the CPU, and where sums must have a fixed order, a
-thread reads the bytes of eight subtrees at a time, nearly always all zero, and processes their leaves in order.
+A byte for each subtree, with a bit for each leaf, says which these are. On CUDA the subtrees that have any are in lists
+(``LeftOut``), which one launch of a fixed size processes. On the CPU, and where sums must have a fixed order, a thread
+reads the bytes of eight subtrees at a time, which are nearly always all zero, and processes their leaves in order.
 """
 
 import warp as wp
@@ -19,16 +19,16 @@ from .left_out import LEAVES, LIST_BLOCK, LISTS, WARP, LeftOut, any_left_out, en
 
 wp.set_module_options({"enable_backward": False})
 
-#: Number of subtrees of one thread; ``flagged`` has a multiple of these.
+#: Number of subtrees that one thread processes; the length of ``flagged`` is a multiple of it.
 SUBTREES = 8
 
-# More rounds would cost more arithmetic than they save sums.
+# More rounds would cost more arithmetic than the atomic additions that they save.
 add_pairs = add_four_forces(1)
 
 
 @wp.func
 def is_left_out(flags: wp.uint64, leaf: int):
-    """Whether the ``leaf``-th of the 64 leaves of eight subtrees was."""
+    """Whether the ``leaf``-th of the 64 leaves of eight subtrees was left out."""
     return ((flags >> wp.uint64(leaf)) & wp.uint64(1)) != wp.uint64(0)
 
 
@@ -41,7 +41,7 @@ def scatter_turned(
     u: wp.array[wp.vec4],
     f: wp.array[wp.vec4],
 ):
-    """Add the forces of element t with r, a rotation from rest space."""
+    """Add the forces of element t with a given rotation r from rest space."""
     q = frame(elements, t)
     m = material.mu[t * material.stride]
     k = material.lam[t * material.stride]
@@ -50,7 +50,7 @@ def scatter_turned(
 
 @wp.func
 def own_stress(elements: ForestElements, t: int, material: IsotropicMaterial, u: wp.array[wp.vec4]):
-    """First Piola-Kirchhoff stress times Q of element t with its own rotation, whatever its F, and whether the subtree
+    """First Piola-Kirchhoff stress of element t with its own rotation, times Q, for any F, and whether the subtree
     kernels could have found it."""
     q = frame(elements, t)
     w = wp.transpose(q) * local_gradient(elements, t, u)
@@ -86,10 +86,10 @@ def repair_listed_own(
     # Out
     f: wp.array[wp.vec4],
 ):
-    """Every leaf with its own rotation, a thread a leaf.
+    """Add the forces of listed leaves, each with its own rotation, a thread a leaf.
 
-    Neighbours' forces are added up before they go to memory. Launch with block_dim LIST_BLOCK and as many ``threads``,
-    a multiple of it; or with one.
+    Forces of neighbours are added up before they go to memory. Launch with block_dim LIST_BLOCK and ``threads``
+    threads, a multiple of LIST_BLOCK, or one.
     """
     if not any_left_out(listed):
         return
@@ -107,7 +107,7 @@ def repair_listed_own(
         while begin < count:
             total = leaves_of_entries(listed, listed.room * list + begin, wp.min(each, count - begin), -1)
             k = wp.tid() % lanes
-            # All threads of a warp stay together, for their neighbours'.
+            # All threads of a warp stay together, because ``add_pairs`` sums the forces of neighbours.
             while k - k % lanes < total:
                 t = int(0)
                 targets = wp.vec4i(-1, -1, -1, -1)
@@ -138,7 +138,10 @@ def repair_listed_shared(
     # Out
     f: wp.array[wp.vec4],
 ):
-    """Every leaf of a listed subtree with the rotation of the subtree's root, a thread a leaf; launch as the other."""
+    """Add the forces of all leaves of listed subtrees with the rotation of the subtree's root, a thread a leaf.
+
+    Launch it like ``repair_listed_own``.
+    """
     if not any_left_out(listed):
         return
     at_a_time = wp.min(threads, LISTS)
@@ -169,7 +172,7 @@ def repair_own(
     # Out
     f: wp.array[wp.vec4],
 ):
-    """Every leaf with its own rotation."""
+    """Add the forces of flagged leaves, each with its own rotation."""
     i = wp.tid()
     flags = flagged[i]
     if flags == wp.uint64(0):
@@ -195,7 +198,7 @@ def repair_shared(
     # Out
     f: wp.array[wp.vec4],
 ):
-    """Every leaf with the rotation of its subtree's root."""
+    """Add the forces of flagged leaves, each with the rotation of its subtree's root."""
     i = wp.tid()
     flags = flagged[i]
     if flags == wp.uint64(0):
