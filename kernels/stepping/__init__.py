@@ -1,1 +1,1 @@
-"""Steps in time: integration, the clock, the stable step, energies, many steps in one launch."""
+"""Time stepping: integration, the clock, the stable step, energies, many steps in one launch."""

@@ -21,8 +21,8 @@ def follow_activation(
     # Out
     activation: wp.array[wp.float32],
 ):
-    """Take the active stress of the keyframes at the beginning of a step, ``offset`` steps after the last counted
-    one.
+    """Set the active stress [Pa] to the keyframes' value at the beginning of a step, ``offset`` steps after the last
+    counted one.
     """
     k = wp.tid()
     t = elements[k]

@@ -1,7 +1,7 @@
-"""The data of a check, found together: energies of each world in float64 and in a fixed order, the clock, and whether a
-user has written to the state; and two copies of the state, one of which is the last good one.
+"""What a check needs: the energies of each world in float64 and in a fixed order, the clock, and whether a user has
+written to the state; and two copies of the state, one of which is the last good one.
 
-A run begins with ``take_over``, which compares the state with the last good copy, and ends with ``sum_nodes``, which
+A run begins with ``take_over``, which compares the state with the last good copy. It ends with ``sum_nodes``, which
 also writes the present state to the other copy, and ``report``, which writes all results for the host to one place.
 """
 
@@ -22,15 +22,15 @@ KINETIC, AHEAD, GRAVITATIONAL, LOADS, SUPPORTS, REACH, ELASTIC, UNTIMELY, WORKED
 )
 COLUMNS = 10
 
-#: Places in the report besides sums: the clock's numbers, the work of moving supports and the sum of its absolute
-#: values [J], the first step that was not finite, whether a user has written to the state, and from CONTROL on the
-#: control of the step.
+#: Places in the report besides the sums: the clock's numbers, the work of moving supports and the sum of its absolute
+#: values [J], the first step that was not finite, whether a user has written to the state, and, from CONTROL on, the
+#: numbers that control the step.
 STEPS, STEPS_THEN, LENGTH, TIME_THEN, LENGTH_BEFORE, WORK, WORK_ABSOLUTE, BAD_STEP, CHANGED, CONTROL = (
     wp.constant(k) for k in range(10)
 )
 NUMBERS = 9 + CONTROLS
 
-#: A run has ended in time if it came this near, in steps: the rounding of the last one.
+#: A run counts as ended if it came this near to its end, in steps, since the last step is rounded.
 NEAR = wp.constant(wp.float64(1e-4))
 
 
@@ -41,7 +41,7 @@ NEAR = wp.constant(wp.float64(1e-4))
     return value;
 """)
 def sum_of_lanes(value: wp.float64) -> wp.float64:
-    """The first lane's is the sum over the warp, added up in one order; a CPU has one lane."""
+    """The sum over the warp, in a fixed order, in the first lane; a CPU has one lane."""
     ...
 
 
@@ -52,13 +52,13 @@ def sum_of_lanes(value: wp.float64) -> wp.float64:
     return value;
 """)
 def most_of_lanes(value: wp.float64) -> wp.float64:
-    """The first lane's is the largest of the warp."""
+    """The largest value of the warp, in the first lane."""
     ...
 
 
 @wp.func
 def equal(a: wp.vec3, b: wp.vec3):
-    """False where anything is NaN."""
+    """False if any component is NaN."""
     return a[0] == b[0] and a[1] == b[1] and a[2] == b[2]
 
 
@@ -79,7 +79,8 @@ def take_over(
     pace: Pace,
     changed: wp.array[wp.int32],
 ):
-    """Adopt positions that a user wrote; compare the state with the last good copy, and update that if they differ."""
+    """Adopt positions that a user wrote; compare the state with the last good copy, and update the copy if they
+    differ."""
     i = wp.tid()
     slot = int(orders[SLOT])
     x = load_node(rest, i)
@@ -142,15 +143,16 @@ def sum_nodes(
     """Add up over free nodes: kinetic and gravitational energy, the work of loads since the last good state, the
     largest displacement. If ``keeps``, keep the present state beside the last good one.
 
-    Velocities are half of the last step behind displacements. With the elastic forces f of these displacements they are
-    known at any time about it. Half of the next step behind times half of it ahead, v_behind . M v_ahead / 2, kinetic
-    energy and ``AHEAD``, is what symplectic Euler keeps exactly with the elastic energy where forces are linear: also
-    beyond the stable step, where it need not be positive. The work of supports from ``add_support_work`` counts half of
-    f's share too early; that half is ``SUPPORTS``. With velocities at the time of the displacements, halfway, kinetic
-    energy is larger than that product by ``UNTIMELY``. With a ``lag`` of zero, velocities are at the time of the
-    displacements, and these terms vanish. The forces besides elasticity in the last step are part of what accelerates
-    nodes; their work is counted elsewhere. That of constraints takes a change of the step into account, so that
-    ``AHEAD`` does not where they act.
+    Velocities are half a step behind displacements. From the elastic forces f of these displacements they are known at
+    any time near them. Let v_behind and v_ahead be the velocities half of the next step before and after the
+    displacements. Where forces are linear, symplectic Euler conserves v_behind . M v_ahead / 2 plus the elastic energy
+    exactly, also beyond the stable step, where this product may be negative. The product is the kinetic energy plus
+    ``AHEAD``. With velocities at the time of the displacements, the kinetic energy is larger than the product by
+    ``UNTIMELY``. ``add_support_work`` counts half of the share of f too early; that half is ``SUPPORTS``. If ``lag`` is
+    zero, velocities are at the time of the displacements, and these terms vanish.
+
+    The forces besides elasticity in the last step accelerate nodes, too; their work is counted elsewhere. The work of
+    constraints already takes a change of the step into account, so ``AHEAD`` does not do so where they act.
     """
     world, thread = wp.tid()
     slot = int(orders[SLOT])
@@ -197,7 +199,7 @@ def sum_nodes(
         k += threads
     untimely = wp.float64(0.125) * dt * dt * untimely
     reach = wp.sqrt(reach)
-    # Otherwise each thread has its own place.
+    # With one lane, each thread adds to its own place.
     if lanes > 1:
         kinetic = sum_of_lanes(kinetic)
         ahead = sum_of_lanes(ahead)
@@ -219,7 +221,7 @@ def sum_nodes(
 
 @wp.kernel(enable_backward=False)
 def sum_elements(energies: wp.array[wp.float64], count: int, threads: int, lanes: int, sums: wp.array3d[wp.float64]):
-    """Add strain energies, ``count`` of each world."""
+    """Add up the strain energies, ``count`` of each world."""
     world, thread = wp.tid()
     total = wp.float64(0.0)
     k = thread
@@ -235,7 +237,7 @@ def sum_elements(energies: wp.array[wp.float64], count: int, threads: int, lanes
 
 @wp.kernel(enable_backward=False)
 def sum_work(account: wp.array2d[wp.float64], count: int, threads: int, lanes: int, sums: wp.array3d[wp.float64]):
-    """Add the work of constraints and its absolute value, from ``count`` places in each world."""
+    """Add up the work of constraints and its absolute value, from ``count`` places in each world."""
     world, thread = wp.tid()
     work = wp.float64(0.0)
     absolute = wp.float64(0.0)
@@ -255,7 +257,7 @@ def sum_work(account: wp.array2d[wp.float64], count: int, threads: int, lanes: i
 
 @wp.kernel(enable_backward=False)
 def keep_words(words: wp.array[wp.uint32], orders: wp.array[wp.float64], beside: int, kept: wp.array2d[wp.uint32]):
-    """Keep further arrays with the last good state, or beside it."""
+    """Copy further arrays to the last good state, or to the copy beside it."""
     i = wp.tid()
     slot = int(orders[SLOT])
     if beside != 0:
@@ -279,9 +281,9 @@ def report(
     totals: wp.array2d[wp.float64],
     numbers: wp.array[wp.float64],
 ):
-    """Add the parts up, reset them, and write all results for the host.
+    """Add up the partial sums, reset them, and write all results for the host.
 
-    The time is exactly ``END`` if the run has reached it.
+    If the run has reached its end, the time is exactly ``END``.
     """
     world, column, lane = wp.tid()
     value = wp.float64(0.0)

@@ -1,11 +1,11 @@
-"""A small body's steps whole in one thread block: nodes and forces in shared memory, many steps a launch.
+"""Whole steps of a small body in one thread block: nodes and forces in shared memory, many steps a launch.
 
-A body of a thousand elements is done before the next launch has begun, so here a block stays with its world. Each
-thread takes a complete subtree, or a part of its leaves where there are too few worlds to fill the card, and writes its
-nodal forces to slots; then each thread sums up the slots of a node and moves it. Nothing is added atomically, so runs
-are reproducible bit by bit, and nothing leaves the multiprocessor but the state at the end.
+A step of a thousand elements takes less time than a launch, so here a block stays with its world for many steps. Each
+thread takes a complete subtree, or some of its leaves if there are too few worlds to fill the card, and writes its
+nodal forces to slots; then each thread sums up the slots of a node and moves it. There are no atomic additions, so runs
+are reproducible bit for bit. Only the final state leaves the multiprocessor.
 
-Where the leaves of a subtree share their dilatation, its threads leave their sums of it in shared memory, and add the
+If the leaves of a subtree share their dilatation, its threads put their sums of it into shared memory, and add the
 forces of the pressure to their slots in a second pass.
 
 CUDA only. ``tables.block_layout`` says which thread does what.
@@ -58,10 +58,10 @@ from .threads import bit_count, lowest_bit, number_in, shuffle_down, synchronize
 
 wp.set_module_options({"enable_backward": False})
 
-#: Threads of a multiprocessor that registers must have room for.
+#: The number of threads for which a multiprocessor's registers must have room.
 BUSY_THREADS = 640
 
-#: What an entry of a block's list is: which thread left it out, and which leaf it is.
+#: An entry of a block's list is the thread that left a leaf out, and from this bit on the number of the leaf.
 LEAF_SHIFT = 16
 
 vec3u = wp.types.vector(length=NODE_WORDS, dtype=wp.uint64)
@@ -69,9 +69,9 @@ vec3u = wp.types.vector(length=NODE_WORDS, dtype=wp.uint64)
 
 @wp.struct
 class BlockBody:
-    """A body as its block goes through it: one world's subtrees, and who adds up which slots."""
+    """A body as a block reads it: the subtrees of one world, and which thread sums which slots."""
 
-    subtrees: Subtrees  # of one world, one by one
+    subtrees: Subtrees  # of one world, not in groups
     subtree_count: int
     node_count: int
     element_count: int
@@ -81,7 +81,7 @@ class BlockBody:
 
 
 def _table(rows: list[list[int]]) -> wp.Function:
-    """Whole numbers by row and column. A matrix that is indexed so would be copied for every use."""
+    """A function that looks up whole numbers by row and column; a Warp matrix would be copied at every use."""
     numbers = ", ".join(str(number) for row in rows for number in row)
     snippet = f"""
     static const signed char numbers[{len(rows) * len(rows[0])}] = {{{numbers}}};
@@ -95,7 +95,7 @@ def _table(rows: list[list[int]]) -> wp.Function:
 
 
 def _vectors(rows: list) -> wp.Function:
-    """Constant vectors by number."""
+    """A function that looks up constant vectors by number."""
     numbers = ", ".join(f"{float(c)!r}f" for row in rows for c in row)
     snippet = f"""
     static const float numbers[{3 * len(rows)}] = {{{numbers}}};
@@ -109,9 +109,10 @@ def _vectors(rows: list) -> wp.Function:
 
 
 def _left_out_of(layout: Layout, displacement: wp.Function, slot: wp.Function) -> tuple[wp.Function, ...]:
-    """What does the leaves that the subtrees' threads leave out.
+    """The list of left-out leaves, and functions that fill it, compute a leaf of it and collect forces.
 
-    These list them, any thread finds the forces of one, and who left it out adds them up, so that sums have one order.
+    The threads of the subtrees list the leaves that they leave out. Any thread computes the forces of a listed leaf.
+    The thread that left it out adds them to its slots, so that sums have a fixed order.
     """
     shape, room = layout.shape, layout.room
     node_of, place_of = _table([list(leaf) for leaf in LEAVES[shape]]), _table(layout.places)
@@ -123,7 +124,7 @@ def _left_out_of(layout: Layout, displacement: wp.Function, slot: wp.Function) -
 
     @wp.func
     def enlist(thread: int, left_out: int):
-        """List a thread's leaves as far as there is room; where the first of them stands."""
+        """List a thread's left-out leaves as far as there is room, and return the place of the first."""
         first = int(0)
         if left_out != 0:
             first = waiting(wp.static(RESERVE), 0, bit_count(left_out))
@@ -137,8 +138,8 @@ def _left_out_of(layout: Layout, displacement: wp.Function, slot: wp.Function) -
 
     @wp.func
     def position(words: vec3u, k: int, q: wp.mat33, inv_h: float):
-        """Of node k, relative to the first's displacement, in edge lengths of a leaf."""
-        # An index that is not known would put the words into memory.
+        """Position of node k relative to the first node's displacement, in edge lengths of a leaf."""
+        # Indexing the words with k would put them into local memory.
         word = wp.where(k < NUMBERS, words[0], wp.where(k < wp.static(2 * NUMBERS), words[1], words[2]))
         moved = displacement(wp.static(LOAD_BYTES), number_in(word, k % NUMBERS), wp.vec3())
         origin = displacement(wp.static(LOAD_BYTES), number_in(words[0], 0), wp.vec3())
@@ -196,7 +197,8 @@ def _left_out_of(layout: Layout, displacement: wp.Function, slot: wp.Function) -
 
     @wp.func
     def collect(s: int, part: int, first: int, left_out: int):
-        """Add the forces of a thread's listed leaves to its slots; the leaves for which there was no room."""
+        """Add the forces of a thread's listed leaves to its slots, and return the leaves for which there was no
+        room."""
         left = int(left_out)
         i = int(first)
         while left != 0 and i < wp.static(room):
@@ -214,12 +216,12 @@ def _left_out_of(layout: Layout, displacement: wp.Function, slot: wp.Function) -
 
 @functools.cache
 def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
-    """Symplectic Euler steps of the corotated model, a block a world; launch with ``layout.threads`` a block.
+    """Symplectic Euler steps of the corotated model, a block a world; launch with blocks of ``layout.threads``.
 
     Args:
-        layout: Who does what. Where leaves share their dilatation, the law's ``lam`` is zero, and that of the
-            dilatation is ``shared_lam``.
-        load_vectors: What loads are an array of, vec3 or vec4.
+        layout: Which thread does what. If leaves share their dilatation, ``lam`` is zero, and ``shared_lam`` [Pa] is
+            lambda of the dilatation.
+        load_vectors: The element type of the array of loads, vec3 or vec4.
     """
     shape, shared, uniform, parts = layout.shape, layout.shared, layout.uniform, layout.parts
     capacity, threads, zero_slot = layout.subtrees, layout.threads, layout.slot_count
@@ -231,7 +233,7 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
     dilating, of = layout.dilating, VOLUME_CHANGE
     slope_of = of.slope
     measure = [dilatation_sums_of(shape, uniform, of, layout.leaves(part)) for part in range(parts)]
-    # All in one pass, after a first one for the sums where two threads have them.
+    # Law and pressure are one pass, after a first pass for the sums if two threads share a subtree.
     at_once = dilating and not shared and layout.tolerance is None
     dilate = [dilating_forces_of(shape, uniform, layout.leaves(part)) for part in range(parts)]
     press = [pressure_forces_of(shape, uniform, of, layout.leaves(part)) for part in range(parts)]
@@ -291,7 +293,7 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
         material_of_world = world * body.element_count * stride
         material = material_of_world + body.subtrees.first[mine] * stride
         damped = 1.0 / (1.0 + dt * damping)
-        # In registers from here on, two nodes each.
+        # Each thread keeps up to two nodes in registers from here on.
         words = vec3u()
         for word in range(wp.static(NODE_WORDS)):
             words[word] = body.nodes[word, mine]

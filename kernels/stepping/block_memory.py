@@ -9,7 +9,8 @@ RESERVE, WRITE, READ, COUNT, CLEAR = 0, 1, 2, 3, 4
 def shared_list(room: int) -> wp.Function:
     """A list of integers in shared memory, as one function.
 
-    It makes room for some and returns where, writes or reads one, returns how many there are, or forgets all.
+    ``access`` says what it does: make room for ``value`` entries and return the first place, write or read entry ``i``,
+    return the number of entries, or clear the list.
     """
     snippet = f"""
 #if defined(__CUDA_ARCH__)
@@ -31,7 +32,10 @@ def shared_list(room: int) -> wp.Function:
 
 
 def shared_vectors(count: int, tag: str) -> wp.Function:
-    """An array of vectors in shared memory, as one function that reads or writes it; ``LOAD_BYTES`` counts in bytes."""
+    """An array of vectors in shared memory, as one function that reads or writes it.
+
+    With ``LOAD_BYTES`` the place is counted in bytes.
+    """
 
     snippet = f"""
 #if defined(__CUDA_ARCH__)

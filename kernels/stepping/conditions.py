@@ -1,7 +1,7 @@
-"""Changes that users make to nodes between steps: hold them, release them, load them. A launch is as large as the
-patch.
+"""Changes that users make to nodes between steps: hold, release and load them. A launch has one thread for each node of
+the patch.
 
-If there are fewer values than nodes, they are repeated: one value for all nodes, or the values of one world for each
+If there are fewer values than nodes, they are repeated: one value for all nodes, or the values of one world for every
 world.
 """
 
@@ -18,7 +18,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def inverse_of(mass: float):
-    """1/m, as every node that is free to move has it, or zero without mass [1/kg]."""
+    """The inverse mass of a free node, 1/m, or zero if it has no mass [1/kg]."""
     if mass > 0.0:
         return float(wp.float64(1.0) / wp.float64(mass))
     return float(0.0)
@@ -50,7 +50,7 @@ def hold_nodes(
     inverse_mass: wp.array[wp.float32],
     v: wp.array[wp.vec4],
 ):
-    """Hold nodes; they move with the velocities given, zero to stay where they are."""
+    """Hold nodes; they move with the given velocities [m/s]. With zero they stay where they are."""
     k = wp.tid()
     i = nodes[k]
     held[i] = wp.uint8(1)
@@ -68,7 +68,7 @@ def release_nodes(
     inverse_mass: wp.array[wp.float32],
     reactions: wp.array[wp.vec4],
 ):
-    """Release nodes with their present velocities."""
+    """Release nodes; they keep their present velocities."""
     i = nodes[wp.tid()]
     held[i] = wp.uint8(0)
     inverse_mass[i] = inverse_of(mass[i])
@@ -83,7 +83,7 @@ def load_nodes(
     # Out
     loads: wp.array[Any],
 ):
-    """Set the loads of nodes."""
+    """Set the loads of nodes [N]."""
     k = wp.tid()
     write_vector(loads, nodes[k], forces[k % forces.shape[0]])
 

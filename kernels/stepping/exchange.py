@@ -2,7 +2,7 @@
 
 import warp as wp
 
-#: How often a block polls for a displacement before it gives up: some seconds.
+#: How often a block polls for a displacement before it gives up; this takes some seconds.
 MOST_LOOKS = 1 << 22
 
 
@@ -10,7 +10,7 @@ MOST_LOOKS = 1 << 22
 class Exchange:
     """The arrays through which blocks exchange displacements."""
 
-    published: wp.array[wp.vec4]  # [2 N] displacements of even and of odd steps, the step's number in the last bits
+    published: wp.array[wp.vec4]  # [2 N] displacements of even and of odd steps; w holds the bits of the step's number
     begun: wp.array[wp.uint32]  # [patches] the number of the next launch's first state
 
 
@@ -41,5 +41,5 @@ def publish(published: wp.array[wp.vec4], i: int, value: wp.vec3, number: wp.uin
     return wp::vec_t<4, wp::float32>(0.0f, 0.0f, 0.0f, 1.0f);
 """)
 def await_displacement(published: wp.array[wp.vec4], i: int, number: wp.uint32) -> wp.vec4:
-    """The displacement of this number and 0, or 1 as the last component if it did not arrive."""
+    """Wait for the displacement of the step ``number``; the last component is 0, or 1 if it did not arrive."""
     ...

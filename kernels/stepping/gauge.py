@@ -1,11 +1,12 @@
-"""How stiff a body is now: one force evaluation measures all places at once, and the elements' strains tell how soon
-that may change.
+"""The gauge: how stiff a body is now. One force evaluation measures all nodes at once, and the elements' strains tell
+how soon the stiffness may change.
 
 Small motions about the present displacements u obey q'' = -A q with A = M^-1/2 K M^-1/2 and q = M^1/2 d. Every free
-node has a direction, |q_i| = 1, so that the stiffest place is not missed wherever it is. A q comes from a difference of
-forces. s_i = q_i . (A q)_i never exceeds the sum of the norms of the blocks of row i, which bounds the eigenvalues of A
-(Gershgorin's circles, for blocks). The directions then turn to A q, each normalised again: a power iteration that keeps
-the directions at softer places. Places that fold (s_i < 0) do not vibrate.
+node has a direction of its own, |q_i| = 1, so that the stiffest place is found wherever it is. A q comes from a
+difference of forces. s_i = q_i . (A q)_i never exceeds the sum of the norms of the blocks of row i, and the largest of
+these sums bounds the eigenvalues of A (Gershgorin's circles, for blocks). The next directions are the vectors of A q,
+each normalised: a power iteration that does not lose the directions at softer places. Where s_i < 0, the body buckles
+and does not vibrate.
 """
 
 import functools
@@ -20,7 +21,7 @@ from .pace import CURVATURE, DONE, DT, STRAIN, Pace
 
 wp.set_module_options({"enable_backward": False})
 
-#: Number of measurements in which every element's strain is measured once.
+#: Every element's strain is measured once in this many measurements.
 TURNS = wp.constant(4)
 
 
@@ -36,7 +37,7 @@ def probe_directions(
     probed: wp.array[wp.vec4],
     f: wp.array[wp.vec4],
 ):
-    """Displacements that are moved along the directions by scale M^-1/2 q; nodes without a direction get one."""
+    """Move displacements along the directions by scale M^-1/2 q; nodes without a direction get one."""
     i = wp.tid()
     w = inverse_mass[i]
     a = load_node(q, i)
@@ -52,8 +53,8 @@ def probe_directions(
     store_node(f, i, wp.vec3())
 
 
-#: Bits of floats that are not negative are ordered as the floats are. Threads of a warp find their largest first:
-#: thousands of atomic operations on one address would take longer than all else here.
+#: The bits of non-negative floats have the order of the floats. The threads of a warp find their largest value first,
+#: because thousands of atomic operations on one address would take longer than everything else here.
 _KEEP_LARGEST = """
     if (!(value > wp::index(largest, place))) return;
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
@@ -71,7 +72,7 @@ _KEEP_LARGEST = """
 
 @wp.func_native(_KEEP_LARGEST)
 def keep_largest(value: float, place: int, largest: wp.array[wp.float32]):
-    """Let a place hold the largest value of all threads, at least zero; NaN is ignored."""
+    """Write the largest value of all threads to a place, at least zero; NaN is ignored."""
     ...
 
 
@@ -87,12 +88,12 @@ def find_curvatures(
     q: wp.array[wp.vec4],
     found: wp.array[wp.float32],
 ):
-    """The largest s_i [1/s^2], and the directions that come next."""
+    """Find the largest s_i [1/s^2] and the next directions."""
     i = wp.tid()
     w = inverse_mass[i]
     if w == 0.0:
         return
-    # The displacement after rounding: far from rest, it is still the motion that made the forces.
+    # The motion after rounding made the forces; far from rest it differs from the motion that was asked for.
     d = load_node(probed, i) - load_node(u, i)
     force = load_node(f, i) - load_node(f_probed, i)
     square = wp.dot(d, d)
@@ -104,9 +105,10 @@ def find_curvatures(
 
 @functools.cache
 def find_strains(Elements: Any) -> wp.Kernel:
-    """The largest entry of C - I = F^T F - I among elements, now and after ``steps`` more at the present rate.
+    """The largest entry of C - I = F^T F - I of any element, now and after ``steps`` more steps at the present rate.
 
-    One element in ``turns`` is measured, others the next time: neighbours, which share nodes, are strained alike.
+    Each measurement takes one element in ``turns``, and the next one takes others. That is enough, because neighbours
+    share nodes and are strained alike.
     """
 
     @unique_kernel()

@@ -1,7 +1,7 @@
-"""Time stepping on the nodes: symplectic Euler, prescribed motion, and the two ways positions and displacements meet.
+"""Time stepping of the nodes: symplectic Euler, prescribed motion, and the exchange of positions with users.
 
-The state is the displacement from rest: float32 positions would lose what small strains need. Positions are published
-for users after each run of steps, and adopted before the next if a user has changed them.
+The state is the displacement from rest, because float32 positions would lose the digits that small strains need.
+Positions are published for users after each run of steps, and adopted before the next run if a user has changed them.
 
 Loads and positions may be arrays of other programs. Kernels that read them exist twice: for vec4 arrays, such as the
 solver's own, and for vec3 arrays with any stride.
@@ -40,13 +40,16 @@ def write_vector(vectors: wp.array[wp.vec3], i: int, value: wp.vec3):
 
 
 def by_vectors(kernel: wp.Kernel, argument: str) -> dict[type, wp.Kernel]:
-    """A generic kernel for either type of vectors in one of its arrays, chosen once and not at every launch."""
+    """The instances of a generic kernel for both vector types of one of its arrays.
+
+    They are made once, because Warp would look for the right one at every launch.
+    """
     return {dtype: wp.overload(kernel, {argument: wp.array(dtype=dtype)}) for dtype in (wp.vec3, wp.vec4)}
 
 
 @wp.func
 def is_finite(a: wp.vec3):
-    """False where any component is NaN or infinite."""
+    """False if any component is NaN or infinite."""
     return wp.abs(a[0]) + wp.abs(a[1]) + wp.abs(a[2]) <= 3.0e38
 
 
@@ -60,7 +63,8 @@ def symplectic_euler_velocity(
 
 @wp.func
 def add_support_work(elastic: wp.vec3, moved: wp.vec3, work: wp.array[wp.float64]):
-    """The work of a support that moves a node against its elastic force; only where supports move at all."""
+    """Add the work [J] of a support that moves a node against its elastic force; zero is not added, which saves
+    time."""
     added = wp.float64(-wp.dot(elastic, moved))
     if added != wp.float64(0.0):
         wp.atomic_add(work, 0, added)
@@ -69,7 +73,10 @@ def add_support_work(elastic: wp.vec3, moved: wp.vec3, work: wp.array[wp.float64
 
 @wp.func
 def count_support_work(elastic: wp.vec3, moved: wp.vec3, i: int, work: wp.array[wp.float64]):
-    """``add_support_work`` in the places of node i if ``work`` has two for each node, the absolute values last."""
+    """``add_support_work`` for a ``work`` array with two places for all nodes, or two for each node i.
+
+    The absolute values are in the second half.
+    """
     added = wp.float64(-wp.dot(elastic, moved))
     if added != wp.float64(0.0):
         count = work.shape[0] / 2
@@ -97,12 +104,12 @@ def step_symplectic_euler(
     support_work: wp.array[wp.float64],
     bad_step: wp.array[wp.int64],
 ):
-    """v <- (v + dt (f/m + g)) / (1 + dt damping); u <- u + dt v; f <- 0 for the next step to add to.
+    """v <- (v + dt (f/m + g)) / (1 + dt damping); u <- u + dt v; f <- 0, so that the next step can add to it.
 
-    After a change of the step, forces act for half of the old one and half of the new one.
+    After the length of a step has changed, forces act for half of the old length and half of the new one.
 
-    ``offset`` is this step's place in a run of recorded ones, whose steps ``pace`` does not count before its end.
-    ``support_work`` adds up the work of moving supports against the elastic forces, and its absolute value [J]: in two
+    ``offset`` is this step's place in a recorded run; ``pace`` counts the steps of a run only at its end.
+    ``support_work`` adds up the work of moving supports against the elastic forces, and its absolute value [J], in two
     places for all nodes, or in two places for each. A node without inverse mass moves with its present velocity (zero
     if fixed), and its support bears the weight, the elastic force and the load.
     """
@@ -132,7 +139,7 @@ def step_symplectic_euler(
 
 @wp.kernel(enable_backward=False)
 def set_start(pace: Pace, world_starts: wp.array[wp.float64]):
-    """Let the time of the only world begin now."""
+    """Set the starting time of the only world to the present time."""
     world_starts[0] = time_after(pace, 0)
 
 
@@ -154,8 +161,9 @@ def follow_trajectory(
 ):
     """Give prescribed nodes the velocity that moves them to their keyframed displacement at the end of the step.
 
-    The work of a step is that of the mean of the forces f at its two ends, by the trapezoidal rule: each force counts
-    with half the motion before it and half the motion after. The step itself takes the velocity after for both.
+    The work of a step is that of the mean of the forces f at its two ends (trapezoidal rule): each force counts along
+    half of the motion before it and half of the motion after it. The step itself counts both halves with the velocity
+    after it; the difference is added here.
     """
     k = wp.tid()
     i = nodes[k]
@@ -194,7 +202,8 @@ def adopt_positions(
     # In and out
     u: wp.array[wp.vec4],
 ):
-    """Adopt positions that a user wrote since they were published; untouched ones keep their digits."""
+    """Adopt positions that a user wrote since they were published; the others keep the digits of their
+    displacements."""
     i = wp.tid()
     x = load_node(rest, i)
     p = vector_at(positions, i)
@@ -221,7 +230,7 @@ def reset_nodes(
     reactions: wp.array[wp.vec4],
     world_starts: wp.array[wp.float64],
 ):
-    """Put the nodes of chosen worlds back to their initial state, or to rest if there is none.
+    """Reset the nodes of chosen worlds to their initial state, or to rest if there is none.
 
     Held nodes keep their velocity.
     """

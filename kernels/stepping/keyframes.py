@@ -7,9 +7,9 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def key_before(times: wp.array[wp.float64], t: wp.float64):
-    """The key before t among two or more, and where t is between it and the next one, 0 to 1.
+    """The last key before t, and how far t is on the way to the next key, 0 to 1. There must be two keys or more.
 
-    Before all keys it is the first, after them the last but one.
+    Before all keys this is the first key, after them the last but one.
     """
     last = times.shape[0] - 1
     key = int(0)

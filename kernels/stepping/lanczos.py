@@ -1,7 +1,7 @@
-"""Vectors of Lanczos' iteration on M^-1/2 K M^-1/2, one vec4 a node: its work between two evaluations of forces.
+"""Vector operations of Lanczos' iteration on M^-1/2 K M^-1/2 between evaluations of forces, with one vec4 a node.
 
-The host reads nothing before the last step. Sums are float64 and always have the same order: first sums of parts, then
-sums of those.
+The host reads nothing before the last step. Sums are float64 and always have the same order: first partial sums, then
+sums of these.
 """
 
 import warp as wp
@@ -10,7 +10,7 @@ from warp_corot.kernels.elements.elements import load_node, store_node
 
 wp.set_module_options({"enable_backward": False})
 
-#: Partial sums, each a thread's, at most; and what these are folded into.
+#: The largest number of partial sums, one for each thread, and the number of sums into which these are folded.
 PARTS = 16384
 FOLDED = 128
 
@@ -49,7 +49,7 @@ def inner_products(a: wp.array[wp.vec4], b: wp.array[wp.vec4], sums: wp.array[wp
         x = load_node(a, i)
         y = load_node(b, i)
         for axis in range(3):
-            # Products of two float32 numbers may be out of float32's range.
+            # The product of two float32 numbers may exceed the range of float32.
             total += wp.float64(x[axis]) * wp.float64(y[axis])
         i += sums.shape[0]
     sums[part] = total
@@ -57,7 +57,7 @@ def inner_products(a: wp.array[wp.vec4], b: wp.array[wp.vec4], sums: wp.array[wp
 
 @wp.kernel(enable_backward=False)
 def fold(parts: wp.array[wp.float64], sums: wp.array[wp.float64], largest: wp.array[wp.float64]):
-    """Sums and largest of every ``FOLDED``-th part."""
+    """Sum, and largest value, of every ``FOLDED``-th part."""
     k = wp.tid()
     total = wp.float64(0.0)
     most = wp.float64(0.0)
@@ -70,7 +70,7 @@ def fold(parts: wp.array[wp.float64], sums: wp.array[wp.float64], largest: wp.ar
 
 @wp.kernel(enable_backward=False)
 def take_scale(probe: float, largest: wp.array[wp.float64], scale: wp.array[wp.float32]):
-    """The factor with which the largest motion becomes ``probe``."""
+    """Find the factor that makes the largest motion ``probe`` [m]."""
     most = wp.float64(0.0)
     for k in range(FOLDED):
         most = wp.max(most, largest[k])
@@ -81,7 +81,7 @@ def take_scale(probe: float, largest: wp.array[wp.float64], scale: wp.array[wp.f
 
 @wp.kernel(enable_backward=False)
 def take_sum(sums: wp.array[wp.float64], root: int, place: int, numbers: wp.array[wp.float64]):
-    """Write a sum, or its root, to its place."""
+    """Write a sum, or its square root, to its place."""
     total = wp.float64(0.0)
     for k in range(FOLDED):
         total += sums[k]
@@ -113,7 +113,7 @@ def apply_stiffness(
 ):
     """w = M^-1/2 K M^-1/2 q - off[step] before, from the forces f = -scale K M^-1/2 q.
 
-    Nothing is ``before`` step 0.
+    In step 0 ``before`` is not read.
     """
     i = wp.tid()
     a = (-wp.sqrt(inverse_mass[i]) / scale[0]) * load_node(f, i)
@@ -124,14 +124,14 @@ def apply_stiffness(
 
 @wp.kernel(enable_backward=False)
 def take_away(numbers: wp.array[wp.float64], place: int, a: wp.array[wp.vec4], b: wp.array[wp.vec4]):
-    """b -= number a."""
+    """b -= numbers[place] a."""
     i = wp.tid()
     store_node(b, i, load_node(b, i) - float(numbers[place]) * load_node(a, i))
 
 
 @wp.kernel(enable_backward=False)
 def divide_by(numbers: wp.array[wp.float64], place: int, a: wp.array[wp.vec4]):
-    """a /= number, if that is not zero."""
+    """a /= numbers[place], if that is not zero."""
     i = wp.tid()
     if numbers[place] > wp.float64(0.0):
         store_node(a, i, float(wp.float64(1.0) / numbers[place]) * load_node(a, i))

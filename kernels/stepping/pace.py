@@ -1,7 +1,7 @@
-"""The time of a simulation on the device: steps done, the length of a step, and the time now.
+"""The clock of a simulation on the device: steps done, the length of a step, and the time.
 
-Kernels read the step from here, so that recorded launches stay valid when it changes. The time is not a sum of steps:
-it is the time at the last change of the step plus a whole number of steps since then.
+Kernels read the length of the step from here, so that recorded launches stay valid when it changes. The time is not a
+sum of steps: it is the time of the last change of the step plus a whole number of steps since then.
 """
 
 import warp as wp
@@ -12,23 +12,23 @@ wp.set_module_options({"enable_backward": False})
 DONE, DONE_THEN = wp.constant(0), wp.constant(1)
 DT, THEN, BEFORE = wp.constant(0), wp.constant(1), wp.constant(2)
 #: Places in ``control``: the step that the state allows, the fraction of it that is used, the longest step at rest, the
-#: shortest and longest steps used, how many checks in a row found the bodies calm, the number of intervals from one
-#: check of energies to the next, the steps done at the last one, and the step that the state allowed then.
+#: shortest and longest steps used, how many checks in a row found the bodies calm, how often energies are checked, the
+#: number of steps done at the last check, and the step that the state allowed then.
 ALLOWED, SHARE, AT_REST, SHORTEST, LONGEST, CALM, CLOSENESS, FOLLOWED, CHECKED = (wp.constant(k) for k in range(9))
 CONTROLS = 9
-#: Places in ``orders``, the host's orders for a run: when it ends [s], NEVER if it has no end; the steps done by then;
-#: and which of the two copies of the state is the last good one.
+#: Places in ``orders``, the host's orders for a run: the time at which it ends [s], NEVER if it has no end; the number
+#: of steps done by then; and which of the two copies of the state is the last good one.
 END, STOP, SLOT = (wp.constant(k) for k in range(3))
 ORDERS = 3
-#: Later than all ends [s].
+#: The end of a run that has none [s].
 NEVER = 1e300
-#: Results of a gauge for a body: the largest curvature [1/s^2], and the largest strain until the next measurement.
+#: Results of the gauge for a body: the largest curvature [1/s^2], and the largest strain until the next measurement.
 CURVATURE, STRAIN = wp.constant(0), wp.constant(1)
 #: Known numbers of a body at rest: the largest stable step [s], the curvature measured there, and the fractions of a
 #: stable step that are safe for small strains and for large ones.
 STABLE, REST_CURVATURE, SAFE, SAFE_STRAINED = (wp.constant(k) for k in range(4))
 
-#: Strains |F^T F - I| up to which the first fraction is safe, and from which on the second one is.
+#: The first fraction is safe up to the first of these strains |F^T F - I|, the second one from the other strain on.
 SMALL, LARGE = wp.constant(wp.float64(0.1)), wp.constant(wp.float64(0.4))
 #: Largest growth of the step from one measurement to the next: a place that was stiff a moment ago may soon be stiff
 #: again.
@@ -44,24 +44,25 @@ class Pace:
     """The clock, on the device."""
 
     counts: wp.array[wp.int64]  # [2] steps done; steps done when their length changed last
-    # [3] length of a step; time when it changed last; length of the step that velocities are half of behind
-    # displacements, zero if a user gave them, who knows of one length only
+    # [3] length of a step; time when it changed last; length of the step by half of which velocities are behind
+    # displacements, zero if a user wrote them: then it is the length of a step
     seconds: wp.array[wp.float64]
 
 
 @wp.func
 def time_after(pace: Pace, steps: int):
-    """The time some steps after those that are done [s], float64."""
+    """The time after ``steps`` more steps [s], float64."""
     made = pace.counts[DONE] + wp.int64(steps) - pace.counts[DONE_THEN]
     return pace.seconds[THEN] + wp.float64(made) * pace.seconds[DT]
 
 
 @wp.func
 def length_before(pace: Pace):
-    """The length of the last step [s], float64: velocities are half of it behind displacements.
+    """The length of the last step [s], float64; velocities are half of it behind displacements.
 
-    If the next one is longer or shorter, forces act for half of each. Otherwise steps that shorten as a body stiffens
-    and lengthen as it springs back would add energy at every bounce, and so would steps fitted to the end of a run.
+    If the next step is longer or shorter, forces act for half of each. Otherwise energy would grow at every bounce,
+    where steps shorten as a body stiffens and lengthen as it springs back, and whenever steps are fitted to the end of
+    a run.
     """
     before = pace.seconds[BEFORE]
     return wp.where(before > wp.float64(0.0), before, pace.seconds[DT])
@@ -77,21 +78,21 @@ def change_step(pace: Pace, dt: wp.float64):
 
 @wp.kernel(enable_backward=False)
 def advance_clock(steps: int, pace: Pace):
-    """Count a run of recorded steps; within the run each step carries its offset."""
+    """Count the steps of a recorded run; within the run each step has its own offset."""
     pace.counts[DONE] = pace.counts[DONE] + wp.int64(steps)
     pace.seconds[BEFORE] = pace.seconds[DT]
 
 
 @wp.kernel(enable_backward=False)
 def set_time(time: wp.float64, pace: Pace):
-    """Let the time now be exactly this."""
+    """Set the present time [s]."""
     pace.seconds[THEN] = time
     pace.counts[DONE_THEN] = pace.counts[DONE]
 
 
 @wp.func
 def safe_step(at_rest: wp.array2d[wp.float64], found: wp.array2d[wp.float32], body: int):
-    """A step that is stable about the present state and, by a margin, until the next measurement [s]."""
+    """A step that is stable at the present state and, with a margin, until the next measurement [s]."""
     stiffer = wp.float64(1.0)
     if at_rest[body, REST_CURVATURE] > wp.float64(0.0):
         stiffer = wp.max(wp.float64(found[body, CURVATURE]) / at_rest[body, REST_CURVATURE], stiffer)
@@ -123,9 +124,9 @@ def take_safe_step(
     control: wp.array[wp.float64],
     pace: Pace,
 ):
-    """Take the smallest of the bodies' safe steps: at once where it is shorter than before, slowly where longer.
+    """Use the smallest of the bodies' safe steps: at once if it is shorter than before, gradually if it is longer.
 
-    No step is so long that a node could pass through an obstacle within it; ``System.motion_rates`` has their speeds.
+    No step is so long that a node could pass through an obstacle in it; ``System.motion_rates`` has the speeds.
     """
     longest = control[AT_REST]
     safe = longest
@@ -149,7 +150,7 @@ def resume_step(control: wp.array[wp.float64], pace: Pace):
 
 @wp.kernel(enable_backward=False)
 def take_orders(given: wp.array[wp.float64], orders: wp.array[wp.float64], changed: wp.array[wp.int32]):
-    """Begin a run: copy the orders from the host's memory, which few threads should read."""
+    """Begin a run: copy the orders from the host's memory, since reading it from every thread would be slow."""
     for k in range(ORDERS):
         orders[k] = given[k]
     changed[0] = 0
@@ -157,10 +158,10 @@ def take_orders(given: wp.array[wp.float64], orders: wp.array[wp.float64], chang
 
 @wp.kernel(enable_backward=False)
 def fit_step(orders: wp.array[wp.float64], control: wp.array[wp.float64], pace: Pace):
-    """Let the steps that are left end in time.
+    """Choose the length of the remaining steps so that the run ends at its time.
 
-    They have equal lengths, no longer than the state allows. If that is shorter than the host knew, they end earlier,
-    and the host orders more.
+    All have the same length, no longer than the state allows. If the state allows less than the host knew when it gave
+    its orders, the run ends early, and the host orders more steps.
     """
     dt = allowed_step(control)
     left = orders[END] - time_after(pace, 0)
@@ -178,7 +179,7 @@ def set_schedule(
     checked: wp.float64,
     control: wp.array[wp.float64],
 ):
-    """Note the result of the last check and when the next one is due; see ``CALM``."""
+    """Store the result of the last check and when the next one is due; see ``CALM``."""
     control[CALM] = calm
     control[CLOSENESS] = closeness
     control[FOLLOWED] = followed

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import warp as wp
 
-#: The layout of a row of ``PatchBody.rest``: the inverse of the rest edges, row by row, then the volume.
+#: A column of ``PatchBody.rest`` has the inverse of the matrix of rest edges, row by row, then the volume.
 VOLUME_ROW = 9
 
 
@@ -40,13 +40,13 @@ class Layout:
 
     @property
     def floats(self) -> int:
-        """The shared memory of a block, in numbers of four bytes."""
+        """The shared memory of a block, in float32 numbers."""
         return 3 * self.vectors + self.groups * (2 * self.members + 2)
 
 
 @wp.struct
 class PatchBody:
-    """A body by patches; see ``solvers.explicit.patch_layout.Patches``."""
+    """The patches of a body; see ``solvers.explicit.patch_layout.Patches``."""
 
     own: wp.array[wp.int32]  # [N]
     own_start: wp.array[wp.int32]  # [patches + 1], as the other starts
@@ -58,15 +58,15 @@ class PatchBody:
     computed: wp.array[wp.int32]  # [patches] number of elements that it computes; it only measures the others
     measures: wp.array[wp.int32]  # [E] where an element's dilatation goes: group by group, one row a member
     corners: wp.array[wp.uint64]  # [E] the four corners' places among the patch's nodes, 16 bits each
-    slots: wp.array[wp.uint64]  # [E] the same of their forces
+    slots: wp.array[wp.uint64]  # [E] the places of the corners' forces in the same form
     bases: wp.array[wp.int32]
     base_start: wp.array[wp.int32]
     rest: wp.array2d[wp.float32]  # [10, E] see ``VOLUME_ROW``
     # Keyframes of all trajectories, one after another.
-    trajectory: wp.array[wp.int32]  # [N] which one a node follows, -1: none
-    place: wp.array[wp.int32]  # [N] its column there
+    trajectory: wp.array[wp.int32]  # [N] the trajectory that a node follows, or -1
+    place: wp.array[wp.int32]  # [N] the node's column there
     key_start: wp.array[wp.int32]  # [trajectories + 1] into ``times``
-    value_start: wp.array[wp.int32]  # [trajectories] into ``values``, whose rows are of ``columns``
+    value_start: wp.array[wp.int32]  # [trajectories] into ``values``, whose rows have ``columns`` entries
     columns: wp.array[wp.int32]  # [trajectories]
     times: wp.array[wp.float64]
     values: wp.array[wp.vec3]

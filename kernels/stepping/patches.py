@@ -1,17 +1,18 @@
 """Many steps of an organ in one launch of resident thread blocks, each of which keeps a patch of nodes.
 
-A block computes every element that touches one of its nodes, including those between patches. So blocks exchange no
+A block computes every element that touches one of its nodes, including those between patches. So blocks do not exchange
 forces, and no block waits for all others. Blocks exchange displacements: each publishes those of its nodes and waits
-for those of its halo, the other corners of its elements. A displacement is one word of 16 bytes, of which the last four
-are the step's number; a reader that sees the number has the value, without fences or counters. Two buffers alternate: a
-block publishes step n + 1 only after it has seen step n of all its neighbours, which then have read its step n - 1.
+for those of its halo, the other corners of its elements. A displacement is one word of 16 bytes, and its last four
+bytes are the step's number. A reader that sees the number has the value, without fences or counters. Two buffers
+alternate: a block publishes step n + 1 only after it has seen step n of all its neighbours, which have then read its
+step n - 1.
 
 If elements share their dilatation, a block also measures the other elements of its elements' groups. Each element
 writes its dilatation to the row of its group, one thread for each group sums the row, and a second pass adds the forces
 of the pressure.
 
-All blocks of a launch must be resident at once, one on each multiprocessor. Sums have a fixed order, so runs are
-reproducible bit by bit. CUDA only; ``solvers.explicit.patch_layout`` divides the work among blocks.
+All blocks of a launch must be resident at the same time, one on each multiprocessor. Sums have a fixed order, so runs
+are reproducible bit for bit. CUDA only; ``solvers.explicit.patch_layout`` divides the work among blocks.
 """
 
 import functools
@@ -35,7 +36,8 @@ from .threads import lowest_bit, number_in, shuffle_down, synchronize_any, synch
 wp.set_module_options({"enable_backward": False})
 
 WARP = 32
-#: The data that a thread keeps for an element: the inverse rest edges, and the volume times mu and times lambda.
+#: The numbers that a thread keeps for an element: the inverse rest edges, the volume times mu and the volume times
+#: lambda.
 CONSTANTS = 11
 
 row = wp.types.vector(length=CONSTANTS, dtype=wp.float32)
@@ -48,7 +50,8 @@ def rest_inverse(c: row):
 
 @wp.func
 def key_from(times: wp.array[wp.float64], key: int, last: int, t: wp.float64):
-    """Like ``keyframes.key_before``, but the search starts at an earlier key; ``last`` is the last key but one."""
+    """The same as ``keyframes.key_before``, but the search starts at an earlier key; ``last`` is the last key but
+    one."""
     found = key
     while found < last and times[found + 1] <= t:
         found += 1
@@ -89,12 +92,12 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
 
     @wp.func
     def law_lam(c: row):
-        """The part of lambda times the volume that the element's own law takes."""
+        """Lambda times the volume in the element's own law: zero if elements share their dilatation."""
         return wp.static(0.0 if shares else 1.0) * c[10]
 
     @wp.func
     def corner_forces(c: row, p: wp.mat33):
-        """The forces on all corners but the first."""
+        """The forces on the last three corners."""
         h = p * wp.transpose(rest_inverse(c))
         return -column(h, 0), -column(h, 1), -column(h, 2)
 
@@ -215,7 +218,7 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                 if wp.static(shares):
                     group_place[k] = body.measures[e]
 
-        # The memory of ``slot`` and ``displacement``; places without a corner are also read, and stay zero.
+        # Reserve the memory of ``slot`` and ``displacement``. Places without a corner are read, too, and stay zero.
         _memory = wp.tile_zeros(shape=wp.static(layout.floats), dtype=wp.float32, storage="shared")
         synchronize_block()
         if moves:
@@ -292,7 +295,7 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                 f = identity3() + displacement_gradient(its_corners, c)
                 store_forces(its_targets, c, turned_stress(f, c[9], law_lam(c)))
             if wp.static(shares):
-                # Elements that are only measured; their data come from the nearest cache.
+                # The elements that are only measured; their data come from the cache.
                 at = computed_count + thread
                 while at < element_count:
                     e = first_element + at
@@ -337,8 +340,8 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                     value = body.values[at]
                     target = value + share * (body.values[at + columns] - value)
                     towards = (target - x) / dt
-                    # As in ``follow_trajectory``, each force does work over half the motion before it and half the
-                    # motion after it.
+                    # As in ``follow_trajectory``, each force does work along half of the motion before it and half of
+                    # the motion after it.
                     add_support_work(elastic, 0.5 * before * (velocity - towards), support_work)
                     velocity = towards
                 force = elastic + load_here
@@ -357,7 +360,7 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
             step += 1
 
         if gave_up != 0:
-            # A failed step must not look like a state.
+            # A block that gave up must not leave something that looks like a valid state.
             x = wp.vec3(wp.nan, wp.nan, wp.nan)
             wp.atomic_min(bad_step, 0, pace.counts[DONE] + wp.int64(step + 1))
         if moves:

@@ -1,8 +1,8 @@
-"""Subnormal numbers count as zero on the CPU: two launches set and restore the thread's floating-point mode.
+"""On the CPU subnormal numbers count as zero: two launches set and restore the thread's floating-point mode.
 
 A core takes a hundred times as long for a subnormal number, and where a wave has not arrived yet, forces and velocities
-are subnormal. The mode is the thread's own, so the kernels of a run stand between one launch that keeps and changes it
-and one that restores exactly what was there: recorded in graphs as any other launch.
+are subnormal. The mode belongs to the thread. So one launch before the kernels of a run saves and changes it, and one
+launch after them restores it. Graphs record both like any other launch.
 """
 
 import warp as wp
@@ -43,11 +43,11 @@ def put_back_mode(mode: wp.array[wp.uint32]): ...
 
 @wp.kernel(enable_backward=False)
 def flush_subnormals(mode: wp.array[wp.uint32]):
-    """Keep the thread's mode in ``mode`` [1] and take subnormal numbers for zero from now on."""
+    """Save the thread's mode in ``mode`` [1], and count subnormal numbers as zero from now on."""
     exchange_mode(mode)
 
 
 @wp.kernel(enable_backward=False)
 def restore_subnormals(mode: wp.array[wp.uint32]):
-    """Restore the kept mode."""
+    """Restore the saved mode."""
     put_back_mode(mode)

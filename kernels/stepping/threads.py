@@ -1,4 +1,4 @@
-"""Threads of a block: waiting for one another, sums over a warp, and numbers packed into words."""
+"""Functions for the threads of a block: barriers, shuffles within a warp, bits, and numbers packed into words."""
 
 import warp as wp
 
@@ -19,7 +19,7 @@ def synchronize_block(): ...
 #endif
 """)
 def synchronize_any(flag: int) -> int:
-    """Wait for the block's threads; whether any has a flag."""
+    """Wait for all threads of the block, and return whether any has a flag."""
     ...
 
 

@@ -1,4 +1,4 @@
-"""The work of forces besides elasticity, for the balance of energy.
+"""The work of forces other than elastic ones, for the balance of energy.
 
 ``integrate.add_support_work`` counts the work of a support against all forces on its nodes. The part against forces
 that are not elastic is subtracted here, because the balance has no energy for them.
@@ -46,8 +46,10 @@ def count_work(
     others: wp.array[wp.vec4],
     account: wp.array2d[wp.float64],
 ):
-    """Each force works along half of the motion before and half of the motion after it, as symplectic Euler keeps
-    energy. Afterwards ``others`` has all forces besides elasticity, constraints included.
+    """Count the work of the other forces, each along half of the motion before it and half of the motion after it.
+
+    That is how symplectic Euler conserves energy. Afterwards ``others`` has all forces besides elasticity, constraints
+    included.
     """
     i = wp.tid()
     force = load_node(others, i)
@@ -85,12 +87,13 @@ def count_constraints(
     # In and out
     account: wp.array2d[wp.float64],
 ):
-    """The work of the forces of constraints, which are part of f.
+    """Count the work of the forces C of constraints, which are part of f.
 
-    A step gives a node the kinetic energy of all forces times their common time, half of the step before and half of
-    this one, times the mean of the velocities v and w before and after it. Elastic forces F, gravity and loads count
-    elsewhere, along half of the motion before and half of the motion after. Constraints decide where a node goes, so
-    the rest is their work: (b + d) / 2 C . (v + w) / 2 + (b - d) / 4 F . (w - v) for steps b and d.
+    Let b and d be the lengths of the last step and of this one, and v and w the velocities before and after the kick.
+    Let F be all other forces: elastic ones, gravity and loads. All forces act for (b + d) / 2, so they add the kinetic
+    energy (b + d) / 2 (F + C) . (v + w) / 2. The work of F is counted elsewhere, along half of the motion before and
+    half of the motion after: F . (b v + d w) / 2. Constraints decide where a node goes, so the rest is their work:
+    (b + d) / 2 C . (v + w) / 2 + (b - d) / 4 F . (w - v).
     """
     i = wp.tid()
     force = load_node(constrained, i)
