@@ -121,7 +121,6 @@ def scatter_soft_contacts(
     body_com: wp.array[wp.vec3],
     yielding: wp.array[wp.spatial_vector],
     share: float,
-    elapsed: float,
     first_row: int,
     # Out
     f: wp.array[wp.vec4],
@@ -133,8 +132,6 @@ def scatter_soft_contacts(
     Args:
         share: The substep's share of the step, for the mean wrench of each contact on its shape's body [N, N m], about
             the body's centre of mass or, for a fixed shape, the origin.
-        elapsed: Time for which bodies have moved since their state [s]; stiff springs would throw light particles if
-            bodies stood still in all substeps of a step, and moved by a whole step at its end.
         first_row: The row of ``reported`` for the first contact; ``reported`` may be empty.
     """
     c = wp.tid()
@@ -154,7 +151,6 @@ def scatter_soft_contacts(
         point = wp.transform_point(pose, point)
         arm = point - wp.transform_point(pose, body_com[body])
         velocity = wp.transform_vector(pose, velocity) + body_point_velocity(body_qd[body], arm)
-        point += elapsed * velocity
     normal = contact_normal[c]
     gap = contact_gap(normal, mean_of(p, q), largest_of(p, radius), point, shape, shape_margin)
     yielded = float(0.0)

@@ -145,13 +145,7 @@ class Contacts:
             wp.launch(check_contact_count, dim=len(trouble), inputs=inputs, outputs=[trouble], device=self.device)
 
     def add_forces(
-        self,
-        substep: Step,
-        of_bodies: newton.State,
-        f: wp.array,
-        trouble: wp.array,
-        share: float = 1.0,
-        elapsed: float = 0.0,
+        self, substep: Step, of_bodies: newton.State, f: wp.array, trouble: wp.array, share: float = 1.0
     ) -> None:
         """Add forces on particles to f, vec4 [P], and set ``reactions``.
 
@@ -162,7 +156,6 @@ class Contacts:
             f: Forces [N], which already hold all others.
             trouble: Failures of worlds.
             share: The substep's share of the step, in the mean of ``reported``.
-            elapsed: Time for which bodies have moved since ``of_bodies`` [s].
         """
         state, _, _, contacts, dt, reported = substep
         model = self.model
@@ -182,7 +175,7 @@ class Contacts:
             inputs += [touching.soft_contact_normal, *self.shapes(), model.shape_material_kd]
             inputs += [model.shape_material_kf, model.shape_material_mu, model.particle_flags, model.particle_world]
             inputs += [model.particle_radius, model.particle_inv_mass, state.particle_q, state.particle_qd]
-            inputs += [model.gravity, self._before, *bodies, share, elapsed, touching.rigid_contact_max]
+            inputs += [model.gravity, self._before, *bodies, share, touching.rigid_contact_max]
             self._launch(scatter_soft_contacts, touching.soft_contact_max, inputs, [f, self.reactions, rows])
         if pairs is not None and self.pairs is not None:
             self.pairs.add_forces(pairs, state, law, dt, self._loads.array, self._before, f, trouble)

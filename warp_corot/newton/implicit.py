@@ -82,7 +82,7 @@ class ImplicitSteps(Steps):
         at_rest: Any = SimpleNamespace(particle_q=now.particle_q, particle_qd=self._still)
         setattr(at_rest, NAMESPACE, getattr(now, NAMESPACE, None))
         self.tetrahedra.add_forces(at_rest, activation, self._f)
-        of_bodies = now if others.has_bodies else given
+        of_bodies = self._bodies_after(done, substep, given)
         self._links.begin(substep, of_bodies)
         self._launch_unknowns(substep, of_bodies, given)
         self._solve()

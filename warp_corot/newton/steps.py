@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import warp as wp
 
 from warp_corot.kernels.newton import particles as kernels
 from warp_corot.kernels.newton import worlds as worlds
+from warp_corot.kernels.newton.bodies import move_bodies
 from warp_corot.kernels.newton.contacts import add_wrenches
 from warp_corot.solvers.subnormals import FlushedSubnormals
 
@@ -53,6 +56,7 @@ class Steps:
         self._body_f = wp.empty(b, dtype=wp.spatial_vector, device=self.device)
         of_bodies = (wp.transform, wp.spatial_vector)
         self._bodies_before = [wp.empty(b, dtype=dtype, device=self.device) for dtype in of_bodies]
+        self._moved = SimpleNamespace(body_q=wp.empty(b, dtype=wp.transform, device=self.device), body_qd=None)
         self._kept_bodies = [wp.empty(b, dtype=dtype, device=self.device) for dtype in of_bodies]
 
     def launch(self, step: Step, count: int, following: Following | None = None) -> None:
@@ -178,6 +182,18 @@ class Steps:
         outputs = [tets.x, tets.u, self._f, *copies, self.report.trouble]
         self._launch(kernels.gather_particles, model.particle_count, inputs, outputs)
 
+    def _bodies_after(self, done: float, substep: Step, given: newton.State) -> newton.State:
+        """The bodies after some time of the step [s]. Those that another solver moves keep their velocities: if they
+        jumped by the motion of a step, stiff contacts would throw light particles."""
+        if self.others.has_bodies:
+            return substep.state_in
+        if not (done and self.model.body_count):
+            return given
+        self._moved.body_qd = given.body_qd
+        inputs = [done, given.body_q, given.body_qd, self.model.body_com]
+        self._launch(move_bodies, self.model.body_count, inputs, [self._moved.body_q])
+        return self._moved
+
     def _launch_forces(self, substep: Step, given: newton.State, share: float, done: float) -> None:
         """All other forces on particles, and on bodies those of particles.
 
@@ -192,9 +208,8 @@ class Steps:
         if control is not None and control.tet_activations is not None:
             activation = control.tet_activations
         self.tetrahedra.add_forces(substep.state_in, activation, self._f)
-        of_bodies = substep.state_in if others.has_bodies else given
-        elapsed = 0.0 if others.has_bodies else done
-        self.contacts.add_forces(substep, of_bodies, self._f, self.report.trouble, share, elapsed)
+        of_bodies = self._bodies_after(done, substep, given)
+        self.contacts.add_forces(substep, of_bodies, self._f, self.report.trouble, share)
         if others.has_bodies:
             wp.copy(self._body_f, given.body_f)
             self._add_wrenches(1.0, self._body_f)
