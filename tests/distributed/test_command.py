@@ -46,11 +46,11 @@ def test_what_does_not_work_is_refused_in_one_line(folder):
 @pytest.mark.parametrize("how", [pytest.param("killed", marks=pytest.mark.slow), "failed", "hung"])
 def test_a_rank_that_ends_takes_the_others_along(how, monkeypatch):
     if how == "hung":
-        monkeypatch.setenv("WARP_COROT_PATIENCE", "10")
+        monkeypatch.setenv("WARP_COROT_PATIENCE", "5")
     done = on_ranks(2, str(FAULTY), how, timeout=120.0)
     assert done.returncode != 0
     if how == "failed":
         said = [line for line in done.stderr.splitlines() if line.startswith("warp-corot:")]
         assert said == ["warp-corot: rank 1 of 2 ends all others: ValueError: rank 1 has had enough"]
     if how == "hung":
-        assert "rank 0 of 2 has waited 10 s for others (an exchange), and ends all" in done.stderr
+        assert "rank 0 of 2 has waited 5 s for others (an exchange), and ends all" in done.stderr

@@ -6,6 +6,7 @@ Three ranks make the runs of one rank, two and three, one after another: every p
 import resource
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -14,6 +15,8 @@ wp.config.quiet = True
 wp.config.enable_backward = False
 
 import warp_corot as wc  # noqa: E402
+from warp_corot.distributed import mpi, simulation  # noqa: E402
+from warp_corot.distributed.patience import Patient, patience  # noqa: E402
 
 
 def graded() -> wc.TetForest:
@@ -26,7 +29,7 @@ def graded() -> wc.TetForest:
 
 def jittered() -> wc.TetMesh:
     """The same region in tetrahedra of any shape."""
-    forest = wc.TetForest.box((1, 1, 3), 0.064, level=5)
+    forest = wc.TetForest.box((1, 1, 3), 0.064, level=4)
     noise = np.random.default_rng(20130705).normal(scale=8e-4, size=forest.points.shape)
     return wc.TetMesh(forest.points + noise, forest.tets)
 
@@ -78,21 +81,46 @@ CASES = {
 }
 
 
-def saved_and_loaded(results: Path, before: list[str], case: str) -> dict[str, np.ndarray]:
-    """A run that goes on from a checkpoint, and one that was never stopped; and one from others' checkpoint."""
+def moved(sim: wc.Simulation, body: wc.SoftBody) -> None:
+    """Move a body for 0.04 s; its load ends on the way."""
+    for number in (1, 2, 3):
+        sim.advance_until(number / 100)
+    body.load("z > 0.09 and z < 0.1", [0.0, 0.0, 0.0])
+    sim.advance(0.01)
+
+
+def options_of(case: str) -> dict[str, Any]:
+    """How a case is stepped."""
+    integrator = INTEGRATORS.get(case, wc.SymplecticEuler)()
+    return {"model": MODELS.get(case), "obstacles": obstacles_of(case), "integrator": integrator}
+
+
+def made(case: str, deterministic: bool, kept: Path | None) -> dict[str, np.ndarray | None]:
+    """What a run finds; with a file to keep, also that of the same run after a checkpoint."""
     import warp_corot.distributed as wd
 
-    sim = wd.Simulation(CASES[case](), deterministic=True, obstacles=obstacles_of(case))
-    sim.advance(0.03)
-    mine = results.with_suffix(f".{case}.npz")
-    sim.save(mine)
-    sim.advance(0.02)
-    found = {"saved.x": wd.gather(sim.body.positions)}
-    for name, path in (("loaded", mine), *(("others", Path(other).with_suffix(f".{case}.npz")) for other in before)):
-        again = wd.Simulation.load(path)
-        again.advance(0.02)
-        found |= {f"{name}.x": wd.gather(again.body.positions), f"{name}.numbers": np.array([again.steps, again.time])}
-    return {f"{case}.{key}": value for key, value in found.items()}
+    body, options = CASES[case](), options_of(case)
+    sim = wd.Simulation(body, deterministic=deterministic, **options)
+    moved(sim, body)
+    found = {"x": wd.gather(body.positions), "v": wd.gather(body.velocities), "energy": np.array(sim.energy())}
+    found["numbers"] = np.array([sim.steps, sim.dt, sim.time, *sim.dt_range])
+    found |= {f"wrench{k}": each.wrench.numpy() for k, each in enumerate(options["obstacles"]) if k}
+    found["costs"] = np.array(sim.measured_costs(2))
+    if kept is not None:
+        sim.save(kept)
+        sim.advance(0.01)
+        found |= {"saved.x": wd.gather(body.positions), "saved.numbers": np.array([sim.steps, sim.time])}
+    return {f"{case}.{deterministic}.{key}": value for key, value in found.items()}
+
+
+def resumed(path: Path) -> dict[str, np.ndarray | None]:
+    """What a run finds that goes on from a checkpoint."""
+    import warp_corot.distributed as wd
+
+    sim = wd.Simulation.load(path)
+    sim.advance(0.01)
+    numbers = np.array([sim.steps, sim.time])
+    return {f"{path.stem}.x": wd.gather(sim.body.positions), f"{path.stem}.numbers": numbers}
 
 
 def touched_in_parts() -> np.ndarray | None:
@@ -101,102 +129,76 @@ def touched_in_parts() -> np.ndarray | None:
 
     body = touched(wd.box((1, 1, 2), 0.05, level=4))
     sim = wd.Simulation(body, deterministic=True, obstacles=obstacles_of("touched"))
-    sim.advance(0.03)
-    body.load("z > 0.09 and z < 0.1", [0.0, 0.0, 0.0])
-    sim.advance(0.01)
+    moved(sim, body)
     return wd.gather(body.positions)
 
 
-def in_parts() -> np.ndarray | None:
-    """The run "worlds" of a mesh that no rank holds whole; the positions of all nodes on rank 0."""
+def worlds_in_parts(stage: Path) -> dict[str, np.ndarray | None]:
+    """The run "worlds" of a mesh that no rank holds whole, recorded; and once more with no room on the last rank."""
     import warp_corot.distributed as wd
 
     body = body_of(wd.box((1, 1, 3), 0.064, level=4), 0.3, worlds=2)
     sim = wd.Simulation(body, deterministic=True, integrator=INTEGRATORS["worlds"]())
-    sim.advance(0.03)
-    body.load("z > 0.09 and z < 0.1", [0.0, 0.0, 0.0])
-    sim.advance(0.01)
+    wd.record(sim, stage, duration=0.03, fps=100, world=0)
+    np.save(stage.with_suffix(f".{sim.rank}.npy"), body.positions.numpy()[: len(body.mesh.points)])
+    moved(sim, body)
     sim.collect()
     # Copies of other ranks' nodes are where these have them.
     whole = sim.comm.bcast(wd.gather(body.positions), root=0)
     np.testing.assert_array_equal(body.positions.numpy(), whole[body.mesh.numbers.in_worlds(2)])
-    return whole if sim.rank == 0 else None
-
-
-def recorded(stage: Path) -> str:
-    """Record a run of a mesh that no rank holds whole, and once more with no room on the last rank; what is raised."""
-    import warp_corot.distributed as wd
-
-    body = body_of(wd.box((1, 1, 3), 0.064, level=4), 0.3)
-    sim = wd.Simulation(body, deterministic=True)
-    wd.record(sim, stage, duration=0.02, fps=100)
-    np.save(stage.with_suffix(f".{sim.rank}.npy"), body.positions.numpy()[: len(body.mesh.points)])
+    found = {"parts.x": whole if sim.rank == 0 else None, "recorded": np.array("")}
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     if sim.rank == sim.size - 1:
         resource.setrlimit(resource.RLIMIT_FSIZE, (2000, hard))
     try:
-        wd.record(sim, stage.with_name(f"full-{stage.name}"), duration=0.02, fps=100)
+        wd.record(sim, stage.with_name(f"full-{stage.name}"), duration=0.02, fps=100, world=0)
     except OSError as error:
-        return str(error)
+        found["recorded"] = np.array(str(error))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    return ""
+    return found
 
 
-def make_all(results: str, names: str, before: list[str]) -> None:
-    """Make runs on the ranks that there are, and write what they find."""
-    import warp_corot.distributed as wd
+def make_all(folder: Path, size: int, names: list[str]) -> None:
+    """Make runs on the ranks that there are, and write what they find.
 
-    found = {}
-    for name in names.split(","):
-        make = CASES[name]
-        for deterministic in (True, False) if name == "forest" and names != "forest" else (True,):
-            body = make()
-            obstacles = obstacles_of(name)
-            options = {
-                "model": MODELS.get(name),
-                "obstacles": obstacles,
-                "integrator": INTEGRATORS.get(name, wc.SymplecticEuler)(),
-            }
-            sim = wd.Simulation(body, deterministic=deterministic, **options)
-            sim.advance(0.03)
-            body.load("z > 0.09 and z < 0.1", [0.0, 0.0, 0.0])
-            sim.advance(0.01)
-            kind = f"{name}.{deterministic}"
-            found |= {f"{kind}.x": wd.gather(body.positions), f"{kind}.v": wd.gather(body.velocities)}
-            found |= {f"{kind}.numbers": np.array([sim.steps, sim.dt, sim.time, *sim.dt_range])}
-            found |= {f"{kind}.energy": np.array(sim.energy())}
-            found |= {f"{kind}.wrench{k}": each.wrench.numpy() for k, each in enumerate(obstacles) if k}
-    found["costs"] = np.array(sim.measured_costs())
-    for name in ("forest", "touched"):
-        if name in names:
-            found |= saved_and_loaded(Path(results), before, name)
-    if "worlds" in names:
-        found |= {"parts.x": in_parts(), "parts.touched.x": touched_in_parts()}
-        found["recorded"] = np.array(recorded(Path(results).with_suffix(".usda")))
-    if sim.rank == 0:
-        np.savez(results, **found)
+    One rank keeps the checkpoint of "forest", from which several go on; these keep that of "touched".
+    """
+    found: dict[str, Any] = {}
+    for name in names:
+        keeps = (name == "forest" and size == 1) or (name == "touched")
+        found |= made(name, True, folder / f"{name}.{size}.npz" if keeps else None)
+    if size > 2:
+        for path in (folder / "forest.1.npz", folder / f"touched.{size}.npz"):
+            if path.stem.split(".")[0] in names and path.exists():
+                found |= resumed(path)
+        if "forest" in names:
+            found |= made("forest", False, None)
+        if "worlds" in names:
+            found |= worlds_in_parts(folder / f"{size}.usda")
+        if "touched" in names:
+            found["parts.touched.x"] = touched_in_parts()
+    if mpi.world().rank == 0:
+        np.savez(folder / f"{size}.npz", **found)
     else:
         assert all(value is None for key, value in found.items() if key.endswith((".x", ".v")))
 
 
 def main() -> None:
-    from warp_corot.distributed import mpi
-    from warp_corot.distributed.patience import Patient, patience
-
-    folder, names = Path(sys.argv[1]), sys.argv[2]
+    folder, names = Path(sys.argv[1]), sys.argv[2].split(",")
     everybody = mpi.world()
     if everybody.size != 3:
-        make_all(str(folder / f"{everybody.size}.npz"), names, [])
+        make_all(folder, everybody.size, names)
         return
-    # Two ranks and one beside them, and then all three, which go on from the checkpoint of the one.
+    # Two ranks and one beside them, and then all three. All kernels are compiled then.
     alone = everybody.rank == 2
     some = Patient(mpi.library().COMM_WORLD.Split(int(alone)), patience())
     mpi.world = lambda: some  # type: ignore[assignment]
-    make_all(str(folder / f"{some.size}.npz"), names if alone else "forest", [])
+    make_all(folder, some.size, names if alone else names[:1])
     mpi.meet(everybody)
     mpi.world = lambda: everybody  # type: ignore[assignment]
-    make_all(str(folder / "3.npz"), names, [str(folder / "1.npz")])
+    simulation.compile_once = lambda *_, **__: None
+    make_all(folder, 3, names)
 
 
 if __name__ == "__main__":
