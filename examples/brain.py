@@ -1,9 +1,9 @@
 """Brain shift: the skull is opened, the fluid around the brain drains, and it sags (pip install nilearn matplotlib).
 
-The part above the fluid loses its buoyancy; below the fluid the skull holds the brain, above nothing does (Dumpuri et
-al. 2007, Med. Image Anal. 11). Moduli: Budday et al. (2015, J. Mech. Behav. Biomed. Mater. 46). In operations it sags
-by 1 cm on average (Roberts et al. 1998, Neurosurgery 43); here that depends mostly on the fluid's level. Head: MNI ICBM
-152.
+The part above the fluid loses its buoyancy. Below the fluid the skull holds the brain, above it nothing does (Dumpuri
+et al. 2007, Med. Image Anal. 11). Moduli: Budday et al. (2015, J. Mech. Behav. Biomed. Mater. 46). In operations the
+brain sags by 1 cm on average (Roberts et al. 1998, Neurosurgery 43); here the sag depends mostly on the fluid's level.
+Head: MNI ICBM 152.
 """
 
 import argparse

@@ -1,8 +1,8 @@
 """A frog of ten tissues, picked up by its back, hangs limp (pip install pyvista matplotlib).
 
-Its segmentation, by the Whole Frog Project, comes with PyVista. It has no skin and no muscle: flesh fills the space
-between the tissues and surrounds them, four voxels thick. It has no unit: the frog is assumed to be 9 cm long. Moduli
-are those of soft tissues except bone, which is gristle: real bone would need steps hundreds of times shorter.
+The segmentation of the Whole Frog Project comes with PyVista. It has no skin and no muscle, so flesh fills the space
+between the tissues and surrounds them, four voxels thick. It has no unit; the frog is assumed to be 9 cm long. Moduli
+are those of soft tissues. Bone is as soft as gristle, because real bone would need steps hundreds of times shorter.
 """
 
 import argparse

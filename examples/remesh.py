@@ -1,7 +1,7 @@
 """A ball is dragged across a slab; the mesh becomes fine at the ball and coarse again behind it.
 
-Elongation would not respond to compression; here elements are refined if they are large for their distance to the ball.
-Contact is a penalty: nodes inside the ball are pushed out by a force that grows with their depth.
+Elongation would not respond to compression, so elements are refined if they are large for their distance to the ball.
+Contact is a penalty: a force that grows with the depth pushes nodes out of the ball.
 """
 
 import argparse

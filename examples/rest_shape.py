@@ -1,8 +1,8 @@
-"""What shape must a beam be made in, so that it hangs straight? Its rest shape is found from the one that it sags into.
+"""In what shape must a beam be made so that it is straight under its weight? The search varies its rest shape.
 
-Unknown are the places of all nodes at rest. The misfit between where the beam sags and a straight one has a derivative
-with respect to all of them from one adjoint solve; SciPy's L-BFGS-B goes downhill with it. The stage shows the beam
-that was found: it begins as it was made, bent upwards, and sags until it is straight.
+The rest positions of all nodes are unknown. One adjoint solve gives the derivative, with respect to all of them, of the
+misfit between the sagging beam and a straight one; SciPy's L-BFGS-B minimises the misfit. The stage shows the result:
+the beam begins as it was made, bent upwards, and sags until it is straight.
 """
 
 import argparse

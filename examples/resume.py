@@ -18,7 +18,7 @@ def cantilever() -> wc.Simulation:
     mesh = wc.TetForest.box(cells=(4, 1, 1), cell_size=0.03, level=3)
     body = wc.SoftBody(mesh, wc.Isotropic(young=3e4, poisson=0.4, density=1000.0), device=args.device)
     body.fix(mesh.points[:, 0] < 1e-9)
-    # A given step: one that follows the state is adjusted to meet the ends of frames.
+    # The step is given, because a step that follows the state is adjusted to meet the ends of frames.
     return wc.Simulation(body, integrator=wc.SymplecticEuler(dt=2e-4, damping=3.0))
 
 

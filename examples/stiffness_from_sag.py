@@ -1,8 +1,8 @@
-"""How stiff is a beam that sags by so much? Its Young's modulus is found from the measured sag of its free end.
+"""How stiff is a beam? Young's modulus is found from the measured sag of the free end.
 
-The sag at each guess and its derivative with respect to Young's modulus come from one static answer and one adjoint
-solve. Newton's method on the logarithms of both needs some four guesses, though soft beams hang rather than bend. The
-stage shows the beam that was found, released from its rest shape.
+For each guess, one static answer and one adjoint solve give the sag and its derivative with respect to Young's modulus.
+Newton's method on the logarithms of both needs about four guesses, even where soft beams hang rather than bend. The
+stage shows the beam with the modulus that was found, released from its rest shape.
 """
 
 import argparse

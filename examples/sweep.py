@@ -1,9 +1,9 @@
 """How far does a beam sag? 256 of the paper's beams, each with a different Young's modulus, hang in one run.
 
 Copies of a body are stepped together. The sag of the free end is drawn over Young's modulus (with matplotlib, if
-installed) beside Timoshenko's beam theory, which holds for small strains. Stiff beams sag in proportion, to 0.75 of
-theory: the mesh is coarse for a nearly incompressible material (at level 9 it is 0.86). Soft ones hang. The stage shows
-the softest. It takes a minute on one CPU core.
+installed) beside Timoshenko's beam theory, which holds for small strains. Stiff beams sag by 0.75 of the theory's sag,
+because the mesh is coarse for a nearly incompressible material (at level 9 it is 0.86). Soft beams hang. The stage
+shows the softest one. The run takes a minute on one CPU core.
 """
 
 import argparse

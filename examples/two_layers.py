@@ -1,8 +1,8 @@
-"""What are the stiffnesses of the two layers of a block? They are found from how its surface moves under a load.
+"""How stiff are the two layers of a block? Their moduli are found from the motion of its surface under a load.
 
-A stiff layer hides below a soft one, or the other way round: nobody can pull at it. The displacements of the upper face
-under a push and a shear are measured; here they come from known moduli, so that one sees whether they are found again.
-SciPy's L-BFGS-B goes downhill with the gradient of the misfit: one adjoint solve for both, and for any number of them.
+A stiff layer lies below a soft one, or the other way round, where nobody can test it by itself. The displacements of
+the upper face under a push and a shear are measured. Here they are computed from known moduli, to see whether these are
+found again. SciPy's L-BFGS-B minimises the misfit; one adjoint solve gives its gradient for any number of moduli.
 """
 
 import argparse

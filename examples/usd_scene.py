@@ -1,6 +1,7 @@
-"""Make a USD stage with OpenUSD: jelly above a table, a ball above the jelly. Newton steps it, and the
-motion and the stress of every tetrahedron are written over it. The stage stays beside the
-output: `warp-corot scene jelly-stage.usda -o jelly.usd` does the same.
+"""Jelly falls on a table, and a ball on the jelly: a USD stage made with OpenUSD and stepped in Newton.
+
+The motion and the stress of every tetrahedron are written over the stage, which stays beside the output. The command
+`warp-corot scene jelly-stage.usda -o jelly.usd` does the same.
 """
 
 import argparse

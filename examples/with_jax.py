@@ -1,7 +1,7 @@
 """A soft blade in a gusty wind, as part of a JAX program: steps are an operation inside `jit` and `scan`.
 
 The wind, a JAX function of place and time, gives the forces, and the steps give the positions a millisecond later, in
-JAX's buffers and without a copy. Velocities stay in the simulation; the operation has no gradient.
+JAX's buffers and without a copy. The velocities stay in the simulation, and the operation has no gradient.
 """
 
 import argparse

@@ -1,8 +1,7 @@
-"""PyTorch holds up sixteen soft beams: one tensor has the forces that steps read, another the positions that they
-write.
+"""PyTorch holds up sixteen soft beams: the steps read forces from one tensor and write positions to another.
 
-Nothing is copied and no value passes through the host. Each beam has a spring of a different stiffness at its tip, with
-a damper, written as tensor code for all of them at once. It needs `pip install "warp-corot[torch]"`.
+Nothing is copied, and no value passes through the host. Each beam has a damped spring of a different stiffness at its
+tip, written as tensor code for all beams at once. It needs `pip install "warp-corot[torch]"`.
 """
 
 import argparse

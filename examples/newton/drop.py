@@ -1,6 +1,7 @@
 """A ball of soft tissue, meshed adaptively, falls on a rigid box; both come to rest on the ground. Stress is logged.
 
-The ball's surface is drawn, bound to its tetrahedra, which extend a little beyond it, since cut ones are whole.
+The ball's surface is drawn and follows its tetrahedra. These extend a little beyond the surface, because cut
+tetrahedra are simulated whole.
 
 python examples/newton/drop.py --viewer null --test, or --viewer usd --output-path drop.usd, gl, rerun, viser.
 Without a display and --viewer, frames go to a USD file.
@@ -55,7 +56,7 @@ class Example:
         self.model.shape_material_ke.fill_(4e4)
         self.model.shape_material_kd.fill_(400.0)
         self.solver = wn.SolverCorotated(self.model, damping=2.0)  # 1/s, so that the ball comes to rest
-        # Number of contact detections in a frame; the solver divides steps further to stay stable.
+        # Contacts are found this often in a frame; the solver divides steps further to stay stable.
         self.steps = 8
         self.pipeline = newton.CollisionPipeline(self.model)
         self.contacts = self.pipeline.contacts()

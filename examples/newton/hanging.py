@@ -1,4 +1,4 @@
-"""Four cantilevers of the same rubber in Newton, with less and less damping; the last one is a forest.
+"""Four cantilevers of the same rubber in Newton, each with less damping than the last; the fourth is a forest.
 
 python examples/newton/hanging.py --viewer null --test, or --viewer usd --output-path hanging.usd, gl, rerun, viser.
 Without a display and --viewer, frames go to a USD file.
@@ -61,7 +61,7 @@ class Example:
         self.graph = capture.graph
 
     def simulate(self):
-        # Two, so that the states end as they began; the solver divides them to stay stable.
+        # Two substeps, so that the two states do not change places; the solver divides them to stay stable.
         for _ in range(2):
             self.state_0.clear_forces()
             self.viewer.apply_forces(self.state_0)

@@ -141,7 +141,7 @@ def test_a_folder_of_slices(folder, capsys):
         writer.SetFileName(str(slices / f"{40 - k:03}.dcm"))
         writer.Execute(part)
     assert simulate("patient", "-o", "a.usd", *SHORT) == 2
-    assert "as intensities do, not labels; say --threshold" in capsys.readouterr().err
+    assert "as intensities do, not labels; give --threshold" in capsys.readouterr().err
     assert simulate("patient", "--threshold", "100", "--tets", 1500, "-o", "a.usd", *SHORT) == 0
     out, _ = capsys.readouterr()
     assert "unit mm, as the file says" in out

@@ -61,7 +61,7 @@ REFUSED = [
     (["organ.obj", "--pull", "right", "0", "0", "1cm", "--tets", "500"], "--pull: expression 'right': 'right' is not"),
     (["organ.obj", "--labels", "liver=3kPa"], "--labels is for scans, and organ.obj is not one"),
     (["organ.obj", "--draw-labels"], "--draw-labels is for scans"),
-    (["box", "--unit", "mm"], "--unit is for files, and box is not one; say --scale"),
+    (["box", "--unit", "mm"], "--unit is for files, and box is not one; use --scale"),
     (["warp:bear", "--tets", "1000"], "--tets is for surfaces and scans"),
     (["box", "--draw-tets"], "--draw-tets is for surfaces and scans"),
     (["organ.obj", "--tets", "0"], "--tets is 0; it must be a whole number, at least 1"),

@@ -99,4 +99,4 @@ def refuse_options(args: argparse.Namespace, opened: Opened) -> None:
 
 
 def _instead(name: str, args: argparse.Namespace) -> str:
-    return "; say --scale" if name == "unit" else ""
+    return "; use --scale" if name == "unit" else ""

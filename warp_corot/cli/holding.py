@@ -87,7 +87,7 @@ def held_by_default(
         subject.mesh, young=material.young, density=material.density, gravity=gravity, surface=subject.surface
     )
     lines = holds.reasons()
-    subject.notes += [*lines[:-1], f"{lines[-1]} (--fix says otherwise)"]
+    subject.notes += [*lines[:-1], f"{lines[-1]} (--fix chooses others)"]
     held = Held(holds.nodes, holds.words, holds.title)
     if not (1.0 < holds.stiffer < np.inf):
         return held, 1.0

@@ -125,7 +125,7 @@ def numbers_by_name(
     said = ", ".join(f"{name} is {number:g}" for name, number in pairs.items())
     return (
         {name: (number,) for name, number in pairs.items()},
-        f"the volume's labels are taken in ascending order: {said} (say {bare[0]}@NUMBER=... for others)",
+        f"the volume's labels are taken in ascending order: {said} ({bare[0]}@NUMBER=... names others)",
     )
 
 

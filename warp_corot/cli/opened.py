@@ -180,5 +180,5 @@ def longest_side(points: np.ndarray) -> float:
 def _guessed(unit: str, size: float, what: str = "body") -> str:
     return (
         f"the coordinates are taken to be in {unit}: the file names no unit, and the {what} is {size:.4g} units long "
-        "(--unit says otherwise)"
+        "(--unit names another)"
     )

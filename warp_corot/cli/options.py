@@ -112,7 +112,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_input(parser: argparse.ArgumentParser) -> None:
-    """Add what is simulated."""
+    """Add the argument INPUT."""
     parser.add_argument(
         "input",
         metavar="INPUT",
@@ -140,7 +140,7 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
 
 
 def add_scene_options(parser: argparse.ArgumentParser) -> None:
-    """Add what is to be known of bodies and their motion, whatever is made of them."""
+    """Add the options that describe bodies and their motion, which ``simulate`` and ``view`` share."""
     body = parser.add_argument_group("the body")
     body.add_argument(
         "--unit",
@@ -270,7 +270,7 @@ def add_scene_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_device(parser: argparse.ArgumentParser) -> None:
-    """Add where it is computed."""
+    """Add the option --device."""
     parser.add_argument("--device", help='where to compute: "cpu", "cuda:0", ... (default: a GPU if there is one)')
 
 

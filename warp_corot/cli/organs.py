@@ -35,7 +35,7 @@ TETS_PER_CUBE = 30
 MAX_LEVEL_FOR_ERROR, DETAIL = 12, 6
 #: Root cubes extend beyond the body by this fraction of its length.
 MARGIN = 1.0e-3
-#: With more root cubes in the body's box for each allowed tetrahedron, no body fits.
+#: If the body's box has more root cubes than this for each allowed tetrahedron, no body fits.
 CUBES_PER_TET = 1000
 #: Names of Python's arguments on the command line.
 ARGUMENTS = {
@@ -148,12 +148,12 @@ def _see_labels(volume: LoadedVolume) -> None:
     if len(fractions):
         raise InputError(
             f"{volume.source}: has values such as {fractions[0]:g}, as probabilities and intensities do, not labels; "
-            "say --threshold LOW[:HIGH] for the voxels that make up the body"
+            "give --threshold LOW[:HIGH] for the voxels that make up the body"
         )
     if np.isfinite(found).all() and (len(found) > MOST_LABELS or found[0] < 0):
         raise InputError(
             f"{volume.source}: has {len(found)} different values or more, {found[0]:g} to {found[-1]:g}, as "
-            "intensities do, not labels; say --threshold LOW[:HIGH] for the voxels that make the body, or --labels"
+            "intensities do, not labels; give --threshold LOW[:HIGH] for the voxels that make up the body, or --labels"
         )
 
 

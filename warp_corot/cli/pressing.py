@@ -99,7 +99,7 @@ def surface_of(patches: Patches) -> SurfaceMesh:
 
 
 def pressed(load: Load, patches: Patches, surface: SurfaceMesh) -> Array:
-    """Forces of one pascal on a patch, at the points of the surface [N], [V, 3].
+    """The nodal forces of a pressure of one pascal on a patch, at the points of the surface [N], [V, 3].
 
     Raises:
         InputError: The patch contains no part of the surface.

@@ -51,7 +51,7 @@ def let_others_speak() -> None:
 
 @contextmanager
 def one_first() -> Iterator[None]:
-    """Rank 0 first, then all others at once: they find the kernels that it has compiled."""
+    """Run the block on rank 0 first, then on all other ranks together, which find the kernels that rank 0 compiled."""
     if not are_several():
         yield
         return

@@ -1,4 +1,4 @@
-"""``warp-corot view``: a body in a browser, which the mouse drags."""
+"""``warp-corot view``: a soft body on a page in a browser, where the mouse can drag it."""
 
 from __future__ import annotations
 

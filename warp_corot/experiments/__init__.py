@@ -1,4 +1,5 @@
-"""A published experiment, repeated: the experiment, its timing, its claims, its report and its figures."""
+"""Experiments: the paper's, with its timing, claims, report and figures; and what adaptive meshes and remeshing
+save."""
 
 from .paper import Results, Run, Settings, run_experiment
 

@@ -11,7 +11,7 @@ from .paper import OWN, PEER, Results, Run
 
 #: Published errors of the observed node against StVK [m], and the error from which linear FEM counts as worse.
 PUBLISHED_COROTATED, PUBLISHED_LINEAR, LINEAR_AT_LEAST = 3.6e-3, 22e-3, 15e-3
-#: A volume with a smaller change is kept; linear FEM's must grow by at least five times that.
+#: A volume that changes by less is kept; that of linear FEM must grow by at least five times as much.
 VOLUME_KEPT = 0.01
 #: "Much faster": the whole step takes at most half the time. "No significant error": sharing rotations moves the node
 #: by at most this fraction of its sag.

@@ -27,7 +27,7 @@ FILES = {
 }
 
 _ROTATION, _FORCE, _REST, _FUSED, _SHIPPED = "#d95f3b", "#3b7ea1", "#b9c3c9", "#8a6f8e", "#4c8c5f"
-#: The time after which nothing moves and the axis of a long run is compressed [s].
+#: After this time nothing moves, and the axis of a long run is compressed [s].
 _SETTLED = 3.0
 
 
@@ -61,7 +61,7 @@ def draw_figures(folder: Path, results: Results) -> list[Path]:
 
 
 def draw_times(path: Path, results: Results) -> None:
-    """Figure 5: time of a step by model and by rotation level: by stages leaf by leaf, and as shipped."""
+    """Figure 5: the time of a step by model and by rotation level, stage by stage (leaf by leaf) and as shipped."""
     figure = new_figure(8.0, 4.9)
     ax = figure.add_axes((0.085, 0.255, 0.895, 0.59))
     runs = [results.runs[name] for name in (PEER, REFERENCE, "neo-hookean")]
@@ -214,7 +214,7 @@ def _label_ends(ax: Axes, values: list[float], labels: list[tuple[str, object]],
                 places[i] += lack / 2
                 places[i - 1] -= lack / 2
         places = np.maximum(places, 0.02 * top)
-    # In fractions of the axes' width, so that the gap looks the same on a wide and on a narrow panel.
+    # The gap is a length on paper, not a fraction of the axes, so that it looks the same on wide and narrow panels.
     unit = 0.01 / ax.get_position().width
     across = ax.get_yaxis_transform()
     for place, index in zip(places, order, strict=True):

@@ -1,4 +1,4 @@
-"""Number of tetrahedra for a surface: adaptive and uniform meshes of a ball and of a body with fine features.
+"""How many tetrahedra a surface needs: adaptive and uniform meshes of a ball and of a body with fine features.
 
 ``python -m warp_corot.experiments.meshes -o lod.png`` measures and draws it.
 """
@@ -23,7 +23,7 @@ from .style import FAINT, INK, LINEAR, OWN_COLOR, new_figure, save, tidy
 
 #: Edge of a root cube [m]; the bodies fit into one cube or a few.
 CELL = 1.0
-#: A mesh farther than this [m], the spines' thickness, from the spiny body has lost most of a spine.
+#: A mesh farther than this, the thickness of the spines, from the spiny body has lost most of a spine [m].
 LOST = 0.02
 
 
@@ -78,7 +78,7 @@ def distance_between(mesh: TetForest, domain: Domain, samples: np.ndarray) -> fl
 
 
 def measured(name: str, kind: str, domain: Domain, samples: np.ndarray, **size: float | None) -> Point:
-    """Make and measure a mesh. ``size`` has arguments of `TetForest.from_domain`."""
+    """Make and measure a mesh; ``size`` are arguments of `TetForest.from_domain`."""
     started = time.perf_counter()
     mesh = TetForest.from_domain(domain, CELL, **size)  # type: ignore[arg-type]
     seconds = time.perf_counter() - started
@@ -87,7 +87,7 @@ def measured(name: str, kind: str, domain: Domain, samples: np.ndarray, **size: 
 
 
 def sampled(domain: Domain, error: float) -> np.ndarray:
-    """Points on the body's surface [n, 3]: those of a mesh with this surface error [m], moved along phi's gradient."""
+    """Points on the body's surface [n, 3]: points of a mesh with this surface error [m], moved along phi's gradient."""
     x = TetForest.from_domain(domain, CELL, max_level=36, surface_error=error).surface().points
     step = 1e-3 * np.eye(3)
     slope = np.stack([domain.phi(x + d) - domain.phi(x - d) for d in step], axis=1)
@@ -99,8 +99,11 @@ def sampled(domain: Domain, error: float) -> np.ndarray:
 def study(
     levels: Sequence[int] = (9, 12, 15, 18, 21), errors: Sequence[float] = (16e-3, 8e-3, 4e-3, 2e-3, 1e-3)
 ) -> list[Point]:
-    """Meshes of the ball, refined at its surface or everywhere, at each level; and of the spiny body, adaptive ones for
-    each surface error [m] and uniform ones of the same levels."""
+    """Measure the meshes of both bodies.
+
+    The ball has, at each level, a mesh refined at its surface and one refined everywhere. The spiny body has adaptive
+    meshes for each surface error [m], and uniform meshes of the same levels.
+    """
     points = []
     domain = ball()
     samples = sampled(domain, 4e-4)
@@ -124,8 +127,10 @@ def ratios_by_level(points: Sequence[Point]) -> dict[int, float]:
 
 
 def ratios_by_error(points: Sequence[Point]) -> dict[float, float]:
-    """For each uniform mesh of the spiny body, the number of tetrahedra of the smallest adaptive mesh that is at least
-    as close, over its own; by its error [m]. Only for uniform meshes that have the spines."""
+    """Adaptive over uniform numbers of tetrahedra of the spiny body, by the uniform mesh's error [m].
+
+    Each uniform mesh that has the spines is compared with the smallest adaptive mesh that is at least as close.
+    """
     found = {}
     for mesh in (p for p in points if (p.name, p.kind) == ("spiny", "uniform") and p.error < LOST):
         enough = [p.tets for p in points if (p.name, p.kind) == ("spiny", "adaptive") and p.error <= mesh.error]

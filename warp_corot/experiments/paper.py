@@ -3,7 +3,7 @@
 After Tagawa, Yamada and Tanaka (IEEE EMBC 2013), section III. Parameters that the paper does not publish reproduce its
 two figures (3.6 and 22 mm): symplectic Euler, a step of 0.2 ms and mass-proportional damping of 15 /s.
 
-Errors and shapes are those of the models as shipped; the stages of steps are timed leaf by leaf, as in the paper.
+Errors and shapes come from the models as shipped; the stages of steps are timed leaf by leaf, as in the paper.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ FULL_DURATION, SHORT_DURATION = 80.0, 4.0
 #: Names of the reference models.
 REFERENCE, PEER, OWN = "stvk", "linear", "corotated"
 
-#: Steps between samples; as many as one graph records, so that sampling costs next to nothing.
+#: Steps between samples; one graph records as many, so that sampling costs next to nothing.
 SAMPLE_STEPS = GRAPH_STEPS
 
 
@@ -125,7 +125,7 @@ class Run:
         path: Displacement of the observed node at each sample [m], float64 [S, 3].
         growth: Volume of the beam over its volume at rest, less 1, at each sample, float64 [S].
         positions: Nodes at the end [m], float64 [N, 3].
-        speed: Largest speed of a node at the end [m/s]; rounding keeps it from being zero.
+        speed: Largest speed of a node at the end [m/s]; because of rounding it never becomes zero.
         rotations: Number of rotations that a step extracts.
         times: Times of a step; None if they were not measured.
     """
@@ -178,8 +178,8 @@ def run_experiment(
     Args:
         settings: None: the short form.
         device: "cpu", "cuda:0", …; None for Warp's default.
-        progress: Called with the current activity and the units of work done since the last call; in all there are
-            ``work(settings)``.
+        progress: Called with the current activity and the units of work done since the last call; ``work(settings)``
+            is their total number.
 
     Raises:
         InputError: The device does not exist, or the step is too large for the mesh.

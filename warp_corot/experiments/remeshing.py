@@ -1,6 +1,6 @@
-"""Savings by remeshing: a notched bar in tension and a pressed slab, on remeshed and on uniform meshes.
+"""What remeshing saves: a notched bar in tension and a pressed slab, on remeshed and on uniform meshes.
 
-``python -m warp_corot.experiments.remeshing`` measures the reaction force, displacements, and the wall time.
+``python -m warp_corot.experiments.remeshing`` measures the reaction force, the displacements and the wall time.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ CELL = 0.02
 TISSUE = Isotropic(young=1e4, poisson=0.3, density=1000.0)
 #: Speed of sound in a thin bar [m/s].
 SPEED = 10.0**0.5
-#: Duration of the face's motion, and time until rest, in times that sound needs to cross the body.
+#: Duration of the face's motion, and of the rest of the run, in units of the time that sound needs to cross the body.
 MOVING, RESTING = 6.0, 12.0
 KEYS = 41
 
@@ -43,16 +43,17 @@ Vectors = npt.NDArray[np.float64]
 
 
 class Scene(ABC):
-    """A body fixed at one face and moved at another, slowly, then held until it is at rest.
+    """A body that is fixed at one face, moved slowly at another, and then held until it is at rest.
 
     Attributes:
         name: Name of the scene.
         size: Size in root cubes along each axis.
         travel: Displacement of the moved face [m], [3].
         across: Distance that sound travels through the strained part [m].
-        probes: Places to compare displacements: two points' difference or one point's [cubes], and which axis.
-        criteria: Criteria with their thresholds; ``depth`` is the number of levels between the coarsest
-            elements and the finest ones, ``parameters`` are in cubes, that of the strain in the coarsest ones' edges.
+        probes: Displacements to compare: the places of one point or of two, whose difference counts [cubes], and the
+            axis.
+        criteria: Criteria with their thresholds; ``depth`` is the number of levels between the coarsest and the finest
+            elements. ``parameters`` are in cubes; that of the strain is in edges of the coarsest elements.
     """
 
     name: str
@@ -75,7 +76,7 @@ class Scene(ABC):
         """Which nodes are moved all the way."""
 
     def coarsest(self, finest: int, criterion: str | None = None) -> int:
-        """The initial level of a mesh with one criterion, or the lowest of all."""
+        """The initial level of a mesh with a criterion; None: the lowest of all criteria."""
         chosen = self.criteria if criterion is None else [criterion]
         return finest - max(self.criteria[name]["depth"] for name in chosen)
 
@@ -128,7 +129,7 @@ class NotchedBar(Scene):
 
 
 class PressedSlab(Scene):
-    """A slab on a table, pressed by a square punch that sticks to it, by 15 % of its thickness."""
+    """A slab on a table; a square punch that sticks to it presses it by 15 % of its thickness."""
 
     name = "slab, pressed"
     size = (5, 2, 5)
@@ -168,7 +169,7 @@ class Outcome:
         mesh: "uniform", or the criterion's name.
         level: The finest level.
         elements: Number of elements at the end.
-        most: Largest number of elements.
+        most: Largest number of elements during the run.
         force: Force on the moved face, along its path [N].
         displacements: By the names of the scene's probes [m].
         field: Displacements of the nodes of the coarse mesh, which all meshes share [m], [n, 3].
@@ -189,14 +190,14 @@ class Outcome:
     seconds: float
 
     def errors(self, reference: Outcome) -> dict[str, float]:
-        """Relative errors of force and displacements against a reference; of the field in the mean square."""
+        """Relative errors of force and displacements against a reference; that of the field is a root mean square."""
         off = np.linalg.norm(self.field - reference.field) / np.linalg.norm(reference.field)
         found = {"force": self.force / reference.force - 1.0, "field": float(off)}
         return found | {name: u / reference.displacements[name] - 1.0 for name, u in self.displacements.items()}
 
 
 def run(scene: Scene, finest: int, device: wp.Device, criterion: str | None = None, *, coarse: bool = False) -> Outcome:
-    """Run the scene on the uniform mesh of the finest level, or on the coarsest one, or on a remeshed one."""
+    """Run the scene on the uniform mesh of the finest level, on the coarsest mesh, or on a remeshed one."""
     lowest = scene.coarsest(finest)
     level = lowest if coarse else finest if criterion is None else scene.coarsest(finest, criterion)
     mesh = scene.mesh(level)
@@ -254,7 +255,7 @@ SCENES: dict[str, Scene] = {"bar": NotchedBar(), "slab": PressedSlab()}
 
 
 def study(scene: Scene, finest: int, device: wp.Device) -> list[Outcome]:
-    """Runs on the uniform fine mesh, the uniform coarse one, and one for each criterion."""
+    """Run the scene on the uniform fine mesh, on the uniform coarse one, and with each criterion."""
     uniform = [run(scene, finest, device, coarse=coarse) for coarse in (False, True)]
     return uniform + [run(scene, finest, device, criterion) for criterion in scene.criteria]
 

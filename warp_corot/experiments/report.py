@@ -61,10 +61,10 @@ def table(results: Results) -> str:
         lines.append(_level_row(results, run))
     lines += [
         "",
-        "'moved': from the run with own rotations. Times up to 'step' are leaf by leaf, as the paper has it (own",
-        "rotations in one kernel with the force, under 'force'), and so is 'times as fast': whole steps, against own",
-        "rotations. 'shipped': the whole step as shipped, by complete subtrees. Errors and shapes are that path's and",
-        "agree with leaf by leaf to rounding.",
+        "'moved' is the distance from the run with own rotations. Times up to 'step' are leaf by leaf, as in the paper",
+        "(own rotations are part of 'force', in one kernel); 'times as fast' compares such steps with own rotations.",
+        "'shipped' is the whole step as shipped, by complete subtrees. Errors and shapes come from that path and agree",
+        "with leaf by leaf to rounding.",
         "",
         "The paper's claims",
     ]

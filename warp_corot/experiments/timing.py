@@ -1,11 +1,11 @@
 """Times of the stages of a time step: rotation, force, and the rest.
 
-For every stage, a graph of many launches is recorded and replayed; all stages of all models are timed in turn,
-round after round, so that other load on the machine affects all alike. Times of one round are relative to the
-peer's time in the same round.
+For every stage, a graph of many launches is recorded and replayed. All stages of all models are timed in turn, round
+after round, so that other load on the machine affects all alike. The times of a round are relative to the peer's time
+in the same round.
 
-Stages are those of the leaf-by-leaf path: corotated forces as shipped use subtrees, with rotation and force in one
-kernel. For that path only the whole step is timed.
+The stages are timed leaf by leaf. Corotated forces as shipped use subtrees, with rotation and force in one kernel, so
+for that path only the whole step is timed.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Times:
         seconds: Absolute [s].
         relative: In units of the peer's stages' sum in the same round.
         spread: Interquartile range of the relative whole step, over its median.
-        fused: Whether rotation and force are one kernel leaf by leaf, too; its time is under ``force``.
+        fused: Whether rotation and force are one kernel also leaf by leaf; its time is then under ``force``.
     """
 
     seconds: StageTimes
@@ -203,7 +203,7 @@ class _NoForces(ForceField):
 
 
 def _integration(sim: Simulation) -> tuple[wp.Graph, list]:
-    """The integrator alone on a body like the simulation's, without velocity and weight, so that it does not move."""
+    """The integrator alone, on a copy of the simulation's body without velocity and weight, which does not move."""
     original = sim.body
     body = SoftBody(original.mesh, original.material, device=original.device)
     body.fix(original.constrained)
@@ -215,7 +215,7 @@ def _integration(sim: Simulation) -> tuple[wp.Graph, list]:
 
 
 def _replays(graph: wp.Graph, device: wp.Device) -> int:
-    """Number of replays in one sample; this also warms up."""
+    """The number of replays in one sample; finding it also warms up."""
     count = 1
     while True:
         seconds = LAUNCHES * count * _seconds(graph, count, device)
@@ -225,7 +225,7 @@ def _replays(graph: wp.Graph, device: wp.Device) -> int:
 
 
 def _seconds(graph: wp.Graph, replays: int, device: wp.Device) -> float:
-    """Seconds of wall time a launch."""
+    """Wall time of one launch [s]."""
     wp.synchronize_device(device)
     start = time.perf_counter()
     for _ in range(replays):

@@ -1,8 +1,9 @@
-"""The subtrees of a uniformly bisected box around given lattice points, without the mesh.
+"""The subtrees of a uniformly bisected box around given lattice points, found without making the mesh.
 
-A point's barycentric weights in a root are whole numbers. Bisection at the middle of the edge between the corners of
-weights a and b turns them into a - b and 2 b, in the child that keeps the first corner if a >= b, and the other way
-round. So a descent needs sums and comparisons of whole numbers alone.
+A point's barycentric weights in a root are whole numbers. An element is bisected at the midpoint of an edge, between
+corners with the weights a and b. If a >= b, the point is in the child that keeps the first corner, with the weights
+a - b there and 2 b at the midpoint; otherwise it is in the other child, with a and b exchanged. So a descent needs only
+sums and comparisons of whole numbers.
 """
 
 from __future__ import annotations
@@ -18,21 +19,21 @@ from .bisection import far_end
 Ints = npt.NDArray[np.int32]
 Longs = npt.NDArray[np.int64]
 
-#: Points that descend at a time.
+#: Number of points that descend at a time.
 CHUNK = 1 << 20
 
 
 def subtrees_around(
     points: Ints, cells: tuple[int, int, int], intervals: int, depth: int, left_out: tuple[int, int]
 ) -> tuple[Longs, Longs]:
-    """All pairs of a point and a subtree that holds it, but for subtrees in one range.
+    """All pairs of a point and a subtree that holds it, except subtrees in one range.
 
     Args:
         points: Vertices of the mesh, with ``intervals`` grid intervals along a cube's edge, int32 [n, 3].
         cells: Number of cubes along x, y, z.
         intervals: A power of two.
         depth: The level of the subtrees' roots; the i-th is the i-th element of that level in tree order.
-        left_out: The first of the subtrees that do not count, and the one after the last.
+        left_out: The range of subtrees to leave out: the first one, and the one after the last.
 
     Returns:
         Places in ``points``, and numbers of subtrees, int64 [m] both.
@@ -73,7 +74,7 @@ def first_subtree(points: Ints, cells: tuple[int, int, int], intervals: int, dep
 
 
 def _in_roots(points: Ints, cells: tuple[int, int, int], intervals: int) -> Iterator[tuple[Longs, Longs, Ints]]:
-    """Points in all roots that hold them: their places, the roots, and their weights there."""
+    """Each point with each root that holds it: places of the points, the roots, and the weights there."""
     strides = np.array([cells[1] * cells[2], cells[2], 1], np.int64)
     for below in itertools.product((0, 1), repeat=3):
         cube = points // intervals - np.array(below, np.int32)

@@ -1,10 +1,10 @@
-"""Bisection of tetrahedra in Maubach order: the rule from which everything else follows.
+"""Bisection of tetrahedra in Maubach order, the rule behind the whole mesh.
 
 A tetrahedron (x0, x1, x2, x3) of type t = level mod 3 is bisected at the midpoint z of its refinement edge x0-xk,
 k = 3 - t, into (x0 .. x(k-1), z, x(k+1) .. x3) and (x1 .. xk, z, x(k+1) .. x3) (Maubach 1995).
 
-All subtrees below elements of one type look the same: a table says which node of which leaf is which, and only the
-nodes are data. ``Patch`` is that table.
+All subtrees below elements of one type have the same structure. ``Patch`` is a table of this structure, so only the
+nodes are data.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 IntArray = npt.NDArray[np.int32]
 
-#: Number of patches that are computed at a time, so that data that are read again are still in the cache.
+#: Number of patches that are computed at a time, few enough that data read again are still in the cache.
 CHUNK = 4096
 
 
@@ -28,7 +28,7 @@ def far_end(kind: int) -> int:
 
 
 def children(tets: np.ndarray, middle: np.ndarray, kind: int) -> np.ndarray:
-    """Both children of elements of one type: [n, 4] and midpoints [n] give [n, 2, 4]."""
+    """Both children, [n, 2, 4], of elements of one type, [n, 4], with the midpoints of their refinement edges, [n]."""
     k = far_end(kind)
     both = np.empty((len(tets), 2, 4), tets.dtype)
     both[:, 0, :k] = tets[:, :k]
@@ -72,9 +72,9 @@ class Patch:
         return len(self.corners) + len(self.middles)
 
     def lattice_points(self, tets: IntArray) -> IntArray:
-        """The patches' nodes below elements [n, 4], where a node's number is an affine function of its coordinates.
+        """The nodes of the patches below elements [n, 4], if nodes are numbered by an affine function of coordinates.
 
-        A midpoint is then the mean of its ends, without a search.
+        Then the number of a midpoint is the mean of those of its ends, and no search is needed.
         """
         points = np.empty((len(tets), self.node_count), np.int32)
         for start in range(0, len(tets), CHUNK):
@@ -118,7 +118,7 @@ def path_tetrahedra(cells: tuple[int, int, int], points: tuple[int, int, int]) -
     for walk, order in zip(walks, itertools.permutations(range(3)), strict=True):
         for step, axis in enumerate(order):
             walk[step + 1 :, axis] = 1
-    # How much a node's number grows from one cube to the next along each axis.
+    # The growth of a node's number from one cube to the next along each axis.
     strides = np.array([points[1] * points[2], points[2], 1])
     strides *= [(p - 1) // n for p, n in zip(points, cells, strict=True)]
     corners = np.indices(cells).reshape(3, -1).T @ strides

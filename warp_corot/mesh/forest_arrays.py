@@ -61,19 +61,21 @@ class ForestArrays:
 
     @cached_property
     def levels(self) -> np.ndarray:
-        """Level of each leaf, int32 [T]; for uniform leaves, a broadcast number that takes no memory."""
+        """Level of each leaf, int32 [T]; for a uniform mesh a broadcast number, which takes no memory."""
         return self.tree.leaf_levels
 
     @cached_property
     def volumes(self) -> np.ndarray:
-        """Rest volume of each leaf [m^3], float64 [T]; for uniform leaves broadcast, as ``levels``."""
+        """Rest volume of each leaf [m^3], float64 [T]; for a uniform mesh a broadcast number, like ``levels``."""
         if isinstance(self.tree, UniformTree):
             return np.broadcast_to(volume_shares(self.tree.depth) * self.cell_size**3, self.levels.shape)
         return volume_shares(self.levels) * self.cell_size**3
 
     def ancestors(self, level: int) -> np.ndarray:
-        """For each leaf, the highest ancestor (or the leaf itself) that is not above ``level`` and whose corners are
-        nodes; indices into the tree, int32 [T]. Except at the border of a body, it is the ancestor at ``level``."""
+        """For each leaf, its highest ancestor, or itself, that is not above ``level`` and whose corners are nodes.
+
+        Except at the border of a body, this is the ancestor at ``level``. Returns indices into the tree, int32 [T].
+        """
         level = checked_level(level, "level")
         if self.node_count == len(self.lattice):
             return self.tree.ancestors(self.tree.leaves, level)

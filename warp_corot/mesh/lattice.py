@@ -12,7 +12,7 @@ from warp_corot.kernels.tables.shapes import VOLUME
 LATTICE_BITS = 16
 MAX_LEVEL = 3 * LATTICE_BITS
 
-#: Root cubes along an axis: lattice coordinates are int32.
+#: The most root cubes along an axis, because lattice coordinates are int32.
 MAX_CELLS = 2 ** (31 - LATTICE_BITS) - 1
 
 
@@ -26,7 +26,7 @@ def checked_level(level: Any, name: str) -> int:
     """A level for which the lattice has room.
 
     Raises:
-        InputError: It is no such level.
+        InputError: It is not a whole number from 0 to ``MAX_LEVEL``.
     """
     try:
         found = int(level)
@@ -42,7 +42,7 @@ def check_levels(min_level: Any, max_level: Any) -> None:
     """Check that two levels are in order; None leaves one open.
 
     Raises:
-        InputError: One is no level, or the first is larger than the second.
+        InputError: One is not a level, or the first is larger than the second.
     """
     levels = {"min_level": min_level, "max_level": max_level}
     found = [checked_level(level, name) for name, level in levels.items() if level is not None]
@@ -70,7 +70,7 @@ def checked_cells(cells: Any) -> tuple[int, int, int]:
 def checked_box(
     cells: Any, cell_size: float, level: Any, origin: Any, up_axis: str
 ) -> tuple[tuple[int, int, int], float, int, tuple[float, float, float]]:
-    """The arguments of ``TetForest.box`` but for the axis, as numbers.
+    """The checked arguments of ``TetForest.box`` except the axis.
 
     Raises:
         InputError: One of them is out of its range.

@@ -1,4 +1,4 @@
-"""Numbers of nodes and of tetrahedra, put in order."""
+"""Renumbering of nodes and tetrahedra."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def in_order_of_leaves(tree: Tree) -> np.ndarray:
     touched = tree.leaf_tets.ravel()
     turn = np.arange(len(touched), dtype=np.int64)
     first = np.empty(int(touched.max()) + 1, np.int64)
-    # The last write to a place stays: walk backwards to keep the first value.
+    # The last write to a place wins, so walk backwards to keep the first value.
     first[touched[::-1]] = turn[::-1]
     return touched[first[touched] == turn]
 
@@ -41,7 +41,7 @@ def pruned(tree: Tree, empty: np.ndarray) -> tuple[Tree, np.ndarray]:
 
     Args:
         tree: Its leaves are live or void.
-        empty: Which void leaves hold nothing at all, bool [M]; two of one parent become one.
+        empty: Which void leaves hold nothing at all, bool [M]; two children of one parent become one leaf.
 
     Returns:
         The tree, and the old tetrahedra that are in it, ascending.

@@ -1,4 +1,4 @@
-"""Launches on all cores of a CPU: Warp runs a kernel on one core, but parts of a launch can run in parallel."""
+"""Launches on all cores of a CPU: Warp runs a kernel on one core, but the parts of a launch can run in parallel."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PARTS = 4
 
 
 def in_parts(device: wp.Device, count: int, work: Callable[[int, int], None]) -> None:
-    """Do work on the numbers from 0 to ``count``: on a CPU in parts on all its cores, elsewhere at once.
+    """Do work on the numbers from 0 to ``count``: in parts on all cores of a CPU, in one call on other devices.
 
     Args:
         device: The device of the launches. While a kernel runs on the CPU, Python is free for other threads.
@@ -30,7 +30,7 @@ def in_parts(device: wp.Device, count: int, work: Callable[[int, int], None]) ->
         work(0, count)
         return
     bounds = [count * part // (PARTS * cores) for part in range(PARTS * cores + 1)]
-    work(bounds[0], bounds[1])  # by itself, since it may compile and load kernels
+    work(bounds[0], bounds[1])  # alone, because it may compile and load kernels
     for _ in _pool().map(work, bounds[1:-1], bounds[2:]):
         pass
 
@@ -39,7 +39,7 @@ def core_count() -> int:
     """Cores that this process may use."""
     try:
         return len(os.sched_getaffinity(0))
-    except AttributeError:  # not on this system
+    except AttributeError:  # this system does not have it
         return os.cpu_count() or 1
 
 
@@ -48,5 +48,5 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(core_count(), thread_name_prefix="warp_corot")
 
 
-if hasattr(os, "register_at_fork"):  # a forked process has the pool without its threads
+if hasattr(os, "register_at_fork"):  # a forked process inherits the pool, but not its threads
     os.register_at_fork(after_in_child=_pool.cache_clear)

@@ -19,7 +19,7 @@ from .surfaces.bound import BoundPoints, bound
 from .surfaces.boundary import signed_volumes
 from .surfaces.locating import embed_in_tets
 
-#: In float32, a tetrahedron with less volume than this times its longest edge cubed looks flat.
+#: A tetrahedron with less volume than this times the cube of its longest edge is flat in float32.
 FLAT = 1e-7
 
 
@@ -27,7 +27,7 @@ class TetMesh:
     """Tetrahedra of any shape.
 
     Mirrored tetrahedra (negative volume) are repaired by exchanging their last two nodes; ``repaired`` says how many.
-    Nodes that no tetrahedron names are kept and stay at rest.
+    Nodes that belong to no tetrahedron are kept and stay at rest.
 
     Args:
         points: Rest positions [m], [N, 3].

@@ -1,4 +1,4 @@
-"""The trees of a forest: every tetrahedron of every level, stored or, if all leaves have one level, computed."""
+"""The trees of a forest: the tetrahedra of all levels, stored, or computed if all leaves have one level."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from .bisection import corner_leaves
 
-#: In place of a first child: a leaf of the mesh, or a leaf outside the body.
+#: Stored in place of a first child: a leaf of the mesh, or a leaf outside the body.
 LIVE = -1
 VOID = -2
 
@@ -69,7 +69,7 @@ class Tree:
         return self.tets[elements], self.level[elements]
 
     def above(self, elements: np.ndarray, steps: int) -> np.ndarray:
-        """The ancestor a number of levels above each element, -1 if it would be above a root; int32."""
+        """The ancestor ``steps`` levels above each element, -1 if there is none; int32."""
         found = np.array(elements, dtype=np.int32)
         for _ in range(steps):
             found = np.where(found >= 0, self.parent[found], np.int32(-1))
@@ -86,10 +86,11 @@ class Tree:
 
 
 class UniformTree(Tree):
-    """A tree whose leaves all have one level: its elements are ordered by level, and each level is in tree order.
+    """A tree whose leaves all have one level.
 
-    So parents, children and levels are computed, and an ancestor's corners are corners of its leaves. Only the leaves
-    are stored; the attributes of ``Tree`` are made on first use. Indices are int64 from 2**31 tetrahedra on.
+    Its elements are ordered by level, and each level is in tree order. So parents, children and levels can be computed,
+    and an ancestor's corners are found among those of its leaves. Only the leaves are stored; the attributes of
+    ``Tree`` are made on first use. Indices are int64 from 2**31 tetrahedra on.
 
     Args:
         leaf_tets: The leaves' nodes in Maubach order, in tree order, int32 [T, 4].
@@ -100,7 +101,7 @@ class UniformTree(Tree):
         self.__dict__.update(leaf_tets=leaf_tets)
         self.depth = depth
         roots = len(leaf_tets) >> depth
-        #: The start of each level, and the end of the last.
+        #: The first element of each level, and the number of all elements.
         self.starts = roots * (2 ** np.arange(depth + 2, dtype=np.int64) - 1)
         self._index = np.int32 if self.starts[-1] < 2**31 else np.int64
 

@@ -1,8 +1,8 @@
-"""A box of root cubes bisected uniformly, without a search.
+"""A box of root cubes, bisected uniformly without a search.
 
-All vertices lie on a grid, and a vertex's place on it is an affine function of its coordinates: a midpoint's place is
-the mean of its ends' places. So tables of whole patches of six levels give the leaves from the roots, and only the last
-patches' nodes, about one in seven of the leaves' entries, are numbered.
+All vertices lie on a grid, and a vertex's place on it is an affine function of its coordinates. So the place of a
+midpoint is the mean of the places of its ends. Tables of patches of six levels lead from the roots to the leaves. Only
+the nodes of the last patches have to be numbered: one seventh as many as the entries of all leaves.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def uniform_leaves(cells: tuple[int, int, int], level: int) -> tuple[IntArray, I
     patches: list[tuple[Patch, IntArray]] = []
     at = 0
     while at < level or not patches:
-        # The remaining levels come first, so that the last patches, which are nearly all, are whole.
+        # Levels that do not fill a patch come first, so that the last patches, which are nearly all, are full.
         depth = (level - at) % PATCH_DEPTH or min(level, PATCH_DEPTH)
         if patches:
             tets = patches[-1][0].leaves_of(patches[-1][1])
@@ -58,14 +58,14 @@ def uniform_leaves(cells: tuple[int, int, int], level: int) -> tuple[IntArray, I
 
 
 def numbered(touched: IntArray, place_count: int) -> tuple[IntArray, IntArray]:
-    """Places numbered in the order in which they are first named.
+    """Number places in the order in which they are first named.
 
     Returns:
         The number of each place, int32 [place_count] (undefined if nothing names it), and the place of each number.
     """
     number = np.empty(place_count, np.int32)
     turn = np.arange(len(touched), dtype=np.int32)
-    # The last write to a place stays: walk backwards to keep the first value.
+    # The last write to a place wins, so walk backwards to keep the first value.
     number[touched[::-1]] = turn[::-1]
     place_of = touched[number[touched] == turn]
     number[place_of] = turn[: len(place_of)]

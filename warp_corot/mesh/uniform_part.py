@@ -1,7 +1,8 @@
-"""Some subtrees of a uniformly bisected box of root cubes: the same elements as in the whole box, which nobody makes.
+"""Some subtrees of a uniformly bisected box of root cubes, with the same elements as in the whole box, which is not
+made.
 
-Between the subtrees and the roots the tree has their ancestors alone, and these ancestors' other children as void
-leaves. Places on the grid are numbered in a table over the cubes that hold the subtrees.
+Above the subtrees, the tree has only their ancestors, and the other children of these ancestors as void leaves. A table
+over the cubes that hold the subtrees numbers the places of the grid.
 """
 
 from __future__ import annotations
@@ -116,8 +117,8 @@ def vertices_of(cells: tuple[int, int, int], level: int, subtrees: npt.NDArray[n
 def _above(
     cells: tuple[int, int, int], level: int, subtrees: npt.NDArray[np.int64]
 ) -> tuple[IntArray, tuple[int, int, int], list[_Elements]]:
-    """The lowest cube of the table, how many grid places it has along each axis, and the elements of each level from
-    the roots to the subtrees' own."""
+    """The lowest cube of the table, its number of grid places along each axis, and the elements of each level from the
+    roots to the subtrees."""
     depth = level - SUBTREE_DEPTH
     low, grid, roots = _roots(cells, level, np.unique(subtrees >> depth))
     found = [roots]
@@ -129,7 +130,7 @@ def _above(
 def _roots(
     cells: tuple[int, int, int], level: int, roots: npt.NDArray[np.int64]
 ) -> tuple[IntArray, tuple[int, int, int], _Elements]:
-    """The lowest cube of the table, how many grid places it has along each axis, and the roots."""
+    """The lowest cube of the table, its number of grid places along each axis, and the roots."""
     intervals = 1 << halvings(level)
     cubes = np.stack(np.unravel_index(roots // 6, cells), axis=1)
     low = cubes.min(axis=0)
@@ -150,7 +151,7 @@ def _roots(
 
 
 def _halved(above: _Elements, at: int, kept: npt.NDArray[np.int64]) -> _Elements:
-    """Both children of all elements that have descendants, of which those in ``kept`` have some."""
+    """Both children of all elements that have descendants; the children in ``kept`` have descendants, too."""
     tets = above.tets[above.kept]
     both = children(tets, _middles(tets, at), at % 3).reshape(-1, 4)
     number = (2 * above.number[above.kept][:, None] + np.arange(2)).ravel()

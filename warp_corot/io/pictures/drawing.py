@@ -50,7 +50,7 @@ def draw_body(
     Args:
         ax: The axes; their frame is switched off and their limits widened to the drawing.
         positions: Nodes [N, 3] [m]. Nodes of no face do not matter.
-        faces: Triangles [F, 3], wound counter-clockwise seen from outside (`mesh.surface.boundary_faces`).
+        faces: Triangles [F, 3], wound counter-clockwise seen from outside (`boundary_faces`).
         scalars: Values to colour by, one a node [N] or one a face [F]; NaN for rigid things, which are grey.
         value_range: Values at the two ends of the colour map; None: 0 to the 99th percentile, rounded up.
         rest: Nodes at rest [N, 3] [m], drawn as a faint silhouette in the background.

@@ -31,7 +31,7 @@ def surface(forest: ForestArrays) -> SurfaceMesh:
         found = _embedded(forest, forest.detail.surface())
     else:
         found = _on_nodes(forest, marched(forest.lattice_points, _all_cut(forest), forest.phi))
-    # Parts that are thinner than all elements and lie between their nodes meet no edge.
+    # A part that is thinner than the elements and lies between their nodes crosses no edge.
     return found if len(found.triangles) else boundary_surface(forest)
 
 
@@ -94,7 +94,7 @@ def summary(forest: ForestArrays) -> list[str]:
 
 
 def _all_cut(forest: ForestArrays) -> np.ndarray:
-    """Nodes of all leaves that hold something, also of those that were left out, int32 [n, 4]."""
+    """Nodes of all leaves that hold a part of the body, including leaves that were left out, int32 [n, 4]."""
     assert forest.phi is not None
     tets = forest.tree.tets[forest.tree.first_child < 0]
     return tets[(forest.phi[tets] < 0).any(axis=1)]
@@ -107,13 +107,13 @@ def _embedded(forest: ForestArrays, found: SurfaceMesh) -> SurfaceMesh:
 
 
 def _within(forest: ForestArrays, detail: Detail, kept: np.ndarray) -> Detail:
-    """The part of a detail that is in, or nearest to, the elements in a mask bool [T]."""
+    """The part of a detail that is in the elements of a mask bool [T], or nearest to them."""
     elements, _ = embed(forest, detail.points[detail.tets].mean(axis=1))
     return Detail.of(detail.points, detail.tets[kept[elements]], detail.phi, detail.labels)
 
 
 def _on_nodes(forest: ForestArrays, found: SurfaceMesh) -> SurfaceMesh:
-    """The surface, in which points without nodes of the mesh are bound to those of the nearest element."""
+    """The surface, with points that no nodes of the mesh carry bound to the nodes of the nearest element."""
     lost = np.flatnonzero(((found.nodes >= forest.node_count) & (found.weights != 0)).any(axis=1))
     unused = found.nodes >= forest.node_count
     nodes = np.where(unused, found.nodes.min(axis=1, keepdims=True), found.nodes)

@@ -62,9 +62,11 @@ class SurfaceMesh(BoundPoints):
 
     @property
     def ends(self) -> np.ndarray:
-        """The ends of the edge on which a point of a marched surface lies, int32 [V, 2]; the same node twice if the
-        point is a node. The point is at the share ``weights[:, 1]`` of the edge. Points on edges of elements that were
-        left out are bound to four nodes of the nearest element instead."""
+        """The ends of the edge on which each point of a marched surface lies, int32 [V, 2].
+
+        A point at a node has this node twice. ``weights[:, 1]`` says how far along the edge the point is, 0 to 1.
+        Points on edges of elements that were left out are bound to four nodes of the nearest element instead.
+        """
         return self.nodes[:, :2]
 
     @cached_property
@@ -80,7 +82,7 @@ class SurfaceMesh(BoundPoints):
     @property
     def volume(self) -> float:
         """The enclosed volume [m^3]."""
-        # About its own centre, so that a body far from the origin loses no digits.
+        # Relative to its centre, so that a body far from the origin loses no digits.
         x = self.points - self.points.mean(axis=0)
         return float(np.einsum("fc,fc->", x[self.triangles[:, 0]], self._doubled_areas) / 6.0)
 
@@ -160,7 +162,7 @@ def vertex_normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def bound(points: np.ndarray, nodes: np.ndarray, weights: np.ndarray, triangles: npt.ArrayLike | None) -> BoundPoints:
-    """A user's points, or with triangles [F, 3] a surface.
+    """A user's points bound to nodes; with triangles [F, 3], a surface.
 
     Args:
         points: Rest positions [m], [V, 3].

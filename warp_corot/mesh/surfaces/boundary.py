@@ -11,7 +11,7 @@ FACES_OF_TET = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]], dtype=np.i
 
 
 def right_handed(tets: NDArray[np.int32], mirrored: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Tetrahedra of which the mirrored ones have two nodes exchanged, int32 [T, 4]: formats require this order."""
+    """Tetrahedra with two nodes of each mirrored one exchanged, int32 [T, 4], because file formats need that order."""
     turned = tets.copy()
     turned[mirrored, 2], turned[mirrored, 3] = tets[mirrored, 3], tets[mirrored, 2]
     return turned
@@ -39,8 +39,8 @@ def boundary_faces(tets: ArrayLike, points: ArrayLike | None = None) -> tuple[ND
 
     Args:
         tets: Vertex indices [T, 4].
-        points: Vertex positions [N, 3], needed if some tetrahedra are mirrored (as half of a bisection forest's are):
-            their faces are reversed. Without points, all tetrahedra must be positively oriented,
+        points: Vertex positions [N, 3], needed if some tetrahedra are mirrored, as half of those of a forest are: their
+            faces are reversed. Without points, all tetrahedra must be positively oriented,
             det(x1−x0, x2−x0, x3−x0) > 0.
 
     Returns:

@@ -1,8 +1,8 @@
 """Marched surfaces that meet the body's own corners.
 
-A corner of three creases lies in one element, whose polygon may see two of its planes alone. Where the corner is known,
-the triangle below it is replaced by three that meet there, and edges around them are turned where that brings the
-surface nearer to the body's.
+A corner of three creases lies in one element, whose polygon may cross only two of the three planes. If the corner is
+known, the triangle below it is replaced by three triangles that meet there, and edges around them are flipped if that
+brings the surface nearer to the body's surface.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 
-#: Number of vertices near a corner whose triangles are tried; if there are more corners than this, none is used,
-#: because they would be noise.
+#: Number of vertices near a corner whose triangles are tried; and the most corners: more than this would be noise, and
+#: none is used.
 TRIED, MOST = 4, 300
-#: A corner that is nearer to a vertex than this share of the shortest edge there is met already.
+#: The surface already meets a corner that is nearer to a vertex than this fraction of the shortest edge there.
 MET = 0.02
-#: A triangle that is nearer to the body's surface than this share of that edge cuts nothing off.
+#: A triangle that is nearer to the body's surface than this fraction of that edge cuts nothing off.
 FAR = 1.0e-3
 #: Number of edges around a corner that are considered, and of triangles that are tried.
 LOOKS, CUTTING = 24, 4
@@ -61,7 +61,7 @@ class _Surface:
         self.x, self.domain, self.given = list(x), domain, triangles
         marked = np.zeros(len(x), bool)
         marked[near] = True
-        # And around their neighbours.
+        # Triangles around their neighbours may be replaced, too.
         marked[triangles[marked[triangles].any(axis=1)]] = True
         self.local = {int(t): tuple(map(int, triangles[t])) for t in np.flatnonzero(marked[triangles].any(axis=1))}
         self.around: dict[int, set[int]] = {}
@@ -69,7 +69,7 @@ class _Surface:
             for corner in corners:
                 self.around.setdefault(corner, set()).add(number)
         self.count = self.count_before = len(triangles)
-        #: The changes of the last fan: number, corners and whether the triangle was added.
+        #: The changes of the last fan: a triangle's number, its corners, and whether it was added.
         self.replaced: list[tuple[int, tuple[int, ...], bool]] = []
 
     def arrays(self) -> tuple[Array, Array]:
@@ -80,7 +80,7 @@ class _Surface:
         return np.array(self.x), np.concatenate([triangles, added]).astype(np.int32)
 
     def meet(self, point: Array, vertices: Array) -> None:
-        """Have a vertex at a point, if that brings the surface nearer to the body's."""
+        """Add a vertex at a point if that brings the surface nearer to the body's surface."""
         ring = sorted({t for v in vertices.tolist() for t in self.around[v]})
         sides = np.array([[self.x[v] for v in self.local[t]] for t in ring])
         shortest = np.linalg.norm(sides - np.roll(sides, 1, axis=1), axis=2).min()
@@ -88,14 +88,14 @@ class _Surface:
             return
         off = self._off(sides)
         far = off > FAR * shortest * np.linalg.norm(_normals(sides), axis=1)
-        # The triangle that cuts the corner off is far from the body's surface.
+        # The triangle that cuts the corner off is the one that is far from the body's surface.
         for place in [place for place in np.argsort(-off)[:CUTTING] if far[place]]:
             if off[place] + self._fan(ring[place], point) > 0.0:
                 return
             self._undo()
 
     def _undo(self) -> None:
-        """Take back all that the last fan has replaced."""
+        """Undo the last fan."""
         for number, corners, added in reversed(self.replaced.copy()):
             if added:
                 self._remove(number)
@@ -105,8 +105,10 @@ class _Surface:
         self.count = self.count_before
 
     def _fan(self, triangle: int, point: Array) -> float:
-        """Put a vertex above a triangle and turn edges around it; the space between new triangles and the body's
-        surface, less what turning saves, below zero."""
+        """Put a vertex above a triangle and flip edges around it.
+
+        Returns the space that the flips save, less the space between the new triangles and the body's surface [m^3].
+        """
         apex, self.count_before = len(self.x), self.count
         self.x.append(point)
         self.around[apex] = set()
@@ -122,7 +124,7 @@ class _Surface:
         return gain
 
     def _turned(self, triangle: int, apex: int, waiting: list[int]) -> float:
-        """Turn the edge across from the apex, if that helps: by how much."""
+        """Flip the edge across from the apex if that saves space, and return how much it saves [m^3]."""
         start = self.local[triangle].index(apex)
         _, a, b = (self.local[triangle][(start + k) % 3] for k in range(3))
         others = (self.around[a] & self.around[b]) - {triangle}
@@ -159,11 +161,11 @@ class _Surface:
             self.around[corner].discard(number)
 
     def _off(self, triangles: Array) -> Array:
-        """About the space between triangles [n, 3, 3] and the body's surface [m^3]."""
+        """An estimate of the space between triangles [n, 3, 3] and the body's surface [m^3]."""
         off = np.abs(np.asarray(self.domain.phi((_WITHIN @ triangles).reshape(-1, 3)), np.float64))
         return np.linalg.norm(_normals(triangles), axis=1) * off.reshape(-1, len(_WITHIN)).mean(axis=1)
 
 
 def _normals(triangles: Array) -> Array:
-    """Vectors across triangles, as long as they are large."""
+    """Normals of triangles whose lengths are proportional to their areas."""
     return 0.5 * np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])

@@ -1,9 +1,9 @@
 """Marched surfaces with the body's own edges (Kobbelt, Botsch, Schwanecke and Seidel 2001, *Feature
 sensitive surface extraction from volume data*).
 
-A vertex of marching tetrahedra sits where the body's surface crosses an edge of an element. Where its normals at the
-vertices of one element's polygon differ by more than an angle, a crease goes through the element: a vertex is put where
-the tangent planes meet, and edges between two elements with such vertices are turned so that they follow the crease.
+A vertex of marching tetrahedra lies where the body's surface crosses an edge of an element. If the normals at the
+vertices of one element's polygon differ by more than an angle, a crease goes through the element. Then a vertex is
+added where the tangent planes meet, and edges between two elements with such vertices are flipped to follow the crease.
 """
 
 from __future__ import annotations
@@ -22,17 +22,18 @@ Array = np.ndarray
 
 #: Normals that differ by more than this make a crease [°].
 ANGLE = 30.0
-#: Polygons whose centre is closer to the surface than this fraction of their size have no crease.
+#: A polygon whose centre is closer to the surface than this fraction of its size has no crease.
 NEAR = 5.0e-3
 #: Crossings of edges are found in this many steps, or until their error is below this fraction of the edge; normals
 #: come from differences over this fraction of a polygon's size.
 STEPS, OFF, APART = 6, 5.0e-5, 0.02
-#: Directions in which planes that meet hardly differ are left alone: singular values below this share of the largest.
+#: Tangent planes determine a vertex only in directions in which they differ: singular values below this fraction of the
+#: largest one count as zero.
 RANK = 0.15
 #: How far outside its element a vertex may be, as a barycentric coordinate, and how much nearer to the surface than the
 #: polygon's middle it must be.
 OUTSIDE, NEARER = -0.2, 0.5
-#: How far along a crease from a polygon's middle a vertex may be, over its size; the middle counts first.
+#: Places along a crease at which a vertex is tried, in polygon sizes from the polygon's middle; the middle comes first.
 SLIDES = np.array(sorted(np.linspace(-1.5, 1.5, 31), key=abs))
 #: Four directions whose differences give a gradient.
 _AROUND = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]]) / np.sqrt(3.0)
@@ -64,8 +65,11 @@ def _phi(domain: Domain, points: Array) -> Array:
 
 
 def _crossings(points: Array, ends: Array, values: Array, domain: Domain) -> tuple[Array, Array]:
-    """Where the surface crosses edges from a node inside to one outside [V, 3], and its unit normals there, NaN where
-    these are not known: by the body's triangles, else by false position (Illinois)."""
+    """The points where the surface crosses edges from a node inside to one outside [V, 3], and its unit normals there,
+    NaN where they are not known.
+
+    They come from the body's triangles if it has any, otherwise from false position (Illinois).
+    """
     a, along = points[ends[:, 0]], points[ends[:, 1]] - points[ends[:, 0]]
     share, normals = np.zeros(len(ends)), np.full((len(ends), 3), np.nan)
     going = np.flatnonzero(ends[:, 0] != ends[:, 1])
@@ -101,8 +105,8 @@ def _apexes(
         x: Vertices [V, 3].
         known: Normals at the vertices, NaN if unknown [V, 3].
         polygons: Their vertices [P, 4].
-        whole: Which have all of their vertices on edges [P].
-        corners: Of their elements [P, 4, 3].
+        whole: Which polygons have all of their vertices on edges [P].
+        corners: Corners of their elements [P, 4, 3].
         domain: The body.
     """
     # Polygons without known normals may contain a crease.
@@ -130,13 +134,13 @@ def _apexes(
 
 
 def _least_cosine(normals: Array) -> Array:
-    """Of the angles between the normals of each polygon [P, 4, 3]; NaN with one that is not known."""
+    """The least cosine of the angles between the normals of each polygon [P, 4, 3]; NaN if one is not known."""
     return np.min([np.einsum("pc,pc->p", normals[:, i], normals[:, j]) for i in range(4) for j in range(i)], axis=0)
 
 
 def _normals(x: Array, known: Array, polygons: Array, size: Array, domain: Domain) -> Array:
-    """The surface's unit normals at the vertices of polygons [P, 4, 3]: where they are not known, from differences over
-    a share of the size of the largest polygon at each vertex."""
+    """The surface's unit normals at the vertices of polygons [P, 4, 3]; unknown ones come from differences over a
+    fraction of the size of the largest polygon at each vertex."""
     used, vertices = np.unique(polygons, return_inverse=True)
     apart = np.zeros(len(used))
     np.maximum.at(apart, vertices.ravel(), np.repeat(APART * size, polygons.shape[1]))
@@ -148,8 +152,8 @@ def _normals(x: Array, known: Array, polygons: Array, size: Array, domain: Domai
 
 
 def _slid(points: Array, along: Array, corners: Array) -> tuple[Array, Array]:
-    """Points moved to and fro along lines to where they are farthest inside elements, and how far: the least of their
-    barycentric coordinates there."""
+    """Points moved along lines to where they are farthest inside their elements, and the least of their barycentric
+    coordinates there."""
     edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
     sides = np.stack([points - corners[:, 0], along], axis=2)
     later = np.linalg.solve(edges, sides)

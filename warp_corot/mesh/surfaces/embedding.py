@@ -70,7 +70,7 @@ def _descended(forest: ForestArrays, points: np.ndarray) -> np.ndarray:
 def _nearest(forest: ForestArrays, points: np.ndarray) -> np.ndarray:
     """The element behind the boundary face that is closest to each point, int32 [n]."""
     faces, parents = _boundary_faces(forest)
-    # About the centre of the mesh, because float32 keeps few digits far from zero.
+    # Relative to the centre of the mesh, because float32 keeps few digits far from zero.
     middle = forest.points.mean(axis=0)
     moved = points - middle
     limit = FARTHEST * np.ptp(forest.points, axis=0).max()
@@ -79,7 +79,7 @@ def _nearest(forest: ForestArrays, points: np.ndarray) -> np.ndarray:
 
 
 def _boundary_faces(forest: ForestArrays) -> tuple[np.ndarray, np.ndarray]:
-    """Boundary faces and their leaves, sought where all nodes are on void tetrahedra or on the border of the grid."""
+    """Boundary faces and their leaves; the nodes of these faces are on void tetrahedra or on the border of the grid."""
     tree = forest.tree
     lattice = forest.lattice[: forest.node_count]
     on_rim = ((lattice == 0) | (lattice == np.array(forest.cells) << LATTICE_BITS)).any(axis=1)

@@ -47,7 +47,7 @@ def embed_in_tets(nodes: np.ndarray, tets: np.ndarray, points: np.ndarray) -> tu
     """
     points = checked_points(points)
     device = wp.get_device("cpu")
-    # About the centre of the mesh, because float32 keeps few digits far from zero.
+    # Relative to the centre of the mesh, because float32 keeps few digits far from zero.
     middle = nodes[tets].reshape(-1, 3).mean(axis=0)
     placed, moved = nodes - middle, points - middle
     size = float(np.ptp(placed, axis=0).max())

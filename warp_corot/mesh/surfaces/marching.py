@@ -1,7 +1,7 @@
 """Marching tetrahedra: the zero surface of the linear interpolant.
 
-Each edge between a node inside and one outside has a vertex, so triangles share vertices by sharing edges. A node at
-exactly zero counts as outside: all vertices around it become one, and triangles that lose a side vanish.
+Each edge between a node inside and one outside has a vertex, so triangles on the same edge share a vertex. A node at
+exactly zero counts as outside; all vertices around it are merged, and triangles that lose a side are removed.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def _without_flat(triangles: Array, at_node: Array) -> Array:
 
 
 def crossing_polygons(points: Array, tets: Array, values: Array) -> tuple[Array, Array, Array]:
-    """The polygons in which a surface crosses elements, from which `plain_triangles` are made.
+    """The polygons in which a surface crosses elements; `plain_triangles` makes triangles of them.
 
     Args:
         points, tets, values: As for `marched`.

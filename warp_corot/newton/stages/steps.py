@@ -56,7 +56,7 @@ class StageSimulation:
         options: Values for what the stage does not define.
         damping: Rate of mass-proportional damping [1/s], which also damps free fall.
         rigid: Newton's solver for rigid bodies and joints: "semi-implicit", "xpbd", or "none".
-        integrator: "explicit", or "implicit", with steps of 1/60 s at most unless ``dt`` says otherwise; soft bodies
+        integrator: "explicit", or "implicit", with steps of 1/60 s at most unless ``dt`` is given; soft bodies
             then pass through one another.
         device: The device of the simulation.
 
