@@ -1,9 +1,10 @@
 #!/usr/bin/env python3
-"""The whole table of states.py in one go: bodies are built side by side in processes, and timed one at a time.
+"""The whole table of states.py in one run: processes build the bodies side by side, and time them one at a time.
 
     python benchmarks/all_states.py [--device cuda:0] [--seconds 190] [--json FOLDER]
 
-What is not done by then is left out, and named. On one GPU with sixteen CPU cores three minutes are enough.
+Parts that are not finished after ``--seconds`` are left out and named. On one GPU with sixteen CPU cores three minutes
+are enough.
 """
 
 from __future__ import annotations

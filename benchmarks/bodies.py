@@ -1,15 +1,15 @@
-"""Fidelity of meshes to their bodies: every triangle mesh and scan that comes with Warp, PyVista, nilearn, Newton
+"""How well meshes approximate their bodies: every triangle mesh and scan that comes with Warp, PyVista, nilearn, Newton
 and MuJoCo (``body_files.py``), and deliberately difficult shapes (``body_shapes.py``).
 
-Each body is processed like by the command line, ``warp-corot simulate BODY --tets N``, in a separate process with
-limits on time and memory, so that one that hangs or exhausts memory does not end the table:
+Each body is meshed as by ``warp-corot simulate BODY --tets N``, in a separate process with limits on time and memory,
+so that a body that hangs or exhausts memory does not end the table:
 
     python benchmarks/bodies.py                           all of them, at 20,000 elements
     python benchmarks/bodies.py knot sheet pyvista/       those whose names contain one of these words
     python benchmarks/bodies.py --fall                    and each with defaults for 2 s: does it topple?
     python benchmarks/bodies.py -o after.md --json after.json --before before.json
 
-With ``--together`` one process measures all meshes, which saves loading libraries for each; limits on time do not hold.
+With ``--together`` one process measures all meshes. It loads libraries only once, but does not limit the time.
 
 Falls have 5,000 elements (``--fall-tets``). Numbers already in the ``--json`` file stay there unless a run
 finds them again, so ``--no-mesh --fall`` adds the falls and ``--no-mesh -o table.md`` only writes the table.

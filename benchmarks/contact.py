@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""What contact costs a time step: a cube that rests, is pressed by a tool, and touches itself or another cube.
+"""What contact adds to the time of a step: a cube rests, is pressed by a tool, and touches itself or another cube.
 
     python benchmarks/contact.py [--device cuda:0] [--level 14] [--steps 200] [--json FILE]
 
-A cube of 0.1 m, 5 kPa, its lower face held, bisected to a level (98,304 elements at level 14), with a given step. Each
-row is the median of several runs of steps in one recorded launch, beside the same cube without contact in the same
-process. What is checked is that the tool feels the tissue and that nothing passes through it.
+The cube has an edge of 0.1 m, 5 kPa and a held lower face. It is bisected to a level (98,304 elements at level 14), and
+the step is given. Each row is the median of several runs of steps in one recorded launch, compared with the same cube
+without contact in the same process. The script checks that the tool feels the tissue and that nothing passes through.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def on_ground(level: int, device: wp.Device) -> wc.Simulation:
 
 
 def pressed(level: int, device: wp.Device, *, itself: bool = False) -> wc.Simulation:
-    """A lying capsule presses into the upper face by a tenth of the cube in 0.05 s."""
+    """A horizontal capsule presses into the upper face, by a tenth of the cube in 0.05 s."""
     tool = wc.Tool(wc.Capsule(radius=0.1 * SIZE, length=0.6 * SIZE))
     along_x = (0.0, np.sqrt(0.5), 0.0, np.sqrt(0.5))
     tool.follow([0.0, 0.05], [[0.5 * SIZE, 0.5 * SIZE, height * SIZE] for height in (1.11, 1.0)], along_x)
@@ -87,7 +87,7 @@ SCENES: dict[str, Callable[[int, wp.Device], wc.Simulation]] = {
 
 
 def seconds_a_step(sim: wc.Simulation, steps: int, until: float) -> float:
-    """Median time of a step [s] after the scene has come to contact."""
+    """Median time of a step [s] once there is contact."""
     sim.advance(until)
     taken = []
     for _ in range(ROUNDS):

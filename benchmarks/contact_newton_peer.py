@@ -26,20 +26,20 @@ def vbd(
     ends: float,
     looked: float,
 ) -> tuple[float, int, float, np.ndarray]:
-    """Seconds, steps, mean force on the ball [N], and where nodes are at the end.
+    """Processor time [s], number of steps, mean force on the ball [N], and final positions of the nodes [m].
 
     The force is that of Newton's penalty, stiffness times depth along each contact's normal, without damping.
 
     Args:
-        mesh: The body, held below.
+        mesh: The body, held at its lower face.
         material: Young's modulus [Pa] and Poisson's ratio.
-        ball: Its radius [m], and where it is at a time [s].
-        masses: Of the nodes [kg].
+        ball: Radius of the ball [m], and a function from the time [s] to its position [m].
+        masses: Masses of the nodes [kg].
         skin: Radius of the nodes [m].
-        stiffness: Of contact, of nodes and of the ball alike [N/m].
+        stiffness: Stiffness of contact, the same for nodes and ball [N/m].
         dt: The step [s].
-        ends: When it ends [s].
-        looked: How long before the end forces are averaged [s].
+        ends: End of the run [s].
+        looked: Time before the end over which forces are averaged [s].
     """
     radius, place = ball
     builder = newton.ModelBuilder(up_axis=newton.Axis.Z, gravity=(0.0, 0.0, 0.0))

@@ -1,12 +1,13 @@
 #!/usr/bin/env python3
-"""The same press here, in MuJoCo's flex and in Newton's VBD: time, depth of the tool in the body, force; one CPU core.
+"""A ball pressed into a cube, here, in MuJoCo's flex and in Newton's VBD: time, force and depth on one CPU core.
 
     python benchmarks/contact_peers.py [--level 9] [--finer 3] [--json FILE]
 
-A rigid ball of 30 mm radius goes 10 mm into the upper face of a cube of 0.1 m, 5 kPa, that is held below, in 0.1 s, and
-stays there until 0.3 s; no friction. What is told is the mean force of the last 25 ms and the deepest node at the end.
-Elastic laws differ: corotated here, St. Venant-Kirchhoff on edges in MuJoCo, neo-Hookean in VBD. The last row is ours
-on a finer mesh, for how far the others are from converged. Newton is left out where it is not installed.
+A rigid ball of 30 mm radius moves 10 mm into the upper face of a cube of 0.1 m, 5 kPa, whose lower face is held. It
+moves for 0.1 s and then stays until 0.3 s, without friction. The table has the mean force of the last 25 ms and the
+deepest node at the end. The elastic laws differ: corotated here, St. Venant-Kirchhoff on edges in MuJoCo, neo-Hookean
+in VBD. The last row is this package on a finer mesh, which shows how far the others are from convergence. Newton is
+left out if it is not installed.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ XML = """
 
 
 def deepest(points: np.ndarray, radius: float) -> float:
-    """How deep nodes are in the ball [m]; negative for the gap of the closest."""
+    """Depth of the deepest node in the ball [m]; negative if no node is inside: the gap of the closest node."""
     return float(radius - np.linalg.norm(points - (0.5 * SIZE, 0.5 * SIZE, LOW), axis=1).min())
 
 
@@ -74,7 +75,7 @@ def ours(mesh: wc.TetForest) -> tuple[float, int, float, float]:
 
 
 def flex(mesh: wc.TetForest, integrator: str, dt: float) -> tuple[float, int, float, float]:
-    """The same of MuJoCo."""
+    """The same for MuJoCo."""
     held = mesh.points[:, 2] < 1e-9
     text = XML.format(
         dt=dt,

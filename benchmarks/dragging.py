@@ -3,10 +3,11 @@
 
     python benchmarks/dragging.py [--device cuda:0] [--level 21] [--json FILE]
 
-One root cube, bisected uniformly to several levels up to the given one, and a patch of its top: about a thousand nodes
-of a body of any size. The time is the host's, until the call returns; on CUDA the device may still be working then.
-``with a step`` is the change, one step and the wait for it, beside the same without the change. The script checks that
-the patch is in the prescribed place, and that no step was recorded again.
+The body is one root cube, bisected uniformly to several levels up to the given one. The patch is a part of its top with
+about a thousand nodes, whatever the size of the body. Times are the host's, until the call returns; on CUDA the device
+may still be working then. ``with a step`` is the time of the change, one step and the wait for both; ``step alone`` is
+the same without the change. The script checks that the patch is in the prescribed place, and that no step was recorded
+again.
 """
 
 from __future__ import annotations

@@ -3,10 +3,10 @@
 
     python benchmarks/haptics.py [--device cuda:0] [--level 9] [--seconds 10] [--json FILE]
 
-A scripted hand moves a sphere of 2 cm in and out of a block 4 x 4 x 2 cm, 3 mm deep, and around on it, at 1 kHz, for so
-many seconds on the wall; ``--seconds 600`` is ten minutes. The simulation publishes a state every 2 ms of its time, or
-as fast as it goes. The script checks that the hand felt a force, that the device did not fail, and that the energy put
-out stayed within the bound.
+A scripted hand moves a sphere of 2 cm in and out of a block of 4 x 4 x 2 cm, 3 mm deep, and around on it, at 1 kHz.
+``--seconds`` is the wall time; 600 is ten minutes. The simulation publishes a state every 2 ms of simulated time, or as
+fast as it can. The script checks that the hand felt a force, that the device did not fail, and that the energy put out
+stayed within the bound.
 """
 
 from __future__ import annotations

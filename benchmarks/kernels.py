@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""Cost of each stage of a time step, and its lower bound.
+"""The cost of each stage of a time step, and its lower bound.
 
     python benchmarks/kernels.py [--device cuda:0] [--level 21] [--json FILE]
 
-One root cube, bisected to a level, nodes jittered by 5 % of the edge length, float32. Every timed result is checked
-against float64 in the same run.
+The mesh is one root cube, bisected to a level, with nodes jittered by 5 % of the edge length, in float32. Every timed
+result is checked against float64 in the same run.
 """
 
 from __future__ import annotations

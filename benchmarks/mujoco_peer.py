@@ -14,7 +14,7 @@ import warp_corot as wc
 
 NAME = f"MuJoCo {mujoco.__version__}"
 
-#: Its model is a text, and it steps on one core.
+#: Largest number of tetrahedra: MuJoCo reads its model from a text and steps on one core.
 MOST_TETS = 50_000
 
 # It would write warnings to a file in the current folder; a diverged state is detected below.

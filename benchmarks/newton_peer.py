@@ -23,7 +23,7 @@ import warp_corot as wc
 
 NAME = f"Newton {newton.__version__}"
 
-#: Its builder keeps Python lists.
+#: Largest number of tetrahedra, because Newton's builder keeps Python lists.
 MOST_TETS = 4_000_000
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
@@ -32,7 +32,7 @@ GRAVITY = np.array([0.0, 0.0, -9.81])
 WRONG_POSITIONS = 1e-2
 
 
-# --- what its elements compute, in float64 ----------------------------------------------------------------------------
+# --- Newton's laws in float64 -----------------------------------------------------------------------------------------
 
 
 def semi_implicit_density(F: np.ndarray, mu: float, lam: float) -> tuple[np.ndarray, np.ndarray]:
@@ -160,7 +160,7 @@ class NewtonSteps(Steppable):
         return float(np.abs(moved).max()) if np.isfinite(moved).all() else float("inf")
 
     def error(self) -> float:
-        """For an explicit solver: error of one step. For the others: remaining residual of the implicit step."""
+        """The error of one step for an explicit solver; for the others, the remaining residual of the implicit step."""
         problem, dt = self.problem, self.dt
         nodes = problem.sample.nodes[~problem.held[problem.sample.nodes]]
         free = ~problem.held[problem.sample.nodes]

@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""Weak and strong scaling of one body over ranks, with a model of it that predicts other numbers of ranks.
+"""Weak and strong scaling of one body over ranks, and a model that predicts other numbers of ranks.
 
     python benchmarks/scaling.py [--device cuda] [--ranks 1,2] [--weak 18,21] [--strong 21] [--json FILE]
 
-The command starts ``mpirun`` by itself for each number of ranks, and needs nothing but this package, mpi4py and MPI; on
-cards nccl4py, too. Weak scaling has a root cube of the level on each rank; strong scaling has as many cubes as the
-largest number of ranks, divided among all. Levels are those of ``TetForest.box``: a cube has 1.6 million tetrahedra at
-level 18, 12.6 million at 21, 100 million at 24.
+The script starts ``mpirun`` for each number of ranks. It needs this package, mpi4py and MPI, and nccl4py for cards.
+Weak scaling has one root cube of the given level on each rank. Strong scaling divides as many cubes as the largest
+number of ranks among all ranks. Levels are those of ``TetForest.box``: a cube has 1.6 million tetrahedra at level 18,
+12.6 million at 21, 100 million at 24.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from typing import Any
 
 import numpy as np
 
-#: Steps in one measurement on a card and on a CPU, measurements, and exchanges that are timed by themselves, in one
-#: graph on cards.
+#: Steps in one measurement, on a card and on a CPU; number of measurements; and number of exchanges timed by
+#: themselves, which are one graph on cards.
 STEPS, CPU_STEPS, ROUNDS, EXCHANGES = 512, 32, 7, 50
-#: Calls before measurements, until two agree to this share of their time; at most so many.
+#: Calls before the measurements go on until two agree to this fraction of their time; the most calls.
 AGREEMENT, MOST_CALLS = 0.03, 12
-#: What is assumed of a network between machines: the time of an exchange without data [us], and bytes in a microsecond.
+#: Assumptions about a network between machines: the time of an exchange without data [us], and bytes per microsecond.
 NETWORK_LATENCY, NETWORK_RATE = 15.0, 40e3
-#: A step far below every stable one [s]: steps of this length cost what others do.
+#: A step far below every stable one [s]; its cost does not depend on its length.
 SHORT_STEP = 1e-7
 
 
 def measured(cubes: int, level: int, device: str) -> dict[str, Any]:
-    """What one rank finds of a row of root cubes, bisected so often; all ranks call."""
+    """One rank's measurements of a row of root cubes, bisected to a level; all ranks must call this."""
     import warp as wp
 
     wp.config.quiet = True
@@ -53,7 +53,7 @@ def measured(cubes: int, level: int, device: str) -> dict[str, Any]:
     ready = time.perf_counter() - began
 
     def timed() -> float:
-        """Seconds for a step."""
+        """Time of a step [s]."""
         steps = STEPS if sim.device.is_cuda else CPU_STEPS
         began = time.perf_counter()
         sim.advance_steps(steps)
@@ -85,7 +85,7 @@ def measured(cubes: int, level: int, device: str) -> dict[str, Any]:
 
 
 def on_ranks(ranks: int, cubes: int, level: int, device: str) -> dict[str, Any]:
-    """The slowest rank's numbers of a run on so many ranks.
+    """The slowest rank's measurements of a run on this number of ranks.
 
     Raises:
         RuntimeError: The run failed.
@@ -105,10 +105,11 @@ def on_ranks(ranks: int, cubes: int, level: int, device: str) -> dict[str, Any]:
 
 
 def fitted(rows: list[dict[str, Any]]) -> dict[str, float]:
-    """The numbers of a model of a step's time [us], by least squares of relative errors, none negative.
+    """The parameters of a model of a step's time [us], by non-negative least squares of relative errors.
 
-    A step on one rank takes start + per_element * computed, an exchange by itself latency + per_byte * sent. A step on
-    several ranks takes as long as its elements would on one, and besides the share ``exposed`` of the exchange.
+    A step on one rank takes start + per_element * computed. An exchange by itself takes latency + per_byte * sent. A
+    step on several ranks takes as long as its elements would on one rank, plus the fraction ``exposed`` of the
+    exchange.
     """
     from scipy.optimize import nnls
 
@@ -134,13 +135,13 @@ def fitted(rows: list[dict[str, Any]]) -> dict[str, float]:
 
 
 def predicted(model: dict[str, float], ranks: int, level: int, *, machines: int = 1) -> dict[str, float]:
-    """Weak scaling that the model predicts: a cube of the level on each rank, copies and exchanges on two sides.
+    """The model's prediction of weak scaling, with a cube of the level on each rank, and neighbours on two sides.
 
-    With several machines, exchanges between them take what is assumed of a network. What they take beyond the time of
-    the elements cannot be hidden.
+    With several machines, exchanges between them take the time assumed for a network. The part that is longer than the
+    computation of the elements cannot be hidden.
     """
     elements = 6 * 2**level
-    # A cut through a cube of edge 2^(level/3) cells meets so many nodes; copies stand on it in layers.
+    # The number of nodes on a cut through a cube with an edge of 2^(level/3) cells; copies lie on it in layers.
     nodes = (2.0 ** (level / 3) + 1.0) ** 2
     sides = min(ranks - 1, 2)
     computed = elements + sides * 12.0 * nodes
@@ -167,7 +168,7 @@ def main() -> int:
     options = of.parse_args()
     if options.worker is not None:
         row = measured(options.worker, options.level, options.device)
-        # One write a line, so that ranks' lines do not mix.
+        # Each line is one write, so that the lines of ranks do not mix.
         os.write(1, f"ROW {json.dumps(row)}\n".encode())
         return 0
     counts = [int(n) for n in options.ranks.split(",")]

@@ -7,7 +7,7 @@ from problem import Sample
 
 #: Below this J the logarithm of neo-Hookean tissue is continued by a parabola.
 CONTINUED_BELOW = 0.5
-#: |theta| from which an element is held on its own, and over which its stiffness grows to lambda.
+#: An element is held on its own from this |theta| on; over this range its stiffness grows to lambda.
 FREE, RAMP = 0.25, 0.5
 
 
@@ -52,7 +52,7 @@ def pressure_forces(
     groups: np.ndarray,
     lam: np.ndarray,
 ) -> np.ndarray:
-    """Nodal forces [n, 3] of what elements share, at the sample's nodes [N].
+    """Nodal forces [n, 3] of the shared dilatation, at the sample's nodes [N].
 
     Args:
         law: A law of the oracle.

@@ -2,7 +2,8 @@
 
     python benchmarks/size.py [--device cuda:0] [--level 21] [--from-level 15] [--deterministic] [--json FILE]
 
-One root cube bisected to every third level in turn, corotated with own rotations; the force is checked against float64.
+The body is one root cube, bisected to every third level in turn, corotated with own rotations. The force is checked
+against float64.
 """
 
 from __future__ import annotations

@@ -17,10 +17,10 @@ from warp_corot.experiments import paper
 from warp_corot.solvers.steps.pace import Pace
 from warp_corot.solvers.system import System
 
-#: Steps of one sample of a whole-step row; on the device, as many as one call takes at an interactive rate.
+#: Steps in one sample of a whole-step row; on CUDA, as many as a call makes at an interactive rate.
 STEPS = {"cuda": 512, "cpu": 64}
 BEAM_STEPS = 1024
-#: The share of the largest stable step that is given.
+#: The given step, as a fraction of the largest stable one.
 GIVEN = 0.8
 #: Copies of the beam that are stepped together.
 BEAM_WORLDS = {"cuda": 1024, "cpu": 16}
@@ -199,7 +199,8 @@ def step_case(
 ) -> Case:
     """Steps from the problem's state, always the same ones, of a given length or of one that follows the state.
 
-    Nodes that are let go where chance has put them vibrate as fast as they can, so that this costs the most checks.
+    Nodes released at random places vibrate as fast as they can, so that a step that follows the state is checked as
+    often as it ever is.
     """
     body = problem.new_body(problem.mesh)
     body.fix(problem.held)

@@ -4,11 +4,11 @@
     python benchmarks/solvers.py [--device cuda:0] [--levels 6 9 12] [--poisson 0.3 0.45 0.49] [--tolerance 1e-4]
                                  [--dilatation shared] [--json FILE] [--plot FILE]
 
-The system is the stiffness at rest, 50 kPa, and the weight. Elements have dilatations of their own, or share them.
-The beam of 64 x 64 x 192 mm is clamped at one end; of the body, two merged balls of levels up to --levels, the lowest
-tenth of the nodes is held. A time is that of one linearisation and its solve, recorded, the least of several. PyAMG
-(smoothed aggregation with the six rigid motions, float64, conjugate gradients) takes its own set-up and solve. What is
-checked, where a direct solve is quick, is the error of every answer in the energy's norm against SciPy's.
+The system is the stiffness at rest, 50 kPa, and the weight. Elements have their own dilatation, or share it. The beam
+of 64 x 64 x 192 mm is clamped at one end. The adaptive body is two merged balls of levels up to --levels, with the
+lowest tenth of the nodes held. A time is the least of several recorded runs of one linearisation and its solve. That of
+PyAMG (smoothed aggregation with the six rigid motions, float64, conjugate gradients) is its own set-up and solve. If a
+direct solve is quick, every answer is compared with SciPy's in the energy norm.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from warp_corot.solvers.implicit.tangent import TangentOperator
 
 YOUNG, DENSITY, DOWN = 50e3, 1000.0, np.array([0.0, -9.8, 0.0])
 MOST = 10000
-#: A solve is timed again until so much time is spent [s], or so often.
+#: A solve is repeated until this much time is spent [s], or this often.
 TIMED, ROUNDS = 2.0, 9
 #: Bodies of more free nodes are not solved directly.
 MOST_DIRECT = 5000
@@ -48,7 +48,7 @@ HEADER = ("body", "level", "elements", "Poisson", "preconditioner", "iterations"
 
 @dataclass
 class Row:
-    """One solve; ``error`` is relative, in the energy's norm."""
+    """One solve; ``error`` is relative, in the energy norm."""
 
     body: str
     level: int
@@ -88,7 +88,7 @@ PRECONDITIONERS: dict[str, Callable[[TangentOperator], Any]] = {
 
 
 class Problem:
-    """A body held somewhere and its weight, on a device and as a float64 matrix of its free nodes."""
+    """A held body under its weight, on a device and as a float64 matrix of its free nodes."""
 
     def __init__(self, mesh: wc.TetForest, fixed: np.ndarray, poisson: float, dilatation: str, device: wp.Device):
         self.mesh, self.free = mesh, ~fixed
@@ -110,7 +110,7 @@ class Problem:
         self._direct = spsolve(self.matrix.tocsc(), self.right[self.free].ravel()) if small else None
 
     def error(self, x: np.ndarray) -> float | None:
-        """Of displacements of all nodes."""
+        """The relative error of displacements of all nodes; None if there is no direct solution."""
         if self._direct is None:
             return None
         off = x[self.free].ravel() - self._direct
@@ -148,7 +148,7 @@ class Problem:
         return time.perf_counter() - began
 
     def solve_algebraically(self, tolerance: float) -> tuple[int, float, float | None]:
-        """The same by PyAMG."""
+        """The same with PyAMG."""
         import pyamg
 
         points = self.mesh.points[self.free] - self.mesh.points.mean(axis=0)

@@ -25,7 +25,7 @@ SVD_WRONG = 1e-2
 
 
 def rotation_cases(problem: Problem) -> list[Case]:
-    """F from the nodes' displacements, R from F, R written; R kept an element, or a unit of the tree."""
+    """Displacements in, R out: one rotation for each element, or for each ancestor some levels up."""
     cases = [
         _rotation_case(problem, "Byers-Xu, to tolerance", byers_xu, 0, work.rotation_flops(tested=True)),
         _rotation_case(problem, "Byers-Xu, 4 iterations", rotation_function("byers-xu", 4), 0),
@@ -70,7 +70,7 @@ def _rotation_case(
 
 
 def _warm_case(problem: Problem) -> Case:
-    """Back and forth between two states a thousandth of an edge apart, like the motion in a step."""
+    """The warm start, back and forth between two states a thousandth of an edge apart, like the motion of a step."""
     units, _unit = problem.units(0)
     elements = forest_elements(problem.mesh, units, problem.device)
     count = len(units)

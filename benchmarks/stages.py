@@ -1,8 +1,8 @@
 """Device code of the benchmark: single stages of a force kernel, which the library only has fused.
 
-Stages end where a result can be checked. The stiffness products end in one number an element, the sum of its
-squared nodal forces: neither a scatter nor wide stores hide the product's cost, and no compiler can shorten it.
-The scatters add a constant, so that the exact result is a count.
+Each stage ends with a result that can be checked. The stiffness products end in one number for each element, the sum of
+its squared nodal forces. So neither a scatter nor wide stores hide the cost of the product, and no compiler can leave a
+part of it out. The scatters add a constant, so that the exact result is a count.
 """
 
 import functools

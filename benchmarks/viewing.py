@@ -1,7 +1,7 @@
 """How many frames a second the page's server makes, and what takes the time.
 
-``python benchmarks/viewing.py [INPUT] [OPTION ...]``: INPUT and options as ``warp-corot view`` has them. A visitor
-without a screen takes all that is sent, in a process of its own. Needs the extra ``view``.
+``python benchmarks/viewing.py [INPUT] [OPTION ...]`` takes the input and options of ``warp-corot view``. A visitor in
+another process, without a screen, receives everything that is sent. The script needs the extra ``view``.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from warp_corot.cli import make_parser
 from warp_corot.cli.prepared import prepared
 from warp_corot.viewing.view import View
 
-#: Time of a measurement, and before it [s].
+#: Duration of a measurement, and of the time before it [s].
 SECONDS, BEFORE = 10.0, 3.0
 
 
 def visitor(address: str, protocol: str, count) -> None:
-    """Take all that a page sends, and count bytes."""
+    """Receive everything that a page sends, and count the bytes."""
     from websockets.sync.client import connect
 
     with connect(address, subprotocols=[protocol], max_size=None, compression=None) as socket:
@@ -28,7 +28,7 @@ def visitor(address: str, protocol: str, count) -> None:
 
 
 def timed(work, seconds: float) -> float:
-    """Milliseconds of a call, the mean of those in so many seconds."""
+    """Mean time of a call [ms], over this many seconds."""
     calls, started = 0, time.perf_counter()
     while time.perf_counter() - started < seconds:
         work()

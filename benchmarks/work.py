@@ -1,10 +1,10 @@
 """Minimum memory traffic and operations of each stage, per tetrahedron.
 
-Bytes: every array that the stage reads or writes counts once, as if each value came from memory exactly
-once; an array that is added to is read and written. Nodal arrays count by nodes per tetrahedron (one sixth in
-a large forest), a node being a vec4 of 16 bytes. In stages that may use them, the forest's connectivity counts as the
-35-node lists of complete six-level subtrees, 2.2 bytes a tetrahedron, for any actual path; in
-stages of single elements as four indices and the shape code, 20 bytes.
+Bytes: every array that the stage reads or writes counts once, as if each value came from memory exactly once; an array
+that is added to is both read and written. Nodal arrays count by nodes per tetrahedron (one sixth in a large forest),
+with 16 bytes for a node (vec4). The connectivity of a forest counts as the 35-node lists of complete six-level
+subtrees, 2.2 bytes a tetrahedron, whatever path a stage takes; in stages of single elements it counts as four indices
+and the shape code, 20 bytes.
 
 Operations: additions, multiplications, divisions and roots of the formulas, one each, counted by hand below (a fused
 multiply-add is two), without addressing, selection by type, or tests that fail.
