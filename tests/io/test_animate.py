@@ -8,7 +8,7 @@ import pytest
 from pxr import Usd, UsdGeom
 
 import warp_corot as wc
-from warp_corot.io.write.animate import Recording, record, signals_held_back, steps_per_frame
+from warp_corot.io.write.animate import Recording, record, rounding, signals_held_back, steps_per_frame
 
 
 def beam(device, x=0.0, young=1e4):
@@ -68,6 +68,16 @@ def test_bad_times_are_refused_before_anything_happens(tmp_path, duration, fps):
         record(sim, tmp_path / "a.usd", duration=duration, fps=fps)
     assert sim.steps == 0
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_duration_between_two_frames_is_reported():
+    assert rounding(0.5, 24.0) is None
+    assert rounding(1e3 / 24, 24.0) is None
+    told = rounding(0.1, 24.0)
+    assert told is not None
+    assert "0.08333 s, not 0.1 s" in told
+    assert "--fps 30" in told
+    assert "--fps" not in str(rounding(0.1234567, 24.0))
 
 
 def test_whatever_ends_it_keeps_frames(tmp_path):

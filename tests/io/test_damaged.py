@@ -1,6 +1,7 @@
 """Effects of damaged files on other libraries, and inconsistent numbers in them: one line each."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -31,6 +32,18 @@ def test_a_binary_stage_is_tried_elsewhere_first(tmp_path, monkeypatch):
     path.write_bytes(path.read_bytes() + b"\0")
     with pytest.raises(InputError, match=r"seed\.usdc: is not a USD file that OpenUSD can open \(it crashed"):
         wc.TetMesh.load(path)
+
+
+def test_files_beside_a_script_do_not_replace_modules_of_readers(tmp_path, monkeypatch):
+    """A script's own ``nt.py`` or ``json.py`` was imported by the process that tries a binary stage."""
+    path = SEEDS["usdc-tets"](tmp_path)
+    for name in ("nt", "json", "random", "numpy"):
+        (tmp_path / f"{name}.py").write_text("raise SystemExit('this is the script')\n")
+    script = tmp_path / "script.py"
+    script.write_text("")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys.modules["__main__"], "__file__", str(script))
+    assert len(wc.TetMesh.load(path).tets) == 2
 
 
 def test_a_series_without_one_of_its_slices(tmp_path):

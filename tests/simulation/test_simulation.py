@@ -240,6 +240,14 @@ def test_steps_that_a_hook_makes_count(device):
     assert seen == [5, 10, 15, 20, 25, 30]
 
 
+def test_a_hook_that_always_advances_is_refused():
+    sim = bar("cpu", dt=5e-4)
+    sim.on_step(lambda s: s.step())
+    for _ in range(2):
+        with pytest.raises(wc.InputError, match=r"the hook .*<lambda> advances the simulation, which calls it again"):
+            sim.advance_steps(1)
+
+
 def test_an_error_in_a_hook_leaves_a_state_to_go_on_from(device):
     sim, other = bar(device, dt=5e-4), bar(device, dt=5e-4)
 

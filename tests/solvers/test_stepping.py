@@ -160,6 +160,22 @@ def test_a_state_gone_wrong_is_made_again_with_half_the_step(device):
     assert sim.energy().total < 1.5 * start
 
 
+@pytest.mark.parametrize("seconds", [0.05, 0.1])
+@pytest.mark.parametrize("share", [0.3, 0.9, None])
+def test_a_swing_back_to_where_it_began_is_no_energy_from_nowhere(device, share, seconds):
+    """One tetrahedron on three held nodes swings with a period of 52 ms: at the checks, gravity has moved little."""
+    mesh = wc.TetMesh(0.1 * np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, -1]]), [[0, 2, 1, 3]])
+    body = wc.SoftBody(mesh, wc.Isotropic(1e5, 0.4, 1e3), device=device)
+    body.fix([0, 1, 2])
+    sim = wc.Simulation(body)
+    if share is not None:
+        sim = wc.Simulation(body, integrator=wc.SymplecticEuler(share * sim.dt))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", wc.StabilityWarning)
+        for _ in range(4):
+            sim.advance(seconds)
+
+
 def test_a_given_step_ends_with_an_error_where_energy_comes_from_nowhere(device):
     """Long before a value is not finite."""
     limit = wc.Simulation(beam(device)).stable_dt

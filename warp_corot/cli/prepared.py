@@ -86,9 +86,11 @@ def prepared(options: Sequence[argparse.Namespace]) -> Run:
 
 def _frames(args: argparse.Namespace, bodies: Sequence[Body]) -> tuple[float, int]:
     """The duration [s], and the number of frames after the first one."""
-    from warp_corot.io.write.animate import frame_count
+    from warp_corot.io.write.animate import frame_count, rounding
 
     duration = args.duration
+    if duration is not None and (note := rounding(duration, args.fps)):
+        bodies[0].subject.notes.append(note)
     if duration is None and getattr(args, "static", False) and not any(body.loads for body in bodies):
         duration = 1.0 / args.fps
     if duration is None:

@@ -163,7 +163,7 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: Newton is missing, bad options, or a bad stage; nothing was simulated or written.
     """
-    from warp_corot.io.write.animate import Recording, frame_count, signals_held_back
+    from warp_corot.io.write.animate import Recording, frame_count, rounding, signals_held_back
     from warp_corot.io.write.usd.pieces import PieceStore
     from warp_corot.newton.stages.stage import StageOptions
     from warp_corot.newton.stages.steps import StageSimulation
@@ -197,7 +197,7 @@ def run(args: argparse.Namespace) -> int:
         )
     count = frame_count(args.duration, sim.fps)
     writer = sim.writer(args.output, show_stress=args.show_stress, flatten=args.flatten)
-    for note in sim.parts.notes:
+    for note in filter(None, [*sim.parts.notes, rounding(args.duration, sim.fps)]):
         complain(note, kind="note")
     done = Recording(writer.path)
     try:

@@ -14,6 +14,7 @@ from warp_corot.simulation.solves import Solves
 
 from .arguments import Step, check_options, check_step, checked_dt, checked_mask
 from .contact import Contacts
+from .elsewhere import Elsewhere
 from .following import Following
 from .implicit import ImplicitSteps
 from .library import CouplingInterface, SolverBase, newton
@@ -82,7 +83,8 @@ class SolverCorotated(SolverBase, CouplingInterface):
             tetrahedra of forests are then computed one by one.
         rotation_level: Level of shared rotations in forests; see ``Corotated``.
         rigid_solver: The solver of rigid bodies: "semi-implicit"; another solver, made for this model, which also gets
-            their forces; or None: no solver, and reactions are added to ``state_in.body_f`` for another program.
+            their forces; or None: no solver, and reactions are added to ``state_in.body_f`` for another program, which
+            moves the bodies. If it moved them beside a solver given here, both would: the first steps warn of that.
         particle_contact: Whether particles collide with one another, as in ``SolverSemiImplicit``. Newton's default
                 radius of 0.1 m makes the particles of finer meshes repel one another.
         self_contact_margin: Distance [m] at which the surfaces of soft bodies and cloth begin to push one another and
@@ -133,6 +135,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
         self.tetrahedra = Tetrahedra(model, lame, rotation == "warm", rotation_level)
         self._contacts = Contacts(model, self_contact_margin)
         self._others = Others(model, rigid_solver, particle_contact)
+        self._elsewhere = Elsewhere(model, self._others.has_bodies)
         self._is_implicit = integrator == "implicit"
         parts = (model, self.tetrahedra, self._contacts, self._others, damping)
         self._steps = ImplicitSteps(*parts) if self._is_implicit else Steps(*parts)
@@ -215,11 +218,13 @@ class SolverCorotated(SolverBase, CouplingInterface):
         check_step(step, self.model, self.tetrahedra.warm)
         self._steps.report.check_earlier(following)
         self._see_surfaces(contacts)
+        self._elsewhere.look(state_in)
         count = self._count_for(dt)
         if following is not None and self.device.is_cpu and not self.device.is_capturing:
             self._steps.launch_retried(step, following)
         else:
             self._steps.launch(step, count, following)
+        self._elsewhere.keep(state_out)
         if self.device.is_cpu and not self.device.is_capturing:
             self.check()
 

@@ -11,7 +11,9 @@ import os
 import signal
 import subprocess
 import sys
+import sysconfig
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -43,10 +45,10 @@ def read_isolated(module: str, path: Path) -> tuple[dict[str, NDArray[Any]] | No
             str(out),
             str(report),
         ]
-        paths = os.pathsep.join(filter(None, sys.path))
+        own = {"PYTHONPATH": _search_path(), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         done = subprocess.run(
             command,
-            env={**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+            env={**os.environ, **own},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
@@ -59,6 +61,23 @@ def read_isolated(module: str, path: Path) -> tuple[dict[str, NDArray[Any]] | No
         if done.returncode == 0 and said.get("foreign"):
             return None, None
         return None, said.get("reason") or _death(done.returncode, done.stderr)
+
+
+def _search_path() -> str:
+    """The folders in which the process looks for modules: the standard library first, then the package.
+
+    The script's folder and the current one are left out: a file ``json.py`` or ``nt.py`` there would be imported in
+    place of another module, and a script named like that would run once more.
+    """
+    standard = [sysconfig.get_path(name) for name in ("stdlib", "platstdlib")]
+    package = str(Path(__file__).parents[3])
+    script = getattr(sys.modules.get("__main__"), "__file__", None)
+    left_out = {os.path.dirname(os.path.abspath(script))} if script else set()
+    with suppress(FileNotFoundError):
+        left_out.add(os.getcwd())
+    others = [path for path in sys.path if path and os.path.abspath(path) not in left_out]
+    folders = [*standard, os.path.join(standard[1], "lib-dynload"), package, *others]
+    return os.pathsep.join(dict.fromkeys(folders))
 
 
 def _death(status: int, stderr: bytes) -> str:

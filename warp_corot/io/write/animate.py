@@ -140,6 +140,17 @@ def frame_count(duration: float, fps: float) -> int:
     return count
 
 
+def rounding(duration: float, fps: float) -> str | None:
+    """What to tell users about a duration [s] that is not a whole number of frames; None if it is one."""
+    end = frame_count(duration, fps) / fps
+    if math.isclose(end, duration, rel_tol=1e-3):
+        return None
+    rates = range(math.ceil(fps), math.ceil(fps) + 100)
+    better = next((rate for rate in rates if math.isclose(rate * duration, round(rate * duration))), None)
+    cure = "" if better is None else f"; with --fps {better} it ends there"
+    return f"the last frame shows {end:.4g} s, not {duration:.4g} s, since frames come every {1.0 / fps:.3g} s{cure}"
+
+
 def record(
     sim: Simulation,
     path: str | PathLike[str],

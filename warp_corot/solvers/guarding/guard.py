@@ -40,6 +40,10 @@ MEMORY = 10.0
 WINDOW = 0.1
 #: Factor on what is tolerated if rotations are shared: their forces have no energy.
 SHARED = 4.0
+#: A body at rest that its weight and loads set in motion moves at least this many times the kinetic energy of half the
+#: first step's velocity: four times at the longest stable step, and this much at half of it. Swinging bodies of few
+#: nodes come back to where they began, where gravity and loads have moved nothing between two checks.
+SET_IN_MOTION = 16.0
 #: Beyond this many sizes of the body, displacements leave no digit of float32 for its strains.
 REACH = 1e6
 
@@ -253,7 +257,8 @@ class Guard:
             self._loads_since = np.zeros(self.worlds)
             # A user may correct a bad world later.
             known = np.where(np.isfinite(found.exact), np.abs(found.exact), 0.0)
-            self._scale = np.maximum(self._scale, known)
+            swing = np.where(np.isfinite(found.untimely), SET_IN_MOTION * found.untimely, 0.0)
+            self._scale = np.maximum(self._scale, np.maximum(known, swing))
         self._counted = None
         self._reference = found
 
