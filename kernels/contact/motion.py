@@ -124,12 +124,11 @@ def sent(now: wp.transform, target: wp.transform, most: float, reach: float):
     return between(now, target, most / far)
 
 
-@wp.kernel(enable_backward=False)
-def move_obstacles(motions: Motions, pace: Pace, world_starts: wp.array[wp.float64], offset: int):
-    """Take each obstacle's pose at the end of the last step as its current one, and find its pose at the end of this
+@wp.func
+def move_obstacle(world: int, o: int, motions: Motions, pace: Pace, world_starts: wp.array[wp.float64], offset: int):
+    """Take an obstacle's pose at the end of the last step as its current one, and find its pose at the end of this
     step.
     """
-    world, o = wp.tid()
     now = motions.later[world, o]
     motions.now[world, o] = now
     mode = motions.mode[o]

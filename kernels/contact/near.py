@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from .motion import Surface
-from .watch import Watch, reserved
+from .motion import Motions, Surface
+from .watch import Watch, reserve_obstacle, reserved
 
 wp.set_module_options({"enable_backward": False})
 
@@ -31,14 +31,29 @@ def mark(near: Near, s: int, flag: int):
 
 
 @wp.kernel(enable_backward=False)
-def reserve_nodes(surface: Surface, watch: Watch, near: Near):
-    """Begin a search: record the positions of nodes and how far they may move from there."""
+def reserve(surface: Surface, motions: Motions, obstacles: int, watch: Watch, near: Near):
+    """Begin a search: record the positions of nodes and the poses of obstacles, and how far they may move from there,
+    with a thread for each of either."""
     s = wp.tid()
     if watch.due[0] == 0:
         return
-    watch.places[s] = surface.x[s]
-    watch.reach[s] = reserved(wp.length(surface.d[s]), watch)
-    near.flags[s] = 0
+    if s < obstacles:
+        reserve_obstacle(s, motions, watch)
+    if s < surface.node.shape[0]:
+        watch.places[s] = surface.x[s]
+        watch.reach[s] = reserved(wp.length(surface.d[s]), watch)
+        near.flags[s] = 0
     if s == 0:
         near.count[0] = 0
         near.touch_count[0] = 0
+
+
+@wp.kernel(enable_backward=False)
+def report_search(watch: Watch, near: Near, most: wp.array[wp.int32], report: wp.array[wp.float64]):
+    """Report to the host the largest number of near pairs, how often an item moved too far, the number of searches, and
+    the number of nodes or triangles that are near something.
+    """
+    report[0] = wp.float64(most[0])
+    report[1] = wp.float64(watch.missed[0])
+    report[2] = wp.float64(watch.searches[0])
+    report[3] = wp.float64(wp.max(near.count[0], near.touch_count[0]))

@@ -6,6 +6,7 @@ from warp_corot.kernels.stepping.balance import sum_of_lanes
 
 from .motion import Motions, Surface
 from .shapes import Shapes, distance_to
+from .touches import Touches
 
 wp.set_module_options({"enable_backward": False})
 
@@ -150,3 +151,23 @@ def find_depths(shapes: Shapes, motions: Motions, surface: Surface, depths: wp.a
         gap, _n = distance_to(shapes, o, motions.later[surface.world[s], o], surface.x[s], 1.0e-3)
         deepest = wp.max(deepest, -gap)
     depths[s] = deepest
+
+
+@wp.kernel(enable_backward=False)
+def share_touches(
+    # In
+    corner_starts: wp.array[wp.int32],
+    corners: wp.array[wp.int32],
+    touches: Touches,
+    forces: wp.array2d[wp.vec3],
+    # Out
+    totals: wp.array2d[wp.vec3],
+):
+    """Add the forces of obstacles on nodes and the nodes' shares of the forces on triangles [N]."""
+    o, s = wp.tid()
+    total = forces[o, s]
+    for k in range(corner_starts[s], corner_starts[s + 1]):
+        t = corners[k] / 3
+        if touches.acts[o, t] != 0:
+            total += touches.shares[o, t][corners[k] % 3] * touches.force[o, t]
+    totals[o, s] = total

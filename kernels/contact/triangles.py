@@ -64,6 +64,27 @@ def crowd_at(s: int, law: Law, dt: float, surface: Surface, skin: Skin, touches:
     return total
 
 
+@wp.func
+def crowd_among(
+    thread: int,
+    threads: int,
+    near: Near,
+    law: Law,
+    dt: float,
+    surface: Surface,
+    skin: Skin,
+    touches: Touches,
+    crowd: wp.array[wp.float32],
+):
+    k = thread
+    count = near.count[0]
+    while k < count:
+        s = near.nodes[k]
+        k += threads
+        if (near.flags[s] & AROUND) != 0:
+            crowd[s] = crowd_at(s, law, dt, surface, skin, touches)
+
+
 @wp.kernel(enable_backward=False)
 def crowd_nodes(
     # In
@@ -79,14 +100,7 @@ def crowd_nodes(
     crowd: wp.array[wp.float32],
 ):
     """Find the contacts that act, and sum their weights at each node. All corners of a triangle find the same."""
-    k = wp.tid()
-    count = near.count[0]
-    dt = float(pace.seconds[DT])
-    while k < count:
-        s = near.nodes[k]
-        k += threads
-        if (near.flags[s] & AROUND) != 0:
-            crowd[s] = crowd_at(s, law, dt, surface, skin, touches)
+    crowd_among(wp.tid(), threads, near, law, float(pace.seconds[DT]), surface, skin, touches, crowd)
 
 
 @wp.func
@@ -120,6 +134,29 @@ def solve_touch(
     touches.more[o, t] = force - before
 
 
+@wp.func
+def solve_among(
+    thread: int,
+    threads: int,
+    near: Near,
+    law: Law,
+    dt: float,
+    surface: Surface,
+    triangles: wp.array[wp.vec3i],
+    crowd: wp.array[wp.float32],
+    corner_yielding: wp.array[wp.float32],
+    touches: Touches,
+):
+    k = thread
+    count = near.touch_count[0]
+    while k < count:
+        o = near.touches[k] // triangles.shape[0]
+        t = near.touches[k] % triangles.shape[0]
+        k += threads
+        if touches.acts[o, t] != 0:
+            solve_touch(o, t, law, dt, surface, triangles[t], crowd, corner_yielding, touches)
+
+
 @wp.kernel(enable_backward=False)
 def solve_touches(
     # In
@@ -139,15 +176,8 @@ def solve_touches(
     Args:
         corner_yielding: ``yielding`` of the surface, also for nodes that another process moves.
     """
-    k = wp.tid()
-    count = near.touch_count[0]
     dt = float(pace.seconds[DT])
-    while k < count:
-        o = near.touches[k] // triangles.shape[0]
-        t = near.touches[k] % triangles.shape[0]
-        k += threads
-        if touches.acts[o, t] != 0:
-            solve_touch(o, t, law, dt, surface, triangles[t], crowd, corner_yielding, touches)
+    solve_among(wp.tid(), threads, near, law, dt, surface, triangles, crowd, corner_yielding, touches)
 
 
 @wp.func
@@ -163,6 +193,36 @@ def add_touches(s: int, skin: Skin, touches: Touches, surface: Surface):
     if wp.dot(total, total) > 0.0:
         surface.f[s] = surface.f[s] + total
         surface.d[s] = surface.d[s] + surface.yielding[s] * total
+
+
+@wp.func
+def push_among(
+    thread: int,
+    threads: int,
+    near: Near,
+    parts: int,
+    skin: Skin,
+    shapes: Shapes,
+    motions: Motions,
+    law: Law,
+    dt: float,
+    touches: Touches,
+    surface: Surface,
+    forces: wp.array2d[wp.vec3],
+    anchors: wp.array2d[wp.vec4],
+):
+    k = thread
+    count = near.count[0]
+    while k < count:
+        s = near.nodes[k]
+        k += threads
+        if (parts & ADD) != 0 and (near.flags[s] & AROUND) != 0:
+            add_touches(s, skin, touches, surface)
+        if (near.flags[s] & BESIDE) != 0:
+            if (parts & (BEGIN | CORRECT)) != 0:
+                touch(s, (parts & BEGIN) != 0, shapes, motions, law, dt, anchors, surface, forces)
+            if (parts & END) != 0:
+                anchor(s, shapes, motions, surface, forces, anchors)
 
 
 @wp.kernel(enable_backward=False)
@@ -189,36 +249,5 @@ def push_nodes(
             with which nodes are outside obstacles at the end of the step, with friction. CORRECT: correct these if
             other forces have moved nodes since. END: update the anchors of sticking nodes.
     """
-    k = wp.tid()
-    count = near.count[0]
     dt = float(pace.seconds[DT])
-    while k < count:
-        s = near.nodes[k]
-        k += threads
-        if (parts & ADD) != 0 and (near.flags[s] & AROUND) != 0:
-            add_touches(s, skin, touches, surface)
-        if (near.flags[s] & BESIDE) != 0:
-            if (parts & (BEGIN | CORRECT)) != 0:
-                touch(s, (parts & BEGIN) != 0, shapes, motions, law, dt, anchors, surface, forces)
-            if (parts & END) != 0:
-                anchor(s, shapes, motions, surface, forces, anchors)
-
-
-@wp.kernel(enable_backward=False)
-def share_touches(
-    # In
-    corner_starts: wp.array[wp.int32],
-    corners: wp.array[wp.int32],
-    touches: Touches,
-    forces: wp.array2d[wp.vec3],
-    # Out
-    totals: wp.array2d[wp.vec3],
-):
-    """Add the forces of obstacles on nodes and the nodes' shares of the forces on triangles [N]."""
-    o, s = wp.tid()
-    total = forces[o, s]
-    for k in range(corner_starts[s], corner_starts[s + 1]):
-        t = corners[k] / 3
-        if touches.acts[o, t] != 0:
-            total += touches.shares[o, t][corners[k] % 3] * touches.force[o, t]
-    totals[o, s] = total
+    push_among(wp.tid(), threads, near, parts, skin, shapes, motions, law, dt, touches, surface, forces, anchors)

@@ -3,8 +3,9 @@
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
+from warp_corot.kernels.stepping.pace import Pace
 
-from .motion import Motions, Surface, distance_between
+from .motion import Motions, Surface, distance_between, move_obstacle
 
 wp.set_module_options({"enable_backward": False})
 
@@ -106,44 +107,56 @@ def add_contact_forces(
 
 
 @wp.kernel(enable_backward=False)
-def watch_obstacles(motions: Motions, watch: Watch):
-    """Check whether obstacles move too far in this step."""
+def move_obstacles(
+    # In
+    motions: Motions,
+    pace: Pace,
+    world_starts: wp.array[wp.float64],
+    offset: int,
+    watches: int,
+    # In and out
+    watch: Watch,
+):
+    """Begin the obstacles' step; ``watches``: check whether they move too far in it."""
     world, o = wp.tid()
-    reach = motions.reach[o]
-    later = motions.later[world, o]
-    step = distance_between(motions.now[world, o], later, reach)
-    if not stays(distance_between(watch.poses[world, o], later, reach), step, watch.reach_of[world, o]):
-        watch.due[0] = 1
+    move_obstacle(world, o, motions, pace, world_starts, offset)
+    if watches != 0:
+        reach = motions.reach[o]
+        later = motions.later[world, o]
+        step = distance_between(motions.now[world, o], later, reach)
+        if not stays(distance_between(watch.poses[world, o], later, reach), step, watch.reach_of[world, o]):
+            watch.due[0] = 1
+
+
+@wp.func
+def raise_fastest(step: float, watch: Watch):
+    if step > watch.fastest[0]:
+        wp.atomic_max(watch.fastest, 0, step)
+
+
+@wp.func
+def pair_of(k: int, watch: Watch):
+    """The world and the obstacle of a number below that of pairs of them."""
+    return k // watch.poses.shape[1], k % watch.poses.shape[1]
 
 
 @wp.kernel(enable_backward=False)
-def find_fastest_node(surface: Surface, watch: Watch):
-    """Find the motion of the fastest node in this step."""
+def find_fastest(surface: Surface, motions: Motions, obstacles: int, watch: Watch):
+    """Find the motion in this step of the fastest node or obstacle, with a thread for each of either."""
     s = wp.tid()
-    if watch.due[0] == 0 or surface.node[s] < 0:
-        return
-    step = wp.length(surface.d[s])
-    if step > watch.fastest[0]:
-        wp.atomic_max(watch.fastest, 0, step)
-
-
-@wp.kernel(enable_backward=False)
-def find_fastest_obstacle(motions: Motions, watch: Watch):
-    """Find the motion of the fastest obstacle in this step, if that is larger."""
-    world, o = wp.tid()
     if watch.due[0] == 0:
         return
-    step = distance_between(motions.now[world, o], motions.later[world, o], motions.reach[o])
-    if step > watch.fastest[0]:
-        wp.atomic_max(watch.fastest, 0, step)
+    if s < surface.node.shape[0] and surface.node[s] >= 0:
+        raise_fastest(wp.length(surface.d[s]), watch)
+    if s < obstacles:
+        world, o = pair_of(s, watch)
+        raise_fastest(distance_between(motions.now[world, o], motions.later[world, o], motions.reach[o]), watch)
 
 
-@wp.kernel(enable_backward=False)
-def reserve_obstacles(motions: Motions, watch: Watch):
-    """Record the poses of obstacles and how far they may move from there."""
-    world, o = wp.tid()
-    if watch.due[0] == 0:
-        return
+@wp.func
+def reserve_obstacle(k: int, motions: Motions, watch: Watch):
+    """Record the pose of an obstacle and how far it may move from there."""
+    world, o = pair_of(k, watch)
     now = motions.now[world, o]
     watch.poses[world, o] = now
     step = distance_between(now, motions.later[world, o], motions.reach[o])
@@ -157,13 +170,3 @@ def end_search(watch: Watch):
         watch.due[0] = 0
         watch.fastest[0] = 0.0
         watch.searches[0] = watch.searches[0] + 1
-
-
-@wp.kernel(enable_backward=False)
-def report_search(watch: Watch, most: wp.array[wp.int32], report: wp.array[wp.float64]):
-    """Report to the host the largest number of near pairs, how often an item moved too far, and the number of
-    searches.
-    """
-    report[0] = wp.float64(most[0])
-    report[1] = wp.float64(watch.missed[0])
-    report[2] = wp.float64(watch.searches[0])

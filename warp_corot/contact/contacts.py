@@ -88,7 +88,8 @@ class Contacts:
     @property
     def launch_revision(self) -> int:
         pairs = 0 if self.pairs is None else self.pairs.revision
-        return self._revision + self.surface.revision + self.obstacles.revision + pairs
+        rigid = 0 if self.rigid is None else self.rigid.revision
+        return self._revision + self.surface.revision + self.obstacles.revision + pairs + rigid
 
     @property
     def state(self) -> dict[str, wp.array]:
@@ -101,6 +102,8 @@ class Contacts:
         before = self.surface.revision
         if self.surface.follow():
             self._follow(before)
+        if self.rigid is not None:
+            self.rigid.prepare()
         if self.pairs is not None:
             if not self.pairs.is_planted:
                 self._predict(0, 0.0)
@@ -142,7 +145,7 @@ class Contacts:
     def launch(self, offset: int, damping: float) -> None:
         system, surface = self.system, self.surface
         if self.obstacles.count:
-            self.obstacles.launch_motion(offset)
+            self.obstacles.launch_motion(offset, self.search.watch, watches=True)
         self._predict(offset, damping)
         self.search.launch(offset)
         self._solve()
@@ -155,7 +158,7 @@ class Contacts:
     def launch_motion(self, offset: int) -> None:
         """Launch the motion of obstacles in an implicit step."""
         if self.obstacles.count:
-            self.obstacles.launch_motion(offset)
+            self.obstacles.launch_motion(offset, self.search.watch, watches=False)
 
     def active_set(self, k: int) -> ActiveSet | None:
         """The contact of a body with obstacles in implicit steps; None without obstacles."""
@@ -263,16 +266,15 @@ class Contacts:
         if pairs is not None:
             pairs.launch_begin(self.law)
         if rigid is not None:
-            rigid.launch_begin(is_end=rounds == 0)
-        for number in range(rounds):
-            if rigid is not None:
-                rigid.launch_round()
-            if pairs is not None:
-                if rigid is not None:
-                    rigid.launch_sum()
-                pairs.launch_round(self.law, self.system.pace.arrays)
-            if rigid is not None:
-                rigid.launch_correction(has_summed=pairs is not None, is_end=number == rounds - 1)
+            rigid.launch(rounds, None if pairs is None else self._solve_pairs)
+        else:
+            for _ in range(rounds):
+                self._solve_pairs()
+
+    def _solve_pairs(self) -> None:
+        """Launch a round of the forces of soft surfaces."""
+        assert self.pairs is not None
+        self.pairs.launch_round(self.law, self.system.pace.arrays)
 
     def _make_arrays(self) -> None:
         surface, device = self.surface, self.device

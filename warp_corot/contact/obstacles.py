@@ -12,6 +12,7 @@ from warp_corot.errors import InputError
 from warp_corot.kernels.contact import motion as kernels
 from warp_corot.kernels.contact.overlaps import find_gaps
 from warp_corot.kernels.contact.shapes import Shapes
+from warp_corot.kernels.contact.watch import Watch, move_obstacles
 from warp_corot.solvers.system import System
 
 from .sampled import SignedDistance, TriangleMesh
@@ -135,8 +136,14 @@ class Obstacles:
         inputs = [given, number, self.motions.target]
         wp.launch(kernels.take_targets, self.worlds, inputs, device=self.device)
 
-    def launch_motion(self, offset: int) -> None:
-        """Launch the motion of obstacles in this step."""
+    def launch_motion(self, offset: int, watch: Watch, *, watches: bool) -> None:
+        """Launch the motion of obstacles in this step.
+
+        Args:
+            offset: The number of steps since the clock was last advanced.
+            watch: What is known of motion since the last search.
+            watches: Whether a search becomes due if they move too far.
+        """
         for number, tool in enumerate(self.tools):
             if tool.poses is not None:
                 if tool.poses.device != self.device or len(tool.poses) not in (1, self.worlds):
@@ -147,8 +154,8 @@ class Obstacles:
                 inputs = [tool.poses, number, self.motions.target]
                 wp.launch(kernels.take_targets, self.worlds, inputs, device=self.device)
         pace, starts = self.system.pace.arrays, self.system.bodies[0].conditions.world_starts
-        inputs = [self.motions, pace, starts, offset]
-        wp.launch(kernels.move_obstacles, (self.worlds, self.count), inputs, device=self.device)
+        inputs = [self.motions, pace, starts, offset, int(watches), watch]
+        wp.launch(move_obstacles, (self.worlds, self.count), inputs, device=self.device)
 
     def reset(self, chosen: wp.array) -> None:
         """Put obstacles of these worlds back to where they were first."""

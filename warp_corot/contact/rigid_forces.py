@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import warp as wp
 
-from warp_corot.kernels.contact import beside, touches, triangles
+from warp_corot.kernels.contact import beside, sums, touches, triangles
 from warp_corot.kernels.contact.law import Law
+from warp_corot.kernels.contact.together import BLOCK, push_together
 from warp_corot.kernels.stepping.pace import Pace
 from warp_corot.solvers.ranks import ALONE, Ranks
 
 from .obstacles import Obstacles
 from .search import Search
 from .surface import ContactSurface
+
+#: With more near nodes or near triangles than this for each thread of a block, the whole device is faster than the
+#: block.
+MOST_EACH = 4
 
 
 class RigidForces:
@@ -32,6 +39,8 @@ class RigidForces:
         kinds: The state of each surface node with each obstacle in implicit steps; see
             ``kernels.contact.active``, [O, S].
         have_edges: Whether any of the obstacles can pass between the nodes.
+        together: Whether one block makes all rounds; None: chosen by how much is near.
+        revision: Changes whenever launches do.
     """
 
     def __init__(
@@ -46,6 +55,8 @@ class RigidForces:
         self.surface, self.obstacles, self.search, self.device = surface, obstacles, search, surface.device
         self._law, self._pace, self._ranks, self._taken = law, pace, ranks, -1
         self.have_edges = obstacles.have_edges
+        self.together: bool | None = None
+        self.revision, self._is_together = 0, False
         search.finders.append(self._find)
         self.follow()
 
@@ -73,6 +84,16 @@ class RigidForces:
         self._skin.corner_starts = self.surface.corner_starts
         self._yielding = self.surface.arrays.yielding
 
+    def prepare(self) -> None:
+        """Choose how forces are launched, by the number of nodes and triangles that were near in the last run."""
+        together = self.together
+        if together is None:
+            most = MOST_EACH * BLOCK * (1.0 if self._is_together else 0.5)
+            is_short = self.have_edges and self.search.most_near <= most
+            together = (self.device.is_cpu or is_short) and self._ranks.is_alone
+        self.revision += int(together != self._is_together)
+        self._is_together = together
+
     def forget(self) -> None:
         """Forget the last step."""
         self.anchors.zero_()
@@ -88,18 +109,48 @@ class RigidForces:
 
     # --- launches --------------------------------------------------------------------------------------------------
 
-    def launch_begin(self, *, is_end: bool) -> None:
+    def launch(self, rounds: int, between: Callable[[], None] | None) -> None:
+        """Launch the forces of a step.
+
+        Args:
+            rounds: The number of rounds, in each of which forces between nodes and then those on nodes are corrected.
+            between: Launches other forces in each round, between the two.
+        """
+        if self._is_together:
+            self._launch_together(rounds, between)
+            return
+        self._launch_begin(is_end=rounds == 0)
+        for number in range(rounds):
+            self._launch_round()
+            if between is not None:
+                if self.have_edges:
+                    self._push(triangles.ADD)
+                between()
+            added = triangles.ADD if self.have_edges and between is None else 0
+            self._push(triangles.CORRECT | added | (triangles.END if number == rounds - 1 else 0))
+
+    def _launch_together(self, rounds: int, between: Callable[[], None] | None) -> None:
+        """Launch them from one block of threads, which takes many parts in one launch."""
+        if between is None:
+            self._push_together(triangles.BEGIN, rounds, triangles.CORRECT | triangles.END)
+            return
+        for number in range(rounds):
+            self._push_together(triangles.CORRECT if number else triangles.BEGIN, 1, 0)
+            between()
+        self._push_together(triangles.CORRECT | triangles.END, 0, 0)
+
+    def _launch_begin(self, *, is_end: bool) -> None:
         """Launch the first forces: those between nodes from the last step, and those on nodes."""
-        parts = triangles.BEGIN
+        parts = triangles.BEGIN | (triangles.END if is_end else 0)
         if self.have_edges:
             self._yielding = self._ranks.completed_yielding(self.surface.arrays.yielding)
             rigid = [self.obstacles.shapes, self.obstacles.motions]
             inputs = [*rigid, self._law, self.surface.arrays, self.surface.triangles, self.touches]
             self._on_touches(touches.find_touches, inputs)
             parts |= triangles.ADD
-        self._push(parts, is_end)
+        self._push(parts)
 
-    def launch_round(self) -> None:
+    def _launch_round(self) -> None:
         """Launch one round of the forces between nodes; their sums at the nodes follow."""
         if not self.have_edges:
             return
@@ -110,27 +161,12 @@ class RigidForces:
         inputs = [*step, self.surface.triangles, self._crowd, self._yielding, self.touches]
         self._on_touches(triangles.solve_touches, inputs)
 
-    def launch_sum(self) -> None:
-        """Launch the sums of a round's forces at the nodes, where other forces have to know of them."""
-        if self.have_edges:
-            self._push(triangles.ADD, is_end=False)
-
-    def launch_correction(self, *, has_summed: bool, is_end: bool) -> None:
-        """Launch the forces on nodes again, because other forces have moved them since.
-
-        Args:
-            has_summed: Whether ``launch_sum`` came before.
-            is_end: Whether these are the last forces of the step: nodes stick from now on where they do.
-        """
-        sums = self.have_edges and not has_summed
-        self._push(triangles.CORRECT | (triangles.ADD if sums else 0), is_end)
-
     def launch_totals(self) -> wp.array:
         """Launch the sums of all forces of each obstacle on each node, [O, S]."""
         if not self.have_edges:
             return self.forces
         inputs = [self.surface.corner_starts, self.surface.corners, self.touches, self.forces]
-        wp.launch(triangles.share_touches, self.forces.shape, inputs, [self.totals], device=self.device)
+        wp.launch(sums.share_touches, self.forces.shape, inputs, [self.totals], device=self.device)
         return self.totals
 
     def _find(self) -> None:
@@ -144,12 +180,19 @@ class RigidForces:
             dim = (self.obstacles.count, self.surface.triangle_count)
             wp.launch(beside.find_triangles_beside, dim, inputs, [near, self.touches], device=self.device)
 
-    def _push(self, parts: int, is_end: bool) -> None:
+    def _push(self, parts: int) -> None:
         """Launch some of what moves one node at a time."""
-        parts |= triangles.END if is_end else 0
         rigid = [self.obstacles.shapes, self.obstacles.motions]
         inputs = [parts, self._skin, *rigid, self._law, self._pace, self.touches, self.surface.arrays]
         self._on_nodes(triangles.push_nodes, [*inputs, self.forces, self.anchors])
+
+    def _push_together(self, before: int, rounds: int, parts: int) -> None:
+        """Launch some of it, and rounds, in one block."""
+        threads = 1 if self.device.is_cpu else BLOCK
+        rigid = [self.obstacles.shapes, self.obstacles.motions]
+        inputs = [threads, self.search.near, before, rounds, parts, self._skin, *rigid, self._law, self._pace]
+        outputs = [self.touches, self._crowd, self.surface.arrays, self.forces, self.anchors]
+        wp.launch(push_together, threads, inputs, outputs, device=self.device, block_dim=threads)
 
     def _on_nodes(self, kernel: wp.Kernel, inputs: list) -> None:
         among = self.search.at_nodes

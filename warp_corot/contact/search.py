@@ -20,8 +20,8 @@ LEAST, MOST = 0.05, 4.0
 WIDER = 4.0
 #: Maximum number of threads that process a list on CUDA.
 MOST_THREADS = 1 << 18
-#: The report of the device to the host: see ``kernels.contact.watch.report_search``.
-PAIRS, MISSED, SEARCHES = range(3)
+#: The report of the device to the host: see ``kernels.contact.near.report_search``.
+PAIRS, MISSED, SEARCHES, NEAR = range(4)
 
 
 class Search:
@@ -49,7 +49,7 @@ class Search:
         self.surface, self.obstacles, self.device = surface, obstacles, surface.device
         self.farthest = MOST * size
         self.finders: list[Callable[[], None]] = []
-        self._report = Mapped(3, self.device)
+        self._report = Mapped(4, self.device)
         self.most = wp.zeros(1, dtype=wp.int32, device=self.device)
         watch, device = kernels.Watch(), self.device
         watch.least = wp.full(1, LEAST * size, dtype=wp.float32, device=device)
@@ -91,6 +91,7 @@ class Search:
             self.near.count, self.near.touch_count = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
             pairs = self.obstacles.count * self.surface.triangle_count if self.obstacles.have_edges else 0
             self.near.touches = wp.zeros(pairs, dtype=wp.int32, device=device)
+            self._report.values[NEAR] = count
             self._taken = self.surface.revision
         self.forget()
 
@@ -112,6 +113,12 @@ class Search:
     def count(self) -> int:
         """The number of searches so far, by the report of the last run."""
         return int(self._report.values[SEARCHES])
+
+    @property
+    def most_near(self) -> int:
+        """The number of nodes or of triangles that were near something, the larger one, by the report of the last run;
+        before, the number of all nodes."""
+        return int(self._report.values[NEAR])
 
     def widen(self) -> None:
         """Search with a larger margin from now on, if something has moved too far.
@@ -139,8 +146,6 @@ class Search:
             return
         if offset == 0:
             self._on_nodes(kernels.watch_nodes, [self.surface.arrays, self.watch])
-        if self.obstacles.count:
-            self._on_obstacles(kernels.watch_obstacles)
         if self._branches:
             wp.capture_if(self.watch.due, self._search)
         else:
@@ -153,21 +158,19 @@ class Search:
 
     def launch_report(self) -> None:
         """Launch the report to the host after a run."""
-        wp.launch(kernels.report_search, 1, [self.watch, self.most, self._report.array], device=self.device)
+        wp.launch(
+            near_kernels.report_search, 1, [self.watch, self.near, self.most, self._report.array], device=self.device
+        )
 
     def _search(self) -> None:
-        arrays = self.surface.arrays
-        self._on_nodes(kernels.find_fastest_node, [arrays, self.watch])
-        if self.obstacles.count:
-            self._on_obstacles(kernels.find_fastest_obstacle)
-            self._on_obstacles(kernels.reserve_obstacles)
-        self._on_nodes(near_kernels.reserve_nodes, [arrays, self.watch, self.near])
+        arrays, obstacles = self.surface.arrays, self.watch.poses.size
+        inputs = [arrays, self.obstacles.motions, obstacles, self.watch]
+        dim = max(self.surface.count, obstacles)
+        wp.launch(kernels.find_fastest, dim, inputs, device=self.device)
+        wp.launch(near_kernels.reserve, dim, [*inputs, self.near], device=self.device)
         for find in self.finders:
             find()
         wp.launch(kernels.end_search, 1, [self.watch], device=self.device)
 
     def _on_nodes(self, kernel: wp.Kernel, inputs: list) -> None:
         wp.launch(kernel, self.surface.count, inputs, device=self.device)
-
-    def _on_obstacles(self, kernel: wp.Kernel) -> None:
-        wp.launch(kernel, self.watch.poses.shape, [self.obstacles.motions, self.watch], device=self.device)
