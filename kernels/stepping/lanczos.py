@@ -80,14 +80,16 @@ def take_scale(probe: float, largest: wp.array[wp.float64], scale: wp.array[wp.f
 
 
 @wp.kernel(enable_backward=False)
-def take_sum(sums: wp.array[wp.float64], root: int, place: int, numbers: wp.array[wp.float64]):
-    """Write a sum, or its square root, to its place."""
+def take_sum(
+    sums: wp.array[wp.float64], root: int, step: wp.array[wp.int32], after: int, numbers: wp.array[wp.float64]
+):
+    """Write a sum, or its square root, to numbers[step + after]."""
     total = wp.float64(0.0)
     for k in range(FOLDED):
         total += sums[k]
     if root != 0:
         total = wp.sqrt(total)
-    numbers[place] = total
+    numbers[step[0] + after] = total
 
 
 @wp.kernel(enable_backward=False)
@@ -104,7 +106,7 @@ def apply_stiffness(
     # In
     scale: wp.array[wp.float32],
     off: wp.array[wp.float64],
-    step: int,
+    step: wp.array[wp.int32],
     inverse_mass: wp.array[wp.float32],
     f: wp.array[wp.vec4],
     before: wp.array[wp.vec4],
@@ -117,24 +119,52 @@ def apply_stiffness(
     """
     i = wp.tid()
     a = (-wp.sqrt(inverse_mass[i]) / scale[0]) * load_node(f, i)
-    if step > 0:
-        a -= float(off[step]) * load_node(before, i)
+    if step[0] > 0:
+        a -= float(off[step[0]]) * load_node(before, i)
     store_node(w, i, a)
 
 
 @wp.kernel(enable_backward=False)
-def take_away(numbers: wp.array[wp.float64], place: int, a: wp.array[wp.vec4], b: wp.array[wp.vec4]):
-    """b -= numbers[place] a."""
+def take_away(numbers: wp.array[wp.float64], step: wp.array[wp.int32], a: wp.array[wp.vec4], b: wp.array[wp.vec4]):
+    """b -= numbers[step] a."""
     i = wp.tid()
-    store_node(b, i, load_node(b, i) - float(numbers[place]) * load_node(a, i))
+    store_node(b, i, load_node(b, i) - float(numbers[step[0]]) * load_node(a, i))
+
+
+@wp.func
+def divided(a: wp.vec3, length: wp.float64):
+    if length > wp.float64(0.0):
+        return float(wp.float64(1.0) / length) * a
+    return a
 
 
 @wp.kernel(enable_backward=False)
-def divide_by(numbers: wp.array[wp.float64], place: int, a: wp.array[wp.vec4]):
-    """a /= numbers[place], if that is not zero."""
+def normalise(lengths: wp.array[wp.float64], q: wp.array[wp.vec4]):
+    """q /= lengths[0], if that is not zero."""
     i = wp.tid()
-    if numbers[place] > wp.float64(0.0):
-        store_node(a, i, float(wp.float64(1.0) / numbers[place]) * load_node(a, i))
+    store_node(q, i, divided(load_node(q, i), lengths[0]))
+
+
+@wp.kernel(enable_backward=False)
+def take_next(
+    # In
+    lengths: wp.array[wp.float64],
+    step: wp.array[wp.int32],
+    w: wp.array[wp.vec4],
+    # In and out
+    q: wp.array[wp.vec4],
+    # Out
+    before: wp.array[wp.vec4],
+):
+    """before = q and q = w / lengths[step + 1], where a length of zero does not divide."""
+    i = wp.tid()
+    store_node(before, i, load_node(q, i))
+    store_node(q, i, divided(load_node(w, i), lengths[step[0] + 1]))
+
+
+@wp.kernel(enable_backward=False)
+def count_step(step: wp.array[wp.int32]):
+    step[0] += 1
 
 
 @wp.kernel(enable_backward=False)

@@ -59,10 +59,14 @@ class _Sum:
 
     def __init__(self, dt: float, elastic: _SmallMotions, viscous: _SmallMotions):
         self.parts = (dt * dt, elastic), (2.0 * dt, viscous)
+        #: The scaled displacements of each part, kept because launches may be recorded.
+        self._scaled: list[wp.array] = []
 
     def add_forces(self, u: wp.array, f: wp.array) -> None:
-        for factor, motions in self.parts:
-            scaled = wp.clone(u)
+        if not self._scaled:
+            self._scaled = [wp.empty_like(u) for _ in self.parts]
+        for (factor, motions), scaled in zip(self.parts, self._scaled, strict=True):
+            wp.copy(scaled, u)
             wp.launch(scale_by, dim=len(u), inputs=[factor, scaled], device=u.device)
             motions.add_forces(scaled, f)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +12,7 @@ from warp_corot.kernels.stepping import gauge as kernels
 from warp_corot.solvers.ranks import ALONE, Ranks
 
 from .pace import Pace
+from .repeated import repeat
 from .stable_step import PROBE
 
 if TYPE_CHECKING:
@@ -91,14 +93,16 @@ class Gauge:
         u, f = (wp.zeros_like(self.body.state.displacements) for _ in range(2))
         with self.field.state_kept():
             self.field.add_forces(u, f)
-            for _ in range(REST_TURNS):
-                self.found.zero_()
-                self._find_curvature(u, f)
+            repeat(partial(self._find_afresh, u, f), REST_TURNS, self.body.device, self._ranks)
             self._ranks.take_most(self.found)
         self._rest_directions = wp.clone(self.directions)
         value = float(self.found.numpy()[0])
         self.found.zero_()
         return value
+
+    def _find_afresh(self, u: wp.array, f: wp.array) -> None:
+        self.found.zero_()
+        self._find_curvature(u, f)
 
     def _find_curvature(self, u: wp.array, f: wp.array) -> None:
         inverse_mass = self.body.conditions.inverse_mass

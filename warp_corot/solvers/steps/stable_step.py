@@ -13,6 +13,8 @@ from warp_corot.errors import InputError
 from warp_corot.kernels.stepping import lanczos
 from warp_corot.solvers.ranks import ALONE, Ranks
 
+from .repeated import repeat
+
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
 
@@ -74,8 +76,7 @@ def largest_eigenvalue(
     iteration = _Lanczos(forces, inverse_mass, probe, launch_nodes or nodes, ranks, number)
     with forces.state_kept():
         iteration.find_rest_forces()
-        for step in range(min(LANCZOS_STEPS, 3 * free)):
-            iteration.launch(step)
+        iteration.launch(min(LANCZOS_STEPS, 3 * free))
     return max(_largest_value(*iteration.coefficients()), 0.0)
 
 
@@ -114,18 +115,24 @@ class _Lanczos:
             for size in (parts, lanczos.FOLDED, lanczos.FOLDED, LANCZOS_STEPS, LANCZOS_STEPS + 1)
         )
         self._scale = wp.empty(1, dtype=wp.float32, device=self.device)
+        self._step = wp.zeros(1, dtype=wp.int32, device=self.device)
         self._steps = 0
         self._launch(lanczos.random_motion, [0, inverse_mass, self.q])
         ranks.number_motion(number, inverse_mass, self.q)
-        self._normalise(self.q, 0)
+        self._sum(self.q, self.q, self._off, root=True)
+        self._launch(lanczos.normalise, [self._off, self.q])
 
     def find_rest_forces(self) -> None:
         """Find the forces at rest, which active stress makes; they are subtracted from those of displacements."""
         self.forces.add_forces(self.u, self._rest)
         self._launch(lanczos.scale_by, [-1.0, self._rest])
 
-    def launch(self, step: int) -> None:
-        """Launch the next step of the iteration."""
+    def launch(self, steps: int) -> None:
+        """Launch all steps of the iteration."""
+        repeat(self._launch_step, steps, self.device, self._ranks)
+        self._steps = steps
+
+    def _launch_step(self) -> None:
         inverse_mass = self.inverse_mass
         self._launch(lanczos.largest_motions, [inverse_mass, self.q, self._parts], len(self._parts))
         self._launch(lanczos.fold, [self._parts, self._sums, self._largest], lanczos.FOLDED)
@@ -135,13 +142,13 @@ class _Lanczos:
         self._ranks.complete(self._number, self.u)
         wp.copy(self.f, self._rest, count=self.count)
         self.forces.add_forces(self.u, self.f)
-        arguments = [self._scale, self._off, step, inverse_mass, self.f, self.before, self.next]
+        arguments = [self._scale, self._off, self._step, inverse_mass, self.f, self.before, self.next]
         self._launch(lanczos.apply_stiffness, arguments)
-        self._sum(self.q, self.next, self._diagonal, step)
-        self._launch(lanczos.take_away, [self._diagonal, step, self.q, self.next])
-        self._normalise(self.next, step + 1)
-        self.before, self.q, self.next = self.q, self.next, self.before
-        self._steps = step + 1
+        self._sum(self.q, self.next, self._diagonal)
+        self._launch(lanczos.take_away, [self._diagonal, self._step, self.q, self.next])
+        self._sum(self.next, self.next, self._off, after=1, root=True)
+        self._launch(lanczos.take_next, [self._off, self._step, self.next, self.q, self.before])
+        self._launch(lanczos.count_step, [self._step], 1)
 
     def coefficients(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """Diagonal and off-diagonal entries of the meaningful steps [1/s^2], with one more off-diagonal at either end.
@@ -153,16 +160,12 @@ class _Lanczos:
         size = int(np.argmax(ended)) + 1 if ended.any() else self._steps
         return diagonal[:size], off[: size + 1]
 
-    def _normalise(self, a: wp.array, place: int) -> None:
-        """Divide a vector by its length, which becomes an off-diagonal entry."""
-        self._sum(a, a, self._off, place, root=True)
-        self._launch(lanczos.divide_by, [self._off, place, a])
-
-    def _sum(self, a: wp.array, b: wp.array, numbers: wp.array, place: int, *, root: bool = False) -> None:
+    def _sum(self, a: wp.array, b: wp.array, numbers: wp.array, *, after: int = 0, root: bool = False) -> None:
+        """Launch that the step's number is a . b, or its root."""
         self._launch(lanczos.inner_products, [a, b, self._parts], len(self._parts))
         self._launch(lanczos.fold, [self._parts, self._sums, self._largest], lanczos.FOLDED)
         self._ranks.add_up(self._parts, self._sums)
-        self._launch(lanczos.take_sum, [self._sums, int(root), place, numbers], 1)
+        self._launch(lanczos.take_sum, [self._sums, int(root), self._step, after, numbers], 1)
 
     def _launch(self, kernel: wp.Kernel, arguments: list, dim: int | None = None) -> None:
         count = self.count if dim is None else dim
