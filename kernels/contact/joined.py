@@ -24,6 +24,8 @@ wp.set_module_options({"enable_backward": False})
 
 #: The stiffness of a pair over that of its nodes.
 STIFF = wp.constant(4.0)
+#: Lists of pairs.
+NEAR, PUSHING, REACHED = (wp.constant(k) for k in range(3))
 
 
 @wp.struct
@@ -44,6 +46,10 @@ class Joined:
     derivative: wp.array[wp.mat33]  # [P] [N/m]
     crowd: wp.array[wp.float32]  # [S] the sum of shares in pairs that push
     locates: wp.array[wp.int32]  # [1] whether pairs are to be located
+    near: wp.array[wp.int32]  # [P] the pairs that may meet, as they were located
+    pushing: wp.array[wp.int32]  # [P] those that push
+    reached: wp.array[wp.int32]  # [P] those that push before or after a change of the motions
+    counts: wp.array[wp.int32]  # [3] the lengths of these three lists
 
 
 @wp.kernel(enable_backward=False)
@@ -99,10 +105,16 @@ def opened_by(row: int, d: wp.array[wp.vec4], rows: Rows, joined: Joined):
 
 @wp.kernel(enable_backward=False)
 def place_nodes(is_first: int, d: wp.array[wp.vec4], joined: Joined, surface: Surface):
-    """Put surface nodes where pairs are to be located: at the beginning of the step, or after motions d."""
+    """Put surface nodes where pairs are to be located: at the beginning of the step, or after motions d. Pairs that
+    were near are forgotten.
+    """
     s = wp.tid()
     i = joined.entry[s]
-    if i < 0 or joined.locates[0] == 0:
+    if joined.locates[0] == 0:
+        return
+    if s == 0:
+        joined.counts[NEAR] = 0
+    if i < 0:
         return
     x = joined.start[s]
     if is_first == 0:
@@ -199,7 +211,9 @@ def locate_rows(
 
 @wp.kernel(enable_backward=False)
 def stiffen_rows(threads: int, rows: Rows, joined: Joined):
-    """Stiffness of the pairs that have been located: those that share nodes share it."""
+    """Stiffness of the pairs that have been located: those that share nodes share it. Only these may meet until
+    pairs are located again.
+    """
     row = wp.tid()
     count = row_count(rows)
     if joined.locates[0] == 0:
@@ -212,6 +226,7 @@ def stiffen_rows(threads: int, rows: Rows, joined: Joined):
             for k in range(4):
                 yielding += wp.abs(w[k]) * wp.max(joined.crowd[p[k]], wp.abs(w[k])) * joined.compliance[p[k]]
             joined.stiffness[row] = STIFF / wp.max(yielding, 1.0e-30)
+            joined.near[wp.atomic_add(joined.counts, NEAR, 1)] = row
         row += threads
 
 
@@ -252,19 +267,40 @@ def row_state(row: int, e: wp.vec3, most: float, rows: Rows, joined: Joined):
 
 
 @wp.kernel(enable_backward=False)
+def empty_list(which: int, joined: Joined):
+    joined.counts[which] = 0
+
+
+@wp.kernel(enable_backward=False)
 def update_rows(threads: int, friction: float, d: wp.array[wp.vec4], rows: Rows, joined: Joined):
-    """Forces and derivatives after motions d, with the friction that the push there allows."""
-    row = wp.tid()
-    count = row_count(rows)
-    while row < count:
-        if joined.stiffness[row] > 0.0:
-            e = opened_by(row, d, rows, joined)
-            most = friction * row_state(row, e, 0.0, rows, joined).push
-            made = row_state(row, e, most, rows, joined)
-            joined.most[row] = most
+    """Forces and derivatives after motions d, with the friction that the push there allows, and the pairs that push."""
+    k = wp.tid()
+    while k < joined.counts[NEAR]:
+        row = joined.near[k]
+        e = opened_by(row, d, rows, joined)
+        push = row_state(row, e, 0.0, rows, joined).push
+        joined.most[row] = friction * push
+        joined.force[row] = wp.vec3()
+        if push > 0.0:
+            made = row_state(row, e, friction * push, rows, joined)
             joined.force[row] = made.force
             joined.derivative[row] = made.derivative
-        row += threads
+            joined.pushing[wp.atomic_add(joined.counts, PUSHING, 1)] = row
+        k += threads
+
+
+@wp.kernel(enable_backward=False)
+def find_reached(threads: int, d: wp.array[wp.vec4], change: wp.array[wp.vec4], rows: Rows, joined: Joined):
+    """The pairs that push after motions d or with the change: as gaps change in proportion, no others push between."""
+    k = wp.tid()
+    while k < joined.counts[NEAR]:
+        row = joined.near[k]
+        e = opened_by(row, d, rows, joined)
+        after = e + opened_by(row, change, rows, joined)
+        push = wp.max(row_state(row, e, 0.0, rows, joined).push, row_state(row, after, 0.0, rows, joined).push)
+        if push > 0.0:
+            joined.reached[wp.atomic_add(joined.counts, REACHED, 1)] = row
+        k += threads
 
 
 @wp.func
@@ -279,26 +315,21 @@ def add_to_entries(row: int, force: wp.vec3, rows: Rows, joined: Joined, y: wp.a
 @wp.kernel(enable_backward=False)
 def add_row_forces(threads: int, rows: Rows, joined: Joined, y: wp.array[wp.vec4]):
     """Add the forces of pairs on nodes that are free [N]."""
-    row = wp.tid()
-    count = row_count(rows)
-    while row < count:
-        force = joined.force[row]
-        if joined.stiffness[row] > 0.0 and wp.dot(force, force) > 0.0:
-            add_to_entries(row, force, rows, joined, y)
-        row += threads
+    k = wp.tid()
+    while k < joined.counts[PUSHING]:
+        row = joined.pushing[k]
+        add_to_entries(row, joined.force[row], rows, joined, y)
+        k += threads
 
 
 @wp.kernel(enable_backward=False)
 def add_row_products(threads: int, rows: Rows, joined: Joined, x: wp.array[wp.vec4], y: wp.array[wp.vec4]):
     """Add the derivative times x."""
-    row = wp.tid()
-    count = row_count(rows)
-    while row < count:
-        if joined.stiffness[row] > 0.0:
-            s = joined.derivative[row]
-            if wp.trace(s) > 0.0:
-                add_to_entries(row, s * opened_by(row, x, rows, joined), rows, joined, y)
-        row += threads
+    k = wp.tid()
+    while k < joined.counts[PUSHING]:
+        row = joined.pushing[k]
+        add_to_entries(row, joined.derivative[row] * opened_by(row, x, rows, joined), rows, joined, y)
+        k += threads
 
 
 @wp.kernel(enable_backward=False)
@@ -314,17 +345,16 @@ def add_row_slopes(
     slopes: wp.array[wp.float64],
 ):
     """Add the power of pairs along a change of motions, at the share that is tried; all bodies are one world."""
-    row = wp.tid()
-    count = row_count(rows)
+    k = wp.tid()
     share = float(search[0, TRIED])
     total = wp.float64(0.0)
-    while row < count:
-        if joined.stiffness[row] > 0.0:
-            along = opened_by(row, change, rows, joined)
-            e = opened_by(row, d, rows, joined) + share * along
-            made = row_state(row, e, joined.most[row], rows, joined)
-            total += wp.dot(wp.vec3d(made.force), wp.vec3d(along))
-        row += threads
+    while k < joined.counts[REACHED]:
+        row = joined.reached[k]
+        along = opened_by(row, change, rows, joined)
+        e = opened_by(row, d, rows, joined) + share * along
+        made = row_state(row, e, joined.most[row], rows, joined)
+        total += wp.dot(wp.vec3d(made.force), wp.vec3d(along))
+        k += threads
     if total != wp.float64(0.0):
         wp.atomic_add(slopes, 0, total)
 

@@ -23,6 +23,9 @@ OF_PAIRS = {
     "most": wp.float32,
     "force": wp.vec3,
     "derivative": wp.mat33,
+    "near": wp.int32,
+    "pushing": wp.int32,
+    "reached": wp.int32,
 }
 
 
@@ -59,6 +62,7 @@ class JoinedRows:
             for name, dtype in fields.items():
                 setattr(joined, name, wp.zeros(size, dtype=dtype, device=self.device))
         joined.locates = self.locates
+        joined.counts = wp.zeros(3, dtype=wp.int32, device=self.device)
         self._joined = joined
         self._added = wp.zeros(sizes[0], dtype=wp.vec3, device=self.device)
 
@@ -94,7 +98,13 @@ class JoinedRows:
 
     def update(self, d: wp.array) -> None:
         """Launch forces and their derivatives after motions d."""
+        self._empty(kernels.PUSHING)
         self._on_rows(kernels.update_rows, [self._pairs.friction, d, self._pairs.rows, self._joined])
+
+    def find_reached(self, d: wp.array, change: wp.array) -> None:
+        """Launch which pairs may push along a change of the motions d; ``add_slopes`` takes only these."""
+        self._empty(kernels.REACHED)
+        self._on_rows(kernels.find_reached, [d, change, self._pairs.rows, self._joined])
 
     def add_forces(self, y: wp.array) -> None:
         self._on_rows(kernels.add_row_forces, [self._pairs.rows, self._joined, y])
@@ -113,6 +123,9 @@ class JoinedRows:
             outputs = [self._added, self._pairs.surface.arrays, body.state.contact_forces]
             self._on_body(k, kernels.end_places, [d, self._joined], outputs)
         self._pairs.search.launch_after()
+
+    def _empty(self, which: int) -> None:
+        wp.launch(kernels.empty_list, 1, [int(which), self._joined], device=self.device)
 
     def _on_rows(self, kernel: wp.Kernel, inputs: Sequence) -> None:
         threads = self._pairs.search.threads(self._pairs.room)

@@ -173,6 +173,7 @@ class JoinedSolve:
             held.launch_friction(part, r)
         self._solver.launch(self._preconditioner, self._r, self._change, like=self._b, share=SHARE)
         self._operator.apply_freely(self._change, self._q)
+        rows.find_reached(d, self._change)
         self._search.launch(self._rest, self._q, self._change, d)
         self._judge()
 
