@@ -43,7 +43,7 @@ class Run:
 
     def begin(self):
         self.body.displacements = self.given["displacements"]
-        self.body.velocities = self.given["velocities"]
+        self.body.state.set_velocities(self.given["velocities"])
 
     def gradient(self, integrator, steps, **options):
         def objective(x):

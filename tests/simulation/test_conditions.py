@@ -56,6 +56,18 @@ def test_forces_and_velocities_on_the_device_are_those_of_numpy(made, each, devi
     np.testing.assert_allclose(ends[1], ends[0], atol=1e-6 * np.abs(ends[0]).max())
 
 
+def test_velocities_of_a_whole_body_leave_held_nodes_alone(device):
+    sim = bar(device)
+    body, top = sim.body, top_of(sim)
+    body.prescribe(top, velocity=(0.1, 0.0, 0.0))
+    body.velocities = np.full((body.node_count, 3), 0.5)
+    sim.advance(0.01)
+    moved, fixed = body.displacements.numpy(), np.flatnonzero(body.mesh.points[:, 2] < 1e-9)
+    np.testing.assert_array_equal(moved[fixed], 0.0)
+    np.testing.assert_allclose(moved[top], np.tile([0.001, 0.0, 0.0], (len(top), 1)), atol=1e-5)
+    assert (moved[~body.constrained] > 1e-3).any()
+
+
 def test_one_worlds_values_mean_all_worlds(device):
     sim = bar(device, worlds=3)
     top = top_of(sim)

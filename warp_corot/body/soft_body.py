@@ -179,13 +179,17 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
 
     @property
     def velocities(self) -> wp.array:
-        """Nodal velocities [m/s], vec3 [worlds * N]: a view of the live array."""
+        """Nodal velocities [m/s], vec3 [worlds * N]: a view of the live array. If you set the property, held nodes
+        keep theirs: fixed nodes stay where they are."""
         return self.nodal_view(self.state.velocities)
 
     @velocities.setter
     @in_turn
     def velocities(self, values: npt.ArrayLike) -> None:
-        self.state.set_velocities(self._checked_vectors(values, "velocities"))
+        given, held = self._checked_vectors(values, "velocities"), self.constrained
+        if held.any():
+            given = np.where(held[:, None], self.velocities.numpy(), given)
+        self.state.set_velocities(given)
 
     @property
     @in_turn

@@ -67,5 +67,6 @@ def _tried_step(one: Body, damping: float, viscosity: float) -> float:
     trial.step()
     trial.von_mises()
     if tried is body:
-        body.displacements = body.velocities = np.zeros_like(body.mesh.points)
+        body.displacements = still = np.zeros_like(body.mesh.points)
+        body.state.set_velocities(still)
     return dt

@@ -79,5 +79,5 @@ def _copy_of(body: SoftBody, material: Material | None) -> SoftBody:
         copy.conditions.set_activations(conditions.activations)
     wp.copy(copy.conditions.world_starts, conditions.world_starts)
     copy.displacements = np.array(body.displacements.numpy())
-    copy.velocities = np.array(body.velocities.numpy())
+    copy.state.set_velocities(body.velocities.numpy())
     return copy

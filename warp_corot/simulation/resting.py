@@ -93,7 +93,7 @@ def rest_on(
         still = np.zeros_like(start)
         try:
             for _ in range(most):
-                body.velocities = still
+                body.state.set_velocities(still)
                 sim.advance_steps(1)
                 correction = _correction(body, dt)
                 steps += 1

@@ -304,7 +304,7 @@ def _unpack_state(body: SoftBody, described: dict[str, Any], prefix: str, arrays
     if prefix + "loads" in arrays:
         wp.copy(body.loads, wp.array(arrays[prefix + "loads"][:, :3], dtype=wp.vec3, device=body.device))
     body.displacements = arrays[prefix + "displacements"][:, :3]
-    body.velocities = arrays[prefix + "velocities"][:, :3]
+    body.state.set_velocities(arrays[prefix + "velocities"][:, :3])
     body.state.reactions.assign(arrays[prefix + "reactions"])
 
 
