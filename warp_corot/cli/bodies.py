@@ -65,7 +65,7 @@ class Body:
 
 def asked_bodies(args: argparse.Namespace) -> list[Body]:
     """The bodies of an input, with their options checked as far as possible without meshes."""
-    model = _model(args.model, args.rotation_level, args.dilatation)
+    model = model_of(args.model, args.rotation_level, args.dilatation)
     opened = open_input(args.input)
     refuse_options(args, opened)
     remesh, loads = remesh_of(args, opened.kind), loads_of(args)
@@ -142,7 +142,12 @@ def gravity_of(args: argparse.Namespace, subject: Subject) -> np.ndarray:
     return np.array(checked_gravity(given, subject.mesh.up_axis))
 
 
-def _model(name: str, rotation_level: int | float | str | None, dilatation: str | None) -> Model:
+def model_of(name: str, rotation_level: int | float | str | None, dilatation: str | None) -> Model:
+    """The elastic model of the options.
+
+    Raises:
+        InputError: Rotations of a level, for a model without rotations.
+    """
     options: dict[str, Any] = {} if dilatation is None else {"dilatation": dilatation}
     if rotation_level is None:
         return MODELS[name](**options)

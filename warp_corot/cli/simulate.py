@@ -13,6 +13,7 @@ from warp_corot.simulation.simulation import Simulation
 from .about import about
 from .bodies import Body
 from .implicit import rest
+from .in_parts import is_in_parts, run_in_parts
 from .options import add_parser
 from .prepared import Run, prepared
 from .previews import Previews, check_preview
@@ -39,9 +40,12 @@ def run(args: argparse.Namespace) -> int:
     """
     from warp_corot.io.write.animate import Recording
 
-    if not leads():
-        return _serve(args)
-    options = bodies_of(args)
+    leading, options = leads(), bodies_of(args)
+    if is_in_parts(options):
+        _check_output(args, options[0])
+        return run_in_parts(options[0])
+    if not leading:
+        return _serve(args, options)
     shared = options[0]
     _check_output(args, shared)
     ready = prepared(options)
@@ -90,9 +94,8 @@ def simulated(args: argparse.Namespace) -> Recording:
     return done
 
 
-def _serve(args: argparse.Namespace) -> int:
+def _serve(args: argparse.Namespace, options: list[argparse.Namespace]) -> int:
     """``run`` on a rank that computes its part of the steps, and neither prints nor writes; returns the exit status."""
-    options = bodies_of(args)
     _check_output(args, options[0])
     ready = prepared(options)
     try:

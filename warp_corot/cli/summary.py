@@ -60,7 +60,7 @@ def summary(
     at_last = " (at the end)" if sim.remeshing.every else ""
     lines, ranks = [], process_count()
     for body in bodies:
-        lines += [f"{body.subject.name}, {body.held.words}", *_aligned(_of_body(body))]
+        lines += [f"{body.subject.name}, {body.held.words}", *aligned(_of_body(body))]
     rows = [
         *remesh_rows(sim, done),
         *touched,
@@ -77,7 +77,7 @@ def summary(
     for name, path in (("preview", shared.preview), ("table", shared.csv)):
         if path:
             rows.append((name, str(path)))
-    return "\n".join([*lines, *([] if len(bodies) == 1 else ["all together"]), *_aligned(rows)])
+    return "\n".join([*lines, *([] if len(bodies) == 1 else ["all together"]), *aligned(rows)])
 
 
 def title_of(bodies: Sequence[Body]) -> str:
@@ -103,7 +103,8 @@ def _of_body(body: Body) -> list[tuple[str, str]]:
     return rows + [("" if number else "moved", str(load)) for number, load in enumerate(body.loads)]
 
 
-def _aligned(rows: Sequence[tuple[str, str]]) -> list[str]:
+def aligned(rows: Sequence[tuple[str, str]]) -> list[str]:
+    """Lines with a name and a text."""
     return [f"  {name:<14}{text}" for name, text in rows]
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_path
 from warp_corot.io.files.whole import written_whole
-from warp_corot.io.write.animate import Recording, frame_count
+from warp_corot.io.write.animate import Progress, Recording, frame_count
 
 from .pieces import Piece
 from .simulation import Simulation
@@ -26,6 +26,8 @@ def record(
     fps: float = 24.0,
     world: int | None = None,
     tets: bool = True,
+    progress: Progress | None = None,
+    recording: Recording | None = None,
 ) -> Recording:
     """Advance a simulation and write ``fps`` frames a second, the current state first; all ranks must call.
 
@@ -41,6 +43,8 @@ def record(
         fps: Frames per second of simulated time.
         world: The world that is drawn; must be given if there are several.
         tets: Whether to write the tetrahedra; without them the surface alone.
+        progress: Called on every rank after each frame with its number and how many come after the first one.
+        recording: Filled while recording, so that the caller has it after an interruption; None: a new one.
 
     Returns:
         The progress at the end, of all ranks.
@@ -58,20 +62,22 @@ def record(
         raise InputError(f"the simulation has {sim.worlds} worlds; say which one to draw, for example world=0")
     if not 0 <= (world or 0) < sim.worlds:
         raise InputError(f"world is {world!r}; it must be a whole number from 0 to {sim.worlds - 1}")
-    return _Pieces(sim, Path(path), fps, world or 0, tets).record(count)
+    done = Recording(Path(path)) if recording is None else recording
+    return _Pieces(sim, done, fps, world or 0, tets).record(count, progress)
 
 
 class _Pieces:
     """The stage of a rank's piece, and on rank 0 the one that joins all."""
 
-    def __init__(self, sim: Simulation, path: Path, fps: float, world: int, tets: bool):
+    def __init__(self, sim: Simulation, done: Recording, fps: float, world: int, tets: bool):
         from warp_corot.io.write.usd.writer import UsdWriter
 
+        path = done.path
         self._sim, self._path, self._fps = sim, path, fps
         self._folder = path.with_name(f"{path.stem}.ranks")
         self._comm = sim.comm
         self._piece = Piece(sim.following, world)
-        self.done = Recording(path)
+        self.done = done
 
         def made() -> Any:
             self._folder.mkdir(exist_ok=True)
@@ -88,7 +94,7 @@ class _Pieces:
 
         self._writer = self._together(made)
 
-    def record(self, count: int) -> Recording:
+    def record(self, count: int, progress: Progress | None) -> Recording:
         """Write the present frame and so many more."""
         sim, done, writer = self._sim, self.done, self._writer
         first_step, first_time = sim.total_steps, sim.total_time
@@ -106,6 +112,8 @@ class _Pieces:
                 done.writing += time.perf_counter() - stepped
                 done.frames = frame + 1
                 done.steps, done.simulated = sim.total_steps - first_step, sim.total_time - first_time
+                if progress is not None:
+                    progress(frame, count)
         except BaseException as error:
             # Frames that wait are written; the first error is the one to raise.
             writer.__exit__(type(error), error, error.__traceback__)

@@ -1,0 +1,208 @@
+"""``warp-corot simulate box`` on several ranks, of which none makes the whole mesh."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from warp_corot.body.soft_body import SoftBody
+from warp_corot.errors import InputError, UnstableError
+from warp_corot.experiments import paper
+from warp_corot.inputs.device import checked_device
+from warp_corot.materials.isotropic import Isotropic
+from warp_corot.simulation.parts import checked_gravity
+from warp_corot.solvers import SymplecticEuler
+
+from .bodies import model_of
+from .compiling import compiling_said
+from .loading import Load, loads_of, ramp_of
+from .opened import offset_of
+from .ranks import are_several
+from .say import complain, kept_so_far
+from .subject import BOX_LEVEL
+from .summary import aligned, length, milliseconds, pressure
+from .waiting import progress_bar
+
+if TYPE_CHECKING:
+    from warp_corot.distributed import Simulation
+    from warp_corot.io.write.animate import Recording
+
+#: The options with which a box is made in parts; with others every rank makes the whole.
+OPTIONS = (
+    {"command", "command_line", "input", "output", "device", "level", "scale", "offset"}
+    | {"young", "poisson", "density", "model", "rotation_level", "dilatation"}
+    | {"fix", "gravity", "pull", "ramp", "damping", "viscosity", "duration", "fps", "dt", "probe", "csv"}
+)
+#: Words of expressions that need the whole mesh.
+WHOLE = frozenset({"flat", "surface", "bottom", "top", "nearest"})
+#: The fewest bisections of a box in parts.
+LEAST_LEVEL = 3
+#: Columns of a probe, as in a table of one process.
+COLUMNS = [f"{what}{axis} [{unit}]" for what, unit in (("u", "m"), ("v", "m/s")) for axis in "xyz"]
+COLUMNS += [f"reaction {axis} [N]" for axis in "xyz"]
+
+
+def is_in_parts(options: Sequence[argparse.Namespace]) -> bool:
+    """Whether ranks make a box in parts; rank 0 says why not if another option than these is given."""
+    args = options[0]
+    if not are_several() or len(options) > 1 or args.input != "box":
+        return False
+    others = sorted(name for name, value in vars(args).items() if name not in OPTIONS and value)
+    if args.level is not None and args.level < LEAST_LEVEL:
+        others.append("level")
+    expressions = [*(args.fix or ()), *(each[0] for each in args.pull or ()), *(args.probe or ())]
+    words = {word for text in expressions for word in re.findall(r"[A-Za-z_]\w*", text)}
+    if any(not re.search("[A-Za-z_]", text) for text in args.probe or ()):
+        others.append("probe")
+    others += sorted(words & WHOLE)
+    if others:
+        complain(f"every rank makes the whole box, because of {', '.join(others)}", kind="note")
+    return not others
+
+
+def run_in_parts(args: argparse.Namespace) -> int:
+    """Run the command on this rank; returns the exit status.
+
+    Raises:
+        InputError: Bad options; nothing was simulated or written.
+    """
+    import warp_corot.distributed as wd
+    from warp_corot.io.write.animate import Recording, frame_count
+
+    duration = paper.SHORT_DURATION if args.duration is None else args.duration
+    done = Recording(args.output)
+    with compiling_said(checked_device(args.device)):
+        sim, loads = _simulation(args, duration)
+        table = _Table(args, sim)
+    try:
+        with progress_bar(frame_count(duration, args.fps)) as progress, table.open() if args.csv else nullcontext():
+
+            def each_frame(frame: int, count: int) -> None:
+                table.add()
+                progress(frame, count)
+
+            wd.record(sim, args.output, duration=duration, fps=args.fps, progress=each_frame, recording=done)
+    except UnstableError as error:
+        complain(f"{error}; {kept_so_far(done)}")
+        return 3
+    except OSError as error:
+        complain(str(error))
+        return 1
+    print(_summary(args, sim, loads, done))
+    return 0
+
+
+def _simulation(args: argparse.Namespace, duration: float) -> tuple[Simulation, list[Load]]:
+    """The simulation of this rank's part, held and moved, and its loads."""
+    import warp_corot.distributed as wd
+    from warp_corot.io.write.animate import steps_per_frame
+
+    scale, (x, y, z) = 1.0 if args.scale is None else args.scale, offset_of(args).tolist()
+    level = BOX_LEVEL if args.level is None else args.level
+    loads = loads_of(args)
+    mesh = wd.box(paper.CELLS, paper.CELL_SIZE * scale, level, origin=(x, y, z))
+    given = {name: getattr(args, name) for name in ("young", "poisson", "density")}
+    material = Isotropic(**{name: paper.MATERIAL[name] if value is None else value for name, value in given.items()})
+    body = SoftBody(mesh, material, device=args.device)
+    for expression in ["z <= zmin"] if args.fix is None else args.fix:
+        body.fix(expression)
+    for load in loads:
+        times, shares = load.curve(ramp_of(args, duration))
+        body.prescribe(load.patch, times=times, displacements=shares[:, None] * load.values)
+    damping = paper.Settings.damping if args.damping is None else args.damping
+    dt = args.dt
+    SymplecticEuler(dt, damping, args.viscosity or 0.0)  # checks all values
+    if dt is not None:
+        dt = 1.0 / (args.fps * steps_per_frame(args.fps, dt))
+    sim = wd.Simulation(
+        body,
+        model=model_of(args.model, args.rotation_level, args.dilatation),
+        integrator=SymplecticEuler(dt, damping, args.viscosity or 0.0),
+        gravity=checked_gravity(paper.GRAVITY if args.gravity is None else tuple(args.gravity), mesh.up_axis),
+    )
+    return sim, loads
+
+
+class _Table:
+    """``--csv``: the rows that one process writes, summed over ranks and written by rank 0.
+
+    Raises:
+        InputError: A probe without nodes.
+    """
+
+    def __init__(self, args: argparse.Namespace, sim: Simulation):
+        self._path, self._sim, self._file = args.csv, sim, None
+        body, part = sim.body, sim.following[0].part
+        own = part.is_own
+        self._probes = []
+        for text in args.probe or () if args.csv else ():
+            nodes = np.flatnonzero(own & np.isin(np.arange(len(own)), body.node_indices(text)))
+            weights = part.masses[nodes]
+            total = sum(sim.comm.allgather(float(weights.sum())))
+            if not total > 0.0:
+                raise InputError(f"--probe {text!r}: there are no nodes in it")
+            self._probes.append((text, nodes, weights / total))
+
+    @contextmanager
+    def open(self) -> Iterator[None]:
+        """The file, on rank 0; a former one is replaced."""
+        if self._sim.rank != 0:
+            yield
+            return
+        with self._path.open("w", newline="") as self._file:
+            names = [f"{text} {column}" for text, *_ in self._probes for column in COLUMNS]
+            self._write(["time [s]", *names, "kinetic [J]", "elastic [J]", "gravitational [J]", "dt [s]"])
+            yield
+
+    def add(self) -> None:
+        """Add a row with the present state; all ranks must call."""
+        if self._path is None:
+            return
+        sim, state = self._sim, self._sim.body.state
+        arrays = [array.numpy()[:, :3].astype(float) for array in (state.displacements, state.velocities)]
+        reactions = state.reactions.numpy()[:, :3].astype(float)
+        own = [
+            [*(weights @ arrays[0][nodes]), *(weights @ arrays[1][nodes]), *reactions[nodes].sum(axis=0)]
+            for _, nodes, weights in self._probes
+        ]
+        values = np.sum(sim.comm.allgather(np.array(own, float).ravel()), axis=0)
+        energy = sim.energy()
+        row = [sim.time, *values, energy.kinetic, energy.elastic, energy.gravitational, sim.dt]
+        self._write([f"{value:.9g}" for value in row])
+
+    def _write(self, row: Sequence[str]) -> None:
+        if self._file is not None:
+            csv.writer(self._file).writerow(row)
+            self._file.flush()
+
+
+def _summary(args: argparse.Namespace, sim: Simulation, loads: Sequence[Load], done: Recording) -> str:
+    from warp_corot.distributed.parts import ForestPart
+
+    body, mesh = sim.body, sim.body.mesh
+    assert isinstance(mesh, ForestPart)
+    nodes = sim.following[0].part.numbers.node_count
+    held = " or ".join(args.fix or ["z <= zmin"])
+    stepping = max(done.stepping, 1e-9)
+    material: Any = body.material
+    shortest, longest = sim.dt_range
+    rows = [
+        ("mesh", f"{nodes} nodes, {mesh.element_count} tetrahedra; {sim.elements_here[0]} on rank 0"),
+        ("material", f"E = {pressure(material.young)}, nu = {material.poisson:g}, rho = {material.density:g} kg/m^3"),
+        ("fixed", f"where {held}"),
+        *[("moved", str(load)) for load in loads],
+        ("gravity", f"{' '.join(f'{g:g}' for g in sim.gravity)} m/s^2"),
+        ("time step", f"{milliseconds(shortest)} to {milliseconds(longest)}"),
+        ("speed", f"{done.steps / stepping:.0f} steps/s, {done.simulated / stepping:.3g} times real time"),
+        ("wall time", f"{done.stepping:.2f} s stepping, {done.writing:.2f} s writing"),
+        ("displacement", f"{length(done.largest_displacement)} largest, {length(done.final_displacement)} at the end"),
+        ("device", f"{sim.device} ({sim.device.name}), {sim.size} ranks"),
+        ("written", f"{done.path} and a piece for each rank, {done.frames} frames, {done.simulated:.4g} s"),
+    ]
+    return "\n".join(["box in parts", *aligned(rows), *([f"  {'table':<14}{args.csv}"] if args.csv else [])])
