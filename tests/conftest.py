@@ -9,6 +9,8 @@ for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
 # Programs that tests start need not compile the package's modules again each time.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
+import gc
+
 import pytest
 import warp as wp
 
@@ -19,6 +21,18 @@ wp.config.quiet = True
 # As the command line has it. Newton's kernels have adjoints otherwise, which take most of the time to compile.
 wp.config.enable_backward = False
 wp.init()
+
+
+def pytest_sessionstart() -> None:
+    """Collect no garbage while modules and tests are collected: imports make next to none."""
+    gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    """From now on collections look through what tests make, not through the syntax trees of all kernels."""
+    gc.collect()
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:

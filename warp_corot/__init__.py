@@ -23,7 +23,10 @@ else:  # hidden from type checkers, which would accept any name
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         from importlib import import_module
 
-        api = import_module(".api", __name__)
+        from .inputs.importing import uncollected
+
+        with uncollected():
+            api = import_module(".api", __name__)
         globals().update({"__all__": api.__all__} | {each: getattr(api, each) for each in api.__all__})
         if name not in globals():
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

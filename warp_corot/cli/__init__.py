@@ -15,6 +15,7 @@ from types import ModuleType
 from typing import NoReturn
 
 from warp_corot.errors import InputError, UnstableError
+from warp_corot.inputs.importing import uncollected
 from warp_corot.inputs.likely import meant
 
 from .parsing import StrictParser
@@ -126,7 +127,7 @@ def _warn(message: str, said: set[str]) -> None:
 
 
 def _run(argv: Sequence[str] | None) -> int:
-    with leaving_at_once():
+    with leaving_at_once(), uncollected():
         import warp as wp
 
         wp.config.log_level = wp.LOG_ERROR  # before Warp starts, so that it prints no banner

@@ -19,7 +19,7 @@ from warp_corot.simulation.static import StaticReport
 
 from . import parameters
 from .objective import Objective, value_and_derivative
-from .precise import FLOAT32, FLOAT64, solved_state
+from .solved import FLOAT32, FLOAT64, solved_state
 
 Array = npt.NDArray[np.float64]
 

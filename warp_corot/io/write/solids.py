@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from warp_corot.contact.sampled import TriangleMesh
 from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, Shape, Sphere
@@ -37,7 +37,7 @@ class Solid:
     def at(self, pose: npt.ArrayLike) -> Floats:
         """The points at a pose [m], [N, 3]: position and quaternion (x, y, z, w)."""
         place = np.asarray(pose, dtype=np.float64)
-        return Rotation.from_quat(place[3:]).apply(self.points) + place[:3]
+        return _rotation(place[3:]).apply(self.points) + place[:3]
 
 
 def shape_of(obstacle: Obstacle) -> Shape:
@@ -66,7 +66,7 @@ def solid_of(shape: Shape) -> Solid | None:
 def ground_corners(ground: Ground, points: npt.ArrayLike) -> Floats:
     """A square of the ground below points [m], [4, 3], counter-clockwise seen from above."""
     x = np.asarray(points, dtype=np.float64)
-    turn = Rotation.from_quat(ground.quaternion)
+    turn = _rotation(ground.quaternion)
     flat = turn.inv().apply(x - ground.position)[:, :2]
     low, high = flat.min(axis=0), flat.max(axis=0)
     center, half = 0.5 * (low + high), GROUND_SIZE * 0.5 * float((high - low).max())
@@ -106,3 +106,10 @@ def _box(half: Floats) -> Solid:
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     triangles = [corner for a, b, c, d in quads for corner in ((a, b, c), (a, c, d))]
     return Solid(points, np.array(triangles, np.int32))
+
+
+def _rotation(quaternion: npt.ArrayLike) -> Any:
+    """SciPy's ``Rotation`` of a quaternion (x, y, z, w)."""
+    from scipy.spatial.transform import Rotation  # takes a sixth of the time of ``import warp_corot``
+
+    return Rotation.from_quat(quaternion)
