@@ -15,7 +15,7 @@ from warp_corot.cli.options import CHOICES
 CUBE = wc.TetForest.box((1, 1, 1), 0.1, 3)
 
 
-def test_box_is_what_the_library_simulates(folder, device, capsys):
+def test_box_simulates_the_same_as_the_library(folder, device, capsys):
     assert simulate("box", "-o", "box.usd", "--duration", 0.1, "--fps", 20, "--dt", 3e-4, "--device", device) == 0
     said = capsys.readouterr().out
     for words in ("325 nodes, 1152 tetrahedra", "steps/s", "times real time", "largest", device, "box.usd, 3 frames"):

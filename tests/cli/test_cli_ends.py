@@ -28,7 +28,7 @@ def nothing_said_of_compiling(monkeypatch):
     monkeypatch.setattr("warp_corot.cli.prepared.compiling_said", lambda device: nullcontext())
 
 
-def test_nothing_fixed_falls_freely_with_a_word(folder, capsys):
+def test_a_free_fall_is_noted(folder, capsys):
     assert simulate("box", "-o", "a.usd", "--fix", "none", "--damping", 0, *SHORT) == 0
     assert "note: no node is held ('none'): the body falls freely" in capsys.readouterr().err
     first, *_, last = frames(folder / "a.usd")
@@ -36,7 +36,7 @@ def test_nothing_fixed_falls_freely_with_a_word(folder, capsys):
     np.testing.assert_allclose(last - first, np.tile([0.0, -0.5 * 9.8 * 0.05**2, 0.0], (325, 1)), rtol=0.01, atol=1e-6)
 
 
-def test_very_many_steps_are_said_beforehand(folder, capsys, monkeypatch):
+def test_very_many_steps_are_announced(folder, capsys, monkeypatch):
     def end(*_, **__):
         raise KeyboardInterrupt
 

@@ -73,7 +73,7 @@ def test_regions_have_materials(folder, suffix, materials, capsys):
         (["--also", "nowhere/a.vtu"], "output folder nowhere does not exist"),
     ],
 )
-def test_what_is_of_no_use_is_refused(folder, args, said, capsys):
+def test_options_without_effect_are_refused(folder, args, said, capsys):
     path = two_regions(folder, ".msh")
     assert simulate(path.name, *args, "-o", "a.usd") == 2
     out, err = capsys.readouterr()

@@ -31,8 +31,9 @@ def table(path) -> tuple[list[str], np.ndarray]:
     return header, np.array(rows, float)
 
 
-def test_a_pull_reaches_its_end_and_is_answered_by_the_stiffness(bar, folder):
-    """At one per cent strain, the end pulls back with nearly E A times that: the fixed face cannot narrow."""
+def test_a_pull_meets_the_stiffness_of_the_bar(bar, folder):
+    """At a strain of 1 %, the end pulls back with nearly E A times the strain; not quite, because the fixed face cannot
+    narrow."""
     args = ["--young", 1e4, "--poisson", 0, "--pull", "x == xmax", 0.002, 0, 0, "--ramp", 0.5, "--duration", 1]
     probes = ["--probe", "x == xmax", "--probe", "0.1 0.025 0.025", "--csv", "a.csv"]
     assert simulate("bar.vtk", "-o", "a.usd", *args, *probes, *STILL, "--fps", 10) == 0
@@ -173,7 +174,7 @@ def frames_of(path) -> np.ndarray:
     return np.array([points.Get(k) for k in range(int(stage.GetEndTimeCode()) + 1)])
 
 
-def test_what_is_asked_on_the_command_line_can_be_written_down(bar, folder):
+def test_options_are_written_as_a_run_file(bar, folder):
     args = ["--fix", "x == xmin", "--pull", "x == xmax", 0, 0, -0.01, "--young", 2e4, *SHORT]
     assert simulate("bar.vtk", "-o", "a.usd", *args, "--write-run", "run.toml") == 0
     run = tomllib.loads((folder / "run.toml").read_text(encoding="utf-8"))
@@ -184,7 +185,7 @@ def test_what_is_asked_on_the_command_line_can_be_written_down(bar, folder):
     np.testing.assert_array_equal(frames(folder / "b.usd"), first)
 
 
-def test_a_stage_knows_what_it_was_made_from(bar, folder):
+def test_a_stage_names_its_input_and_command(bar, folder):
     assert simulate("bar.vtk", "-o", "a.usd", "--young", 2e4, "--fix", "x == xmin", *SHORT) == 0
     stage, tets = opened(folder / "a.usd")
     said = stage.GetRootLayer().customLayerData["warp_corot"]
@@ -229,7 +230,7 @@ def test_an_output_goes_into_a_scene(bar, folder):
     assert (last - first)[BAR.points[:, 0] == LENGTH, 2].max() < -0.01
 
 
-def test_what_a_user_may_not_have_meant_is_noted(bar, capsys):
+def test_unlikely_options_are_noted(bar, capsys):
     args = ["--fix", "x == xmin", "--pull", "z == zmax", 0, 0, "1mm", "--ramp", 2, "--density", 1.1, *SHORT]
     assert simulate("bar.vtk", "-o", "a.usd", *args) == 0
     said = capsys.readouterr().err
@@ -301,7 +302,7 @@ def test_bad_run_files_are_one_line(bar, folder, text, said, capsys):
     assert_refused(folder, capsys, said, "run.toml", "-o", "a.usd")
 
 
-def test_of_several_bodies_in_a_file_those_are_moved_that_have_the_patch(folder, capsys):
+def test_a_pull_moves_the_bodies_that_have_the_patch(folder, capsys):
     ball = trimesh.creation.icosphere(2, 0.05)
     scene = trimesh.Scene()
     for name, place in (("left", 0.0), ("right", 0.2)):

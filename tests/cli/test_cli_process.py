@@ -115,8 +115,8 @@ def test_reader_that_leaves_is_no_error(tmp_path):
         pytest.param("2>/dev/full", 0, "", marks=pytest.mark.slow),
     ],
 )
-def test_streams_that_take_nothing_cost_no_frames(tmp_path, streams, status, said):
-    """stderr gets the notes about the missing --young, stdout the summary."""
+def test_full_or_closed_streams_lose_no_frames(tmp_path, streams, status, said):
+    """The notes about the missing --young go to stderr, the summary to stdout."""
     if "/dev/full" in streams and not os.path.exists("/dev/full"):
         pytest.skip("no /dev/full")
     record_block(tmp_path / "b.usd")
@@ -149,7 +149,7 @@ def test_a_kernel_cache_that_cannot_be_made_is_one_line(tmp_path):
     assert re.fullmatch(r"warp-corot: error: Warp's kernel cache .*; name a folder .* WARP_CACHE_PATH\n", err), err
 
 
-def test_compiling_is_said_when_kernels_are_compiled_and_only_then(tmp_path):
+def test_compiling_is_announced_only_if_kernels_are_compiled(tmp_path):
     """The message comes once, on stderr, in a separate line; stdout does not depend on the cache.
 
     The cache has all kernels that were compiled before except those of the clock.

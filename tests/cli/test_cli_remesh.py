@@ -39,7 +39,7 @@ def test_the_mesh_follows_the_motion(folder, capsys):
     assert (folder / "a.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_it_is_what_the_library_simulates(folder):
+def test_it_simulates_the_same_as_the_library(folder):
     options = ["--remesh-levels", 5, 8, "--remesh-every", 7, "--capacity", 3000]
     assert simulate("box", "-o", "a.usd", *BENT, *options, "--duration", 0.2, "--fps", 10) == 0
     mesh = wc.TetForest.box(cells=(1, 1, 3), cell_size=0.064, level=6)
@@ -65,7 +65,7 @@ def table(path) -> dict[str, np.ndarray]:
     return dict(zip(header, np.array(rows, float).T, strict=True))
 
 
-def test_a_pressure_stays_what_it_is_while_the_mesh_changes(folder, capsys):
+def test_a_pressure_stays_the_same_while_the_mesh_changes(folder, capsys):
     """Pressure on one side of the free half: the reactions are pressure times area, and the beam bends to that side."""
     still = ["--gravity", 0, 0, 0, "--device", "cpu"]
     follows = [
@@ -101,7 +101,7 @@ def test_a_pressure_stays_what_it_is_while_the_mesh_changes(folder, capsys):
     assert columns["z > zmax - 1e-6 uy [m]"][-1] == pytest.approx(stays, rel=0.1)
 
 
-def test_of_a_surface_the_one_given_is_drawn(folder, capsys):
+def test_the_given_surface_is_drawn(folder, capsys):
     mesh = wc.TetForest.from_domain(wc.Domain.sphere(0.05), 0.05, max_level=3)
     surface = mesh.surface()
     trimesh.Trimesh(surface.points, surface.triangles).export(folder / "ball.stl")

@@ -35,7 +35,7 @@ def test_static_writes_the_state_at_rest(tmp_path, capsys):
 
 
 def test_static_follows_a_pull(tmp_path, capsys):
-    """A state of rest for each frame, and the patch where the pull has brought it by then."""
+    """Each frame has a state of rest, with the patch where the pull has brought it by then."""
     path, table = tmp_path / "pulled.usd", tmp_path / "pulled.csv"
     pull = ["--pull", "z == zmax", "0", "0", "0.02", "--probe", "z == zmax", "--csv", table]
     assert simulate(*BOX, "--static", *pull, "--duration", "0.2", "--fps", "20", "-o", path) == 0
@@ -48,7 +48,7 @@ def test_static_follows_a_pull(tmp_path, capsys):
 
 
 def test_an_implicit_run(tmp_path, capsys):
-    """Steps of 16 ms are shortened to a whole number a frame; the run file makes the same run."""
+    """Steps of 16 ms are shortened until a whole number of them makes a frame; the run file repeats the run."""
     path, run = tmp_path / "swings.usd", tmp_path / "run.toml"
     options = ["--integrator", "backward-euler", "--dt", "16ms", "--duration", "0.1", "--fps", "30"]
     assert simulate(*BOX, *options, "--write-run", run, "-o", path) == 0
@@ -81,7 +81,7 @@ def test_a_body_falls_in_implicit_steps(tmp_path, capsys):
         (["--integrator", "euler"], "argument --integrator: invalid choice: 'euler'"),
     ],
 )
-def test_what_does_not_go_together_is_refused(options, said, tmp_path, capsys):
+def test_options_that_exclude_each_other_are_refused(options, said, tmp_path, capsys):
     assert_refused(tmp_path, capsys, said, *BOX, *options, "-o", tmp_path / "out.usd")
 
 

@@ -173,7 +173,7 @@ def test_the_preview_shows_the_surface(folder):
     assert (folder / "a.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_unlikely_units_are_warned_of(folder, capsys):
+def test_unlikely_units_cause_a_warning(folder, capsys):
     trimesh.creation.icosphere(2, 1500.0).export(folder / "organ.obj")
     assert simulate("organ.obj", "-o", "a.usd", "--tets", 300, "--duration", 0.05, "--fps", 20) == 0
     err = capsys.readouterr().err

@@ -49,7 +49,7 @@ def test_the_ground_carries_what_stands_on_it(block, folder):
     assert not np.any(UsdGeom.PrimvarsAPI(tets).GetPrimvar("fixed").Get())
 
 
-def test_a_dropped_body_falls_so_far(block, folder):
+def test_a_dropped_body_falls_by_the_given_height(block, folder):
     args = ["--drop", "2cm", "-o", "a.usd", "--csv", "a.csv", "--probe", "all", "--fps", 100, "--duration", 0.1]
     assert simulate("block.vtk", *args, *SOFT, "--damping", 0) == 0
     of = table("a.csv")
@@ -101,7 +101,7 @@ def test_a_tool_that_turns_has_its_turn_in_the_stage(block, folder):
     np.testing.assert_allclose(axis, (0, -1, 0), atol=1e-5)
 
 
-def test_two_tools_with_places_of_their_own(block, folder):
+def test_two_tools_have_their_own_places(block, folder):
     write_path(folder, "0,0.02,0.02,0.029\n")
     (folder / "far.csv").write_text("0,0,0,1\n1,0,0,2\n")
     tools = ["--tool", "sphere:r=1cm,friction=0", "--tool", "box:x=1cm,y=1cm,z=1cm"]
@@ -117,7 +117,7 @@ def test_two_tools_with_places_of_their_own(block, folder):
 
 @pytest.mark.parametrize("tool", ["sphere:r=1cm", "capsule:r=0.3mm,l=30mm"])
 def test_a_start_inside_is_noted(block, folder, capsys, tool):
-    """Also of a needle that no node is in."""
+    """This includes a needle with no node inside it."""
     write_path(folder, "0,0.0137,0.0121,0.012\n")
     args = ["--tool", tool, "--tool-path", "path.csv", "--fix", "z == zmin", "-o", "a.usd", *SHORT]
     assert simulate("block.vtk", *args) == 0
@@ -127,7 +127,7 @@ def test_a_start_inside_is_noted(block, folder, capsys, tool):
 
 
 def test_tools_are_drawn(block, folder):
-    """In a colour that the body has not: more blue than red."""
+    """Their colour, with more blue than red, does not occur on the body."""
     assert press(folder, "--preview", "a.png", "--preview-frames", "0") == 0
     pixels = np.asarray(Image.open("a.png").convert("RGB")).astype(int)
     steel = (pixels[..., 2] > pixels[..., 0] + 15) & (pixels[..., 2] < 240)
@@ -189,7 +189,7 @@ def test_bodies_of_a_run_file_touch_if_asked(block, folder):
         ("0,0,0,0,0,0,0,0\n1,0,0,0,0,0,0,1\n", "quaternion"),
     ],
 )
-def test_paths_that_are_none_are_refused(block, folder, capsys, text, said):
+def test_invalid_paths_are_refused(block, folder, capsys, text, said):
     write_path(folder, text)
     tool = ["--tool", "sphere:r=1cm", "--tool-path", "path.csv"]
     assert_refused(folder, capsys, said, "block.vtk", *tool, "-o", "a.usd", *SHORT)
@@ -227,13 +227,13 @@ def test_columns_with_units_and_without_names_are_the_same(folder):
         read_tool_path(folder)
 
 
-def test_the_command_knows_its_way(folder, capsys):
+def test_tool_options_are_in_the_help(folder, capsys):
     assert run("simulate", "--help") == 0
     assert "--tool-path" in capsys.readouterr().out
 
 
 def test_obstacles_of_every_form_are_in_a_stage(folder):
-    """Of a simulation in Python, with forms that turn inside the stage as they do in the simulation."""
+    """In a simulation in Python, every shape is in the stage and turns there as it does in the simulation."""
     box = wc.Box((0.02, 0.02, 0.01), position=(1, 0, 0), quaternion=(0, 0, 1, 1))
     corners = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], float) * 0.01
     faces = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]

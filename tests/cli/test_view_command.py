@@ -26,7 +26,7 @@ OUTPUTS = {"output", "also", "preview", "preview_frames", "preview_views", "prob
 
 
 def spoken(err):
-    """The lines of stderr but for what an empty kernel cache makes it say."""
+    """The lines of stderr, without those that an empty kernel cache adds."""
     return [line for line in err.splitlines() if "compiling kernels" not in line and "note" not in line]
 
 
@@ -63,7 +63,7 @@ def test_what_simulate_refuses_view_refuses(folder, capsys):
         assert said in line
 
 
-def test_a_port_that_is_taken_is_said_before_anything_is_meshed(capsys):
+def test_a_port_in_use_is_reported_before_meshing(capsys):
     pytest.importorskip("viser")
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
@@ -114,7 +114,7 @@ def test_ctrl_c_ends_it_quietly(number, status, tmp_path):
     assert spoken(err) == []
 
 
-def test_the_run_file_is_what_is_on_the_page(folder):
+def test_the_run_file_has_the_state_of_the_page(folder):
     ready = prepared(asked("box", "--device", "cpu", "--gravity", "0", "0", "-1", "--fix", "z == zmin"))
     body = ready.bodies[0]
     options = [body.args]
@@ -136,7 +136,7 @@ def test_the_run_file_is_what_is_on_the_page(folder):
     assert "model" not in plain  # the default
 
 
-def test_what_is_pressed_is_pressed_after_a_switch(folder):
+def test_pressed_patches_stay_pressed_after_a_switch(folder):
     ready = prepared(
         asked("box", "--device", "cpu", "--press", "z == zmax", "10", "--ramp", "0.001", "--gravity", 0, 0, 0)
     )

@@ -18,7 +18,7 @@ def work_of_contact(sim):
 
 
 def recorded(sim, body, steps, at):
-    """Velocities, contact forces, reactions, elastic energy and work after each of some steps [s]."""
+    """Velocities, contact forces, reactions, elastic energy and work after each of the given steps [s]."""
     found = []
     for number, dt in enumerate(steps):
         if number in at:
@@ -33,9 +33,9 @@ def recorded(sim, body, steps, at):
 
 @pytest.mark.parametrize("below", ["free", "prescribed"])
 def test_all_energy_comes_from_somewhere(device, below):
-    """Steps whose lengths differ up to twenty times: with a linear law the energy of a step, with velocities half of it
-    behind and ahead, grows by the work of contact, friction, grasp and supports, to rounding, and by what a change of
-    the step adds where nothing touches."""
+    """The lengths of steps differ by up to a factor of twenty. With a linear law, the energy of a step, with velocities
+    half a step behind and ahead, grows to rounding by the work of contact, friction, grasp and supports, and by what a
+    change of the step adds where nothing touches."""
     body = block(device, 1)
     if below == "prescribed":
         body.prescribe("z == zmin", times=[0.0, 0.01, 0.02], displacements=[(0, 0, 0), (0, 5e-4, -5e-4), (0, 0, 0)])
@@ -68,8 +68,8 @@ def test_all_energy_comes_from_somewhere(device, below):
         assert energy == pytest.approx(given, abs=1e-5 * np.abs(work).max())
 
 
-def test_a_tool_that_comes_late_gives_what_it_gives(device):
-    """A hand is held up for a moment: the tool runs after it at 1 m/s into a block of few elements. The first step
+def test_a_tool_that_comes_late_does_its_work(device):
+    """The hand stops for a moment; then the tool catches up at 1 m/s and hits a block of few elements. The first step
     after that is many times shorter than the one before."""
     body = block(device, 0)
     body.fix("z == zmin")

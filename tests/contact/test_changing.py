@@ -20,7 +20,7 @@ def weight(body):
 
 
 def test_contact_follows_two_bodies_that_adapt(device):
-    """A ball pressed on two blocks refines one of them; the ground still carries all that presses on it."""
+    """A ball pressed on two blocks refines one of them; the ground still carries the whole load."""
     low, high = block(device, 0.0), block(device, 0.0205)
     ground, ball = wc.Ground(), wc.Tool(wc.Sphere(0.012))
     ball.follow([0.0, 0.2], [(0.02, 0.02, 0.0526), (0.02, 0.02, 0.046)])
@@ -62,7 +62,7 @@ def test_a_general_mesh_lies_on_a_forest(device, rng):
     assert -ground.wrench.numpy()[0, 2] == pytest.approx(weight(low) + weight(high), rel=2e-3)
 
 
-def test_runs_come_out_the_same(device):
+def test_runs_repeat(device):
     """Obstacles and soft surfaces, with deterministic=True on every device."""
     found = []
     for _ in range(2):

@@ -45,7 +45,7 @@ def test_a_turning_tool_turns_the_patch(device, integrator):
 
 
 @BOTH
-def test_a_hanging_body_weighs_what_it_weighs(device, integrator):
+def test_a_hanging_body_pulls_with_its_weight(device, integrator):
     body, _tool, sim, grasp = held_block(
         device, worlds=2, gravity=(0.0, 0.0, -9.81), fixed=False, integrator=integrator
     )
@@ -56,7 +56,7 @@ def test_a_hanging_body_weighs_what_it_weighs(device, integrator):
 
 @BOTH
 def test_a_springy_hold_gives_way(device, integrator):
-    """A rigid patch on a spring: the tool's way is shared between the spring and the body."""
+    """A rigid patch on a spring: the motion of the tool is shared between the spring and the body."""
     body, tool, sim, grasp = held_block(device, stiffness=200.0, integrator=integrator)
     tool.move((0.02, 0.02, 0.034))
     sim.advance(0.4)
@@ -82,7 +82,7 @@ def test_a_released_patch_falls_back(device, integrator):
 
 @BOTH
 def test_a_grasped_patch_is_remeshed(device, integrator):
-    """New nodes between those that are held are held; where elements are joined, what is left is."""
+    """New nodes between held nodes are held; where elements are merged, the remaining nodes are held."""
     body = wc.SoftBody(wc.TetForest.box((2, 2, 1), 0.02, 1), SOFT, device=device)
     body.fix("z == zmin")
     tool = wc.Tool(wc.Sphere(0.002, position=(0.02, 0.02, 0.03)), speed=0.1)

@@ -9,7 +9,7 @@ DOWN = (0.0, 0.0, -9.81)
 
 
 def turned(rng):
-    """A rotation at random, by quaternions."""
+    """A random rotation, by quaternions."""
     w, x, y, z = (q := rng.normal(size=4)) / np.linalg.norm(q)
     return np.array(
         [
@@ -22,7 +22,8 @@ def turned(rng):
 
 @pytest.mark.parametrize("count", [30, pytest.param(1000, marks=pytest.mark.slow)])
 def test_bodies_poured_into_a_bowl_stay_in_it(device, rng, count):
-    """Cubes of 8 mm, each turned as it likes and all of one mesh: they come to rest, and the bowl carries them."""
+    """Cubes of 8 mm with one mesh, each in a random orientation: they come to rest, and the bowl carries their
+    weight."""
     size = 0.01
     side = max(int(np.ceil((count / 2) ** (1 / 3))), 2)
     places = np.array([(i, j, k) for k in range(4 * side) for i in range(side) for j in range(side)][:count])
@@ -62,7 +63,8 @@ def test_bodies_poured_into_a_bowl_stay_in_it(device, rng, count):
 
 @pytest.mark.parametrize("itself", [True, False])
 def test_a_folded_sheet_lies_on_itself(device, itself):
-    """A sheet of 2 mm, whose outer faces are brought to 3 mm from one another; without contact its halves cross."""
+    """The outer faces of a sheet of 2 mm are brought to within 3 mm of one another; without contact its halves would
+    cross."""
     mesh = wc.TetForest.box(cells=(20, 3, 1), cell_size=0.002, level=0, origin=(-0.02, -0.003, -0.001))
     body = wc.SoftBody(mesh, wc.Isotropic(5e4, 0.3, 1000.0), device=device)
     x = mesh.points
@@ -95,7 +97,7 @@ def test_a_folded_sheet_lies_on_itself(device, itself):
 
 @pytest.mark.parametrize("speed", [1.0, 10.0, pytest.param(50.0, marks=pytest.mark.slow)])
 def test_a_thrown_sheet_does_not_pass_a_sheet(device, speed):
-    """Two sheets of 2 mm; waves run at 7 m/s in one that is soft, and at 71 m/s in a stiffer one."""
+    """Two sheets of 2 mm; waves travel at 7 m/s in the soft one and at 71 m/s in the stiffer one."""
     material = wc.Isotropic(5e4 if speed < 5.0 else 5e6, 0.3, 1000.0)
     low, high = (
         wc.SoftBody(
@@ -120,7 +122,7 @@ def test_a_thrown_sheet_does_not_pass_a_sheet(device, speed):
 
 @pytest.mark.parametrize("seconds", [0.15, pytest.param(5.0, marks=pytest.mark.slow)])
 def test_a_tool_at_random_leaves_an_organ_whole(device, rng, seconds):
-    """A ball of 12 mm presses and shears a body of 60 mm at up to 1 m/s, and then goes away."""
+    """A ball of 12 mm presses and shears a body of 60 mm at up to 1 m/s, and then leaves."""
     mesh = wc.TetForest.from_domain(wc.Domain.sphere(0.03, device=device), target_elements=1500, device=device)
     points = mesh.points
     size = np.ptp(points[:, 2])
@@ -182,8 +184,9 @@ def square_rod(r, half):
     ],
 )
 def test_a_thin_tool_stabs_an_organ(device, kind, radius, speed, seed, itself):
-    """24 mm deep into a ball of 60 mm of elements larger than the tool, whose elements it turns inside out: the run
-    goes on, nothing is thrown, and the body is whole once the tool has gone, also where it touches itself."""
+    """It goes 24 mm deep into a ball of 60 mm, whose elements are larger than the tool, and turns some of them
+    inside out. The run continues, nothing is thrown off, and the body is whole once the tool has left, also with
+    self-contact."""
     mesh = wc.TetForest.from_domain(wc.Domain.sphere(0.03, device=device), target_elements=1500, device=device)
     points = mesh.points
     body = wc.SoftBody(mesh, wc.Isotropic(2e4, 0.4, 1000.0), device=device)
@@ -213,7 +216,7 @@ def test_a_thin_tool_stabs_an_organ(device, kind, radius, speed, seed, itself):
 
 
 def closest_to_rod(points, tool, half):
-    """How far points are from the axis of a rod at most [m]."""
+    """The largest distance of points from the axis of a rod [m]."""
     pose = tool.present_pose[0]
     x, y, z, w = pose[3:]
     axis = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
@@ -222,7 +225,7 @@ def closest_to_rod(points, tool, half):
 
 
 def volume_ratios(mesh, body):
-    """Of each element now to that at rest."""
+    """The volume of each element over its volume at rest."""
     now, rest = (
         np.linalg.det(x[mesh.tets[:, 1:]] - x[mesh.tets[:, :1]])
         for x in (body.positions.numpy().astype(float), mesh.points)
@@ -230,8 +233,8 @@ def volume_ratios(mesh, body):
     return now / rest
 
 
-def test_elements_turned_inside_out_are_said(device):
-    """Once; the run goes on."""
+def test_elements_turned_inside_out_cause_a_warning(device):
+    """The warning comes once, and the run continues."""
     body = wc.SoftBody(wc.TetForest.box((2, 2, 1), 0.02, 4), wc.Isotropic(2e4, 0.4, 1000.0), device=device)
     body.fix("z == zmin")
     tool = wc.Tool(wc.Capsule(1e-3, 0.04))
@@ -242,8 +245,8 @@ def test_elements_turned_inside_out_are_said(device):
     assert len(said) == 1
 
 
-def test_overlaps_at_the_start_are_said(device):
-    """Of two bodies, and of a needle that lies in one between its nodes."""
+def test_overlaps_at_the_start_cause_a_warning(device):
+    """Two bodies overlap, and a needle lies in one of them between its nodes."""
     low, high = (
         wc.SoftBody(
             wc.TetForest.box((2, 2, 1), 0.02, 1, origin=(0, 0, z)), wc.Isotropic(2e4, 0.4, 1000.0), device=device

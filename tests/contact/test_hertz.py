@@ -31,7 +31,7 @@ def test_a_ball_sinks_in_as_hertz_says(device, finest):
 
 @pytest.mark.parametrize("finest", [(12, 9), pytest.param((15, 12), marks=pytest.mark.slow)])
 def test_two_elastic_balls_touch_as_hertz_says(device, finest):
-    """Meshes that do not fit one another, one turned against the other."""
+    """The meshes do not fit one another: one is turned against the other."""
     radius = 4.0 * RADIUS
     depth = CONTACT**2 / (0.5 * radius)
     force = 4.0 / 3.0 * (0.5 * YOUNG / (1.0 - POISSON**2)) * np.sqrt(0.5 * radius) * depth**1.5
@@ -46,8 +46,8 @@ def test_two_elastic_balls_touch_as_hertz_says(device, finest):
 
 @pytest.mark.parametrize(("finest", "error"), [(15, 0.08), pytest.param(18, 0.03, marks=pytest.mark.slow)])
 def test_a_flat_punch_sinks_in_as_the_closed_form_says(device, finest, error):
-    """Its rim presses without bound, so that forces converge with the first order of the size of elements there: 17, 7
-    and 2 % too much."""
+    """The pressure at its rim is unbounded, so forces converge with the first order of the size of elements there: they
+    are 17, 7 and 2 % too large."""
     mesh, depth, length = refined_block(12), 2e-4, 0.01
     for level in range(13, finest + 1):
         centres = mesh.points[mesh.tets].mean(axis=1)

@@ -84,7 +84,7 @@ def test_a_plate_presses_as_in_explicit_steps(device):
 
 
 def test_worlds_and_saved_runs(device, tmp_path):
-    """A world that is reset falls again, and the others do not notice; a run that is loaded goes on bit by bit."""
+    """A world that is reset falls again without any effect on the others; a loaded run continues bit for bit."""
     body = block(device, origin=(0.0, 0.0, 0.001), cells=(1, 1, 1), worlds=2)
     sim = wc.Simulation(body, obstacles=wc.Ground(), gravity=DOWN, integrator=EULER)
     sim.advance_steps(3)

@@ -10,7 +10,7 @@ EVERY, LEAVING = 0.1, 0.5
 
 
 def way_of(rng, third, count):
-    """Directions from above, in one third of the circle, so that tools do not meet, [count, 3]."""
+    """Directions from above within one third of the circle, so that tools do not meet, [count, 3]."""
     angle = 2.0 * np.pi * (third + rng.uniform(0.0, 0.8, count)) / 3.0
     height = rng.uniform(0.2, 1.0, count)
     flat = np.sqrt(1.0 - height**2)
@@ -25,9 +25,9 @@ def way_of(rng, third, count):
     + [pytest.param(3600.0, 20130705, marks=pytest.mark.slow)],
 )
 def test_tools_at_random_leave_an_organ_whole(device, seconds, seed):
-    """A ball, a rod and a square bar, 6 to 12 mm thick, go up to 16 mm deep into a ball of 60 mm and across it, at
-    about 0.5 m/s, and crush some elements. The run goes on, and the body is whole once they have gone: until then
-    a tool that stands beside it may hold a corner by friction."""
+    """A ball, a rod and a square bar, 6 to 12 mm thick, move up to 16 mm deep into a ball of 60 mm and across it, at
+    about 0.5 m/s, and crush some elements. The run continues, and the body is whole once they have left; until then a
+    tool beside it may hold a corner by friction."""
     rng = np.random.default_rng(seed)
     mesh = wc.TetForest.from_domain(wc.Domain.sphere(0.03, device=device), target_elements=250, device=device)
     points = mesh.points

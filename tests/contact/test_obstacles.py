@@ -1,4 +1,4 @@
-"""Soft bodies against rigid obstacles: weights, slopes, rebounds, a sharp needle, and who feels what."""
+"""Soft bodies against rigid obstacles: weights, slopes, rebounds, a sharp needle, and the forces on either side."""
 
 import numpy as np
 import pytest
@@ -126,8 +126,8 @@ def top_of(shape):
 
 
 @pytest.mark.parametrize("shape", HANDS, ids=repr)
-def test_a_shape_presses_with_what_the_support_takes(device, shape):
-    """Action is reaction: what the tool feels, the nodes feel, and the fixed side takes it."""
+def test_action_is_reaction(device, shape):
+    """The wrench on the tool is the sum of the forces on the nodes, and the fixed side bears it."""
     body = block(device)
     body.fix("z == zmin")
     tool = wc.Tool(shape)
@@ -171,7 +171,8 @@ def test_forces_of_contacts_add_up_to_the_wrench(device, shape):
 
 
 def closest_to_axis(body, tool):
-    """The least distance between a capsule's axis and the body's surface [m], and whether it goes through."""
+    """The least distance between a capsule's axis and the body's surface [m], and whether the axis goes through the
+    body."""
     pose = tool.present_pose[0]
     half = np.array([0.0, 0.0, tool.shape.size[1]])
     axis = pose[:3] + np.linspace(-1.0, 1.0, 2001)[:, None] * half
@@ -189,7 +190,7 @@ def closest_to_axis(body, tool):
 
 @pytest.mark.parametrize("speed", [1.0, 10.0, 50.0])
 def test_a_needle_does_not_pass(device, speed):
-    """1 mm thick, on a sheet of 2 mm, between the nodes; the speed of waves in the sheet is 3.6 m/s."""
+    """A needle of 1 mm meets a sheet of 2 mm between its nodes; waves travel at 3.6 m/s in the sheet."""
     mesh = wc.TetForest.box(cells=(5, 5, 1), cell_size=0.002, level=0, origin=(-0.005, -0.005, -0.002))
     body = wc.SoftBody(mesh, wc.Isotropic(young=5e3, poisson=0.4, density=1000.0), device=device)
     body.fix("(x == xmin) | (x == xmax) | (y == ymin) | (y == ymax)")
@@ -207,7 +208,7 @@ def test_a_needle_does_not_pass(device, speed):
 
 @pytest.mark.parametrize("rod", [wc.Capsule, wc.Box])
 def test_a_block_on_two_rods_does_not_creep(device, rod):
-    """At 0.7 of the angle of friction, on what touches it only between its nodes."""
+    """At 0.7 of the angle of friction, on rods that touch it only between its nodes."""
     mesh = wc.TetForest.box(cells=(4, 1, 1), cell_size=0.01, level=2, origin=(-0.02, -0.005, 0.003))
     body = wc.SoftBody(mesh, wc.Isotropic(young=5e4, poisson=0.3, density=1000.0), device=device)
     along_y = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
@@ -260,7 +261,7 @@ def test_a_tool_follows_an_array_on_the_device(device):
 
 
 @pytest.mark.parametrize("wrong", [(np.nan, 0, 2, 0, 0, 0, 1), (0, 0, np.inf, 0, 0, 0, 1), (0, 0, 2, 0, 0, 0, 0)])
-def test_what_is_no_pose_is_passed_over(device, wrong):
+def test_invalid_poses_are_ignored(device, wrong):
     body, tool = block(device), wc.Tool(wc.Sphere(0.01, position=(0.0, 0.0, 1.0)), speed=100.0)
     poses = wp.array([[0, 0, 1.1, 0, 0, 0, 2]], dtype=wp.transform, device=device)
     tool.use_poses(poses)
@@ -285,7 +286,7 @@ def test_worlds_have_tools_of_their_own(device):
     assert force_on(ground, 0)[2] == pytest.approx(-weight(body) - force_on(tool, 0)[2], rel=1e-2)
 
 
-def test_a_start_in_overlap_is_said_and_undone_gently(device):
+def test_an_overlap_at_the_start_warns_and_is_undone_slowly(device):
     body, ground = block(device, origin=(0.0, 0.0, -0.002)), wc.Ground()
     sim = wc.Simulation(body, obstacles=ground, gravity=DOWN, integrator=CALM)
     fastest = 0.0

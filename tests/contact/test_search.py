@@ -1,4 +1,4 @@
-"""What is near is found before it is reached, whenever it was last looked for."""
+"""The search finds nodes and triangles before they meet, whenever it last ran."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def closest(p, a, b, c):
 
 
 def within_reach(contacts, itself):
-    """All nodes and triangles that could meet in the last step, seen one by one: [n, 2]."""
+    """All nodes and triangles that could meet in the last step, tested one by one: [n, 2]."""
     surface = contacts.surface
     arrays, corners = surface.arrays, surface.triangles.numpy()
     node, world, body = arrays.node.numpy(), arrays.world.numpy(), surface.body_of_places()
@@ -55,7 +55,7 @@ def candidates(contacts):
 
 
 def watched(sim, steps, itself):
-    """Make steps one at a time and look at each; how many pairs were within reach."""
+    """Make steps one at a time and check the pairs after each; returns how many pairs were within reach."""
     seen = 0
     for _ in range(steps):
         sim.advance_steps(1)
@@ -67,8 +67,8 @@ def watched(sim, steps, itself):
 
 
 @pytest.mark.parametrize("itself", [False, True])
-def test_all_that_may_meet_is_known(device, rng, itself):
-    """Against every pair, while two blocks of two worlds are thrown at one another, turn and bounce."""
+def test_the_search_finds_all_pairs_within_reach(device, rng, itself):
+    """Compared with every pair, while two blocks in two worlds are thrown at one another, turn and bounce."""
     low, high = block(device, 0.0, worlds=2), block(device, 0.0202, cells=(1, 1, 1), at=0.008, worlds=2)
     sim = wc.Simulation([low, high], contact=wc.Contact(self_contact=itself), gravity=(0.0, 0.0, 0.0), integrator=CALM)
     for body, toward in ((low, 0.5), (high, -1.0)):
@@ -79,7 +79,7 @@ def test_all_that_may_meet_is_known(device, rng, itself):
     assert watched(sim, 60, itself) > 50
 
 
-def test_all_that_may_meet_is_known_of_bodies_that_adapt(device):
+def test_the_search_finds_all_pairs_of_remeshed_bodies(device):
     low, high = block(device, 0.0, level=3), block(device, 0.0202, level=3)
     sim = wc.Simulation(
         [low, high],
@@ -94,7 +94,7 @@ def test_all_that_may_meet_is_known_of_bodies_that_adapt(device):
 
 
 def thrown(device, least, **sizes):
-    """Where two blocks are that were thrown at one another, and the search for pairs."""
+    """Final positions of two blocks that were thrown at one another, and the search for pairs."""
     low, high = block(device, 0.0), block(device, 0.0205, cells=(1, 1, 1), at=0.008)
     integrator = wc.SymplecticEuler(dt=2e-4, viscosity=1e-3)
     sim = wc.Simulation([low, high], contact=wc.Contact(), gravity=(0.0, 0.0, 0.0), integrator=integrator)
@@ -108,16 +108,18 @@ def thrown(device, least, **sizes):
     return high.positions.numpy(), search
 
 
-def test_it_does_not_matter_when_it_was_looked():
-    """Bit by bit on the CPU, where pairs are added up in one order: whether it is looked in many steps or in few."""
+def test_the_times_of_searches_do_not_matter():
+    """On the CPU, where pairs are added up in one order, runs with many and with few searches are the same bit for
+    bit."""
     found = [thrown("cpu", least) for least in (2e-4, 8e-3)]
     counts = [search.count for _, search in found]
     assert counts[0] > counts[1]
     np.testing.assert_array_equal(found[0][0], found[1][0])
 
 
-def test_what_goes_too_far_is_found_out():
-    """Where too little is reserved the run is made again with more, and comes out as if there had been enough."""
+def test_motion_beyond_the_margin_repeats_the_run():
+    """If too little room was reserved, the run is repeated with more, with the same result as if there had been
+    enough."""
     enough, _ = thrown("cpu", 2e-4)
     again, search = thrown("cpu", 1e-6, size=1e-9)
     assert float(search.watch.least.numpy()[0]) > 1e-5
@@ -125,13 +127,13 @@ def test_what_goes_too_far_is_found_out():
     np.testing.assert_array_equal(again, enough)
 
 
-def test_nobody_looks_farther_than_steps_can_go(device):
+def test_the_search_reaches_no_farther_than_steps_can_go(device):
     with pytest.raises(wc.UnstableError, match="in one step"):
         thrown(device, 1e-6, size=1e-9, most=1e-7)
 
 
 def marked(contacts):
-    """The nodes and the triangles that the first obstacle is known to be near."""
+    """The nodes and the triangles that the search has marked as near the first obstacle."""
     near = contacts.search.near
     nodes = near.nodes.numpy()[: int(near.count.numpy()[0])]
     beside = nodes[near.flags.numpy()[nodes] & 2 != 0]
@@ -141,7 +143,7 @@ def marked(contacts):
 
 
 def reached_by_ball(contacts, radius):
-    """The nodes and the triangles that a ball could meet in the last step, seen one by one."""
+    """The nodes and the triangles that a ball could meet in the last step, tested one by one."""
     surface, motions = contacts.surface, contacts.obstacles.motions
     arrays, corners = surface.arrays, surface.triangles.numpy()
     used, world = np.flatnonzero(arrays.node.numpy() >= 0), arrays.world.numpy()
@@ -157,9 +159,9 @@ def reached_by_ball(contacts, radius):
 
 
 @pytest.mark.parametrize("adapts", [False, True])
-def test_all_that_a_tool_may_reach_is_known(device, rng, adapts):
-    """Against every node and triangle, while a ball goes to and fro at random through two worlds, or over a body that
-    adapts."""
+def test_the_search_finds_everything_within_a_tools_reach(device, rng, adapts):
+    """Compared with every node and triangle, while a ball moves to and fro at random through two worlds, or over a
+    remeshed body."""
     low = block(device, 0.0, level=3) if adapts else block(device, 0.0, worlds=2)
     low.fix("z == zmin")
     ball = wc.Tool(wc.Sphere(0.012))
@@ -181,8 +183,8 @@ def test_all_that_a_tool_may_reach_is_known(device, rng, adapts):
 
 
 @pytest.mark.parametrize("shape", [wc.Box((0.01, 0.008, 0.006)), wc.Capsule(0.002, 0.02)], ids=["box", "capsule"])
-def test_tools_feel_the_same_whenever_it_was_looked(shape):
-    """Bit by bit on the CPU."""
+def test_the_times_of_searches_do_not_matter_to_tools(shape):
+    """On the CPU the results are the same bit for bit."""
     found = []
     for least in (1e-4, 1e-2):
         body, tool = block("cpu", 0.0, level=3), wc.Tool(shape)

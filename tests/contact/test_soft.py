@@ -11,7 +11,7 @@ CALM = wc.SymplecticEuler(viscosity=1e-3)
 
 @pytest.mark.parametrize("alike", [True, False], ids=["alike", "unlike"])
 def test_a_block_on_a_block_carries_its_weight(device, alike):
-    """To 0.1 %, with meshes that are alike or not; what one feels the other feels, to rounding."""
+    """To 0.1 %, with equal and unequal meshes; the forces on both are opposite, to rounding."""
     low = block(device, 0.0)
     high = block(device, 0.0202) if alike else block(device, 0.0202, cells=(1, 1, 1), level=4, at=0.011)
     ground = wc.Ground()
@@ -24,7 +24,7 @@ def test_a_block_on_a_block_carries_its_weight(device, alike):
 
 
 def pressure_loads(body, pressure):
-    """Consistent forces of a pressure on the upper side."""
+    """Consistent nodal forces of a pressure on the upper side."""
     x, corners = body.mesh.points, body.surface_triangles
     corners = corners[(x[corners][:, :, 2] > x[:, 2].max() - 1e-9).all(axis=1)]
     sides = x[corners[:, 1:]] - x[corners[:, :1]]
@@ -39,8 +39,8 @@ def pressure_loads(body, pressure):
     ("cells", "level", "error"), [((2, 2, 1), 3, 1e-5), ((3, 3, 1), 3, 1e-4), ((3, 3, 2), 1, 0.05)]
 )
 def test_pressure_goes_through_a_contact_evenly(device, cells, level, error):
-    """The patch test: uniaxial stress in both blocks. It is passed to rounding if forces of the nodes of both sides,
-    which can only push, can be those of an even pressure; on the last pair of meshes they cannot."""
+    """The patch test: uniaxial stress in both blocks. It is passed to rounding if non-negative nodal forces on both
+    sides can represent an even pressure; on the last pair of meshes they cannot."""
     pressure, young, poisson = 200.0, 2e4, 0.3
     size = 0.04 / cells[0]
     meshes = [
@@ -67,7 +67,7 @@ def test_pressure_goes_through_a_contact_evenly(device, cells, level, error):
 
 @pytest.mark.parametrize("seconds", [1.0, pytest.param(120.0, marks=pytest.mark.slow)])
 def test_a_soft_block_rests_on_a_soft_slope(device, seconds):
-    """At 0.95 of the angle of friction, on a mesh unlike its own."""
+    """At 0.95 of the angle of friction, on a mesh that differs from its own."""
     angle = 0.95 * np.arctan(0.4)
     low, high = block(device, 0.0), block(device, 0.0200005, cells=(1, 1, 1), at=0.0107)
     low.fix("z == zmin")
@@ -87,7 +87,7 @@ def test_a_soft_block_rests_on_a_soft_slope(device, seconds):
 
 @pytest.mark.parametrize("count", [5, pytest.param(20, marks=pytest.mark.slow)])
 def test_a_stack_stands(device, count):
-    """Slabs of two sizes of elements, each a little beside the one below it."""
+    """Slabs with two sizes of elements, each a little to one side of the slab below it."""
     beside = np.random.default_rng(0).uniform(-5e-4, 5e-4, (count, 2))
     slabs = []
     for k in range(count):
@@ -112,7 +112,7 @@ def test_a_stack_stands(device, count):
 
 
 def test_worlds_do_not_meet(device):
-    """Blocks of several worlds lie in the same place."""
+    """Blocks of several worlds are in the same place."""
     low, high = block(device, 0.0, worlds=2), block(device, 0.0202, worlds=2)
     lifted = high.positions.numpy()
     lifted[high.world_node_count :, 2] += 0.1
@@ -127,7 +127,7 @@ def test_worlds_do_not_meet(device):
 
 @pytest.mark.parametrize("speed", [0.2, 3.0])
 def test_an_edge_does_not_pass_an_edge(device, speed):
-    """Two beams on their edges, crossed, where neither has a node; waves run at 8 m/s."""
+    """Two beams on their edges cross where neither has a node; waves travel at 8 m/s."""
     low = roof(device, 0, 0.0)
     top = np.sqrt(2.0) * 0.01
     high = roof(device, 1, top + 0.0005)
@@ -157,7 +157,7 @@ def test_an_edge_does_not_pass_an_edge(device, speed):
 
 @pytest.mark.parametrize("itself", [True, False])
 def test_a_folded_body_touches_itself(device, itself):
-    """The arms of a horseshoe are bent together by more than the gap between them; without contact they cross."""
+    """The arms of a horseshoe are bent together by more than the gap between them; without contact they would cross."""
     body = horseshoe(device)
     x = body.mesh.points
     arms = [np.flatnonzero((np.abs(x[:, 0] - side) < 1e-6) & (x[:, 2] > 0.03)) for side in (0.0, 0.05)]
@@ -178,7 +178,7 @@ def test_a_folded_body_touches_itself(device, itself):
 
 
 def test_room_for_contacts_grows(device):
-    """What the room is too small for is not left out: the run is made again with more."""
+    """If there is too little room for the contacts, none is left out: the run is repeated with more room."""
     low, high = block(device, 0.0), block(device, 0.0202)
     ground = wc.Ground()
     sim = wc.Simulation([low, high], obstacles=ground, gravity=DOWN, integrator=CALM)

@@ -32,7 +32,7 @@ def test_a_block_on_a_block_carries_its_weight(device, alike):
 
 
 def test_two_elastic_balls_touch_as_hertz_says(device):
-    """Meshes that do not fit one another, one turned against the other; as in explicit steps."""
+    """The meshes do not fit one another: one is turned against the other, as in explicit steps."""
     radius = 4.0 * RADIUS
     depth = CONTACT**2 / (0.5 * radius)
     force = 4.0 / 3.0 * (0.5 * YOUNG / (1.0 - POISSON**2)) * np.sqrt(0.5 * radius) * depth**1.5
@@ -47,7 +47,7 @@ def test_two_elastic_balls_touch_as_hertz_says(device):
 
 @pytest.mark.parametrize("speed", [1.0, 5.0])
 def test_nothing_passes(device, speed):
-    """A block that goes up to four times its own height in a step falls on one as thick."""
+    """A block that moves by up to four times its own height in a step falls on another one of the same height."""
     low, high = block(device, 0.0), block(device, 0.05, cells=(1, 1, 1), level=4, at=0.011)
     low.fix("z == zmin")
     high.velocities = np.tile((0.0, 0.0, -speed), (high.node_count, 1))
@@ -86,7 +86,7 @@ def test_an_edge_does_not_pass_an_edge(device, speed):
 
 
 def test_a_soft_block_rests_on_a_soft_slope(device):
-    """At 0.95 of the angle of friction, on a mesh unlike its own."""
+    """At 0.95 of the angle of friction, on a mesh that differs from its own."""
     angle = 0.95 * np.arctan(0.4)
     low, high = block(device, 0.0), block(device, 0.0200005, cells=(1, 1, 1), at=0.0107)
     low.fix("z == zmin")
@@ -102,7 +102,7 @@ def test_a_soft_block_rests_on_a_soft_slope(device):
 
 @pytest.mark.parametrize("itself", [True, False])
 def test_a_folded_body_touches_itself(device, itself):
-    """The arms of a horseshoe are bent together by more than the gap between them; without contact they cross."""
+    """The arms of a horseshoe are bent together by more than the gap between them; without contact they would cross."""
     body = horseshoe(device)
     x = body.mesh.points
     arms = [np.flatnonzero((np.abs(x[:, 0] - side) < 1e-6) & (x[:, 2] > 0.03)) for side in (0.0, 0.05)]
@@ -124,7 +124,7 @@ def test_a_folded_body_touches_itself(device, itself):
 
 
 def test_worlds_and_saved_runs(device, tmp_path):
-    """Blocks of several worlds lie in the same place and do not meet; a run that is loaded goes on bit by bit."""
+    """Blocks of several worlds are in the same place and do not meet; a loaded run continues bit for bit."""
     low, high = (block(device, z, cells=(1, 1, 1), worlds=2) for z in (0.0, 0.0202))
     low.fix("z == zmin")
     lifted = high.positions.numpy()

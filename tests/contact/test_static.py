@@ -9,7 +9,7 @@ import warp_corot as wc
 
 @pytest.mark.parametrize("above", [0.0, 0.01])
 def test_a_block_rests_on_the_ground(device, above):
-    """Nothing but the ground holds it; it may begin above that."""
+    """Only the ground holds it; it may begin above the ground."""
     body, ground = block(device, above), wc.Ground()
     report = wc.solve_static(body, gravity=DOWN, obstacles=ground, contact=wc.Contact(friction=0.1))
     assert report.converged
@@ -22,7 +22,7 @@ def test_a_block_rests_on_the_ground(device, above):
 
 @pytest.mark.parametrize("law", [wc.Corotated(), wc.NeoHookean(), wc.Linear()])
 def test_a_beam_on_a_floor_is_where_long_runs_end(device, law):
-    """Without friction there is one answer; the floor carries what the support does not."""
+    """Without friction there is one answer; the floor carries the rest of the weight."""
     mesh = wc.TetForest.box(cells=(1, 1, 3), cell_size=0.064, level=1)
     ends, loads = [], []
     for static in (True, False):

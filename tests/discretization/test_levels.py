@@ -94,8 +94,8 @@ def places_of(levels):
     return np.concatenate([np.arange(levels.mesh_nodes), levels.others.numpy()])
 
 
-def assert_is_the_trees(levels, body):
-    """Levels, ends and finest levels equal those from walking down the tree; and every order is deterministic."""
+def assert_equals_the_tree(levels, body):
+    """Levels, ends and finest levels equal those found by walking down the tree, and every order is deterministic."""
     lattice, tree = lattice_and_tree(body)
     expected = TreeLevels.of(tree, len(lattice))
     places, order, starts = places_of(levels), levels.nodes.numpy(), levels.starts
@@ -153,7 +153,7 @@ def assert_prolongates_linear_functions(levels, lattice):
 @forests
 def test_levels_and_ends_are_the_trees(name, device):
     body = body_of(name, device)
-    assert_is_the_trees(body.discretization.levels(), body)
+    assert_equals_the_tree(body.discretization.levels(), body)
 
 
 @forests
@@ -178,7 +178,7 @@ def test_levels_follow_a_mesh_that_changes(name, device, rng):
         assert added
         assert removed
         levels = body.discretization.levels()
-        assert_is_the_trees(levels, body)
+        assert_equals_the_tree(levels, body)
         lattice, _ = lattice_and_tree(body)
         assert_prolongates_linear_functions(levels, lattice)
         assert (levels.node_count > levels.mesh_nodes) == (name != "mixed")

@@ -25,8 +25,8 @@ def test_groups_have_about_eight_elements(level):
 
 
 @pytest.mark.parametrize("level", [3, 6])
-def test_groups_hang_together(level):
-    """By faces: elements of one group are one piece."""
+def test_groups_are_connected(level):
+    """The elements of one group are connected by faces."""
     points, tets = general(level)
     group = neighbour_groups(points, tets)
     pairs = face_pairs(tets)
@@ -42,8 +42,9 @@ def test_faces_are_those_of_two_elements():
     assert face_pairs(tets).tolist() in ([[0, 1]], [[1, 0]])
 
 
-def test_the_order_of_elements_does_not_matter_to_their_number(rng):
-    """Nor does that of the nodes; which neighbours join may change where several are as near."""
+def test_the_order_of_elements_does_not_change_the_number_of_groups(rng):
+    """The order of the nodes does not change it either. If several neighbours are equally near, which of them join may
+    change."""
     mesh = jittered()
     order = rng.permutation(len(mesh.tets))
     turned = np.asarray(mesh.tets)[order][:, [1, 2, 0, 3]]

@@ -121,7 +121,7 @@ def test_slots_are_the_oracles(mesh, level, rotation_level, grouped, device):
 
 
 @pytest.mark.parametrize("threads", [2, 7, 5000])
-def test_any_number_of_threads_comes_to_the_same_plan(threads, device, monkeypatch):
+def test_any_number_of_threads_makes_the_same_plan(threads, device, monkeypatch):
     for module in ("fixed", "targets"):
         monkeypatch.setattr(f"warp_corot.discretization.planning.{module}.threads_on", lambda device: threads)
     forest, device = mixed(7), wp.get_device(device)

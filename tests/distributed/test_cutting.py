@@ -1,4 +1,4 @@
-"""Parts of a box that are made without the whole are those that are cut out of it. One process is enough."""
+"""Parts of a box that are made without the whole box equal those cut out of it. One process is enough."""
 
 from types import SimpleNamespace
 
@@ -79,7 +79,7 @@ def test_a_large_box_is_cut_without_the_whole():
     assert len(cut.elements) < 3 * np.count_nonzero(cut.counted)
 
 
-def test_copies_learn_their_numbers_from_those_who_move_them():
+def test_copies_get_their_numbers_from_the_ranks_that_move_them():
     """Three ranks in one process, one after another."""
     cuts = [cut_box((1, 1, 2), 6, 3, rank) for rank in range(3)]
     mesh = wc.TetForest.box((1, 1, 2), 1.0, 6)
@@ -87,7 +87,7 @@ def test_copies_learn_their_numbers_from_those_who_move_them():
     counts = [int((cut.owner == rank).sum()) for rank, cut in enumerate(cuts)]
 
     def told(rank, keys):
-        """The numbers of nodes that a rank moves."""
+        """The numbers of the nodes that a rank moves."""
         own = np.flatnonzero(cuts[rank].owner == rank)
         first = sum(counts[:rank])
         number = dict(zip(cuts[rank].keys[own].tolist(), range(first, first + len(own)), strict=True))
@@ -109,7 +109,7 @@ def test_copies_learn_their_numbers_from_those_who_move_them():
         assert count == len(mesh.points)
 
 
-def test_a_part_is_not_taken_for_a_whole_body(monkeypatch):
+def test_a_part_is_refused_as_a_whole_body(monkeypatch):
     asked = []
 
     def alltoall(values):

@@ -1,4 +1,4 @@
-"""Who computes what: dealing out, sums in any order, numbers of nodes. One process is enough."""
+"""The division of work among ranks: elements, sums in any order, numbers of nodes. One process is enough."""
 
 import math
 from contextlib import nullcontext
@@ -20,7 +20,7 @@ from warp_corot.distributed.settled import settled_sums
 
 
 class Others:
-    """Ranks that have nothing to add, in place of a communicator."""
+    """Other ranks that have nothing to add, in place of a communicator."""
 
     def allgather(self, value):
         return [value, np.zeros_like(value)]
@@ -94,7 +94,7 @@ def test_masses_of_parts_are_those_of_the_body(make):
     np.testing.assert_array_equal(found, body.masses)
 
 
-def test_groups_that_await_nodes_are_apart_from_others():
+def test_groups_that_wait_for_nodes_are_separate():
     mesh = wc.TetForest.box((1, 1, 2), level=9)
     (batch,) = ForcePlan.of_forest(mesh, None, wp.get_device("cpu"), grouped=True).batches
     awaited = Awaited(mesh.points[:, 2] > 1.4, nullcontext)
@@ -133,7 +133,7 @@ def test_sums_are_the_same_in_any_order(rng):
     np.testing.assert_array_equal(settled_sums(np.zeros((3, 1)), Others()), [0.0])
 
 
-def test_directions_depend_on_a_nodes_number_alone():
+def test_directions_depend_only_on_a_nodes_number():
     every = normal_numbers(np.arange(10000), 3)
     np.testing.assert_array_equal(normal_numbers(np.array([17, 4]), 3), every[[17, 4]])
     assert abs(every.mean()) < 0.02

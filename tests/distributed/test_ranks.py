@@ -19,7 +19,7 @@ pytestmark = needs_mpi
 
 
 def made_on(count, folder, cases):
-    """The results of so many ranks; three make those of one and two ranks, too."""
+    """The results of this number of ranks; three ranks make those of one and two ranks, too."""
     found = {}
     done = on_ranks(count, str(Path(ranked.__file__)), str(folder), ",".join(cases), timeout=1200.0)
     assert done.returncode == 0, done.stderr
@@ -36,7 +36,7 @@ def runs(tmp_path_factory):
 
 
 def sizes_of(case):
-    """Numbers of ranks above one that have made a case."""
+    """The numbers of ranks above one that have made a case."""
     return [size for size in SIZES[1:] if case in SHORT.get(size, CASES)]
 
 
@@ -87,7 +87,7 @@ def test_ranks_write_pieces_of_one_stage(runs):
 
 
 def test_any_run_is_the_same_to_rounding(runs):
-    """Rounding alone tells runs apart, and the steps that it changes: the beams have moved by some centimetres."""
+    """Runs differ only by rounding and by the steps that rounding changes; the beams have moved by some centimetres."""
     np.testing.assert_allclose(runs[3]["forest.False.x"], runs[1]["forest.True.x"], atol=1e-5)
     energies = [runs[size][f"forest.{kind}.energy"] for size, kind in ((3, "False"), (1, "True"))]
     np.testing.assert_allclose(*energies, rtol=1e-3, atol=1e-6)

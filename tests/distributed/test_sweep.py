@@ -1,4 +1,4 @@
-"""Sweeps over parameters: every combination once, whatever ends in between."""
+"""Sweeps over parameters: every combination is run once, even after an interruption."""
 
 import csv
 from concurrent.futures import ThreadPoolExecutor
@@ -71,7 +71,7 @@ def test_a_worker_that_is_killed_loses_nothing(folder):
     assert calls(folder) == ["1 1", "1 2", "2 1", "2 2"]
 
 
-def test_what_failed_is_said_and_tried_again(folder):
+def test_failures_are_reported_and_repeated(folder):
     grid = {"a": [1, 2], "folder": [str(folder)]}
     with ThreadPoolExecutor(1) as engine:
         rows = wd.sweep(swept.failing, grid, folder="results", executor=engine, retries=1)
@@ -96,7 +96,7 @@ def test_bad_parameters_are_refused(given, said):
         wd.sweep(swept.failing, given)
 
 
-def test_a_function_that_other_processes_cannot_get_is_refused():
+def test_a_function_that_other_processes_cannot_import_is_refused():
     with pytest.raises(wc.InputError, match="top of a module"):
         wd.sweep(lambda a: {"b": a}, {"a": [1]})
     with pytest.raises(wc.InputError, match="folder is 5"):

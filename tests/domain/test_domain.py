@@ -41,7 +41,7 @@ KINDS = {
 
 @pytest.mark.filterwarnings("ignore:the surface is open")
 @pytest.mark.parametrize("kind", KINDS)
-def test_phi_is_no_steeper_than_said_and_the_bounds_hold_the_inside(kind, device, rng):
+def test_phi_keeps_its_lipschitz_constant_and_bounds(kind, device, rng):
     domain = KINDS[kind](device)
     a = around(domain, rng)
     b = a + directions(rng, len(a)) * 10.0 ** rng.uniform(-4, 0, (len(a), 1))
@@ -53,7 +53,7 @@ def test_phi_is_no_steeper_than_said_and_the_bounds_hold_the_inside(kind, device
 
 
 @pytest.mark.parametrize("kind", ["sphere", "surface", "device function", "difference"])
-def test_warp_arrays_are_answered_where_they_are(kind, device, rng):
+def test_warp_arrays_are_evaluated_on_their_device(kind, device, rng):
     domain = KINDS[kind]("cpu")
     points = around(domain, rng).astype(np.float32)
     there = domain.phi(wp.array(points, dtype=wp.vec3, device=device))
@@ -93,7 +93,7 @@ def test_shapes_along_their_normals(device, rng):
     assert np.allclose(box.phi(face + t * np.eye(3)[0]), t[:, 0], atol=ROUNDING)
 
 
-def test_sets_hold_what_set_theory_says(device, rng):
+def test_sets_agree_with_set_theory(device, rng):
     a, b = Domain.sphere(0.7, device=device), Domain.torus(0.6, 0.3, device=device)
     points = around(a | b, rng)
     in_a, in_b = a.phi(points) < 0, b.phi(points) < 0
@@ -164,7 +164,7 @@ def test_bad_arguments_are_refused_in_one_line(tmp_path):
         assert "\n" not in str(raised.value)
 
 
-def test_a_domain_has_what_its_kind_has():
+def test_domains_have_the_attributes_of_their_kind():
     """A domain of voxels has their numbers and positions, one of a surface the closed surface."""
     voxels = Domain.from_labels(np.ones((2, 3, 4), np.int16), (0.01, 0.01, 0.01), device="cpu")
     assert np.count_nonzero(voxels.numbers) == 24

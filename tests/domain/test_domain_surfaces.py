@@ -74,8 +74,8 @@ def test_a_cavity_stays_hollow(inward, device):
     assert "1 cavities" in domain.report()
 
 
-def test_many_parts_each_turned_as_it_should(device):
-    """Balls inside a ball are cavities, balls beside it are bodies; the input has all wound inwards."""
+def test_parts_are_turned_by_their_nesting(device):
+    """Balls inside a ball are cavities, balls beside it are bodies; in the input all are wound inwards."""
     ball = trimesh.creation.icosphere(1, radius=0.3)
     ball.invert()
     places = [np.array(k) - 1.0 for k in np.ndindex(3, 3, 3)]

@@ -64,7 +64,7 @@ def test_a_cavity_is_no_piece_and_what_lies_in_it_is() -> None:
     assert given.volume == pytest.approx(4 / 3 * np.pi * (1 - 0.8**3 + 0.4**3), rel=0.02)
 
 
-def test_shells_within_one_another_are_pieces_of_their_own() -> None:
+def test_nested_shells_are_separate_pieces() -> None:
     """A cavity belongs to the shell that contains it, or to all solid parts around it."""
     shells = [ball(r) for r in (1.0, 0.9, 0.7, 0.6, 0.3)]
     for cavity in shells[1::2]:
@@ -112,7 +112,7 @@ def test_overlapping_parts_count_once() -> None:
     assert not ((np.abs(given.points[:, :2]) < 0.49).all(axis=1) & (np.abs(given.points[:, 2]) < 0.49)).any()
 
 
-def test_lost_and_joined_pieces_are_told() -> None:
+def test_lost_and_joined_pieces_are_reported() -> None:
     far = TetForest.from_domain(surface_of(ball(1.0)), 0.5, max_level=3)
     lost = fidelity(far, surface_of(ball(1.0), ball(0.2, 3.0)))
     assert lost.lost_pieces == 1

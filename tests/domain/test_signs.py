@@ -72,8 +72,8 @@ def test_lines_through_points_in_which_many_triangles_meet_count_right(device):
             assert (windings_of(mesh, lines, wp.array(off * scale, dtype=wp.vec3, device=device)) == expected).all()
 
 
-def test_a_part_that_crosses_itself_is_known_away_from_where_it_does(device):
-    """A ring that is thicker than its hole: what is in the middle is enclosed once each way, which is not at all."""
+def test_a_part_that_crosses_itself_is_right_away_from_the_crossing(device):
+    """A ring that is thicker than its hole: its middle is enclosed once in each direction, so it is outside."""
     ring = trimesh.creation.torus(0.15, 0.3, major_sections=48, minor_sections=40)
     ring.apply_transform(trimesh.transformations.euler_matrix(0.3, 0.2, 0.1))
     domain = wc.Domain.from_surface((ring.vertices, ring.faces), device=device)
@@ -88,7 +88,8 @@ def test_a_part_that_crosses_itself_is_known_away_from_where_it_does(device):
 
 
 def test_segments_leave_the_body_where_it_ends(device):
-    """Balls that cross, one within another, and a box around: where the value changes its sign, with the normal."""
+    """Crossing balls, nested balls, and a box around them: a segment ends where the value changes its sign, with the
+    normal there."""
     balls = [
         trimesh.creation.icosphere(3, 0.5).apply_translation((0.7 * k, 0.013 * k, 0.0)).apply_scale(1.0 + 1e-3 * k)
         for k in range(3)

@@ -77,7 +77,7 @@ def test_a_ball_converges_with_the_voxels(device, rng):
 
 
 @pytest.mark.parametrize("how", ["straight", "turned", "sheared", "smoothed"])
-def test_phi_is_no_steeper_than_said_and_the_bounds_hold_the_inside(how, device, rng):
+def test_phi_keeps_its_lipschitz_constant_and_bounds(how, device, rng):
     directions = np.eye(3) if how == "straight" else turned(rng)
     if how == "sheared":
         directions = directions @ np.array([[1, 0.3, 0.1], [0, 0.9, 0.2], [0, 0, 1]])

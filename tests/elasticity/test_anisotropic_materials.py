@@ -217,7 +217,7 @@ REFUSED_MODELS = {
 
 
 @pytest.mark.parametrize("case", REFUSED_MODELS)
-def test_models_that_know_no_directions(case):
+def test_models_without_directions_refuse_them(case):
     with pytest.raises(
         wc.InputError, match=case if " is " in case else "TransverselyIsotropic; only the model Corotated"
     ):

@@ -42,7 +42,7 @@ def definiteness(F):
 
 
 def expected(mesh, tensor, u, p, active=None):
-    """``active``: stress [T] and direction [T, 3] besides."""
+    """The expected product; ``active`` are the stress [T] and direction [T, 3] of active fibres."""
     reference = oracle_mesh(mesh)
     tensor = np.broadcast_to(tensor, (len(mesh.tets), 3, 3, 3, 3))
 
@@ -108,7 +108,7 @@ def test_elements_where_the_law_goes_over_to_the_isotropic_one(device, rng):
 
 
 @pytest.mark.parametrize("case", SHORTENED_ENDS)
-def test_no_state_gives_what_is_not_finite(case, device, rng):
+def test_every_state_is_finite(case, device, rng):
     mesh = MESHES[case]()
     field, _ = bound(mesh, made("wood field", mesh, rng)[0], device)
     p = random_displacement(mesh, rng, 1.0)

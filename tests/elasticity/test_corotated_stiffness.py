@@ -188,7 +188,7 @@ def near_rotations(mesh, x, own, tolerance):
 
 
 @pytest.mark.parametrize("case", ["level 3", "general"])
-def test_no_state_gives_what_is_not_finite(case, device, rng):
+def test_every_state_is_finite(case, device, rng):
     """At rest, flat, a point, a point reflection, inverted and stretched a thousandfold."""
     mesh = MESHES[case]()
     field = bound(mesh, device)

@@ -57,8 +57,8 @@ def nodal(array):
 
 
 @pytest.mark.parametrize(("law", "kind"), crossed(MODELS, ["level 3", "mixed levels", "general"], is_short))
-def test_forces_of_elements_that_are_held(law, kind, device, rng):
-    """Some elements have lost or gained more than half of their volume."""
+def test_forces_of_elements_with_large_changes_of_volume(law, kind, device, rng):
+    """Some elements have lost or gained more than half of their volume and are held back on their own."""
     mesh = MESHES[kind][0]()
     stretched = strained(mesh, rng) + mesh.points @ np.diag([0.4, 0.3, -0.05])
     reference_mesh = oracle.Mesh(mesh.points, mesh.tets)
@@ -112,8 +112,9 @@ def test_stiffness_is_minus_the_derivative_of_the_forces(law, kind, device, rng)
 
 
 @pytest.mark.parametrize(("law", "kind"), crossed(MODELS, ["level 3", "mixed levels", "general"], is_short))
-def test_what_a_tangent_keeps_is_the_stiffness(law, kind, device, rng):
-    """Products and diagonals of kept rows are those found anew, also where elements are held from turning over."""
+def test_kept_rows_give_the_stiffness(law, kind, device, rng):
+    """Products and diagonals from kept rows equal those computed directly, also where elements are held from turning
+    over."""
     mesh = MESHES[kind][0]()
     _, field = bound(law, mesh, device)
     u = strained(mesh, rng) + mesh.points @ np.diag([0.4, 0.3, -0.05])
@@ -180,7 +181,7 @@ def test_a_free_body_has_six_motions_without_energy(law, device):
 
 @pytest.mark.parametrize("poisson", [0.3, 0.49, 0.4999])
 def test_a_beam_of_nearly_incompressible_tissue_does_not_lock(poisson, device):
-    """Its sag is that of float64, but for what float32 makes of a lambda much larger than mu; plain elements lock."""
+    """Its sag is that of float64, up to what float32 loses where lambda is much larger than mu; plain elements lock."""
     mesh = wc.TetForest.box((1, 1, 3), CUBE, 3)
     material, gravity = wc.Isotropic(5e4, poisson, 1000.0), (0.0, -9.8, 0.0)
     fixed = mesh.points[:, 2] < 1e-9
@@ -211,8 +212,8 @@ def test_rigid_motion_makes_no_force(law, kind, device, rng):
 
 
 @pytest.mark.parametrize("law", MODELS)
-def test_one_launch_does_what_passes_do(law, device, rng, monkeypatch):
-    """Also where elements are flat or turned over, of many materials, and the law leaves some of them out."""
+def test_one_launch_gives_the_forces_of_several_passes(law, device, rng, monkeypatch):
+    """This includes flat and inverted elements, many materials, and elements that the law leaves out."""
     mesh = mixed_forest()
     material = wc.Isotropic(rng.uniform(1e3, 1e4, len(mesh.tets)), rng.uniform(0.0, 0.49, len(mesh.tets)), 1000.0)
     body = wc.SoftBody(mesh, material, device=device)
@@ -232,7 +233,7 @@ def test_elements_share_by_default_from_a_ratio_on(poisson, is_shared, device):
     assert not isinstance(wc.Corotated(dilatation="element").bind(body), DilatationField)
 
 
-def test_worlds_have_what_each_would_have_alone(device, rng):
+def test_worlds_equal_single_bodies(device, rng):
     mesh, young = mixed_forest(), rng.uniform(1e3, 1e4, (2, 1))
     states = [strained(mesh, rng) for _ in range(2)]
     both = wc.SoftBody(mesh, wc.Isotropic(young, POISSON, 1000.0), worlds=2, device=device)
@@ -263,12 +264,12 @@ def test_a_run_with_remeshing_keeps_its_energy(device):
 
 
 @pytest.mark.parametrize("model", [wc.Linear, wc.Corotated, wc.NeoHookean, wc.StVenantKirchhoff, wc.EdgeStVK])
-def test_other_values_are_refused(model):
+def test_invalid_options_are_refused(model):
     with pytest.raises(wc.InputError, match="dilatation is 'nodal'"):
         model(dilatation="nodal")
 
 
-def test_springs_and_fibres_have_none_to_share(device):
+def test_springs_and_fibres_have_no_dilatation_to_share(device):
     with pytest.raises(wc.InputError, match="which has springs"):
         wc.MassSpring(dilatation="shared")
     mesh = wc.TetForest.box((1, 1, 1), CUBE, 3)

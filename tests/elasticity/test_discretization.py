@@ -33,7 +33,7 @@ def random_displacements(count, places, rng, device):
 @pytest.mark.parametrize("worlds", [1, 3])
 @pytest.mark.parametrize("general", [False, True])
 @pytest.mark.parametrize("subtrees", [False, True])
-def test_forces_by_way_of_slots_are_those_added_to_the_nodes(subtrees, general, worlds, device, rng):
+def test_forces_by_slots_equal_forces_added_to_nodes(subtrees, general, worlds, device, rng):
     """Elements of a plan with slots write to slots, and gathering gives the same sums as adding to the nodes."""
     mesh = adaptive(rng)
     mesh = wc.TetMesh(mesh.points, mesh.tets) if general else mesh
@@ -54,7 +54,7 @@ def test_forces_by_way_of_slots_are_those_added_to_the_nodes(subtrees, general, 
     np.testing.assert_allclose(found.numpy(), expected.numpy(), atol=1e-6 * np.abs(expected.numpy()).max())
 
 
-def test_a_field_without_subtrees_goes_through_the_bodys_own_elements(device, rng):
+def test_a_field_without_subtrees_uses_the_bodys_elements(device, rng):
     body = wc.SoftBody(adaptive(rng), MATERIAL, device=device)
     plan = body.discretization.plan(subtrees=False)
     assert plan.elements is body.discretization.elements
@@ -66,8 +66,8 @@ def test_a_field_without_subtrees_goes_through_the_bodys_own_elements(device, rn
 
 
 @pytest.mark.parametrize("model", [wc.Corotated(), wc.Corotated(rotation_level=4), wc.NeoHookean()], ids=str)
-def test_a_field_bound_to_a_body_that_has_changed_goes_through_its_present_mesh(model, device, rng):
-    """And the simulation's own field still follows the mesh."""
+def test_a_field_bound_to_a_remeshed_body_uses_its_present_mesh(model, device, rng):
+    """The simulation's own field still follows the mesh."""
     source = adaptive(rng)
     body = wc.SoftBody(source, MATERIAL, device=device)
     options = wc.OnlineRemesh(capacity=4 * len(source.tets), min_level=0, max_level=48)

@@ -85,8 +85,8 @@ def nominal(F, material, device):
 
 
 def test_closed_forms(device):
-    """Isochoric, so that what lateral faces carry is taken off as a pressure: along fibres, in the plane of two
-    families at right angles, in shear, and in compression, where fibres bear nothing."""
+    """The deformations are isochoric, and the stress of the lateral faces is subtracted as a pressure: along fibres, in
+    the plane of two families at right angles, in shear, and in compression, where fibres bear nothing."""
     k1, k2 = 300.0, 2.0
 
     def pull(e, stretch):
@@ -169,7 +169,7 @@ def test_worlds_share_their_dilatation(device):
     assert u[0] > 1.02 * u[1] > 0
 
 
-def test_refuses_what_it_does_not_know(device):
+def test_invalid_arguments_are_refused(device):
     mesh = wc.TetForest.box((1, 1, 1), 0.064, 0)
     body = wc.SoftBody(mesh, tissue(np.eye(3)), device=device)
     for model in (wc.Corotated(), wc.NeoHookean(dilatation="element")):
@@ -188,7 +188,7 @@ def test_refuses_what_it_does_not_know(device):
 
 @pytest.mark.parametrize("poisson", [0.4, 0.49], ids=["own dilatation", "shared"])
 def test_active_fibres_shorten_a_beam_at_rest(poisson, device):
-    """Forces balance there: the energy of Newton's line search counts what active stress does."""
+    """Forces balance there, because the energy of Newton's line search includes the active stress."""
     mesh = wc.TetForest.box((1, 1, 2), 0.064, 2)
     fibres = wc.FibreReinforced(3e3, poisson, 200.0, 1.0, [0.0, 0.0, 1.0], 1000.0)
     body = wc.SoftBody(mesh, fibres, device=device)

@@ -55,7 +55,7 @@ def moved(body, rng):
 
 
 @pytest.mark.parametrize("model", MODELS, ids=str)
-def test_forces_and_energy_are_those_of_a_material_of_that_share(ball, model, device, rng):
+def test_forces_and_energy_scale_with_the_filled_fraction(ball, model, device, rng):
     isotropic = [wc.Isotropic(3e3 * share, 0.4, 1000.0 * share) for share in (1.0, ball.fill)]
     body, weak = bodies(ball, device, isotropic)
     if not isinstance(model, wc.Corotated):
@@ -87,7 +87,7 @@ def test_stress_is_that_of_the_material(ball, model, device, rng):
 
 
 @pytest.mark.parametrize("model", [wc.Corotated(), wc.Corotated(rotation="svd")], ids=str)
-def test_fibres_and_what_they_pull_with_count_by_the_share(ball, model, device, rng):
+def test_fibres_and_active_stress_scale_with_the_filled_fraction(ball, model, device, rng):
     share = ball.fill
     weaker = FIBRES | {name: FIBRES[name] * share for name in ("young_along", "young_across", "shear_along", "density")}
     materials = [wc.TransverselyIsotropic(direction=[1.0, 2.0, 0.5], **given) for given in (FIBRES, weaker)]
@@ -102,7 +102,7 @@ def test_fibres_and_what_they_pull_with_count_by_the_share(ball, model, device, 
     assert sims[0].energy().elastic == pytest.approx(sims[1].energy().elastic, rel=1e-4)
 
 
-def test_mass_is_the_density_times_the_volume_within_the_surface(ball, device):
+def test_mass_is_the_density_times_the_volume_inside_the_surface(ball, device):
     surface = ball.surface()
     a, b, c = surface.points[surface.triangles].transpose(1, 0, 2)
     volume = np.einsum("ti,ti->", a, np.cross(b, c)) / 6.0

@@ -1,9 +1,6 @@
-"""Whether shared dilatation has pressures that no motion feels, and how well motions feel the others: inf-sup
-constants.
-
-The constant is the least of sup_u (p, div u) / (|grad u| |p|) over pressures p with a value for each group; a clamped
-beam, float64, from points and tetrahedra alone.
-"""
+"""Inf-sup constants of shared dilatation: whether some pressures do no work in any motion, and how well the others are
+controlled. The constant is the least of sup_u (p, div u) / (|grad u| |p|) over pressures p with a value for each group,
+for a clamped beam, in float64, from points and tetrahedra alone."""
 
 import numpy as np
 import oracle
@@ -38,15 +35,15 @@ def constants(mesh, groups):
 @pytest.mark.parametrize(
     ("level", "least"), [(0, 1.05), (3, 0.44), (6, 0.25), pytest.param(9, 0.115, marks=pytest.mark.slow)]
 )
-def test_groups_of_a_forest_have_no_pressure_that_nothing_feels(level, least):
-    """The constant falls with the size of elements, to about a half each time that they are halved."""
+def test_groups_of_a_forest_have_no_spurious_pressure(level, least):
+    """The constant falls with the size of elements, by about a half each time that they are halved."""
     forest = wc.TetForest.box((1, 1, 3), 0.064, level)
     found = constants(forest, of_forest(forest))
     print(f"level {level}: {found[0]:.3f}, {found[1]:.3f}")
     assert found[0] > least
 
 
-def test_elements_by_themselves_and_nodes_have_such_pressures():
+def test_single_elements_and_nodes_have_spurious_pressures():
     forest = wc.TetForest.box((1, 1, 3), 0.064, 3)
     plain = constants(forest, identity(len(forest.tets), format="csr"))
     assert (plain < 1e-6).sum() == 57

@@ -32,7 +32,7 @@ def forces(body, model, u):
 
 @pytest.mark.parametrize("level", [2, 5, 7])
 @pytest.mark.parametrize("rotation_level", [None, 0, 2, 3, 4, 5, 6, 9])
-def test_every_leaf_is_done_once(level, rotation_level, device, rng):
+def test_every_leaf_is_computed_once(level, rotation_level, device, rng):
     forest = mixed(level, rng)
     plan = ForcePlan.of_forest(forest, rotation_level, wp.get_device(device))
     done = [plan.flat.leaves.numpy()]
@@ -86,7 +86,7 @@ def test_subtrees_give_the_forces_of_their_leaves(level, rotation_level, uniform
 
 
 @pytest.mark.parametrize("rotation_level", [None, 3])
-def test_what_the_fast_iteration_cannot_turn_is_flagged_and_done_all_the_same(rotation_level, device, rng):
+def test_leaves_that_the_fast_iteration_fails_on_are_flagged_and_repaired(rotation_level, device, rng):
     """Inverted, flat, tiny and hugely stretched leaves; the number of flags shows that the second kernel had work."""
     forest = wc.TetForest.box((2, 2, 1), 0.1, 6)
     body = wc.SoftBody(forest, MATERIAL, device=device)

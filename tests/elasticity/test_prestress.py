@@ -81,7 +81,7 @@ def test_force_and_stiffness_are_derivatives(make, device, rng):
     assert np.abs(np.cross(x, there).sum(0)).max() < 1e-5 * np.abs(x).max() * np.abs(there).sum()
 
 
-def test_it_is_saved_and_in_all_worlds(device, tmp_path):
+def test_it_is_saved_and_acts_in_all_worlds(device, tmp_path):
     mesh = wc.TetForest.box((1, 1, 2), 0.064, 1)
     body = wc.SoftBody(mesh, wc.Isotropic(500.0, 0.3, 10.0), worlds=2, device=device)
     body.fix("z == zmin")
@@ -95,7 +95,7 @@ def test_it_is_saved_and_in_all_worlds(device, tmp_path):
     assert wc.Simulation.load(tmp_path / "stressed.npz", device=device).models == sim.models
 
 
-def test_refuses_what_is_no_stress(device):
+def test_invalid_stresses_are_refused(device):
     body = wc.SoftBody(wc.TetForest.box((1, 1, 1), 0.1, 1), wc.Isotropic(500.0, 0.3, 10.0), device=device)
     for stress in ([1.0, 2.0], np.full((3, 3), np.nan), [[0, 1, 0], [0, 0, 0], [0, 0, 0]]):
         with pytest.raises(wc.InputError, match="stress"):

@@ -1,4 +1,5 @@
-"""Prony series: relaxation, creep and loss against closed forms; rotations, stiffness, energy, and what goes on."""
+"""Prony series: relaxation, creep and loss against closed forms; rotations, stiffness, energy, resumed and remeshed
+runs."""
 
 import numpy as np
 import oracle
@@ -21,7 +22,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::warp_corot.StabilityWarning")
 
 
 class Cube:
-    """A cube whose nodes are put where one likes, step after step of a given length."""
+    """A cube whose nodes are placed by hand in each step of a given length."""
 
     def __init__(self, device, dt, model=None, make=None):
         self.mesh = wc.TetForest.box((1, 1, 1), 1.0, 1) if make is None else make()
@@ -36,7 +37,7 @@ class Cube:
         self.field.complete_step(self.body.state.displacements, self.sim.pace.arrays)
 
     def shear(self, amount):
-        """Shear by so much in a step."""
+        """Apply a shear of this amount in one step."""
         self.move(np.outer(self.mesh.points[:, 1], [amount, 0, 0]))
 
     @property
@@ -172,8 +173,8 @@ def test_refuses_numbers_out_of_range():
 
 
 def test_elements_carry_their_history_where_the_mesh_changes(device, tmp_path):
-    """A beam that swings while elements are bisected and merged sinks between a coarse and a fine one, and a
-    saved one goes on exactly."""
+    """While elements are bisected and merged, a swinging beam sinks by an amount between those of a coarse and a fine
+    mesh, and a saved run continues exactly."""
     tips = {}
     for name, level, remesh in (
         ("coarse", 3, None),

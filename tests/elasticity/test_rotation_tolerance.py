@@ -118,7 +118,7 @@ def test_both_kinds_are_used(way, device):
 
 
 @pytest.mark.parametrize(("way", "tolerance"), [(LANES, 0.5), (SUBTREES, AUTO_TOLERANCE)])
-def test_what_own_rotations_hold_is_theirs(way, tolerance, device, rng):
+def test_strongly_strained_leaves_keep_their_own_rotations(way, tolerance, device, rng):
     """Inverted, flat and strongly strained leaves never share: their forces are those of own rotations, or they are
     left out as without a tolerance."""
     forest = wc.TetForest.box((1, 1, 1), 0.1, 9)
@@ -171,7 +171,7 @@ def test_materials_of_elements(device, rng):
         assert error.max() > 100 * rounding
 
 
-def test_levels_that_are_none():
+def test_invalid_levels_are_refused():
     for level in (0.0, -0.1, 0.7, "often", True, -1, 3.5):
         with pytest.raises(wc.InputError, match="level"):
             wc.Corotated(rotation_level=level)

@@ -41,7 +41,7 @@ def test_at_rest_it_is_the_linear_stiffness_of_the_velocities(mesh, device, rng)
 
 
 @pytest.mark.parametrize("mesh", [BOX, GENERAL], ids=["forest", "general"])
-def test_it_takes_power_and_neither_momentum(mesh, device, rng):
+def test_it_removes_energy_and_conserves_both_momenta(mesh, device, rng):
     u = strained(mesh, rng)
     for _ in range(5):
         v = rng.normal(size=u.shape)
@@ -53,7 +53,7 @@ def test_it_takes_power_and_neither_momentum(mesh, device, rng):
 
 
 @pytest.mark.parametrize("mesh", [BOX, GENERAL], ids=["forest", "general"])
-def test_what_turns_as_a_whole_is_not_damped(mesh, device, rng):
+def test_rigid_rotation_is_not_damped(mesh, device, rng):
     """At any strain."""
     u = strained(mesh, rng)
     stretching = np.abs(forces(mesh, u, (mesh.points + u) @ (SKEW + SKEW.T + np.eye(3)), device)).max()
@@ -70,9 +70,9 @@ def test_crushed_elements_are_finite_and_lose_energy(device, rng):
         assert np.sum(f * v) < 0.0
 
 
-def test_no_strain_makes_it_stiffer_than_rates_are(device, rng):
-    """Elements turned inside out among them: power is at most (2 mu + 3 lambda) |A|^2 for a rate A, so that explicit
-    steps bear it."""
+def test_its_power_is_bounded_at_any_strain(device, rng):
+    """For a rate A the power is at most (2 mu + 3 lambda) |A|^2, also in elements turned inside out, so that explicit
+    steps stay stable."""
     x, corners = BOX.points, BOX.tets
     seconds, sides = 0.1, np.moveaxis(x[corners[:, 1:]] - x[corners[:, :1]], 1, 2)
     volumes = np.abs(np.linalg.det(sides)) / 6.0
@@ -84,7 +84,7 @@ def test_no_strain_makes_it_stiffer_than_rates_are(device, rng):
         assert 0.0 < -np.sum(forces(BOX, u, v, device, seconds) * v) < most
 
 
-def test_it_comes_out_the_same_in_one_order_and_in_all_worlds(device, rng):
+def test_it_is_the_same_with_sums_in_one_order_and_in_all_worlds(device, rng):
     u, v = strained(BOX, rng), rng.normal(size=BOX.points.shape)
     expected = forces(BOX, u, v, device)
     scale = np.abs(expected).max()

@@ -22,7 +22,7 @@ def held_bar(device="cpu", *, worlds=1):
 
 
 def given(body, rng):
-    """Arguments and weights of J = sum w . x."""
+    """The arguments, and the weights of J = sum w . x."""
     count, nodes = len(body.mesh.tets), body.node_count
     young = 500.0 * rng.uniform(0.5, 2.0, count)
     loads = 1e-4 * rng.standard_normal((nodes, 3))
@@ -61,8 +61,9 @@ class TestPyTorch:
         assert_near(tensors["loads"].grad.numpy(), right.loads)
         assert not body.displacements.numpy().any()
 
-    def test_arguments_that_are_not_elements(self, torch, device, rng):
-        """A number, rest positions, places of held nodes and gravity, along random ways, in one chain with others."""
+    def test_other_arguments(self, torch, device, rng):
+        """A single modulus, rest positions, places of held nodes and gravity, along random directions, in a chain with
+        other operations."""
         body = held_bar(device)
         _, weights = given(body, rng)
         weights = torch.tensor(weights)
@@ -95,7 +96,7 @@ class TestPyTorch:
             assert along == pytest.approx(difference, rel=2e-3)
 
     def test_one_of_two_worlds(self, torch, device):
-        """A modulus for each world; J of the second alone says nothing of the first."""
+        """Each world has its own modulus; the J of the second one does not depend on the first."""
         body = held_bar(device, worlds=2)
         young = torch.tensor([[300.0], [900.0]], requires_grad=True)
         x = wc.torch.static(body, young=young, options=OPTIONS)
@@ -151,7 +152,7 @@ class TestJAX:
 
 
 @pytest.mark.parametrize("name", ["torch", "jax"])
-def test_a_framework_that_is_not_there(name, monkeypatch):
+def test_a_missing_framework_is_named(name, monkeypatch):
     there = builtins.__import__
 
     def without(wanted, *rest, **others):

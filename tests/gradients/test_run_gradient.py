@@ -18,7 +18,7 @@ TOLERANCE = 1e-4
 
 
 class Run:
-    """A bar that begins strained and in motion, one end held, of which two nodes move on."""
+    """A bar that begins strained and in motion, with one end held and two of its nodes moving on."""
 
     def __init__(self, device, law="corotated", level=2):
         self.mesh = wc.TetForest.box((1, 1, 2), CUBE, level)
@@ -53,7 +53,7 @@ class Run:
         return wc.run_gradient(self.body, objective, integrator=integrator, steps=steps, **options)
 
     def value(self, integrator, steps, every=None, **changed):
-        """J in float64, with some of what is given changed."""
+        """J in float64, with some of the arguments changed."""
         given = self.given | changed
         mesh, lame = oracle.Mesh(given["rest"], self.mesh.tets), oracle.lame(given["young"], 0.3)
         masses = mesh.masses(given["density"])[:, None]
@@ -121,7 +121,7 @@ class Run:
 
 @pytest.mark.parametrize("every", [None, 7])
 def test_explicit_steps(every, device):
-    """Of 30 steps in segments, at the end or as a sum over times that segments are cut at."""
+    """30 steps in segments, with an objective at the end, or as a sum over times that cut the segments."""
     run, integrator = Run(device), wc.SymplecticEuler(dt=2e-3, damping=DAMPING)
     found = run.gradient(integrator, 30, every=every)
     run.check(found, integrator, 30, every)

@@ -53,7 +53,7 @@ class Case:
         return wc.static_gradient(self.body, objective, model=MODELS[self.law](), gravity=GRAVITY, **options)
 
     def value(self, **changed):
-        """J by the oracle, with some of what is given changed."""
+        """J by the oracle, with some of the arguments changed."""
         given = self.given | changed
         mesh = oracle.Mesh(given["rest"], self.mesh.tets)
         loads = given["loads"] + mesh.masses(given["density"])[:, None] * given["gravity"]
@@ -128,7 +128,7 @@ def add_squares(x: wp.array[wp.vec3], loss: wp.array[float]):
 
 
 def test_objectives_of_both_kinds_agree(device):
-    """A tape's, and a pair of value and gradient."""
+    """An objective with a tape, and one that returns a value and its gradient."""
     body = wc.SoftBody(wc.TetForest.box((1, 1, 1), CUBE, 3), wc.Isotropic(500.0, 0.4, 10.0), device=device)
     body.fix(body.mesh.points[:, 2] < 1e-9)
 
@@ -148,7 +148,7 @@ def test_objectives_of_both_kinds_agree(device):
     assert first.loads == pytest.approx(second.loads, abs=1e-5 * np.abs(second.loads).max())
 
 
-def test_worlds_are_each_their_own(device):
+def test_each_world_has_its_own_gradient(device):
     """Shapes follow the material's; each world's gradient is that of the body alone."""
     mesh = wc.TetForest.box((1, 1, 1), CUBE, 3)
     young = np.array([[400.0], [900.0]])
@@ -169,8 +169,8 @@ def test_worlds_are_each_their_own(device):
         assert rest == pytest.approx(alone.rest, abs=1e-4 * np.abs(alone.rest).max())
 
 
-def test_relaxed_tissue_is_that_of_slow_motion(device):
-    """With Maxwell elements beside the law the gradient at rest is the law's own."""
+def test_relaxed_tissue_has_the_gradient_of_the_law(device):
+    """With Maxwell elements beside the law, the gradient at rest is that of the law alone."""
     body = wc.SoftBody(wc.TetForest.box((1, 1, 1), CUBE, 3), wc.Isotropic(500.0, 0.4, 10.0), device=device)
     body.fix(body.mesh.points[:, 2] < 1e-9)
     options = {"wrt": ("loads", "density"), "gravity": 50.0 * GRAVITY}
@@ -221,7 +221,7 @@ def work_by_differences(law, mesh, groups, u, motion):
     ],
 )
 def test_work_of_a_shared_dilatation(law, mesh, device):
-    """With a shear modulus of almost nothing; of groups in a forest and in a general mesh."""
+    """The shear modulus is almost zero; in groups of a forest and of a general mesh."""
     rng = np.random.default_rng(5)
     if mesh == "forest":
         mesh = wc.TetForest.box((1, 1, 3), CUBE, 3).refine(np.arange(144) % 17 == 0)

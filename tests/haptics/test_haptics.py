@@ -1,4 +1,4 @@
-"""The haptic loop: energy through the device, the stiffness that is felt, failures, and clean ends."""
+"""The haptic loop: energy through the device, the rendered stiffness, failures, and clean ends."""
 
 import logging
 import sys
@@ -55,7 +55,7 @@ def run_slowly(sim, loop, clock, seconds, every, pace=1.0):
 
 
 def work_of(felt):
-    """Energy put out by each reading [J], cumulated: of a force that is held while the hand goes on."""
+    """The cumulated energy put out at each reading [J], by a force that is held while the hand moves on."""
     values = np.array(felt)
     way = np.diff(values[:, 1:4], axis=0)
     return np.cumsum(np.einsum("kx,kx->k", values[:-1, 4:7], way))
@@ -65,7 +65,7 @@ def work_of(felt):
 
 
 def slow_wall(controlled, *, stiffness=1000.0, every=50, seconds=5.0):
-    """A wall that is computed at 20 Hz, with the delay of one period, and a hand that goes in and out at 2 Hz."""
+    """A wall that is computed at 20 Hz with a delay of one period, and a hand that moves in and out at 2 Hz."""
     control = PassivityControl(BOUND, 1e-3, 1e-2)
     model = LocalModel(stiffness, 1e9)
     none, felt, before, seen = np.zeros(3), [], None, None
@@ -97,8 +97,8 @@ def test_a_slow_wall_makes_energy_and_control_bounds_it():
     assert np.linalg.norm(felt[:, 4:7], axis=1).max() > 1.0  # it is felt all the same
 
 
-def test_energy_comes_back_through_turns_too():
-    """A torque that turns the hand puts out energy until there is none."""
+def test_torques_put_out_bounded_energy():
+    """A torque that turns the hand puts out energy only until none is left."""
     control, none, turned = PassivityControl(BOUND, 1e-3, 1e-2), np.zeros(3), np.array([5e-3, 0.0, 0.0])
     out = 0.0
     for reading in range(1000):
@@ -108,7 +108,7 @@ def test_energy_comes_back_through_turns_too():
         assert out <= BOUND * (1.0 + reading / RATE) + 1e-12
 
 
-def test_forces_that_take_energy_are_left_alone():
+def test_forces_that_take_energy_are_not_changed():
     control, none = PassivityControl(BOUND, 1e-3, 1e-2), np.zeros(3)
     depth = 0.0
     for _ in range(200):
@@ -139,8 +139,8 @@ def test_a_slow_simulation_puts_out_no_more_energy_than_the_bound(device, every)
 # --- stiffness -----------------------------------------------------------------------------------------------------
 
 
-def test_the_stiffness_felt_is_the_tissues(device):
-    """Pressed slowly; the reference holds the same tool at some depths, without any loop."""
+def test_the_rendered_stiffness_is_that_of_the_tissue(device):
+    """The tissue is pressed slowly; the reference holds the same tool at several depths, without a loop."""
     depths = np.array([0.001, 0.0015, 0.002])
     sim, tool = scene(device)
     held = []
@@ -167,7 +167,7 @@ def test_the_stiffness_felt_is_the_tissues(device):
     assert loop.report.damped == 0
 
 
-def test_the_local_model_finds_a_springs_stiffness_and_goes_on_with_it():
+def test_the_local_model_finds_a_springs_stiffness_and_continues_with_it():
     model, none = LocalModel(100.0, 1e5), np.zeros(3)
     for count in range(1, 60):
         at = np.array([0.0, 0.0, -1e-5 * count])
@@ -211,7 +211,7 @@ def test_a_tool_follows_the_hand_and_the_thread_ends(device):
 
 
 class Failing(MouseDevice):
-    """Is unplugged at the third reading, or at the third force."""
+    """A device that is unplugged at the third reading, or at the third force."""
 
     def __init__(self, method):
         super().__init__((0.02, 0.02, 0.2))
@@ -248,7 +248,7 @@ def test_a_device_that_fails_stops_the_loop_with_one_line(method, caplog):
 
 
 @pytest.mark.parametrize("reading", [((0, 0, np.nan), (0, 0, 0, 1)), ((0, 0), (0, 0, 0, 1)), ((0, 0, 0), (0, 0, 0, 0))])
-def test_readings_that_are_no_pose_stop_the_loop(reading, caplog):
+def test_invalid_readings_stop_the_loop(reading, caplog):
     sim, tool = scene("cpu")
     hand = MouseDevice()
     hand._pose = reading
@@ -283,7 +283,7 @@ def test_states_are_never_half_written():
     assert first.time == pytest.approx(sim.total_time)
 
     class Torn:
-        """Changes the count after each look at a slot."""
+        """Changes the count after each look at a slot, as if a state were being written."""
 
         def __init__(self, values):
             self.values, self.looks = values, 0

@@ -49,7 +49,7 @@ def test_several_bodies_are_one_mesh(device, tmp_path):
     assert done.largest_displacement >= done.final_displacement
 
 
-def test_goes_on_from_where_the_simulation_is(tmp_path):
+def test_a_recording_continues_from_the_current_state(tmp_path):
     sim = wc.Simulation(beam("cpu"))
     sim.advance(0.05)
     before = sim.body.positions.numpy().copy()
@@ -80,7 +80,7 @@ def test_a_duration_between_two_frames_is_reported():
     assert "--fps" not in str(rounding(0.1234567, 24.0))
 
 
-def test_whatever_ends_it_keeps_frames(tmp_path):
+def test_frames_are_kept_however_a_run_ends(tmp_path):
     sim = wc.Simulation(beam("cpu"))
     done = Recording(tmp_path / "a.usd")
 

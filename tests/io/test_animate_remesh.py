@@ -90,7 +90,7 @@ def test_one_of_two_bodies_is_remeshed(tmp_path):
     np.testing.assert_array_equal(points[: still.node_count], still.positions.numpy())
 
 
-def test_goes_on_after_the_mesh_has_changed(tmp_path):
+def test_a_recording_continues_after_the_mesh_has_changed(tmp_path):
     sim = swaying(bar())
     surface = sim.body.mesh.surface()
     sim.advance(0.1)
@@ -153,7 +153,7 @@ def test_sections_go_along_with_the_present_mesh():
     np.testing.assert_array_equal(section.numbers, numbers)
 
 
-def test_whatever_ends_it_keeps_frames(tmp_path):
+def test_frames_are_kept_however_a_run_ends(tmp_path):
     sim = swaying(bar())
     done = Recording(tmp_path / "a.usd")
 

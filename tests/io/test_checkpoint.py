@@ -79,8 +79,8 @@ def test_a_resumed_run_is_the_uninterrupted_one(device, tmp_path, make, model):
 
 @pytest.mark.parametrize(("saved", "level", "pull"), [(0.03, 4, [0, 0, 0.06]), (0.05, 5, [0.06, 0, 0])])
 def test_a_run_that_went_back_resumes(tmp_path, saved, level, pull):
-    """An end of very soft tissue is pulled fast: the run goes back to shorter steps, after the checkpoint or before and
-    after it. Each step follows from what was counted before."""
+    """One end of very soft tissue is pulled fast. The run goes back to shorter steps after the checkpoint, or before
+    and after it; each step depends on what was counted before."""
     body = wc.SoftBody(wc.TetForest.box((1, 1, 3), 0.064, level), wc.Isotropic(300.0, 0.49, 1000.0), device="cpu")
     body.fix("z == zmin")
     body.prescribe("z == zmax", times=[0.0, 0.05], displacements=[[0, 0, 0], pull])
@@ -150,7 +150,7 @@ while True:
 
 
 @pytest.mark.parametrize("content", [None, b"", b"no archive", b"PK\x03\x04 half an archive"])
-def test_what_is_no_checkpoint_is_refused(tmp_path, content):
+def test_other_files_are_refused(tmp_path, content):
     path = tmp_path / "state.npz"
     if content is not None:
         path.write_bytes(content)

@@ -81,7 +81,7 @@ def test_a_resumed_run_is_the_uninterrupted_one(tmp_path, make):
     assert make is pressed or len(whole.body.mesh.tets) != count
 
 
-def test_a_tool_that_followed_an_array_goes_where_it_was_sent_last(tmp_path):
+def test_a_tool_that_followed_an_array_stays_at_its_last_target(tmp_path):
     sim = pressed("cpu")
     sim.advance(0.01)
     sim.obstacles[2].move((0.02, 0.02, 0.06))
@@ -91,7 +91,7 @@ def test_a_tool_that_followed_an_array_goes_where_it_was_sent_last(tmp_path):
     np.testing.assert_allclose(again.obstacles[2].present_pose[0, :3], (0.02, 0.02, 0.06), atol=1e-6)
 
 
-def test_a_shape_of_ones_own_is_refused(tmp_path):
+def test_a_users_own_shape_is_refused(tmp_path):
     class Egg(wc.Sphere):
         pass
 

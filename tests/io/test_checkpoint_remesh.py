@@ -155,7 +155,7 @@ def test_a_body_beside_one_that_is_remeshed(tmp_path):
     assert resumed.remeshing.changing[0] is None
 
 
-def test_criteria_of_ones_own_are_asked_for(tmp_path):
+def test_a_users_own_criterion_must_be_passed_again(tmp_path):
     sim = wc.Simulation(box("cpu"), remesh=nearness(0.1, "cpu"))
     sim.advance_steps(5)
     sim.save(tmp_path / "a.npz")

@@ -17,8 +17,8 @@ from warp_corot.io.read.filemesh import FileMesh, Unreadable
 from warp_corot.io.read.volumes import load_volume
 
 
-def test_a_binary_stage_is_tried_elsewhere_first(tmp_path, monkeypatch):
-    """Once for each version of a file; one that crashes OpenUSD is not opened here. Text is not tried."""
+def test_a_binary_stage_is_tried_in_another_process_first(tmp_path, monkeypatch):
+    """Once for each version of a file; a stage that crashes OpenUSD is not opened here. Text is not tried."""
     path, tried = SEEDS["usdc-tets"](tmp_path), []
     real = usd_files.read_isolated
     monkeypatch.setattr(usd_files, "read_isolated", lambda *given: tried.append(given) or real(*given))
@@ -56,7 +56,7 @@ def test_a_series_without_one_of_its_slices(tmp_path):
     assert volume.values.shape == (10, 10, 9)
 
 
-def test_a_scan_with_a_unit_that_there_is_not_and_one_without_voxels(tmp_path):
+def test_a_scan_with_an_unknown_unit_and_one_without_voxels(tmp_path):
     nibabel = pytest.importorskip("nibabel")
     path = SEEDS["nii"](tmp_path)
     data = bytearray(path.read_bytes())
@@ -96,7 +96,7 @@ def test_two_dashes_are_no_value(tmp_path, capsys):
     ("name", "value"),
     [("leaf_tets.0", 1 << 30), ("leaves.0", -1), ("code.0", 1 << 30), ("level.0", 99), ("counts", 999)],
 )
-def test_places_beyond_the_ends_of_a_changing_mesh(tmp_path, name, value):
+def test_indices_beyond_a_changing_mesh(tmp_path, name, value):
     """Kernels do not check indices."""
     path = SEEDS["checkpoint-remesh"](tmp_path)
     with np.load(path) as archive:
@@ -109,7 +109,7 @@ def test_places_beyond_the_ends_of_a_changing_mesh(tmp_path, name, value):
 
 
 def test_a_nastran_file_that_ends_before_its_first_card(tmp_path):
-    """meshio by itself waits for a first card for ever."""
+    """meshio alone would wait for the first card for ever."""
     pytest.importorskip("meshio")
     path = SEEDS["bdf"](tmp_path)
     assert len(wc.TetMesh.load(path).tets) == 2

@@ -268,8 +268,8 @@ def test_garbage_is_refused_with_the_readers_own_reason(tmp_path, suffix):
         assert "needs: pip install" in said or len(said.partition("that can be read (")[2]) > 12
 
 
-def test_a_reader_that_crashes_hangs_or_eats_memory_is_told_of(tmp_path, monkeypatch):
-    """Each runs in a separate process, whose end does not affect this one."""
+def test_a_reader_that_crashes_hangs_or_exhausts_memory_is_reported(tmp_path, monkeypatch):
+    """Each reader runs in a separate process, whose end does not affect this one."""
     bodies = {
         "crash": "import ctypes; ctypes.string_at(0)",
         "leave": "import os; os._exit(7)",

@@ -99,7 +99,7 @@ def refused(path, match, **options):
     return str(raised.value)
 
 
-def test_files_that_are_none_are_refused_in_one_line(tmp_path):
+def test_invalid_files_are_refused_in_one_line(tmp_path):
     refused(tmp_path / "none.usd", "none.usd: no such file")
     refused(tmp_path, "is a folder")
     refused("warp:lion", "warp:bear")

@@ -61,8 +61,8 @@ def test_a_plain_surface_shows_the_stress(folder):
     assert mesh.GetPrim().GetAttribute("primvars:displayColor:indices").GetNumTimeSamples()
 
 
-def test_what_was_written_goes_in_again(folder):
-    """A surface that shows the stress of one run shows that of the next."""
+def test_a_written_surface_is_an_input_again(folder):
+    """A surface that shows the stress of one run shows that of the next one."""
     trimesh.creation.icosphere(2, 0.03).export(folder / "ball.ply")
     assert simulate("ball.ply", "-o", "a.usd", "--unit", "m", "--tets", 300, *SHORT) == 0
     assert simulate("a.usd", "-o", "b.usd", "--tets", 300, "--young", 5e3, *SHORT) == 0

@@ -58,7 +58,7 @@ def ball() -> wc.TetForest:
 
 @pytest.fixture(scope="module")
 def moved(ball) -> np.ndarray:
-    """Displacements that strain elements by tenths, float32 [N, 3]."""
+    """Displacements that strain elements by some tenths, float32 [N, 3]."""
     x = ball.points
     bent = np.column_stack([8.0 * x[:, 1] * x[:, 2], 6.0 * x[:, 0] ** 2, 5.0 * x[:, 0] * x[:, 1]])
     noise = np.random.default_rng(1).standard_normal(x.shape)
@@ -177,7 +177,7 @@ def test_pairs_that_have_moved_far_keep_their_digits(ball, moved, of_forest, dev
 @pytest.mark.parametrize("of_forest", [True, False])
 @pytest.mark.parametrize("stride", [0, 1])
 def test_pairs_measure_their_groups(ball, moved, of_forest, stride, device, rng):
-    """Means of J - 1, weighted by lambda and volume, of groups whose elements lie anywhere."""
+    """They find the means of J - 1, weighted by lambda and volume, of groups whose elements lie anywhere."""
     mesh = ball if of_forest else wc.TetMesh(ball.points, ball.tets)
     scatter = ClusterScatter(device_elements(mesh, wp.get_device(device)), isotropic_law(corotated_stress))
     group_of = rng.permutation(len(ball.tets)) // 9

@@ -95,7 +95,7 @@ def test_a_bit_names_the_leaf_that_is_left_out(name):
 
 
 @pytest.mark.parametrize("law", [*LAWS.values(), wc.Corotated(rotation_level="auto")], ids=repr)
-def test_what_a_lane_comes_to_does_not_depend_on_the_others(law, rng):
+def test_a_lanes_result_does_not_depend_on_the_others(law, rng):
     """Three worlds with numbers of subtrees and elements that eight does not divide: each bit for bit as alone."""
     mesh = MESHES["mixed levels"]()
     u = [random_displacement(mesh, rng, size) for size in (0.2, 1e-4, 0.6)]

@@ -102,8 +102,8 @@ def test_one_bad_leaf_is_left_out_alone(device, rng):
 
 
 @pytest.mark.parametrize("share", [0.1, 1.0])
-def test_leaves_that_a_block_does_itself(share, device, rng):
-    """A body of one type of subtree, in two evaluations: the second knows what the first left out."""
+def test_leaves_that_a_block_computes_itself(share, device, rng):
+    """A body with one type of subtree, in two evaluations: the second one knows what the first one left out."""
     forest = wc.TetForest.box((2, 1, 1), 0.1, 9)
     body = wc.SoftBody(forest, wc.Isotropic(1e4, 0.4, 1000.0), device=device)
     far = rng.random((len(forest.points), 1)) < share
@@ -128,7 +128,7 @@ def test_leaves_that_a_block_does_itself(share, device, rng):
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 1.0])
 def test_every_leaf_may_be_listed(share, device, rng):
-    """Even unnecessarily: the forces of a body with all subtrees on the lists."""
+    """Leaves may be listed unnecessarily: the forces of a body with all subtrees on the lists are right."""
     forest = wc.TetForest.box((2, 1, 1), 0.1, 9)
     young = rng.uniform(5e3, 2e4, len(forest.tets))
     body = wc.SoftBody(forest, wc.Isotropic(young, 0.4, 1000.0), device=device)

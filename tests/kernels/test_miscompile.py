@@ -67,7 +67,7 @@ def test_corotated_general_elements(uniform, device, rng):
 
 
 @pytest.mark.parametrize("name", ["type 0", "type 1", "type 2", "general"])
-def test_some_elements_left_to_the_second_kernel(name, device, rng):
+def test_some_elements_are_left_to_the_second_kernel(name, device, rng):
     """Every tenth node is displaced by an edge and more: elements that the fast iteration leaves out lie in lanes
     between those that it handles.
 

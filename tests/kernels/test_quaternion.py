@@ -82,7 +82,7 @@ def test_the_maximiser_of_every_matrix(kind, device, rng):
 
 
 @pytest.mark.parametrize("scale", [1e-42, 1e-30, 1e-15, 1e15, 1e30, 3e38])
-def test_size_does_not_matter(scale, device, rng):
+def test_the_size_of_the_matrix_does_not_matter(scale, device, rng):
     """From denormals to the largest float."""
     F = matrices(signed(rng, 0.3, True)[:1000], rng)
     F /= np.abs(F).max(axis=(1, 2), keepdims=True)
@@ -92,7 +92,7 @@ def test_size_does_not_matter(scale, device, rng):
     assert np.linalg.norm(R - best, axis=(1, 2))[gap > 0.2].max() < digits
 
 
-def test_what_is_none_gives_the_identity(device):
+def test_zero_and_invalid_matrices_give_the_identity(device):
     F = np.tile(np.eye(3, dtype=np.float32), (31, 1, 1))
     for entry in range(9):
         for k, value in enumerate((np.nan, np.inf, -np.inf)):

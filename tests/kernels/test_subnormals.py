@@ -72,7 +72,7 @@ def test_an_error_inside_puts_the_mode_back():
     assert are_kept()
 
 
-def test_nothing_is_left_of_it_after_steps_hooks_and_errors():
+def test_the_mode_is_restored_after_steps_hooks_and_errors():
     sim = simulation(gravity=(0.0, -9.8, 0.0))
     seen = []
     sim.on_step(lambda _: seen.append(are_kept()), every=3)
@@ -91,7 +91,7 @@ def test_nothing_is_left_of_it_after_steps_hooks_and_errors():
     assert are_kept()
 
 
-def test_nothing_is_left_of_it_in_a_capture_of_the_users():
+def test_the_mode_is_restored_in_a_users_capture():
     sim = simulation(gravity=(0.0, 0.0, 0.0))
     sim.step()
     with wp.ScopedCapture(device="cpu") as capture:
@@ -101,7 +101,7 @@ def test_nothing_is_left_of_it_in_a_capture_of_the_users():
     assert are_kept()
 
 
-def test_nothing_is_left_of_it_after_a_step_in_newton():
+def test_the_mode_is_restored_after_a_step_in_newton():
     newton_scenes = pytest.importorskip("newton_scenes")
     model = newton_scenes.grid_model("cpu")
     solver = newton_scenes.wn.SolverCorotated(model)

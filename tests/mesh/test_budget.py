@@ -41,7 +41,7 @@ SHAPES = {
 @pytest.mark.parametrize(
     "shape", [pytest.param(shape, marks=pytest.mark.slow) if shape == "tube" else shape for shape in SHAPES]
 )
-def test_all_of_a_body_is_in_as_many_elements_as_asked_for(shape):
+def test_the_whole_body_is_meshed_with_the_requested_number(shape):
     domain = SHAPES[shape]()
     mesh = wc.TetForest.from_domain(domain, target_elements=3000)
     found = fidelity(mesh, domain)
@@ -117,8 +117,8 @@ def test_slivers_that_connect_stay():
     assert connected_components(links)[0] == 1
 
 
-def test_a_cube_takes_what_it_is_given(tmp_path):
-    """Many of its elements have the same need, so none of them fits the number, and nothing is left to evaluate."""
+def test_a_cube_is_meshed_with_the_requested_number(tmp_path):
+    """Many of its elements have equal needs, so that none of them fits the number, and nothing is left to evaluate."""
     trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "cube.stl")
     mesh = wc.TetForest.from_domain(wc.Domain.from_surface(tmp_path / "cube.stl"), target_elements=20000)
     assert 18000 <= len(mesh.tets) <= 20000
@@ -140,8 +140,8 @@ def test_a_pipe_with_a_wall_thinner_than_its_elements_stays_whole():
     assert abs(found.volume_error) < 0.03
 
 
-def test_tips_that_hang_on_to_nothing_are_left_out_of_a_body_of_one_piece():
-    """A spike that ends in a blob of 4e-6 of the body: the elements of the blob alone are a piece."""
+def test_disconnected_tips_are_left_out_of_a_body_of_one_piece():
+    """A spike that ends in a blob of 4e-6 of the body, whose elements alone would be a piece."""
     tets = np.array([[0, 1, 2, 3], [1, 2, 3, 4], [5, 6, 7, 8]], np.int32)
     held, none = np.array([1.0, 1.0, 4.0e-6]), np.zeros(3, bool)
     ball, balls = trimesh.creation.icosphere(2), trimesh.creation.icosphere(2).apply_translation((3.0, 0.0, 0.0))

@@ -43,8 +43,8 @@ def test_fine_local_features_need_a_tenth():
     assert len(forest.tets) < 0.1 * 6 * 2**18 * volume
 
 
-def test_each_point_is_looked_at_once():
-    """Except for the last evaluation of a few elements, whose middle may be another's node."""
+def test_each_point_is_evaluated_once():
+    """Except in the last evaluation of a few elements, whose midpoint may be another element's node."""
     body = ball()
     forest = wc.TetForest.from_domain(body, 1.0, max_level=15, surface_error=1e-3)
     asked = np.concatenate(body.asked)
@@ -80,7 +80,7 @@ def test_refining_where_a_field_varies(device):
 
 
 @pytest.mark.parametrize("target", [500, 3000, 20000])
-def test_a_number_of_elements_can_be_asked_for(target):
+def test_a_number_of_elements_can_be_given(target):
     forest = wc.TetForest.from_domain(ball(), 0.5, max_level=24, target_elements=target)
     assert 0.5 * target < len(forest.tets) <= target
 
@@ -122,7 +122,7 @@ def test_the_same_mesh_comes_out_twice(device):
     assert np.array_equal(one.phi, two.phi)
 
 
-def test_an_empty_body_is_said_so():
+def test_an_empty_body_is_refused():
     with pytest.raises(wc.InputError, match="empty"):
         wc.TetForest.from_domain(Body(lambda x: np.ones(len(x)), [[0, 0, 0], [1, 1, 1]]), 0.5, max_level=6)
 

@@ -26,7 +26,7 @@ def test_share_inside_is_the_volume_of_the_convex_hull():
 
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("sliver", [0.0, 0.02, 0.3])
-def test_what_elements_hold_is_what_the_surface_encloses(shape, sliver):
+def test_filled_volumes_add_up_to_the_enclosed_volume(shape, sliver):
     forest = wc.TetForest.from_domain(SHAPES[shape][0](), 0.3, max_level=9, surface_error=3e-3, sliver=sliver)
     surface = forest.surface()
     assert held(forest) == pytest.approx(surface.volume, rel=1e-11)

@@ -92,7 +92,7 @@ def test_the_largest_piece_alone():
 
 
 @pytest.mark.parametrize("far", [1e2, 1e8, 1e20, 1e300])
-def test_points_however_far_are_held_by_elements_on_their_side(forest, far):
+def test_far_points_are_bound_to_elements_on_their_side(forest, far):
     middle = forest.points.mean(axis=0)
     for axis, sign in itertools.product(range(3), (-1.0, 1.0)):
         (element,), _ = forest.embed([middle + sign * far * np.eye(3)[axis]])

@@ -76,7 +76,7 @@ def test_cells_with_merged_corners_lose_the_flat_tetrahedra():
     assert signed_volumes(points, tets).sum() == pytest.approx(0.5)
 
 
-def test_polyhedra_go_by_the_same_rule():
+def test_polyhedra_follow_the_same_rule():
     """The cube given by its faces is split like the cube given by its corners."""
     rng = np.random.default_rng(3)
     cube = np.array(list(itertools.product((0.0, 1.0), repeat=3)))[[0, 4, 6, 2, 1, 5, 7, 3]]

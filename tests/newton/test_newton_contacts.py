@@ -73,7 +73,7 @@ class TestGround:
         creep = (places[-1] - places[1749]) / (750 * DT)
         assert creep == pytest.approx(weight[0] / (nodes * KF), rel=0.2)
 
-    def test_is_not_fallen_through(self, device):
+    def test_nothing_falls_through(self, device):
         model, pipeline = on_ground(device, vel=(0.0, 0.0, -3.0), damp=50.0)
         lowest = []
         run(
@@ -151,7 +151,7 @@ class TestBodies:
         p = model.particle_mass.numpy() @ after.particle_qd.numpy()[:, 1]
         assert p == pytest.approx(2.0 * model.particle_count * 1e-4, rel=1e-3)
 
-    def test_nobody_steps_the_bodies(self, device):
+    def test_rigid_solver_none_leaves_bodies_alone(self, device):
         """With rigid_solver=None, reactions are left in state_in.body_f, and bodies do not move."""
         model, pipeline = with_box(device, velocity=(0.0, 0.0, -1.0))
         solver = wn.SolverCorotated(model, rigid_solver=None)
@@ -164,9 +164,9 @@ class TestBodies:
         np.testing.assert_array_equal(before.body_f.numpy(), solver.body_reactions.numpy())
         assert not after.body_q.numpy().any()
 
-    def test_a_plate_that_others_move_throws_nothing(self, device):
-        """It moves on in each substep. Particles of 0.7 g on springs of 2e6 N/m would leave at metres a second if it
-        jumped by the 0.05 mm of a step."""
+    def test_a_plate_moved_by_another_solver_throws_nothing(self, device):
+        """It moves in each substep. If it jumped by the 0.05 mm of a step, particles of 0.7 g on springs of 2e6 N/m
+        would leave at metres a second."""
         made = builder(gravity=(0.0, 0.0, 0.0), radius=0.005)
         add_grid(made, dims=(2, 2, 2), cell=0.018, mu=1e6, lam=1e6, damp=1.0)
         plate = made.add_body(xform=wp.transform(wp.vec3(-0.0101, 0.018, 0.018), wp.quat_identity()))

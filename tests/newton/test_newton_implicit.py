@@ -68,7 +68,7 @@ def test_steps_agree_with_short_explicit_ones(device):
 
 
 @pytest.mark.parametrize(("young", "poisson", "dt"), [(1e9, 0.49999, DT), (1.0, 0.3, DT), (3e4, 0.4, 1e3)])
-def test_free_fall_is_right_whatever_falls(device, young, poisson, dt):
+def test_free_fall(device, young, poisson, dt):
     made = builder()
     forest = wc.TetForest.box(cells=(2, 2, 1), cell_size=0.1, level=0)
     wn.add_forest(made, forest, wc.Isotropic(young, poisson, 1000.0))
@@ -92,7 +92,7 @@ def test_a_block_rests_on_the_ground(device):
     assert solver.solves.unfinished == 0
 
 
-def test_friction_holds_below_its_angle_alone(device):
+def test_friction_holds_only_below_its_angle(device):
     """The ground's coefficient and the particles' are 0.5, and the slope's tangent is 0.4 or 0.7."""
     slid = []
     for slope in (0.4, 0.7):
@@ -166,7 +166,7 @@ def test_a_world_does_not_depend_on_others(device):
     np.testing.assert_allclose(found[per_world:], wanted.particle_q.numpy()[per_world:], rtol=0.0, **exact)
 
 
-def test_what_it_does_not_know_is_refused(device):
+def test_unsupported_models_are_refused(device):
     made = builder()
     block(made)
     model = made.finalize(device=device)

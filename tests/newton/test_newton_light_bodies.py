@@ -162,7 +162,7 @@ class TestEnergy:
             ("capsule", 0.05, 0.0, 0.05),
         ],
     )
-    def test_throws_gain_none(self, device, shape, mass, aside, cell, ke):
+    def test_throws_gain_no_energy(self, device, shape, mass, aside, cell, ke):
         """Without dampers and friction: the kinetic energy never exceeds the initial one, and the body comes back."""
         model = thrown(device, shape, mass, aside, cell, height=0.0037)
         contact_parameters(model, ke=ke, kd=0.0, kf=0.0, mu=0.0)

@@ -335,7 +335,7 @@ class TestContactOfParticles:
         assert np.abs(ends[1] - model.particle_qd.numpy()[8:]).max() > 0.1
         np.testing.assert_allclose(ends[0], ends[1], atol=2e-5 * np.abs(ends[1]).max())
 
-    def test_is_of_no_account_where_there_is_none(self, device):
+    def test_it_has_no_effect_without_contact(self, device):
         model = grid_model(device)
         apart, together = (wn.SolverCorotated(model, particle_contact=c).contact_dt for c in (False, True))
         assert together < apart

@@ -106,7 +106,7 @@ def test_a_leaning_capsule_swings_for_long(device, kind):
 
 
 class TestWhatWentWrong:
-    """A body whose assumed substep is eight times as long as the stable one."""
+    """Failed steps: a body whose assumed substep is eight times as long as the stable one."""
 
     def solver(self, device):
         made = builder(gravity=(0.0, 0.0, 0.0))

@@ -23,7 +23,7 @@ def pose(stage, path, frame):
 
 
 @pytest.mark.parametrize("form", [{}, {"metres": 0.01, "up": "Y"}])
-def test_frames_are_what_the_solver_has(tmp_path, form):
+def test_frames_have_the_state_of_the_solver(tmp_path, form):
     shown = []
     sim = written(crowd(tmp_path / "in.usda", **form).save(), tmp_path / "out.usdc", 8, shown)
     stage = Usd.Stage.Open(str(tmp_path / "out.usdc"))
@@ -46,7 +46,7 @@ def test_frames_are_what_the_solver_has(tmp_path, form):
     assert len(stress.Get(8)) == len(mesh.GetTetVertexIndicesAttr().Get()) == 72
 
 
-def test_colours_show_the_stress_where_nothing_else_is_said(tmp_path):
+def test_colours_show_the_stress_by_default(tmp_path):
     made = StageMaker(tmp_path / "in.usda")
     mesh = made.block()
     made.material(mesh)
@@ -298,7 +298,7 @@ def test_a_state_that_is_not_finite_leaves_the_frames_before(tmp_path, monkeypat
         (signal.SIGKILL, -9),
     ],
 )
-def test_whatever_ends_a_run_the_stage_opens(tmp_path, number, status):
+def test_the_stage_opens_however_a_run_ends(tmp_path, number, status):
     """Even after a kill, when the pieces play: with the looks of the stage below, and our motion."""
     crowd(tmp_path / "in.usda").save()
     command = [sys.executable, "-m", "warp_corot", "scene", "in.usda", "-o", "out.usda", "--device", "cpu"]

@@ -46,7 +46,7 @@ def bind(made, mesh, api=True, **values):
 class TestMaterials:
     @pytest.mark.parametrize("marked", [True, False])
     @pytest.mark.parametrize("form", [{}, {"metres": 0.01, "kilograms": 0.001}])
-    def test_options_are_what_the_stage_does_not_say(self, tmp_path, marked, form):
+    def test_options_fill_in_what_the_stage_does_not_define(self, tmp_path, marked, form):
         """For any TetMesh, in any units; the mass is the density times the volume."""
         path = block(tmp_path / "in.usda", material=False, marked=marked, **form)
         made = parts(path, young=7e3, poisson=0.25, density=500.0)
@@ -91,7 +91,7 @@ class TestMaterials:
         assert "density" not in made.notes[0].replace("--density is not used", "")
 
     @pytest.mark.filterwarnings("ignore:.*treating it as unauthored")
-    def test_values_that_are_none(self, tmp_path):
+    def test_invalid_values_count_as_missing(self, tmp_path):
         """Newton treats them as missing; the substitutes are reported."""
 
         def spoil(made, mesh):
@@ -209,11 +209,11 @@ class TestLyingInOneAnother:
             StageSimulation(path, device="cpu")
 
     @pytest.mark.filterwarnings("error:.*deep in")
-    def test_what_only_touches_is_not_spoken_of(self, tmp_path):
+    def test_mere_contact_is_not_reported(self, tmp_path):
         sim = simulated(block(tmp_path / "in.usda"), 1)
         assert "deep" not in "\n".join(sim.parts.notes)
 
-    def test_bodies_with_a_radius_rest_that_far_off(self, tmp_path):
+    def test_bodies_with_a_radius_rest_at_that_distance(self, tmp_path):
         """The sag of the springs at the base is less than a fiftieth of an edge."""
         path = block(tmp_path / "in.usda", ground=False)
         sim = simulated(path, 36, options=StageOptions(radius=0.04, viscosity=5e-3))

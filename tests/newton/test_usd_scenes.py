@@ -167,7 +167,7 @@ def test_materials_of_older_schemas(tmp_path):
     assert (body.young, body.poisson, body.density) == pytest.approx((7e4, 0.25, 700.0), rel=1e-4)
 
 
-def test_what_a_stage_does_not_say_is_chosen_and_said(tmp_path):
+def test_missing_values_are_chosen_and_reported(tmp_path):
     made = StageMaker(tmp_path / "stage.usda", scene=False, metres=0.01)
     made.block(marked=False)
     sim = simulated(made.save(), 24)
@@ -206,7 +206,7 @@ def test_a_box_on_joints_stays(tmp_path):
     assert StageSimulation(made.save(), device="cpu").parts.ground is None
 
 
-def test_an_expression_that_holds_nothing_is_said(tmp_path):
+def test_an_expression_that_holds_nothing_is_reported(tmp_path):
     path = standing(tmp_path / "stage.usda")
     notes = [
         StageSimulation(path, device="cpu", options=StageOptions(fix=f)).parts.notes for f in ("z > 9", "z < 0.01")
@@ -307,7 +307,7 @@ def test_attachments_to_the_world_hold_points(tmp_path):
     assert lowest == pytest.approx(0.5 * DENSITY * G * HEIGHT**2 / YOUNG, rel=0.3)
 
 
-def test_a_bar_hangs_by_what_its_weight_makes_of_it(tmp_path):
+def test_a_hanging_bar_lengthens_by_its_weight(tmp_path):
     """rho g L^2 / (2 E), exact for linear tetrahedra at zero Poisson's ratio."""
     made = StageMaker(tmp_path / "stage.usda", metres=0.01)
     made.material(made.block(cells=(1, 1, 6), at=(0.0, 0.0, 1.0)), young=2e6)

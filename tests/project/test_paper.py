@@ -190,7 +190,7 @@ def test_json_holds_what_the_table_says(device, tmp_path):
         assert found.measured in text
 
 
-def test_claims_that_do_not_hold_are_said_not_to(device):
+def test_claims_that_do_not_hold_are_reported(device):
     """If the linear model is passed as the corotated one, the report must say that the claims fail."""
     results = coarse(device)
     runs = {**results.runs, OWN: results.runs[PEER], PEER: results.runs[OWN]}

@@ -1,4 +1,4 @@
-"""What a user hands in reaches the kernels by way of few files; ``tests/support/walks.py`` prints the ways."""
+"""A user's values reach the kernels through few files; ``tests/support/walks.py`` prints the files."""
 
 import re
 

@@ -129,7 +129,7 @@ def test_compaction_changes_numbers_alone(device, rng):
 
 
 @pytest.mark.parametrize("threads", [2, 7, 5000])
-def test_any_number_of_threads_comes_to_the_same_leaves(threads, device, rng):
+def test_any_number_of_threads_makes_the_same_leaves(threads, device, rng):
     forest = wc.TetForest.box((2, 1, 1), CUBE, 2)
     found = [DeviceForest(forest, 20000, device=device) for _ in range(2)]
     found[1].threads = threads

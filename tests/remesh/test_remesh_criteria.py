@@ -119,7 +119,7 @@ def always(element: ElementState, parameters: wp.array[wp.float32]):
     return 2.0
 
 
-def test_what_holds_little_is_not_refined_for_its_own_sake(device):
+def test_nearly_empty_elements_are_refined_only_for_conformity(device):
     mesh = wc.TetForest.from_domain(wc.Domain.sphere(0.04, device=device), 0.03, max_level=4)
     forest = DeviceForest(mesh, 50_000, device=device)
     RemeshPass(forest, criterion=always, refine_above=1.0, simplify_below=0.0, max_level=20).run()

@@ -65,7 +65,7 @@ def active_twin(body, model, sim):
 
 
 def assert_goes_on(sim, model):
-    """A few steps give the same as on a mesh made that way."""
+    """A few steps give the same as on a mesh that was made that way."""
     body, fixed = sim.body, active_twin(sim.body, model, sim)
     for each in (sim, fixed):
         each.advance_steps(3)
@@ -107,7 +107,7 @@ def test_steps_go_on_as_on_a_mesh_made_that_way(kind, model, device):
 
 @pytest.mark.parametrize("model", MODELS, ids=repr)
 @pytest.mark.parametrize("has_fibres", [False, True], ids=["isotropic", "fibres"])
-def test_elements_that_a_body_takes_a_share_of(has_fibres, model, device, rng):
+def test_partly_filled_elements(has_fibres, model, device, rng):
     mesh = ball(device)
     count = len(mesh.tets)
     stiffer = rng.uniform(0.5, 2.0, count)
@@ -161,7 +161,7 @@ def test_fibres_pull_by_where_they_are(device):
         sim.advance_steps(2)
 
 
-def test_keyframes_of_single_elements_go_to_what_is_made_of_them(device, rng):
+def test_keyframes_of_single_elements_go_to_their_children(device, rng):
     mesh = wc.TetForest.box((2, 1, 1), 0.05, 3)
     body = wc.SoftBody(mesh, muscle([1, 1, 0]), device=device)
     body.fix([0])
@@ -195,7 +195,7 @@ def by_corners(corners):
     return {frozenset(map(tuple, each)): n for n, each in enumerate(corners.tolist())}
 
 
-def test_what_a_parent_has_of_its_children(device, rng):
+def test_what_a_parent_takes_from_its_children(device, rng):
     mesh = ball(device)
     count = len(mesh.tets)
     material = wood(random_axes(rng, count), young=rng.uniform(0.5, 2.0, (count, 1)) * [3e4, 8e3, 4e3])
@@ -232,7 +232,7 @@ def test_what_a_parent_has_of_its_children(device, rng):
     np.testing.assert_array_equal(still_follows, follows[first])
 
 
-def test_what_is_written_to_activation_is_taken_over_by_a_pass(device):
+def test_a_pass_keeps_what_is_written_to_activation(device):
     body = bar(muscle([1, 0, 0]), device)
     before = body.activation
     remesh = near(0.1, device)

@@ -41,7 +41,7 @@ def elements_after_a_step(criterion, numbers, device, **options):
     return body.element_count
 
 
-def test_a_criterion_of_a_users_is_made_of_exported_names(device):
+def test_a_users_criterion_needs_only_exported_names(device):
     edge = SIZE / 4 * np.sqrt(3.0)  # the longest one of elements of type 0
     limits = {"refine_above": 0.2, "simplify_below": 0.1}
     assert elements_after_a_step(strain_of_long_elements, [SIZE / 4, 0.99 * edge], device, **limits) > 384

@@ -34,7 +34,7 @@ def test_remeshed_bodies_resist_and_move_as_finely_meshed_ones(name, criterion, 
     assert max(map(abs, coarse.errors(fine).values())) > 0.02
 
 
-def test_what_is_let_go_is_coarse_again(device):
+def test_a_released_bar_is_coarse_again(device):
     """A bar that is stretched and brought back has its initial mesh and masses, and is straight."""
     scene = SCENES["bar"]
     mesh = scene.mesh(5)

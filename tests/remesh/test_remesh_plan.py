@@ -198,7 +198,7 @@ def test_a_pass_that_changes_nothing_leaves_the_plan_alone(device):
 
 
 @pytest.mark.parametrize("threads", [2, 7, 5000])
-def test_any_number_of_threads_comes_to_the_same_plan(threads, device, rng):
+def test_any_number_of_threads_makes_the_same_plan(threads, device, rng):
     forest = made("uniform", device)
     forest.threads = threads
     remesh, plan = RemeshPass(forest), DevicePlan(forest, 4)

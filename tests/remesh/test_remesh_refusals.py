@@ -61,7 +61,7 @@ def test_what_is_refused_leaves_all_bodies_as_they_are(device):
 @pytest.mark.parametrize(
     "go", [lambda sim: sim.step(), lambda sim: sim.advance(sim.dt), lambda sim: sim.advance_steps(1)]
 )
-def test_a_full_mesh_is_said_at_the_line_of_the_user(go, device):
+def test_a_full_mesh_warns_at_the_users_line(go, device):
     body = bar(device)
     sim = wc.Simulation(body, remesh=near(0.1, device, every=1, capacity=body.element_count))
     with pytest.warns(wc.CapacityWarning) as said:

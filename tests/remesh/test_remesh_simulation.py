@@ -24,7 +24,7 @@ def test_arrays_are_those_of_the_present_mesh(device):
     assert len(sim.von_mises()) == body.element_count
 
 
-def test_old_views_say_that_they_are_stale(device):
+def test_old_views_raise_an_error(device):
     body = bar(device)
     before = body.positions
     sim = wc.Simulation(body, remesh=near(0.1, device))
@@ -131,7 +131,7 @@ def test_the_initial_state_is_one_on_the_mesh_of_its_time(device):
     np.testing.assert_array_equal(body.displacements.numpy(), moved)
 
 
-def test_a_full_mesh_is_said_once_and_goes_on(device):
+def test_a_full_mesh_warns_once_and_continues(device):
     body = bar(device)
     count = body.element_count
     sim = wc.Simulation(body, remesh=near(0.1, device, capacity=count + 40, simplify_below=0.0))

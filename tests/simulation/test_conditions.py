@@ -134,7 +134,7 @@ def test_a_hand_that_drags_leaves_recorded_steps_as_they_are(device):
     assert [t.host_nodes.tolist() for t in body.conditions.trajectories] == [[top[-1]]]
 
 
-def test_a_node_that_is_let_go_is_as_heavy_as_before(device):
+def test_a_released_node_has_its_former_mass(device):
     sim = bar(device)
     before = sim.body.node_inverse_mass.numpy().copy()
     top = top_of(sim)

@@ -18,7 +18,7 @@ def some_forces(sim, rng):
 
 
 @pytest.mark.parametrize("steps", [1, 70], ids=["a step", "runs of steps"])
-def test_every_form_of_array_comes_to_the_same_bit_by_bit(form, steps, device, rng):
+def test_every_form_of_array_gives_the_same_bits(form, steps, device, rng):
     """Compared with loads and positions of the body itself."""
     ordinary, sim = bar(device, gravity=(0.0, -9.81, 0.0)), bar(device, gravity=(0.0, -9.81, 0.0))
     n = sim.body.node_count
@@ -55,7 +55,7 @@ def test_forces_become_momentum(form, device, rng):
     np.testing.assert_allclose(momentum, expected, atol=2e-5 * DT * 70)
 
 
-def test_written_positions_are_where_steps_go_on(form, device):
+def test_steps_continue_from_written_positions(form, device):
     """A free body placed elsewhere without strain stays there; a stretched one contracts."""
     sim = bar(device, fixed=False)
     x = sim.body.mesh.points

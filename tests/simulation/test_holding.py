@@ -87,7 +87,7 @@ def test_organs_do_not_topple(shape):
         assert "lowest 10 %" in chosen.reasons()[0]
 
 
-def test_what_is_not_chosen_topples():
+def test_a_patch_that_is_not_chosen_lets_the_body_topple():
     """The estimate is needed: a pear fixed at its lower tip does topple."""
     mesh = shaped(gall_bladder)
     tip = mesh.points[:, 2] < mesh.points[:, 2].min() + 0.1 * np.ptp(mesh.points[:, 2])
@@ -95,7 +95,7 @@ def test_what_is_not_chosen_topples():
     assert largest_displacement(mesh, tip, soft(mesh), 0.5) > 1.0
 
 
-def test_what_stands_stays_standing():
+def test_a_standing_body_stays_standing():
     cube = wc.TetForest.box((2, 2, 2), 0.05, 3)
     (hold,) = held(cube).pieces
     assert hold.stands
@@ -181,7 +181,7 @@ def test_arms_next_to_one_another_are_not_one():
     assert own == pytest.approx(settled, rel=0.03)
 
 
-def test_a_crumb_that_dangles_says_nothing_of_the_body():
+def test_a_dangling_crumb_does_not_count():
     """A nearly empty tetrahedron on a face."""
     cube = wc.TetForest.box((1, 1, 1), 0.1, 6)
     held = np.flatnonzero(cube.points[:, 2] == 0.0)

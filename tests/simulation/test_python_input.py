@@ -48,7 +48,7 @@ def body(mesh):
         (lambda mesh: wc.Simulation.load(5), "path is 5"),
     ],
 )
-def test_what_a_body_is_not_made_of(mesh, make, said):
+def test_wrong_arguments_of_a_body(mesh, make, said):
     with pytest.raises(wc.InputError, match=said) as raised:
         make(mesh)
     assert "\n" not in str(raised.value)
@@ -72,7 +72,7 @@ def test_what_a_body_is_not_made_of(mesh, make, said):
         (lambda sim: wc.record(sim.body, "a.usd", duration=1.0), r"sim is .*SoftBody.*Simulation\(body\)"),
     ],
 )
-def test_what_a_simulation_does_not_take(body, use, said, folder):
+def test_wrong_arguments_of_a_simulation(body, use, said, folder):
     with pytest.raises(wc.InputError, match=said):
         use(wc.Simulation(body))
     assert not list(folder.iterdir())
@@ -125,8 +125,9 @@ CALLS = [
         if name != "affine"
     ],
 )
-def test_what_no_argument_is(call, right, name):
-    """An InputError, or, where a part of it is meant, a result; no error of NumPy's or Warp's."""
+def test_odd_values_in_every_argument(call, right, name):
+    """The call raises an InputError, or gives a result if the value can be meant; it never raises an error of NumPy or
+    Warp."""
     call(**right)
     said = []
     for wrong in NOTHING:

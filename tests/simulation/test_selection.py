@@ -91,7 +91,7 @@ def test_given_bounds_are_used():
         ("z < 1 and " * 200 + "z < 1", "at most 1000"),
     ],
 )
-def test_anything_else_is_one_clear_line(expression, said):
+def test_other_expressions_are_refused_in_one_line(expression, said):
     with pytest.raises(wc.InputError, match="expression ") as caught:
         select_nodes(expression, POINTS)
     assert said in str(caught.value)

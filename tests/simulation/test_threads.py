@@ -18,7 +18,7 @@ def swinging() -> wc.Simulation:
 
 
 def run(sim: wc.Simulation) -> np.ndarray:
-    """Runs of all lengths, each of which is recorded anew, with what users do in between."""
+    """Runs of several lengths, each of which is recorded separately, with a user's actions in between."""
     for count in range(1, 20):
         sim.advance_steps(count)
         sim.body.load("z == zmax", (0.0, 1e-3 * count, 0.0))
@@ -40,7 +40,7 @@ def test_simulations_in_threads_are_those_of_one_thread():
         np.testing.assert_array_equal(each, alone)
 
 
-def test_a_thread_that_waits_has_its_turn():
+def test_a_waiting_thread_gets_its_turn():
     """A long run does not keep others from reading its body."""
     sim, read = swinging(), threading.Event()
     ends_early: list[int] = []
@@ -73,7 +73,7 @@ def test_bodies_and_simulations_are_not_copied(take):
         take(sim)
 
 
-def test_what_has_no_state_is_copied():
+def test_things_without_state_can_be_copied():
     mesh = wc.TetForest.box((1, 1, 1), 0.1, 3)
     for each in (mesh, wc.Isotropic(5e3, 0.3, 1e3), wc.Corotated(), wc.Contact(), wc.BackwardEuler(), mesh.surface()):
         assert type(pickle.loads(pickle.dumps(each))) is type(each)

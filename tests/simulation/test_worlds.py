@@ -40,7 +40,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("mesh", "model"), CASES, ids=repr)
-def test_every_world_is_a_body_of_its_own(mesh, model, device, rng):
+def test_every_world_equals_a_single_body(mesh, model, device, rng):
     scene = Scene(MESHES[mesh](), rng)
     sim = simulated(scene.together(device), model)
     sim.advance_steps(25)
@@ -57,7 +57,7 @@ def test_every_world_is_a_body_of_its_own(mesh, model, device, rng):
 
 
 @pytest.mark.parametrize("model", [wc.Corotated(), wc.Corotated(rotation_level=0), wc.MassSpring()], ids=repr)
-def test_a_number_for_each_world_is_as_a_number_for_a_body(model, device):
+def test_a_number_for_each_world_equals_a_number_for_a_body(model, device):
     """Shared rotations with one material use another kernel than with several: equal except for rounding."""
     young = [2e3, 5e3, 9e3]
     sim = simulated(beam(device, young=np.reshape(young, (3, 1))), model)

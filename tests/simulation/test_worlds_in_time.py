@@ -16,7 +16,7 @@ from warp_corot.io.write.animate import record
 
 @pytest.mark.parametrize("worlds", [1, 3])
 @pytest.mark.parametrize("count", [1, 2, 3])
-def test_keyframes_for_all_nodes_alike(count, worlds, device):
+def test_keyframes_shared_by_all_nodes(count, worlds, device):
     """[K, 3], even if the number of nodes equals the number of vector components."""
     body = beam(device, worlds=worlds)
     end = np.array([0.001, 0.002, 0.003])
@@ -234,7 +234,7 @@ def test_many_unstable_worlds_are_counted():
         simulated(body, wc.StVenantKirchhoff()).advance_steps(100)
 
 
-def test_a_reset_before_anybody_looked_forgets_what_was_unstable(device):
+def test_a_reset_before_the_check_forgets_an_unstable_world(device):
     """Recorded steps are not checked; a world that has been reset since does not stop the run."""
     for worlds in (None, [1]):
         sim = simulated(beam(device), wc.StVenantKirchhoff())

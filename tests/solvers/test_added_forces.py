@@ -14,7 +14,7 @@ def pull_home(stiffness: float, mass: wp.array[wp.float32], u: wp.array[wp.vec4]
 
 
 class Springs:
-    """Pull every node to where it was at rest [1/s^2 for each kilogramme]."""
+    """Pull every node to its rest position [1/s^2, for each kilogram of its mass]."""
 
     def __init__(self, body, curvature, *, says_so=True):
         self.body, self.stiffness = body, curvature
@@ -34,7 +34,8 @@ def block(device, worlds=1):
 
 @pytest.mark.parametrize("worlds", [1, 2])
 def test_a_spring_that_gives_energy_back_is_no_error(device, worlds):
-    """A body bounces on springs as on one: height g / w^2 (1 - cos w t), with the step it has without them."""
+    """A body bounces on springs like on a single one: its height is g / w^2 (1 - cos w t), with the same steps as
+    without them."""
     body = block(device, worlds)
     sim = wc.Simulation(body)
     longest, w2 = sim.dt, 100.0
@@ -62,7 +63,7 @@ def test_a_stiff_spring_shortens_the_step(device):
     assert np.abs(body.displacements.numpy()).max() < 1e-5
 
 
-def test_forces_that_are_none_are_refused(device):
+def test_invalid_forces_are_refused(device):
     sim = wc.Simulation(block(device))
     with pytest.raises(wc.InputError, match="add_forces"):
         sim.add_forces(3.0)

@@ -152,7 +152,7 @@ def test_steps_of_the_beam_that_shares_its_dilatation(worlds, device):
 
 
 def check_shared_steps(name, form, worlds, up, device):
-    """From a start that takes some elements beyond a quarter of their volume."""
+    """The start takes some elements beyond a quarter of their volume."""
     sims = pair(device, forest(name), up, form=form, worlds=worlds, amount=0.25, dt=2e-5, shared=True)
     for steps, most in ((1, ONE), (30, MANY)):
         for sim in sims:
@@ -228,7 +228,7 @@ def test_single_crushed_subtrees_are_repaired(device):
 # --- what changes on the way ---------------------------------------------------------------------------------------
 
 
-def test_what_is_held_and_loaded_may_change(up, device):
+def test_supports_and_loads_may_change(up, device):
     mesh = forest("type 2")
     sims = pair(device, mesh, up, worlds=2, loads=False)
     z = mesh.points[:, 2]
@@ -343,7 +343,7 @@ def test_a_world_that_is_not_finite_leaves_the_others(device):
     np.testing.assert_array_equal(a, b)
 
 
-def test_bodies_that_are_not_for_blocks(device):
+def test_bodies_that_blocks_do_not_step(device):
     """Too large, with several kinds of subtrees, without subtrees, with another law, or with rotations from higher
     up."""
     beam = wc.TetForest.box((1, 1, 3), CUBE, 6)

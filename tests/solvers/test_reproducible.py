@@ -181,7 +181,7 @@ def test_a_resumed_run_is_the_uninterrupted_one_bit_by_bit(device, tmp_path):
 
 @pytest.mark.parametrize(("mesh", "model"), CASES, ids=repr)
 @pytest.mark.parametrize("amount", [0.1, 0.9])
-def test_sums_in_one_order_are_the_same_forces(mesh, model, amount, device):
+def test_sums_in_one_order_give_the_same_forces(mesh, model, amount, device):
     """Up to some fifty forces at a node, each rounded to 6e-8: 1e-6 of the largest times a few."""
     if device == "cpu":
         pytest.skip("one thread, one order: nothing is done differently")

@@ -73,7 +73,7 @@ def test_anisotropic_bodies_are_stiff_along_their_fibres():
     assert largest(5e4, 5e3, 0.45, 0.45, shear) > 1.2 * isotropic
 
 
-def test_of_rotations_that_are_shared_the_own_level_gives_the_own():
+def test_shared_rotations_at_the_leaves_level_are_own_rotations():
     mesh = cases.oracle_mesh(wc.TetForest.box((1, 1, 1), cases.CUBE, 3))
     x = bent(mesh)
     own = spectrum.stiffness("corotated", mesh, x, 3.0, 5.0)

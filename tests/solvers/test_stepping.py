@@ -140,8 +140,8 @@ def test_worlds_share_the_smallest_step(device):
 # --- going back ----------------------------------------------------------------------------------------------------
 
 
-def test_a_state_gone_wrong_is_made_again_with_half_the_step(device):
-    """A blow between two measurements: the state before does not show that the step must be so short."""
+def test_a_failed_run_is_repeated_with_half_the_step(device):
+    """A blow between two measurements: the state before it does not show that the step must be so short."""
     sim = wc.Simulation(beam(device), gravity=(0, 0, 0))
     sim.advance_steps(INTERVAL + 1)
     velocities = np.zeros((sim.body.node_count, 3))
@@ -218,7 +218,7 @@ def wound(sim):
 @pytest.mark.parametrize("model", [wc.Corotated(), wc.NeoHookean(), wc.MassSpring()], ids=repr)
 @pytest.mark.parametrize("act", [pushed, pulled, wound])
 @pytest.mark.filterwarnings("ignore:the state went wrong")
-def test_work_that_is_put_in_is_not_taken_for_energy_from_nowhere(device, model, act):
+def test_work_put_in_is_not_energy_from_nowhere(device, model, act):
     for dt in (None, 1e-4):
         sim = wc.Simulation(beam(device), model=model, gravity=(0, 0, 0), integrator=wc.SymplecticEuler(dt=dt))
         act(sim)
@@ -240,7 +240,7 @@ def test_the_balance_accounts_for_supports_to_the_digits_of_the_forces(device):
     assert drift < 1e-3 * scale
 
 
-def test_states_written_from_outside_begin_a_new_balance(device):
+def test_states_that_a_user_writes_begin_a_new_balance(device):
     sim = wc.Simulation(beam(device), gravity=(0, 0, 0))
     sim.advance(0.05)
     stretched(sim.body, 0.5)

@@ -70,7 +70,7 @@ def test_the_ordinary_call_is_one_graph(device, calls):
     assert calls == {"waits": 1, "graphs": 1}
 
 
-def test_what_the_host_knows_is_not_asked_for(device, calls):
+def test_the_host_does_not_ask_for_what_it_knows(device, calls):
     sim = simulation(device)
     sim.advance(0.01)
     calls.clear()
@@ -125,7 +125,7 @@ def test_a_hand_that_pushes_costs_nothing_more(device, calls):
 
 @pytest.mark.parametrize("dt", [None, 2e-4])
 def test_a_hand_that_shakes_held_nodes_is_no_fault(device, dt):
-    """At any velocities; the user sets the state each time."""
+    """Held nodes move at any velocity; the user sets the state each time."""
     sim = simulation(device, dt=dt)
     end = np.flatnonzero(sim.body.mesh.points[:, 2] > 0.192 - 1e-9)
     rng = np.random.default_rng(5)
@@ -136,8 +136,8 @@ def test_a_hand_that_shakes_held_nodes_is_no_fault(device, dt):
 
 
 @pytest.mark.parametrize("dt", [None, 5e-4])
-def test_loads_that_come_and_go_put_in_what_they_do(device, dt):
-    """Their work counts while they act: their energy does not come from nowhere when they are gone."""
+def test_the_work_of_temporary_loads_counts(device, dt):
+    """Their work counts while they act, so that their energy does not seem to come from nowhere when they are gone."""
     sim = wc.Simulation(beam(device), gravity=(0, 0, 0), integrator=wc.SymplecticEuler(dt=dt))
     end = np.flatnonzero(sim.body.mesh.points[:, 2] > 0.192 - 1e-9)
     for k in range(60):

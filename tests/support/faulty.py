@@ -1,4 +1,4 @@
-"""A run on several ranks of which rank 1 ends in the middle: ``mpirun -n 2 python faulty.py killed out.usda``."""
+"""A run on several ranks, in which rank 1 ends in the middle: ``mpirun -n 2 python faulty.py killed out.usda``."""
 
 import os
 import signal

@@ -200,7 +200,7 @@ def _see(mesh) -> None:
 
 @contextmanager
 def said_by_all():
-    """Output to stdout and stderr, by libraries too."""
+    """The output to stdout and stderr, including that of libraries."""
     sys.stdout.flush()
     sys.stderr.flush()
     kept = [os.dup(1), os.dup(2)]
@@ -221,7 +221,7 @@ def said_by_all():
 
 
 def files_in(folder: Path) -> dict[str, tuple[int, int]]:
-    """All files, with their sizes and times, but what Warp's compiler keeps until the process ends."""
+    """All files with their sizes and times, except those that Warp's compiler keeps until the process ends."""
     found = {}
     for below, folders, names in os.walk(folder):
         folders[:] = [name for name in folders if not name.startswith("wp_pch_")]
@@ -242,7 +242,7 @@ def outputs(command: list[str]) -> set[str]:
 
 
 def wrong_with(command: list[str], folder: Path) -> str | None:
-    """An error in the end of a command, if any: neither a body nor one line, or a file is touched."""
+    """What is wrong with the end of a command, if anything: it is neither a body nor one line, or it touched a file."""
     from warp_corot.cli import main
 
     before = files_in(folder)

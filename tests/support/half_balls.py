@@ -13,7 +13,8 @@ HALF = 0.032  # of the block that stands for the half-space [m]
 
 
 def boussinesq(points):
-    """Displacements of a half-space z < 0 under a force at the origin: right far away, whatever is pressed how."""
+    """Displacements of a half-space z < 0 under a force at the origin; far away they are right for any pressure
+    distribution with that force."""
     x, y, z = points[:, 0], points[:, 1], -points[:, 2]
     shear = 0.5 * YOUNG / (1.0 + POISSON)
     r = np.sqrt(x**2 + y**2 + z**2)
@@ -38,10 +39,8 @@ def border(x):
 
 
 def half_ball(device, finest, radius, force, nearer, turn):
-    """The part of an elastic ball around the place where it is touched, the surface of a half-space but for that place.
-
-    It comes nearer to the other one by so many metres, below it, or above it and turned if there is a turn.
-    """
+    """The part of an elastic ball around the place of contact: a half-space whose surface is curved there. It
+    approaches the other one by this distance [m], from below, or, if there is a rotation, rotated and from above."""
     mesh = refined_block(finest)
     x, edge = mesh.points.copy(), border(mesh.points)
     moved = boussinesq(x[edge]) * force / FORCE + (0.0, 0.0, nearer)

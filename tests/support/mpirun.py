@@ -18,11 +18,8 @@ needs_mpi = pytest.mark.skipif(
 
 
 def on_ranks(count: int, *command: str, timeout: float = 900.0) -> subprocess.CompletedProcess:
-    """Run Python with these arguments on so many ranks, more than there are cores if need be.
-
-    Raises:
-        TimeoutError: The run hangs; all its processes are ended.
-    """
+    """Run Python with these arguments on this number of ranks, even if there are fewer cores. Raises TimeoutError if
+    the run hangs; all its processes are then ended."""
     assert MPIRUN is not None
     start = [MPIRUN, "--oversubscribe", "--allow-run-as-root", "-n", str(count), sys.executable, *command]
     environment = {**os.environ, "OMPI_MCA_mpi_yield_when_idle": "1", "OMP_NUM_THREADS": "1"}

@@ -46,13 +46,13 @@ def body_of(mesh: wc.TetForest | wc.TetMesh, poisson: float, worlds: int = 1) ->
 
 
 def touched(mesh: wc.TetForest | None = None) -> wc.SoftBody:
-    """A soft block."""
+    """A soft block that touches obstacles."""
     mesh = wc.TetForest.box((1, 1, 2), 0.05, level=4) if mesh is None else mesh
     return wc.SoftBody(mesh, wc.Isotropic(2e3, 0.3, 1000.0), device="cpu")
 
 
 def obstacles_of(case: str) -> list[wc.Ground | wc.Tool]:
-    """What the block falls on, and what comes down on its edges, between its nodes."""
+    """The obstacle on which the block falls, and the one that comes down on its edges, between its nodes."""
     if case != "touched":
         return []
     tool = wc.Tool(wc.Capsule(0.004, 0.06))
@@ -82,7 +82,7 @@ CASES = {
 
 
 def moved(sim: wc.Simulation, body: wc.SoftBody) -> None:
-    """Move a body for 0.04 s; its load ends on the way."""
+    """Move a body for 0.04 s; its load ends during that time."""
     for number in (1, 2, 3):
         sim.advance_until(number / 100)
     body.load("z > 0.09 and z < 0.1", [0.0, 0.0, 0.0])
@@ -90,13 +90,13 @@ def moved(sim: wc.Simulation, body: wc.SoftBody) -> None:
 
 
 def options_of(case: str) -> dict[str, Any]:
-    """How a case is stepped."""
+    """The options with which a case is stepped."""
     integrator = INTEGRATORS.get(case, wc.SymplecticEuler)()
     return {"model": MODELS.get(case), "obstacles": obstacles_of(case), "integrator": integrator}
 
 
 def made(case: str, deterministic: bool, kept: Path | None) -> dict[str, np.ndarray | None]:
-    """What a run finds; with a file to keep, also that of the same run after a checkpoint."""
+    """The results of a run; if a file is given, also those of the same run after a checkpoint in it."""
     import warp_corot.distributed as wd
 
     body, options = CASES[case](), options_of(case)
@@ -114,7 +114,7 @@ def made(case: str, deterministic: bool, kept: Path | None) -> dict[str, np.ndar
 
 
 def resumed(path: Path) -> dict[str, np.ndarray | None]:
-    """What a run finds that goes on from a checkpoint."""
+    """The results of a run that resumes from a checkpoint."""
     import warp_corot.distributed as wd
 
     sim = wd.Simulation.load(path)
@@ -124,7 +124,7 @@ def resumed(path: Path) -> dict[str, np.ndarray | None]:
 
 
 def touched_in_parts() -> np.ndarray | None:
-    """The run "touched" of a mesh that no rank holds whole; the positions of all nodes on rank 0."""
+    """The run "touched" with a mesh of which each rank holds a part; the positions of all nodes on rank 0."""
     import warp_corot.distributed as wd
 
     body = touched(wd.box((1, 1, 2), 0.05, level=4))
@@ -134,7 +134,8 @@ def touched_in_parts() -> np.ndarray | None:
 
 
 def worlds_in_parts(stage: Path) -> dict[str, np.ndarray | None]:
-    """The run "worlds" of a mesh that no rank holds whole, recorded; and once more with no room on the last rank."""
+    """The run "worlds" with a mesh of which each rank holds a part, recorded; and once more with no disk space on the
+    last rank."""
     import warp_corot.distributed as wd
 
     body = body_of(wd.box((1, 1, 3), 0.064, level=4), 0.3, worlds=2)
@@ -160,10 +161,8 @@ def worlds_in_parts(stage: Path) -> dict[str, np.ndarray | None]:
 
 
 def make_all(folder: Path, size: int, names: list[str]) -> None:
-    """Make runs on the ranks that there are, and write what they find.
-
-    One rank keeps the checkpoint of "forest", from which several go on; these keep that of "touched".
-    """
+    """Make runs on the present ranks, and write their results. One rank keeps the checkpoint of "forest", from which
+    several ranks resume; these keep that of "touched"."""
     found: dict[str, Any] = {}
     for name in names:
         keeps = (name == "forest" and size == 1) or (name == "touched")

@@ -22,13 +22,13 @@ def of_nodes(mesh):
 
 
 def of_neighbours(mesh):
-    """Neighbours in a general mesh, [groups, T]; what such groups are is tested by themselves."""
+    """Groups of neighbours in a general mesh, [groups, T]; their properties have their own tests."""
     group, count = neighbour_groups(mesh.points, mesh.tets), len(mesh.tets)
     return coo_matrix((np.ones(count), (group, np.arange(count)))).tocsr()
 
 
 def of_forest(forest):
-    """Groups from the bottom of the tree upwards, leaf by leaf as one would do it by hand, [groups, T]."""
+    """Groups from the bottom of the tree upwards, formed leaf by leaf, [groups, T]."""
     tree = forest.tree
     leaf_of = {int(element): k for k, element in enumerate(tree.leaves)}
     groups = []
@@ -69,7 +69,7 @@ MEASURES = {
 
 
 def energy(law, mesh, groups, lam, u):
-    """The energy that lambda multiplies [J]."""
+    """The energy of the shared dilatation, the part that lambda multiplies [J]."""
     reference = oracle.Mesh(mesh.points, mesh.tets)
     theta = MEASURES[law](reference.deformation_gradients(reference.points + u))
     weights = groups @ (lam * reference.volumes)

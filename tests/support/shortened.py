@@ -1,7 +1,5 @@
-"""Pairs of test parameters of which the default run takes some; the others are slow.
-
-Each law on each kind of mesh is a kernel of its own, and compiling it takes longer than running it.
-"""
+"""Pairs of test parameters, of which the default run takes some; the others are slow. Each law on each kind of mesh is
+a separate kernel, and compiling it takes longer than running it."""
 
 from collections.abc import Callable, Iterable
 

@@ -1,4 +1,4 @@
-"""Blocks of soft tissue that touch obstacles, and what is felt and moves."""
+"""Blocks of soft tissue that touch obstacles, with the forces on them and their motion."""
 
 import warp_corot as wc
 

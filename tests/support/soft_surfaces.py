@@ -1,4 +1,4 @@
-"""Soft blocks, bodies with edges that cross, and with arms that meet; and what they feel."""
+"""Soft blocks, bodies with crossing edges, and bodies with arms that meet; and the forces on them."""
 
 import numpy as np
 

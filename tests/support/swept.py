@@ -22,14 +22,14 @@ def deadly(a: float, b: float, folder: str) -> dict[str, float]:
 
 
 def failing(a: float, folder: str) -> float:
-    """Fails for a = 2 until somebody has put things right."""
+    """Fails for a = 2 until the cause is removed."""
     if a == 2 and not (Path(folder) / "right").exists():
         raise ValueError("a is two")
     return a
 
 
 def side_by_side(a: list[float], b: list[float], folder: list[str]) -> dict[str, list[float]]:
-    """All products at once; fails where some a is 3 beside others."""
+    """All products in one call; it fails if an a is 3 beside others."""
     with open(Path(folder[0]) / "calls.txt", "a") as calls:
         calls.write(f"{len(a)}\n")
     if 3 in a and len(a) > 1:

@@ -1,9 +1,7 @@
-"""Follows what a user hands in from file to file, to the kernels that get it: ``python tests/support/walks.py``.
-
-A file counts when a variable of one of its functions holds the thing, or a number that was made of it. A move from one
-file to another counts once; it is a return if the other was left before. Prints for each word the files entered, the
-returns, and the files in the order in which they are entered first.
-"""
+"""Follows a user's values from file to file, to the kernels that get them: ``python tests/support/walks.py``. A file
+counts if a variable of one of its functions holds the value, or a number made of it. A move from one file to another
+counts once; it is a return if the other file was left before. Prints for each word the files entered, the returns, and
+the files in the order of their first entry."""
 
 from __future__ import annotations
 
@@ -25,7 +23,7 @@ LAME = (YOUNG / (2 + 2 * POISSON), YOUNG * POISSON / ((1 + POISSON) * (1 - 2 * P
 
 
 class Level(int):
-    """A number that is known again."""
+    """A number that can be recognised again."""
 
 
 def holds_number(value: Any, wanted: tuple[float, ...]) -> bool:
@@ -44,7 +42,7 @@ def holds_number(value: Any, wanted: tuple[float, ...]) -> bool:
 
 
 def parts_of(value: Any) -> list[Any]:
-    """What a value is made of, if it is a list or a struct of Warp's."""
+    """The parts of a value, if it is a list or a struct of Warp's."""
     if isinstance(value, list | tuple):
         return [part for each in value for part in (each, *parts_of(each))]
     if type(value).__name__ == "StructInstance" or hasattr(value, "_cls"):

@@ -1,4 +1,5 @@
-"""Who may come in: without a token this computer, with one those who bring it; all else is refused."""
+"""Access to the page: without a token from this computer only, with one for those who bring it; everything else is
+refused."""
 
 import http.client
 import socket

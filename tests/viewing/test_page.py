@@ -56,7 +56,7 @@ def new_tab(chromium, page):
 
 
 def until(true, what):
-    """Wait until something is so."""
+    """Wait until a condition holds."""
     end = time.monotonic() + PATIENCE
     while time.monotonic() < end:
         if true():
@@ -79,7 +79,7 @@ def press_mouse(tab, page, by=(80, -60)):
 
 
 def drawn(tab):
-    """Where the scene of a tab is not empty, bool [rows, columns]; what lies over it is left out."""
+    """Where the scene in a tab is not empty, bool [rows, columns]; what covers it is left out."""
     picture = np.asarray(Image.open(io.BytesIO(tab.screenshot(clip=SCENE))).convert("RGB"))
     return np.pad(picture.min(axis=2) < 250, ((SCENE["y"], 0), (0, 0)))
 
@@ -90,7 +90,7 @@ def held(page):
 
 
 def newtons(tab):
-    """The force that the page tells [N]."""
+    """The force that the page shows [N]."""
     text = tab.get_by_text("force on the tissue").inner_text()
     number, unit = re.search(r"([\d.e-]+) (m?N)", text).groups()
     return float(number) * (1e-3 if unit == "mN" else 1.0)

@@ -23,7 +23,7 @@ def ticks(of, count):
 
 
 def still(of, seconds):
-    """A frame after so much simulated time, whatever the clock on the wall says."""
+    """A frame after this much simulated time, whatever the wall clock says."""
     of.take_commands()
     of.sim.advance(seconds)
     return of.frame()
@@ -141,7 +141,7 @@ def test_reset_goes_back_to_the_beginning():
     np.testing.assert_allclose(frame.positions[0], page.shown[0].rest, atol=1e-7)
 
 
-def test_time_goes_by_as_asked_and_says_when_it_cannot():
+def test_time_runs_as_requested_or_the_page_says_so():
     pace = Pace(rate=0.1)
     assert pace.wanted(1.0, 0.03) == pytest.approx(0.1 * 0.03)
     assert pace.wanted(0.05, 0.03) == pytest.approx(0.05 * 0.03)
@@ -176,7 +176,7 @@ def test_colours(colors):
     assert frame.highest == {"level": 6.0, "": 0.0}.get(colors, frame.highest)
 
 
-def test_a_level_that_is_no_tree_s_is_no_source():
+def test_levels_are_no_colours_without_a_tree():
     forest = wc.TetForest.box(cells=(1, 1, 1), cell_size=0.1, level=3)
     body = wc.SoftBody(wc.TetMesh(forest.points, forest.tets), wc.Isotropic(5e3, 0.4, 1000.0), device="cpu")
     page = Session(wc.Simulation(body))
@@ -257,7 +257,7 @@ def test_switched_motion_goes_on(what, of, device):
 
 
 def test_switched_and_back_it_is_the_same_motion():
-    """What goes on with the same law ends where it would have."""
+    """A motion that is continued with the same law ends where it would have ended."""
     one, other = moving(), moving()
     other.switch()
     for page in (one, other):
@@ -351,7 +351,7 @@ def test_a_visitor_grasps_with_a_tool(device):
     assert np.abs(page.sim.body.displacements.numpy()).max() < 5e-4
 
 
-def test_what_no_visitor_moves_is_said():
+def test_tools_that_a_visitor_cannot_move_are_named():
     page, tool = with_tool()
     page.ask(lambda: page.press_tool(1, 1))
     page.take_commands()

@@ -17,7 +17,7 @@ def under_hands(sim):
 
 
 class Stiff(Drag):
-    """As stiff as with the longest step, whatever the step is."""
+    """A spring as stiff as with the longest step, whatever the step is."""
 
     def __init__(self, springs, shown, pick, radius):
         dt = springs.sim.dt
@@ -64,8 +64,8 @@ def test_nothing_but_the_patch_is_pulled(device):
     assert np.linalg.norm(sim.body.mesh.points[moved] - TOP, axis=1).max() < 0.02
 
 
-def test_the_work_of_the_hand_is_the_energy_that_there_is(device):
-    """Without damping: kinetic and elastic energy are what the spring has put in, ends of runs included."""
+def test_the_work_of_the_hand_is_the_energy_of_the_body(device):
+    """Without damping, kinetic and elastic energy equal the work of the spring, also at the ends of runs."""
     found = []
     for dt in (8e-4, 2e-4):  # velocities are half a step behind displacements
         sim = block(device, damping=0.0, dt=dt)
@@ -89,7 +89,7 @@ def test_a_sudden_pull_from_rest_is_no_error(device, recwarn):
     assert not [w for w in recwarn if issubclass(w.category, wc.StabilityWarning)]
 
 
-def test_pulled_to_and_fro_no_state_is_taken_for_wrong(device, recwarn):
+def test_pulling_to_and_fro_is_no_fault(device, recwarn):
     sim = block(device, damping=1.0)
     hand = hand_at(sim, radius=0.03)
     for k in range(60):
@@ -143,7 +143,7 @@ def test_recorded_steps_take_up_hands_and_leave_them(device):
     assert np.abs(sim.body.displacements.numpy()).max() < 5e-5
 
 
-def test_there_are_so_many_hands_and_no_more():
+def test_the_number_of_hands_is_limited():
     sim = block()
     springs, shown = under_hands(sim)
     pick = shown.pick(0, TOP)
@@ -154,7 +154,7 @@ def test_there_are_so_many_hands_and_no_more():
     Drag(springs, shown, pick, 0.02)
 
 
-def test_a_patch_is_what_is_near_and_never_too_much():
+def test_a_patch_is_near_and_limited():
     sim = block(level=9)
     _, shown = under_hands(sim)
     pick = shown.pick(0, TOP + np.array([0.001, 0.002, 0.0]))

@@ -10,7 +10,7 @@ YOUNG, POISSON = 1e5, 0.3
 
 
 def torque_over_that_of_a_long_bar(level: int) -> float:
-    """A square bar, 1 : 4, twisted by its ends: its torque over G J times the rate of twist in the middle."""
+    """The torque of a square bar, 1 : 4, twisted by its ends, over G J times the rate of twist in the middle."""
     side, angle, shear = 0.064, 0.02, YOUNG / (2.0 * (1.0 + POISSON))
     mesh = wc.TetForest.box((1, 1, 4), side, level, origin=(-0.5 * side, -0.5 * side, 0.0))
     body = wc.SoftBody(mesh, wc.Isotropic(YOUNG, POISSON, 1e3), device="cpu")
@@ -34,8 +34,8 @@ def torque_over_that_of_a_long_bar(level: int) -> float:
 
 
 def growth_over_that_of_a_pipe(layers: int) -> float:
-    """A pipe with free ends, radii 1 : 2, pressed from inside and held nowhere: how the inner radius grows over Lamé's
-    solution, in so many layers of a general mesh."""
+    """The growth of the inner radius of a pipe with free ends, radii 1 : 2, pressed from inside and held nowhere, over
+    Lamé's solution, with this number of layers in a general mesh."""
     inner, outer, height, pressure = 0.05, 0.1, 0.02, 100.0
     around, along = 12 * layers, max(layers // 2, 1)
     turn = np.arange(around) * 2.0 * np.pi / around

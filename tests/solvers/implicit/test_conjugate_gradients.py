@@ -82,7 +82,7 @@ def test_solution_is_that_of_the_dense_matrix(model, device, rng):
 
 
 @pytest.mark.parametrize("exact", [False, True])
-def test_rotations_that_are_found_once_are_those_of_each_product(exact, device, rng):
+def test_stored_rotations_equal_those_of_each_product(exact, device, rng):
     mesh, _, operator = system("corotated", device, exact=exact)
     u, p = (random_displacement(mesh, rng, 0.1) for _ in range(2))
     field = operator.field

@@ -30,7 +30,7 @@ def reissner():
 
 
 def error(level, device):
-    """How much too little the end moves across, and along, as shares."""
+    """Relative errors of the end's displacement across and along the beam: how much too little it moves."""
     mesh = wc.TetForest.box((1, 1, 10), SIDE, level)
     body = wc.SoftBody(mesh, wc.Isotropic(YOUNG, 0.0, 1000.0), device=device)
     body.fix("z == zmin")

@@ -1,5 +1,5 @@
-"""Implicit steps and static answers where little is reasonable: they converge, or say that they did not, and what they
-leave is finite."""
+"""Implicit steps and static answers with extreme values: they converge or report that they did not, and leave a finite
+state."""
 
 import numpy as np
 import pytest

@@ -21,7 +21,7 @@ def setups(sim):
 
 
 def test_it_is_set_up_less_often_than_steps_are_made(device):
-    """And the motion is that of the block diagonal, where both are solved well."""
+    """The motion is that with the block diagonal, if both are solved well."""
     sim, other = (swinging(device, preconditioner=name, linear_tolerance=1e-6) for name in (None, "diagonal"))
     for each in (sim, other):
         each.advance_steps(40)
@@ -50,7 +50,7 @@ def test_it_is_set_up_again_where_other_nodes_are_held(device):
 
 @pytest.mark.parametrize("general", [False, True])
 def test_products_of_crushed_elements_are_those_of_their_rotations(general, device, rng):
-    """Elements without a good rotation in the lanes get one of their own."""
+    """Elements for which the lanes find no good rotation get a robust one."""
     mesh = wc.TetForest.box(cells=(1, 1, 1), cell_size=0.1, level=4)
     if general:
         mesh = wc.TetMesh(mesh.points, mesh.tets)

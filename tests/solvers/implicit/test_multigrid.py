@@ -316,7 +316,7 @@ def shared_operator(mesh, fixed, poisson, device, law=wc.Linear):
 
 
 class Ground:
-    """Stiff springs from nodes to the ground along y, one of which pushes."""
+    """Stiff springs from nodes to the ground along y; one of them pushes."""
 
     def __init__(self, nodes, stiffness, device):
         blocks = np.zeros((len(nodes), 3, 3), np.float32)
@@ -334,7 +334,7 @@ class Ground:
 
 
 def test_other_forces_count_with_their_diagonal(device, rng):
-    """On the finest level, without what is negative."""
+    """On the finest level, without the negative entries."""
     mesh = mixed_forest(level=4)
     operator = operator_of(mesh, device)
     nodes = mesh.points[:, 2] < 1e-9

@@ -29,7 +29,8 @@ def swung(device, integrator, remesh, seconds=0.5):
     ids=["multigrid", "diagonal", "bdf2"],
 )
 def test_a_bar_that_adapts_comes_to_rest_where_its_mesh_does(integrator, device):
-    """Passes every 8 steps refine the bar and simplify it; then it hangs where ``solve_static`` has its last mesh."""
+    """Passes every 8 steps refine and simplify the bar; in the end it hangs where ``solve_static`` finds it on its last
+    mesh."""
     remesh = wc.OnlineRemesh(every=8, max_level=6, refine_above=1.05, simplify_below=1.01)
     sim = swung(device, replace(integrator, damping=15.0), remesh, seconds=0.9)
     body = sim.body
@@ -41,7 +42,7 @@ def test_a_bar_that_adapts_comes_to_rest_where_its_mesh_does(integrator, device)
     assert np.abs(body.displacements.numpy() - fixed.displacements.numpy()).max() < 2e-4
 
 
-def test_a_saved_run_goes_on_as_it_would_have(device, tmp_path):
+def test_a_resumed_run_is_the_uninterrupted_one(device, tmp_path):
     remesh = wc.OnlineRemesh(every=8, max_level=6, refine_above=1.05, simplify_below=1.01)
     sim = swung(device, wc.BackwardEuler(dt=0.01), remesh, seconds=0.25)
     sim.save(tmp_path / "state.npz")

@@ -120,8 +120,8 @@ def test_soft_and_hard_tissue(young, device):
 
 @pytest.mark.parametrize("case", ["nearly incompressible", "hard and soft slices"])
 def test_hard_cases_are_as_exact_as_others(case, device):
-    """nu = 0.49999, and slices whose stiffness jumps by 10,000: forces of float32 are out of balance by a hundredth of
-    the weight in the end, displacements are off by less than 1e-5 all the same."""
+    """With nu = 0.49999, and with slices whose stiffness jumps by 10,000, float32 forces stay out of balance by a
+    hundredth of the weight, but displacements are right to 1e-5."""
     mesh = wc.TetForest.box((1, 1, 3), CUBE, 3)
     height = mesh.points[mesh.tets].mean(1)[:, 2]
     slices = np.where((height * 30).astype(int) % 2 == 0, 1e2, 1e6)
@@ -162,10 +162,8 @@ def test_one_body_of_one_pascal_and_one_gigapascal(device):
     ],
 )
 def test_any_start_leads_to_rest(start, dilatation, device):
-    """From a beam that is crushed into a plane, turned inside out or blown up: the state that rest leads to.
-
-    Inside out, elements that share their dilatation have a state of rest of their own.
-    """
+    """The search starts from a beam crushed into a plane, turned inside out or blown up, and ends where the search from
+    rest ends. Turned inside out, elements that share their dilatation have a state of rest of their own."""
     body, usual = beam(3, device=device), beam(3, device=device)
     model = wc.Corotated(dilatation=dilatation)
     assert wc.solve_static(usual, model=model, gravity=GRAVITY).converged
@@ -197,7 +195,8 @@ def test_a_body_that_nothing_holds(device):
 
 @pytest.mark.parametrize("model", [wc.Linear(), wc.Corotated()], ids=lambda model: type(model).__name__)
 def test_a_free_bar_under_even_tension(model, device):
-    """It grows by the stress over E and narrows by nu times that, also if more digits are asked for than there are."""
+    """It lengthens by the stress over E and narrows by nu times that, also if more digits are requested than float32
+    has."""
     young, poisson, stress = 1e5, 0.3, 100.0
     mesh = wc.TetForest.box((1, 1, 3), CUBE, 3)
     body = wc.SoftBody(mesh, wc.Isotropic(young, poisson, 1000.0), device=device)
@@ -215,8 +214,9 @@ def test_a_free_bar_under_even_tension(model, device):
     assert wide == pytest.approx(poisson * stress / young, rel=1e-4)
 
 
-def test_what_has_no_answer_keeps_the_last_state_at_rest(device):
-    """St. Venant and Kirchhoff's law gives way under a load that presses it flat; the report says how far it went."""
+def test_a_load_without_an_answer_keeps_the_last_state_at_rest(device):
+    """St. Venant and Kirchhoff's law gives way under a load that presses it flat; the report says which part of the
+    load it carried."""
     body = beam(3, device=device)
     tip = body.mesh.points[:, 2] > 3 * CUBE - 1e-9
     body.load(np.flatnonzero(tip), [0.0, 0.0, -1e4])
@@ -244,12 +244,12 @@ def test_what_has_no_answer_keeps_the_last_state_at_rest(device):
         ({"gravity": (0, 1)}, "gravity"),
     ],
 )
-def test_options_that_are_none(options, says):
+def test_invalid_options_are_refused(options, says):
     with pytest.raises(wc.InputError, match=says):
         wc.solve_static(beam(3), **options)
 
 
-def test_no_body_and_no_free_node():
+def test_no_body_or_no_free_node_is_refused():
     with pytest.raises(wc.InputError, match="body is 3"):
         wc.solve_static(3)
     body = beam(3)
@@ -275,7 +275,7 @@ def test_answers_in_float64_balance_to_its_rounding(poisson, device):
     np.testing.assert_allclose(ends["float32"], ends["float64"], atol=1e-5 * np.abs(report.displacements).max())
 
 
-def test_what_has_no_answer_in_float64_is_refused():
+def test_cases_without_a_float64_answer_are_refused():
     free = wc.SoftBody(wc.TetForest.box((1, 1, 1), 0.064, 0), wc.Isotropic(2e4, 0.3, 1000.0), device="cpu")
     with pytest.raises(wc.InputError, match="it needs held nodes in each world"):
         wc.solve_static(free, gravity=(0.0, 0.0, 0.0), precision="float64")

@@ -36,7 +36,8 @@ def slowest():
 
 
 def swung(integrator, slowest, device, seconds):
-    """How far the beam is along its slowest vibration after some time, begun at rest shape with velocity 1 m/s."""
+    """The displacement along the slowest vibration after some time, starting from the rest shape with a velocity of 1
+    m/s."""
     shape, _ = slowest
     body = beam(device)
     body.velocities = shape
@@ -102,7 +103,7 @@ def test_newmark_keeps_energy_and_backward_euler_loses_it(slowest, device):
 
 @pytest.mark.parametrize("damping", ["damping", "viscosity"])
 @pytest.mark.parametrize("name", SCHEMES)
-def test_damping_is_what_it_says(name, damping, slowest, device):
+def test_vibrations_decay_at_the_stated_rate(name, damping, slowest, device):
     """A vibration decays by damping / 2, or by viscosity w^2 / 2, to the order of the scheme."""
     scheme, order = SCHEMES[name]
     shape, w = slowest
@@ -188,7 +189,7 @@ def test_worlds_step_by_themselves_and_are_reset(name, device):
 
 
 @pytest.mark.parametrize("name", SCHEMES)
-def test_a_saved_run_goes_on_as_it_would_have(name, device, tmp_path):
+def test_a_resumed_run_is_the_uninterrupted_one(name, device, tmp_path):
     body = beam(device)
     sim = wc.Simulation(body, integrator=SCHEMES[name][0](dt=0.01), gravity=(0, -9.8, 0))
     sim.advance_steps(5)
@@ -213,7 +214,7 @@ def test_a_body_thrown_flat_recovers(device):
     assert np.abs(body.displacements.numpy()).max() < 2e-4
 
 
-def test_a_state_that_is_not_finite_is_taken_back(device):
+def test_a_state_that_is_not_finite_is_undone(device):
     body = beam(device)
     sim = wc.Simulation(body, integrator=wc.BackwardEuler(dt=0.01), gravity=(0, 0, 0))
     sim.advance_steps(3)
@@ -247,7 +248,7 @@ def test_a_stretched_bar_contracts_with_each_law(device):
         ({"preconditioner": "ilu"}, "preconditioner is 'ilu'"),
     ],
 )
-def test_options_that_are_none(options, says):
+def test_invalid_options_are_refused(options, says):
     with pytest.raises(wc.InputError, match=says):
         wc.BackwardEuler(**options)
 
@@ -262,7 +263,8 @@ def test_options_of_single_schemes():
 
 
 def test_quasi_static_steps_are_static_answers(device):
-    """Where keyframes have pulled the end of the beam, ``solve_static`` finds the same with the end held there."""
+    """Where keyframes have pulled the end of the beam, ``solve_static`` finds the same state with the end held
+    there."""
     body, rest = beam(device), beam(device)
     end = np.flatnonzero(body.mesh.points[:, 2] > 0.19)
     body.prescribe(end, times=[0.0, 1.0], displacements=[[0, 0, 0], [0.0, 0.04, 0.02]])
@@ -281,7 +283,7 @@ def test_quasi_static_steps_are_static_answers(device):
 
 
 class Springs:
-    """Springs from nodes to where these are at rest [N/m]; what they put in counts by itself."""
+    """Springs [N/m] from nodes to their rest positions; their energy counts in the balance."""
 
     def __init__(self, body, nodes, stiffness):
         self.body, self.stiffness = body, stiffness
@@ -319,8 +321,8 @@ def add_spring_blocks(stiffness: wp.array[wp.float32], blocks: wp.array[wp.mat33
     "integrator", [wc.BackwardEuler(dt=0.1, damping=10.0), wc.BDF2(dt=0.1, damping=10.0), wc.QuasiStatic(dt=1.0)]
 )
 def test_stiff_springs_are_in_the_tangent(integrator, preconditioner, device):
-    """Springs far stiffer than the body, which steps of this length would make explode without their stiffness: the end
-    that they hold comes to rest where its springs carry what a support there would."""
+    """Springs far stiffer than the body, with which steps of this length would explode if their stiffness were left
+    out: the held end comes to rest where its springs carry what a support there would carry."""
     integrator = replace(integrator, preconditioner=preconditioner)
     body, held = beam(device), beam(device)
     end = np.flatnonzero(body.mesh.points[:, 2] > 0.19)

@@ -31,7 +31,7 @@ def moved(mesh, worlds, rng):
 @pytest.mark.parametrize("make", [forest, graded, general])
 @pytest.mark.parametrize("dilatation", ["shared", "element"])
 def test_a_limited_lambda_is_that_of_another_material(make, dilatation, device, rng):
-    """Forces are those of elements of the smaller ratio, and afterwards they are what they were."""
+    """Forces are those of elements of the smaller ratio, and afterwards they are the original ones."""
     mesh = make()
     young, poisson = rng.uniform(1e3, 2e3, len(mesh.tets)), rng.uniform(0.3, 0.4999, len(mesh.tets))
     u = moved(mesh, 2, rng)
@@ -68,7 +68,7 @@ def test_limits_end_before_the_material(poisson, expected):
 
 @pytest.mark.parametrize("model", [wc.Corotated(), wc.NeoHookean()])
 def test_soft_bodies_come_to_rest_in_few_iterations(model, device):
-    """A beam of 3 kPa that hangs straight down; without states on the way it took 700 iterations and more."""
+    """A beam of 3 kPa that hangs straight down; without intermediate states it took more than 700 iterations."""
     body = wc.SoftBody(forest(6), wc.Isotropic(3e3, 0.4999, 1060.0), device=device)
     body.fix("z == zmin")
     report = wc.solve_static(body, model=model, gravity=GRAVITY)
