@@ -132,10 +132,7 @@ class Search:
         self.watch.missed.zero_()
         self._report.values[MISSED] = 0.0
         if least > self.farthest:
-            raise UnstableError(
-                f"surfaces that are hit go farther than {1e3 * self.farthest:.3g} mm in one step; the step must be "
-                "shorter, or what hits them slower"
-            )
+            raise UnstableError(f"surfaces that are hit go farther than {1e3 * self.farthest:.3g} mm in one step")
         self.watch.least.fill_(least)
 
     # --- launches --------------------------------------------------------------------------------------------------

@@ -14,6 +14,8 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from warp_corot.errors import StabilityWarning, UnstableError, depth_of_user
 from warp_corot.inputs.turns import TURN
 from warp_corot.kernels.stepping.pace import GROWTH
@@ -296,10 +298,11 @@ class Running:
         """
         sim = self._sim
         if fault.is_want_of_room:
-            sim.guard.go_back()
-            for constraint in sim.system.constraints:
-                constraint.grow()
-            return
+            too_far = self._grow()
+            if too_far is None:
+                sim.guard.go_back()
+                return
+            fault = too_far
         if sim.safe_step is None or self._returns >= MOST_RETURNS:
             self._returns = 0
             message = fault_message(sim, fault, MOST_RETURNS)
@@ -320,6 +323,18 @@ class Running:
                 f"t = {sim.time:.4g} s with half the step, and will do so again without a warning"
             )
             warnings.warn(message, StabilityWarning, stacklevel=depth_of_user())
+
+    def _grow(self) -> Fault | None:
+        """Make the room that the last run needed; the fault if no room is enough for the motion in its steps."""
+        said = ""
+        for constraint in self._sim.system.constraints:
+            try:
+                constraint.grow()
+            except UnstableError as error:
+                said = str(error)
+        if not self._sim.ranks.most(float(bool(said))):
+            return None
+        return Fault(said or "surfaces of another rank go too far in one step", np.arange(self._sim.worlds))
 
 
 def _steps(seconds: float, dt: float) -> int:

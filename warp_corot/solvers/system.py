@@ -74,7 +74,11 @@ class Constraint(Protocol):
         ...
 
     def grow(self) -> None:
-        """Make the room that the last run needed."""
+        """Make the room that the last run needed.
+
+        Raises:
+            UnstableError: No room is enough: something goes too far in one step.
+        """
         ...
 
     def forget(self) -> None:
