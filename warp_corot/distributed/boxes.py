@@ -1,4 +1,4 @@
-"""Uniformly bisected boxes in parts: every rank makes its own, and no rank the whole."""
+"""Uniformly bisected boxes in parts: every rank makes its own part, and no rank the whole box."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ def box(
     up_axis: str = "Y",
     costs: npt.ArrayLike | None = None,
 ) -> ForestPart:
-    """This rank's part of the mesh that ``TetForest.box`` makes; all ranks must call.
+    """This rank's part of the mesh that ``TetForest.box`` makes; all ranks must call this.
 
-    A rank makes only the leaves that it computes: its share along the tree's order, and those around the nodes that it
-    moves. ``SoftBody`` and ``Simulation`` take the part as they take a whole mesh, and a run has the same results, with
-    ``deterministic=True`` bit for bit. Nodes and elements of the body are those of the part; ``gather`` puts nodal
-    arrays together on rank 0 in the order of the whole mesh. In expressions, ``zmin`` and the other bounds are those of
-    the whole box.
+    A rank makes only the leaves that it computes: its share along the order of the tree, and the leaves around the
+    nodes that it moves. ``SoftBody`` and ``Simulation`` take the part like a whole mesh. A run has the results of the
+    whole mesh; with ``deterministic=True`` they are the same bits. Nodes and elements of the body are those of the
+    part; ``gather`` puts nodal arrays together on rank 0 in the order of the whole mesh. In expressions, ``zmin`` and
+    the other bounds are those of the whole box.
 
     Args:
         cells, cell_size, origin, up_axis: As for ``TetForest.box``.
@@ -46,8 +46,8 @@ def box(
         costs: The cost of an element on each rank, in any unit, [ranks]; None: the same everywhere.
 
     Raises:
-        InputError: MPI is not there, an argument is out of its range, a part has too many elements, or there are fewer
-            groups of eight elements than ranks.
+        InputError: MPI is not installed, an argument is out of its range, a part has too many elements, or there are
+            fewer groups of eight elements than ranks.
     """
     comm = mpi.world()
     cells, cell_size, level, origin = checked_box(cells, cell_size, level, origin, up_axis)
@@ -77,10 +77,10 @@ def box(
 
 
 def numbered_nodes(cut: Cut, comm: Any) -> tuple[Longs, int]:
-    """The numbers that a part's nodes have in the whole box, int64 [n], and how many nodes this has.
+    """The numbers of a part's nodes in the whole box, int64 [n], and the number of nodes of the whole box.
 
-    The whole box's nodes are in the order in which its leaves first name them. So those that a rank moves have numbers
-    one after another; it tells them to the ranks that hold copies. All ranks must call.
+    The nodes of the whole box are in the order in which its leaves first name them. So the nodes that a rank moves have
+    consecutive numbers; the rank sends them to the ranks that hold copies. All ranks must call this.
 
     Args:
         cut: This rank's part.

@@ -49,13 +49,14 @@ class CardExchange:
     def __init__(self, halo: Halo, device: wp.Device):
         self._nccl, self._device = nccl_of(device.alias), device
         self._sent, self._received = (_joined(lists, device) for lists in (halo.sent, halo.received))
-        #: Where it is launched beside other things, before them where there is a choice.
+        #: The stream on which it runs beside other launches, with a higher priority.
         self.aside = wp.Stream(device, priority=-1)
         self.is_under_way = False
         self._rooms = {kind: self._room_for(kind) for kind in kernels.EXCHANGED}
 
     def launch(self, nodal: wp.array) -> None:
-        """Launch that ghosts get their values, in a nodal array of float32, vec3 or vec4; may be recorded."""
+        """Launch the exchange that gives ghosts their values, in a nodal array of float32, vec3 or vec4; may be
+        recorded."""
         import nccl.core as nccl
 
         stream, (received, by), (nodes, to) = wp.get_stream(self._device), self._received, self._sent
@@ -69,26 +70,26 @@ class CardExchange:
         wp.launch(kernels.SCATTER[nodal.dtype], len(received), [received, given], [nodal], device=self._device)
 
     def begin(self, nodal: wp.array) -> None:
-        """Launch the same beside what follows."""
+        """Launch the exchange so that it runs beside the following launches."""
         with wp.ScopedStream(self.aside):
             self.launch(nodal)
         self.is_under_way = True
 
     def end(self) -> None:
-        """Launch that what follows waits for what was begun."""
+        """Let the following launches wait for the exchange that was begun."""
         if self.is_under_way:
             wp.get_stream(self._device).wait_stream(self.aside)
             self.is_under_way = False
 
     @contextmanager
     def later(self) -> Iterator[None]:
-        """Launches within come after what was begun, and before all that follows."""
+        """Launches in the block run after the exchange that was begun, and before the launches after the block."""
         with wp.ScopedStream(self.aside, sync_enter=not self.is_under_way, sync_exit=True):
             yield
         self.is_under_way = False
 
     def _room_for(self, kind: Any) -> tuple[wp.array, wp.array]:
-        """Buffers for what is sent and received."""
+        """The buffers for sent and received values."""
         out, given = (
             wp.zeros(len(nodes), dtype=kind, device=self._device) for nodes in (self._sent[0], self._received[0])
         )
@@ -96,9 +97,7 @@ class CardExchange:
 
 
 def take_most(values: wp.array) -> None:
-    """Launch a reduction in place, after which an array on a card has the largest values of all ranks; may be
-    recorded.
-    """
+    """Replace the values of an array on a card by the largest ones of all ranks; may be recorded."""
     import nccl.core as nccl
 
     own, stream = nccl_of(values.device.alias), wp.get_stream(values.device)
@@ -106,7 +105,7 @@ def take_most(values: wp.array) -> None:
 
 
 def add_up(values: wp.array) -> None:
-    """Launch that an array on a card holds the sums over all ranks, in place; may be recorded."""
+    """Replace the values of an array on a card by the sums over all ranks; may be recorded."""
     import nccl.core as nccl
 
     own, stream = nccl_of(values.device.alias), wp.get_stream(values.device)

@@ -1,4 +1,5 @@
-"""Checkpoints of a run on several ranks: the same files as of one process, from which any number of ranks resumes."""
+"""Checkpoints of a run on several ranks: the files that one process would write, from which any number of ranks can
+resume."""
 
 from __future__ import annotations
 
@@ -21,7 +22,7 @@ from .touch_checkpoint import gathered_contact, resume_contact
 if TYPE_CHECKING:
     from warp_corot.simulation.simulation import Simulation
 
-#: How the names of kept nodal arrays begin; other kept arrays are the same on all ranks.
+#: The beginnings of the names of kept nodal arrays; other kept arrays are the same on all ranks.
 DIRECTIONS, VELOCITIES, HISTORY = "directions", "velocities.", "history."
 
 
@@ -42,13 +43,13 @@ def save(
     following: list[Following],
     comm: Any,
 ) -> None:
-    """Write a checkpoint on rank 0; all ranks must call, with bodies in which all nodes are up to date.
+    """Write a checkpoint on rank 0; all ranks must call this, with bodies in which all nodes are up to date.
 
     Args:
         path: The file.
         bodies: The whole bodies.
         parts: This rank's simulation of parts.
-        following: Of each body.
+        following: The ``Following`` of each body.
         comm: The ranks.
 
     Raises:
@@ -87,7 +88,7 @@ def save(
 
 
 def body_of(name: str, parts: Simulation) -> int | None:
-    """Which body a kept array is of, if it has an entry for each node."""
+    """The body to which a kept array belongs, if it has an entry for each node; otherwise None."""
     if name.startswith(HISTORY):
         count = sum(each.startswith(HISTORY) for each in parts.kept)
         return int(name.removeprefix(HISTORY)) * len(parts.bodies) // count
@@ -103,7 +104,7 @@ def resume(loaded: Simulation, parts: SimulationOfParts, following: list[Followi
     Args:
         loaded: The simulation that one process loads from the checkpoint.
         parts: This rank's simulation of parts of the same bodies.
-        following: Of each body.
+        following: The ``Following`` of each body.
     """
     for name, array in parts.kept.items():
         values = loaded.kept[name].numpy()

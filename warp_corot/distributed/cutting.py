@@ -27,9 +27,9 @@ class Cut:
         lattice: Grid coordinates of the nodes and the tree's other corners, 2**halvings(level) intervals a cube edge.
         ends, tree: As in ``TetForest``.
         elements: The leaves' numbers in the whole box, int64 [t].
-        counted: Which of them this rank counts, bool [t].
+        counted: Which of the leaves this rank counts, bool [t].
         owner: The rank that moves each node, int32 [n].
-        keys: A number of each node by its coordinates, int64 [n].
+        keys: A number for each node, from its coordinates, int64 [n].
     """
 
     lattice: Ints
@@ -42,14 +42,14 @@ class Cut:
 
 
 def cut_box(cells: tuple[int, int, int], level: int, ranks: int, rank: int, costs: npt.ArrayLike | None = None) -> Cut:
-    """What ``Partition`` and ``part_of_mesh`` make of ``TetForest.box``, in the same order.
+    """The part that ``Partition`` and ``part_of_mesh`` make of ``TetForest.box``, with the same order.
 
-    The leaves are dealt out in subtrees of eight along the tree's order; the rank of the first leaf around a node in
-    this order moves it.
+    The leaves are divided in subtrees of eight along the order of the tree. A node is moved by the rank of the first
+    leaf around it in this order.
 
     Args:
         cells, level: As for ``TetForest.box``; at least three levels.
-        ranks, rank: How many ranks there are, and which this is.
+        ranks, rank: The number of ranks, and the number of this rank.
         costs: The cost of an element on each rank, in any unit, [ranks]; None: the same everywhere.
 
     Raises:
@@ -78,7 +78,7 @@ def cut_box(cells: tuple[int, int, int], level: int, ranks: int, rank: int, cost
 
 
 def dealt_starts(subtrees: int, ranks: int, costs: npt.ArrayLike | None) -> Longs:
-    """The first subtree of each rank, and at last their number; int64 [ranks + 1].
+    """The first subtree of each rank, then the number of subtrees; int64 [ranks + 1].
 
     Raises:
         InputError: As for ``cut_box``.
@@ -87,7 +87,7 @@ def dealt_starts(subtrees: int, ranks: int, costs: npt.ArrayLike | None) -> Long
     if subtrees < ranks:
         raise InputError(f"the body has {subtrees} groups of elements for {ranks} ranks; take fewer ranks")
     leaves, half = 1 << SUBTREE_DEPTH, 1 << (SUBTREE_DEPTH - 1)
-    # A subtree belongs to the rank in whose share its middle lies.
+    # A subtree belongs to the rank whose share contains its middle.
     bounds = np.cumsum(shares)[:-1] * (leaves * subtrees)
     turn = np.arange(ranks)
     starts = np.concatenate([[0], np.ceil((bounds - half) / leaves)]).astype(np.int64)
@@ -98,7 +98,7 @@ def dealt_starts(subtrees: int, ranks: int, costs: npt.ArrayLike | None) -> Long
 
 
 def keys_of(nodes: Ints, cells: tuple[int, int, int], intervals: int) -> Longs:
-    """The place of grid points among all grid points of the box, int64 [n]."""
+    """The places of grid points among all grid points of the box, int64 [n]."""
     _, ny, nz = (np.int64(n * intervals + 1) for n in cells)
     x, y, z = nodes.astype(np.int64).T
     return (x * ny + y) * nz + z

@@ -9,7 +9,7 @@ import numpy.typing as npt
 def normal_numbers(numbers: npt.NDArray[np.int64], seed: int) -> npt.NDArray[np.float64]:
     """Three normally distributed numbers for each node, float64 [n, 3].
 
-    By SplitMix64 (Steele, Lea and Flood 2014) and Box and Muller's transform.
+    They come from SplitMix64 (Steele, Lea and Flood 2014) and Box and Muller's transform.
 
     Args:
         numbers: Numbers of the nodes, int64 [n].
@@ -23,7 +23,7 @@ def normal_numbers(numbers: npt.NDArray[np.int64], seed: int) -> npt.NDArray[np.
 
 
 def _uniform(numbers: npt.NDArray[np.int64], stream: np.uint64) -> npt.NDArray[np.float64]:
-    """Numbers above 0 and up to 1."""
+    """Uniformly distributed numbers, above 0 and up to 1."""
     with np.errstate(over="ignore"):
         state = numbers.astype(np.uint64) * np.uint64(64) + stream
         state = (state + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)

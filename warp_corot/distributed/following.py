@@ -16,7 +16,7 @@ from warp_corot.errors import InputError
 from .parts import ForestPart, Part
 from .places import Places
 
-#: What is known of each node after a step.
+#: The nodal arrays that a step changes.
 STATE = ("displacements", "velocities", "reactions")
 
 
@@ -44,14 +44,14 @@ class Following:
         self._own = Places(self.own_nodes, np.flatnonzero(own).astype(np.int32), *devices)
         elements = (part.numbers.element_places + whole.world_element_count * shift).ravel()
         self._elements = Places(elements, np.arange(len(elements), dtype=np.int32), *devices)
-        #: The numbers of this rank's nodes among all of the whole mesh, int64; and how many there are.
+        #: The numbers of this rank's nodes in the whole mesh, int64; and the number of nodes of the whole mesh.
         self._everywhere = part.numbers.in_worlds(worlds)[own]
         self._total = worlds * part.numbers.node_count
         #: The number in the part of each node that this rank moves, -1 for others.
         self._number = np.full(worlds * count, -1, np.int32)
         self._number[self.own_nodes] = np.flatnonzero(own)
         self._trajectories: list[Trajectory] = []
-        #: Triangles of the surface around this rank's nodes; None before anything can be touched.
+        #: Triangles of the surface around this rank's nodes; None before there is contact.
         self._triangles: Places | None = None
 
     @property
@@ -94,7 +94,8 @@ class Following:
             self._publish_touch()
 
     def _publish_touch(self) -> None:
-        """Give the whole body the contact forces of the nodes that this rank moves, and pressures around them."""
+        """Copy the contact forces of the nodes that this rank moves, and the pressures around them, to the whole
+        body."""
         whole, part = self.whole.state, self.part.state
         if self._triangles is None:
             whole.make_contact_forces()

@@ -1,7 +1,7 @@
-"""Graphs whose kernels run by the priorities of the streams on which they were recorded.
+"""Graphs whose kernels have the priorities of the streams on which they were recorded.
 
-Warp makes graphs in which all kernels have the priority of the stream that launches the graph. NCCL's blocks, each with
-640 threads, then stand in line behind all blocks of the elements, until these are nearly done.
+In graphs that Warp makes, all kernels have the priority of the stream that launches the graph. Then NCCL's blocks, each
+with 640 threads, wait behind all blocks of the elements until these are nearly done.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def keep_priorities(graph: wp.Graph) -> None:
     with wp.ScopedDevice(graph.device):
         flags = ctypes.c_ulonglong(AUTO_FREE_ON_LAUNCH | USE_NODE_PRIORITY)
         failed = _driver().cuGraphInstantiateWithFlags(ctypes.byref(made), graph.graph, flags)
-    # Warp makes one itself only where there is none.
+    # Warp instantiates the graph only if nobody else has.
     if not failed:
         graph.graph_exec = made
 

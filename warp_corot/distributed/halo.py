@@ -16,7 +16,7 @@ Room = dict[int, npt.NDArray[Any]]
 
 @dataclass(frozen=True, eq=False)
 class Halo:
-    """What a part sends and receives, neighbour by neighbour in ascending order of ranks.
+    """The values that a part sends and receives, neighbour by neighbour in ascending order of ranks.
 
     Attributes:
         sent: Neighbours, and the nodes whose values each gets, as numbers within the part, int32.
@@ -28,19 +28,19 @@ class Halo:
 
     @classmethod
     def of(cls, nodes: npt.NDArray[np.integer], owner: Ints, worlds: int, comm: Any) -> Halo:
-        """Make the lists; all ranks must call.
+        """Make the lists; all ranks must call this.
 
         Args:
             nodes: The numbers of the part's nodes in the whole mesh, [n].
             owner: The rank that moves each of them, int32 [n].
-            worlds: Copies of the body.
+            worlds: Number of copies of the body.
             comm: The ranks.
         """
         wanted: list[npt.NDArray[np.integer]] = []
         received = {}
         for rank in range(comm.size):
             ghosts = np.flatnonzero(owner == rank).astype(np.int32)
-            # Both sides have them in the order of the whole mesh's numbers.
+            # Both sides use the order of the numbers in the whole mesh.
             ghosts = ghosts[np.argsort(nodes[ghosts])] if rank != comm.rank else ghosts[:0]
             wanted.append(nodes[ghosts])
             if len(ghosts):
@@ -88,7 +88,7 @@ class HostExchange:
             values[nodes] = received[rank]
 
     def _room_for(self, values: npt.NDArray[Any]) -> tuple[Room, Room]:
-        """Buffers for what is sent and received."""
+        """The buffers for sent and received values."""
         kind = (values.dtype, *values.shape[1:])
         if kind not in self._rooms:
             out, received = (

@@ -16,7 +16,7 @@ from warp_corot.inputs.processes import process_count
 
 from .patience import Patient, patience
 
-#: How long a rank sleeps between two looks at what it waits for [s].
+#: Time for which a waiting rank sleeps between two checks [s].
 REST = 0.01
 
 

@@ -1,4 +1,4 @@
-"""A rank's own simulation of its parts, and what makes it."""
+"""A rank's own simulation of its parts, and the functions that make it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ from .partition import Partition
 from .parts import ForestPart, Part
 from .ranks import MpiRanks
 
-#: Parts of so many elements are tried by one rank first; larger ones take longer than several ranks' compiling.
+#: If parts have at most this many elements, one rank tries its own first; larger ones take longer than compiling on
+#: several ranks.
 FEW_ELEMENTS = 200_000
 TRIED_STEPS = 10
 
@@ -45,7 +46,7 @@ class SimulationOfParts(on_one.Simulation):
         super().__init__(parts, **options)
 
     def measured_costs(self, count: int) -> list[float]:
-        """As ``Simulation.measured_costs``, of displacements that are up to date."""
+        """``Simulation.measured_costs``, for displacements that are up to date."""
         times = []
         for _ in range(count + 1):
             wp.synchronize_device(self.device)
@@ -62,7 +63,7 @@ class SimulationOfParts(on_one.Simulation):
         return self.ranks.comm.allgather(statistics.median(times[1:]) / elements)
 
     def world_energies(self) -> WorldEnergies:
-        """This rank's share."""
+        """This rank's share of the energies."""
         found = super().world_energies()
         elastic = np.zeros(self.worlds)
         for k, (part, field) in enumerate(zip(self.bodies, self.fields, strict=True)):
@@ -105,7 +106,7 @@ def part_of(body: SoftBody, model: Model, comm: Any, costs: npt.ArrayLike | None
 
 
 class _Tried(on_one.Simulation):
-    """A rank's parts by themselves."""
+    """A simulation of one rank's parts that exchanges nothing."""
 
     ranks = Ranks()
 

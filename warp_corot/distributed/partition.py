@@ -1,4 +1,5 @@
-"""Which rank computes which elements and moves which nodes, and which elements of others it needs."""
+"""The division of a mesh among ranks: which elements each rank computes, which nodes it moves, and which elements of
+other ranks it needs."""
 
 from __future__ import annotations
 
@@ -25,11 +26,12 @@ CURVE_BITS = 20
 
 @dataclass(frozen=True, eq=False)
 class Partition:
-    """How a mesh is divided.
+    """The division of a mesh.
 
     Attributes:
         groups: The group of each element, int32 [T]; elements of a group are computed together.
-        sharing: The group in which the element may share its dilatation, int32 [T]; groups are one of these or several.
+        sharing: The group in which the element may share its dilatation, int32 [T]; a group consists of one or several
+            of these.
         rank_of_element: The rank that counts the element's energy, int32 [T].
         rank_of_node: The rank that moves the node, int32 [N]; -1 for nodes of no element.
     """
@@ -90,8 +92,8 @@ class Partition:
         return cls(groups, sharing, rank.astype(np.int32), owner)
 
     def needed(self, mesh: Mesh, rank: int) -> npt.NDArray[np.bool_]:
-        """The elements that a rank computes, its own and copies of others', bool [T]: the groups of all elements around
-        its nodes."""
+        """The elements that a rank computes, its own and copies of other ranks', bool [T]: the groups of all elements
+        around its nodes."""
         around = (self.rank_of_node == rank)[mesh.tets].any(axis=1)
         in_groups = np.zeros(int(self.groups.max()) + 1, bool)
         in_groups[self.groups[around]] = True
@@ -120,7 +122,7 @@ def _groups(mesh: Mesh, grouped: bool) -> Ints:
 
 
 def _merged(groups: Ints, others: npt.NDArray[np.integer]) -> Ints:
-    """The smallest groups that have each of these groups and each of others whole, int32 [T]."""
+    """The smallest groups that divide none of these groups and none of the others, int32 [T]."""
     ends = [np.unique(each, return_inverse=True)[1].ravel() for each in (groups, others)]
     first, count = int(ends[0].max()) + 1, sum(int(each.max()) + 1 for each in ends)
     links = coo_matrix((np.ones(len(groups), np.int8), (ends[0], first + ends[1])), (count, count))
@@ -128,7 +130,7 @@ def _merged(groups: Ints, others: npt.NDArray[np.integer]) -> Ints:
 
 
 def _ordered(groups: Ints) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-    """Elements group after group, groups in the order of their first elements; and the size of each group."""
+    """The elements, group after group in the order of the groups' first elements; and the size of each group."""
     _, first, inverse, sizes = np.unique(groups, return_index=True, return_inverse=True, return_counts=True)
     turn = np.argsort(first, kind="stable")
     place = np.empty_like(turn)
@@ -137,7 +139,7 @@ def _ordered(groups: Ints) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
 
 
 def _nobody_empty(rank_of_group: npt.NDArray[np.intp], ranks: int) -> npt.NDArray[np.intp]:
-    """The same ranks in ascending order, but with at least one group each."""
+    """The same ascending ranks, changed so that each has at least one group."""
     count = len(rank_of_group)
     starts = np.searchsorted(rank_of_group, np.arange(ranks))
     starts = np.maximum.accumulate(np.maximum(starts - np.arange(ranks), 0)) + np.arange(ranks)
@@ -167,7 +169,7 @@ def _dealt_general(mesh: TetMesh, ranks: int, shares: npt.NDArray[np.float64]) -
 
 
 def _along_curve(mesh: TetMesh, ranks: int, shares: npt.NDArray[np.float64]) -> Ints:
-    """Elements along the curve that interleaves the bits of their centroids' coordinates."""
+    """The ranks of elements along the curve that interleaves the bits of the coordinates of their centroids."""
     centre = mesh.points[mesh.tets].mean(axis=1)
     low, extent = centre.min(axis=0), max(float(np.ptp(centre, axis=0).max()), 1e-300)
     place = np.minimum(((centre - low) / extent * 2**CURVE_BITS).astype(np.int64), 2**CURVE_BITS - 1)

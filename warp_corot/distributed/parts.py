@@ -1,4 +1,4 @@
-"""A rank's part of a body: its elements, copies of its neighbours', and their nodes."""
+"""A rank's part of a body: its elements, copies of its neighbours' elements, and their nodes."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ class Numbers:
         owner: The rank that moves each of the nodes, int32 [n].
         counted: Whether this rank counts the element's energy, bool [t].
         node_count: Number of nodes of the whole mesh.
-        places, element_places: Where the nodes and elements are in the body that this rank holds: the same numbers, or
-            those of its own part if no rank holds the whole mesh, int32 [n] and [t].
+        places, element_places: Places of the nodes and elements in the body that this rank holds, int32 [n] and [t]:
+            the same numbers, or those of its own part if no rank holds the whole mesh.
     """
 
     nodes: npt.NDArray[np.integer]
@@ -74,10 +74,10 @@ class ForestPart(TetForest):
     bounds: npt.NDArray[np.float64]
 
     def refine(self, leaves: npt.ArrayLike) -> TetForest:
-        """Not in parts.
+        """A forest in parts cannot be refined, because a rank would bisect without its neighbours.
 
         Raises:
-            InputError: Always: ranks would bisect without their neighbours.
+            InputError: Always.
         """
         raise InputError("a forest in parts cannot be refined; make it with another level")
 
@@ -106,7 +106,7 @@ class ForestPart(TetForest):
             InputError: It asks for nearest nodes.
         """
         if "nearest" in expression:
-            raise InputError("nearest needs the whole mesh, and this rank holds a part; take sphere or box")
+            raise InputError("nearest needs the whole mesh, and this rank holds a part; use sphere or box")
 
 
 class Part(SoftBody):
@@ -116,7 +116,7 @@ class Part(SoftBody):
         whole: The body.
         partition: The division of its mesh; None if this rank holds only its part.
         rank: The rank of the part.
-        device: Where it is computed; None: where the body is.
+        device: The device of the part; None: that of the body.
     """
 
     def __init__(self, whole: SoftBody, partition: Partition | None, rank: int, device: wp.Device | None = None):
@@ -147,13 +147,13 @@ class Part(SoftBody):
 
     @property
     def surface_faces(self) -> tuple[Ints, Ints]:
-        """The triangles of the whole body's surface around the nodes that this rank moves, int32 [f, 3], in the order
-        that they have there; and the element of each, [f]."""
+        """The triangles of the whole body's surface around the nodes that this rank moves, int32 [f, 3], in the whole
+        body's order; and the element of each, [f]."""
         return self._surface[1:]
 
     @property
     def surface_here(self) -> Ints:
-        """Which triangles of the whole body's surface these are, int32 [f]."""
+        """The numbers of ``surface_faces`` among the triangles of the whole body's surface, int32 [f]."""
         return self._surface[0]
 
     @functools.cached_property

@@ -1,4 +1,4 @@
-"""Waits for other ranks, all of which end with one line if one of them never comes."""
+"""Waits for other ranks: if one rank never comes, all ranks end with one line."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from typing import Any
 
 from warp_corot.errors import InputError
 
-#: The variable of the environment that says how long a rank waits [s], and how long it does without.
+#: The environment variable with the time that a rank waits [s], and its default.
 VARIABLE, SECONDS = "WARP_COROT_PATIENCE", 600.0
-#: The calls that wait for others.
+#: The calls of a communicator that wait for other ranks.
 WATCHED = frozenset({"allgather", "allreduce", "alltoall", "Barrier", "bcast", "gather"})
 #: Time that MPI has to end all ranks before this one ends by itself [s].
 GRACE = 5.0
 
 
 def patience() -> float:
-    """How long a rank waits for others [s].
+    """The time that a rank waits for others [s].
 
     Raises:
-        InputError: ``WARP_COROT_PATIENCE`` is no positive number.
+        InputError: ``WARP_COROT_PATIENCE`` is not a positive number.
     """
     given = os.environ.get(VARIABLE, "")
     try:
@@ -38,7 +38,7 @@ def patience() -> float:
 
 
 class Patient:
-    """A communicator of MPI whose waits end after some time, with all ranks.
+    """A communicator of MPI with limited waits: after that time it ends all ranks.
 
     Args:
         comm: The communicator.
@@ -69,7 +69,7 @@ class Patient:
 
     @contextmanager
     def waiting(self, what: str) -> Iterator[None]:
-        """What is done within waits for other ranks."""
+        """Watch the time of the block, which waits for other ranks."""
         self._wait = time.monotonic(), what
         try:
             yield

@@ -1,4 +1,4 @@
-"""What a rank draws of bodies: the elements that it counts, and their faces on the bodies' surface."""
+"""The piece of the bodies that a rank draws: the elements that it counts, and their faces on the bodies' surface."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Piece:
     Attributes:
         points, tets: The mesh at rest [m], [N, 3], and [T, 4].
         fixed: Whether each node is held, bool [N].
-        young, poisson, density: Of the elements, a number or [T].
+        young, poisson, density: The elements' material [Pa], -, [kg/m^3], a number or [T].
         skin: The faces on the bodies' surface.
     """
 
@@ -54,9 +54,10 @@ class Piece:
             setattr(self, name, self._property(name))
 
     def state(self, name: str, completed: Callable[[int, str], wp.array]) -> npt.NDArray[np.float32]:
-        """Vectors of the nodes, float32 [N, 3]: an array of the state, by its name.
+        """A nodal array of the state at the piece's nodes, float32 [N, 3].
 
         Args:
+            name: The name of the array.
             completed: Gives the array of a body's part with the values of other ranks' nodes.
         """
         found = []
@@ -73,7 +74,7 @@ class Piece:
         return np.concatenate(found)
 
     def _nodal(self, name: str) -> npt.NDArray[np.uint8]:
-        """A condition of the nodes in the bodies that users hold."""
+        """A condition of the nodes, from the bodies that users hold."""
         found = []
         for each, nodes in zip(self._following, self._nodes, strict=True):
             first = self._world * each.whole.world_node_count

@@ -1,4 +1,4 @@
-"""Entries of a whole body's arrays and the same entries of its part's, which may be on another device."""
+"""Copies of entries between the arrays of a whole body and those of its part, which may be on another device."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ Ints = npt.NDArray[np.int32]
 
 
 class Places:
-    """Where some values are in arrays of the whole body, and in those of its part.
+    """The places of some values in arrays of the whole body, and in those of its part.
 
     Args:
-        whole, part: Their places, int32 [n] both.
-        whole_device, part_device: Where the arrays are.
-        direct: Whether values go from one array to the other in one launch; None: where both are on one device.
+        whole, part: The places, int32 [n] both.
+        whole_device, part_device: The devices of the arrays.
+        direct: Whether values go from one array to the other in one launch; None: if both are on one device.
     """
 
     def __init__(
@@ -33,7 +33,7 @@ class Places:
         self._copy(whole, self._in_whole, self.whole, part, self._in_part)
 
     def to_whole(self, part: wp.array, whole: wp.array) -> None:
-        """The other way."""
+        """Copy the values of an array of the part to one of the whole body."""
         self._copy(part, self._in_part, self.part, whole, self._in_whole)
 
     def _copy(self, source: wp.array, sources: wp.array, numbers: Ints, found: wp.array, targets: wp.array) -> None:

@@ -27,7 +27,7 @@ from .parts import ForestPart, Part
 from .settled import settled_sums
 from .surfaces import SurfacePlaces
 
-#: How often exchanges in a row are timed.
+#: Number of times that a row of exchanges is timed.
 TIMED = 5
 
 
@@ -49,7 +49,7 @@ class MpiRanks(Ranks):
         wholes: The bodies.
         parts: This rank's part of each.
         settled: Whether sums are the same bit for bit for any number of ranks.
-        records: Whether steps can be recorded on cards, as they cannot where numbers of iterations are not known.
+        records: Whether steps can be recorded on cards; they cannot if the number of iterations is not known.
     """
 
     is_alone = False
@@ -233,7 +233,9 @@ class MpiRanks(Ranks):
         return found
 
     def exchange_seconds(self, vectors: Sequence[wp.array], count: int) -> float:
-        """The mean time of so many exchanges in a row, of a nodal array of each body [s]; on cards recorded ones."""
+        """The mean time of an exchange of a nodal array of each body, over ``count`` of them in a row [s]; on cards
+        they
+        are recorded."""
 
         def exchange() -> None:
             for _ in range(count):

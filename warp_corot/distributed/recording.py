@@ -29,25 +29,26 @@ def record(
     progress: Progress | None = None,
     recording: Recording | None = None,
 ) -> Recording:
-    """Advance a simulation and write ``fps`` frames a second, the current state first; all ranks must call.
+    """Advance a simulation and write ``fps`` frames a second, the current state first; all ranks must call this.
 
     ``beam.usd`` becomes a small stage that refers to ``beam.ranks/rank-0000.usdc`` and so on: every rank writes the
-    elements that it counts and their faces on the surface, and no rank gathers the whole. All pieces have one range
-    of colours. Bodies made from a domain are drawn by their tetrahedra. If the run is interrupted, the frames up to
-    seconds before stay.
+    elements that it counts and their faces on the surface, and no rank gathers the whole body. All pieces have the same
+    range of colours. Bodies made from a domain are drawn by their tetrahedra. If the run is interrupted, all but the
+    last few seconds of frames are kept.
 
     Args:
         sim: The simulation; it continues from its current state.
-        path: A .usd, .usdc or .usda file in a folder that all ranks see.
+        path: A .usd, .usdc or .usda file in a folder that all ranks can see.
         duration: Simulated time [s], rounded to whole frames.
         fps: Frames per second of simulated time.
         world: The world that is drawn; must be given if there are several.
-        tets: Whether to write the tetrahedra; without them the surface alone.
-        progress: Called on every rank after each frame with its number and how many come after the first one.
-        recording: Filled while recording, so that the caller has it after an interruption; None: a new one.
+        tets: Whether to write the tetrahedra; if not, only the surface is written.
+        progress: Called on every rank after each frame, with the number of finished frames and the number of frames
+            after the first one.
+        recording: Filled during the run, so that it is available if the run ends early; None: a new one.
 
     Returns:
-        The progress at the end, of all ranks.
+        The progress of all ranks at the end.
 
     Raises:
         InputError: A path that cannot be written to, a duration or frame rate out of range, or no such world.
@@ -95,7 +96,7 @@ class _Pieces:
         self._writer = self._together(made)
 
     def record(self, count: int, progress: Progress | None) -> Recording:
-        """Write the present frame and so many more."""
+        """Write the present frame and ``count`` more."""
         sim, done, writer = self._sim, self.done, self._writer
         first_step, first_time = sim.total_steps, sim.total_time
         try:
@@ -105,7 +106,7 @@ class _Pieces:
                 stepped = time.perf_counter()
                 self._write_frame()
                 if frame == 0:
-                    # From now on the joining stage shows what there is.
+                    # From now on the joining stage shows the frames written so far.
                     self._together(writer.flush)
                     self._together(lambda: self._join(count + 1))
                 done.stepping += stepped - started
@@ -115,7 +116,7 @@ class _Pieces:
                 if progress is not None:
                     progress(frame, count)
         except BaseException as error:
-            # Frames that wait are written; the first error is the one to raise.
+            # Write the waiting frames; the first error is the one to raise.
             writer.__exit__(type(error), error, error.__traceback__)
             raise
         self._together(writer.close)
@@ -165,7 +166,7 @@ class _Pieces:
         root = UsdGeom.Xform.Define(stage, "/SoftBody").GetPrim()
         stage.SetDefaultPrim(root)
         Usd.ModelAPI(root).SetKind(Kind.Tokens.assembly)
-        # An open stage would look for the pieces beside a layer that has no place yet.
+        # An open stage would look for the pieces beside a layer without a path.
         del root, stage
         for rank in range(self._comm.size):
             prim = Sdf.CreatePrimInLayer(layer, f"/SoftBody/rank_{rank:04d}")
@@ -173,7 +174,7 @@ class _Pieces:
             prim.referenceList.Prepend(Sdf.Reference(f"./{self._folder.name}/{_name(rank)}"))
         layer.customLayerData = {"warp_corot": {"ranks": self._comm.size}}
         with written_whole(self._path) as part:
-            # OpenUSD knows formats by their endings.
+            # OpenUSD finds the format by the extension.
             aside = part.with_name(part.name + self._path.suffix)
             try:
                 if not layer.Export(str(aside)):

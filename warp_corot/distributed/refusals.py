@@ -24,7 +24,7 @@ def check_supported(
 
     Args:
         bodies, models, integrator: As for ``Simulation``.
-        cards: How many cards compute a run that must be the same bit for bit for any number of them; 0 for others.
+        cards: The number of cards, if the run must give the same bits for any number of them; otherwise 0.
         others: Its other arguments, by name.
 
     Raises:
@@ -35,7 +35,7 @@ def check_supported(
     contact = others.get("contact")
     if getattr(contact, "self_contact", False) or (len(bodies) > 1 and (contact or others.get("obstacles"))):
         raise InputError(
-            "contact of soft surfaces does not work on several ranks yet; take one body and no self_contact, or run on "
+            "contact of soft surfaces does not work on several ranks yet; use one body without self_contact, or run on "
             "one process"
         )
     if getattr(integrator, "preconditioner", None) not in (None, DIAGONAL):

@@ -13,7 +13,8 @@ import numpy.typing as npt
 
 Floats = npt.NDArray[np.float64]
 
-#: Bits of a whole number that an addend gives at a time, so that 2**32 of them fit into int64, and how many times.
+#: Bits of the whole numbers into which addends are split, so that sums of 2**32 of them fit into int64; and the number
+#: of splits.
 BITS, ROUNDS = 30, 3
 
 
@@ -38,7 +39,7 @@ def settled_sums(addends: Floats, comm: Any) -> Floats:
         left = left - whole * unit
         parts[number] = whole.astype(np.int64).sum(axis=0)
     together = np.array(comm.allgather(parts)).sum(axis=0)
-    # The smallest first.
+    # Add the smallest units first.
     for number in reversed(range(ROUNDS)):
         total += together[number] * units[number]
     return np.where(bad, np.nan, total)

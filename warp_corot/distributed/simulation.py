@@ -45,19 +45,19 @@ class Simulation:
         bodies, model, integrator, gravity: As for ``warp_corot.Simulation``.
         deterministic: Whether the run must be the same bit for bit for any number of ranks.
         costs: The cost of an element on each rank, in any unit, [ranks]; None: the same everywhere.
-        device: Where this rank computes; None: where the bodies are. With bodies on the CPU and "cuda" here, a card
-            holds this rank's parts alone.
+        device: The device of this rank; None: that of the bodies. With bodies on the CPU and "cuda" here, a card holds
+            only this rank's parts.
         others: ``obstacles`` and ``contact`` as for ``warp_corot.Simulation``; its further arguments do not work on
             several ranks yet.
 
     Attributes:
         bodies: Tuple of the whole bodies.
-        rank, size, comm: This rank's number, how many there are, and their MPI communicator.
+        rank, size, comm: This rank's number, the number of ranks, and their MPI communicator.
         worlds, device, stable_dt, gravity: As for ``warp_corot.Simulation``.
 
     Raises:
-        InputError: MPI is not there, something that does not work on several ranks, a body of fewer groups of elements
-            than ranks, or as for ``warp_corot.Simulation``.
+        InputError: MPI is not installed, an argument does not work on several ranks, a body has fewer groups of
+            elements than there are ranks, or as for ``warp_corot.Simulation``.
     """
 
     def __init__(
@@ -106,31 +106,31 @@ class Simulation:
 
     def __getattr__(self, name: str) -> Any:
         if not name.startswith("_") and hasattr(on_one.Simulation, name):
-            raise AttributeError(f"{name} does not work on several ranks yet; it is there on one process")
+            raise AttributeError(f"{name} does not work on several ranks yet, only on one process")
         raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     # --- stepping --------------------------------------------------------------------------------------------------
 
     def step(self) -> None:
-        """Advance by one time step; as ``warp_corot.Simulation.step``."""
+        """Advance by one time step, like ``warp_corot.Simulation.step``. All ranks must call this."""
         self._take_over()
         self._parts.step()
         self._publish()
 
     def advance(self, seconds: float) -> None:
-        """Advance by ``seconds``; as ``warp_corot.Simulation.advance``. All ranks must call."""
+        """Advance by ``seconds``, like ``warp_corot.Simulation.advance``. All ranks must call this."""
         self._take_over()
         self._parts.advance(seconds)
         self._publish()
 
     def advance_until(self, total_time: float) -> None:
-        """Advance until ``total_time`` [s], as ``advance``; do nothing if that time is past."""
+        """Advance until ``total_time`` [s], like ``advance``; do nothing if that time is past."""
         self._take_over()
         self._parts.advance_until(total_time)
         self._publish()
 
     def advance_steps(self, count: int) -> None:
-        """Advance by ``count`` time steps; as ``advance``."""
+        """Advance by ``count`` time steps, like ``advance``."""
         self._take_over()
         self._parts.advance_steps(count)
         self._publish()
@@ -152,7 +152,7 @@ class Simulation:
         self._parts.on_step(called, checked_count(every, "every", least=1))
 
     def reset(self, worlds: npt.ArrayLike | wp.array | None = None) -> None:
-        """Put worlds back to their initial state; as ``warp_corot.Simulation.reset``."""
+        """Reset worlds to their initial state, like ``warp_corot.Simulation.reset``."""
         self._take_over()
         for each in self._following:
             each.take_initial()
@@ -168,7 +168,7 @@ class Simulation:
 
     @property
     def worlds(self) -> int:
-        """Copies of the bodies."""
+        """Number of copies of the bodies."""
         return self._parts.worlds
 
     @property
@@ -198,7 +198,7 @@ class Simulation:
 
     @property
     def total_steps(self) -> int:
-        """Time steps done, whatever has been reset since."""
+        """Time steps done, including those before resets."""
         return self._parts.total_steps
 
     @property
@@ -208,7 +208,7 @@ class Simulation:
 
     @property
     def total_time(self) -> float:
-        """Simulated time [s], whatever has been reset since."""
+        """Simulated time [s], including that before resets."""
         return self._parts.total_time
 
     @property
@@ -224,13 +224,15 @@ class Simulation:
         return sum(each.sent_bytes for each in self._parts.ranks.halos)
 
     def exchange_seconds(self, count: int) -> float:
-        """The mean time of one exchange alone, over a number of them in a row [s]; all ranks must call."""
+        """The mean time of one exchange alone, over ``count`` of them in a row [s]; all ranks must call this."""
         probes = [wp.zeros_like(each.part.state.displacements) for each in self._following]
         return self._parts.ranks.exchange_seconds(probes, checked_count(count, "count", least=1))
 
     def measured_costs(self, count: int = 20) -> list[float]:
-        """What an element's forces take on each rank [s], the median of so many times: for ``costs`` of another
-        simulation of the same bodies. All ranks must call."""
+        """The time that the forces of an element take on each rank [s], the median of ``count`` measurements.
+
+        The result is meant for ``costs`` of another simulation of the same bodies. All ranks must call this.
+        """
         self._take_over()
         return self._parts.measured_costs(checked_count(count, "count", least=1))
 
@@ -239,15 +241,15 @@ class Simulation:
         return self.world_energies().together
 
     def world_energies(self) -> WorldEnergies:
-        """The same of each world [J], float64 [worlds]."""
+        """The same energies of each world [J], float64 [worlds]."""
         self._take_over()
         own = self._parts.world_energies()
         return WorldEnergies(*np.sum(self._comm.allgather(np.array(own)), axis=0))
 
     def collect(self) -> None:
-        """Bring the state of all nodes into the bodies of all ranks; all ranks must call.
+        """Bring the state of all nodes into the bodies of all ranks; all ranks must call this.
 
-        Of a body in parts, the nodes of this rank's part.
+        If no rank holds the whole mesh, these are the nodes of this rank's part.
         """
         for k, each in enumerate(self._following):
             if each.is_in_parts:
@@ -260,8 +262,10 @@ class Simulation:
             each.collect_touch()
 
     def completed(self, k: int, name: str) -> wp.array:
-        """A nodal array of the state of this rank's part of the k-th body, with the values of other ranks' nodes; until
-        the next call. All ranks must call."""
+        """A nodal array of the state of this rank's part of the k-th body, with the values of other ranks' nodes.
+
+        It is valid until the next call. All ranks must call this.
+        """
         return self._parts.ranks.completed(k, getattr(self._following[k].part.state, name))
 
     @property
@@ -276,12 +280,12 @@ class Simulation:
 
     @property
     def solves(self) -> Solves | None:
-        """The cost of an implicit integrator's solves so far; as ``warp_corot.Simulation.solves``."""
+        """The cost of an implicit integrator's solves so far, like ``warp_corot.Simulation.solves``."""
         return self._parts.solves
 
     @property
     def contact(self) -> Contacts | None:
-        """Contact of this rank's parts; None without."""
+        """The contact of this rank's parts; None without contact."""
         return self._parts.contact
 
     @property
@@ -292,9 +296,10 @@ class Simulation:
     # --- keeping ---------------------------------------------------------------------------------------------------
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write a checkpoint on rank 0, as ``warp_corot.Simulation.save`` does; all ranks must call.
+        """Write a checkpoint on rank 0, like ``warp_corot.Simulation.save``; all ranks must call this.
 
-        One process, or any number of ranks, goes on from it. The bodies of all ranks are up to date at all nodes then.
+        One process, or any number of ranks, can resume from it. Afterwards the bodies of all ranks are up to date at
+        all nodes.
 
         Raises:
             InputError: On all ranks, if rank 0 cannot write to the folder.
@@ -307,9 +312,10 @@ class Simulation:
 
     @classmethod
     def load(cls, path: str | PathLike[str], *, device: str | wp.Device | None = None) -> Simulation:
-        """Go on from a checkpoint that ``save`` wrote, on any number of ranks, or one process; all ranks must call.
+        """Resume from a checkpoint that ``save`` or one process wrote, on any number of ranks; all ranks must call
+        this.
 
-        A deterministic run goes on bit by bit as if it had never stopped.
+        A resumed deterministic run gives the same bits as an uninterrupted one.
 
         Args:
             path: The file, which every rank reads.

@@ -14,21 +14,21 @@ from .parts import Part
 
 
 class SurfacePlaces:
-    """Which places of a surface are ghosts, and who gets the values of which.
+    """The ghosts among the places of a surface, and the ranks that exchange their values.
 
-    A rank has all triangles of the bodies' surfaces around its nodes, and finds the forces of obstacles on them as
-    their other ranks do, from the same numbers. What it finds at ghosts is not whole, and is replaced.
+    A rank has all triangles of the bodies' surfaces around its nodes. It finds the forces of obstacles on them from the
+    same numbers as the other ranks that have these triangles. Its sums at ghosts are incomplete and are replaced.
 
     Args:
-        nodes: The node of its part at each place of this rank's surfaces, in all worlds, int32; -1 where none is.
-        places: Those of each part.
+        nodes: The node of its part at each place of this rank's surfaces, in all worlds, int32; -1 for unused places.
+        places: The places of each part.
         parts: This rank's parts.
         starts: The number of each body's first node among those of all bodies.
         numbers: The numbers of each part's nodes among those of all worlds of its body.
         comm: The ranks.
 
     Attributes:
-        halo: Who gets what, in places of the surface.
+        halo: The lists of places to send and to receive.
         ghosts: Places of nodes that other ranks move, int32.
     """
 
@@ -42,7 +42,7 @@ class SurfacePlaces:
         comm: Any,
     ):
         node = nodes.numpy()
-        # Places that are not in use are nobody else's.
+        # Unused places belong to no other rank.
         number = np.iinfo(np.int64).max - np.arange(len(node), dtype=np.int64)
         owner = np.full(len(node), comm.rank)
         for k, part in enumerate(parts):

@@ -1,4 +1,4 @@
-"""Many runs with different parameters at the same time: which there are, which are finished, and their results."""
+"""Sweeps: many runs with different parameters at the same time, which of them are finished, and their results."""
 
 from __future__ import annotations
 

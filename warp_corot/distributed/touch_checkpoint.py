@@ -1,4 +1,4 @@
-"""Contact in checkpoints of several ranks: the contact of whole bodies, from that of the ranks' parts and back."""
+"""Contact in checkpoints of several ranks: from the ranks' parts to the whole body, and back."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ Ints = npt.NDArray[np.intp]
 
 
 def gathered_contact(body: SoftBody, parts: SimulationOfParts, following: Following, comm: Any) -> Contacts | None:
-    """What contact of the whole body continues from, on rank 0; None elsewhere. All ranks must call.
+    """The state from which contact of the whole body continues, on rank 0; None elsewhere. All ranks must call this.
 
     Args:
         body: The whole body, with contact forces of all nodes.
         parts: This rank's simulation of its part.
-        following: The body's.
+        following: The ``Following`` of the body.
         comm: The ranks.
     """
     here = parts.contact
@@ -66,7 +66,7 @@ def resume_contact(loaded: Contacts, parts: SimulationOfParts, following: Follow
     Args:
         loaded: That contact.
         parts: This rank's simulation of its part.
-        following: The body's.
+        following: The ``Following`` of the body.
     """
     here = parts.contact
     assert here is not None
@@ -89,8 +89,8 @@ def resume_contact(loaded: Contacts, parts: SimulationOfParts, following: Follow
 
 
 def _places(here: Contacts, following: Following) -> tuple[npt.NDArray[np.bool_], Ints, Ints]:
-    """Which places of this rank's surface have nodes that it moves; the place of each among those of the whole body,
-    -1 where there is none; and the same of triangles, world after world."""
+    """Which places of this rank's surface have nodes that it moves; the place of each in the whole body's surface, -1
+    if there is none; and the places of its triangles there, world after world."""
     whole, numbers, skin = following.whole, following.part.numbers, here.surface.parts[0]
     triangles = whole.surface_triangles
     nodes = np.unique(triangles)
@@ -106,7 +106,7 @@ def _places(here: Contacts, following: Following) -> tuple[npt.NDArray[np.bool_]
 
 
 def _take_common(to: Contacts, other: Contacts) -> None:
-    """What is the same on all ranks: where obstacles are, what they feel, and how far contacts may come nearer."""
+    """Copy what is the same on all ranks: poses and wrenches of obstacles, and the law's tolerance and recovery."""
     to.law.tolerance, to.law.recovery = other.law.tolerance, other.law.recovery
     for name in ("now", "later", "target"):
         getattr(to.obstacles.motions, name).assign(getattr(other.obstacles.motions, name).numpy())
