@@ -127,3 +127,16 @@ def test_a_checkpoint_goes_on_with_any_number_of_ranks(runs, case, size):
     for what in ("x", "numbers"):
         resumed = runs[3][f"{case}.{size}.{what}"]
         np.testing.assert_array_equal(resumed, runs[1][f"{case}.True.saved.{what}"])
+
+
+@pytest.mark.parametrize("size", [1, 3])
+def test_a_checkpoint_in_parts_goes_on_with_any_number_of_ranks(runs, size):
+    for what in ("x", "numbers"):
+        np.testing.assert_array_equal(runs[3][f"parts.{size}.{what}"], runs[1][f"worlds.True.saved.{what}"])
+
+
+def test_one_process_says_that_a_checkpoint_is_in_parts(runs):
+    with pytest.raises(wc.InputError, match="bodies in parts"):
+        wc.Simulation.load(runs["folder"] / "parts.1.npz")
+    names = sorted(path.name for path in (runs["folder"] / "parts.3.ranks").iterdir())
+    assert [name.partition("-rank-")[2] for name in names] == [f"000{rank}.npz" for rank in range(3)]

@@ -143,6 +143,7 @@ def worlds_in_parts(stage: Path) -> dict[str, np.ndarray | None]:
     wd.record(sim, stage, duration=0.03, fps=100, world=0)
     np.save(stage.with_suffix(f".{sim.rank}.npy"), body.positions.numpy()[: len(body.mesh.points)])
     moved(sim, body)
+    sim.save(stage.with_name(f"parts.{sim.size}.npz"))
     sim.collect()
     # Copies of other ranks' nodes are where these have them.
     whole = sim.comm.bcast(wd.gather(body.positions), root=0)
@@ -160,13 +161,25 @@ def worlds_in_parts(stage: Path) -> dict[str, np.ndarray | None]:
     return found
 
 
+def kept_in_parts(kept: Path) -> None:
+    """Save the run "worlds" of a mesh in parts."""
+    import warp_corot.distributed as wd
+
+    body = body_of(wd.box((1, 1, 3), 0.064, level=4), 0.3, worlds=2)
+    sim = wd.Simulation(body, deterministic=True, integrator=INTEGRATORS["worlds"]())
+    moved(sim, body)
+    sim.save(kept)
+
+
 def make_all(folder: Path, size: int, names: list[str]) -> None:
     """Make runs on the present ranks, and write their results. One rank keeps the checkpoint of "forest", from which
     several ranks resume; these keep that of "touched"."""
     found: dict[str, Any] = {}
     for name in names:
-        keeps = (name == "forest" and size == 1) or (name == "touched")
+        keeps = size == 1 or name == "touched"
         found |= made(name, True, folder / f"{name}.{size}.npz" if keeps else None)
+    if size == 1 and "worlds" in names:
+        kept_in_parts(folder / "parts.1.npz")
     if size > 2:
         for path in (folder / "forest.1.npz", folder / f"touched.{size}.npz"):
             if path.stem.split(".")[0] in names and path.exists():
@@ -175,6 +188,8 @@ def make_all(folder: Path, size: int, names: list[str]) -> None:
             found |= made("forest", False, None)
         if "worlds" in names:
             found |= worlds_in_parts(folder / f"{size}.usda")
+            for path in folder.glob("parts.?.npz"):
+                found |= resumed(path)
         if "touched" in names:
             found["parts.touched.x"] = touched_in_parts()
     if mpi.world().rank == 0:

@@ -27,7 +27,7 @@ DIRECTIONS, VELOCITIES, HISTORY = "directions", "velocities.", "history."
 
 
 @dataclass(frozen=True, eq=False)
-class _Values:
+class Values:
     """Numbers in place of an array on a device."""
 
     values: np.ndarray
@@ -61,7 +61,7 @@ def save(
         k = body_of(name, parts)
         if k is not None:
             values = following[k].whole_values(values)
-        kept[name] = _Values(values)
+        kept[name] = Values(values)
     contact = None
     if parts.contact is not None:
         contact = gathered_contact(bodies[0], parts, following[0], comm)
@@ -98,7 +98,7 @@ def body_of(name: str, parts: Simulation) -> int | None:
     return None
 
 
-def resume(loaded: Simulation, parts: SimulationOfParts, following: list[Following]) -> None:
+def resume(loaded: Simulation | SimpleNamespace, parts: SimulationOfParts, following: list[Following]) -> None:
     """Resume a simulation of parts from a saved one.
 
     Args:

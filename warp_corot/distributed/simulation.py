@@ -26,7 +26,7 @@ from warp_corot.simulation.solves import Solves
 from warp_corot.solvers import Integrator, SymplecticEuler
 from warp_corot.solvers.implicit.schemes import ImplicitIntegrator
 
-from . import checkpoint, mpi
+from . import checkpoint, in_pieces, mpi
 from .following import Following
 from .gathering import register
 from .of_parts import SimulationOfParts, compile_once, of_their_own, part_of, settled_model
@@ -300,13 +300,16 @@ class Simulation:
 
         One process, or any number of ranks, can resume from it. Afterwards the bodies of all ranks are up to date at
         all nodes.
+        Of bodies in parts, every rank writes the nodes that it moves to ``run.ranks/`` beside ``run.npz``, and any
+        number of ranks can resume from these files.
 
         Raises:
-            InputError: On all ranks, if rank 0 cannot write to the folder.
+            InputError: On all ranks, if one cannot write to the folder; or bodies in parts with contact.
         """
-        if any(each.is_in_parts for each in self._following):
-            raise InputError("checkpoints of bodies in parts do not work yet")
         self._take_over()
+        if any(each.is_in_parts for each in self._following):
+            in_pieces.save(path, self._parts, self._following, self._comm)
+            return
         self.collect()
         checkpoint.save(path, self.bodies, self._parts, self._following, self._comm)
 
@@ -318,12 +321,18 @@ class Simulation:
         A resumed deterministic run gives the same bits as an uninterrupted one.
 
         Args:
-            path: The file, which every rank reads.
+            path: The file, which every rank reads; of bodies in parts also the files beside it.
             device: The device; None: the one on which it was saved, or the rank's own card.
 
         Raises:
             InputError: As for ``warp_corot.Simulation.load``, or a run that does not work on several ranks.
         """
+        in_parts = in_pieces.load(path, device)
+        if in_parts is not None:
+            options = {name: getattr(in_parts, name) for name in ("integrator", "gravity", "deterministic")}
+            made = cls(in_parts.bodies, model=in_parts.models, **options)
+            checkpoint.resume(in_parts, made._parts, made._following)
+            return made
         loaded = on_one.Simulation.load(path, device=device)
         touching: dict[str, Any] = {}
         if loaded.contact is not None:

@@ -23,6 +23,7 @@ from warp_corot.io.files.whole import written_whole
 from warp_corot.materials.anisotropic import Orthotropic, TransverselyIsotropic
 from warp_corot.materials.isotropic import Isotropic
 from warp_corot.materials.reinforced import FibreReinforced
+from warp_corot.mesh import TetForest, TetMesh
 from warp_corot.remesh.online import OnlineRemesh
 from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import INTEGRATORS
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
 
 Remesh = OnlineRemesh | Sequence[OnlineRemesh | None] | None
 
-FORMAT = "warp-corot checkpoint"
+FORMAT, FORMAT_IN_PARTS = "warp-corot checkpoint", "warp-corot checkpoint in parts"
 #: 2: worlds, deterministic runs. 3: anisotropic materials, activation, forests made from domains. 4: meshes that
 #: change, steps of changing length. 5: a step that follows the state, starts of worlds in seconds. 6: the step at the
 #: last check. 7: contact. 8: how a run that went back continues. All are read.
@@ -69,7 +70,7 @@ def save_checkpoint(sim: Simulation, path: str | PathLike[str]) -> None:
         "steps_before_reset": sim.steps_before_reset,
         "time_before_reset": sim.time_before_reset,
         "gravity": sim.gravity,
-        "integrator": _described(sim.integrator, INTEGRATORS),
+        "integrator": described_of(sim.integrator, INTEGRATORS),
         "deterministic": sim.deterministic,
         "worlds": sim.worlds,
         "bodies": [],
@@ -82,28 +83,33 @@ def save_checkpoint(sim: Simulation, path: str | PathLike[str]) -> None:
         arrays[f"guard.{name}"] = values
     packed = zip(sim.bodies, sim.models, sim.fields, sim.remeshing.changing, strict=True)
     for number, (body, model, field, changing) in enumerate(packed):
-        header["bodies"].append(_pack_body(body, model, field, changing, f"body{number}.", arrays))
+        header["bodies"].append(pack_body(body, model, field, changing, f"body{number}.", arrays))
     header["contact"] = pack_contact(sim.contact, sim.grasps, arrays)
     arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
-    _write_whole(target, arrays)
+    write_archive(target, arrays)
 
 
-def _pack_body(
+def pack_body(
     body: SoftBody,
     model: Model,
     field: ForceField,
     changing: Changing | None,
     prefix: str,
     arrays: dict[str, np.ndarray],
+    *,
+    with_mesh: bool = True,
 ) -> dict[str, Any]:
-    """Put a body into arrays whose names begin with ``prefix``; returns the remaining data for JSON."""
+    """Put a body, with its mesh or without, into arrays whose names begin with ``prefix``.
+
+    Returns the remaining data for JSON.
+    """
     body.state.adopt_positions()
     mesh, material = body.mesh, body.material
     if changing is not None:
         mesh, material = changing.forest.source, changing.carried_material.given
     described = {
-        "model": _described(model, MODELS),
-        "mesh": pack_mesh(mesh, prefix, arrays),
+        "model": described_of(model, MODELS),
+        "mesh": pack_mesh(mesh, prefix, arrays) if with_mesh else None,
         "material": _name_of(material, MATERIALS),
         "trajectories": 0,
         "activations": len(body.conditions.activations),
@@ -161,6 +167,8 @@ def load_checkpoint(
                 raise InputError(f"{what}: {name} is not an array")
         header = json.loads(arrays["header"].tobytes())
         newer = header["version"] > VERSION
+        if header["format"] == FORMAT_IN_PARTS:
+            raise InputError(f"{source} is a checkpoint of bodies in parts; warp_corot.distributed.Simulation loads it")
         if header["format"] != FORMAT:
             raise InputError(what)
     except InputError:
@@ -234,9 +242,9 @@ def _rebuilt_simulation(
     place = header["device"] if device is None else device
     bodies, models = [], []
     for number, described in enumerate(header["bodies"]):
-        bodies.append(_rebuilt_body(described, f"body{number}.", arrays, header["worlds"], place))
-        models.append(_rebuilt(described["model"], MODELS))
-    integrator = _rebuilt(header["integrator"], INTEGRATORS)
+        bodies.append(rebuilt_body(described, f"body{number}.", arrays, header["worlds"], place))
+        models.append(rebuilt(described["model"], MODELS))
+    integrator = rebuilt(header["integrator"], INTEGRATORS)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", StabilityWarning)  # the warning was shown when the simulation was made
         sim = Simulation(
@@ -267,10 +275,16 @@ def _rebuilt_simulation(
     return sim
 
 
-def _rebuilt_body(
-    described: dict[str, Any], prefix: str, arrays: dict[str, np.ndarray], worlds: int, device: str | wp.Device
+def rebuilt_body(
+    described: dict[str, Any],
+    prefix: str,
+    arrays: dict[str, np.ndarray],
+    worlds: int,
+    device: str | wp.Device,
+    mesh: TetForest | TetMesh | None = None,
 ) -> SoftBody:
-    mesh = unpack_mesh(described["mesh"], prefix, arrays)
+    """The body that ``pack_body`` stored, with another mesh if it was stored without."""
+    mesh = unpack_mesh(described["mesh"], prefix, arrays) if mesh is None else mesh
     material_kind = MATERIALS[described["material"]]
     material = material_kind(*(arrays[prefix + f.name][()] for f in dataclasses.fields(material_kind)))
     body = SoftBody(mesh, material, worlds=worlds, device=device)
@@ -308,12 +322,12 @@ def _unpack_state(body: SoftBody, described: dict[str, Any], prefix: str, arrays
     body.state.reactions.assign(arrays[prefix + "reactions"])
 
 
-def _described(thing: Any, names: dict[str, Any]) -> dict[str, Any]:
+def described_of(thing: Any, names: dict[str, Any]) -> dict[str, Any]:
     """A listed dataclass of plain values or of other listed ones, for JSON: its name in the list and its values."""
     values = dataclasses.asdict(thing)
     for name in values:
         if type(getattr(thing, name)) in names.values():
-            values[name] = _described(getattr(thing, name), names)
+            values[name] = described_of(getattr(thing, name), names)
     return {"name": _name_of(thing, names), "values": values}
 
 
@@ -324,13 +338,19 @@ def _name_of(thing: Any, names: dict[str, Any]) -> str:
     raise InputError(f"a {type(thing).__name__} cannot be saved; only {', '.join(c.__name__ for c in names.values())}")
 
 
-def _rebuilt(described: dict[str, Any], names: dict[str, Any]) -> Any:
+def rebuilt(described: dict[str, Any], names: dict[str, Any]) -> Any:
+    """What ``described_of`` has described."""
     values = described["values"]
-    parts = {name: _rebuilt(value, names) for name, value in values.items() if isinstance(value, dict)}
+    parts = {name: rebuilt(value, names) for name, value in values.items() if isinstance(value, dict)}
     return names[described["name"]](**(values | parts))
 
 
-def _write_whole(target: Path, arrays: dict[str, np.ndarray]) -> None:
+def write_archive(target: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Write arrays, completely or not at all.
+
+    Raises:
+        InputError: They cannot be written.
+    """
     try:
         with written_whole(target) as part, part.open("wb") as file:
             np.savez(file, allow_pickle=False, **arrays)

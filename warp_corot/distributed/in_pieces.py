@@ -1,0 +1,239 @@
+"""Checkpoints of bodies in parts: a file for each rank, and one that names them; any number of ranks can load them."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from os import PathLike
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.elasticity import MODELS, ForceField, Model
+from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_path
+from warp_corot.io.checkpoint.archive import (
+    FORMAT_IN_PARTS,
+    GUARDED,
+    VERSION,
+    described_of,
+    pack_body,
+    rebuilt,
+    rebuilt_body,
+    write_archive,
+)
+from warp_corot.solvers import INTEGRATORS
+
+from .boxes import box
+from .checkpoint import Values, body_of
+from .following import Following
+from .of_parts import SimulationOfParts
+from .parts import ForestPart
+
+Arrays = dict[str, npt.NDArray[Any]]
+
+#: Nodal arrays of a body, by the ends of their names.
+NODAL = ("displacements", "velocities", "reactions", "constrained", "loads")
+#: What pieces have of a prescribed motion.
+MOTION = ("world", "nodes", "times", "to")
+
+
+def save(path: str | PathLike[str], parts: SimulationOfParts, following: list[Following], comm: Any) -> None:
+    """Write a checkpoint; all ranks must call.
+
+    ``run.npz`` names the files ``run.ranks/step-…-rank-0000.npz`` and so on, each with the nodes that a rank moves.
+    Those of a former checkpoint of this name are removed once all are written.
+
+    Raises:
+        InputError: On all ranks: contact, active stress, bodies that are not in parts, or a rank cannot write.
+    """
+    target = checked_path(path, "path")
+    if parts.contact is not None:
+        raise InputError("checkpoints of bodies in parts with contact do not work yet")
+    if not all(each.is_in_parts and not each.whole.discretization.has_activation for each in following):
+        raise InputError("checkpoints of bodies in parts beside others or with active stress do not work yet")
+    folder = target.with_name(f"{target.stem}.ranks")
+    names = [f"step-{parts.total_steps:012d}-rank-{rank:04d}.npz" for rank in range(comm.size)]
+    piece: Arrays = {}
+    bodies = [
+        _pack(each, model, field, k, piece)
+        for k, (each, model, field) in enumerate(zip(following, parts.models, parts.fields, strict=True))
+    ]
+    for name, array in parts.kept.items():
+        body = body_of(name, parts)
+        rows = array.numpy()
+        if body is None:
+            piece[f"same/kept.{name}"] = rows
+        else:
+            piece[f"nodes{body}/kept.{name}"] = rows[following[body].part.is_own]
+    guard = {f"guard.{name}": values for name, values in parts.guard.state.items()}
+    header = _header(parts) | {"bodies": bodies, "pieces": names}
+
+    def write_piece() -> None:
+        folder.mkdir(exist_ok=True)
+        write_archive(folder / names[comm.rank], piece)
+
+    def write_header() -> None:
+        if comm.rank == 0:
+            write_archive(target, guard | {"header": np.frombuffer(json.dumps(header).encode(), np.uint8)})
+
+    for act in (write_piece, write_header):
+        _together(act, comm)
+    if comm.rank == 0:
+        for former in folder.glob("step-*-rank-*.npz"):
+            if former.name not in names:
+                former.unlink(missing_ok=True)
+
+
+def load(path: str | PathLike[str], device: str | wp.Device | None) -> SimpleNamespace | None:
+    """The bodies of a checkpoint, of which this rank has its part, and what a simulation of them continues from.
+
+    None if the file is another checkpoint, or none. All ranks must call.
+
+    Raises:
+        InputError: A piece is missing or damaged.
+    """
+    target = checked_path(path, "path")
+    try:
+        with np.load(target, allow_pickle=False) as archive:
+            header = json.loads(archive["header"].tobytes())
+            if header["format"] != FORMAT_IN_PARTS:
+                return None
+            guard = {name: archive[f"guard.{name}"] for name in GUARDED}
+    except Exception:  # whoever reads it as another checkpoint says what is wrong
+        return None
+    try:
+        return _rebuilt_run(target, header, guard, device)
+    except InputError:
+        raise
+    except Exception as error:  # any error of NumPy, zip files, or missing names
+        raise InputError(f"{target} is not a complete checkpoint of bodies in parts: {error}") from error
+
+
+def _header(parts: SimulationOfParts) -> dict[str, Any]:
+    plain = ("stable_dt", "steps_before_reset", "time_before_reset", "gravity", "deterministic", "worlds")
+    return {name: getattr(parts, name) for name in plain} | {
+        "format": FORMAT_IN_PARTS,
+        "version": VERSION,
+        "device": str(parts.device),
+        "integrator": described_of(parts.integrator, INTEGRATORS),
+        "running": parts.running.state,
+    }
+
+
+def _pack(each: Following, model: Model, field: ForceField, k: int, piece: Arrays) -> dict[str, Any]:
+    """Put this rank's part of the k-th body into its piece; returns what is the same on all ranks."""
+    body, numbers, prefix = each.whole, each.part.numbers, f"body{k}."
+    mesh, arrays = body.mesh, Arrays()
+    assert isinstance(mesh, ForestPart)
+    described = pack_body(body, model, field, None, prefix, arrays, with_mesh=False)
+    described.pop("trajectories")
+    owned, counted = each.part.is_own, np.flatnonzero(numbers.counted)
+    piece[f"nodes{k}/numbers"] = numbers.nodes[owned[: len(numbers.nodes)]]
+    piece[f"elements{k}/numbers"] = numbers.elements[counted]
+    for name, values in arrays.items():
+        own = name.removeprefix(prefix)
+        if own.rpartition(".")[2] in NODAL and not own.startswith("trajectory"):
+            piece[f"nodes{k}/{name}"] = values[owned]
+        elif own in {each.name for each in dataclasses.fields(body.material)}:
+            axis = values.ndim - len(body.material.components.get(own, ())) - 1
+            if axis >= 0 and values.shape[axis] == len(numbers.elements) > 1:
+                piece[f"elements{k}/{name}"] = np.moveaxis(np.take(values, counted, axis=axis), axis, 0)
+                described.setdefault("axes", {})[name] = axis
+            else:
+                piece[f"same/{name}"] = values
+        elif not own.startswith("trajectory"):
+            piece[f"same/{name}"] = values
+    for number, motion in enumerate(body.conditions.trajectories):
+        mine = owned[motion.host_nodes]
+        times, displacements = motion.keys()
+        of_each = displacements if displacements.ndim == 2 else displacements[:, mine]
+        world, node = np.divmod(motion.host_nodes[mine], len(numbers.nodes))
+        for what, values in (("world", world), ("nodes", numbers.nodes[node]), ("times", times), ("to", of_each)):
+            piece[f"motion{k}/{number}.{what}"] = values
+    place = {"cells": mesh.cells, "cell_size": mesh.cell_size, "origin": mesh.origin, "up_axis": mesh.up_axis}
+    return described | {"box": place | {"level": int(mesh.tree.leaf_levels[0])}}
+
+
+def _rebuilt_run(
+    target: Path, header: dict[str, Any], guard: Arrays, device: str | wp.Device | None
+) -> SimpleNamespace:
+    worlds, bodies = header["worlds"], []
+    meshes = [box(**each["box"] | {"cells": tuple(each["box"]["cells"])}) for each in header["bodies"]]
+    arrays: Arrays = {}
+    counts = [0] * len(meshes)
+    for name in header["pieces"]:
+        with np.load(target.with_name(f"{target.stem}.ranks") / name, allow_pickle=False) as archive:
+            piece = {name: archive[name] for name in archive.files}
+        for k, mesh in enumerate(meshes):
+            _take(piece, mesh, k, worlds, arrays)
+            counts[k] += _take_motions(piece, mesh, k, counts[k], arrays)
+        arrays |= {name.removeprefix("same/"): values for name, values in piece.items() if name.startswith("same/")}
+    if device is None:
+        device = "cpu" if header["device"] == "cpu" else wp.get_device()
+    for k, (each, mesh) in enumerate(zip(header["bodies"], meshes, strict=True)):
+        for name, axis in each.get("axes", {}).items():
+            arrays[name] = np.moveaxis(arrays[name], 0, axis)
+        body = rebuilt_body(each | {"trajectories": counts[k]}, f"body{k}.", arrays, worlds, device, mesh)
+        body.conditions.world_starts.assign(arrays[f"body{k}.world_starts"].astype(np.float64))
+        bodies.append(body)
+    kept = {name.removeprefix("kept."): Values(a) for name, a in arrays.items() if name.startswith("kept.")}
+    plain = ("gravity", "deterministic", "stable_dt", "steps_before_reset", "time_before_reset")
+    return SimpleNamespace(
+        **{name: header[name] for name in plain},
+        bodies=bodies,
+        models=[rebuilt(each["model"], MODELS) for each in header["bodies"]],
+        integrator=rebuilt(header["integrator"], INTEGRATORS),
+        kept=kept,
+        contact=None,
+        guard=SimpleNamespace(state=guard),
+        running=SimpleNamespace(state=header["running"]),
+    )
+
+
+def _take(piece: Arrays, mesh: ForestPart, k: int, worlds: int, arrays: Arrays) -> None:
+    """Copy a piece's values to the arrays of this rank's part of the k-th body."""
+    for kind, numbers, copies in (("nodes", mesh.numbers.nodes, worlds), ("elements", mesh.numbers.elements, 1)):
+        prefix = f"{kind}{k}/"
+        given = piece[prefix + "numbers"]
+        _, here, there = np.intersect1d(numbers, given, assume_unique=True, return_indices=True)
+        for name, values in piece.items():
+            if not name.startswith(prefix) or name == prefix + "numbers":
+                continue
+            shape = (copies * len(numbers), *values.shape[1:])
+            found = arrays.setdefault(name.removeprefix(prefix), np.zeros(shape, values.dtype))
+            by_world = found.reshape(copies, len(numbers), *values.shape[1:])
+            by_world[:, here] = values.reshape(copies, len(given), *values.shape[1:])[:, there]
+
+
+def _take_motions(piece: Arrays, mesh: ForestPart, k: int, first: int, arrays: Arrays) -> int:
+    """Copy prescribed motions of nodes of this rank's part of the k-th body; returns how many there are."""
+    count, nodes = 0, mesh.numbers.nodes
+    order = np.argsort(nodes)
+    for name in sorted(name for name in piece if name.startswith(f"motion{k}/") and name.endswith(".nodes")):
+        world, wanted, times, to = (piece[f"{name.removesuffix('nodes')}{what}"] for what in MOTION)
+        place = order[np.searchsorted(nodes[order], wanted).clip(max=len(nodes) - 1)]
+        here = nodes[place] == wanted
+        if here.any():
+            motion = f"body{k}.trajectory{first + count}."
+            arrays[motion + "nodes"] = (place + len(nodes) * world)[here].astype(np.int32)
+            arrays |= {motion + "times": times, motion + "displacements": to if to.ndim == 2 else to[:, here]}
+            count += 1
+    return count
+
+
+def _together(act: Callable[[], None], comm: Any) -> None:
+    """Call on every rank; if one fails, all raise its error."""
+    failed = None
+    try:
+        act()
+    except (OSError, InputError) as error:
+        failed = str(error)
+    for rank, said in enumerate(comm.allgather(failed)):
+        if said is not None:
+            raise InputError(f"rank {rank} of {comm.size}: {said}")
