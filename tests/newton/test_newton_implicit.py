@@ -174,7 +174,7 @@ def test_unsupported_models_are_refused(device):
         wn.SolverCorotated(model, integrator="midpoint")
     with pytest.raises(wc.InputError, match="self_contact_margin is given, and integrator is 'implicit'"):
         wn.SolverCorotated(model, integrator="implicit", self_contact_margin=0.01)
-    with pytest.raises(wc.InputError, match="integrator='implicit' steps tetrahedra alone"):
+    with pytest.raises(wc.InputError, match="integrator='implicit' steps only tetrahedra"):
         wn.SolverCorotated(model, integrator="implicit", particle_contact=True)
     solver = wn.SolverCorotated(model, integrator="implicit")
     assert solver.safe_dt == solver.recorded_dt == float("inf")

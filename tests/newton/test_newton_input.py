@@ -148,7 +148,7 @@ class TestBodiesThatAnotherSolverMovesToo:
             now, after = after, now
 
     def test_a_warning(self, device):
-        with pytest.warns(UserWarning, match="something else moves them, and rigid_solver in these steps as well"):
+        with pytest.warns(UserWarning, match="something else moves them, and so does rigid_solver in these steps"):
             self.steps(device, "semi-implicit", lambda _: True)
 
     def test_none_if_only_one_moves_them(self, device):

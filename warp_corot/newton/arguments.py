@@ -63,12 +63,12 @@ def check_options(
     if self_contact_margin is not None and integrator == "implicit":
         raise InputError(
             "self_contact_margin is given, and integrator is 'implicit', in whose steps soft bodies do not touch one "
-            "another: take integrator='explicit', or no self_contact_margin"
+            "another: use integrator='explicit', or no self_contact_margin"
         )
 
 
 def check_step(step: Step, model: newton.Model, warm: bool) -> None:
-    """Check the arguments of ``SolverCorotated.step`` but its dt.
+    """Check the arguments of ``SolverCorotated.step`` except dt.
 
     Args:
         step: The arguments.

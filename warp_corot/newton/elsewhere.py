@@ -1,4 +1,4 @@
-"""A warning if something else moves the bodies that the solver moves, too."""
+"""A warning if another solver also moves the bodies that this solver moves."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ from warp_corot.errors import depth_of_user
 
 from .library import newton
 
-#: How many of the first steps are looked at, which waits for the device; and the number of these in a row before which
-#: bodies must have moved for the warning. A reset moves them once, and a new state has them where the model has them.
+#: The number of first steps that are checked, each of which waits for the device; and the number of steps in a row
+#: before which bodies must have moved for the warning. (A reset moves them once, and in a new state they are where the
+#: model has them.)
 LOOKS, IN_A_ROW = 8, 3
 
 
 class Elsewhere:
-    """Compares the bodies that come into the first steps with those that left the steps before.
+    """Compares the bodies at the start of each of the first steps with those at the end of the step before.
 
     Args:
         model: The model.
@@ -31,7 +32,7 @@ class Elsewhere:
         self._poses: npt.NDArray[np.float32] | None = None
 
     def look(self, state: newton.State) -> None:
-        """Look at the bodies before a step."""
+        """Check the bodies before a step, and warn if something else has moved them."""
         if not self._left or self._model.device.is_capturing:
             return
         if self._poses is not None:
@@ -44,7 +45,7 @@ class Elsewhere:
         self._left = 0
         warnings.warn(
             f"bodies have moved between the last {IN_A_ROW} steps, for example body {int(np.argmax(moved))}: "
-            "something else moves them, and rigid_solver in these steps as well; "
+            "something else moves them, and so does rigid_solver in these steps; "
             "rigid_solver=None leaves them to the other solver",
             UserWarning,
             stacklevel=depth_of_user(),
@@ -57,7 +58,7 @@ class Elsewhere:
             self._left -= 1
 
     def _are_free(self) -> npt.NDArray[np.bool_]:
-        """Bodies that only the solver should move: not the kinematic ones, nor those of a coupled solver."""
+        """Bodies that only this solver should move: not kinematic ones, nor those of a coupled solver."""
         model, flags = self._model, newton.BodyFlags
         bits = model.body_flags.numpy()
         return ((bits & int(flags.KINEMATIC | flags.PROXY)) == 0) & (model.body_inv_mass.numpy() > 0.0)

@@ -28,9 +28,9 @@ from .unknowns import Unknowns
 
 #: Residual of the linear solve over its right side.
 TOLERANCE = 1e-4
-#: Iterations of a linear solve at most.
+#: The most iterations of a linear solve.
 ITERATIONS = 1000
-#: Linear solves of a step at most: contacts open, close and slide from one to the next.
+#: The most linear solves of a step; from one to the next, contacts open, close and slide.
 ROUNDS = 16
 #: The longest step of Newton's semi-implicit solver of rigid bodies [s].
 RIGID_STEP = 5e-4
@@ -40,7 +40,7 @@ class ImplicitSteps(Steps):
     """Backward Euler for the tetrahedra of a model, with one linearisation of elastic forces a step.
 
     Contacts, attachments and the bodies that they act on are solved for together with the tetrahedra. In these solves
-    nothing but soft bodies, gravity and forces in the state act on bodies, which then move as their own solver has it.
+    only soft bodies, gravity and forces in the state act on rigid bodies; their own solver then moves them.
 
     Args:
         model: The model.
@@ -48,7 +48,7 @@ class ImplicitSteps(Steps):
         damping: Rate of mass-proportional damping [1/s].
 
     Raises:
-        InputError: The model has something that only explicit steps know.
+        InputError: The model has something that only explicit steps support.
     """
 
     def __init__(self, model: newton.Model, tetrahedra: Tetrahedra, contacts: Contacts, others: Others, damping: float):
@@ -56,7 +56,7 @@ class ImplicitSteps(Steps):
         if others.has_particles:
             raise InputError(
                 "the model has springs, cloth or bending edges with stiffness, or particle_contact is given; "
-                "integrator='implicit' steps tetrahedra alone: take integrator='explicit'"
+                "integrator='implicit' steps only tetrahedra: use integrator='explicit'"
             )
         self._unknowns = Unknowns(model)
         self._links = LinkForces(model, contacts, self._unknowns)
@@ -108,7 +108,7 @@ class ImplicitSteps(Steps):
         operator.take(now.particle_q, dt)
 
     def _solve(self) -> None:
-        """Launch linear solves until contacts stay as they are."""
+        """Launch linear solves until contacts no longer change."""
         self._iterations.zero_()
         self._rounds.zero_()
         if self._links.count:

@@ -74,7 +74,7 @@ class LinkForces:
         self._launch(kernels.add_link_blocks, [self._links], [blocks])
 
     def report(self, reported: wp.array | None, reactions: wp.array, share: float) -> None:
-        """Launch the wrenches on bodies [N, N m], and the share of the step of those of contacts."""
+        """Launch the wrenches on bodies [N, N m], and add those of contacts, times ``share``, to ``reported``."""
         reactions.zero_()
         if not self.count:
             return

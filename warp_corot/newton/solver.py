@@ -54,11 +54,12 @@ class SolverCorotated(SolverBase, CouplingInterface):
     then, a later ``step`` warns and uses twice the substeps; ``check`` raises an error. With given substeps it is an
     error at once, on CUDA from a later ``step`` or ``check``. There are no gradients.
 
-    With ``integrator="implicit"`` a step is one of backward Euler, or as many as ``substeps`` says, stable at any
-    length. Elastic forces are linearised once; contacts, attachments and damping are those of its end. These forces
-    and the bodies that they move are found together, with bodies free but for them, gravity and given forces. The
-    semi-implicit solver of bodies then takes steps of at most 0.5 ms. Only tetrahedra are implicit: models with
-    springs, cloth or bending edges of any stiffness, ``particle_contact`` and ``self_contact_margin`` are refused.
+    With ``integrator="implicit"`` a step is one step of backward Euler, or ``substeps`` of them, stable at any length.
+    Elastic forces are linearised once; contacts, attachments and damping are those of the end of the step. These forces
+    and the motion of the bodies on which they act are found together; in that solve only these forces, gravity and
+    given forces act on the bodies. The semi-implicit solver of bodies then takes steps of at most 0.5 ms. Only
+    tetrahedra are implicit: models with springs, cloth or bending edges of any stiffness, ``particle_contact`` and
+    ``self_contact_margin`` are refused.
 
     Newton's positions are float32, and small motions vanish in their rounding. An undamped beam of 19 cm, 5 kPa and
     1000 kg/m^3 with initial velocity v = a (z/L)^2 keeps its energy to 1 % over 20,000 steps down to a = 0.012 m/s; at
@@ -84,7 +85,8 @@ class SolverCorotated(SolverBase, CouplingInterface):
         rotation_level: Level of shared rotations in forests; see ``Corotated``.
         rigid_solver: The solver of rigid bodies: "semi-implicit"; another solver, made for this model, which also gets
             their forces; or None: no solver, and reactions are added to ``state_in.body_f`` for another program, which
-            moves the bodies. If it moved them beside a solver given here, both would: the first steps warn of that.
+            moves the bodies. If another program moves them in spite of a solver given here, both do: the first
+            steps warn of that.
         particle_contact: Whether particles collide with one another, as in ``SolverSemiImplicit``. Newton's default
                 radius of 0.1 m makes the particles of finer meshes repel one another.
         self_contact_margin: Distance [m] at which the surfaces of soft bodies and cloth begin to push one another and

@@ -35,8 +35,8 @@ class Steps:
 
     Attributes:
         report: Failures of worlds.
-        totals: Of implicit steps: steps, linear solves, iterations of these, and steps in which one did not converge,
-            int64 [4].
+        totals: The cost of implicit steps: steps, linear solves, iterations of these, and steps with a solve that did
+            not converge, int64 [4].
     """
 
     def __init__(self, model: newton.Model, tetrahedra: Tetrahedra, contacts: Contacts, others: Others, damping: float):
@@ -183,8 +183,11 @@ class Steps:
         self._launch(kernels.gather_particles, model.particle_count, inputs, outputs)
 
     def _bodies_after(self, done: float, substep: Step, given: newton.State) -> newton.State:
-        """The bodies after some time of the step [s]. Those that another solver moves keep their velocities: if they
-        jumped by the motion of a step, stiff contacts would throw light particles."""
+        """The bodies after some time of the step [s].
+
+        Bodies that another solver moves go on with their velocities: if they jumped by the motion of a step, stiff
+        contacts would throw light particles.
+        """
         if self.others.has_bodies:
             return substep.state_in
         if not (done and self.model.body_count):
@@ -195,7 +198,7 @@ class Steps:
         return self._moved
 
     def _launch_forces(self, substep: Step, given: newton.State, share: float, done: float) -> None:
-        """All other forces on particles, and on bodies those of particles.
+        """Launch all other forces on particles, and the particles' forces on bodies.
 
         Args:
             substep: From the present state.

@@ -1,4 +1,4 @@
-"""Where particles and bodies stand in the vectors of implicit steps."""
+"""The places of particles and bodies in the vectors of implicit steps."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ PADDING = 2
 class Unknowns:
     """Entries of vectors: one for each particle, two for each body, world after world.
 
-    Worlds are solved each by itself if nothing that moves is in no world; else all of them together.
+    Each world is solved by itself if everything that moves is in a world; otherwise all worlds are solved together.
 
     Args:
         model: The model.
 
     Attributes:
-        worlds: Worlds that are solved side by side.
-        count: Entries of each.
+        worlds: Number of worlds that are solved side by side.
+        count: Number of entries of each.
         particle, body: Entries of particles, and of bodies' translations, int32 [P], [B].
         owner: The body of an entry, or -1, int32 [worlds * count].
     """
@@ -62,7 +62,7 @@ def _worlds_of(model: newton.Model) -> tuple[npt.NDArray[np.integer], npt.NDArra
 
 
 def _places(worlds: npt.NDArray[np.integer]) -> npt.NDArray[np.integer]:
-    """The number of each among those of its world."""
+    """The number of each entry among those of its world."""
     order = np.argsort(worlds, kind="stable")
     starts = np.searchsorted(worlds[order], worlds[order], "left")
     places = np.empty_like(order)
