@@ -13,7 +13,10 @@ class StaleViewError(InputError):
 
 
 class UnstableError(RuntimeError):
-    """The state is no longer finite: the message names the step at which this was found."""
+    """The simulation cannot continue: its state is not finite, has energy from nowhere, or moves too far in a step.
+
+    The message says what was found, and at which step.
+    """
 
 
 class ConvergenceError(RuntimeError):
@@ -21,7 +24,11 @@ class ConvergenceError(RuntimeError):
 
 
 class StabilityWarning(UserWarning):
-    """The time step is larger than the explicit integrator's stability limit."""
+    """The simulation continues, but something may be wrong: the message says what.
+
+    The given time step is larger than the stable one, a run was repeated with half the step, bodies overlap at the
+    start, elements were turned inside out, or a grasp has nothing left to hold.
+    """
 
 
 class CapacityWarning(UserWarning):

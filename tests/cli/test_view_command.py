@@ -70,7 +70,7 @@ def test_a_port_in_use_is_reported_before_meshing(capsys):
         taken.listen()
         assert run("view", "box", "--port", taken.getsockname()[1]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert re.search(r"port \d+ of 127.0.0.1 cannot be had \(Address already in use\)", line)
+    assert re.search(r"port \d+ of 127.0.0.1 cannot be opened \(Address already in use\)", line)
 
 
 def test_without_viser_one_line_says_what_to_install(monkeypatch, capsys):

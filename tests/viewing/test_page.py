@@ -189,7 +189,7 @@ def test_two_visitors_see_the_same_and_both_have_hands(chromium, tab, page):
 @pytest.mark.slow
 def test_controls(tab, page, tmp_path):
     tab.get_by_role("button", name="pause").click()
-    until(lambda: not page.session.controls.running, "time stands still")
+    until(lambda: not page.session.controls.running, "paused")
     steps = page.sim.total_steps
     tab.get_by_role("button", name="one step").click()
     until(lambda: page.sim.total_steps == steps + 1, "one step is made")

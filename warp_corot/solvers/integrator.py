@@ -34,7 +34,7 @@ class Stepper(ABC):
         return False
 
     def prepare(self) -> None:  # noqa: B027 (most need nothing)
-        """Update what launches read of the bodies' conditions; called before steps are recorded."""
+        """Copy what launches read of the bodies' conditions to the device; called before steps are recorded."""
 
     @abstractmethod
     def forces(self, offset: int = 0) -> None:
@@ -45,7 +45,7 @@ class Stepper(ABC):
         """Launch steps, the first ones since the clock was last advanced.
 
         Args:
-            count: How many.
+            count: Number of steps.
             forces_known: Whether ``forces`` has been launched for the first of them.
         """
 

@@ -41,50 +41,52 @@ class Ranks:
         """Prepare a graph of steps that was just recorded."""
 
     def complete(self, k: int, vectors: wp.array) -> None:
-        """Launch that ghosts of the k-th body get their values, in a nodal array vec4."""
+        """Launch the exchange that gives the ghosts of the k-th body their values in a nodal array, vec4."""
 
     def begin_completion(self, k: int, vectors: wp.array) -> None:
-        """The same, but launches may go on before; ``end_completion`` must follow before any but forces read ghosts."""
+        """Begin the same exchange and let other launches follow meanwhile; ``end_completion`` must be called before
+        anything but elastic forces reads ghosts."""
 
     def end_completion(self) -> None:
-        """Launch that everything that follows waits for what ``begin_completion`` has begun."""
+        """Launch a wait for the exchange that ``begin_completion`` has begun: later launches come after it."""
 
     def completed(self, k: int, vectors: wp.array) -> wp.array:
-        """The same in another array, if there are ghosts; the array itself stays as it is."""
+        """The array after the same exchange, as a copy if there are ghosts; the array itself stays as it is."""
         return vectors
 
     def take_most(self, values: wp.array) -> None:
-        """Launch that an array holds the largest values of all ranks, in place."""
+        """Launch the replacement of each value of an array by the largest of all ranks."""
 
     def agree_on_changes(self, changed: wp.array, clock: Pace) -> None:
-        """Launch that all ranks know whether the state has changed on any; after ``Copies.launch_take_over``."""
+        """Launch the exchange after which every rank knows whether the state has changed on any of them; after
+        ``Copies.launch_take_over``."""
 
     def leave_own(self, k: int, energies: wp.array) -> None:
-        """Launch that energies of elements that other ranks count are zero."""
+        """Launch the reset to zero of the energies of elements that other ranks count."""
 
     def number_directions(self, k: int, directions: wp.array) -> None:
         """Give every node of the k-th body, in a nodal array vec4, a direction that does not depend on how many ranks
         there are."""
 
     def number_motion(self, k: int, inverse_mass: wp.array, motion: wp.array) -> None:
-        """The same with normally distributed numbers at free nodes, zero at others."""
+        """The same with normally distributed numbers at free nodes, and zero at others."""
 
     def add_up(self, parts: wp.array, sums: wp.array) -> None:
-        """Let an array, whose sum is that of this rank's parts, have the sum over all ranks; both float64.
+        """Launch the replacement of this rank's sums by those over all ranks; both arrays float64.
 
         Args:
             parts: Addends of this rank; if sums are settled, one for each node.
-            sums: Their sums.
+            sums: Sums of this rank's addends before, of all ranks' after.
         """
 
     # --- implicit steps --------------------------------------------------------------------------------------------
 
     def take_in_parts(self, parts: wp.array, columns: Sequence[int], most: bool) -> None:
-        """Let columns of parts of sums, float64 [worlds, parts, columns], be those of all ranks: what they add up to,
-        or the largest."""
+        """Launch the replacement of columns of partial sums, float64 [worlds, parts, columns], by those of all ranks:
+        their sums, or the largest values with ``most``."""
 
     def clear_ghosts(self, k: int, vectors: wp.array) -> None:
-        """Launch that a nodal array of the k-th body, vec4, is zero at ghosts."""
+        """Launch the reset to zero of a nodal array of the k-th body, vec4, at ghosts."""
 
     # --- contact ---------------------------------------------------------------------------------------------------
 
@@ -93,21 +95,22 @@ class Ranks:
 
         Args:
             nodes: The node of its body at each place, in all worlds, int32; -1 at places that are not in use.
-            places: Those of each body.
+            places: The places of each body.
         """
 
     def complete_surface(self, values: wp.array) -> None:
-        """Launch that places of ghosts get their values, in an array of float32 or vec3 over the surface's places."""
+        """Launch the exchange that gives ghosts their values in an array over the surface's places, float32 or vec3."""
 
     def completed_yielding(self, yielding: wp.array) -> wp.array:
-        """How surface nodes yield, also ghosts, which are held here; in another array, if there are ghosts."""
+        """How surface nodes yield, with the values of ghosts, which this rank holds fixed; a copy if there are
+        ghosts."""
         return yielding
 
     def clear_surface(self, forces: wp.array) -> None:
-        """Launch that forces on ghosts are zero, vec3 over the surface's places: their ranks have them."""
+        """Launch the reset to zero of forces on ghosts, vec3 over the surface's places: their own ranks add them."""
 
     def add_up_wrenches(self, parts: wp.array) -> None:
-        """Launch that parts of wrenches on obstacles are those of all ranks, in place."""
+        """Launch the replacement of partial wrenches on obstacles by those of all ranks."""
 
     def counted(self, k: int) -> wp.array | None:
         """Elements of the k-th body that this rank counts, int32 [worlds * T], nonzero; None: all."""
@@ -135,13 +138,13 @@ class Ranks:
         """Sums of the columns of ``kernels.stepping.balance`` over all ranks, float64 [worlds, COLUMNS].
 
         Args:
-            totals: Those of this rank.
-            addends: What they are sums of [worlds, n, COLUMNS]; only if sums are settled.
+            totals: The sums of this rank.
+            addends: Their addends [worlds, n, COLUMNS]; given only if sums are settled.
         """
         return totals
 
     def whole(self, body: SoftBody) -> SoftBody:
-        """The body, as far as this rank holds it, of which another is this rank's part."""
+        """The body to which this part belongs, as far as this rank holds it."""
         return body
 
     def bounds(self, body: SoftBody) -> Floats:

@@ -44,10 +44,10 @@ class Segment:
         resumes: Whether the allowed step is taken again after shorter ones at the end of a run.
         measured: The number of steps for which the stable step is measured first; zero: it is not measured.
         fits: Whether the remaining steps are fitted to the end of the run.
-        count: How many steps.
+        count: Number of steps.
         publishes: Whether positions are published.
         ends: Whether a run ends, for the guard.
-        whole: Whether elastic energies are found then.
+        whole: Whether elastic energies are found at the end of the run.
     """
 
     count: int
@@ -67,7 +67,7 @@ class Segment:
     def pieces(self, longest: int, *, edges: bool = False) -> Iterator[Segment]:
         """The segment in pieces of a power of two steps, at most ``longest``, so that there are few different pieces.
 
-        With ``edges`` the first and the last piece are single steps, which have most of the differences.
+        With ``edges`` the first and the last piece are single steps: segments differ mostly in how they begin and end.
         """
         sizes = [1, *powers(self.count - 2, longest), 1] if edges and self.count > 2 else powers(self.count, longest)
         piece = replace(self, publishes=False, ends=False, whole=False)
@@ -109,7 +109,7 @@ class RecordedSteps:
         self._flushed = FlushedSubnormals(system.device)
         self._graphs: dict[Segment, wp.Graph] = {}
         self._asked: set[Segment] = set()
-        #: How calm the bodies are, as a ``Schedule`` has it.
+        #: How calm the bodies are; see ``Schedule``.
         self.calm = UNKNOWN
         self._revisions = (-1, -1)
         self._rewritten = -1

@@ -63,7 +63,7 @@ class Constraint(Protocol):
         all other forces, and after prescribed nodes have the velocities of the step.
 
         Args:
-            offset: How many launched steps the clock does not count yet.
+            offset: Number of launched steps that the clock does not count yet.
             damping: Rate of mass-proportional damping of the step [1/s].
         """
         ...
@@ -106,7 +106,7 @@ class System:
         fields: The elastic force field of each.
         pace: The clock and the length of a step; steps recorded in one run add their offset.
         gravity: [m/s^2].
-        ranks: Who makes the same steps with other parts of the bodies.
+        ranks: The processes that make the same steps with other parts of the bodies.
 
     Attributes:
         forces: Forces besides elasticity.

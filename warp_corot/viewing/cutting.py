@@ -51,7 +51,7 @@ class Plane:
 def cut(surface: SurfaceMesh, mesh: Any, plane: Plane) -> SurfaceMesh:
     """The surface without what is beyond a plane, closed by the section through the tetrahedra.
 
-    The section of a body made from a domain ends where its marched surface does, any other where the elements end.
+    The section of a body made from a domain ends at its marched surface, any other where the elements end.
 
     Args:
         surface: Bound to the nodes of ``mesh``.
@@ -73,7 +73,7 @@ def cut(surface: SurfaceMesh, mesh: Any, plane: Plane) -> SurfaceMesh:
 
 
 def _kept(surface: SurfaceMesh, beyond: npt.NDArray[np.float64]) -> SurfaceMesh:
-    """Triangles on the near side. Those that the plane crosses end there: their far corners move along edges to it."""
+    """The triangles on the near side. The far corners of those that the plane crosses move along edges to the plane."""
     outside = beyond > 0.0
     corners = surface.triangles
     count = outside[corners].sum(axis=1)

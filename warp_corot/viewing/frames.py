@@ -46,7 +46,7 @@ class Frame:
     """The picture at one time.
 
     Attributes:
-        number: A number of the surfaces' topology, which changes with the triangles.
+        number: The version of the surfaces' topology, which changes with the triangles.
         positions: The shown points of each body [m], float32 [V, 3].
         triangles: int32 [F, 3] for each body.
         colors: uint8 [V, 3] for each body.

@@ -35,7 +35,7 @@ def is_loopback(host: str) -> bool:
     """Whether an address can be reached only from this computer.
 
     Raises:
-        InputError: It is no text.
+        InputError: The address is not a text.
     """
     if not isinstance(host, str):
         raise InputError(f"host is {shown(host)}; it must be an address of this computer")
@@ -64,7 +64,7 @@ class Gate:
     def __init__(self, host: str, token: str | None = None):
         if token is not None and not (isinstance(token, str) and token.strip()):
             given = "empty" if isinstance(token, str) else shown(token)
-            raise InputError(f"token is {given}; it must be a word that only those know who may come in")
+            raise InputError(f"token is {given}; it must be a word that only those who may enter know")
         if token is None and not is_loopback(host):
             raise InputError(f"host is {host}, which others can reach; it must have a token")
         self.host, self.token = host, token
@@ -181,4 +181,4 @@ def check_port(host: str, port: int) -> None:
         if isinstance(error, socket.gaierror):
             raise InputError(f"host is {host!r}; it must be an address of this computer") from None
         why = error.strerror or str(error)
-        raise InputError(f"port {port} of {host} cannot be had ({why}); it must be a free one, or 0 for any") from None
+        raise InputError(f"port {port} of {host} cannot be opened ({why}); use a free one, or 0 for any") from None

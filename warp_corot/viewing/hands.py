@@ -80,8 +80,8 @@ HANDS: dict[str, type[SpringHand]] = {"drag": Drag, "press": Press, "grasp": Gra
 
 
 def patch_around(shown: Shown, pick: Pick, radius: float) -> Patch:
-    """The points of the shown surface within a rest radius of a place [m], with larger weights nearer to it; at least
-    the corners of its triangle."""
+    """The points of the shown surface that are at rest within a radius [m] of a place, and at least the corners of its
+    triangle; the nearer a point, the larger its weight."""
     corners = shown.triangles[pick.triangle]
     distance = np.linalg.norm(shown.rest - shown.at(pick, shown.rest), axis=1)
     near = np.flatnonzero(distance < radius)

@@ -29,7 +29,7 @@ class Pace:
     _then: float = 0.0
 
     def wanted(self, speed: float, period: float) -> float:
-        """Simulated seconds of the next frame: as requested, if a frame's time is enough.
+        """Simulated seconds of the next frame: as many as requested, if a frame's time is enough for them.
 
         Args:
             speed: Wanted simulated seconds for each second of wall time.

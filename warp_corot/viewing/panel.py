@@ -45,7 +45,8 @@ class Panel:
         self._add_looks()
         Tissue(server, session)
 
-    # --- what is told ----------------------------------------------------------------------------------------------
+    # --- words and numbers
+    # ----------------------------------------------------------------------------------------------
 
     def tell(self, frame: Frame, now: float) -> None:
         """Update words, numbers and the plot.
@@ -92,7 +93,7 @@ class Panel:
         with self._gui.add_folder("time"):
             self._running = self._gui.add_button("pause")
             self._running.on_click(lambda _: session.ask(lambda: session.change(running=not session.controls.running)))
-            step = self._gui.add_button("one step", hint="while time stands still")
+            step = self._gui.add_button("one step", hint="while the simulation is paused")
             step.on_click(lambda _: session.ask(session.step))
             reset = self._gui.add_button("reset")
             reset.on_click(lambda _: session.ask(session.reset))
@@ -103,7 +104,7 @@ class Panel:
         with self._gui.add_folder("hand"):
             self._choice("hand", list(HANDS), "hand", "what the left mouse button does on the tissue")
             self._slider("radius", 0.0, 0.25, 0.01, "radius", hint="of the patch, over the body's size")
-            self._slider("strength", 0.02, 1.0, 0.02, "strength", hint="of the spring, over what the time step carries")
+            self._slider("strength", 0.02, 1.0, 0.02, "strength", hint="of the spring, over the largest stable one")
             release = self._gui.add_button("release all")
             release.on_click(lambda _: session.ask(session.release_all))
 
@@ -150,11 +151,11 @@ class Panel:
 def state_words(frame: Frame, session: Session) -> str:
     """The time, its speed, the meaning of colours, and notes for the visitor."""
     controls = session.controls
-    pace = "time stands still"
+    pace = "paused"
     if controls.running:
         pace = f"{frame.ratio:.2g} × real time"
         if frame.slow:
-            pace += f", **slower than asked for** ({controls.speed:g} ×)"
+            pace += f", **slower than requested** ({controls.speed:g} ×)"
     lines = [f"t = {frame.time:.2f} s, {pace}"]
     source = session.sources.get(controls.colors)
     if source is not None:

@@ -176,7 +176,7 @@ def _drawn(client: Any) -> Image:
     try:
         drawn = Image.fromarray(client.get_render(HEIGHT, WIDTH, transport_format="png", timeout=PATIENCE))
     except TimeoutError:
-        raise RuntimeError("the browser does not draw; its tab must be seen") from None
+        raise RuntimeError("the browser does not draw; its tab must be visible") from None
     # The background is transparent, which films do not support.
     paper = Image.new("RGBA", drawn.size, "white")
     return Image.alpha_composite(paper, drawn.convert("RGBA")).convert("RGB")

@@ -47,7 +47,7 @@ def open_server(gate: Gate, port: int, title: str) -> ViserServer:
         if port not in (0, bound):
             raise InputError(f"port is {port}, which is taken; it must be free, or 0 for any")
         if not is_closed(gate, bound):
-            raise InputError(f"viser {viser.__version__} does not ask who may come in; the page needs another version")
+            raise InputError(f"viser {viser.__version__} does not ask who may enter; the page needs another version")
         _without_tunnel(server)
     except BaseException:
         stop(server)

@@ -148,7 +148,7 @@ class Session:
         """Take an obstacle with a mouse. With the hand ``grasp`` the tool also holds the tissue that is near it.
 
         Raises:
-            InputError: It is no ``Tool``, something else moves it, or there is no tissue to grasp.
+            InputError: The obstacle is not a ``Tool``, something else moves it, or there is no tissue to grasp.
         """
         given = self.sim.obstacles[number]
         if not isinstance(given, Tool):
@@ -197,7 +197,7 @@ class Session:
             elif self._steps_asked:
                 self.sim.advance_steps(self._steps_asked)
         except UnstableError as error:
-            self.note = f"{error}; time stands still, reset goes back to the beginning"
+            self.note = f"{error}; the simulation is paused, and reset goes back to the beginning"
             self.controls = replace(self.controls, running=False)
         stepping += time.perf_counter()
         self._steps_asked = 0

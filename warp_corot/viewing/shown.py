@@ -15,7 +15,7 @@ from warp_corot.mesh.surfaces.bodies import boundary_surface
 from warp_corot.mesh.surfaces.bound import BoundPoints, DeviceBinding, SurfaceMesh
 from warp_corot.mesh.surfaces.locating import nearest_faces
 
-#: The names of surfaces that a body may have; the first one there is is shown at first.
+#: The names of surfaces that a body may have. At first the page shows the first of them that the body has.
 INPUT, MARCHED, ELEMENTS = "input's own", "marched", "tetrahedra"
 
 
@@ -40,8 +40,8 @@ class Pick:
     """A place on a shown surface.
 
     Attributes:
-        body: Which body of the simulation.
-        triangle: Which triangle of the shown surface.
+        body: The number of the body in the simulation.
+        triangle: The number of the triangle of the shown surface.
         place: Barycentric coordinates in it, float64 [3].
     """
 
@@ -71,7 +71,7 @@ class Shown:
         if body.changing is not None:
             self.binding = body.bind(surface.points)
         else:
-            # Without triangles, because browsers compute normals themselves.
+            # Triangles are not needed here, because browsers compute normals themselves.
             self.binding = BoundPoints(surface.points, surface.nodes, surface.weights).on_device(body.device)
         self.positions = surface.points.astype(np.float32)
 

@@ -31,8 +31,8 @@ class Patch:
 
     Attributes:
         points: int32 [k], at most MOST_POINTS.
-        shares: They sum to one, float64 [k].
-        area: Of the surface around them at rest [m^2].
+        shares: The points' weights, which sum to one, float64 [k].
+        area: Area of the surface around the points at rest [m^2].
     """
 
     points: npt.NDArray[np.int32]
@@ -75,7 +75,7 @@ class Springs:
         """Take hold of a patch as it is now.
 
         Args:
-            body: Which body.
+            body: The number of the body.
             patch: Points of its shown surface.
             rigid: Whether every point is held; otherwise only their mean is.
             strength: Stiffness over the largest stable one at the time step, 0 to 1.
@@ -98,7 +98,7 @@ class Spring:
     """The spring of one hand; see ``Springs.hold``.
 
     Attributes:
-        stiffness: Of the whole patch [N/m].
+        stiffness: Stiffness of the spring, for the whole patch [N/m].
         limit: The largest force on it [N].
         slot: Its place among the hands of the body.
         motion: How far the hand has moved since it took hold [m], float64 [3].

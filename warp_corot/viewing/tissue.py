@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from .session import Session
 
-#: Every element has its own rotation.
+#: The name of the choice that gives every element its own rotation.
 OWN = "own"
 
 

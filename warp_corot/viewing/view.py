@@ -39,7 +39,7 @@ class View:
         token: The word that visitors need; see ``view``.
         own: The user's own surface of each body, or None.
         made: Called with every simulation that replaces another.
-        run_file: The text of the run file that the page saves; None: it saves none.
+        run_file: Gives the text of the run file that the page saves; None: it saves none.
         title: The title of the page.
 
     Attributes:
@@ -107,7 +107,7 @@ class View:
 
     @contextmanager
     def held(self) -> Iterator[Simulation]:
-        """Inside this block time stands still, and the caller may read and change the simulation."""
+        """Inside this block the simulation is paused, and the caller may read and change it."""
         with self._lock:
             yield self.session.sim
 

@@ -37,14 +37,14 @@ class Patches:
         halo, halo_start: Nodes of other patches that patches read, int32 [H].
         elements, element_start: Elements of patches: those without halo, then the others that they compute, then those
             that they only measure; int32 [E].
-        interior: How many elements of each patch have no corner in the halo, int32 [patches].
-        computed: How many elements each patch computes, int32 [patches].
+        interior: Number of elements of each patch without a corner in the halo, int32 [patches].
+        computed: Number of elements that each patch computes, int32 [patches].
         corners: The four nodes of each element, numbered in the patch, int32 [E, 4].
         slots: The slot of each corner's force; ``NO_SLOT`` at corners of the halo; int32 [E, 4].
         bases, base_start: Where each warp's slots begin, and after a patch's last warp the number of its slots, int32.
         groups: The group of each element, numbered in the patch, int32 [E]; zero where there are no groups.
         ranks: Its place in that group, int32 [E].
-        group_counts: How many groups each patch has, int32 [patches].
+        group_counts: Number of groups of each patch, int32 [patches].
     """
 
     lanes: int
@@ -73,7 +73,7 @@ class Patches:
         Args:
             points: Rest positions, float64 [N, 3].
             tets: int32 [T, 4].
-            count: How many patches, at most the number of nodes.
+            count: Number of patches, at most the number of nodes.
             threads: Threads of a block; they determine how many add up one node.
             groups: The group of each element, int [T]; None: there are none.
         """
@@ -196,7 +196,7 @@ def _elements_by_patch(
 
     Args:
         owners: The patches of the elements' nodes, [T, 4].
-        count: How many patches.
+        count: Number of patches.
         groups: As for ``Patches.of``.
     """
     new = np.ones(owners.shape, bool)

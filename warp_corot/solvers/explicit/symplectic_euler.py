@@ -153,6 +153,7 @@ class SymplecticEulerStepper(Stepper):
 
 
 def _steps_in_one_launch(system: System, k: int) -> BlockSteps | PatchSteps | None:
-    """One body is sooner stepped by all multiprocessors, many small ones by one each; None where neither can be."""
+    """The steps of a body in one launch, None if there are none: one world is faster on all multiprocessors together,
+    many small worlds are faster on one each."""
     body, field = system.bodies[k], system.fields[k]
     return PatchSteps.of(body, field) or BlockSteps.of(body, field)

@@ -92,7 +92,7 @@ class Balance:
         self._threads = warps * self._lanes
         self._ranks = system.ranks
         if self._ranks.is_settled:
-            # Every node and every element is an addend: sums of theirs are the same in any order.
+            # Every node and every element is an addend, because their sums are the same in any order.
             self._lanes, warps = 1, max(max(b.sizes.launch_nodes, b.sizes.launch_elements) for b in self.bodies)
             warps = self._threads = max(warps // self.worlds, 1)
         self._sums = wp.zeros((self.worlds, warps, kernels.COLUMNS), dtype=wp.float64, device=self.device)

@@ -255,7 +255,7 @@ class Guard:
         else:
             self._loads, self._height = np.zeros(self.worlds), found.gravitational
             self._loads_since = np.zeros(self.worlds)
-            # A user may correct a bad world later.
+            # The user may still correct a bad world.
             known = np.where(np.isfinite(found.exact), np.abs(found.exact), 0.0)
             swing = np.where(np.isfinite(found.untimely), SET_IN_MOTION * found.untimely, 0.0)
             self._scale = np.maximum(self._scale, np.maximum(known, swing))
@@ -388,7 +388,7 @@ class Guard:
             if not 0.0 <= now - self._window_at < WINDOW:
                 self.trend = float((self._lately - self._lately_before)[most] * known[most])
                 self._window_at, self._lately_before = now, self._lately
-            with np.errstate(over="ignore"):  # of a body that flies off, where infinity is as wrong
+            with np.errstate(over="ignore"):  # a body that flies off is found out by infinity, too
                 self.untimely = float(np.max(np.maximum(found.untimely - floor, 0.0) * known))
         else:
             self.gain = self.surplus = self.untimely = 0.0

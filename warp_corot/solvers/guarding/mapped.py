@@ -13,7 +13,7 @@ class Mapped:
     The host sees what a kernel wrote once the stream has finished it. Few threads should use this memory.
 
     Args:
-        count: How many numbers.
+        count: Number of values.
         device: The device.
 
     Attributes:

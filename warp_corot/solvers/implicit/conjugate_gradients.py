@@ -49,8 +49,9 @@ class ConjugateGradients:
     Attributes:
         tolerance: Norm of the residual over that of b at which a world stops, float64 [worlds] on the device.
         iterations: Number of iterations of the last solve, int32 [worlds] on the device.
-        scalars: Those of the iteration, as there, float64 [worlds, SCALARS] on the device.
-        status: How it ended, as in ``kernels.implicit.conjugate_gradients``, int32 [worlds] on the device.
+        scalars: Scalars of the iteration, see ``kernels.implicit.conjugate_gradients``, float64 [worlds, SCALARS] on
+            the device.
+        status: How the last solve ended, see there, int32 [worlds] on the device.
     """
 
     def __init__(self, operator: LinearOperator, length: int, *, most: int = 1000, ranks: Ranks = ALONE):

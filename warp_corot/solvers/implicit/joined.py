@@ -15,7 +15,7 @@ from .newton import Newton
 from .operator import LinearOperator, Preconditioner
 from .touching import SETTLED, SHARE, FreePreconditioner, Held, Rows
 
-#: Linear solves of a step at most.
+#: Maximum number of linear solves in a step.
 ROUNDS = 40
 #: Pairs are located again once the residual of a solve begins at less than this many times the tolerance.
 NEAR = 100.0
@@ -25,8 +25,8 @@ class Parts:
     """The bodies' parts of vectors that they share.
 
     Args:
-        lengths: How many entries each body has.
-        device: Where.
+        lengths: Number of entries of each body.
+        device: The device.
     """
 
     def __init__(self, lengths: Sequence[int], device: wp.Device):
@@ -70,7 +70,7 @@ class JoinedOperator:
 
 
 class JoinedPreconditioner:
-    """That of each body, S T B T S where obstacles hold it; see ``FreePreconditioner``."""
+    """The preconditioner of each body, as S T B T S where obstacles hold it; see ``FreePreconditioner``."""
 
     def __init__(
         self, preconditioners: Sequence[Preconditioner], held: Sequence[Held | None], like: wp.array, parts: Parts
@@ -82,7 +82,7 @@ class JoinedPreconditioner:
         ]
 
     def update(self, operator: LinearOperator) -> None:
-        """Bodies' own are kept up to date by ``JoinedSolve``."""
+        """Do nothing: ``JoinedSolve`` keeps the bodies' preconditioners up to date."""
 
     def apply(self, r: wp.array, z: wp.array) -> None:
         for preconditioner, a, b in zip(self._each, self._parts.of(r), self._parts.of(z), strict=True):
@@ -93,15 +93,15 @@ class JoinedSolve:
     """Solves for the steps of all bodies, with one linearisation of each.
 
     Args:
-        newtons: Of the bodies; their operators, residuals, steps and preconditioners are used.
-        held: Obstacles at each body, or None.
-        rows: What acts between them.
-        worlds: How many worlds bodies have; they are solved together.
+        newtons: Newton's method of each body, whose operator, residual, step and preconditioner are used.
+        held: The contact of each body with obstacles, or None.
+        rows: The contact of the bodies with one another.
+        worlds: Number of worlds, which are solved together.
         tolerance: Residual of a linear solve over the forces that are out of balance at the beginning.
-        most: Iterations of a linear solve at most.
+        most: Maximum number of iterations of a linear solve.
 
     Attributes:
-        iterations, status: Of the linear solves of the step, the same for every world, int32 [worlds].
+        iterations, status: Results of the step's linear solves, the same for every world, int32 [worlds].
     """
 
     def __init__(
@@ -134,7 +134,7 @@ class JoinedSolve:
         self.iterations, self.status = self._both[0], self._both[1]
 
     def launch(self, offset: int) -> None:
-        """Launch the steps of all bodies, from guesses of them, after their residuals."""
+        """Launch the solve for the steps of all bodies, from guesses; the residuals must be known."""
         rows, blocks = self._rows, []
         for k, newton in enumerate(self._newtons):
             operator = newton.operator
@@ -184,7 +184,7 @@ class JoinedSolve:
             held.add_slopes(own, part, search, slopes)
 
     def _judge(self) -> None:
-        """Launch which nodes obstacles hold from now on, and whether another round is needed."""
+        """Launch the choice of the nodes that obstacles hold from now on, and whether another round is needed."""
         rows, d = self._rows, self._d
         rows.update(d)
         self._operator.apply_freely(d, self._q)
@@ -199,7 +199,7 @@ class JoinedSolve:
         wp.launch(kernels.judge_round, 1, inputs, outputs, device=self.device)
 
     def _each_held(self, vector: wp.array) -> list[tuple[Held, wp.array]]:
-        """Obstacles at bodies, and these bodies' parts of a vector."""
+        """The contacts of bodies with obstacles, and these bodies' parts of a vector."""
         each = zip(self._held, self._parts.of(vector), strict=True)
         return [(held, part) for held, part in each if held is not None]
 

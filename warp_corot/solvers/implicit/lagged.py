@@ -15,7 +15,7 @@ class CostlySetUp(Preconditioner, Protocol):
     """A preconditioner whose set-up costs as much as many iterations.
 
     Attributes:
-        revision: Changes whenever launches do.
+        revision: Changes whenever its launches do, so that they must be recorded again.
     """
 
     revision: int

@@ -10,7 +10,7 @@ from warp_corot.kernels.implicit import line_search as kernels
 
 from .sums import WorldSums
 
-#: Shares that are tried, with 0 and 1.
+#: Number of shares that are tried, with 0 and 1.
 TRIALS = 10
 
 
@@ -18,8 +18,8 @@ class Contacts(Protocol):
     """Forces of contacts as functions of the motions in a step."""
 
     def add_slopes(self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array) -> None:
-        """Launch that the power along a change from motions d, at the share in ``search``, is added to that of its
-        world, float64 [worlds]."""
+        """Launch the addition of the contacts' power along a change from motions d, at the share in ``search``, to
+        ``slopes``, float64 [worlds]."""
         ...
 
 
@@ -27,10 +27,10 @@ class LineSearch:
     """Finds how much of a change of the motions to take, in each world.
 
     Args:
-        worlds: How many worlds.
-        count: Entries of each.
-        contacts: What opens and closes.
-        device: Where.
+        worlds: Number of worlds.
+        count: Number of entries of each world.
+        contacts: The contacts that open and close.
+        device: The device.
     """
 
     def __init__(self, worlds: int, count: int, contacts: Contacts, device: wp.Device):
@@ -44,7 +44,7 @@ class LineSearch:
 
         Args:
             rest: b - A d, where A has no contacts.
-            product: A change.
+            product: A times the change.
             change: The change, zero at entries that are not free.
             d: Motions.
         """

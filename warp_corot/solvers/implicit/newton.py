@@ -113,7 +113,7 @@ class Newton:
     # --- launches ----------------------------------------------------------------------------------------------------
 
     def launch_begin(self) -> None:
-        """Launch the begin of all worlds, from ``base`` and ``increment``."""
+        """Launch the beginning of the method in all worlds, from ``base`` and ``increment``."""
         self.running.zero_()
         outputs = [self._scalars, self.iterations, self.solved, self.status, self.running]
         wp.launch(kernels.begin_worlds, self.worlds, [], outputs, device=self.device)

@@ -37,7 +37,7 @@ class PreciseRest:
         loads: Loads and weight [N], float64 [worlds * N, 3].
 
     Attributes:
-        elements: Those of each world.
+        elements: The elements of each world.
         u: Displacements [m], float64 [worlds, N, 3].
         held: Whether nodes are held, bool [worlds, N].
         free: Free entries of each world's displacements, int64 each.

@@ -18,7 +18,7 @@ from .tangent import TangentOperator
 PLAIN: dict[str, Any] = {"most_lambda": 4.0}
 #: The same where they share it at nodes. As the two differ, better smoothing saves no iterations there.
 AT_NODES: dict[str, Any] = {"degree": 2, "rise": 0, **PLAIN}
-#: Of a short cycle on the CPU: sweeps, and the nodes of a level that is not made coarser.
+#: A short cycle on the CPU: its sweeps, and the number of nodes of a level that is not made coarser.
 SHORT: dict[str, Any] = {"sweeps": 1, "few_nodes": 24}
 
 
@@ -36,7 +36,7 @@ def _multigrid(operator: TangentOperator, short_cycles: bool) -> Multigrid:
     return Multigrid(operator.body, is_turned=is_turned, stiffening=stiffening, members=members, **options)
 
 
-#: By name.
+#: The preconditioners by name.
 PRECONDITIONERS: dict[str, Callable[[TangentOperator, bool], Preconditioner]] = {
     "multigrid": _multigrid,
     "diagonal": lambda operator, _: BlockDiagonal(operator),

@@ -64,7 +64,7 @@ class StaticSolver:
         self.share = 0.0
 
     def solve(self) -> NewtonReport:
-        """Find the state of rest; the body has the last good state then. Waits for the device.
+        """Find the state of rest, or leave the body in the last good state on the way there. Waits for the device.
 
         If the search begins with elements turned over, their neighbours may hold such elements in place. Then another
         search begins with all free nodes at rest, and the state with less energy is used.

@@ -39,8 +39,8 @@ class ImplicitStepper(Stepper):
     Attributes:
         totals: Steps, iterations of Newton's method and of linear solves, and steps that did not come within the
             tolerance, of all bodies, int64 [4].
-        touching: The constraints.
-        rows: What acts between bodies, or None.
+        touching: The constraints that implicit steps resolve.
+        rows: The contact of bodies with one another, or None.
     """
 
     graph_steps = 8
@@ -122,7 +122,7 @@ class ImplicitStepper(Stepper):
 
     @property
     def holds(self) -> list[Hold]:
-        """Constraints that are springs."""
+        """The constraints that are springs in implicit steps."""
         return cast("list[Hold]", [each for each in self.system.constraints if hasattr(each, "add_stiffness")])
 
     def add_counted_forces(self) -> None:
@@ -226,7 +226,7 @@ class BodySteps:
         self.field.potentials(u)
 
     def launch_begin(self, offset: int) -> None:
-        """Launch what the ``offset``-th step since the clock was last advanced begins with."""
+        """Launch the beginning of the ``offset``-th step since the clock was last advanced."""
         self.body.conditions.follow_activations(self.system.pace, offset + 1)
         self._follow_trajectories(offset)
         self._begin()
@@ -254,7 +254,7 @@ class BodySteps:
         self._take(iterations, solver.status)
 
     def take_solved(self, joined: JoinedSolve) -> None:
-        """Launch that the step is that of a solve of all bodies."""
+        """Launch the copy of this body's step from a solve for all bodies."""
         self._take(joined.iterations, joined.status)
 
     def _take(self, iterations: wp.array, status: wp.array) -> None:
@@ -266,7 +266,7 @@ class BodySteps:
         self._counts, self._good = [self._one, iterations, status], int(conjugate_gradients.CONVERGED)
 
     def launch_end(self, offset: int) -> None:
-        """Launch the state after the step, and what it has cost."""
+        """Launch the state after the step, and the count of its iterations."""
         self._end(offset, self._counts[-1])
         wp.launch(kernels.count_solves, 1, [*self._counts, self._good], [self.stepper.totals], device=self.device)
 

@@ -46,10 +46,10 @@ class WorldSums:
         self.take_in(column)
 
     def take_in(self, *columns: int, most: bool = False) -> None:
-        """Let columns of new parts be those of all ranks.
+        """Launch the replacement of columns of new parts by those of all ranks.
 
         Args:
-            columns: Which.
+            columns: The numbers of the columns.
             most: Whether their largest parts are asked for, not their sums.
         """
         self._ranks.take_in_parts(self.parts, columns, most)

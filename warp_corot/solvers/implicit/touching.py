@@ -15,7 +15,7 @@ from .operator import LinearOperator, Preconditioner
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
 
-#: Linear solves of a step at most.
+#: Maximum number of linear solves in a step.
 ROUNDS = 16
 #: A solve ends at this share of its first residual, because contact may change after it.
 SHARE = 0.15
@@ -52,7 +52,7 @@ class Held(Protocol):
 
 
 class Rows(Protocol):
-    """Forces between bodies, such as ``contact.joined_rows.JoinedRows``, which says what its members do."""
+    """Forces between bodies, such as ``contact.joined_rows.JoinedRows``, which explains the members."""
 
     locates: wp.array
 
@@ -84,7 +84,7 @@ class Hold(Protocol):
     """A constraint that is a spring in implicit steps, such as ``contact.grasp.Grasp``."""
 
     def launch_begin(self) -> None:
-        """Launch what a step begins with."""
+        """Launch the beginning of a step."""
         ...
 
     def add_forces(self) -> None: ...
@@ -94,7 +94,7 @@ class Hold(Protocol):
     def add_diagonal(self, body: SoftBody, blocks: wp.array) -> None: ...
 
     def launch_held(self, body: SoftBody) -> None:
-        """Launch that its forces on a body after the step are among those of contact."""
+        """Launch the addition of its forces on a body after the step to those of contact."""
         ...
 
 
@@ -173,7 +173,7 @@ class TouchingSolve:
         self._rounds, self._going = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(2))
 
     def launch(self) -> None:
-        """Launch ``newton.step``, from a guess of it, after the residual."""
+        """Launch the solve for ``newton.step``, from a guess; the residual must be known."""
         newton, held = self.newton, self.held
         self._operator.take(newton.body.state.displacements)
         self._preconditioner.update(self._operator)

@@ -31,7 +31,7 @@ class Gauge:
         body: The body.
         field: Its force field.
         found: The result, float32 [2], zero before: ``CURVATURE`` and ``STRAIN`` of ``kernels.stepping.pace``.
-        ranks, number: Who has the other parts of the body, and the number under which they know it.
+        ranks, number: The processes that have the other parts of the body, and its number there.
     """
 
     def __init__(self, body: SoftBody, field: ForceField, found: wp.array, ranks: Ranks = ALONE, number: int = 0):
@@ -70,7 +70,7 @@ class Gauge:
         """
         body = self.body
         self._find_curvature(body.state.displacements, body.state.forces)
-        # Parts of a body number their elements each in their own way: there, all are looked at.
+        # Each part of a body numbers its elements in its own way, so all of them are measured there.
         turns = int(kernels.TURNS) if self._ranks.is_alone else 1
         wp.launch(
             kernels.find_strains(body.discretization.element_kind),

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from warp_corot.solvers.system import System
 
 #: Steps between two measurements: usually; if one launch makes many steps, which a measurement interrupts; for bodies
-#: that change fast; and while nothing is known of their motion. A measurement takes about as long as a step.
+#: that change fast; and as long as nothing is known of their motion. A measurement takes about as long as a step.
 INTERVAL, BLOCK_INTERVAL = 32, 128
 LIVELY_INTERVAL, LIVELY_BLOCK_INTERVAL = 8, 32
 FIRST_INTERVAL = 8
