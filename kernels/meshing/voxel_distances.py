@@ -79,36 +79,58 @@ def find_nearest_across(
     k = t % squares.shape[2]
     n = squares.shape[1]
     count = int(0)
+    top = wp.vec2d()
+    below = wp.vec2d()
     for j in range(n):
-        if squares[i, j, k] < NOTHING:
-            new = parabola(squares, i, j, k, step)
+        square = squares[i, j, k]
+        counts = square < NOTHING
+        if square == 0.0 and j > 0 and j < n - 1:
+            # Between two voxels of the set this one is the nearest to itself alone.
+            counts = squares[i, j - 1, k] > 0.0 or squares[i, j + 1, k] > 0.0
+        if counts:
+            x = step * wp.float64(j)
+            new = wp.vec2d(x, wp.float64(square) + x * x)
             hidden = bool(count >= 2)
             while hidden:
-                top = parabola(squares, i, int(kept[i, count - 1, k]), k, step)
-                below = parabola(squares, i, int(kept[i, count - 2, k]), k, step)
                 hidden = hides(below, top, new)
                 if hidden:
                     count -= 1
+                    top = below
                     hidden = count >= 2
+                    if hidden:
+                        below = parabola(squares, i, int(kept[i, count - 2, k]), k, step)
             kept[i, count, k] = wp.int16(j)
             count += 1
+            below = top
+            top = new
     at = int(0)
+    here = wp.vec2d()
+    after = wp.vec2d()
+    if count > 0:
+        here = parabola(squares, i, int(kept[i, 0, k]), k, step)
+    if count > 1:
+        after = parabola(squares, i, int(kept[i, 1, k]), k, step)
     for j in range(n):
-        nearest[i, j, k] = wp.int16(-1)
-        total[i, j, k] = NOTHING
-        if count > 0:
+        if count == 0:
+            nearest[i, j, k] = wp.int16(-1)
+            total[i, j, k] = NOTHING
+        elif squares[i, j, k] == 0.0:
+            nearest[i, j, k] = wp.int16(j)
+            total[i, j, k] = 0.0
+        else:
             x = step * wp.float64(j)
-            here = parabola(squares, i, int(kept[i, at, k]), k, step)
             best = here[1] - wp.float64(2.0) * x * here[0]
             going = bool(at + 1 < count)
             while going:
-                after = parabola(squares, i, int(kept[i, at + 1, k]), k, step)
                 value = after[1] - wp.float64(2.0) * x * after[0]
                 going = value <= best
                 if going:
                     best = value
                     at += 1
+                    here = after
                     going = at + 1 < count
+                    if going:
+                        after = parabola(squares, i, int(kept[i, at + 1, k]), k, step)
             nearest[i, j, k] = kept[i, at, k]
             total[i, j, k] = float(best + x * x)
 

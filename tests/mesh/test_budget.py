@@ -6,10 +6,15 @@ import trimesh
 
 import warp_corot as wc
 from warp_corot.domain.fidelity import fidelity
+from warp_corot.domain.thinness import elements_through
 from warp_corot.mesh.growing.cut import face_pairs, without_slivers
 from warp_corot.mesh.growing.strays import strays
 
 TURN = trimesh.transformations.rotation_matrix(0.4, (1.0, 2.0, 3.0))
+
+
+def sample(mesh: trimesh.Trimesh) -> np.ndarray:
+    return np.asarray(trimesh.sample.sample_surface(mesh, 2000, seed=0)[0])
 
 
 def turned(mesh: trimesh.Trimesh) -> wc.Domain:
@@ -141,12 +146,40 @@ def test_a_pipe_with_a_wall_thinner_than_its_elements_stays_whole():
 
 
 def test_disconnected_tips_are_left_out_of_a_body_of_one_piece():
-    """A spike that ends in a blob of 4e-6 of the body, whose elements alone would be a piece."""
+    """A spike that ends in a blob of 4e-6 of the body, whose elements alone would be a piece. A warning names larger
+    tips, of up to 2e-4."""
     tets = np.array([[0, 1, 2, 3], [1, 2, 3, 4], [5, 6, 7, 8]], np.int32)
     held, none = np.array([1.0, 1.0, 4.0e-6]), np.zeros(3, bool)
     ball, balls = trimesh.creation.icosphere(2), trimesh.creation.icosphere(2).apply_translation((3.0, 0.0, 0.0))
     one = wc.Domain.from_surface((ball.vertices, ball.faces))
-    assert strays(tets, held, none, one).tolist() == [False, False, True]
-    assert not strays(tets, held * [1.0, 1.0, 100.0], none, one).any()
+    found, said = strays(tets, held, none, one)
+    assert found.tolist() == [False, False, True]
+    assert not said
+    assert "1 pieces of the mesh" in strays(tets, held * [1.0, 1.0, 80.0], none, one)[1]
+    assert not strays(tets, held * [1.0, 1.0, 200.0], none, one)[0].any()
     both = trimesh.util.concatenate([ball, balls])
-    assert not strays(tets, held, none, wc.Domain.from_surface((both.vertices, both.faces))).any()
+    assert not strays(tets, held, none, wc.Domain.from_surface((both.vertices, both.faces)))[0].any()
+
+
+def test_tips_of_crossing_parts_are_left_out_as_well():
+    """Needles stuck into a ball, parts of one piece: tips hang on by less than a face, and the mesh says so."""
+    needles = []
+    for direction in np.random.default_rng(1).standard_normal((20, 3)):
+        needle = trimesh.creation.cone(0.1, 3.4, sections=8)
+        needles.append(needle.apply_transform(trimesh.geometry.align_vectors([0.0, 0.0, 1.0], direction)))
+    body = trimesh.util.concatenate([trimesh.creation.icosphere(2), *needles])
+    domain = wc.Domain.from_surface((body.vertices, body.faces))
+    with pytest.warns(UserWarning, match="tips of the body"):
+        mesh = wc.TetForest.from_domain(domain, target_elements=2000)
+    assert fidelity(mesh, domain).pieces == 1
+
+
+def test_a_broken_wall_says_how_many_elements_it_takes():
+    """Flat walls of 1/500 of the length: seven elements for each square of two walls, as large as these are thick."""
+    inner = trimesh.creation.box((0.996, 0.996, 0.996))
+    inner.invert()
+    box = trimesh.util.concatenate([trimesh.creation.box((1.0, 1.0, 1.0)), inner])
+    domain = wc.Domain.from_surface((box.vertices, box.faces))
+    assert elements_through(domain.kind, sample(box), 0.1) == pytest.approx(7.0 * 12.0 / 0.002**2, rel=0.03)
+    solid = trimesh.creation.box((1.0, 1.0, 1.0))
+    assert elements_through(wc.Domain.from_surface((solid.vertices, solid.faces)).kind, sample(solid), 0.1) == 0

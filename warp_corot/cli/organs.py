@@ -205,8 +205,12 @@ def _measured(args: argparse.Namespace, mesh: TetForest, domain: Domain, surface
     from warp_corot.domain.units import length
 
     found = fidelity(mesh, domain, surface=surface)
+    more, through = 2 * len(mesh.tets), ""
+    if found.needed > more:
+        more = int(float(f"{found.needed:.1e}"))
+        through = ", of which one fits through the thinnest walls"
     for doubt in found.doubts():
-        warnings.warn(doubt.replace("more tetrahedra", f"more tetrahedra (--tets {2 * len(mesh.tets)})"), stacklevel=2)
+        warnings.warn(doubt.replace("more tetrahedra", f"more tetrahedra (--tets {more}{through})"), stacklevel=2)
     off = max(found.distance_95)
     if args.surface_error is not None and off > args.surface_error:
         helps = "a larger --tets" if args.tets is not None else f"--max-level {int(mesh.levels.max()) + 3}"

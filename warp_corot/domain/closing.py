@@ -10,7 +10,8 @@ from scipy.spatial import cKDTree
 
 from warp_corot.errors import InputError
 
-from .winding import edge_parts, linked, net_edges, part_volumes, wind_alike, wind_outwards
+from .edges import Edges
+from .winding import edge_parts, linked, part_volumes, wind_alike, wind_outwards
 
 #: Where the surface is open, points closer than this share of its size are welded.
 WELD = 1.0e-6
@@ -27,6 +28,8 @@ class ClosedSurface:
     Attributes:
         points: float64 [N, 3].
         triangles: int32 [T, 3]; the last ones close the holes.
+        edges: The edges of these.
+        parts: The part of each triangle, of those connected by edges [T].
         caps: Number of triangles that close holes.
         open_edges: Number of edges of holes.
         holes: Number of connected groups of these edges.
@@ -41,6 +44,8 @@ class ClosedSurface:
 
     points: npt.NDArray[np.float64]
     triangles: npt.NDArray[np.int32]
+    edges: Edges
+    parts: npt.NDArray[np.int32]
     caps: int
     open_edges: int
     holes: int
@@ -65,17 +70,19 @@ def close_surface(points: np.ndarray, triangles: np.ndarray) -> ClosedSurface:
             thickness.
     """
     given = len(triangles)
-    points, triangles = weld(points, triangles)
-    triangles, twofold = drop_useless(triangles)
+    points, triangles, edges = weld(points, triangles)
+    triangles, twofold = drop_useless(triangles, edges)
     if not len(triangles):
         raise InputError(f"none of the {given} triangles has an area; the surface is degenerate")
     dropped = given - len(triangles)
-    triangles, turned = wind_alike(triangles)
-    parts = edge_parts(triangles)
+    edges = Edges(triangles) if dropped else edges
+    triangles, turned = wind_alike(triangles, edges)
+    edges = Edges(triangles) if turned else edges
+    parts = edge_parts(triangles, edges)
     area = float(areas(points, triangles).sum())
     if not area > 0.0:  # lengths whose squares are too small for a number
         raise InputError(f"none of the {given} triangles has an area; the surface is degenerate")
-    points, caps, cap_parts, open_edges, holes = cones(points, triangles, parts)
+    points, caps, cap_parts, open_edges, holes = cones(points, triangles, parts, edges)
     cap_share = float(areas(points, caps).sum()) / area
     if cap_share > LARGEST_HOLES:
         if twofold:
@@ -86,6 +93,7 @@ def close_surface(points: np.ndarray, triangles: np.ndarray) -> ClosedSurface:
         )
     closed, all_parts = np.concatenate([triangles, caps]), np.concatenate([parts, cap_parts])
     closed, inside_out, cavities = wind_outwards(points, closed, all_parts)
+    edges = Edges(closed) if len(caps) or inside_out else edges
     volume = float(part_volumes(points, closed, np.zeros(len(closed), int)).sum())
     size = float(np.ptp(points[closed.ravel()], axis=0).max())
     if not volume > 0.5 * THINNEST * size * area:
@@ -95,22 +103,28 @@ def close_surface(points: np.ndarray, triangles: np.ndarray) -> ClosedSurface:
         )
     pieces = int(all_parts.max()) + 1 - cavities
     return ClosedSurface(
-        points, closed.astype(np.int32), len(caps), open_edges, holes, cap_share, turned, inside_out, dropped, pieces,
-        cavities, volume,
+        points, closed.astype(np.int32), edges, all_parts.astype(np.int32), len(caps), open_edges, holes, cap_share,
+        turned, inside_out, dropped, pieces, cavities, volume,
     )  # fmt: skip
 
 
-def weld(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def weld(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, Edges]:
     """Merge points in the same place, and then, where the surface is still open, points in nearly the same place.
 
     Points that no triangle names are left out.
+
+    Returns:
+        The points, in ascending order, the triangles, and their edges.
     """
-    used, triangles = np.unique(triangles, return_inverse=True)
+    used = np.zeros(len(points), bool)
+    used[triangles] = True
     points = points[used] + 0.0
-    rows = np.ascontiguousarray(points).view([("", np.float64)] * 3).ravel()
-    _, first, place = np.unique(rows, return_index=True, return_inverse=True)
-    points, triangles = points[first], place.ravel()[triangles.reshape(-1, 3)]
-    rims = np.unique(net_edges(triangles)[0])
+    points, place = _without_twins(points)
+    named = np.zeros(len(used), np.int64)
+    named[used] = place
+    triangles = named[triangles]
+    edges = Edges(triangles)
+    rims = np.unique(edges.net()[0])
     if len(rims):
         near = WELD * float(np.ptp(points, axis=0).max())
         pairs = cKDTree(points[rims]).query_pairs(near, output_type="ndarray")
@@ -120,17 +134,34 @@ def weld(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndar
             first = np.full(count, len(points))
             np.minimum.at(first, place, np.arange(len(points)))
             points, triangles = points[first], place[triangles]
-    return points, triangles
+            edges = Edges(triangles)
+    return points, triangles, edges
 
 
-def drop_useless(triangles: np.ndarray) -> tuple[np.ndarray, bool]:
+def _without_twins(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points in ascending order, each once, and the place of each given point among them."""
+    order = np.argsort(points[:, 0], kind="stable")
+    along = points[order, 0]
+    if (along[1:] == along[:-1]).any():
+        order = np.lexsort(points.T[::-1])
+    ordered = points[order]
+    new = np.append(True, (ordered[1:] != ordered[:-1]).any(axis=1))
+    place = np.empty(len(points), np.int64)
+    place[order] = np.cumsum(new) - 1
+    return ordered[new], place
+
+
+def drop_useless(triangles: np.ndarray, edges: Edges) -> tuple[np.ndarray, bool]:
     """Remove triangles that name a point twice, repeat another, or coincide with one that faces the other way.
 
     If at least half of the triangles coincide with one that faces the other way, they are two sides of one sheet: one
     of each pair stays, and the second value is True.
     """
     a, b, c = triangles.T
-    triangles = triangles[(a != b) & (b != c) & (c != a)]
+    good = (a != b) & (b != c) & (c != a)
+    if good.all() and not _coincide(triangles, edges):
+        return triangles, False
+    triangles = triangles[good]
     if not len(triangles):
         return triangles, False
     order = np.argsort(triangles, axis=1)
@@ -143,8 +174,17 @@ def drop_useless(triangles: np.ndarray) -> tuple[np.ndarray, bool]:
     return triangles[np.sort(first if twofold else first[net != 0])], twofold
 
 
+def _coincide(triangles: np.ndarray, edges: Edges) -> bool:
+    """Whether some triangles may have the same three points: two at one edge do, or more than two share an edge."""
+    if (edges.sharers > 2).any():
+        return True
+    one, other = edges.twos
+    sums = triangles.sum(axis=1)
+    return bool((sums[one // 3] == sums[other // 3]).any())
+
+
 def cones(
-    points: np.ndarray, triangles: np.ndarray, parts: np.ndarray
+    points: np.ndarray, triangles: np.ndarray, parts: np.ndarray, edges: Edges
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int, int]:
     """Close every hole by a cone from its rim to the rim's centre.
 
@@ -154,26 +194,27 @@ def cones(
     Returns:
         Points with the centres appended, caps [C, 3], the part of each, number of open edges, number of holes.
     """
+    if not len(edges.net()[0]):
+        return points, np.empty((0, 3), np.int64), np.empty(0, np.int64), 0, 0
     # A rim runs through points of one part: a point that several parts share counts once for each.
     count = len(points)
     places, nodes = np.unique(parts[:, None] * count + triangles, return_inverse=True)
-    edges, often = net_edges(nodes.reshape(-1, 3))
-    if not len(edges):
-        return points, np.empty((0, 3), np.int64), np.empty(0, np.int64), 0, 0
-    rim = np.unique(edges)
-    a, b = np.searchsorted(rim, edges).T
-    owner, edges = places[edges[:, 0]] // count, places[edges] % count
+    ends, often = Edges(nodes.reshape(-1, 3)).net()
+    rim = np.unique(ends)
+    a, b = np.searchsorted(rim, ends).T
+    owner, ends = places[ends[:, 0]] // count, places[ends] % count
     holes, hole = linked(a, b, len(rim))
     hole = hole[a]
-    lengths = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
+    lengths = np.linalg.norm(points[ends[:, 0]] - points[ends[:, 1]], axis=1)
     weights = np.maximum(lengths, 1e-30) / np.bincount(hole, weights=np.maximum(lengths, 1e-30))[hole]
     centres = np.zeros((holes, 3))
-    np.add.at(centres, hole, weights[:, None] * points[edges].mean(axis=1))
-    caps = np.stack([edges[:, 1], edges[:, 0], len(points) + hole], axis=1)
-    return np.concatenate([points, centres]), np.repeat(caps, often, axis=0), np.repeat(owner, often), len(edges), holes
+    np.add.at(centres, hole, weights[:, None] * points[ends].mean(axis=1))
+    caps = np.stack([ends[:, 1], ends[:, 0], len(points) + hole], axis=1)
+    return np.concatenate([points, centres]), np.repeat(caps, often, axis=0), np.repeat(owner, often), len(ends), holes
 
 
 def areas(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Areas of triangles [T]."""
     a, b, c = points[triangles].transpose(1, 0, 2)
-    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    crossed = np.cross(b - a, c - a)
+    return 0.5 * np.sqrt(np.einsum("ij,ij->i", crossed, crossed))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from warp_corot.mesh.surfaces.bodies import boundary_surface
 
 from .domain import Domain
 from .reference import reference_of
+from .thinness import elements_through
 from .units import length, volume
 from .winding import net_edges
 
@@ -43,6 +44,8 @@ class Fidelity:
         watertight: Whether every edge of the mesh's surface is used once in each direction.
         smallest_dihedral: The sharpest angle between two faces of an element.
         elements: Number of elements.
+        needed: About the number of elements of which one fits through the body wherever it is thin; 0 if the mesh holds
+            the body well, so that nobody asks.
     """
 
     volume: float
@@ -56,6 +59,7 @@ class Fidelity:
     watertight: bool
     smallest_dihedral: float
     elements: int
+    needed: int = 0
 
     @property
     def volume_error(self) -> float:
@@ -77,7 +81,9 @@ class Fidelity:
         """Defects and their remedies, a line each; empty if the mesh is good."""
         found = []
         if abs(self.volume_error) > LARGEST_VOLUME_ERROR:
-            found.append(f"the tetrahedra hold {self.volume_error:+.1%} of the body's volume; more of them would help")
+            found.append(
+                f"the tetrahedra hold {self.volume_error:+.1%} of the body's volume; more tetrahedra would help"
+            )
         if self.lost_pieces:
             found.append(
                 f"{self.lost_pieces} of the body's {self.input_pieces} pieces are in no tetrahedron; more tetrahedra "
@@ -128,7 +134,7 @@ def fidelity(
     forth = np.abs(np.asarray(domain.phi(_spread(surface, samples)), np.float64))
     back = _distances(surface, given.points, domain.device)
     lost = tuple(n for n in domain.label_names if not (n in _labels(mesh) and mesh.elements_of(n).any()))
-    return Fidelity(
+    found = Fidelity(
         volume=held_volume(mesh),
         input_volume=given.volume,
         distance_mean=(float(forth.mean()), float(back.mean())),
@@ -141,16 +147,24 @@ def fidelity(
         smallest_dihedral=smallest_dihedral(mesh),
         elements=len(mesh.tets),
     )
+    broken = found.pieces > found.input_pieces - found.lost_pieces
+    if not broken and abs(found.volume_error) <= LARGEST_VOLUME_ERROR:
+        return found
+    length = float(np.cbrt(12.0 * np.median(np.abs(mesh_volumes(mesh)))))
+    return replace(found, needed=elements_through(domain.kind, given.points, length))
+
+
+def mesh_volumes(mesh: TetForest | TetMesh) -> np.ndarray:
+    """Volumes of a mesh's elements [m^3]."""
+    from warp_corot.mesh.surfaces.boundary import signed_volumes
+
+    volumes = getattr(mesh, "volumes", None)
+    return np.abs(signed_volumes(mesh.points, mesh.tets)) if volumes is None else volumes
 
 
 def held_volume(mesh: TetForest | TetMesh) -> float:
     """Volume of a mesh's elements [m^3]; elements that a surface cuts count with the part inside."""
-    from warp_corot.mesh.surfaces.boundary import signed_volumes
-
-    volumes = getattr(mesh, "volumes", None)
-    if volumes is None:
-        volumes = np.abs(signed_volumes(mesh.points, mesh.tets))
-    fill = getattr(mesh, "fill", None)
+    volumes, fill = mesh_volumes(mesh), getattr(mesh, "fill", None)
     return float(np.sum(volumes if fill is None else volumes * fill))
 
 

@@ -6,16 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.ndimage
-import warp as wp
 
-from warp_corot.kernels.meshing import measuring as kernels
 from warp_corot.kernels.meshing.domain import BOUNDARY
 
 from .labels import LabelDomain
 from .signed import SignedFunction
 from .surface import SurfaceDomain
 from .voxels import piece_of_voxels
-from .winding import Parts, edge_parts, linked, part_volumes
 
 #: Number of points along the longest side at which a function is first evaluated, and of halvings of cells at the
 #: surface.
@@ -61,7 +58,7 @@ def reference_of(domain: SignedFunction, count: int) -> Reference:
 
 def _of_surface(domain: SurfaceDomain, count: int) -> Reference:
     points, triangles = domain.closed.points, domain.closed.triangles.astype(np.int64)
-    pieces, piece, crossing = joined_parts(points, triangles, domain.device)
+    pieces, piece, crossing = domain.joined
     corners = points[triangles]
     areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     rng = np.random.default_rng(0)
@@ -97,67 +94,6 @@ def volume_along_lines(domain: SurfaceDomain) -> float:
     starts[:, across] = low[across] + (cells + np.random.default_rng(0).random(cells.shape)) * (size / counts)
     starts[:, lines.axis] = lines.low
     return float(domain.lengths_inside(starts).mean() * size.prod())
-
-
-def joined_parts(points: np.ndarray, triangles: np.ndarray, device: wp.Device) -> tuple[int, np.ndarray, bool]:
-    """Pieces of the body that a closed surface encloses: its parts, joined if they touch, cross or contain one another.
-
-    Returns:
-        The number of pieces, the piece of each triangle [T] (a cavity belongs to its surroundings), and whether parts
-        overlap.
-    """
-    part = edge_parts(triangles)
-    count = int(part.max()) + 1
-    if count == 1:
-        return 1, np.zeros(len(triangles), np.int32), False
-    # Parts that share a point.
-    at = np.unique(np.stack([triangles.ravel(), np.repeat(part, 3)], axis=1), axis=0)
-    same = at[1:, 0] == at[:-1, 0]
-    links = [np.stack([at[:-1][same, 1], at[1:][same, 1]], axis=1)]
-    crossings = _crossings(points, triangles, part, device)
-    links.append(crossings)
-    # Parts inside the body of others: a cavity in its surroundings, or a part buried in it.
-    groups, outward = Parts(points, triangles, part), part_volumes(points, triangles, part) > 0.0
-    holders = [groups.holders(groups.corners[groups.slices[own]][0, 0], own) for own in range(count)]
-    overlap = len(crossings) > 0
-    for own in range(count):
-        around = _bounds_around(own, holders, outward)
-        links.append(np.stack([np.full(len(around), own), around], axis=1))
-        overlap |= len(around) > 0 and bool(outward[own])
-    pairs = np.concatenate(links)
-    pieces, of_part = linked(pairs[:, 0], pairs[:, 1], count)
-    return pieces, of_part[part].astype(np.int32), overlap
-
-
-def _bounds_around(own: int, holders: list[np.ndarray], outward: np.ndarray) -> np.ndarray:
-    """The parts that bound the body just outside a part: from the innermost one around it outwards, as far as the body
-    reaches.
-    """
-    inmost_first = sorted(holders[own], key=lambda holder: -len(holders[holder]))
-    depth = np.cumsum([0, *(1 if outward[holder] else -1 for holder in reversed(inmost_first))])[::-1]
-    ends = np.flatnonzero(depth <= 0)
-    return np.array(inmost_first[: ends[0]], np.int64)
-
-
-def _crossings(points: np.ndarray, triangles: np.ndarray, part: np.ndarray, device: wp.Device) -> np.ndarray:
-    """Pairs of parts where an edge of one passes through a triangle of the other [n, 2]."""
-    edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    edges, first = np.unique(edges, axis=0, return_index=True)
-    own = part[first // 3]
-    middle = points.mean(axis=0)
-    placed = wp.array(points - middle, dtype=wp.vec3, device=device)
-    mesh = wp.Mesh(placed, wp.array(triangles.astype(np.int32).ravel(), dtype=wp.int32, device=device))
-    crossed = wp.empty(len(edges), dtype=wp.int32, device=device)
-    inputs = [
-        placed,
-        wp.array(edges.astype(np.int32), dtype=wp.vec2i, device=device),
-        wp.array(own.astype(np.int32), dtype=wp.int32, device=device),
-        mesh.id,
-        wp.array(part.astype(np.int32), dtype=wp.int32, device=device),
-    ]
-    wp.launch(kernels.find_crossed_parts, len(edges), inputs, [crossed], device=device)
-    other = crossed.numpy()
-    return np.unique(np.stack([own, other], axis=1)[other >= 0], axis=0)
 
 
 def _of_voxels(domain: LabelDomain, count: int) -> Reference:

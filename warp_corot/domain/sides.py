@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -10,8 +11,13 @@ import warp as wp
 from warp_corot.kernels.meshing import domain as kernels
 from warp_corot.kernels.meshing import measuring
 from warp_corot.kernels.meshing.windings import Lines
+from warp_corot.mesh.side_by_side import in_parts
 
+from .edges import Edges
 from .winding import linked
+
+if TYPE_CHECKING:
+    from .closing import ClosedSurface
 
 #: Winding numbers are evaluated this far off a triangle, over its own size and, at least, over the surface's.
 ASIDE, LEAST_ASIDE = 1.0e-3, 2.0e-6
@@ -54,7 +60,7 @@ class Sides:
         ]
 
 
-def sides_of(points: np.ndarray, triangles: np.ndarray, mesh: wp.Mesh, lines: Lines) -> Sides:
+def sides_of(closed: ClosedSurface, mesh: wp.Mesh, lines: Lines) -> Sides:
     """Find what is on the two sides of each triangle.
 
     If the triangles of a patch meet others only along common edges, all of them have the same sides, and two winding
@@ -63,50 +69,46 @@ def sides_of(points: np.ndarray, triangles: np.ndarray, mesh: wp.Mesh, lines: Li
     crosses itself in many places, no triangle is sure.
 
     Args:
-        points: float64 [N, 3].
-        triangles: Closed, int32 [T, 3].
+        closed: The surface.
         mesh: The same surface on the device.
         lines: The lines along which winding numbers are found.
     """
-    triangles = triangles.astype(np.int64)
+    points, triangles, edges = closed.points, closed.triangles.astype(np.int64), closed.edges
     count = len(triangles)
-    # Edge k of a triangle is across from its corner k.
-    ends = np.sort(triangles[:, [1, 2, 2, 0, 0, 1]].reshape(-1, 2), axis=1)
-    keys = ends[:, 0] * (int(triangles.max()) + 1) + ends[:, 1]
-    order = np.argsort(keys, kind="stable")
-    starts = np.flatnonzero(np.diff(keys[order], prepend=-1))
-    sharers = np.diff(starts, append=len(order))
-    two = starts[sharers == 2]
-    one, other = order[two], order[two + 1]
+    one, other = edges.twos
     a, b = one // 3, other // 3
 
     corners = points[triangles]
     crossed = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    double_area = np.linalg.norm(crossed, axis=1)
+    double_area = np.sqrt(np.einsum("ij,ij->i", crossed, crossed))
     normal = crossed / np.maximum(double_area, 1e-300)[:, None]
     edge_normals = np.zeros((3 * count, 3), np.float32)
-    edge_normals[one] = edge_normals[other] = normal[a] + normal[b]
-    corner_normals = _corner_normals(corners, triangles, normal, len(points))
+    # The half-edge from corner k is the edge across from corner k + 2.
+    across = np.array([2, 0, 1])
+    edge_normals[3 * a + across[one % 3]] = edge_normals[3 * b + across[other % 3]] = normal[a] + normal[b]
+    corner_normals = _corner_normals(corners, triangles, normal, double_area, len(points))
     unknown = np.full(count, kernels.UNSURE, np.uint8)
 
     def with_sides(known: np.ndarray) -> Sides:
         return Sides(known, edge_normals.reshape(count, 3, 3), corner_normals)
 
-    touched = _touched(ends[order[starts]], mesh)
-    parts, owner_of = linked(a, b, count)[1], order[starts] // 3
-    hit = touched >= 0
-    crosses_itself = parts[owner_of[hit]] == parts[touched[hit]]
+    touched = _touched(edges.ends, mesh)
+    hit = np.flatnonzero(touched >= 0)
+    owner = edges.order[edges.starts[hit]] // 3
+    crosses_itself = closed.parts[owner] == closed.parts[touched[hit]]
     if np.count_nonzero(crosses_itself) + np.count_nonzero(touched < -1) > MESSY * len(touched):
         return with_sides(unknown)
-    doubtful = np.zeros(count, bool)
-    doubtful[order[np.repeat((touched != -1) | (sharers != 2), sharers)] // 3] = True
-    doubtful[touched[touched >= 0]] = True
+    doubtful: np.ndarray = np.zeros(count, bool)
+    doubtful[edges.order[np.repeat((touched != -1) | (edges.sharers != 2), edges.sharers)] // 3] = True
+    doubtful[touched[hit]] = True
     folded = np.linalg.norm(normal[a] + normal[b], axis=1) < FOLDED
     doubtful[a[folded]] = doubtful[b[folded]] = True
     doubtful |= _needles(corners, double_area, LEAST_ASIDE * float(np.ptp(points, axis=0).max()))
-    doubtful |= np.isin(triangles, _pinched(triangles, one, other)).any(axis=1)
+    near = _pinched(triangles, one, other, len(points))[triangles].any(axis=1) | doubtful
     # And their neighbours, because in float32 a crossing does not end at a triangle's edge.
-    doubtful |= np.isin(triangles, triangles[doubtful]).any(axis=1)
+    of_doubtful = np.zeros(len(points), bool)
+    of_doubtful[triangles[near]] = True
+    doubtful = np.asarray(of_doubtful[triangles].any(axis=1))
     linking = ~(doubtful[a] | doubtful[b])
     patches, patch = linked(a[linking], b[linking], count)
     sure = np.unique(patch[~doubtful])
@@ -143,39 +145,49 @@ def _needles(corners: np.ndarray, double_area: np.ndarray, least: float) -> np.n
     return double_area < np.maximum(least, NEEDLE * longest) * longest
 
 
-def _corner_normals(corners: np.ndarray, triangles: np.ndarray, normal: np.ndarray, count: int) -> np.ndarray:
+def _corner_normals(
+    corners: np.ndarray, triangles: np.ndarray, normal: np.ndarray, double_area: np.ndarray, count: int
+) -> np.ndarray:
     found = np.zeros((count, 3))
     for n in range(3):
         u, v = corners[:, (n + 1) % 3] - corners[:, n], corners[:, (n + 2) % 3] - corners[:, n]
-        angle = np.arctan2(np.linalg.norm(np.cross(u, v), axis=1), np.einsum("ij,ij->i", u, v))
+        angle = np.arctan2(double_area, np.einsum("ij,ij->i", u, v))
         for axis in range(3):
             found[:, axis] += np.bincount(triangles[:, n], angle * normal[:, axis], count)
     return found.astype(np.float32)
 
 
-def _pinched(triangles: np.ndarray, one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Points around which triangles are not all linked by common edges."""
-    count = len(triangles)
-    links = []
-    for a_corner in (1, 2):
-        mine = 3 * (one // 3) + (one + a_corner) % 3
-        point = triangles.ravel()[mine]
-        for b_corner in (1, 2):
-            theirs = 3 * (other // 3) + (other + b_corner) % 3
-            same = triangles.ravel()[theirs] == point
-            links.append(np.stack([mine[same], theirs[same]]))
+def _pinched(triangles: np.ndarray, one: np.ndarray, other: np.ndarray, count: int) -> np.ndarray:
+    """Mask of the points around which triangles are not all linked by common edges, bool [count].
+
+    Args:
+        triangles: [T, 3].
+        one, other: The half-edges of edges that two triangles share.
+        count: Number of points.
+    """
+    of_corner = triangles.ravel()
+    start, end = one, 3 * (one // 3) + (one + 1) % 3
+    # Half-edges start at their own corner; the other triangle's run the same way or back.
+    start_other, end_other = other, 3 * (other // 3) + (other + 1) % 3
+    alike = of_corner[start] == of_corner[start_other]
+    links = [start, np.where(alike, start_other, end_other)], [end, np.where(alike, end_other, start_other)]
     a, b = np.concatenate(links, axis=1)
-    _, fan = linked(a, b, 3 * count)
-    fans = np.unique(np.stack([triangles.ravel(), fan], axis=1), axis=0)[:, 0]
-    names, times = np.unique(fans, return_counts=True)
-    return names[times > 1]
+    fans, fan = linked(a, b, len(of_corner))
+    point_of = np.empty(fans, np.int64)
+    point_of[fan] = of_corner
+    return np.bincount(point_of, minlength=count) > 1
 
 
 def _touched(edges: np.ndarray, mesh: wp.Mesh) -> np.ndarray:
     touched = wp.empty(len(edges), dtype=wp.int32, device=mesh.device)
     given = wp.array(edges.astype(np.int32), dtype=wp.vec2i, device=mesh.device)
-    inputs = [mesh.points, given, mesh.id, mesh.indices]
-    wp.launch(measuring.find_touched_triangles, len(edges), inputs, [touched], device=mesh.device)
+
+    def find(start: int, stop: int) -> None:
+        inputs = [mesh.points, given[start:stop], mesh.id, mesh.indices]
+        outputs = [touched[start:stop]]
+        wp.launch(measuring.find_touched_triangles, stop - start, inputs, outputs, device=mesh.device)
+
+    in_parts(mesh.device, len(edges), find)
     return touched.numpy()
 
 
@@ -196,24 +208,22 @@ def _near(corners: np.ndarray, area: np.ndarray) -> np.ndarray:
     return np.einsum("nc,ncx->nx", rng.dirichlet([1.0, 1.0, 1.0], TRIED), corners[chosen]) + apart
 
 
-def corner_points(points: np.ndarray, triangles: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+def corner_points(points: np.ndarray, triangles: np.ndarray, edges: Edges, bounds: np.ndarray) -> np.ndarray:
     """Numbers of the points where three or more sharp edges meet.
 
     Args:
         points: float64 [N, 3].
         triangles: Closed, int64 [T, 3].
+        edges: Their edges.
         bounds: Mask of the triangles with the body on one side and the outside on the other, bool [T]; points of others
             do not count.
     """
     corners = points[triangles]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-    ends = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    keys = ends[:, 0] * len(points) + ends[:, 1]
-    order = np.argsort(keys, kind="stable")
-    pair = np.flatnonzero(keys[order[1:]] == keys[order[:-1]])
-    one, other = order[pair] // 3, order[pair + 1] // 3
-    sharp = np.einsum("nc,nc->n", normal[one], normal[other]) < np.cos(np.radians(SHARP))
-    found = np.bincount(ends[order[pair[sharp]]].ravel(), minlength=len(points)) >= 3
+    normal /= np.maximum(np.sqrt(np.einsum("ij,ij->i", normal, normal)), 1e-300)[:, None]
+    one, other = edges.pairs
+    sharp = one[np.einsum("nc,nc->n", normal[one // 3], normal[other // 3]) < np.cos(np.radians(SHARP))]
+    meeting = [np.bincount(ends[sharp], minlength=len(points)) for ends in (edges.starting, edges.ending)]
+    found = meeting[0] + meeting[1] >= 3
     found[triangles[~bounds].ravel()] = False
     return np.flatnonzero(found)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from functools import cached_property
 from os import PathLike
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ from warp_corot.kernels.meshing import domain as kernels
 from warp_corot.kernels.meshing import windings
 from warp_corot.mesh.side_by_side import in_parts
 
+from .joined import joined_parts
 from .sides import corner_points, sides_of
 from .signed import SignedFunction
 from .units import length, metres_per_unit, unlikely_size, volume
@@ -46,7 +48,9 @@ class SurfaceDomain(SignedFunction):
     """
 
     def __init__(self, closed: ClosedSurface, notes: Sequence[str] = (), **options: Any):
-        used = closed.points[np.unique(closed.triangles)]
+        named = np.zeros(len(closed.points), bool)
+        named[closed.triangles] = True
+        used = closed.points[named]
         # Triangles are kept in float32; its rounding may move them outwards.
         rounding = 2.0**-23 * np.abs(used).max()
         bounds = np.stack([used.min(axis=0) - rounding, used.max(axis=0) + rounding])
@@ -62,7 +66,7 @@ class SurfaceDomain(SignedFunction):
                 f"the surface crosses itself so that {self.reversed:.0%} of what it encloses is inside out; it must be "
                 f"wound outwards throughout (at most {LARGEST_REVERSED:.0%})"
             )
-        self.sides = sides_of(closed.points, closed.triangles, self._mesh(self.device), self.lines)
+        self.sides = sides_of(closed, self._mesh(self.device), self.lines)
 
     def _phi(self, points: wp.array) -> wp.array:
         phi = wp.empty(points.size, wp.float32, device=points.device)
@@ -92,7 +96,12 @@ class SurfaceDomain(SignedFunction):
 
     def corners(self) -> np.ndarray:
         points, triangles = self.closed.points, self.closed.triangles.astype(np.int64)
-        return points[corner_points(points, triangles, self.sides.known == kernels.BOUNDARY)]
+        return points[corner_points(points, triangles, self.closed.edges, self.sides.known == kernels.BOUNDARY)]
+
+    @cached_property
+    def joined(self) -> tuple[int, np.ndarray, bool]:
+        """The body's pieces; see `joined_parts`."""
+        return joined_parts(self.closed, self.device)
 
     @property
     def has_pieces(self) -> bool:

@@ -6,58 +6,21 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components
 
+from .edges import Edges
+
 #: Approximate number of corners of a part that are tested to find whether it lies within another.
 CORNERS = 16
 
 
-def walked_edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-    """The three edges of each triangle.
-
-    Returns:
-        A number for each edge [3 T], low * count + high of its two points, whether it is walked from the low one to the
-        high one, bool [3 T], and that count.
-    """
-    edges = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
-    count = int(triangles.max()) + 1
-    return edges.min(axis=1) * count + edges.max(axis=1), edges[:, 0] < edges[:, 1], count
-
-
 def net_edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Edges that are not walked as often one way as the other: the boundary of the surface.
-
-    Returns:
-        Edges [E, 2], walked the way of the triangles beside them, and how often more, [E].
-    """
-    keys, forward, count = walked_edges(triangles)
-    unique, place = np.unique(keys, return_inverse=True)
-    net = np.bincount(place.ravel(), weights=np.where(forward, 1, -1)).astype(np.int64)
-    found = net != 0
-    low, high = unique[found] // count, unique[found] % count
-    turned = net[found] < 0
-    return np.stack([np.where(turned, high, low), np.where(turned, low, high)], axis=1), np.abs(net[found])
+    """The boundary of a surface; see `Edges.net`."""
+    return Edges(triangles).net()
 
 
-def edge_pairs(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pairs of triangles that share an edge; more than two triangles at an edge form a chain of pairs.
-
-    Returns:
-        ``pairs`` [P, 2], ``against`` bool [P] (both walk the edge the same way: one must be turned), ``alone`` bool [P]
-        (no third shares the edge).
-    """
-    keys, forward, _ = walked_edges(triangles)
-    order = np.argsort(keys, kind="stable")
-    ordered = keys[order]
-    same = np.flatnonzero(ordered[1:] == ordered[:-1])
-    sharers = np.unique(ordered, return_inverse=True, return_counts=True)
-    alone = sharers[2][sharers[1].ravel()[same]] == 2
-    a, b = order[same], order[same + 1]
-    return np.stack([a // 3, b // 3], axis=1), forward[a] == forward[b], alone
-
-
-def edge_parts(triangles: np.ndarray) -> np.ndarray:
+def edge_parts(triangles: np.ndarray, edges: Edges | None = None) -> np.ndarray:
     """The connected part of each triangle; triangles that share an edge are connected."""
-    a, b = edge_pairs(triangles)[0].T
-    return linked(a, b, len(triangles))[1]
+    one, other = (Edges(triangles) if edges is None else edges).pairs
+    return linked(one // 3, other // 3, len(triangles))[1]
 
 
 def linked(a: np.ndarray, b: np.ndarray, count: int) -> tuple[int, np.ndarray]:
@@ -67,16 +30,17 @@ def linked(a: np.ndarray, b: np.ndarray, count: int) -> tuple[int, np.ndarray]:
     return connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(count, count)), directed=False)
 
 
-def wind_alike(triangles: np.ndarray) -> tuple[np.ndarray, int]:
+def wind_alike(triangles: np.ndarray, edges: Edges) -> tuple[np.ndarray, int]:
     """Reverse triangles that traverse an edge in the same direction as the neighbour across it; return how many (the
     minority of each part).
 
     Edges of three or more triangles bind nothing. On a surface with one side only, some edges stay as they are.
     """
-    pairs, against, alone = edge_pairs(triangles)
-    if not (against & alone).any():
+    one, other = edges.twos
+    against = edges.forward[one] == edges.forward[other]
+    if not against.any():
         return triangles, 0
-    (a, b), against = pairs[alone].T, against[alone]
+    a, b = one // 3, other // 3
     count = len(triangles)
     parts = linked(a, b, count)[1]
     # One node more, tied to one triangle of each part, makes a single search of all parts.

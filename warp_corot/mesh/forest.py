@@ -145,6 +145,9 @@ class TetForest(ForestArrays):
         Raises:
             InputError: An argument is out of its range, no tetrahedron holds any of the body, or even the coarsest mesh
                 has more elements.
+
+        Warns:
+            UserWarning: The mesh leaves out tips of the body that no face of an element joins to the rest.
         """
         from warp_corot.domain import Domain
         from warp_corot.mesh.growing.from_domain import mesh_domain

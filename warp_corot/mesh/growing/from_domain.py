@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -78,7 +79,8 @@ def mesh_domain(
     closer = Closer(detail, CLOSER_ERROR, CLOSER_ELEMENTS) if detail else None
     grown = grow(domain, float(cell_size), wishes, where, closer)
     resolved = Resolved(grown, float(cell_size), domain if detail else None)
-    forest = _finished(resolved, resolved.as_wished(), domain, sliver)
+    forest, left_out = _finished(resolved, resolved.as_wished(), domain, sliver)
+    _say(left_out)
     if not detail:
         return forest
     return replace(forest, detail=_detail(resolved, grown.tree.first_child, domain))
@@ -88,13 +90,13 @@ def _of_size(domain: Domain, budget: Budget, sliver: float, device: wp.Device) -
     """The mesh with at most the given number of elements."""
     meshes = chosen_meshes(domain, budget, sliver, device)
     best: TetForest | None = None
-    counted, threshold = 0, 0.0
+    counted, threshold, said = 0, 0.0, ""
     for _ in range(MOST_MESHES if meshes else 0):
         assert meshes is not None
-        forest = _finished(meshes.resolved, meshes.child, domain, sliver)
+        forest, left_out = _finished(meshes.resolved, meshes.child, domain, sliver)
         found = len(forest.tets)
         if found <= budget.target and (best is None or found > len(best.tets)):
-            best, threshold = forest, meshes.threshold
+            best, threshold, said = forest, meshes.threshold, left_out
         if NEAR_ENOUGH * budget.target <= found <= budget.target or meshes.count == counted:
             break
         # Slivers that were kept to connect pieces were not counted, and others may be given up in vain.
@@ -106,6 +108,7 @@ def _of_size(domain: Domain, budget: Budget, sliver: float, device: wp.Device) -
             + (f", of cells of {budget.cell_size:g} m" if budget.cell_size else "")
         )
     assert meshes is not None
+    _say(said)
     return replace(best, detail=_detail(meshes.resolved, meshes.surface(threshold), domain))
 
 
@@ -146,8 +149,13 @@ def _check_cubes(domain: Domain, size: float | None, target: int) -> None:
         )
 
 
-def _finished(resolved: Resolved, child: np.ndarray, domain: Domain, sliver: float) -> TetForest:
-    """A separate mesh from a grown forest, without empty and nearly empty elements."""
+def _say(left_out: str) -> None:
+    if left_out:
+        warnings.warn(left_out, UserWarning, stacklevel=4)
+
+
+def _finished(resolved: Resolved, child: np.ndarray, domain: Domain, sliver: float) -> tuple[TetForest, str]:
+    """A separate mesh from a grown forest, without empty and nearly empty elements, and what else it leaves out."""
     grown, cell_size = resolved.grown, resolved.cell_size
     tree, stays = resolved.tree_of(child)
     tree, kept = pruned(tree, (tree.first_child < 0) & (resolved.held[stays] <= 0.0))
@@ -161,7 +169,8 @@ def _finished(resolved: Resolved, child: np.ndarray, domain: Domain, sliver: flo
     held, given_up = without_slivers(
         tree.leaf_tets, resolved.held[stays[leaves]], resolved.volume[stays[leaves]], sliver
     )
-    given_up |= strays(tree.leaf_tets, held, given_up, domain)
+    stray, left_out = strays(tree.leaf_tets, held, given_up, domain)
+    given_up |= stray
     if given_up.any():
         live = np.zeros(len(tree.level), bool)
         live[leaves[~given_up]] = True
@@ -185,7 +194,7 @@ def _finished(resolved: Resolved, child: np.ndarray, domain: Domain, sliver: flo
         node_labels = np.asarray(domain.labels_at(forest.lattice_points, nearest=True), np.int32)
         forest = replace(forest, labels=labels, node_labels=node_labels, label_names=tuple(domain.label_names))
         forest = replace(forest, labels=_with_lost(forest, domain))
-    return forest
+    return forest, left_out
 
 
 def _with_lost(forest: TetForest, domain: Domain) -> np.ndarray:

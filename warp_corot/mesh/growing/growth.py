@@ -118,6 +118,8 @@ class Growth:
 
     def flagged(self, flags: wp.array, first: int = 0) -> wp.array:
         """The numbers, counted from ``first``, of flags [n] that are one."""
+        if self.device.is_cpu:
+            return wp.array(np.flatnonzero(flags.numpy()) + first, dtype=wp.int32, device=self.device)
         places = wp.empty(len(flags), dtype=wp.int32, device=self.device)
         wp.utils.array_scan(flags, places, inclusive=True)
         count = int(places[-1:].numpy()[0]) if len(flags) else 0

@@ -165,6 +165,9 @@ class Judge:
         return int(count.numpy()[0])
 
     def of_state(self, states: wp.array, state: int, first: int) -> wp.array:
+        if self.device.is_cpu:
+            found = np.flatnonzero(states.numpy() == int(state)) + first
+            return wp.array(found, dtype=wp.int32, device=self.device)
         flags = wp.empty(len(states), dtype=wp.int32, device=self.device)
         self.growth.launch(kernels.flag_equal, len(states), [states, state], [flags])
         return self.growth.flagged(flags, first)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,13 +12,16 @@ if TYPE_CHECKING:
     from warp_corot.domain import Domain
 
 #: A piece that holds less than this share of the body is a stray.
-STRAY = 1.0e-4
+STRAY = 2.0e-4
 #: Meshes of more elements keep their strays; the search would take long.
 MOST_ELEMENTS = 100_000
+#: Strays that together hold more than this share of the body are named.
+NAMED = 1.0e-4
 
 
-def strays(tets: np.ndarray, held: np.ndarray, given_up: np.ndarray, domain: Domain) -> np.ndarray:
-    """Which elements are strays, bool [n]; none if the body is not known to be one piece.
+def strays(tets: np.ndarray, held: np.ndarray, given_up: np.ndarray, domain: Domain) -> tuple[np.ndarray, str]:
+    """Which elements are strays, bool [n], and a sentence about them, empty if they hold next to nothing. None are if
+    the body is not known to be one piece.
 
     Args:
         tets: int32 [n, 4].
@@ -26,12 +29,22 @@ def strays(tets: np.ndarray, held: np.ndarray, given_up: np.ndarray, domain: Dom
         given_up: Which are not part of the mesh, bool [n].
         domain: The body.
     """
+    kind: Any = domain.kind
     found = np.zeros(len(tets), bool)
-    closed = getattr(domain.kind, "closed", None)
-    if closed is None or closed.pieces > 1 or len(tets) > MOST_ELEMENTS:
-        return found
+    if getattr(kind, "closed", None) is None or len(tets) > MOST_ELEMENTS:
+        return found, ""
     kept = np.flatnonzero(~given_up)
     piece = linked(face_pairs(tets[kept]), len(kept))
+    # Parts of a surface that touch or cross are one piece of the body.
+    if not piece.any() or kind.joined[0] > 1:
+        return found, ""
     volumes = np.bincount(piece, held[kept])
-    found[kept] = (volumes < STRAY * volumes.sum())[piece]
-    return found
+    stray = volumes < STRAY * volumes.sum()
+    found[kept] = stray[piece]
+    share = float(volumes[stray].sum() / volumes.sum())
+    if share <= NAMED:
+        return found, ""
+    return found, (
+        f"{np.count_nonzero(stray)} pieces of the mesh, tips of the body that are thinner than its tetrahedra, touch "
+        f"the rest by less than a face and are left out: {share:.2%} of the volume; more tetrahedra would help"
+    )
