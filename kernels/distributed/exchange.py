@@ -21,7 +21,7 @@ def scatter_values(places: wp.array[wp.int32], source: wp.array[Any], found: wp.
     found[places[i]] = source[i]
 
 
-#: What cards exchange, and the kernels for each.
+#: The types of values that GPUs exchange, and the kernels for each.
 EXCHANGED = (wp.float32, wp.vec3, wp.vec4)
 GATHER, SCATTER = (
     {kind: wp.overload(kernel, [wp.array[wp.int32], wp.array[kind], wp.array[kind]]) for kind in EXCHANGED}
@@ -38,19 +38,19 @@ def move_values(sources: wp.array[wp.int32], targets: wp.array[wp.int32], source
 
 @wp.kernel(enable_backward=False)
 def clear_energies(places: wp.array[wp.int32], energies: wp.array[wp.float64]):
-    """Zero at some places."""
+    """Set energies at some places to zero."""
     energies[places[wp.tid()]] = wp.float64(0.0)
 
 
 @wp.kernel(enable_backward=False)
 def clear_forces(places: wp.array[wp.int32], forces: wp.array[wp.vec3]):
-    """Zero at some places."""
+    """Set forces at some places to zero."""
     forces[places[wp.tid()]] = wp.vec3()
 
 
 @wp.kernel(enable_backward=False)
 def clear_vectors(places: wp.array[wp.int32], vectors: wp.array[wp.vec4]):
-    """The same for vec4."""
+    """Set vectors at some places to zero."""
     vectors[places[wp.tid()]] = wp.vec4()
 
 

@@ -27,7 +27,7 @@ UNSURE = wp.constant(0)
 BOUNDARY = wp.constant(1)
 BURIED = wp.constant(2)
 
-#: How many triangles a segment is followed through, and how far beyond each it goes on, as a share of its length.
+#: The most triangles through which a segment is followed, and how far beyond each it goes on, as a share of its length.
 MOST_PASSED = wp.constant(8)
 PASSED = wp.constant(1.0e-4)
 
@@ -277,7 +277,8 @@ def combine(
     # Out
     phi: wp.array[wp.float32],
 ):
-    """The maximum of two functions with signs: union (-1, -1), intersection (1, 1), difference (1, -1)."""
+    """The union of two domains for signs ``outer`` and ``inner`` of -1 and -1, the intersection for 1 and 1, the
+    difference for 1 and -1."""
     i = wp.tid()
     phi[i] = outer * wp.max(outer * first[i], inner * second[i])
 
@@ -361,7 +362,7 @@ def find_exits(
 ):
     """Where segments from inside to outside leave the body, as a share of their length, and the normal there.
 
-    At the first triangle that bounds the body; at one that is unsure if it is the only one. -1 where neither is so.
+    The exit is at the first triangle that bounds the body, or at an unsure one if it is the only one; else -1.
     """
     i = wp.tid()
     length = wp.length(along[i])

@@ -100,5 +100,5 @@ def find_touched_triangles(
                 touched[i] = found.face
                 return
             at += found.t + ENDS * length
-    # More triangles than can be passed: no result is certain.
+    # With more triangles than can be passed no result is certain.
     touched[i] = -2

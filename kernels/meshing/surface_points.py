@@ -1,4 +1,4 @@
-"""Where elements are cut by a surface that is known at their corners alone."""
+"""Where elements are cut by a surface that is known only at their corners."""
 
 import warp as wp
 
@@ -19,7 +19,7 @@ def find_surface_points(
 ):
     """A point where the linear interpolant is zero, or nearly, and the unit vector inwards there.
 
-    From the middle it goes along the gradient, but no farther than the longest edge at the first corner.
+    The search goes from the middle along the gradient, but no farther than the longest edge at the first corner.
     """
     i = wp.tid()
     tet = tets[i]

@@ -8,7 +8,7 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-#: A squared distance to nothing.
+#: The squared distance where there is no voxel of the set.
 NOTHING = wp.constant(1.0e30)
 
 
@@ -48,8 +48,10 @@ def find_nearest_in_rows(
 
 @wp.func
 def hides(low: wp.vec2d, middle: wp.vec2d, high: wp.vec2d):
-    """Whether two parabolas leave nothing of the one between them, each given by its place and its square plus the
-    place's."""
+    """Whether two parabolas are below the one between them everywhere.
+
+    Each is given by its place and by its lowest value plus the square of its place.
+    """
     left = (middle[1] - low[1]) * (high[0] - middle[0])
     return left >= (high[1] - middle[1]) * (middle[0] - low[0])
 
@@ -72,8 +74,8 @@ def find_nearest_across(
     nearest: wp.array3d[wp.int16],
     total: wp.array3d[wp.float32],
 ):
-    """The voxel on each line along the second axis whose square and squared distance are least together, -1 for none,
-    and that sum."""
+    """The voxel on each line along the second axis with the least sum of its square and its squared distance, -1 for
+    none, and that sum."""
     t = first + wp.tid()
     i = t // squares.shape[2]
     k = t % squares.shape[2]
@@ -149,8 +151,10 @@ def take_distances(
     phi: wp.array3d[wp.float32],
     nearest: wp.array4d[wp.int16],
 ):
-    """Distances from voxels that are not in the set to the nearest one that is, less half of the last step; positive
-    where the set is inside, and then the nearest voxels, too."""
+    """Distances from voxels outside the set to the nearest voxel of the set, less half of the last step.
+
+    If the set is the body's inside, distances are positive, and the nearest voxels are written, too.
+    """
     t = first + wp.tid()
     i = t // inside.shape[1]
     j = t % inside.shape[1]

@@ -1,4 +1,4 @@
-"""Winding numbers of closed surfaces, exact but for float64's rounding of points in float32.
+"""Winding numbers of closed surfaces around points in float32, exact except for the rounding of float64.
 
 A line runs from the point out of the surface's box. A triangle that it meets counts 1 where the line leaves the
 enclosed space and -1 where it enters it. The line is almost parallel to an axis, so it passes few boxes of the
@@ -50,8 +50,8 @@ def passes_left(a: wp.vec3d, b: wp.vec3d, i: int, j: int, p: wp.vec3d):
 
 @wp.func
 def meets(mesh: wp.uint64, indices: wp.array[wp.int32], face: int, axis: int, p: wp.vec3d):
-    """How high the line through p meets a triangle, and 1 where it leaves upwards what the surface encloses, -1 where
-    it enters it; 0 where it does not meet the triangle."""
+    """The height at which the line through p meets a triangle; and 1 if the line, on its way up, leaves the enclosed
+    space there, -1 if it enters it, 0 if it does not meet the triangle."""
     i = indices[3 * face]
     j = indices[3 * face + 1]
     k = indices[3 * face + 2]
@@ -115,7 +115,7 @@ def measure_lines(
     # Out
     lengths: wp.array[wp.float64],
 ):
-    """The length of the line upwards from each point on which winding numbers are above zero [m]."""
+    """The length of the line upwards from each point, counting only where winding numbers are above zero [m]."""
     n = wp.tid()
     start = starts[n]
     axis = lines.axis

@@ -178,7 +178,7 @@ def test_unlikely_units_cause_a_warning(folder, capsys):
     assert simulate("organ.obj", "-o", "a.usd", "--tets", 300, "--duration", 0.05, "--fps", 20) == 0
     err = capsys.readouterr().err
     assert (
-        "warning: organ.obj: the body is 3e+03 m long: if its coordinates are in mm, say --unit 'mm' (a factor" in err
+        "warning: organ.obj: the body is 3e+03 m long: if its coordinates are in mm, give --unit 'mm' (a factor" in err
     )
     assert simulate("organ.obj", "-o", "a.usd", "--tets", 300, "--unit", "0.05mm", *SHORT) == 0
     out, err = capsys.readouterr()

@@ -147,7 +147,7 @@ def test_bad_arguments_are_refused_in_one_line(tmp_path):
         (lambda: Domain.capsule((0, 0, 0), (0, 0, 0), 1.0), "ends must differ"),
         (lambda: Domain.sphere(1.0, up_axis="up"), "up_axis is 'up'"),
         (lambda: Domain.sphere(1.0, device="cuda:99"), "no device 'cuda:99'"),
-        (lambda: Domain.from_function(lambda x: 3.0 * x[:, 0], box), "changes by 3 m a metre; lipschitz is 1"),
+        (lambda: Domain.from_function(lambda x: 3.0 * x[:, 0], box), "changes by 3 m per metre; lipschitz is 1"),
         (lambda: Domain.from_function(lambda x: x[:, 0] * np.nan, box), "must be finite"),
         (lambda: Domain.from_function(lambda x: x, box), r"shape \(4096, 3\)"),
         (lambda: Domain.from_function(lambda x: x[:, 0], box[::-1]), "bounds are"),

@@ -196,9 +196,9 @@ def test_units_and_unlikely_sizes():
     metres = Domain.from_surface(CUBE).bounds
     assert np.allclose(Domain.from_surface(CUBE, unit="cm").bounds, 0.01 * metres)
     assert np.allclose(Domain.from_surface((250 * CUBE[0], CUBE[1]), unit="mm").bounds, 0.25 * metres)
-    with pytest.warns(UserWarning, match=r"300 m long.*in mm, say unit='mm'.*0\.001: 300 mm"):
+    with pytest.warns(UserWarning, match=r"300 m long.*in mm, give unit='mm'.*0\.001: 300 mm"):
         Domain.from_surface((300 * CUBE[0], CUBE[1]))
-    with pytest.warns(UserWarning, match=r"300 um long.*in m, say unit='m'.*1000: 300 mm"):
+    with pytest.warns(UserWarning, match=r"300 um long.*in m, give unit='m'.*1000: 300 mm"):
         Domain.from_surface((0.3 * CUBE[0], CUBE[1]), unit="mm")
     assert np.allclose(Domain.from_surface(CUBE, unit="inch").bounds, 0.0254 * metres)
     for unit in ("kg", "inches of rope", "-3mm", 0.0):

@@ -25,7 +25,7 @@ def test_nifti_in_its_own_unit_and_place(tmp_path, device, rng):
         # The format stores its matrix in float32.
         assert np.allclose(domain.phi(points), expected.phi(points), atol=1e-5)
         assert any("as the file says" in line for line in domain.report())
-    with pytest.raises(InputError, match=r"c\.nii: the file names no unit of length; say unit='mm'"):
+    with pytest.raises(InputError, match=r"c\.nii: the file names no unit of length; give unit='mm'"):
         Domain.from_labels(tmp_path / "c.nii")
     domain = Domain.from_labels(tmp_path / "c.nii", unit="mm", device=device)
     assert np.allclose(domain.phi(points), expected.phi(points), atol=1e-5)
@@ -96,9 +96,9 @@ def test_a_body_cut_off_by_the_scan_and_in_pieces_is_said(rng):
 
 def test_a_unit_taken_wrongly_draws_a_warning():
     volume, _ = ball(0.1)
-    with pytest.warns(UserWarning, match=r"say unit='mm'"):
+    with pytest.warns(UserWarning, match=r"give unit='mm'"):
         Domain.from_labels(volume, 1e3 * SPACING)
-    with pytest.warns(UserWarning, match=r"say unit='m'"):
+    with pytest.warns(UserWarning, match=r"give unit='m'"):
         Domain.from_labels(volume, SPACING, unit="mm")
 
 

@@ -36,7 +36,7 @@ def body(mesh):
             r"young has shape \(3, 1\); .*it must be \[48\], \[4, 1\] or \[4, 48\]",
         ),
         (lambda mesh: wc.TetMesh("x.msh", [[0, 1, 2, 3]]), r"points is 'x\.msh'.*TetMesh\.load"),
-        (lambda mesh: wc.TetMesh(np.eye(4, 3), [[0, 1, 2, 3], [0]]), "tets has rows of several lengths"),
+        (lambda mesh: wc.TetMesh(np.eye(4, 3), [[0, 1, 2, 3], [0]]), "tets has rows of different lengths"),
         (lambda mesh: wc.TetMesh.load(5), "path is 5"),
         (lambda mesh: wc.TetForest.box((1, 1, 1), "a", 3), "cell_size is 'a'"),
         (
@@ -60,7 +60,7 @@ def test_wrong_arguments_of_a_body(mesh, make, said):
     [
         (lambda sim: setattr(sim.body, "positions", "x"), r"positions is 'x'; .*\[27, 3\]"),
         (lambda sim: setattr(sim.body, "velocities", [[1], [1, 2]]), r"velocities is \[\[1\], \[1, 2\]\]"),
-        (lambda sim: sim.body.fix([[0], [1, 2]]), "rows of several lengths"),
+        (lambda sim: sim.body.fix([[0], [1, 2]]), "rows of different lengths"),
         (lambda sim: sim.body.prescribe([0], times="x", displacements=[[0, 0, 0]]), "times is 'x'"),
         (lambda sim: sim.body.prescribe([0], times=[0, 1], displacements="y"), "displacements is 'y'"),
         (lambda sim: sim.advance("x"), "seconds is 'x'"),

@@ -288,7 +288,7 @@ def test_a_checkpoint_of_version_1_is_one_world(tmp_path, rng):
 def test_one_world_is_recorded(device, tmp_path):
     young = np.array([[2e3], [5e3], [9e3]])
     sim = simulated([beam(device, young=young), beam(device)], [wc.Corotated(), wc.Linear()])
-    with pytest.raises(wc.InputError, match=r"3 worlds; say which one to draw, for example world=0"):
+    with pytest.raises(wc.InputError, match=r"3 worlds; choose the one to draw, for example world=0"):
         record(sim, tmp_path / "a.usd", duration=0.1)
     for wrong in (3, -1, 0.5, "first"):
         with pytest.raises(wc.InputError, match="must be a whole number from 0 to 2"):

@@ -136,7 +136,7 @@ class ChosenNodes:
         """Keyframes of the nodes of one world, [K, n, 3], repeated for each world; other keyframes unchanged."""
         try:
             shape = np.shape(given)
-        except ValueError:  # rows of several lengths: an error when they are read
+        except ValueError:  # rows of different lengths: an error when they are read
             return given
         if self.each is None or len(shape) != 3 or shape[1] != self.each:
             return given

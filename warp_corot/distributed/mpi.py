@@ -44,7 +44,7 @@ def world() -> Patient:
     rank that has waited too long for others.
 
     Raises:
-        InputError: MPI is not installed, or ``WARP_COROT_PATIENCE`` is no positive number.
+        InputError: MPI is not installed, or ``WARP_COROT_PATIENCE`` is not a positive number.
     """
     comm = Patient(library().COMM_WORLD.Dup(), patience())
     if comm.size > 1:

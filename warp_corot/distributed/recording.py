@@ -60,7 +60,7 @@ def record(
     checked_path(path, "path")
     count = frame_count(duration, fps)
     if world is None and sim.worlds > 1:
-        raise InputError(f"the simulation has {sim.worlds} worlds; say which one to draw, for example world=0")
+        raise InputError(f"the simulation has {sim.worlds} worlds; choose the one to draw, for example world=0")
     if not 0 <= (world or 0) < sim.worlds:
         raise InputError(f"world is {world!r}; it must be a whole number from 0 to {sim.worlds - 1}")
     done = Recording(Path(path)) if recording is None else recording

@@ -89,7 +89,7 @@ def close_surface(points: np.ndarray, triangles: np.ndarray) -> ClosedSurface:
             raise InputError("the surface has zero thickness: its triangles lie on one another, facing both ways")
         raise InputError(
             f"the surface is open: {open_edges} edges in {holes} hole{'s'[: holes != 1]}, and closing takes "
-            f"{cap_share:.0%} of its own area; it must be closed but for {LARGEST_HOLES:.0%}"
+            f"{cap_share:.0%} of its own area; it must take at most {LARGEST_HOLES:.0%}"
         )
     closed, all_parts = np.concatenate([triangles, caps]), np.concatenate([parts, cap_parts])
     closed, inside_out, cavities = wind_outwards(points, closed, all_parts)

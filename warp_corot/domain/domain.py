@@ -86,7 +86,8 @@ class Domain(SignedFunction):
             device: The device that evaluates it; None: Warp's default.
 
         Raises:
-            InputError: The argument is no surface, or encloses no body: more than a third of its area is open, it has
+            InputError: The argument is not a surface, or encloses no body: more than a third of its area is open, it
+            has
                 zero thickness, or it crosses itself so that part of the body is inside out.
 
         Warns:
@@ -134,7 +135,7 @@ class Domain(SignedFunction):
             device: The device that evaluates it; None: Warp's default.
 
         Raises:
-            InputError: The argument is no label volume, is empty, has values that are not whole or finite, has no
+            InputError: The argument is not a label volume, is empty, has values that are not whole or finite, has no
                 spacing or no unit, or does not have a label; the message lists the labels that exist.
 
         Warns:

@@ -63,7 +63,7 @@ class FunctionDomain(SignedFunction):
         if values.shape != (len(points),) or values.dtype.kind not in "fiu":
             raise InputError(
                 f"the function gave {values.dtype} of shape {values.shape} for points [{len(points)}, 3]; "
-                f"it must give one number a point"
+                f"it must give one number for each point"
             )
         return values.astype(np.float32)
 
@@ -85,7 +85,7 @@ class FunctionDomain(SignedFunction):
         slopes = np.abs(a - b)[apart > 0] / apart[apart > 0]
         if not slopes.max() <= self.lipschitz * (1.0 + SLACK):
             raise InputError(
-                f"the function changes by {slopes.max():.3g} m a metre; lipschitz is {self.lipschitz:g} and must be "
+                f"the function changes by {slopes.max():.3g} m per metre; lipschitz is {self.lipschitz:g} and must be "
                 f"at least that"
             )
         axes, ends = rng.integers(0, 3, PAIRS), rng.integers(0, 2, PAIRS)

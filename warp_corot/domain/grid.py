@@ -49,7 +49,7 @@ def placed_grid(scan: Volume, spacing: Any, origin: Any, affine: Any, unit: str 
         loaded = scan if isinstance(scan, LoadedVolume) else load_volume(scan)
         values, given, notes, source = loaded.values, loaded.affine, list(loaded.notes), f"{loaded.source}: "
         if loaded.unit is None and unit is None:
-            raise InputError(f"{source}the file names no unit of length; say unit='mm', 'cm' or 'm'")
+            raise InputError(f"{source}the file names no unit of length; give unit='mm', 'cm' or 'm'")
         if unit is None or unit == loaded.unit:
             notes.append(f"unit {loaded.unit}, as the file says")
         elif loaded.unit is not None:
@@ -75,7 +75,7 @@ def _checked_values(scan: Any) -> np.ndarray:
     try:
         return np.asarray(scan)
     except ValueError:
-        raise InputError("the volume has rows of several lengths; it must be [nx, ny, nz]") from None
+        raise InputError("the volume has rows of different lengths; it must be [nx, ny, nz]") from None
 
 
 def _replaced(affine: np.ndarray, spacing: Any, origin: Any) -> np.ndarray:

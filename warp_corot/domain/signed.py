@@ -147,7 +147,7 @@ class SignedFunction:
     # Methods that each kind of body defines.
 
     def _phi(self, points: wp.array) -> wp.array:
-        """float32 [n] on the points' device."""
+        """The function at points: float32 [n] on the points' device [m]."""
         raise NotImplementedError
 
     def _labels(self, points: wp.array) -> wp.array:
@@ -155,7 +155,7 @@ class SignedFunction:
         raise NotImplementedError
 
     def _thickness(self, points: wp.array, along: wp.array, reach: float, side: float) -> np.ndarray:
-        """float32 [n]; of the body for a ``side`` of 1, of what is around it for -1.
+        """The thickness of the body for a ``side`` of 1, of the space around it for -1: float32 [n] [m].
 
         By sphere tracing: each step is the distance within which there can be no surface.
         """

@@ -57,7 +57,7 @@ def metres_per_unit(unit: str | float) -> float:
             number.
 
     Raises:
-        InputError: It is no positive length.
+        InputError: It is not a positive length.
     """
     if isinstance(unit, str) and unit in UNITS:
         return UNITS[unit]
@@ -78,7 +78,7 @@ def in_units(given: str | float, unit: str) -> float:
         unit: A unit in Pint's notation, such as "Pa" or "kg/m^3".
 
     Raises:
-        InputError: No number, or a unit that is not known or of another kind.
+        InputError: The text has no number, or its unit is not known or of another kind.
     """
     if isinstance(given, int | float | np.number) and not isinstance(given, bool):
         return checked_number(given, "the quantity", unit)
@@ -177,6 +177,6 @@ def unlikely_size(size: float, metres: float) -> str | None:
     if math.isclose(factor, 1.0) or not SMALLEST <= becomes <= LARGEST:
         return f"the body is {length(size)} long: is its unit right?"
     return (
-        f"the body is {length(size)} long: if its coordinates are in {likely}, say unit={likely!r} "
+        f"the body is {length(size)} long: if its coordinates are in {likely}, give unit={likely!r} "
         f"(a factor of {factor:g}: {length(becomes)})"
     )

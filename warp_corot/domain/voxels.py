@@ -29,7 +29,7 @@ def signed_distance(inside: np.ndarray, spacing: np.ndarray) -> tuple[np.ndarray
         ``phi`` float32 [nx, ny, nz] [m], and ``nearest`` int16 [3, nx, ny, nz], the indices of the nearest voxel inside
         (a voxel's own, inside).
     """
-    # Of several nearest voxels the one taken should not hang on the last digits of the spacing.
+    # Which one of several nearest voxels is taken should not depend on the last digits of the spacing.
     ratios = np.round(spacing / spacing.min(), 5)
     cpu = wp.get_device("cpu")
     given = wp.array(inside.astype(np.uint8), dtype=wp.uint8, device=cpu)
@@ -44,7 +44,8 @@ def signed_distance(inside: np.ndarray, spacing: np.ndarray) -> tuple[np.ndarray
 def _nearest_of(inside: wp.array, wanted: int, ratios: np.ndarray) -> list[wp.array]:
     """The nearest voxels that are inside, or outside, by their place along each axis, int16 [nx, ny, nz] each.
 
-    The second place stands at the voxel that the first one leads to, and the third at the one that both lead to.
+    The first index is read at the voxel itself, the second at the voxel with that first index, and the third at the
+    voxel with both.
     """
     shape, cpu = inside.shape, inside.device
     third, second, first, kept = (wp.empty(shape, dtype=wp.int16, device=cpu) for _ in range(4))

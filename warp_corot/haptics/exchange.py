@@ -24,7 +24,7 @@ class ToolState:
     """The published state of a tool.
 
     Attributes:
-        count: How many states were published up to this one.
+        count: Number of states published up to this one.
         time: Simulated time [s].
         stamp: When the position to which it moves was read from the device, on the loop's clock [s]; zero: never.
         position: [m], [3].

@@ -155,14 +155,14 @@ class HapticLoop:
         self.stop()
 
     def run(self, seconds: float, every: float = EVERY) -> float:
-        """Advance the simulation with the clock on the wall, or as fast as it goes if that is slower.
+        """Advance the simulation in real time, or as fast as it goes if that is slower.
 
         Args:
-            seconds: On the wall [s].
+            seconds: Wall time [s].
             every: Simulated time between two states that the loop reads [s].
 
         Returns:
-            Simulated time over time on the wall.
+            Simulated time over wall time.
 
         Raises:
             InputError: A time is not positive.

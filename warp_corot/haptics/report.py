@@ -63,7 +63,7 @@ class Times:
     """The last values of a quantity that is measured often, in a ring.
 
     Attributes:
-        count: How many values there were.
+        count: Number of values so far.
         largest: The largest of all values.
     """
 

@@ -23,7 +23,7 @@ def checked_indices(given: npt.ArrayLike, count: int, thing: str) -> npt.NDArray
         chosen = np.asarray(given)
     except ValueError:
         wanted = f"a mask [{count}] or a list of whole numbers"
-        raise InputError(f"{thing} indices have rows of several lengths; they must be {wanted}") from None
+        raise InputError(f"{thing} indices have rows of different lengths; they must be {wanted}") from None
     if chosen.dtype == bool:
         if chosen.shape != (count,):
             raise InputError(f"the {thing} mask has shape {chosen.shape}; it must be [{count}]")

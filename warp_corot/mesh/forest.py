@@ -182,7 +182,7 @@ class TetForest(ForestArrays):
             leaves: Mask bool [T] or indices into the leaves.
 
         Raises:
-            InputError: The argument is no mask or list of leaves, or a leaf is already at the deepest level.
+            InputError: The argument is not a mask or list of leaves, or a leaf is already at the deepest level.
         """
         chosen = checked_indices(leaves, len(self.tets), "leaf")
         return refined(self, chosen)

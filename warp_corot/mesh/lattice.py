@@ -58,7 +58,7 @@ def checked_cells(cells: Any) -> tuple[int, int, int]:
     """
     try:
         counts = np.asarray(cells)
-    except ValueError:  # rows of several lengths
+    except ValueError:  # rows of different lengths
         counts = np.empty(0)
     whole = counts.shape == (3,) and np.issubdtype(counts.dtype, np.integer)
     if not (whole and counts.min() >= 1 and counts.max() <= MAX_CELLS):

@@ -67,7 +67,7 @@ class TetMesh:
         try:
             given = np.asarray(tets)
         except ValueError:
-            raise InputError("tets has rows of several lengths; it must be [T, 4]") from None
+            raise InputError("tets has rows of different lengths; it must be [T, 4]") from None
         if points.ndim != 2 or points.shape[1] != 3 or not len(points):
             raise InputError(f"points has shape {points.shape}; it must be [N, 3] with at least one node")
         if given.ndim != 2 or given.shape[1] != 4 or not len(given):
@@ -212,7 +212,7 @@ def _checked_labels(given: np.ndarray, count: int, names: int) -> np.ndarray:
     try:
         labels = np.asarray(given)
     except ValueError:
-        raise InputError(f"labels has rows of several lengths; it must be integers [{count}]") from None
+        raise InputError(f"labels has rows of different lengths; it must be integers [{count}]") from None
     if labels.shape != (count,) or labels.dtype.kind not in "iu":
         raise InputError(f"labels have shape {labels.shape} and dtype {labels.dtype}; they must be integers [{count}]")
     if len(labels) and not 0 <= labels.min() <= labels.max() <= names:

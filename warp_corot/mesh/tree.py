@@ -23,7 +23,7 @@ class Tree:
         level: int32 [M].
         parent: Index of the parent, -1 for roots, int32 [M].
         first_child: Index of the first of the two children, ``LIVE`` (-1) for leaves, ``VOID`` (-2) for leaves that lie
-            outside the body and are no part of the mesh, int32 [M].
+            outside the body and not part of the mesh, int32 [M].
     """
 
     tets: np.ndarray

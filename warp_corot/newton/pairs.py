@@ -103,7 +103,7 @@ class SoftPairs:
 
 
 def _facing(model: newton.Model, triangles: npt.NDArray[np.int32]) -> npt.NDArray[np.float32]:
-    """Whether triangles' normals point out of tetrahedra (1) or into them (-1); 0: the triangle is no face of one, or
+    """Whether triangles' normals point out of tetrahedra (1) or into them (-1); 0: the triangle is a face of none, or
     of two.
     """
     tets = model.tet_indices.numpy().reshape(-1, 4)

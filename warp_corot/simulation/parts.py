@@ -89,7 +89,7 @@ def checked_contact(
     """What bodies touch, and how; None if there is no contact.
 
     Raises:
-        InputError: Something is no obstacle, or no ``Contact``.
+        InputError: Something is not an obstacle, or not a ``Contact``.
     """
     given = checked_things(obstacles, Shape | Tool, "an obstacle", "a shape such as Ground() or a Tool")
     if contact is not None and not isinstance(contact, Contact):

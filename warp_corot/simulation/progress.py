@@ -17,7 +17,7 @@ _shown = True
 def show_progress(shown: bool) -> None:
     """Whether terminals show a bar while ``Simulation.advance`` or ``record`` takes more than two seconds.
 
-    They do unless this is called with False. Nothing is shown where stderr is no terminal.
+    They do unless this is called with False. Nothing is shown if stderr is not a terminal.
     """
     global _shown
     _shown = bool(shown)

@@ -200,7 +200,8 @@ class Running:
     # --- what a run is to be ---------------------------------------------------------------------------------------
 
     def _plan(self, done: int, most: int, end: float | None) -> tuple[list[Segment], int]:
-        """Plan a run of at most a number of steps; also how many steps are done if the run ends in time.
+        """Plan a run of at most ``most`` steps; return its segments, and the total number of steps at ``end`` if the
+        run gets there, else 0.
 
         The number of the last steps before ``end`` follows from the step that the device last reported. If a
         measurement within the run allows longer steps, they stay shorter; if it allows only shorter ones, the run ends
@@ -236,8 +237,8 @@ class Running:
         return segments, stop
 
     def _steps_for(self, left: float, before: int) -> float:
-        """An estimate of the steps for the remaining time [s], made ``before`` so many steps, after which the step is
-        measured again."""
+        """An estimate of the number of steps in the remaining time [s]; after ``before`` of them the step is measured
+        again."""
         safe = self._sim.safe_step
         assert safe is not None
         if math.isinf(left):
@@ -271,11 +272,16 @@ class Running:
         share, allowed, at_rest = safe.shares
         return share * allowed < GROWN * at_rest
 
-    # --- what became of it -----------------------------------------------------------------------------------------
+    # --- after a run -----------------------------------------------------------------------------------------------
 
     def _check(self, now: int, whole: bool, judged: bool) -> bool:
-        """Check the state, also by elastic energies if these were found, which count if asked to; False if the state
-        was put back."""
+        """Check the state; return False if it was put back.
+
+        Args:
+            now: Steps done.
+            whole: Whether energies are counted from this state on.
+            judged: Whether elastic energies were found, so that the state is checked by them, too.
+        """
         sim = self._sim
         strict = sim.safe_step is not None and self._returns < STRICT_RETURNS
         fault = sim.guard.check(whole=judged, counts=whole, strict=strict, lenient=sim.safe_step is not None)
@@ -338,5 +344,5 @@ class Running:
 
 
 def _steps(seconds: float, dt: float) -> int:
-    """Whole steps that take some time, if they are as long as dt or a little shorter [s]."""
+    """The number of equal steps in some time [s], each as long as ``dt`` [s] or a little shorter."""
     return max(math.ceil(seconds / dt * (1.0 - 1e-9)), 1)

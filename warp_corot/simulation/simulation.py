@@ -351,7 +351,8 @@ class Simulation(Clock, FormerNames):
             remesh: Replaces the saved options, which do not include a criterion of your own; the capacity stays.
 
         Raises:
-            InputError: The file does not exist, is no checkpoint or was written by a newer version, the device does not
+            InputError: The file does not exist, is not a checkpoint or was written by a newer version, the device does
+            not
                 exist, or a criterion is missing.
         """
         from warp_corot.io.checkpoint.archive import load_checkpoint

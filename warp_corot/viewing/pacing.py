@@ -1,4 +1,4 @@
-"""Simulated time beside a clock on the wall."""
+"""Simulated time over wall time."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ def checked_thresholds(refine_above: Any, simplify_below: Any) -> tuple[float, f
     """Both thresholds, in the criterion's unit.
 
     Raises:
-        InputError: One of them is no finite number, or the second is not below the first.
+        InputError: One of them is not a finite number, or the second is not below the first.
     """
     above, below = (
         _finite(given, name) for name, given in (("refine_above", refine_above), ("simplify_below", simplify_below))

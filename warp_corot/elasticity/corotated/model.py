@@ -154,7 +154,7 @@ def _check_level(level: int | float | str | None) -> None:
     """Check a rotation level.
 
     Raises:
-        InputError: It is no rotation level.
+        InputError: It is not a rotation level.
     """
     if level is None or (isinstance(level, str) and level == "auto"):
         return

@@ -214,7 +214,7 @@ def record(
     count = frame_count(duration, fps)
     others = [also_writer(Path(other)) for other in also]
     if world is None and sim.worlds > 1:
-        raise InputError(f"the simulation has {sim.worlds} worlds; say which one to draw, for example world=0")
+        raise InputError(f"the simulation has {sim.worlds} worlds; choose the one to draw, for example world=0")
     joined = _Joined(sim, world or 0)
     skins = joined.skins(surface, tets, labels)
     writer = UsdWriter(

@@ -177,7 +177,7 @@ def bound(points: np.ndarray, nodes: np.ndarray, weights: np.ndarray, triangles:
     try:
         faces = np.asarray(triangles)
     except ValueError:
-        raise InputError("triangles has rows of several lengths; it must be [F, 3]") from None
+        raise InputError("triangles has rows of different lengths; it must be [F, 3]") from None
     if faces.ndim != 2 or faces.shape[1] != 3:
         raise InputError(f"triangles has shape {faces.shape}; it must be [F, 3]")
     checked_indices(faces.ravel(), len(rest), "point")

@@ -45,8 +45,8 @@ def boundary_faces(tets: ArrayLike, points: ArrayLike | None = None) -> tuple[ND
 
     Returns:
         ``faces`` int32 [F, 3], in the order of the tetrahedra they come from, and ``parents`` int32 [F], the
-        tetrahedron of each. A face shared by three or more tetrahedra (they overlap) is no boundary; a warning counts
-        these faces.
+        tetrahedron of each. A face shared by three or more tetrahedra (they overlap) is not a boundary; a warning
+        counts these faces.
     """
     t = np.ascontiguousarray(tets, dtype=np.int32).reshape(-1, 4)
     if len(t) == 0:
