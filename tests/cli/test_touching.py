@@ -87,6 +87,16 @@ def test_a_tool_presses_and_its_force_is_in_table_and_stage(block, folder):
         np.testing.assert_allclose(place, (0.02, 0.02, z), atol=1e-6)
     felt = prim.GetPrim().GetAttribute("contact:force")
     assert felt.Get(stage.GetEndTimeCode())[2] == pytest.approx(force[-1], rel=1e-5)
+    for name in ("tetrahedra", "surface"):
+        drawn = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(f"/SoftBody/{name}"))
+        on_nodes, pressure = (
+            np.array(drawn.GetPrimvar(f"contact{kind}").Get(stage.GetEndTimeCode())) for kind in ("Force", "Pressure")
+        )
+        assert len(on_nodes) == len(pressure) == len(UsdGeom.PointBased(drawn.GetPrim()).GetPointsAttr().Get(0))
+        np.testing.assert_allclose(on_nodes.astype(float).sum(axis=0)[2], -force[-1], rtol=1e-4)
+        assert pressure.max() > force[-1] / 0.04**2  # more than all over the upper face
+        assert (pressure[np.linalg.norm(on_nodes, axis=1) > 0.0] > 0.0).all()
+        assert not np.array(drawn.GetPrimvar("contactForce").Get(0)).any()
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     assert UsdValidation.ValidationContext(validators).Validate(stage) == []
 

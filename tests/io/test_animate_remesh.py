@@ -168,3 +168,34 @@ def test_frames_are_kept_however_a_run_ends(tmp_path):
     assert stage.GetEndTimeCode() == 4
     for k in range(5):
         assert_whole(stage, k, VOLUME)
+
+
+def test_contact_is_in_every_frame_of_a_mesh_that_changes(device, tmp_path):
+    """Forces on the nodes of two bodies add up to what the ball and the ground feel, whatever the mesh is."""
+    low, high = (
+        wc.SoftBody(
+            wc.TetForest.box((2, 2, 1), 0.02, 3, origin=(0.0, 0.0, z)), wc.Isotropic(5e3, 0.4, 1e3), device=device
+        )
+        for z in (0.0, 0.0205)
+    )
+    ball = wc.Tool(wc.Sphere(0.012))
+    ball.follow([0.0, 0.1], [(0.02, 0.02, 0.0526), (0.02, 0.02, 0.046)])
+    sim = wc.Simulation(
+        [low, high],
+        obstacles=[wc.Tool(wc.Ground()), ball],
+        gravity=(0.0, 0.0, -9.81),
+        integrator=wc.SymplecticEuler(damping=20.0, viscosity=2e-3),
+        remesh=wc.OnlineRemesh(every=32, max_level=5, refine_above=1.02, simplify_below=1.005),
+    )
+    done = wc.record(sim, tmp_path / "a.usda", duration=0.12, fps=50)
+    assert len(set(done.elements)) > 1
+    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    primvars = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/SoftBody/tetrahedra"))
+    felt = [stage.GetPrimAtPath(f"/SoftBody/obstacles/tool_{k}").GetAttribute("contact:force") for k in (1, 2)]
+    for code in range(done.frames):
+        forces = np.array(primvars.GetPrimvar("contactForce").Get(code), float)
+        points = UsdGeom.TetMesh(primvars.GetPrim()).GetPointsAttr().Get(code)
+        assert len(forces) == len(points) == len(primvars.GetPrimvar("contactPressure").Get(code))
+        total = forces.sum(axis=0) + sum(np.array(each.Get(code)) for each in felt)
+        np.testing.assert_allclose(total, 0.0, atol=1e-4)
+    assert np.abs(forces).max() > 0.01

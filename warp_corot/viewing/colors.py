@@ -11,6 +11,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
+from warp_corot.contact.nodal import pressure_at_nodes
 from warp_corot.io.pictures.colors import TISSUE, color_index, round_limit, stress_colors
 from warp_corot.kernels.viewing import values as kernels
 from warp_corot.mesh import TetForest
@@ -107,12 +108,7 @@ def _level(sim: Simulation, body: SoftBody) -> wp.array:
 def contact_pressure(sim: Simulation, shown: Shown) -> Values:
     """Contact pressure in the last step [Pa]: triangles' values, averaged to nodes by area."""
     body = shown.body
-    corners, pressure = body.surface_triangles, body.contact_pressure.numpy()
-    a, b, c = np.moveaxis(body.mesh.points[corners], 1, 0)
-    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    count = len(body.mesh.points)
-    weighted = np.bincount(corners.ravel(), np.repeat(areas * pressure[: len(corners)], 3), count)
-    nodal = weighted / np.maximum(np.bincount(corners.ravel(), np.repeat(areas, 3), count), 1e-300)
+    nodal = pressure_at_nodes(body.mesh.points, body.surface_triangles, body.contact_pressure.numpy())
     return np.einsum("vn,vn->v", shown.binding.weights.numpy(), nodal[shown.binding.nodes.numpy()])
 
 

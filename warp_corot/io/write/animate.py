@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from warp_corot.contact.nodal import contact_at_nodes
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, checked_path, shown
 from warp_corot.inputs.turns import in_turn
@@ -26,6 +27,7 @@ from .provenance import provenance, steps_made
 from .skins import BoundSkins, has_domain
 
 if TYPE_CHECKING:
+    from warp_corot.io.write.usd.touched import Touched
     from warp_corot.io.write.usd.writer import UsdWriter
 
     from .paraview import Writer
@@ -272,13 +274,28 @@ def _write_frame(writer: UsdWriter, sim: Simulation, joined: _Joined, done: Reco
     positions = [w.positions.numpy() for w in joined.worlds]
     velocities = [w.velocities.numpy() for w in joined.worlds]
     stresses = [sim.von_mises(w.body)[w.elements] for w in joined.worlds]
-    writer.write(np.concatenate(positions), velocities=np.concatenate(velocities), von_mises=np.concatenate(stresses))
+    writer.write(
+        np.concatenate(positions),
+        velocities=np.concatenate(velocities),
+        von_mises=np.concatenate(stresses),
+        touched=_touched(sim, joined),
+    )
     done.frames = writer.frames
     done.elements.append(len(joined.tets))
     # In float64: before a state becomes infinite, squares overflow float32.
     lengths = [np.linalg.norm(w.displacements.numpy().astype(np.float64), axis=1).max() for w in joined.worlds]
     done.final_displacement = float(max(lengths))
     done.largest_displacement = max(done.largest_displacement, done.final_displacement)
+
+
+def _touched(sim: Simulation, joined: _Joined) -> Touched | None:
+    """Contact on the drawn bodies, if there is any in the simulation."""
+    from warp_corot.io.write.usd.touched import Touched
+
+    if sim.contact is None:
+        return None
+    found = [contact_at_nodes(sim.contact, k, world.index) for k, world in enumerate(joined.worlds)]
+    return Touched(*(np.concatenate(each) for each in zip(*found, strict=True)))
 
 
 @contextmanager

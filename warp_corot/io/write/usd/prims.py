@@ -16,6 +16,7 @@ from warp_corot.io.write.skins import Skin
 from warp_corot.mesh.surfaces.bound import SurfaceMesh, vertex_normals
 
 from .pieces import Samples
+from .touched import ATTRIBUTES, PRESSURE, Touched, declare_touched
 
 ROOT, TETS, SURFACE = "/SoftBody", "/SoftBody/tetrahedra", "/SoftBody/surface"
 MATERIALS = "/SoftBody/materials"
@@ -26,12 +27,14 @@ Limits = tuple[float, float]
 
 
 class Frame(NamedTuple):
-    """One frame: positions [N, 3], velocities [N, 3] or None, stress [T] or None and its averages at nodes [N]."""
+    """One frame: positions [N, 3], velocities [N, 3] or None, stress [T] or None and its averages at nodes [N], contact
+    or None."""
 
     positions: NDArray[np.float32]
     velocities: NDArray[np.float32] | None
     stress: NDArray[np.float32] | None
     nodal: NDArray[np.float64] | None
+    touched: Touched | None = None
 
 
 class Present(NamedTuple):
@@ -47,10 +50,11 @@ class Present(NamedTuple):
 
 @dataclass(frozen=True)
 class Statics:
-    """Properties of all frames: whether they have velocities and stress."""
+    """Properties of all frames: whether they have velocities, stress and contact."""
 
     velocities: bool
     stress: bool
+    touched: bool
 
 
 class SkinPrim:
@@ -79,7 +83,7 @@ class SkinPrim:
     @property
     def follows(self) -> dict[str, str]:
         """See `PieceStore.declare`."""
-        own = ("points", "normals", "velocities", "primvars:vonMises")
+        own = ("points", "normals", "velocities", "primvars:vonMises", *ATTRIBUTES)
         return {f"{self._path}.{name}": f"{self._path}.faceVertexIndices" for name in own}
 
     def declare(self, stage: Any, statics: Statics) -> None:
@@ -106,6 +110,8 @@ class SkinPrim:
             primvars = UsdGeom.PrimvarsAPI(mesh)
             stress = primvars.CreatePrimvar("vonMises", Sdf.ValueTypeNames.FloatArray, UsdGeom.Tokens.vertex)
             stress.GetAttr().SetDocumentation("Von Mises stress, averaged over the tetrahedra around [Pa]")
+        if statics.touched:
+            declare_touched(mesh, forces=False)
         declare_moving(mesh, statics.stress, colored=self._with_colors)
 
     def samples(self, frame: Frame) -> Samples:
@@ -121,6 +127,9 @@ class SkinPrim:
             samples[f"{self._path}.normals"] = Vt.Vec3fArray.FromNumpy(normals)
         if frame.nodal is not None:
             samples[f"{self._path}.primvars:vonMises"] = Vt.FloatArray.FromNumpy(self._skin.values(frame.nodal))
+        if frame.touched is not None:
+            pressure = self._skin.values(frame.touched.pressure.astype(np.float64))
+            samples[f"{self._path}.primvars:{PRESSURE}"] = Vt.FloatArray.FromNumpy(pressure)
         if frame.velocities is not None:
             of_points = np.einsum("vn,vnc->vc", surface.weights, frame.velocities[surface.nodes])
             samples[f"{self._path}.velocities"] = Vt.Vec3fArray.FromNumpy(of_points.astype(np.float32))

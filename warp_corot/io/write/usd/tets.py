@@ -25,6 +25,7 @@ from .prims import (
     floats,
     triangle_samples,
 )
+from .touched import ATTRIBUTES, declare_touched
 
 INDICES = f"{TETS}.tetVertexIndices"
 FACES = f"{TETS}.surfaceFaceVertexIndices"
@@ -57,9 +58,10 @@ class TetPrims:
     @property
     def follows(self) -> dict[str, str]:
         """See `PieceStore.declare`."""
-        own = ["points", "velocities", "primvars:rest", "primvars:vonMises", *(f"primvars:{name}" for name in UNITS)]
+        moving = ("points", "velocities", *ATTRIBUTES)
+        own = [*moving, "primvars:rest", "primvars:vonMises", *(f"primvars:{name}" for name in UNITS)]
         found = {f"{TETS}.{name}": INDICES for name in own}
-        return found | {f"{SURFACE}.{name}": f"{SURFACE}.faceVertexIndices" for name in ("points", "velocities")}
+        return found | {f"{SURFACE}.{name}": f"{SURFACE}.faceVertexIndices" for name in moving}
 
     def declare(self, stage: Any, statics: Statics) -> None:
         """Declare everything that does not change, and the attributes that do, without values."""
@@ -73,12 +75,16 @@ class TetPrims:
             tets.CreateVelocitiesAttr()
         self._declare_primvars(UsdGeom.PrimvarsAPI(tets), statics)
         declare_moving(tets, statics.stress)
+        if statics.touched:
+            declare_touched(tets)
         if self._boundary:
             surface = UsdGeom.Mesh.Define(stage, SURFACE)
             declare_triangles(surface)
             declare_moving(surface, statics.stress)
             if statics.velocities:
                 surface.CreateVelocitiesAttr()
+            if statics.touched:
+                declare_touched(surface)
         if not self._changing:
             for path, value in {**self._topology(), **self._surface_topology()}.items():
                 stage.GetAttributeAtPath(path).Set(value)
@@ -91,6 +97,9 @@ class TetPrims:
             samples[f"{TETS}.velocities"] = Vt.Vec3fArray.FromNumpy(v)
         if frame.stress is not None:
             samples[STRESS] = Vt.FloatArray.FromNumpy(frame.stress)
+        if frame.touched is not None:
+            samples |= frame.touched.samples(TETS)
+            samples |= frame.touched.samples(SURFACE, self._surface.nodes) if self._boundary else {}
         if self._boundary:
             nodes = self._surface.nodes
             samples |= {f"{SURFACE}.points": Vt.Vec3fArray.FromNumpy(x[nodes]), f"{SURFACE}.extent": extent(x[nodes])}

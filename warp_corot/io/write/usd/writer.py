@@ -22,6 +22,7 @@ from .obstacles import ObstaclePrim, obstacle_prims
 from .pieces import PieceStore, Samples
 from .prims import ROOT, SURFACE, TETS, Frame, Present, SkinPrim, Statics, floats, skin_paths
 from .tets import TetPrims
+from .touched import Touched
 
 __all__ = ["ROOT", "SURFACE", "TETS", "Mesh", "UsdWriter"]
 
@@ -43,8 +44,9 @@ class UsdWriter:
     *guide*, and ``surface``, a `UsdGeom.Mesh` of only the surface nodes, which viewers draw. Frame i is time code i.
     Both have ``points``, ``velocities`` [m/s] and ``extent`` in each frame. The TetMesh has primvars ``rest`` (vertex),
     ``fixed`` (vertex, 1 if held), ``young`` [Pa], ``poisson``, ``density`` [kg/m³] (constant, or uniform: one a
-    tetrahedron) and ``vonMises`` [Pa] (uniform, in each frame). Both prims show the stress as ``displayColor``:
-    averages over the tetrahedra around each node, as indices into the 256 colours of `colors.stress_colors`; custom
+    tetrahedron) and ``vonMises`` [Pa] (uniform, in each frame). With contact, both have ``contactForce`` [N] and
+    ``contactPressure`` [Pa] (vertex, in each frame). Both show the stress as ``displayColor``: averages over the
+    tetrahedra around each node, as indices into the 256 colours of `colors.stress_colors`; custom
     data of ``/SoftBody`` name the map and its range. ``/SoftBody/physics`` has the physics materials, and with
     ``gravity`` a physics scene, see `usd.materials.declare_physics`.
 
@@ -135,7 +137,7 @@ class UsdWriter:
         self._range_given = stress_range is not None
         self._stress_range = stress_range or (0.0, 0.0)
         self._ranges_used: set[tuple[float, float]] = set()
-        self._given: tuple[bool, bool] | None = None  # velocities, von_mises
+        self._given: Statics | None = None
         self._closed = False
 
     @property
@@ -179,7 +181,12 @@ class UsdWriter:
             prim.follow(skin, mesh.points)
 
     def write(
-        self, positions: ArrayLike, *, velocities: ArrayLike | None = None, von_mises: ArrayLike | None = None
+        self,
+        positions: ArrayLike,
+        *,
+        velocities: ArrayLike | None = None,
+        von_mises: ArrayLike | None = None,
+        touched: Touched | None = None,
     ) -> None:
         """Add a frame; all frames must have the same optional arguments.
 
@@ -187,6 +194,7 @@ class UsdWriter:
             positions: [N, 3] [m], in the mesh's node order.
             velocities: [N, 3] [m/s].
             von_mises: [T] [Pa].
+            touched: Contact on the body.
 
         Raises:
             InputError: A shape that does not fit the mesh, or other optional arguments than in the first frame.
@@ -194,12 +202,12 @@ class UsdWriter:
         """
         if self._closed:
             raise InputError(f"{self.path}: is closed; frames must be added before")
-        given = (velocities is not None, von_mises is not None)
+        given = Statics(velocities is not None, von_mises is not None, touched is not None)
         if self._given is None:
             self._given = given
             self._store.declare(self._static_layer(), self._follows())
         elif given != self._given:
-            raise InputError("velocities and von_mises must be given either for every frame or for none")
+            raise InputError("velocities, von_mises and contact must be given either for every frame or for none")
 
         x = floats(positions, self._present.points.shape, "positions")
         v = None if velocities is None else floats(velocities, x.shape, "velocities")
@@ -211,7 +219,7 @@ class UsdWriter:
             self._ranges_used.add(self._stress_range)
             self._store.custom_data["stressColors"] = self._color_legend()
         self._store.layer_data = {KEY: self.about} if self.about else {}
-        frame = Frame(x, v, stress, nodal)
+        frame = Frame(x, v, stress, nodal, touched)
         samples: Samples = {}
         for prim in self._prims:
             own = prim.samples(frame)
@@ -286,9 +294,8 @@ class UsdWriter:
         root = UsdGeom.Xform.Define(stage, ROOT).GetPrim()
         stage.SetDefaultPrim(root)
         Usd.ModelAPI(root).SetKind(Kind.Tokens.component)
-        statics = Statics(*self._given)
         for prim in self._prims:
-            prim.declare(stage, statics)
+            prim.declare(stage, self._given)
         declare_physics(
             stage,
             self._present,

@@ -1,0 +1,44 @@
+"""Contact of a body at its nodes, for the host: forces and averaged pressures."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from .contacts import Contacts
+
+Floats = npt.NDArray[np.float64]
+
+
+def contact_at_nodes(contacts: Contacts, k: int, world: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    """Contact of a body in the last step; waits for the device. Zero if the mesh has changed since.
+
+    Returns:
+        The forces on the nodes of one world [N], float32 [N, 3], and the pressure averaged at them [Pa], float32 [N].
+    """
+    body, part = contacts.system.bodies[k], contacts.surface.parts[k]
+    count = body.world_node_count
+    if body.version != part.version:
+        return np.zeros((count, 3), np.float32), np.zeros(count, np.float32)
+    forces = body.contact_forces.numpy()[world * count : (world + 1) * count]
+    pressures = body.contact_pressure.numpy().reshape(body.worlds, -1)[world]
+    nodal = pressure_at_nodes(body.mesh.points, body.surface_triangles, pressures)
+    return forces.astype(np.float32), nodal.astype(np.float32)
+
+
+def pressure_at_nodes(points: Floats, triangles: npt.NDArray[np.int32], pressures: npt.NDArray[np.float32]) -> Floats:
+    """Pressures of triangles [Pa], averaged at nodes by areas at rest, [N]; zero at inner nodes.
+
+    Args:
+        points: Nodes at rest [m], [N, 3].
+        triangles: The surface, int32 [F, 3].
+        pressures: [F], or more, of which the first ones count.
+    """
+    a, b, c = np.moveaxis(points[triangles], 1, 0)
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    corners, count = triangles.ravel(), len(points)
+    weighted = np.bincount(corners, np.repeat(areas * pressures[: len(triangles)], 3), count)
+    return weighted / np.maximum(np.bincount(corners, np.repeat(areas, 3), count), 1e-300)
