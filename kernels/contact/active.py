@@ -33,8 +33,8 @@ LATE = wp.constant(12)
 RELEASED = wp.constant(3)
 #: The stiffness of friction over that of the node.
 STIFF = wp.constant(32.0)
-#: What slides has no stiffness in the direction in which it slides. The matrix has this share of the change, because
-#: sliding nodes of a patch start and stop in turns with all of it.
+#: A sliding node has no stiffness in the direction in which it slides. The matrix has only this share of the change,
+#: because with all of it the nodes of a sliding patch start and stop in turns.
 LOOSE = wp.constant(0.97)
 #: A motion of up to this fraction of half the obstacle's thickness is checked at its end.
 NEAR_END = wp.constant(0.5)

@@ -59,10 +59,10 @@ def scatter_lanes(code: str, Units: type, Material: type, missed_type: type) -> 
     """The kernel that adds forces on the CPU; a thread is eight units.
 
     Args:
-        code: What it does with them. In: units, the number ``block`` of the eight, the ``count`` of all, material, u.
+        code: C++ code for eight units. In: units, the number ``block`` of the eight, the ``count`` of all, material, u.
             Out: f, and ``missed``, what is left out.
         Units, Material: Structs of the units and of their material.
-        missed_type: uint8: flags of a subtree's leaves; int32: a list of elements, how many and then which.
+        missed_type: uint8: flags of a subtree's leaves; int32: a list of elements, their number first.
     """
 
     @wp.func_native(on_cpu(code))

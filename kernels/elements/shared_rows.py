@@ -63,8 +63,8 @@ def list_members(
     ranges: wp.array[wp.vec2i],
     members: wp.array[wp.int32],
 ):
-    """A thread a group; see ``shared_dilatation.range_of`` for what a group is. Those of elements from ``below`` on are
-    left empty."""
+    """Write the range and the members of each group, a thread for each; see ``shared_dilatation.range_of``. Groups of
+    elements from ``below`` on are left empty."""
     g = wp.tid()
     ranges[first_group + g] = wp.vec2i(0, 0)
     if not is_live(live, g):
@@ -89,7 +89,7 @@ def count_nodes(
     # Out
     counts: wp.array[wp.int32],
 ):
-    """How many nodes a group has."""
+    """The number of nodes of each group."""
     g = wp.tid()
     begin = ranges[g][0]
     count = int(0)

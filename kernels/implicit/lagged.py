@@ -16,7 +16,7 @@ wp.set_module_options({"enable_backward": False})
 #: set-up.
 SETUPS, FIRST, BEYOND, WORTH, BEFORE = (wp.constant(k) for k in range(5))
 COUNTS = 5
-#: What is due: nothing, a set-up for the present state, or a repetition of the last one whose result has been lost.
+#: The set-up that is due: none, one for the present state, or a repetition of the last one whose result has been lost.
 NOTHING, PRESENT, AGAIN = (wp.constant(k) for k in range(3))
 #: Number of iterations that a set-up is worth, at first and at most.
 LEAST_WORTH, MOST_WORTH = wp.constant(8), wp.constant(256)

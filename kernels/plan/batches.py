@@ -27,8 +27,8 @@ class Batches:
     # The leaf of the subtree, or of the group, and its node for each place, by shape; negative past the last.
     places: wp.array2d[wp.vec2i]  # [3, 10]
     group_places: wp.array2d[wp.vec2i]  # [3, 40]
-    # Nodes of a class begin at a place. Those of groups are [groups, 40]; of single subtrees [10, room], else
-    # [room, 10] if ``by_node`` is zero.
+    # Nodes of a class begin at a place: [groups, 40] for groups; for single subtrees [10, room], or [room, 10] if
+    # ``by_node`` is zero.
     by_node: int
     node_begin: places_t
     room: places_t

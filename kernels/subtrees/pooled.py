@@ -15,7 +15,7 @@ wp.set_module_options({"enable_backward": False})
 
 #: Threads of a block of the subtree kernels.
 SUBTREE_BLOCK = 128
-#: What ``leaves_of_block`` is asked to do.
+#: The actions of ``leaves_of_block``.
 COLLECT, LEAF, FIRST, MARK, MARKED = range(5)
 #: Set in a list's entry if its subtree asks which leaves the subtree kernels would leave out.
 ASKS = 1 << 15
@@ -70,7 +70,7 @@ def leaves_of_block(what: int, value: int, first: int, to_come: int) -> int:
     """A block's list of leaves, as one function. On the CPU a block is one thread.
 
     Args:
-        what: What to do:
+        what: The action:
             ``COLLECT``: list the leaves of the mask ``value`` of each thread's subtree, and return the number of all.
             ``first`` is the subtree's first leaf, or its complement if the subtree asks. All threads must call this
             together.

@@ -152,8 +152,8 @@ class Conditions:
         self.revision += int(self.discretization.make_activation())
 
     def follow_trajectories(self, clock: Clock, offset: int, support_work: wp.array) -> None:
-        """Launch that prescribed nodes get the velocity of a step, of the ``offset``-th since the clock was last
-        advanced, and count what their supports put in against the forces so far."""
+        """Launch the velocities of prescribed nodes in the ``offset``-th step since the clock was last advanced, and
+        the count of the work that their supports do against the forces so far."""
         state = self.state
         for each in self.trajectories:
             inputs = [each.nodes, each.times, each.displacements, clock.arrays, self.world_starts]

@@ -138,7 +138,7 @@ class Grasp:
         wp.launch(kernel, len(self._nodes), inputs, outputs, device=self.device)
 
     def launch_begin(self) -> None:
-        """Launch what an implicit step begins with."""
+        """Launch the beginning of an implicit step."""
         if self.stiffness is None and len(self._nodes):
             wp.copy(self._multipliers, self._forces)
 
@@ -159,7 +159,7 @@ class Grasp:
             self._launch(kernels.add_hold_blocks, [self._nodes, self._implicit_stiffness], [blocks])
 
     def launch_held(self, body: SoftBody) -> None:
-        """Launch that its forces at the end of an implicit step are among those of contact."""
+        """Launch the addition of its forces at the end of an implicit step to those of contact."""
         if body is self.body:
             self._launch(kernels.add_held_forces, [self._nodes, self._forces], [body.state.contact_forces])
 

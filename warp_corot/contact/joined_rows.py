@@ -117,7 +117,7 @@ class JoinedRows:
         self._on_rows(kernels.add_row_slopes, [self._pairs.rows, self._joined, d, change, search, slopes])
 
     def launch_end(self, d: wp.array) -> None:
-        """Launch what users read of contact, and whether it is time to search again."""
+        """Launch the update of what users read about contact, and of whether a new search is due."""
         self._on_rows(kernels.end_rows, [self._pairs.rows, self._joined, self._added])
         for k, body in enumerate(self._system.bodies):
             outputs = [self._added, self._pairs.surface.arrays, body.state.contact_forces]

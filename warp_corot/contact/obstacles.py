@@ -141,7 +141,7 @@ class Obstacles:
 
         Args:
             offset: The number of steps since the clock was last advanced.
-            watch: What is known of motion since the last search.
+            watch: The motion since the last search, as far as it is known.
             watches: Whether a search becomes due if they move too far.
         """
         for number, tool in enumerate(self.tools):

@@ -37,7 +37,7 @@ class Pairs:
 
     Attributes:
         rows: The pairs, as a struct for kernels.
-        meeting: What may meet, as kernels take it.
+        meeting: The things that may meet, as a struct for kernels.
         revision: Changes whenever launches do.
     """
 
@@ -190,7 +190,7 @@ class Pairs:
         wp.launch(search_kernels.end_rows, 1, [watch, rows], [self.search.most], device=device)
 
     def _bound(self) -> None:
-        """Launch what each body may reach: all others need no search there."""
+        """Launch the bounds of what each body may reach; no pairs are searched for outside."""
         watch, meeting, device = self.search.watch, self.meeting, self.device
         bounds = [meeting.lower, meeting.upper]
         wp.launch(boxes.clear_bounds, meeting.lower.shape, [watch], bounds, device=device)

@@ -30,7 +30,7 @@ class RigidForces:
         search: The search for nearby surfaces.
         law: The law of contact: how far gaps may close in a step.
         pace: The clock.
-        ranks: Who moves the other nodes of the triangles here.
+        ranks: The processes that move the other nodes of the triangles here.
 
     Attributes:
         forces: The force of each obstacle on each surface node itself in the last step [N], vec3 [O, S].

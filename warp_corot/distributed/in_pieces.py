@@ -39,7 +39,7 @@ Arrays = dict[str, npt.NDArray[Any]]
 
 #: Nodal arrays of a body, by the ends of their names.
 NODAL = ("displacements", "velocities", "reactions", "constrained", "loads")
-#: What pieces have of a prescribed motion.
+#: The arrays of a prescribed motion that pieces contain.
 MOTION = ("world", "nodes", "times", "to")
 
 
@@ -47,7 +47,7 @@ def save(path: str | PathLike[str], parts: SimulationOfParts, following: list[Fo
     """Write a checkpoint; all ranks must call.
 
     ``run.npz`` names the files ``run.ranks/step-…-rank-0000.npz`` and so on, each with the nodes that a rank moves.
-    Those of a former checkpoint of this name are removed once all are written.
+    The files of a former checkpoint of this name are removed once all are written.
 
     Raises:
         InputError: On all ranks: contact, active stress, bodies that are not in parts, or a rank cannot write.

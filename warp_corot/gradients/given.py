@@ -25,8 +25,8 @@ def with_values(body: SoftBody, values: Values) -> SoftBody:
     place.
 
     Args:
-        body: The body, which does not change.
-        values: By name: "young", "poisson" and "density" as a material takes them; "loads" [N], [worlds * N, 3];
+        body: The body, which does not change. values: The values by name: "young", "poisson" and "density" as a
+        material takes them; "loads" [N], [worlds * N, 3];
             "boundary", positions, of which only those of held nodes are read, [worlds * N, 3]; "rest", rest positions
             [N, 3], with which the mesh is a general one; "activation" [worlds, T] or as ``activate`` takes it.
 

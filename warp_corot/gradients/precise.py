@@ -18,13 +18,13 @@ Array = npt.NDArray[np.float64]
 
 
 class PreciseState:
-    """A body at rest in float64, and gradients there; as ``RestState``.
+    """A body at rest in float64, and gradients there; used like ``RestState``.
 
     Args:
         solved: The state in float32; its body moves to the answer.
 
     Attributes:
-        body, report: Those of ``solved``.
+        body, report: The body and the report of ``solved``.
         adjoint_iterations, adjoint_residual: Zero, since there are no conjugate gradients.
 
     Raises:

@@ -12,7 +12,8 @@ from warp_corot.errors import InputError
 from .directional import Array, Directional, any_across, unit
 from .isotropic import Field, Isotropic, set_checked
 
-#: What checks of "zero or more" let pass.
+#: Values down to this pass checks of "zero or more", because of rounding; and directions are at right angles if their
+#: inner product is below this.
 _BELOW = -1e-12
 _RIGHT_ANGLE = 1e-3
 

@@ -137,7 +137,7 @@ class Steps:
     # --- pieces ----------------------------------------------------------------------------------------------------
 
     def _launch_begin(self, step: Step) -> tuple[list[wp.array], list[wp.array]]:
-        """Launch what is done once a step.
+        """Launch everything that is done once in a step.
 
         Returns:
             Particles and bodies before the step: those of ``state_in``, or copies if the step overwrites them.

@@ -59,19 +59,19 @@ class DeviceForest:
 
     Args:
         forest: The mesh to begin with. Its void tetrahedra stay as they are.
-        capacity: How many leaves there may ever be.
+        capacity: Maximum number of leaves.
         density: Mass per rest volume [kg/m^3], a number or one for each leaf [T], to be multiplied by the forest's
             filled share.
         values: Other quantities of leaves by name, [T] each, per full rest volume, as Lamé's parameters times the
             filled share. Children have their parent's value; a parent has its children's mean, or what a ``Column``
             says.
-        node_capacity: How many nodes there may be; None: one more for every two more leaves. Meshes usually have five
-            or six leaves a node.
+        node_capacity: Maximum number of nodes; None: one more for every two more leaves. Meshes usually have five or
+            six leaves for each node.
         device: "cpu", "cuda:0", …; None for Warp's default.
 
     Attributes:
         pools: ``kernels.remesh.pools.Pools``.
-        carriage: What nodes and tetrahedra carry.
+        carriage: The quantities that nodes and tetrahedra carry.
         source: The forest that this began as.
         capacity, node_capacity, tree_capacity: Places for leaves, nodes, and tetrahedra of all levels.
         remembered: The state to which ``restart`` returns.
@@ -132,7 +132,7 @@ class DeviceForest:
 
     @property
     def free_leaves(self) -> int:
-        """How many more leaves there is room for."""
+        """Number of further leaves for which there is room."""
         return self.count(kernels.FREE_PAIRS)
 
     @property

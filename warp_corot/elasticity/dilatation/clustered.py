@@ -21,9 +21,9 @@ class ClusteredGroups:
 
     Args:
         scatter: Adds the forces.
-        elements: How many elements the mesh has.
-        batches: Groups as ``kernels.elements.shared_dilatation.share_in_groups`` takes them, and how many; together
-            they have all elements that the clusters have.
+        elements: Number of elements of the mesh.
+        batches: Groups as ``kernels.elements.shared_dilatation.share_in_groups`` takes them, and their number;
+            together they have all elements that the clusters have.
         of: The shared dilatation.
         lam: Gives lambda [Pa] as the elements have it.
     """

@@ -148,7 +148,7 @@ class ChangingClusterScatter:
         elements: The leaves, with padding.
         counts: The number of leaves.
         law: A function of ``kernels.clusters.laws`` that works in any axes.
-        layout: What kernels are generated for.
+        layout: The layout for which kernels are generated.
 
     Attributes:
         clusters, elements: ``kernels.clusters.single.Clusters``, ``kernels.clusters.elements.AlignedElements``.

@@ -29,7 +29,7 @@ def split_solids(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:
     """The tetrahedra of cells with volume.
 
-    Tetrahedra do not change. Those of any other cell have the orientation of the cell, positive if its volume is
+    Tetrahedra do not change. The tetrahedra of any other cell have the cell's orientation: positive if its volume is
     positive. Tetrahedra with a repeated corner, from cells with merged corners, are left out.
 
     Args:

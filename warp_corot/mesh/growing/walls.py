@@ -27,12 +27,12 @@ _AROUND = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0
 
 
 def wall_shares(corners: np.ndarray, points: np.ndarray, sampled: np.ndarray, domain: Domain) -> np.ndarray:
-    """What share of elements without a corner inside is wall, float64 [n].
+    """The share of each element without a corner inside that is wall, float64 [n].
 
     Args:
-        corners: Of the elements [m], float64 [n, 4, 3].
+        corners: Corners of the elements [m], float64 [n, 4, 3].
         points: A point in each that is near the body [m], float64 [n, 3].
-        sampled: What share is inside by random points [n].
+        sampled: The share of random points in each that are inside [n].
         domain: The body.
     """
     edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)

@@ -36,7 +36,7 @@ GAP = 3.0
 ROOM = 64
 #: Longest implicit step unless another is given [s].
 IMPLICIT_STEP = 1.0 / 60.0
-#: What comes at this speed is found before an implicit step in which it touches something [m/s].
+#: Things that approach at up to this speed are found before an implicit step in which they touch something [m/s].
 FAST = 10.0
 #: Longest step if rigid bodies touch something [s].
 RIGID_STEP = 5e-4

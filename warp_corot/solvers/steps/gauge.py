@@ -66,7 +66,7 @@ class Gauge:
 
         Args:
             pace: The length of the steps to come.
-            ahead: How many steps come before the next measurement.
+            ahead: Number of steps before the next measurement.
         """
         body = self.body
         self._find_curvature(body.state.displacements, body.state.forces)

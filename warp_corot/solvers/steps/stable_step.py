@@ -33,7 +33,7 @@ def largest_frequency(body: SoftBody, field: SmallForces, ranks: Ranks = ALONE, 
 
     Args:
         body, field: The body and its forces.
-        ranks, number: Who has the other parts of the body, and the number under which they know it.
+        ranks, number: The processes that have the other parts of the body, and its number there.
     """
     largest = largest_eigenvalue(
         field,
@@ -65,8 +65,8 @@ def largest_eigenvalue(
         forces: The forces.
         inverse_mass: Inverse masses of the nodes [1/kg], float32, zero for held ones; nodal arrays are equally long.
         smallest_volume: The volume of the smallest element [m^3], which sets the size of small displacements.
-        nodes: How many nodes there are.
-        launch_nodes: How many nodes launches go through; None: ``nodes``.
+        nodes: Number of nodes.
+        launch_nodes: Number of nodes that launches go through; None: ``nodes``.
         ranks, number: As for ``largest_frequency``.
     """
     free = int(ranks.together(int((inverse_mass[:nodes].numpy() > 0).sum())))
@@ -161,7 +161,7 @@ class _Lanczos:
         return diagonal[:size], off[: size + 1]
 
     def _sum(self, a: wp.array, b: wp.array, numbers: wp.array, *, after: int = 0, root: bool = False) -> None:
-        """Launch that the step's number is a . b, or its root."""
+        """Launch the step's entry of ``numbers``: a . b, or its square root with ``root``."""
         self._launch(lanczos.inner_products, [a, b, self._parts], len(self._parts))
         self._launch(lanczos.fold, [self._parts, self._sums, self._largest], lanczos.FOLDED)
         self._ranks.add_up(self._parts, self._sums)

@@ -39,15 +39,15 @@ class Level:
         pattern: The pattern of its matrix.
         worlds: Number of worlds.
         ranks: Number of nodes of all levels, M.
-        free: Which nodes are free, by rank, uint8 [worlds * M].
+        free: Nonzero for free nodes, by rank, uint8 [worlds * M].
         degree: The degree of the smoother.
         is_bounded: Whether the bound on the eigenvalues of D^-1 A must be kept by smaller inverses, as where groups of
             more than four nodes share a dilatation.
-        is_half: Whether the cycle takes the matrix in half precision.
+        is_half: Whether the cycle uses the matrix in half precision.
 
     Attributes:
         blocks: Values of the entries, transposed, mat33 [worlds * entries + 1].
-        inverses: Of the diagonal blocks, mat33 [worlds * n].
+        inverses: Inverses of the diagonal blocks, mat33 [worlds * n].
         r, z, other: Residual, correction, and a vector to work with, vec4 [worlds * n].
         factors: The factors of the smoother's steps.
         lanes: Number of threads that share a row.
@@ -87,7 +87,7 @@ class Level:
             self.lanes = 1
 
     def pack(self) -> None:
-        """Launch what the cycle takes of the matrix."""
+        """Launch the copy of the matrix that the cycle uses, if that is one in half precision."""
         if not self._is_half:
             return
         pattern, rows = self.pattern, self.rows
@@ -95,11 +95,11 @@ class Level:
         self.launch(cycle.pack_rows, self.count * self.lanes, inputs, [rows.packed, rows.sums, rows.units])
 
     def smooth_before(self) -> None:
-        """Smooth from zero, of which ``z`` has the first step."""
+        """Smooth from zero; ``z`` already has the first step."""
         self.smooth(1)
 
     def smooth_after(self) -> None:
-        """Go on with ``z`` as the transpose of ``smooth_before``."""
+        """Smooth ``z`` further, by the transpose of ``smooth_before``."""
         self.smooth()
 
     def find_residual(self) -> None:
@@ -140,5 +140,5 @@ class Level:
         self.launch(cycle.prolongate_correction, fine.count, inputs, [fine.z])
 
     def launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any]) -> None:
-        """Launch a kernel over a number of things in each world."""
+        """Launch a kernel with ``count`` threads for each world."""
         wp.launch(kernel, dim=(self.worlds, count), inputs=inputs, outputs=outputs, device=self.device)

@@ -25,7 +25,7 @@ from .swept import SweptLevel
 
 #: The largest coarsest level that is inverted [nodes].
 MOST_DENSE = 64
-#: By how much degrees are smaller where the second level has more than half of the finest one's nodes.
+#: By how much degrees are smaller if the second level has more than half as many nodes as the finest one.
 STEPS_LESS = 2
 #: The smoother's degree or sweeps on a coarsest level that is not inverted, for example of a grid of many cubes.
 COARSEST_DEGREE, COARSEST_SWEEPS = 24, 8
@@ -57,12 +57,12 @@ class Multigrid:
         stiffening: Viscous over elastic stress at one strain [s], as in the operator's D.
         most_lambda: Lambda is at most this many times mu.
         members: Returns the groups of elements, among those below a number, that share their dilatation; None: none do.
-        half: Whether the cycle takes matrices in half precision; only where lambda is less than some 64 times mu.
-        sweeps: Smoothing by so many sweeps of Gauss and Seidel; on the CPU. Zero: Chebyshev's iteration.
+        half: Whether the cycle uses matrices in half precision; only where lambda is less than some 64 times mu.
+        sweeps: Number of Gauss-Seidel sweeps that smooth, only on the CPU; zero: Chebyshev's iteration.
 
     Attributes:
         discretization: The body's discretization.
-        revision: Changes whenever launches do.
+        revision: Changes whenever its launches do, so that they must be recorded again.
 
     Raises:
         InputError: The mesh is not a forest, or a stride or degree is out of its range.

@@ -16,18 +16,18 @@ from warp_corot.kernels.plan.levels import flag_first
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """The entries of a level's matrix, one world's, by rank.
+    """The entries of a level's matrix in one world, by rank.
 
     Attributes:
         count: Number of nodes of the level, n.
         entries: Number of entries.
-        starts: The begin of each row, and the end of the last one, int32 [n + 1].
+        starts: The beginning of each row, and the end of the last one, int32 [n + 1].
         columns: int32 [entries], ascending in a row.
         pairs: Row and column of each entry, vec2i [entries].
         diagonal: The place of each row's diagonal entry, int32 [n].
         upper: Rank and higher or equal rank of each entry in the upper triangle, vec2i [U].
         places: The places of each of these and of its mirror image among the entries, vec2i [U].
-        sum_starts: The begin of the contributions to each of these, and the end of the last ones, int32 [U + 1].
+        sum_starts: The beginning of the contributions to each of these, and the end of the last ones, int32 [U + 1].
         codes: The contributions, int32: see ``kernels.implicit.multigrid.pattern``.
     """
 
@@ -48,7 +48,7 @@ class Midpoints:
     """For each node of a level, the finer level's nodes whose edges end there.
 
     Attributes:
-        starts: The begin of each node's list, and the end of the last one, int32 [n + 1].
+        starts: The beginning of each node's list, and the end of the last one, int32 [n + 1].
         midpoints: Ranks, ascending for each node, int32.
     """
 
@@ -74,9 +74,9 @@ class PatternFinder:
         """The pattern of the finest level, from the nodes of the first leaves by number and the rank of each number.
 
         Args:
-            tets: Of all leaves, vec4i.
+            tets: Node numbers of all leaves, vec4i.
             leaves: The number of leaves that count.
-            rank: int32.
+            rank: The rank of each node number, int32.
             members: Groups whose nodes are all coupled, if there are any.
 
         Returns:

@@ -1,4 +1,4 @@
-"""A level that the CPU smooths by sweeps of Gauss and Seidel; see ``kernels.implicit.multigrid.sweeps``."""
+"""A level that the CPU smooths by Gauss-Seidel sweeps; see ``kernels.implicit.multigrid.sweeps``."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from .pattern import Pattern
 
 
 class SweptLevel(Level):
-    """Smoothing before is ``sweeps`` times a sweep forward and one back, but the last time without that back if there
-    is one sweep alone; smoothing after is its transpose.
+    """A level with sweeps in place of Chebyshev's iteration. Smoothing after is the transpose of smoothing before.
 
     Args:
         pattern, worlds, ranks, free: As for every level.
-        sweeps: One: a sweep forward before, and one back after. More: so many pairs of them before and after.
+        sweeps: With one, a sweep forward before and one back after; with more, so many pairs of a sweep forward and one
+            back, before and after.
     """
 
     def __init__(self, pattern: Pattern, worlds: int, ranks: int, free: wp.array, sweeps: int):
