@@ -99,9 +99,3 @@ def test_worlds_and_saved_runs(device, tmp_path):
     later.advance_steps(3)
     error = np.abs(later.body.displacements.numpy() - body.displacements.numpy()).max()
     assert error <= (0.0 if body.device.is_cpu else 1e-6)
-
-
-def test_what_implicit_steps_cannot_touch_is_refused(device):
-    first = block(device)
-    with pytest.raises(wc.InputError, match="BDF2 does not support contact"):
-        wc.Simulation(first, obstacles=wc.Ground(), integrator=wc.BDF2(dt=0.01))

@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from warp_corot.kernels.contact import active as kernels
+from warp_corot.kernels.contact.meetings import find_meetings
 
 if TYPE_CHECKING:
     from .contacts import Contacts
@@ -34,6 +35,8 @@ class ActiveSet:
         self._rounds = wp.zeros(1, dtype=wp.int32, device=self.device)
         #: Whether other nodes are held than in the last round, int32 [1].
         self.changed = wp.zeros(1, dtype=wp.int32, device=self.device)
+        #: Which nodes touched each obstacle after the step before the last one, int32 [obstacles, places].
+        self.kinds_before = wp.zeros((0, 0), dtype=wp.int32, device=self.device)
         self.prepare()
 
     def prepare(self) -> None:
@@ -41,6 +44,8 @@ class ActiveSet:
         rigid, holding = self._rigid, kernels.Holding()
         holding.kinds, holding.forces = rigid.kinds, rigid.forces
         shape, device = rigid.kinds.shape, self.device
+        if self.kinds_before.shape != shape:
+            self.kinds_before = wp.clone(rigid.kinds)
         holding.released = wp.zeros(shape, dtype=wp.int32, device=device)
         holding.normals, holding.multipliers = (wp.zeros(shape, dtype=wp.vec3, device=device) for _ in range(2))
         holding.least, holding.most = (wp.zeros(shape, dtype=wp.float32, device=device) for _ in range(2))
@@ -52,19 +57,25 @@ class ActiveSet:
 
     # --- launches ----------------------------------------------------------------------------------------------------
 
-    def launch_begin(self, d: wp.array, blocks: wp.array) -> None:
+    def launch_begin(self, u: wp.array, d: wp.array, blocks: wp.array) -> None:
         """Launch the begin of a step: nodes are held as at the end of the last one.
 
         Args:
+            u: Displacements at the begin of the step [m], vec4.
             d: A guess [m], vec4.
             blocks: The blocks on the diagonal of the matrix, mat33.
         """
         state, conditions = self.body.state, self.body.conditions
-        inputs = [conditions.inverse_mass, state.rest, state.displacements, blocks, self._surface, self._holding]
+        inputs = [conditions.inverse_mass, state.rest, u, blocks, self._surface, self._holding]
         self._launch(kernels.begin_places, inputs)
         self._rounds.zero_()
         self._find_bounds(d, int(kernels.THOSE_TOUCHED), at_end=False)
         self._hold()
+
+    def launch_again(self) -> None:
+        """Launch the begin of another linearisation of the same step."""
+        self._rounds.zero_()
+        self._holding.released.zero_()
 
     def launch_free(self, v: wp.array) -> None:
         """Launch v = S v, without the directions that are held."""
@@ -114,6 +125,17 @@ class ActiveSet:
     def launch_end(self, d: wp.array) -> None:
         """Launch the results of contact for users."""
         self._launch(kernels.end_places, [d, self._holding, self._surface, self.body.state.contact_forces])
+
+    def launch_meetings(self, begins: wp.array) -> None:
+        """Launch whether contact has changed in the last step, or nodes will meet an obstacle in this one.
+
+        Args:
+            begins: Nonzero afterwards if so, int32 [1].
+        """
+        state, obstacles, pace = self.body.state, self._contacts.obstacles, self._contacts.system.pace.arrays
+        inputs = [self.body.conditions.inverse_mass, state.rest, state.displacements, state.velocities, pace]
+        inputs += [obstacles.shapes, obstacles.motions, self._contacts.law, self._surface, self._rigid.kinds]
+        self._launch(find_meetings, [*inputs, self.kinds_before, begins])
 
     # --- pieces ------------------------------------------------------------------------------------------------------
 

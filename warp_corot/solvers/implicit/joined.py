@@ -143,9 +143,9 @@ class JoinedSolve:
             blocks.append(operator.diagonal_blocks())
             rows.launch_begin(k, self._parts.starts[k], blocks[k], newton.increment, newton.step)
         rows.launch_search(offset)
-        for held, d, own in zip(self._held, self._parts.of(self._d), blocks, strict=True):
+        for newton, held, d, own in zip(self._newtons, self._held, self._parts.of(self._d), blocks, strict=True):
             if held is not None:
-                held.launch_begin(d, own)
+                held.launch_begin(newton.body.state.displacements, d, own)
         rows.locates.fill_(1)
         rows.launch_located(self._d, is_first=True)
         self._rounds.zero_()

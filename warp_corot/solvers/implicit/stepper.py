@@ -22,6 +22,7 @@ from .newton import Newton
 from .preconditioners import preconditioner_of
 from .tangent import TangentOperator
 from .touching import Held, Hold, Touching, TouchingSolve
+from .touching_newton import TouchingNewton
 
 if TYPE_CHECKING:
     from warp_corot.solvers.system import System
@@ -60,6 +61,8 @@ class ImplicitStepper(Stepper):
         arrays = enumerate(array for body in self._bodies for array in body.history)
         kept = {f"history.{number}": array for number, array in arrays}
         kept |= {f"velocities.{k}": body.before for k, body in enumerate(self._bodies)}
+        schemes = [(k, body.held) for k, body in enumerate(self._bodies) if body.history and body.held is not None]
+        kept |= {f"meetings.{k}": held.kinds_before for k, held in schemes}
         lagged = [(k, body.lagged) for k, body in enumerate(self._bodies) if body.lagged is not None]
         return kept | {f"setup.{k}.{name}": array for k, each in lagged for name, array in each.state.items()}
 
@@ -114,6 +117,11 @@ class ImplicitStepper(Stepper):
             most=self.integrator.linear_iterations,
         )
 
+    @property
+    def in_one_solve(self) -> bool:
+        """Whether a step with contact is one linearisation of backward Euler."""
+        return self.integrator.tolerance is None and self.integrator.history == 0
+
     def add_other_forces(self) -> None:
         """Launch all forces except elastic ones in the present state to ``state.forces`` of the bodies."""
         self.forget_forces()
@@ -159,7 +167,10 @@ class BodySteps:
         self.body, self.field, self.system = system.bodies[k], system.fields[k], system
         self.device = self.body.device
         self.viscosity = Viscosity(self.body, self.field, options.viscosity) if options.viscosity else None
-        exact = options.tolerance is not None
+        sets = [each.active_set(k) for each in stepper.touching]
+        self.held: Held | None = next((each for each in sets if each is not None), None)
+        # Contact needs a matrix that is positive definite.
+        exact = options.tolerance is not None and self.held is None
         self.operator = TangentOperator(
             self.body, self.field, viscosity=self.viscosity, exact=exact, ranks=system.ranks, number=k
         )
@@ -167,8 +178,6 @@ class BodySteps:
         self.lagged: Lagged | None = None
         if not exact and isinstance(self._preconditioner, Multigrid):
             self._preconditioner = self.lagged = Lagged(self._preconditioner, self.operator)
-        sets = [each.active_set(k) for each in stepper.touching]
-        self.held: Held | None = next((each for each in sets if each is not None), None)
         self._make_solvers()
         like = self.body.state.displacements
         self._none = wp.zeros(1, dtype=wp.vec4, device=self.device)
@@ -182,6 +191,9 @@ class BodySteps:
         self._is_prepared = False
         self._one = wp.ones(self.body.worlds, dtype=wp.int32, device=self.device)
         tables = np.stack([options.scheme(options.dt), options.start(options.dt)])
+        if self.held is not None:
+            # The increments of a step with contact begin with zero.
+            tables[:, int(kernels.STAGE), 1] = 0.0
         self._table = wp.array(tables, dtype=wp.float32, device=self.device)
 
     def _make_solvers(self) -> None:
@@ -198,8 +210,13 @@ class BodySteps:
             others=self._add_others,
         )
         self.touching: TouchingSolve | None = None
+        self.touching_newton: TouchingNewton | None = None
         if self.held is not None and self.stepper.rows is None:
             self.touching = TouchingSolve(self.newton, self.held)
+            if not self.stepper.in_one_solve:
+                most = 1 if options.tolerance is None else options.iterations
+                tolerance = options.tolerance or 1.0
+                self.touching_newton = TouchingNewton(self.touching, tolerance=tolerance, most=most)
 
     def prepare(self) -> None:
         """Make everything that launches use, so that they can be recorded."""
@@ -219,7 +236,7 @@ class BodySteps:
             *(each for each in self.system.forces if hasattr(each, "add_stiffness")),
             *self.stepper.holds,
         )
-        if self.stepper.integrator.tolerance is None:
+        if self.stepper.integrator.tolerance is None or self.touching_newton is not None:
             self.newton.solver.tolerance.fill_(self.stepper.integrator.linear_tolerance)
         u = self.body.state.displacements
         self.field.elastic_forces(u)
@@ -233,12 +250,15 @@ class BodySteps:
 
     def launch_residual(self) -> None:
         """Launch the forces that are out of balance, if the step is solved for by itself."""
-        if self.stepper.integrator.tolerance is None:
+        if self.stepper.integrator.tolerance is None and self.touching_newton is None:
             self.newton.launch_residual()
 
     def launch_solve(self) -> None:
         """Launch the solve for the step."""
         newton, solver = self.newton, self.newton.solver
+        if self.touching_newton is not None:
+            self._solve_touching(self.touching_newton)
+            return
         if self.stepper.integrator.tolerance is not None:
             newton.launch_begin()
             wp.capture_while(newton.running, newton.launch_iteration)
@@ -252,6 +272,14 @@ class BodySteps:
             self.touching.launch()
             iterations = self.touching.iterations
         self._take(iterations, solver.status)
+
+    def _solve_touching(self, solve: TouchingNewton) -> None:
+        """Launch the solve for a step with contact by Newton's method."""
+        solve.launch()
+        if self.lagged is not None:
+            self.lagged.judge(solve.linear_iterations, solve.status)
+        self._counts = [solve.iterations, solve.linear_iterations, solve.status]
+        self._good = int(conjugate_gradients.CONVERGED)
 
     def take_solved(self, joined: JoinedSolve) -> None:
         """Launch the copy of this body's step from a solve for all bodies."""
@@ -294,6 +322,9 @@ class BodySteps:
         if self.history:
             inputs = [conditions.inverse_mass, state.displacements, state.velocities, *self._left]
             self._launch(kernels.find_changes, inputs, [self._begins])
+            if self.held is not None:
+                # Velocities jump when nodes meet obstacles, so schemes of second order begin again.
+                self.held.launch_meetings(self._begins)
             system.ranks.take_most(self._begins)
         inputs = [self._begins, self._table, options.damping]
         outputs = [self.operator.scales, newton.inertia]

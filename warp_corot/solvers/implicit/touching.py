@@ -29,10 +29,13 @@ class Held(Protocol):
     """
 
     changed: wp.array
+    kinds_before: wp.array
 
     def prepare(self) -> None: ...
 
-    def launch_begin(self, d: wp.array, blocks: wp.array) -> None: ...
+    def launch_begin(self, u: wp.array, d: wp.array, blocks: wp.array) -> None: ...
+
+    def launch_again(self) -> None: ...
 
     def launch_free(self, v: wp.array) -> None: ...
 
@@ -49,6 +52,8 @@ class Held(Protocol):
     def launch_judgement(self, b: wp.array, q: wp.array, d: wp.array) -> None: ...
 
     def launch_end(self, d: wp.array) -> None: ...
+
+    def launch_meetings(self, begins: wp.array) -> None: ...
 
 
 class Rows(Protocol):
@@ -150,7 +155,7 @@ class FreePreconditioner:
 
 
 class TouchingSolve:
-    """Solves for the step of ``newton`` with one linearisation.
+    """Solves for the step of ``newton`` with one linearisation, or with several; see ``TouchingNewton``.
 
     Args:
         newton: Newton's method with the operator, residual, preconditioner and linear solver.
@@ -174,15 +179,22 @@ class TouchingSolve:
 
     def launch(self) -> None:
         """Launch the solve for ``newton.step``, from a guess; the residual must be known."""
-        newton, held = self.newton, self.held
-        self._operator.take(newton.body.state.displacements)
-        self._preconditioner.update(self._operator)
+        self.linearise()
         self.iterations.zero_()
+        self.held.launch_begin(self.newton.body.state.displacements, self.newton.step, self._operator.diagonal_blocks())
+        self.launch_rounds()
+        self.held.launch_end(self.newton.step)
+
+    def linearise(self) -> None:
+        """Launch the linearisation at the present displacements."""
+        self._operator.take(self.newton.body.state.displacements)
+        self._preconditioner.update(self._operator)
+
+    def launch_rounds(self) -> None:
+        """Launch the linear solves, until contact no longer changes."""
         self._rounds.zero_()
         self._going.fill_(1)
-        held.launch_begin(newton.step, self._operator.diagonal_blocks())
         wp.capture_while(self._going, self._round)
-        held.launch_end(newton.step)
 
     def _round(self) -> None:
         newton, held, d = self.newton, self.held, self.newton.step

@@ -1,0 +1,83 @@
+"""Newton's method for an implicit step with contact: increments, and when they are good enough."""
+
+import warp as wp
+
+from warp_corot.kernels.elements.elements import load_node, store_node
+
+from .conjugate_gradients import BROKEN, CONVERGED, LIMIT
+
+wp.set_module_options({"enable_backward": False})
+
+#: Columns of sizes: the largest change of an increment, and the largest displacement [m].
+CHANGE, REACH = (wp.constant(k) for k in range(2))
+COLUMNS = 2
+
+
+@wp.kernel(enable_backward=False)
+def take_free(inverse_mass: wp.array[wp.float32], increment: wp.array[wp.vec4], d: wp.array[wp.vec4]):
+    """d = the increment at free nodes, zero at the others."""
+    i = wp.tid()
+    free = wp.vec3()
+    if inverse_mass[i] > 0.0:
+        free = load_node(increment, i)
+    store_node(d, i, free)
+
+
+@wp.kernel(enable_backward=False)
+def add_product(product: wp.array[wp.vec4], r: wp.array[wp.vec4]):
+    """r += A d."""
+    i = wp.tid()
+    store_node(r, i, load_node(r, i) + load_node(product, i))
+
+
+@wp.kernel(enable_backward=False)
+def take_increments(
+    # In
+    count: int,
+    inverse_mass: wp.array[wp.float32],
+    base: wp.array[wp.vec4],
+    d: wp.array[wp.vec4],
+    # In and out
+    increment: wp.array[wp.vec4],
+    # Out
+    u: wp.array[wp.vec4],
+    sizes: wp.array2d[wp.float32],
+):
+    """Take d as the increment of free nodes, and find the largest change and displacement of each world."""
+    i = wp.tid()
+    world = i / count
+    if inverse_mass[i] > 0.0:
+        after = load_node(d, i)
+        wp.atomic_max(sizes, world, CHANGE, wp.length(after - load_node(increment, i)))
+        store_node(increment, i, after)
+        place = load_node(base, i) + after
+        store_node(u, i, place)
+        wp.atomic_max(sizes, world, REACH, wp.length(place))
+
+
+@wp.kernel(enable_backward=False)
+def judge_increments(
+    # In
+    sizes: wp.array2d[wp.float32],
+    linear: wp.array[wp.int32],
+    solved: wp.array[wp.int32],
+    tolerance: float,
+    most: int,
+    # In and out
+    iterations: wp.array[wp.int32],
+    total: wp.array[wp.int32],
+    # Out
+    status: wp.array[wp.int32],
+    going: wp.array[wp.int32],
+):
+    """Count a linearisation; another one follows if increments of a world still change."""
+    world = wp.tid()
+    total[world] = total[world] + linear[world]
+    iterations[world] = iterations[world] + 1
+    status[world] = CONVERGED
+    if solved[world] == BROKEN:
+        status[world] = BROKEN
+    elif sizes[world, CHANGE] > tolerance * sizes[world, REACH]:
+        status[world] = LIMIT
+        if iterations[world] < most:
+            going[0] = 1

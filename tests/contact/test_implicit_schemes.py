@@ -1,0 +1,87 @@
+"""Obstacles in the implicit integrators besides backward Euler with one linear solve a step."""
+
+import numpy as np
+import pytest
+from soft_blocks import DOWN, block, force_on, motion, weight
+
+import warp_corot as wc
+
+DT = 0.016
+SCHEMES = {
+    "BackwardEuler": wc.BackwardEuler(dt=DT, tolerance=1e-4),
+    "BDF2": wc.BDF2(dt=DT),
+    "GeneralizedAlpha": wc.GeneralizedAlpha(dt=DT, spectral_radius=0.0),
+}
+
+
+@pytest.fixture(params=list(SCHEMES))
+def scheme(request):
+    return SCHEMES[request.param]
+
+
+def test_a_block_that_falls_comes_to_rest(device, scheme):
+    """An impact that steps do not resolve hardly throws it back, and contact takes the weight's momentum."""
+    body, ground = block(device, origin=(0.0, 0.0, 0.01)), wc.Ground()
+    body.velocities = np.tile([0.3, 0.0, 0.0], (body.node_count, 1))
+    sim = wc.Simulation(body, obstacles=ground, gravity=DOWN, integrator=scheme, contact=wc.Contact(friction=0.3))
+    given = body.masses.sum() * np.array([0.3, 0.0, 0.0])
+    felt, highest = np.zeros(3), 0.0
+    for _ in range(30):
+        sim.advance_steps(1)
+        felt -= DT * force_on(ground)
+        given += DT * body.masses.sum() * np.array(DOWN)
+        highest = max(highest, motion(body)[1][2])
+        assert body.positions.numpy()[:, 2].min() > -1e-6
+    assert highest < 0.1
+    assert force_on(ground)[2] == pytest.approx(-weight(body), rel=1e-3)
+    assert np.abs(body.velocities.numpy()).max() < 1e-4
+    np.testing.assert_allclose(felt, -given, atol=0.03 * np.linalg.norm(given))
+    assert sim.solves.unfinished == 0
+
+
+@pytest.mark.parametrize("name", [*SCHEMES, "QuasiStatic"])
+def test_a_plate_presses_as_in_explicit_steps(device, name):
+    def pressed(integrator):
+        body, plate = block(device), wc.Tool(wc.Box((0.06, 0.06, 0.01)))
+        body.fix(body.mesh.points[:, 2] < 1e-9)
+        plate.follow([0.0, 0.1], [(0.02, 0.02, 0.025), (0.02, 0.02, 0.017)])
+        options = {"gravity": (0.0, 0.0, 0.0), "contact": wc.Contact(friction=0.0)}
+        sim = wc.Simulation(body, obstacles=plate, **options, integrator=integrator)
+        sim.advance(0.4)
+        assert sim.solves is None or sim.solves.unfinished == 0
+        return force_on(plate)[2]
+
+    explicit = pressed(wc.SymplecticEuler(damping=60.0))
+    assert explicit > 10.0
+    assert pressed(SCHEMES.get(name, wc.QuasiStatic(dt=0.02))) == pytest.approx(explicit, rel=1e-3)
+
+
+def test_a_saved_run_goes_on(device, tmp_path):
+    body = block(device, origin=(0.0, 0.0, 0.001), cells=(1, 1, 1), worlds=2)
+    sim = wc.Simulation(body, obstacles=wc.Ground(), gravity=DOWN, integrator=wc.BDF2(dt=DT))
+    sim.advance_steps(4)
+    sim.save(tmp_path / "state.npz")
+    sim.advance_steps(3)
+    later = wc.Simulation.load(tmp_path / "state.npz")
+    later.advance_steps(3)
+    error = np.abs(later.body.displacements.numpy() - body.displacements.numpy()).max()
+    assert error <= (0.0 if body.device.is_cpu else 1e-6)
+
+
+@pytest.mark.parametrize(
+    ("integrator", "refused"),
+    [
+        (wc.Newmark(dt=DT), "Newmark does not support contact"),
+        (wc.GeneralizedAlpha(dt=DT), "only with spectral_radius=0"),
+    ],
+    ids=["Newmark", "GeneralizedAlpha"],
+)
+def test_integrators_that_cannot_touch_are_refused(device, integrator, refused):
+    with pytest.raises(wc.InputError, match=refused):
+        wc.Simulation(block(device), obstacles=wc.Ground(), integrator=integrator)
+
+
+def test_soft_surfaces_need_backward_euler(device):
+    bodies = [block(device), block(device, origin=(0.0, 0.0, 0.1))]
+    with pytest.raises(wc.InputError, match="BDF2 does not support contact between soft surfaces"):
+        wc.Simulation(bodies, contact=wc.Contact(), integrator=wc.BDF2(dt=DT))
