@@ -6,7 +6,7 @@ principal stretches,
 A part v_p of the logarithm of a term and of its stretches goes to neo-Hookean's energy, whose shear modulus is
 mu sum_p v_p then. What is left is mu sum_i G(c_i) with
     G = sum_p m_p / alpha_p (c^(alpha_p / 2) - 1) - v_p / 2 (c - 1) - (m_p - v_p) / 2 ln c,  G(1) = G'(1) = 0.
-All resistance to turned-over elements is neo-Hookean's: G depends on C alone, and has a bounded second derivative,
+All resistance to turned-over elements is neo-Hookean's: G depends only on C, and has a bounded second derivative,
 because it goes on as a parabola where stretches are outside limits that follow from alpha_p. v_p is m_p where alpha_p
 is positive, w_p where it is negative, so that what is left never pulls a crushed element together.
 """

@@ -87,7 +87,7 @@ def find_nearest_across(
         square = squares[i, j, k]
         counts = square < NOTHING
         if square == 0.0 and j > 0 and j < n - 1:
-            # Between two voxels of the set this one is the nearest to itself alone.
+            # Between two voxels of the set, this one is the nearest only to itself.
             counts = squares[i, j - 1, k] > 0.0 or squares[i, j + 1, k] > 0.0
         if counts:
             x = step * wp.float64(j)

@@ -1,4 +1,4 @@
-"""Nodes of a forest by tree level, found from their lattice points alone, and the tables for transfers.
+"""Nodes of a forest by tree level, found only from their lattice points, and the tables for transfers.
 
 A node is the midpoint of the refinement edge of a tetrahedron one level up, or a corner of a root. Let t be the
 smallest number of trailing zero bits of the nonzero coordinates of its lattice point. Three levels halve the edges, and

@@ -68,8 +68,8 @@ def add_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParse
 {run_file.HELP}
 
 a label in --labels and --materials is {FORM}: a name and the
-numbers of its voxels or region, or a number for both; names alone are the file's
-regions, or a volume's labels in ascending order.
+numbers of its voxels or region, or a number for both; names without numbers are
+the file's regions, or a volume's labels in ascending order.
 
 quantities are in SI units or have a unit: 5kPa, 1.06g/cm3, 500ms, 0.2inch.
 
@@ -119,8 +119,8 @@ def add_input(parser: argparse.ArgumentParser) -> None:
         help="what to simulate. A mesh with volume, whose other cells are split into tetrahedra: a USD file with a "
         "TetMesh, or a Mesh with tetraIndices; .vtk, .vtu, .vtm, .msh of Gmsh, .inp of Abaqus, .mesh, .node, "
         ".ele, .vol and others; warp:bear, a toy bear; or box, the beam of Tagawa et al. 2013. A closed "
-        "surface: .obj, .stl, .ply, .off, .glb, .vtp, a USD file with Mesh prims alone, one of the other "
-        "files with triangles alone; or warp:bunny. A segmented scan: .nii, .nii.gz, .mgz, .mha, .mhd, .nrrd, "
+        "surface: .obj, .stl, .ply, .off, .glb, .vtp, a USD file with only Mesh prims, one of the other "
+        "files with only triangles; or warp:bunny. A segmented scan: .nii, .nii.gz, .mgz, .mha, .mhd, .nrrd, "
         ".vti, or a folder with a DICOM series. Or a run file, .toml",
     )
 

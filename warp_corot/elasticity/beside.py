@@ -70,7 +70,7 @@ class BesideField(ForceField):
         self.add_own_forces(u, f)
 
     def add_own_forces(self, u: wp.array, f: wp.array) -> None:
-        """Launch the kernel that adds the forces of the additional stress alone."""
+        """Launch the kernel that adds only the forces of the additional stress."""
         if self._slotted is None:
             self.launch(self._forces, self.element_count, [self.elements, self.material, u], [f])
             return

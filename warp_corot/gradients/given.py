@@ -71,7 +71,7 @@ def _mesh(body: SoftBody, rest: npt.ArrayLike | None) -> Any:
     if rest is None:
         return mesh
     if body.discretization.fill is not None:
-        raise InputError("the mesh has cut elements, which are cut in one rest shape alone; rest cannot be replaced")
+        raise InputError("the mesh has cut elements, which belong to one rest shape; rest cannot be replaced")
     points = np.asarray(rest, np.float64)
     if points.shape != mesh.points.shape:
         raise InputError(f"rest has shape {points.shape}; it must be [{len(mesh.points)}, 3]")

@@ -1,4 +1,4 @@
-"""A state of rest in the precision that was asked for; SciPy is imported for float64 alone."""
+"""A state of rest in the requested precision; SciPy is imported only for float64."""
 
 from __future__ import annotations
 

@@ -222,7 +222,7 @@ def _draw_silhouette(ax: "Axes", x: Array, tri: NDArray[np.int64], camera: Camer
 def _draw_outline(
     ax: "Axes", x: Array, tri: NDArray[np.int64], color: Any, camera: Camera, *, width: float, order: int
 ) -> None:
-    """Draw lines along edges that one face alone has among those that face the viewer; inner ones are drawn over."""
+    """Draw lines along edges that belong to only one of the faces that face the viewer; inner ones are drawn over."""
     from matplotlib.collections import LineCollection
 
     front = tri[camera.sees_outside(x[tri])]
