@@ -78,6 +78,19 @@ def clear_bounds(watch: Watch, lower: wp.array2d[wp.vec3], upper: wp.array2d[wp.
         upper[world, k] = -wp.vec3(NOWHERE, NOWHERE, NOWHERE)
 
 
+@wp.func
+def extend_bounds(
+    world: int, body: int, low: wp.vec3, high: wp.vec3, lower: wp.array2d[wp.vec3], upper: wp.array2d[wp.vec3]
+):
+    """Extend a body's bounds; threads whose boxes are inside already do not wait for the others."""
+    a = lower[world, body]
+    b = upper[world, body]
+    if low[0] < a[0] or low[1] < a[1] or low[2] < a[2]:
+        wp.atomic_min(lower, world, body, low)
+    if high[0] > b[0] or high[1] > b[1] or high[2] > b[2]:
+        wp.atomic_max(upper, world, body, high)
+
+
 @wp.kernel(enable_backward=False)
 def bound_bodies(
     # In
@@ -109,8 +122,7 @@ def bound_bodies(
             # Places are sorted by body, so a thread rarely moves on to another body.
             if meeting.body[place] != body or surface.world[place] != world:
                 if body >= 0:
-                    wp.atomic_min(lower, world, body, low)
-                    wp.atomic_max(upper, world, body, high)
+                    extend_bounds(world, body, low, high, lower, upper)
                 body = meeting.body[place]
                 world = surface.world[place]
                 low = boxes_lower[i]
@@ -120,8 +132,7 @@ def bound_bodies(
                 high = wp.max(high, boxes_upper[i])
         i += threads
     if body >= 0:
-        wp.atomic_min(lower, world, body, low)
-        wp.atomic_max(upper, world, body, high)
+        extend_bounds(world, body, low, high, lower, upper)
 
 
 @wp.func

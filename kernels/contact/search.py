@@ -11,6 +11,10 @@ from .watch import Watch
 
 wp.set_module_options({"enable_backward": False})
 
+#: Number of neighbours that a thread keeps; with more, it finds them a second time.
+KEPT = wp.constant(16)
+Kept = wp.types.vector(length=16, dtype=wp.int32)
+
 #: Edges with a larger sine of the bend are sharp.
 SHARP = wp.constant(0.15)
 
@@ -119,26 +123,32 @@ def add_other(start: int, count: int, other: int, rows: Rows):
 
 
 @wp.func
-def near_node(i: int, start: int, of_triangles: wp.uint64, surface: Surface, meeting: Meeting, near: Near, rows: Rows):
-    """Count the triangles near a node, and write them if a start is given."""
+def near_node(
+    i: int, start: int, of_triangles: wp.uint64, surface: Surface, meeting: Meeting, near: Near, rows: Rows, kept: Kept
+):
+    """Count the triangles near a node and keep the first ones, or write all if a start is given."""
     count = int(0)
     reach = meeting.reach[i]
     beyond = wp.vec3(reach, reach, reach)
     if not may_reach_others(i, surface.x[i] - beyond, surface.x[i] + beyond, surface, meeting):
-        return 0
+        return 0, kept
     query = wp.bvh_query_aabb(of_triangles, surface.x[i] - beyond, surface.x[i] + beyond)
     t = int(0)
     while wp.bvh_query_next(query, t):
         if node_is_near(i, t, surface, meeting, near):
             if start >= 0:
                 add_other(start, count, t, rows)
+            elif count < KEPT:
+                kept[count] = t
             count += 1
-    return count
+    return count, kept
 
 
 @wp.func
-def near_edge(k: int, start: int, of_edges: wp.uint64, surface: Surface, meeting: Meeting, near: Near, rows: Rows):
-    """Count the edges near a sharp one, and write them if a start is given."""
+def near_edge(
+    k: int, start: int, of_edges: wp.uint64, surface: Surface, meeting: Meeting, near: Near, rows: Rows, kept: Kept
+):
+    """Count the edges near a sharp one and keep the first ones, or write all if a start is given."""
     count = int(0)
     e = meeting.edges[k]
     a = surface.x[e[0]]
@@ -146,17 +156,19 @@ def near_edge(k: int, start: int, of_edges: wp.uint64, surface: Surface, meeting
     reach = edge_reach(meeting, e)
     beyond = wp.vec3(reach, reach, reach)
     if not may_reach_others(e[0], wp.min(a, b) - beyond, wp.max(a, b) + beyond, surface, meeting):
-        return 0
+        return 0, kept
     if bend(surface, meeting, k) <= SHARP:
-        return 0
+        return 0, kept
     query = wp.bvh_query_aabb(of_edges, wp.min(a, b) - beyond, wp.max(a, b) + beyond)
     m = int(0)
     while wp.bvh_query_next(query, m):
         if edge_is_near(k, m, surface, meeting, near):
             if start >= 0:
                 add_other(start, count, m, rows)
+            elif count < KEPT:
+                kept[count] = m
             count += 1
-    return count
+    return count, kept
 
 
 @wp.func
@@ -169,15 +181,17 @@ def near_owner(
     meeting: Meeting,
     near: Near,
     rows: Rows,
+    kept: Kept,
 ):
     nodes = meeting.body.shape[0]
     count = int(0)
+    found = kept
     if i < nodes:
         if surface.node[i] >= 0:
-            count = near_node(i, start, of_triangles, surface, meeting, near, rows)
+            count, found = near_node(i, start, of_triangles, surface, meeting, near, rows, kept)
     elif meeting.edges[i - nodes][0] >= 0:
-        count = near_edge(i - nodes, start, of_edges, surface, meeting, near, rows)
-    return count
+        count, found = near_edge(i - nodes, start, of_edges, surface, meeting, near, rows, kept)
+    return count, found
 
 
 @wp.func
@@ -215,7 +229,7 @@ def find_pairs(
     if watch.due[0] == 0:
         return
     room = rows.owner.shape[0]
-    count = near_owner(i, -1, of_triangles, of_edges, surface, meeting, near, rows)
+    count, kept = near_owner(i, -1, of_triangles, of_edges, surface, meeting, near, rows, Kept())
     start = int(0)
     rows.counts[i] = 0
     if count > 0:
@@ -228,7 +242,11 @@ def find_pairs(
         return
     if count == 0:
         return
-    near_owner(i, start, of_triangles, of_edges, surface, meeting, near, rows)
+    if count <= KEPT:
+        for k in range(count):
+            add_other(start, k, kept[k], rows)
+    else:
+        near_owner(i, start, of_triangles, of_edges, surface, meeting, near, rows, kept)
     rows.counts[i] = count
     before = old.starts[i]
     last = before + old.counts[i]

@@ -129,28 +129,30 @@ def move_obstacles(
 
 
 @wp.func
-def raise_fastest(step: float, watch: Watch):
-    if step > watch.fastest[0]:
-        wp.atomic_max(watch.fastest, 0, step)
-
-
-@wp.func
 def pair_of(k: int, watch: Watch):
     """The world and the obstacle of a number below that of pairs of them."""
     return k // watch.poses.shape[1], k % watch.poses.shape[1]
 
 
 @wp.kernel(enable_backward=False)
-def find_fastest(surface: Surface, motions: Motions, obstacles: int, watch: Watch):
-    """Find the motion in this step of the fastest node or obstacle, with a thread for each of either."""
-    s = wp.tid()
+def find_fastest(threads: int, surface: Surface, motions: Motions, obstacles: int, watch: Watch):
+    """Find the motion in this step of the fastest node or obstacle."""
+    thread = wp.tid()
     if watch.due[0] == 0:
         return
-    if s < surface.node.shape[0] and surface.node[s] >= 0:
-        raise_fastest(wp.length(surface.d[s]), watch)
-    if s < obstacles:
-        world, o = pair_of(s, watch)
-        raise_fastest(distance_between(motions.now[world, o], motions.later[world, o], motions.reach[o]), watch)
+    fastest = float(0.0)
+    s = int(thread)
+    while s < surface.node.shape[0]:
+        if surface.node[s] >= 0:
+            fastest = wp.max(fastest, wp.length(surface.d[s]))
+        s += threads
+    k = int(thread)
+    while k < obstacles:
+        world, o = pair_of(k, watch)
+        fastest = wp.max(fastest, distance_between(motions.now[world, o], motions.later[world, o], motions.reach[o]))
+        k += threads
+    if fastest > watch.fastest[0]:
+        wp.atomic_max(watch.fastest, 0, fastest)
 
 
 @wp.func

@@ -20,6 +20,8 @@ LEAST, MOST = 0.05, 4.0
 WIDER = 4.0
 #: Maximum number of threads that process a list on CUDA.
 MOST_THREADS = 1 << 18
+#: Threads that find the fastest item on CUDA, at most: each ends with an atomic maximum.
+MEASURING_THREADS = 1 << 14
 #: The report of the device to the host: see ``kernels.contact.near.report_search``.
 PAIRS, MISSED, SEARCHES, NEAR = range(4)
 
@@ -163,7 +165,8 @@ class Search:
         arrays, obstacles = self.surface.arrays, self.watch.poses.size
         inputs = [arrays, self.obstacles.motions, obstacles, self.watch]
         dim = max(self.surface.count, obstacles)
-        wp.launch(kernels.find_fastest, dim, inputs, device=self.device)
+        threads = 1 if self.device.is_cpu else min(dim, MEASURING_THREADS)
+        wp.launch(kernels.find_fastest, threads, [threads, *inputs], device=self.device)
         wp.launch(near_kernels.reserve, dim, [*inputs, self.near], device=self.device)
         for find in self.finders:
             find()
