@@ -84,6 +84,7 @@ def test_vtk_voxels_polyhedra_and_structured_grids(tmp_path):
     prism = [(np.cos(a), np.sin(a), z) for z in (0, 1) for a in np.arange(6) * np.pi / 3]
     mesh = wc.TetMesh.load(write_with_vtk(tmp_path / "prism.vtu", vtk_grid(prism, [(16, list(range(12)))])))
     assert mesh.volumes.sum() == pytest.approx(1.5 * np.sqrt(3))
+    assert load_tets(tmp_path / "prism.vtu").notes == ["1 hexagonal prism is split into tetrahedra"]
     axes = []
     for values in ([0, 1, 3], [0, 2], [0, 0.5, 1]):
         axes.append(vtkDoubleArray())

@@ -1,9 +1,10 @@
 """Damaged files and random option lists for the command line, in separate processes.
 
 ``python fuzzing.py FOLDER FORMATS FIRST COUNT`` damages the seed of each format (names separated by commas) for
-each case number from FIRST up to COUNT, and lets ``warp-corot simulate`` read it. A line of JSON for each case goes to
-the file ``cases``: before it begins, so that a crash is identified by its number, and again with the error. A good case
-ends with a body or with one line and status 2. FORMAT ``options`` makes random option lists in place of files.
+each case number from FIRST up to COUNT, and lets ``warp-corot simulate`` read it; ``FORMAT:COUNT`` gives a format a
+count of its own. A line of JSON for each case goes to the file ``cases``: before it begins, so that a crash is
+identified by its number, and again with the error. A good case ends with a body or with one line and status 2. FORMAT
+``options`` makes random option lists in place of files.
 """
 
 from __future__ import annotations
@@ -37,6 +38,8 @@ KEPT, FULL = 1 << 30, 98
 #: Most cases stop at a domain, since its mesh takes a hundred times as long, or at a mesh without its supports, or at a
 #: body without its options.
 MESHED_EVERY, HELD_EVERY, MADE_EVERY = 100, 4, 10
+#: Of the first cases, which the short run has, fewer get supports or a domain from their surface, and none a mesh.
+FIRST, FIRST_HELD_EVERY, FIRST_ENCLOSED_EVERY = 300, 20, 5
 #: Formats whose seed is tetrahedra: their number is not reported.
 TETRAHEDRA = {
     "usda-tets",
@@ -128,8 +131,8 @@ def _tried(module: str, path: Path):
     return (None, f"it crashed ({status})") if status else ({}, None)
 
 
-def prepared() -> None:
-    """Nothing is simulated, readers run here, the parser is made once, no warnings."""
+def prepared(scenes: bool) -> None:
+    """Nothing is simulated, readers run here, the parser is made once, no warnings; Newton only for scenes."""
     import warnings
 
     import warp as wp
@@ -137,6 +140,7 @@ def prepared() -> None:
     from warp_corot import cli
     from warp_corot.body.soft_body import SoftBody
     from warp_corot.cli import bodies, scene, simulate  # noqa: F401 (all modules that read files)
+    from warp_corot.domain import surface
     from warp_corot.experiments import paper
     from warp_corot.io.write import animate
     from warp_corot.mesh import TetForest
@@ -151,6 +155,13 @@ def prepared() -> None:
         if "bodies" not in making:
             raise Reached
         made(self, mesh, *arguments, **options)
+
+    enclosed = surface.surface_domain
+
+    def encloses(*arguments, **options):
+        if "domains" not in making:
+            raise Reached
+        return enclosed(*arguments, **options)
 
     held = bodies.held_by_default
 
@@ -167,6 +178,7 @@ def prepared() -> None:
             raise Reached
         return meshed(*arguments, **options)
 
+    surface.surface_domain = encloses
     bodies.held_by_default = holds
     SoftBody.__init__ = body  # type: ignore[method-assign]
     TetForest.from_domain = mesh  # type: ignore[method-assign]
@@ -179,6 +191,8 @@ def prepared() -> None:
     warnings.simplefilter("ignore")
     wp.config.log_level = wp.LOG_ERROR
     with suppress(Exception):  # without Newton there are no scenes
+        if not scenes:
+            return
         from warp_corot.newton.stages.steps import StageSimulation
 
         solver = StageSimulation._new_solver
@@ -319,6 +333,8 @@ class Cases:
         else:
             self.seed = SEEDS[form](folder)
         self.good = {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+        self.sizes = files_in(folder)
+        self.broken: Path | None = None
 
     def run(self, number: int, broken: bool = True) -> str | None:
         """Run a case; returns its error, if any."""
@@ -331,14 +347,18 @@ class Cases:
             if self.form == "run" and rng.random() < 0.9:
                 path = self.seed
             if broken:
+                self.broken = path
                 path.write_bytes(damaged(self.good[path], rng))
         making.clear()
-        if number % MESHED_EVERY == MESHED_EVERY - 1 or (self.form in ("options", "run") and number % MADE_EVERY == 0):
+        meshed = number >= FIRST and number % MESHED_EVERY == MESHED_EVERY - 1
+        if meshed or (self.form in ("options", "run") and number % MADE_EVERY == 0):
             making.add("meshes")
-        if number % HELD_EVERY == 0:
+        if number % (HELD_EVERY if number >= FIRST else FIRST_HELD_EVERY) == 0:
             making.add("holds")
+        if number >= FIRST or number % FIRST_ENCLOSED_EVERY == 0:
+            making.add("domains")
         if self.form.startswith("checkpoint") or (self.form in ("options", "run") and number % MADE_EVERY == 0):
-            making.update(("bodies", "holds"))
+            making.update(("bodies", "holds", "domains"))
         if self.form.startswith("checkpoint"):
             wrong = wrong_with_checkpoint(self.seed)
         else:
@@ -349,11 +369,15 @@ class Cases:
         return f"{wrong}\n{command}" if wrong else None
 
     def _restore(self) -> None:
-        for path in [path for path in self.folder.rglob("*") if path.is_file() and path not in self.good]:
-            path.unlink()
+        now = files_in(self.folder)
+        for name in now.keys() - self.sizes.keys():
+            (self.folder / name).unlink()
         for path, content in self.good.items():
-            if not path.exists() or path.read_bytes() != content:
+            name = os.path.relpath(path, self.folder)
+            if path == self.broken or now.get(name) != self.sizes[name]:
                 path.write_bytes(content)
+                about = path.stat()
+                self.sizes[name] = about.st_size, about.st_mtime_ns
         if self.form == "scene":  # a stage that stays open would be taken for that of the next file
             gc.collect()
 
@@ -435,11 +459,12 @@ def run_all(folder: Path, form: str, first: int, count: int) -> None:
 
 
 def main(folder: Path, forms: list[str], first: int, count: int) -> None:
-    prepared()
+    prepared(any(form.startswith(("options", "scene")) for form in forms))
     with open(folder / "cases", "a", encoding="utf-8") as file:
         cases.append(file)
         for form in forms:
-            run_all(folder, form, first, count)
+            name, _, own = form.partition(":")
+            run_all(folder, name, first, int(own or count))
 
 
 if __name__ == "__main__":

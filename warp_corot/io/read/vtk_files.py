@@ -34,6 +34,12 @@ KINDS = {
 }
 LINEAR = {10, 12, 13, 14, 5, 9}
 VOXEL, PIXEL, STRIP, POLYGON, PENTAPRISM, HEXAPRISM, POLYHEDRON = 11, 8, 6, 7, 15, 16, 42
+#: Cells that are split one by one: the name of one and of several.
+MANY_FACED = {
+    PENTAPRISM: ("pentagonal prism", "pentagonal prisms"),
+    HEXAPRISM: ("hexagonal prism", "hexagonal prisms"),
+    POLYHEDRON: ("polyhedron", "polyhedra"),
+}
 #: Arrays that do not number regions.
 INTERNAL = (
     *("vtkGhostType", "vtkOriginalCellIds", "vtkOriginalPointIds"),
@@ -187,6 +193,10 @@ def _cells(data: Any, ignored: dict[str, int], notes: list[str]) -> Iterator[Blo
                 notes.append(corners_note(kind, 2 if number < 69 else None))
         elif number in (STRIP, POLYGON, PENTAPRISM, HEXAPRISM, POLYHEDRON):
             yield _by_faces(number, cells, data)
+            if number in MANY_FACED:
+                one, more = MANY_FACED[number]
+                some = f"1 {one} is" if len(cells) == 1 else f"{len(cells)} {more} are"
+                notes.append(f"{some} split into tetrahedra")
         else:
             ignored[f"VTK's type {number}" if number > 4 else "line"] = len(cells)
 
