@@ -87,8 +87,7 @@ class Domain(SignedFunction):
 
         Raises:
             InputError: The argument is not a surface, or encloses no body: more than a third of its area is open, it
-            has
-                zero thickness, or it crosses itself so that part of the body is inside out.
+                has zero thickness, or it crosses itself so that part of the body is inside out.
 
         Warns:
             UserWarning: The body is longer than 100 m or shorter than 1 mm, or holes are more than one per cent of the

@@ -353,8 +353,7 @@ class Simulation(Clock, FormerNames):
 
         Raises:
             InputError: The file does not exist, is not a checkpoint or was written by a newer version, the device does
-            not
-                exist, or a criterion is missing.
+                not exist, or a criterion is missing.
         """
         from warp_corot.io.checkpoint.archive import load_checkpoint
 
