@@ -65,10 +65,9 @@ def until(true, what):
     raise AssertionError(f"{what}: not within {PATIENCE:g} s")
 
 
-def press_mouse(tab, page, by=(80, -60)):
-    """Press the mouse on the body and move it."""
-    until(lambda: drawn(tab).any(), "the body is drawn")
-    rows, columns = np.nonzero(drawn(tab))
+def press_mouse(tab, seen, by=(80, -60)):
+    """Press the mouse on the body, where the scene is not empty, and move it."""
+    rows, columns = np.nonzero(seen)
     start = np.array([np.median(columns), np.median(rows[np.abs(columns - np.median(columns)) < 3])])
     tab.mouse.move(*start)
     tab.mouse.down()
@@ -78,10 +77,21 @@ def press_mouse(tab, page, by=(80, -60)):
     return start
 
 
-def drawn(tab):
-    """Where the scene in a tab is not empty, bool [rows, columns]; what covers it is left out."""
-    picture = np.asarray(Image.open(io.BytesIO(tab.screenshot(clip=SCENE))).convert("RGB"))
+def drawn(tab, path=None):
+    """Where the scene in a tab is not empty, bool [rows, columns]; what covers it is left out.
+
+    Chromium takes four seconds of a core for a picture; the file is for the reader of a failure.
+    """
+    taken = tab.screenshot(clip=SCENE, path=path, timeout=1e3 * PATIENCE)
+    picture = np.asarray(Image.open(io.BytesIO(taken)).convert("RGB"))
     return np.pad(picture.min(axis=2) < 250, ((SCENE["y"], 0), (0, 0)))
+
+
+def when_drawn(tab, path=None):
+    """The same, as soon as something is drawn."""
+    seen = []
+    until(lambda: seen.append(drawn(tab, path)) or seen[-1].any(), "the scene is drawn")
+    return seen[-1]
 
 
 def held(page):
@@ -108,24 +118,20 @@ def plotted(tab):
 
 
 def test_a_drag_moves_tissue_and_the_plot_shows_its_force(tab, page, tmp_path):
-    tab.screenshot(path=tmp_path / "loaded.png")
-    before = drawn(tab)
-    assert before.any()
+    before = when_drawn(tab, tmp_path / "loaded.png")
     assert newtons(tab) == 0.0
     flat = plotted(tab)
     assert np.ptp(flat) < 5
-    press_mouse(tab, page)
+    press_mouse(tab, before)
     until(lambda: held(page)[1] and held(page)[0] > 0.002, "the tissue moves")
     (force,) = held(page)[1]
     assert np.linalg.norm(force) > 0.01
     until(lambda: newtons(tab) > 0.01, "the force is told")
     until(lambda: np.ptp(plotted(tab)) > 20, "the plot shows the force")
-    tab.screenshot(path=tmp_path / "dragged.png")
-    assert (drawn(tab) != before).sum() > 200
+    assert (drawn(tab, tmp_path / "dragged.png") != before).sum() > 200
     tab.mouse.up()
     until(lambda: not held(page)[1] and held(page)[0] < 1e-4, "the tissue goes back")
     until(lambda: newtons(tab) == 0.0, "no force is told")
-    tab.screenshot(path=tmp_path / "released.png")
     assert tab.errors == []
 
 
@@ -137,9 +143,8 @@ def below_a_ball(level):
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [{"sim": below_a_ball}], indirect=True)
 def test_a_tool_follows_the_mouse_and_presses(tab, page, tmp_path):
-    until(lambda: drawn(tab).any(), "the scene is drawn")
     # The ball is nearest to the viewer, on the left; away from there it goes into the block.
-    rows, columns = np.nonzero(drawn(tab))
+    rows, columns = np.nonzero(when_drawn(tab))
     start = np.array([columns.min() + 80.0, np.median(rows[columns < columns.min() + 80])])
     tab.mouse.move(*start)
     tab.mouse.down()
@@ -159,7 +164,7 @@ def test_a_tool_follows_the_mouse_and_presses(tab, page, tmp_path):
 
 @pytest.mark.slow
 def test_reloads_and_lost_connections_do_no_harm(tab, page, tmp_path):
-    press_mouse(tab, page)
+    press_mouse(tab, when_drawn(tab))
     until(lambda: held(page)[1], "the tissue is held")
     tab.reload()
     until(lambda: not held(page)[1], "who is gone holds nothing")
@@ -167,7 +172,7 @@ def test_reloads_and_lost_connections_do_no_harm(tab, page, tmp_path):
     page._server._websock_server.disconnect_all_clients()
     until(lambda: len(page._server.get_clients()) == 1, "the browser comes back")
     tab.get_by_text("force on the tissue").wait_for(timeout=1e3 * PATIENCE)
-    press_mouse(tab, page)
+    press_mouse(tab, when_drawn(tab))
     until(lambda: held(page)[1], "the tissue is held again")
     tab.screenshot(path=tmp_path / "again.png")
     tab.mouse.up()
@@ -177,8 +182,8 @@ def test_reloads_and_lost_connections_do_no_harm(tab, page, tmp_path):
 @pytest.mark.slow
 def test_two_visitors_see_the_same_and_both_have_hands(chromium, tab, page):
     for second in new_tab(chromium, page):
-        press_mouse(tab, page)
-        press_mouse(second, page, by=(-60, -40))
+        press_mouse(tab, when_drawn(tab))
+        press_mouse(second, when_drawn(second), by=(-60, -40))
         until(lambda: len(held(page)[1]) == 2, "both hold the tissue")
         second.context.close()
         until(lambda: len(held(page)[1]) == 1, "one holds it still")
