@@ -6,6 +6,8 @@ from functools import cached_property
 
 import numpy as np
 
+from warp_corot.mesh.sorting import sorted_keys
+
 
 class Edges:
     """The edges of triangles, and the half-edges of each.
@@ -72,19 +74,3 @@ class Edges:
         found = np.flatnonzero(net)
         ends = self.ends[found]
         return np.where((net[found] < 0)[:, None], ends[:, ::-1], ends), np.abs(net[found])
-
-
-def sorted_keys(keys: np.ndarray, limit: int) -> tuple[np.ndarray, np.ndarray]:
-    """Keys from 0 to below a limit in ascending order, and their places before; equal keys keep their order.
-
-    Args:
-        keys: int64 [n].
-        limit: A number above all keys.
-    """
-    bits = max(len(keys) - 1, 1).bit_length()
-    if limit.bit_length() + bits > 63:
-        order = np.argsort(keys, kind="stable")
-        return keys[order], order
-    # Numbers that hold key and place sort several times as fast as places do by their keys.
-    both = np.sort(keys << bits | np.arange(len(keys)))
-    return both >> bits, both & ((1 << bits) - 1)

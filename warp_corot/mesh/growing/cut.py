@@ -10,6 +10,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from warp_corot.mesh.sorting import sorted_keys
+
 Array = np.ndarray
 
 #: A part that would come off is given up if it has at most this many elements and less than this fraction of its piece.
@@ -254,13 +256,12 @@ def _crumbs(tets: Array, piece: Array, small: Array, held: Array) -> tuple[Array
 
 def face_pairs(tets: Array) -> Array:
     """Pairs of elements that share a face [m, 2]."""
-    a, b, c, d = np.sort(tets, axis=1).astype(np.uint64).T
-    count = np.uint64(int(tets.max()) + 1)
+    a, b, c, d = np.sort(tets, axis=1).astype(np.int64).T
+    count = int(tets.max()) + 1
     ab, cd = a * count + b, c * count + d
-    if int(count) ** 3 < 2**64:
+    if count**3 <= 2**63:
         keys = np.concatenate([b * count**2 + cd, a * count**2 + cd, ab * count + d, ab * count + c])
-        order = np.argsort(keys)
-        keys = keys[order]
+        keys, order = sorted_keys(keys, count**3)
         same = keys[1:] == keys[:-1]
     else:
         first = np.concatenate([b * count + c, a * count + c, ab, ab])
