@@ -60,6 +60,7 @@ def test_all_cases_are_the_same_on_seven_ranks(tmp_path):
 def test_a_mesh_that_no_rank_holds_whole_gives_the_same_run(runs):
     np.testing.assert_array_equal(runs[3]["parts.x"], runs[1]["worlds.True.x"])
     np.testing.assert_array_equal(runs[3]["parts.touched.x"], runs[1]["touched.True.x"])
+    np.testing.assert_array_equal(runs[3]["divided.x"], runs[1]["forest.True.x"])
 
 
 def test_ranks_write_pieces_of_one_stage(runs):

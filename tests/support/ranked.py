@@ -133,6 +133,33 @@ def touched_in_parts() -> np.ndarray | None:
     return wd.gather(body.positions)
 
 
+def forest_divided() -> np.ndarray | None:
+    """The run "forest" of a mesh that rank 0 makes and divides; the positions of all nodes on rank 0."""
+    import warp_corot.distributed as wd
+
+    def make() -> wc.TetForest:
+        assert mpi.world().rank == 0
+        return graded()
+
+    mesh = wd.divided(make)
+    body = body_of(mesh, 0.49)
+    sim = wd.Simulation(body, deterministic=True)
+    moved(sim, body)
+    triangles, parents = body.surface_faces
+    own = triangles[mesh.are_outer(triangles) & mesh.numbers.counted[parents]]
+    corners = mesh.points[own]
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
+    np.testing.assert_allclose(sum(sim.comm.allgather(area)), 14 * 0.064**2, rtol=1e-9)
+    said = ""
+    try:
+        wd.divided(lambda: wc.TetForest.box(level=-1))
+    except wc.InputError as error:
+        said = str(error)
+    # All ranks learn what was wrong on rank 0.
+    assert "level is -1" in said
+    return wd.gather(body.positions)
+
+
 def worlds_in_parts(stage: Path) -> dict[str, np.ndarray | None]:
     """The run "worlds" with a mesh of which each rank holds a part, recorded; and once more with no disk space on the
     last rank."""
@@ -185,7 +212,7 @@ def make_all(folder: Path, size: int, names: list[str]) -> None:
             if path.stem.split(".")[0] in names and path.exists():
                 found |= resumed(path)
         if "forest" in names:
-            found |= made("forest", False, None)
+            found |= made("forest", False, None) | {"divided.x": forest_divided()}
         if "worlds" in names:
             found |= worlds_in_parts(folder / f"{size}.usda")
             for path in folder.glob("parts.?.npz"):

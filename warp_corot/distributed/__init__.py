@@ -6,11 +6,12 @@
 
 from . import mpi
 from .boxes import box
+from .dividing import divided
 from .gathering import gather
 from .recording import record
 from .simulation import Simulation
 from .sweeping import sweep
 
-__all__ = ["Simulation", "box", "gather", "record", "sweep"]
+__all__ = ["Simulation", "box", "divided", "gather", "record", "sweep"]
 
 mpi.choose_device()

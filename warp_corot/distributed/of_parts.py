@@ -85,7 +85,9 @@ def part_of(body: SoftBody, model: Model, comm: Any, costs: npt.ArrayLike | None
     level = getattr(model, "level", None)
     if isinstance(body.mesh, ForestPart):
         if costs is not None:
-            raise InputError("the mesh is divided already; give costs to warp_corot.distributed.box")
+            raise InputError("the mesh is divided already; give costs to warp_corot.distributed.box or divided")
+        if level is not None and not body.mesh.is_box:
+            raise InputError(f"rotation_level is {level}; of a divided mesh it must be a tolerance or None")
         if level is not None and level < body.mesh.tree.leaf_levels[0] - SUBTREE_DEPTH:
             raise InputError(
                 f"rotation_level is {level}; of a box in parts it must be at least "

@@ -61,17 +61,36 @@ class ForestPart(TetForest):
         numbers: Their numbers in the whole forest.
         element_count: Number of leaves of the whole forest.
         bounds: Lowest and highest coordinates of the whole forest [m], float64 [2, 3].
+        smallest_volume: Volume of the smallest element of the whole forest [m^3].
+        outer: The triangles of the part's nodes on the surface of the whole forest, int32 [F, 3]; None: the forest is a
+            box, uniformly bisected.
     """
 
     def __init__(
-        self, *arrays: Any, numbers: Numbers, element_count: int, bounds: npt.NDArray[np.float64], **others: Any
+        self,
+        *arrays: Any,
+        numbers: Numbers,
+        element_count: int,
+        bounds: npt.NDArray[np.float64],
+        smallest_volume: float | None = None,
+        outer: Ints | None = None,
+        **others: Any,
     ):
         super().__init__(*arrays, **others)
+        smallest_volume = float(np.min(self.volumes)) if smallest_volume is None else smallest_volume
         self.__dict__.update(numbers=numbers, element_count=element_count, bounds=bounds)
+        self.__dict__.update(smallest_volume=smallest_volume, outer=outer)
 
     numbers: Numbers
     element_count: int
     bounds: npt.NDArray[np.float64]
+    smallest_volume: float
+    outer: Ints | None
+
+    @property
+    def is_box(self) -> bool:
+        """Whether the whole forest is a box, uniformly bisected."""
+        return self.outer is None
 
     def refine(self, leaves: npt.ArrayLike) -> TetForest:
         """A forest in parts cannot be refined, because a rank would bisect without its neighbours.
@@ -79,7 +98,7 @@ class ForestPart(TetForest):
         Raises:
             InputError: Always.
         """
-        raise InputError("a forest in parts cannot be refined; make it with another level")
+        raise InputError("a forest in parts cannot be refined; make it finer")
 
     def check_whole(self) -> None:
         """Check that this part is the whole, as on one rank.
@@ -89,12 +108,17 @@ class ForestPart(TetForest):
         """
         if len(self.tets) < self.element_count:
             raise InputError(
-                f"the mesh is a part, {len(self.tets)} of {self.element_count} elements, of a box that several ranks "
+                f"the mesh is a part, {len(self.tets)} of {self.element_count} elements, of a mesh that several ranks "
                 "hold; only warp_corot.distributed.Simulation can compute it"
             )
 
     def are_outer(self, triangles: Ints) -> npt.NDArray[np.bool_]:
-        """Which triangles, int32 [F, 3], lie on the surface of the whole box; others are faces to leaves elsewhere."""
+        """Which triangles, int32 [F, 3], lie on the surface of the whole forest; others are faces to leaves
+        elsewhere."""
+        if self.outer is not None:
+            base = np.array([len(self.points) ** 2, len(self.points), 1], np.int64)
+            given, outer = (np.sort(each, axis=1).astype(np.int64) @ base for each in (triangles, self.outer))
+            return np.isin(given, outer)
         corners = self.lattice[triangles]
         ends = np.array([np.zeros(3, np.int64), np.array(self.cells) << LATTICE_BITS])
         return np.any([(corners == end).all(axis=1).any(axis=1) for end in ends], axis=0)
@@ -134,7 +158,8 @@ class Part(SoftBody):
             material = part_of_material(material, elements, len(whole.mesh.tets))
         self.is_own = np.tile(self.numbers.owner == rank, whole.worlds)
         super().__init__(mesh, material, worlds=whole.worlds, device=device or whole.device)
-        self.discretization.smallest_volume = whole.discretization.smallest_volume
+        in_parts = isinstance(mesh, ForestPart)
+        self.discretization.smallest_volume = mesh.smallest_volume if in_parts else whole.discretization.smallest_volume
 
     def _discretized(self, mesh: Mesh, material: Material) -> Discretization:
         shared = mesh is self._whole.mesh and self.device == self._whole.device
