@@ -158,8 +158,8 @@ class Part(SoftBody):
             material = part_of_material(material, elements, len(whole.mesh.tets))
         self.is_own = np.tile(self.numbers.owner == rank, whole.worlds)
         super().__init__(mesh, material, worlds=whole.worlds, device=device or whole.device)
-        in_parts = isinstance(mesh, ForestPart)
-        self.discretization.smallest_volume = mesh.smallest_volume if in_parts else whole.discretization.smallest_volume
+        of_whole = whole.mesh if isinstance(whole.mesh, ForestPart) else whole.discretization
+        self.discretization.smallest_volume = of_whole.smallest_volume
 
     def _discretized(self, mesh: Mesh, material: Material) -> Discretization:
         shared = mesh is self._whole.mesh and self.device == self._whole.device
