@@ -32,6 +32,16 @@ def least_motion(gap: float, law: Law, dt: float):
 
 
 @wp.func
+def left_to_held(demand: float, share: float):
+    """The part of a demanded motion that belongs to held nodes, if nodes with this share of the weights give way.
+
+    It is left undone. If the others made up for it, they would go by the demand over their share, and a tool that
+    presses on the edge of a support would throw them away.
+    """
+    return wp.max(1.0 - share, 0.0) * wp.max(demand, 0.0)
+
+
+@wp.func
 def held_back(force: wp.vec3, normal_force: float, friction: float):
     """Coulomb's bound on a force across the contact."""
     most = friction * normal_force

@@ -8,7 +8,7 @@ import warp as wp
 
 from warp_corot.kernels.stepping.pace import DT, Pace
 
-from .law import Law, held_back, least_motion
+from .law import Law, held_back, least_motion, left_to_held
 from .locate import locate_edge, locate_node
 from .motion import Surface
 from .near import PAIRED, Near
@@ -102,13 +102,20 @@ def solve_row(
     p = rows.places[row]
     w = rows.shares[row]
     yielding = float(0.0)
+    share = float(0.0)
+    free = wp.vec3()
     for k in range(4):
         yielding += wp.abs(w[k]) * (float(crowd[p[k]]) / SHARES) * surface.yielding[p[k]]
+        if surface.yielding[p[k]] > 0.0:
+            share += wp.abs(w[k])
+            free += w[k] * surface.d[p[k]]
     if yielding <= 0.0:
         return
     n = rows.normal[row]
     before = rows.force[row]
-    normal_force = wp.max(wp.dot(before, n) + missing(row, law, dt, surface, rows) / yielding, 0.0)
+    wanted = missing(row, law, dt, surface, rows)
+    wanted -= left_to_held(wanted + wp.dot(free, n), share)
+    normal_force = wp.max(wp.dot(before, n) + wanted / yielding, 0.0)
     slip = across(opened(row, surface, rows), n)
     force = normal_force * n + held_back(across(before, n) - slip / yielding, normal_force, friction)
     rows.force[row] = force

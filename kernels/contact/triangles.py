@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_corot.kernels.stepping.pace import DT, Pace
 
-from .law import Law, held_back, least_motion
+from .law import Law, held_back, least_motion, left_to_held
 from .motion import Motions, Surface
 from .near import AROUND, BESIDE, Near
 from .shapes import Shapes
@@ -117,9 +117,14 @@ def solve_touch(
 ):
     w = touches.shares[o, t]
     yielding = float(0.0)
+    share = float(0.0)
+    free = wp.vec3()
     for k in range(3):
         s = corners[k]
         yielding += w[k] * crowd[s] * corner_yielding[s]
+        if corner_yielding[s] > 0.0:
+            share += w[k]
+            free += w[k] * surface.d[s]
     before = touches.force[o, t]
     touches.more[o, t] = wp.vec3()
     if yielding <= 0.0:
@@ -127,6 +132,7 @@ def solve_touch(
     n = touches.normal[o, t]
     d = approach(touches, o, t, surface, corners)
     wanted = least_motion(touches.gap[o, t], law, dt) - wp.dot(d, n)
+    wanted -= left_to_held(wanted + wp.dot(free, n), share)
     normal_force = wp.max(wp.dot(before, n) + wanted / yielding, 0.0)
     sideways = held_back(across(before, n) - across(d, n) / yielding, normal_force, touches.friction[o, t])
     force = normal_force * n + sideways
