@@ -14,7 +14,8 @@ def block(device="cpu", level=6, held=True, **options):
     body = wc.SoftBody(mesh, wc.Isotropic(young=5e3, poisson=0.4, density=1000.0), device=device)
     if held:
         body.fix("z == zmin")
-    integrator = wc.SymplecticEuler(options.pop("dt", None), options.pop("damping", 20.0))
+    explicit = wc.SymplecticEuler(options.pop("dt", None), options.pop("damping", 20.0))
+    integrator = options.pop("integrator", explicit)
     return wc.Simulation(body, integrator=integrator, gravity=(0, 0, 0), **options)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .shown import Pick, Shown
-from .springs import MOST_POINTS, Patch, Springs
+from .springs import MOST_POINTS, AllSprings, Patch
 
 Vector = npt.NDArray[np.float64]
 
@@ -31,7 +31,7 @@ class SpringHand:
     rigid: ClassVar[bool] = False
     stays: ClassVar[bool] = False
 
-    def __init__(self, springs: Springs, shown: Shown, pick: Pick, radius: float, strength: float = 1.0):
+    def __init__(self, springs: AllSprings, shown: Shown, pick: Pick, radius: float, strength: float = 1.0):
         self.pick = pick
         self._inward = -shown.normal(pick)
         self._spring = springs.hold(pick.body, patch_around(shown, pick, radius), rigid=self.rigid, strength=strength)

@@ -26,7 +26,7 @@ from .frames import Controls, Frame, Vector
 from .hands import HANDS, SpringHand
 from .pacing import Pace
 from .shown import Shown, surfaces_of
-from .springs import Springs
+from .implicit_springs import springs_of
 from .tools import ToolHand
 
 
@@ -267,7 +267,7 @@ class Session:
             self._close()
         pairs = zip(self.sim.bodies, self.surfaces, strict=True)
         self.shown = [Shown(body, self._surface(body.mesh, surfaces)) for body, surfaces in pairs]
-        self.springs = Springs(self.sim, self.shown)
+        self.springs = springs_of(self.sim, self.shown)
         self.number += 1
         for shown in self.shown:
             shown.read()

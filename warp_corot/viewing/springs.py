@@ -40,7 +40,7 @@ class Patch:
     area: float
 
 
-class Springs:
+class AllSprings:
     """The springs of all hands of a simulation. ``sim.system.forces`` has one of these.
 
     Args:
@@ -53,8 +53,12 @@ class Springs:
 
     def __init__(self, sim: Simulation, shown: Sequence[Shown]):
         self.sim, self.shown, self.revision = sim, shown, 0
-        self._bodies: dict[int, _BodySprings] = {}
+        self._bodies: dict[int, BodySprings] = {}
         sim.system.forces.append(self)
+
+    def _springs_of(self, body: int) -> BodySprings:
+        """The springs that hold a body, none yet."""
+        raise NotImplementedError
 
     def close(self) -> None:
         """Let everything go and leave the simulation."""
@@ -65,11 +69,6 @@ class Springs:
         """Launch the forces of all hands; may be recorded."""
         for springs in self._bodies.values():
             springs.launch()
-
-    def complete_work(self) -> None:
-        """Launch the count of the work of all hands up to the present state; may be recorded."""
-        for springs in self._bodies.values():
-            springs.launch_completion()
 
     def hold(self, body: int, patch: Patch, *, rigid: bool, strength: float = 1.0) -> Spring:
         """Take hold of a patch as it is now.
@@ -84,7 +83,7 @@ class Springs:
             LookupError: The maximum number of hands hold the body already.
         """
         if body not in self._bodies:
-            self._bodies[body] = _BodySprings(self.sim, self.shown[body])
+            self._bodies[body] = self._springs_of(body)
             self.revision += 1
         return self._bodies[body].hold(patch, rigid, strength)
 
@@ -94,8 +93,20 @@ class Springs:
             springs.refit()
 
 
+class Springs(AllSprings):
+    """The springs of explicit steps, which count their work themselves."""
+
+    def _springs_of(self, body: int) -> ExplicitSprings:
+        return ExplicitSprings(self.sim, self.shown[body])
+
+    def complete_work(self) -> None:
+        """Launch the count of the work of all hands up to the present state; may be recorded."""
+        for springs in self._bodies.values():
+            springs.launch_completion()
+
+
 class Spring:
-    """The spring of one hand; see ``Springs.hold``.
+    """The spring of one hand; see ``AllSprings.hold``.
 
     Attributes:
         stiffness: Stiffness of the spring, for the whole patch [N/m].
@@ -104,7 +115,7 @@ class Spring:
         motion: How far the hand has moved since it took hold [m], float64 [3].
     """
 
-    def __init__(self, owner: _BodySprings, slot: int, patch: Patch, rigid: bool, strength: float):
+    def __init__(self, owner: BodySprings, slot: int, patch: Patch, rigid: bool, strength: float):
         self._owner, self.slot = owner, slot
         self.patch, self.rigid, self.strength = patch, rigid, strength
         self.stiffness = self.damping = self.limit = 0.0
@@ -132,7 +143,7 @@ class Spring:
         return middle + self._owner.found()[self.slot, 1], middle + self.start + self.motion
 
 
-class _BodySprings:
+class BodySprings:
     """The springs that hold one body."""
 
     def __init__(self, sim: Simulation, shown: Shown):
@@ -144,24 +155,14 @@ class _BodySprings:
         self._shares = wp.zeros(size, dtype=wp.float32, device=device)
         self._starts = wp.zeros(size, dtype=wp.vec3, device=device)
         self._parts = wp.zeros(size, dtype=wp.vec4, device=device)
-        self._counted = wp.zeros(MOST_HANDS, dtype=wp.float32, device=device)
-        self._last = wp.zeros(size, dtype=wp.vec3, device=device)
         self._found = wp.zeros((MOST_HANDS, 2), dtype=wp.vec3, device=device)
 
     def launch(self) -> None:
-        system, state, binding = self.sim.system, self.body.state, self.shown.binding
-        inputs = [self._springs, self._patches, self._shares, self._starts, self._parts, binding.nodes]
-        inputs += [binding.weights, system.pace.arrays, system.offset, system.gravity]
-        inputs += [self.body.conditions.inverse_mass, state.displacements, state.velocities]
-        outputs = [self._last, self._counted, state.forces, self._found, system.support_work]
-        wp.launch(kernels.pull, MOST_HANDS, inputs, outputs, device=self.body.device)
+        """Launch the forces of the hands."""
+        raise NotImplementedError
 
     def launch_completion(self) -> None:
-        system, binding = self.sim.system, self.shown.binding
-        inputs = [self._springs, self._patches, binding.nodes, binding.weights]
-        inputs += [system.pace.arrays, self.body.state.velocities]
-        outputs = [self._last, self._counted, system.support_work]
-        wp.launch(kernels.complete_work, MOST_HANDS, inputs, outputs, device=self.body.device)
+        """Launch the count of their work up to the present state, if they count it."""
 
     def hold(self, patch: Patch, rigid: bool, strength: float) -> Spring:
         if None not in self._held:
@@ -175,10 +176,13 @@ class _BodySprings:
         inputs = [self._patches[slot], binding.nodes, binding.weights, self.body.state.displacements]
         wp.launch(kernels.take_hold, count, inputs, [self._starts[slot]], device=self.body.device)
         spring.start = patch.shares @ self._starts[slot].numpy()[:count]
-        self._last[slot].zero_()
+        self._begin(slot)
         self._fit(spring)
         self.write(slot)
         return spring
+
+    def _begin(self, slot: int) -> None:
+        """Forget what an earlier hand left."""
 
     def release(self, slot: int, spring: Spring) -> None:
         if self._held[slot] is spring:
@@ -220,8 +224,40 @@ class _BodySprings:
         # The largest eigenvalue of the spring over masses for a stiffness of one: exact if the hand holds the mean,
         # else a bound.
         softness = float((total / mass).max() if spring.rigid else (total**2 / mass).sum())
-        safe = self.sim.safe_step
-        dt = self.sim.dt if safe is None else safe.at_rest
+        dt = self._longest_step()
         spring.stiffness = spring.strength * STIFF / (dt**2 * softness)
         spring.limit = HARDEST * float(np.mean(self.body.material.isotropic.young)) * spring.patch.area
         spring.damping = 2.0 * DAMPED * (spring.stiffness / softness) ** 0.5
+
+    def _longest_step(self) -> float:
+        """The explicit step that the springs must bear [s]."""
+        safe = self.sim.safe_step
+        return self.sim.dt if safe is None else safe.at_rest
+
+
+class ExplicitSprings(BodySprings):
+    """The springs that hold one body in explicit steps."""
+
+    def __init__(self, sim: Simulation, shown: Shown):
+        super().__init__(sim, shown)
+        device = self.body.device
+        self._counted = wp.zeros(MOST_HANDS, dtype=wp.float32, device=device)
+        self._last = wp.zeros((MOST_HANDS, MOST_POINTS), dtype=wp.vec3, device=device)
+
+    def launch(self) -> None:
+        system, state, binding = self.sim.system, self.body.state, self.shown.binding
+        inputs = [self._springs, self._patches, self._shares, self._starts, self._parts, binding.nodes]
+        inputs += [binding.weights, system.pace.arrays, system.offset, system.gravity]
+        inputs += [self.body.conditions.inverse_mass, state.displacements, state.velocities]
+        outputs = [self._last, self._counted, state.forces, self._found, system.support_work]
+        wp.launch(kernels.pull, MOST_HANDS, inputs, outputs, device=self.body.device)
+
+    def launch_completion(self) -> None:
+        system, binding = self.sim.system, self.shown.binding
+        inputs = [self._springs, self._patches, binding.nodes, binding.weights]
+        inputs += [system.pace.arrays, self.body.state.velocities]
+        outputs = [self._last, self._counted, system.support_work]
+        wp.launch(kernels.complete_work, MOST_HANDS, inputs, outputs, device=self.body.device)
+
+    def _begin(self, slot: int) -> None:
+        self._last[slot].zero_()

@@ -65,9 +65,6 @@ class View:
     ):
         if not isinstance(sim, Simulation):
             raise InputError(f"sim is {as_shown(sim)}; it must be a Simulation, as Simulation(body) makes one")
-        if sim.integrator.is_implicit:
-            name = type(sim.integrator).__name__
-            raise InputError(f"hands on the page need explicit steps; the integrator is {name}, not SymplecticEuler")
         gate = Gate(host, token if token is not None or is_loopback(host) else new_token())
         self._server = open_server(gate, port, title)
         self.port = self._server.get_port()

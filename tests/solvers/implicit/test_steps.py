@@ -335,9 +335,3 @@ def test_stiff_springs_are_in_the_tangent(integrator, preconditioner, device):
     assert np.abs(u - held.displacements.numpy()).max() < 1e-4
     carried = held.reactions.numpy()[end].astype(float)
     assert (-1e5 * u[end]).sum(0) == pytest.approx(carried.sum(0), abs=0.02 * np.abs(carried).sum())
-
-
-def test_a_page_with_hands_is_refused():
-    pytest.importorskip("viser")
-    with pytest.raises(wc.InputError, match="hands on the page need explicit steps; the integrator is BackwardEuler"):
-        wc.view(wc.Simulation(beam(), integrator=wc.BackwardEuler()), port=0, wait=False)
