@@ -106,7 +106,7 @@ def add_blocks(
     # In and out
     blocks: wp.array[wp.mat33],
 ):
-    """Add the blocks on K's diagonal; where points of a patch share nodes and only their mean is held, a part of them."""
+    """Add the blocks on K's diagonal, or a part of them where points of a patch share nodes and their mean is held."""
     hand = wp.tid()
     spring = springs[hand]
     for k in range(spring.count):

@@ -24,9 +24,9 @@ from .colors import Range, Source, colored, sources
 from .cutting import cut
 from .frames import Controls, Frame, Vector
 from .hands import HANDS, SpringHand
+from .implicit_springs import springs_of
 from .pacing import Pace
 from .shown import Shown, surfaces_of
-from .implicit_springs import springs_of
 from .tools import ToolHand
 
 
