@@ -1,5 +1,7 @@
 """Nodes chosen by expressions: equal to NumPy's own answer, and only arithmetic is ever evaluated."""
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -104,3 +106,15 @@ def test_nothing_runs(tmp_path):
         with pytest.raises(wc.InputError):
             select_nodes(attempt, POINTS)
     assert not file.exists()
+
+
+def test_an_expression_that_holds_nowhere_warns():
+    """Most often, coordinates were taken for millimetres."""
+    body = wc.SoftBody(wc.TetForest.box((1, 1, 2), 0.1, 0), wc.Isotropic(1e4, 0.4, 1e3), device="cpu")
+    with pytest.warns(UserWarning, match="no node is where .z > 150.; the body lies between .0, 0, 0. and"):
+        body.fix("z > 150")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        body.fix("none")
+        body.fix("z > 0.15")
+        body.fix(lambda x: x[:, 2] > 150)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import keyword
 import re
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -14,7 +15,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.discretization.elements import Mesh
-from warp_corot.errors import InputError
+from warp_corot.errors import InputError, depth_of_user
 from warp_corot.inputs.checks import FLOAT32, shown
 from warp_corot.inputs.device_arrays import vectors_on_device
 from warp_corot.inputs.indices import checked_indices
@@ -48,6 +49,7 @@ def named_nodes(mesh: Mesh) -> dict[str, Callable[[], npt.NDArray[np.bool_]]]:
 def nodes_at(nodes: Nodes, mesh_of: Callable[[], Mesh]) -> Any:
     """A mask bool [N] in place of an expression or a function; any other value unchanged.
 
+    An expression that holds nowhere warns, except on a part of a mesh, and unless it says "none".
     In expressions ``zmin`` and the other bounds are those of nodes of elements; names of the mesh's labels and node
     sets can be used, too (`named_nodes`).
 
@@ -64,7 +66,12 @@ def nodes_at(nodes: Nodes, mesh_of: Callable[[], Mesh]) -> Any:
         return nodes
     mesh = mesh_of()
     if isinstance(nodes, str):
-        return select_nodes(nodes, mesh.points, bounds=_bounds(mesh, nodes), named=named_nodes(mesh))
+        chosen = select_nodes(nodes, mesh.points, bounds=_bounds(mesh, nodes), named=named_nodes(mesh))
+        if not chosen.any() and "none" not in nodes and getattr(mesh, "bounds", None) is None:
+            low, high = (", ".join(f"{x:.3g}" for x in end) for end in _bounds(mesh, nodes))
+            message = f"no node is where {nodes!r}; the body lies between ({low}) and ({high}) m"
+            warnings.warn(message, UserWarning, stacklevel=depth_of_user())
+        return chosen
     count = len(mesh.points)
     try:
         found = np.asarray(nodes(mesh.points.copy()))
