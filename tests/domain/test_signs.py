@@ -35,6 +35,7 @@ def test_signs_are_those_of_winding_numbers(device):
     exact = np.array([winding_number(corners, point) for point in points]) > 0.5
     assert 0.2 < exact.mean() < 0.8
     assert np.array_equal(domain.phi(points) < 0.0, exact)
+    assert np.array_equal(domain.holds(points), exact)
 
 
 def test_lines_that_are_parallel_to_faces_and_through_corners_count_right(device):

@@ -247,6 +247,9 @@ class _Made(Domain):
     def part(self, name: str) -> Domain:
         return _Made(self._kind.part(name))
 
+    def holds(self, points: npt.ArrayLike) -> np.ndarray:
+        return self._kind.holds(points)
+
     def exits(self, starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         return self._kind.exits(starts, ends)
 

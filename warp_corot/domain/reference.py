@@ -78,7 +78,7 @@ def _of_surface(domain: SurfaceDomain, count: int) -> Reference:
         normal = np.cross(corners[chosen, 1] - corners[chosen, 0], corners[chosen, 2] - corners[chosen, 0])
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
         aside = ASIDE * float(np.ptp(domain.bounds, axis=0).max()) * normal
-        bounds = (domain.phi(spread + aside) > 0.0) & (domain.phi(spread - aside) < 0.0)
+        bounds = ~domain.holds(spread + aside) & domain.holds(spread - aside)
         spread, own = spread[bounds], own[bounds]
     return Reference(volume, spread, own, pieces)
 

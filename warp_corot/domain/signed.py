@@ -57,6 +57,10 @@ class SignedFunction:
             return self._phi(_checked_vec3(points))
         return self._phi(self._on_device(points)).numpy()
 
+    def holds(self, points: npt.ArrayLike) -> np.ndarray:
+        """Whether points [n, 3] [m] are inside, bool [n]."""
+        return np.asarray(self.phi(points)) < 0.0
+
     def labels_at(self, points: Any, *, nearest: bool = False) -> Any:
         """The label at each point.
 

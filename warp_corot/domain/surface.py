@@ -35,6 +35,8 @@ SAMPLES = 16
 LARGEST_REVERSED = 0.05
 #: Rays into the body start this far inside, over their length.
 START = 0.01
+#: If more than this share of the triangles does not tell inside from outside, winding numbers alone do.
+UNSURE = 0.5
 #: Holes above this share of the area draw a warning.
 LARGE_HOLES = 0.01
 
@@ -79,6 +81,12 @@ class SurfaceDomain(SignedFunction):
 
         in_parts(points.device, points.size, evaluate)
         return phi
+
+    def holds(self, points: npt.ArrayLike) -> np.ndarray:
+        # Where signs take winding numbers anyway, the distance is not needed.
+        if np.count_nonzero(self.sides.known == kernels.UNSURE) < UNSURE * len(self.sides.known):
+            return super().holds(points)
+        return windings_of(self._mesh(self.device), self.lines, self._on_device(points)) > 0
 
     def exits(self, starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         given, along = self._on_device(starts), self._on_device(ends - starts)
@@ -245,8 +253,12 @@ def lines_through(bounds: np.ndarray) -> windings.Lines:
 def windings_of(mesh: wp.Mesh, lines: windings.Lines, points: wp.array) -> np.ndarray:
     """Winding numbers of a closed surface around points, int32 [n]."""
     found = wp.empty(points.size, wp.int32, device=points.device)
-    inputs = [points, mesh.id, mesh.indices, lines]
-    wp.launch(windings.find_windings, points.size, inputs, [found], device=points.device)
+
+    def find(start: int, stop: int) -> None:
+        inputs = [points[start:stop], mesh.id, mesh.indices, lines]
+        wp.launch(windings.find_windings, stop - start, inputs, [found[start:stop]], device=points.device)
+
+    in_parts(points.device, points.size, find)
     return found.numpy()
 
 

@@ -275,15 +275,17 @@ def _sampled_shares(
     grown: Grown, elements: np.ndarray, cell_size: float, domain: Domain, shares: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The filled fraction of elements, by a point in each of their eighths, or in some of these for many elements; at
-    least a small fraction if a corner is inside. Also the point of each element that is nearest to the body, or
-    deepest inside it [n, 3].
+    least a small fraction if a corner is inside. Also, for elements without such a corner, the point of each that is
+    nearest to the body, or deepest inside it [n, 3].
     """
     rng = np.random.default_rng(0)
     found, nearest = np.zeros(len(elements)), np.zeros((len(elements), 3))
     some = int(np.clip(MOST_POINTS // max(len(elements), 1), 1, 8))
     for part in np.array_split(np.arange(len(elements)), len(elements) // 100_000 + 1):
         within = points_within(grown, elements[part], cell_size, some, rng)
-        phi = np.asarray(domain.phi(within.reshape(-1, 3))).reshape(-1, some)
-        found[part] = (phi < 0.0).mean(axis=1)
-        nearest[part] = within[np.arange(len(part)), np.argmin(phi, axis=1)]
+        bare = shares[part] <= 0.0
+        phi = np.asarray(domain.phi(within[bare].reshape(-1, 3))).reshape(-1, some)
+        found[part[bare]] = (phi < 0.0).mean(axis=1)
+        nearest[part[bare]] = within[bare][np.arange(len(phi)), np.argmin(phi, axis=1)]
+        found[part[~bare]] = domain.holds(within[~bare].reshape(-1, 3)).reshape(-1, some).mean(axis=1)
     return np.where(shares > 0.0, np.maximum(found, LEAST), found), nearest
