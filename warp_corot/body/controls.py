@@ -186,7 +186,7 @@ class Controls:
             worlds: As in ``fix``.
 
         Raises:
-            InputError: The material has no fibres, wrong shapes, or values that are not finite.
+            InputError: The material has no fibres, a shape is wrong, or values are not finite.
         """
         self._make_activation()
         count = self.world_element_count

@@ -237,7 +237,7 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
     def _check_touched(self) -> None:
         if not self.state.is_touched:
             raise InputError(
-                "the body touches nothing; it must be in a Simulation with obstacles or with contact=Contact()"
+                "the body is in no simulation with contact; it must be in one with obstacles or contact=Contact()"
             )
 
     def nodal_view(self, array: wp.array) -> wp.array:

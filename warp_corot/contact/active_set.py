@@ -35,7 +35,7 @@ class ActiveSet:
         self._rounds = wp.zeros(1, dtype=wp.int32, device=self.device)
         #: Whether other nodes are held than in the last round, int32 [1].
         self.changed = wp.zeros(1, dtype=wp.int32, device=self.device)
-        #: Which nodes touched each obstacle after the step before the last one, int32 [obstacles, places].
+        #: Nonzero for nodes that touched an obstacle after the step before the last one, int32 [obstacles, places].
         self.kinds_before = wp.zeros((0, 0), dtype=wp.int32, device=self.device)
         self.prepare()
 
@@ -58,10 +58,10 @@ class ActiveSet:
     # --- launches ----------------------------------------------------------------------------------------------------
 
     def launch_begin(self, u: wp.array, d: wp.array, blocks: wp.array) -> None:
-        """Launch the begin of a step: nodes are held as at the end of the last one.
+        """Launch the beginning of a step: nodes are held as at the end of the last one.
 
         Args:
-            u: Displacements at the begin of the step [m], vec4.
+            u: Displacements at the beginning of the step [m], vec4.
             d: A guess [m], vec4.
             blocks: The blocks on the diagonal of the matrix, mat33.
         """
@@ -73,7 +73,7 @@ class ActiveSet:
         self._hold()
 
     def launch_again(self) -> None:
-        """Launch the begin of another linearisation of the same step."""
+        """Launch the beginning of another linearisation of the same step."""
         self._rounds.zero_()
         self._holding.released.zero_()
 
@@ -99,14 +99,15 @@ class ActiveSet:
         self._launch(kernels.add_friction, [motions, self._surface, self._holding, d, r])
 
     def add_slopes(self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array) -> None:
-        """Launch the power of friction along a change; see ``solvers.implicit.line_search``. All worlds are one where
-        there is one slope."""
+        """Launch the power of friction along a change; see ``solvers.implicit.line_search``. If there is only one
+        slope,
+        it is that of all worlds together."""
         motions = self._contacts.obstacles.motions
         inputs = [int(len(slopes) == 1), motions, self._surface, self._holding, d, change, search]
         self._launch(kernels.add_slopes, [*inputs, slopes])
 
     def launch_judgement(self, b: wp.array, q: wp.array, d: wp.array) -> None:
-        """Launch the decision which nodes are held from now on, and ``changed``.
+        """Launch the choice of the nodes that are held from now on, and ``changed``.
 
         Args:
             b: Forces at the beginning of the step without contact [N].
@@ -127,7 +128,7 @@ class ActiveSet:
         self._launch(kernels.end_places, [d, self._holding, self._surface, self.body.state.contact_forces])
 
     def launch_meetings(self, begins: wp.array) -> None:
-        """Launch whether contact has changed in the last step, or nodes will meet an obstacle in this one.
+        """Launch the test whether contact has changed in the last step, or nodes will meet an obstacle in this one.
 
         Args:
             begins: Nonzero afterwards if so, int32 [1].

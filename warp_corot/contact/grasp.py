@@ -35,8 +35,8 @@ class Grasp:
         stiffness: Stiffness of the whole patch [N/m]; None: the patch is held rigidly.
 
     Raises:
-        InputError: The tool is in no simulation or the body in another, no node of the surface is meant, a body that is
-            remeshed in several worlds, or a stiffness that is not positive.
+        InputError: The tool is in no simulation or the body in another, the patch has no node of the surface, the body
+            is remeshed in several worlds, or the stiffness is not positive.
     """
 
     def __init__(self, body: SoftBody, patch: Nodes, *, tool: Tool, stiffness: float | None = None):
@@ -117,8 +117,8 @@ class Grasp:
         held = patch_of(mesh, np.unique(self.body.surface_triangles), places)
         if not held:
             warnings.warn(
-                "remeshing has left no node of a grasped patch, which is held no more; it must have corners of coarse "
-                "elements, or remeshing a min_level that keeps it",
+                "remeshing has left no node of a grasped patch, which is no longer held; the patch must have corners "
+                "of coarse elements, or remeshing a min_level that keeps it",
                 StabilityWarning,
                 stacklevel=depth_of_user(),
             )
@@ -164,20 +164,20 @@ class Grasp:
             self._launch(kernels.add_held_forces, [self._nodes, self._forces], [body.state.contact_forces])
 
     def measure(self) -> None:
-        """A grasp is no faster than its tool."""
+        """Do nothing: a grasp is no faster than its tool."""
 
     def publish(self) -> None:
         inputs = [self._per_world, self._number, self._obstacles.motions, self._places, self._forces]
         wp.launch(kernels.sum_held, self.body.worlds, inputs, [self._wrenches], device=self.device)
 
     def grow(self) -> None:
-        """It needs no room."""
+        """Do nothing: a grasp needs no room."""
 
     def forget(self) -> None:
-        """It keeps nothing."""
+        """Do nothing: a grasp keeps nothing from the last steps."""
 
     def reset(self, chosen: wp.array) -> None:
-        """A grasp keeps holding."""
+        """Do nothing: a grasp goes on holding."""
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
@@ -186,7 +186,7 @@ class Grasp:
             wp.launch(kernel, len(self._nodes), inputs, outputs, device=self.device)
 
     def _rigid_stiffness(self) -> float:
-        """Of a node that is held rigidly in implicit steps [N/m]."""
+        """The stiffness of a node that is held rigidly in implicit steps [N/m]."""
         mesh = self.body.mesh
         size = float(np.mean(mesh.volumes)) ** (1.0 / 3.0)
         return RIGID * float(np.max(self.body.material.isotropic.young)) * size
@@ -220,7 +220,7 @@ def patch_of(
     Args:
         mesh: The present mesh.
         surface: The nodes on its surface.
-        places: Of the patch's nodes on the mesh before, by their lattice points.
+        places: Places of the patch's nodes on the mesh before, by their lattice points.
 
     Returns:
         Places by node: of former nodes, and of new ones halfway between two nodes of the patch.

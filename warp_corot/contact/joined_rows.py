@@ -39,7 +39,7 @@ class JoinedRows:
 
     Attributes:
         locates: Whether pairs are located in the next round, int32 [1].
-        total: How many pairs there are, int32 [1].
+        total: Number of pairs, int32 [1].
     """
 
     def __init__(self, system: System, pairs: Pairs, law: Law):
@@ -69,10 +69,10 @@ class JoinedRows:
     # --- launches ----------------------------------------------------------------------------------------------------
 
     def launch_begin(self, k: int, first: int, blocks: wp.array, increment: wp.array, guess: wp.array) -> None:
-        """Launch where the k-th body begins.
+        """Launch the state of the k-th body at the beginning of a step.
 
         Args:
-            k: Which body.
+            k: The number of the body.
             first: Its first entry in vectors of all bodies.
             blocks: The blocks on the diagonal of its matrix, mat33.
             increment: How far held nodes have gone in the step [m], vec4.
@@ -88,7 +88,8 @@ class JoinedRows:
         self._pairs.search.launch(offset)
 
     def launch_located(self, d: wp.array, *, is_first: bool) -> None:
-        """Launch where pairs are closest, at the beginning of the step or after motions d, if it is time to."""
+        """Launch the search for the closest points of pairs, at the beginning of the step or after motions d, if it is
+        due."""
         surface, joined = self._pairs.surface.arrays, self._joined
         inputs = [int(is_first), d, joined, surface]
         wp.launch(kernels.place_nodes, self._pairs.surface.count, inputs, device=self.device)
@@ -102,7 +103,7 @@ class JoinedRows:
         self._on_rows(kernels.update_rows, [self._pairs.friction, d, self._pairs.rows, self._joined])
 
     def find_reached(self, d: wp.array, change: wp.array) -> None:
-        """Launch which pairs may push along a change of the motions d; ``add_slopes`` takes only these."""
+        """Launch the list of pairs that may push along a change of the motions d; ``add_slopes`` visits only these."""
         self._empty(kernels.REACHED)
         self._on_rows(kernels.find_reached, [d, change, self._pairs.rows, self._joined])
 

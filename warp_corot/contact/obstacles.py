@@ -39,12 +39,13 @@ class Obstacles:
         given: The obstacles, as they were given.
         tools: All of them as tools.
         shapes, motions: Their structs for kernels.
-        thinnest: Half of the smallest way through any of them [m].
+        thinnest: Half of the shortest way through any of them [m].
         revision: Changes whenever launches do.
 
     Raises:
-        InputError: Something else among them, a tool that another simulation has, one given twice, or one that is too
-            fast for the given step.
+        InputError: Something is not an obstacle, another simulation has a tool, an obstacle is given twice, or a tool
+        is
+            too fast for the given step.
     """
 
     def __init__(self, given: Sequence[Obstacle], friction: float, system: System, dt: float | None = None):
@@ -158,14 +159,14 @@ class Obstacles:
         wp.launch(move_obstacles, (self.worlds, self.count), inputs, device=self.device)
 
     def reset(self, chosen: wp.array) -> None:
-        """Put obstacles of these worlds back to where they were first."""
+        """Put the obstacles of chosen worlds back to where they began."""
         if self.tools:
             inputs = [chosen, self.initial, self.motions]
             wp.launch(kernels.reset_obstacles, (self.worlds, self.count), inputs, device=self.device)
 
     def gaps(self, points: npt.NDArray[np.float64], most: float) -> npt.NDArray[np.float32]:
-        """Distances of points [m], [n, 3], from the obstacles of the first world [m], negative inside, [O, n]; what is
-        more than ``most`` need not be right. Waits for the device."""
+        """Distances of points [m], [n, 3], from the obstacles of the first world [m], negative inside, [O, n]; only
+        those of less than ``most`` are exact. Waits for the device."""
         found = wp.zeros((self.count, len(points)), dtype=wp.float32, device=self.device)
         asked = wp.array(points, dtype=wp.vec3, device=self.device)
         wp.launch(find_gaps, found.shape, [self.shapes, self.motions, asked, most], [found], device=self.device)

@@ -48,7 +48,7 @@ class Pairs:
         search.finders.append(self._find)
         self.follow()
 
-    # --- what is there ---------------------------------------------------------------------------------------------
+    # --- places and room -------------------------------------------------------------------------------------------
 
     def follow(self) -> None:
         """Update to the present surfaces."""

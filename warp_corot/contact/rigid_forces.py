@@ -39,7 +39,7 @@ class RigidForces:
         kinds: The state of each surface node with each obstacle in implicit steps; see
             ``kernels.contact.active``, [O, S].
         have_edges: Whether any of the obstacles can pass between the nodes.
-        together: Whether one block makes all rounds; None: chosen by how much is near.
+        together: Whether one block makes all rounds; None: chosen by the number of nodes and triangles that are near.
         revision: Changes whenever launches do.
     """
 
@@ -181,13 +181,13 @@ class RigidForces:
             wp.launch(beside.find_triangles_beside, dim, inputs, [near, self.touches], device=self.device)
 
     def _push(self, parts: int) -> None:
-        """Launch some of what moves one node at a time."""
+        """Launch some of the parts that act on one node at a time."""
         rigid = [self.obstacles.shapes, self.obstacles.motions]
         inputs = [parts, self._skin, *rigid, self._law, self._pace, self.touches, self.surface.arrays]
         self._on_nodes(triangles.push_nodes, [*inputs, self.forces, self.anchors])
 
     def _push_together(self, before: int, rounds: int, parts: int) -> None:
-        """Launch some of it, and rounds, in one block."""
+        """Launch some of these parts, and rounds, in one block."""
         threads = 1 if self.device.is_cpu else BLOCK
         rigid = [self.obstacles.shapes, self.obstacles.motions]
         inputs = [threads, self.search.near, before, rounds, parts, self._skin, *rigid, self._law, self._pace]

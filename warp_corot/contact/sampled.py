@@ -124,7 +124,7 @@ def _check_closed(triangles: npt.NDArray[np.int32]) -> None:
     there = np.sort(edges[:, 0].astype(np.int64) * (triangles.max() + 1) + edges[:, 1])
     back = np.sort(edges[:, 1].astype(np.int64) * (triangles.max() + 1) + edges[:, 0])
     if not np.array_equal(there, back):
-        raise InputError("the triangle mesh is not closed; every edge must have a triangle on either side, alike wound")
+        raise InputError("the triangle mesh is not closed; every edge must have two triangles with the same winding")
 
 
 def _sampled(

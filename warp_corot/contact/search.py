@@ -36,8 +36,8 @@ class Search:
         surface: The bodies' surfaces.
         obstacles: The obstacles.
         size: The size of the smallest element [m].
-        branches: Whether a recorded search may be left out by a branch of the graph, which NCCL's launches after it
-            do not bear.
+        branches: Whether a recorded search may be left out by a branch of the graph; NCCL's launches cannot follow such
+            a branch.
 
     Attributes:
         watch: The places at the last search, as a struct for kernels.

@@ -40,7 +40,7 @@ class Shape:
         kind: Its kind in ``kernels.contact.shapes``.
         size: Its sizes there [m].
         thickness: Half of the shortest way through it [m]; infinite for a half-space. Steps are so short that nothing
-            passes it.
+            passes through it.
         reach: The largest distance of its points from its origin [m]; infinite for a half-space.
 
     Raises:
@@ -66,7 +66,7 @@ class Shape:
         """As ``Tool.wrench``, for a shape that does not move.
 
         Raises:
-            InputError: It belongs to no simulation.
+            InputError: The shape is in no simulation.
         """
         if self.felt is None:
             raise InputError(f"no simulation has this {self!r}; name it among obstacles of a Simulation")
@@ -107,7 +107,7 @@ class Sphere(Shape):
     """A ball.
 
     Args:
-        radius: [m].
+        radius: The radius [m].
     """
 
     kind = int(kernels.SPHERE)
@@ -123,7 +123,7 @@ class Capsule(Shape):
 
     Args:
         radius: [m].
-        length: From the centre of one end to that of the other [m].
+        length: Distance between the centres of the two ends [m].
     """
 
     kind = int(kernels.CAPSULE)
@@ -139,8 +139,8 @@ class Cylinder(Shape):
     twentieth of the radius or of half the length.
 
     Args:
-        radius: [m].
-        length: [m].
+        radius: The radius [m].
+        length: The length [m].
     """
 
     kind = int(kernels.CYLINDER)

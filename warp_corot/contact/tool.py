@@ -34,7 +34,7 @@ class Tool:
             passes through it.
 
     Raises:
-        InputError: Not a shape, or a speed that is not positive.
+        InputError: The argument is not a shape, or the speed is not positive.
     """
 
     def __init__(self, shape: Shape, *, speed: float = SPEED):
@@ -82,7 +82,7 @@ class Tool:
         """Move to a place on a straight line, no faster than ``speed``; at once if no simulation has the tool yet.
 
         Raises:
-            InputError: Not three finite numbers, or not a quaternion (x, y, z, w).
+            InputError: The position is not three finite numbers, or the rotation is not a quaternion (x, y, z, w).
         """
         p = checked_vector(position, "position")
         q = self.pose[3:] if quaternion is None else checked_quaternion(quaternion)
@@ -102,13 +102,13 @@ class Tool:
             poses: ``wp.transform`` [1], or [worlds] with one for each.
 
         Raises:
-            InputError: Another type.
+            InputError: The array has another type or length.
         """
         if not isinstance(poses, wp.array) or poses.dtype != wp.transformf or poses.ndim != 1 or not len(poses):
             raise InputError(f"poses is {shown(poses)}; it must be a Warp array of wp.transform, [1] or [worlds]")
         self._move_by(None, poses, True)
 
-    # --- what it feels ---------------------------------------------------------------------------------------------
+    # --- forces ----------------------------------------------------------------------------------------------------
 
     @property
     def wrench(self) -> wp.array:
@@ -147,7 +147,7 @@ class Tool:
         """Become an obstacle of a simulation, which calls this.
 
         Raises:
-            InputError: Another simulation has it already.
+            InputError: Another simulation has the tool already.
         """
         if self._bound is not None:
             raise InputError("a tool is in two simulations; make another one of its shape")
@@ -190,7 +190,7 @@ def as_tool(given: Any) -> Tool:
     """A tool, or a tool at rest for a shape.
 
     Raises:
-        InputError: Something else.
+        InputError: The argument is neither.
     """
     if isinstance(given, Tool):
         return given

@@ -33,11 +33,11 @@ Floats = npt.NDArray[np.float64]
 
 
 def warn_of_overlaps(contacts: Contacts, least: float) -> None:
-    """See what begins in something else. Obstacles are looked at in all worlds, all else in the first.
+    """Check whether anything begins inside something else: obstacles in all worlds, soft bodies in the first.
 
     Args:
-        contacts: Of a state that has not been stepped.
-        least: Overlaps that are told [m].
+        contacts: Contact in a state that has not been stepped.
+        least: The smallest overlap that is reported [m].
 
     Warns:
         StabilityWarning: Surface nodes begin inside obstacles or other bodies, or a tool in a body.
@@ -71,7 +71,7 @@ def _own_surfaces(contacts: Contacts) -> Iterator[tuple[Floats, npt.NDArray[np.i
 
 
 def warn_of_crushed(contacts: Contacts) -> bool:
-    """See whether elements are turned inside out now; waits for the device.
+    """Check whether elements are turned inside out now; waits for the device.
 
     Warns:
         StabilityWarning: Some are.
@@ -98,7 +98,7 @@ def warn_of_crushed(contacts: Contacts) -> bool:
 
 
 def _warn_of_what_bodies_hold(contacts: Contacts, axes: list[tuple[Tool, Floats]], least: float, speed: str) -> None:
-    """The same of the nodes of bodies, and of axes of tools, in other bodies."""
+    """Warn of nodes of bodies, and of axes of tools, that begin inside other bodies."""
     surfaces = list(_own_surfaces(contacts))
     own = [points for points, _ in surfaces]
     ends = np.cumsum([0, *(len(points) for points in own), *(len(points) for _, points in axes)])
@@ -120,7 +120,7 @@ def _warn_of_what_bodies_hold(contacts: Contacts, axes: list[tuple[Tool, Floats]
 
 
 def _axis(tool: Tool, pose: Floats) -> Floats:
-    """Points inside a tool, which may lie between the nodes of a body, [n, 3]; none of what has no known middle."""
+    """Points inside a tool, which may lie between the nodes of a body, [n, 3]; none if its middle is not known."""
     shape = tool.shape
     if isinstance(shape, Ground | TriangleMesh | SignedDistance):
         return np.zeros((0, 3))
