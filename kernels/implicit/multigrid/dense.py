@@ -5,8 +5,7 @@ the inverse.
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
-from warp_corot.kernels.elements.lanes import COMPILER_FLAGS
-from warp_corot.kernels.stepping.threads import synchronize_block
+from warp_corot.kernels.elements.lanes import COMPILER_FLAGS, native
 
 from .cycle import sum_over_lanes
 
@@ -14,105 +13,77 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": COMPILER_
 
 #: Added to the diagonal, which is scaled to one: the inverse stays finite for a body that nothing holds.
 SHIFT = wp.constant(wp.float64(1.0e-5))
+#: Number of threads of ``invert_in_registers``.
+SWEEPERS = 320
 
 
 @wp.kernel(enable_backward=False)
 def fill_dense(
     # In
+    lanes: int,
     entries: int,
     starts: wp.array[wp.int32],
     columns: wp.array[wp.int32],
     diagonal: wp.array[wp.int32],
     blocks: wp.array[wp.mat33],
-    # Out
+    # In and out
     matrix: wp.array3d[wp.float64],
+    # Out
     scale: wp.array2d[wp.float64],
 ):
-    """Write the matrix, scaled to a diagonal of ones; rows without an entry are zero and have scale zero."""
-    world, i = wp.tid()
+    """Write the matrix, scaled to a diagonal of ones, where it was zero; rows without an entry have scale zero.
+
+    ``lanes`` threads share a node's entries.
+    """
+    world, thread = wp.tid()
+    i, lane = thread / lanes, thread % lanes
     first = world * entries
     own = blocks[first + diagonal[i]]
-    for a in range(3):
-        for column in range(matrix.shape[2]):
-            matrix[world, 3 * i + a, column] = wp.float64(0.0)
-        scale[world, 3 * i + a] = wp.float64(0.0)
-        if own[a, a] > 0.0:
-            scale[world, 3 * i + a] = wp.float64(1.0) / wp.sqrt(wp.float64(own[a, a]))
-    for p in range(starts[i], starts[i + 1]):
+    for p in range(starts[i] + lane, starts[i + 1], lanes):
         j = columns[p]
         other = blocks[first + diagonal[j]]
         for a in range(3):
             for b in range(3):
+                value = wp.float64(0.0)
                 if own[a, a] > 0.0 and other[b, b] > 0.0:
                     value = wp.float64(blocks[first + p][b, a])
-                    size = wp.sqrt(wp.float64(own[a, a]) * wp.float64(other[b, b]))
-                    matrix[world, 3 * i + a, 3 * j + b] = value / size
-    for a in range(3):
-        matrix[world, 3 * i + a, 3 * i + a] += SHIFT
-        if own[a, a] <= 0.0:
-            matrix[world, 3 * i + a, 3 * i + a] = wp.float64(1.0)
+                    value /= wp.sqrt(wp.float64(own[a, a]) * wp.float64(other[b, b]))
+                if i == j and a == b:
+                    value = wp.where(own[a, a] > 0.0, value + SHIFT, wp.float64(1.0))
+                matrix[world, 3 * i + a, 3 * j + b] = value
+    if lane == 0:
+        for a in range(3):
+            scale[world, 3 * i + a] = wp.float64(0.0)
+            if own[a, a] > 0.0:
+                scale[world, 3 * i + a] = wp.float64(1.0) / wp.sqrt(wp.float64(own[a, a]))
 
 
-@wp.func_native("""
-const double* row = &wp::index(rows, world, 0);
-double* a = &wp::index(matrix, world, i, 0);
-for (int j = lane; j <= i; j += lanes) a[j] -= factor * row[j];
-""")
-def subtract_row(
-    matrix: wp.array3d[wp.float64],
-    rows: wp.array2d[wp.float64],
-    world: int,
-    i: int,
-    lane: int,
-    lanes: int,
-    factor: wp.float64,
-):
-    """Subtract a multiple of the pivot's row from row i of the lower triangle; ``lanes`` threads share its entries."""
+@wp.func_native(native("sweep_matrix"))
+def sweep(matrix: wp.array3d[wp.float64], world: int, rows: wp.array2d[wp.float64]):
+    """Overwrite the lower triangle of a world's matrix with minus its inverse, by symmetric sweeps; ``rows`` has the
+    pivot's row.
+    """
     ...
 
 
 @wp.kernel(enable_backward=False)
-def invert_dense(
-    # In
-    lanes: int,
-    # In and out
-    matrix: wp.array3d[wp.float64],
-    # Out
-    rows: wp.array2d[wp.float64],
-):
-    """Overwrite the lower triangle of each world's matrix with minus its inverse, by symmetric sweeps. Each world has
-    one thread block, which keeps the pivot's row in ``rows``; ``lanes`` of its threads share a row of the matrix.
+def invert_dense(matrix: wp.array3d[wp.float64], rows: wp.array2d[wp.float64]):
+    """Overwrite the lower triangle of each world's matrix with minus its inverse; a thread for each world."""
+    sweep(matrix, wp.tid(), rows)
+
+
+@wp.func_native(native("sweep_in_registers"))
+def sweep_in_registers(matrix: wp.array3d[wp.float64], world: int):
+    """Overwrite the lower triangle of a world's matrix of at most 192 rows with minus its inverse, by symmetric sweeps.
+    Each of 300 threads has eight by eight entries of it in registers.
     """
-    thread = wp.tid()
-    threads = wp.block_dim()
-    world = thread / threads
-    lane = thread % threads
-    size = matrix.shape[1]
-    for k in range(size):
-        pivot = matrix[world, k, k]
-        for j in range(lane, size, threads):
-            if j < k:
-                rows[world, j] = matrix[world, k, j]
-            elif j > k:
-                rows[world, j] = matrix[world, j, k]
-            else:
-                rows[world, j] = wp.float64(0.0)
-        synchronize_block()
-        inverse = wp.float64(1.0) / pivot
-        part = lane % lanes
-        for i in range(lane / lanes, size, threads / lanes):
-            if i != k:
-                factor = rows[world, i] * inverse
-                subtract_row(matrix, rows, world, i, part, lanes, factor)
-                # Entry k of the row is in the pivot's column; the lane that has subtracted from it writes it.
-                if i > k and part == k % lanes:
-                    matrix[world, i, k] = factor
-            else:
-                for j in range(part, k, lanes):
-                    matrix[world, k, j] = rows[world, j] * inverse
-                if part == 0:
-                    matrix[world, k, k] = -inverse
-        synchronize_block()
+    ...
+
+
+@wp.kernel(enable_backward=False, grid_stride=False, launch_bounds=SWEEPERS)
+def invert_in_registers(matrix: wp.array3d[wp.float64]):
+    """Do the same as ``invert_dense`` on CUDA, with a block of SWEEPERS threads for each world."""
+    sweep_in_registers(matrix, wp.tid() / wp.block_dim())
 
 
 @wp.kernel(enable_backward=False)

@@ -8,9 +8,6 @@ from warp_corot.kernels.implicit.multigrid import dense as kernels
 
 from .level import Level
 
-#: Number of threads in the block that inverts a world's matrix on CUDA, and of those that share one of its rows.
-BLOCK, LANES = 1024, 8
-
 
 class DenseInverse:
     """The inverse of a level's matrix, float32 [worlds, 3 n, 3 n]."""
@@ -25,11 +22,14 @@ class DenseInverse:
     def update(self) -> None:
         """Launch the inversion of the present matrix."""
         level, pattern = self.level, self.level.pattern
-        inputs = [pattern.entries, pattern.starts, pattern.columns, pattern.diagonal, level.blocks]
-        level.launch(kernels.fill_dense, level.count, inputs, [self._matrix, self._scale])
-        block, lanes = (BLOCK, LANES) if level.device.is_cuda else (1, 1)
-        outputs = [self._matrix, self._rows]
-        wp.launch(kernels.invert_dense, level.worlds * block, [lanes], outputs, device=level.device, block_dim=block)
+        self._matrix.zero_()
+        inputs = [level.lanes, pattern.entries, pattern.starts, pattern.columns, pattern.diagonal, level.blocks]
+        level.launch(kernels.fill_dense, level.lanes * level.count, inputs, [self._matrix, self._scale])
+        if level.device.is_cuda:
+            kernel, block = kernels.invert_in_registers, kernels.SWEEPERS
+            wp.launch(kernel, level.worlds * block, [self._matrix], device=level.device, block_dim=block)
+        else:
+            wp.launch(kernels.invert_dense, level.worlds, [self._matrix, self._rows], device=level.device)
         shape = self.inverse.shape
         inputs = [self._matrix, self._scale]
         wp.launch(kernels.store_inverse, dim=shape, inputs=inputs, outputs=[self.inverse], device=level.device)
