@@ -27,6 +27,7 @@ def refused_meshes(folder: Path) -> None:
 
 REFUSED = [
     (["none.usd"], "none.usd: no such file"),
+    (["https://example.com/liver.stl"], "liver.stl: is a web address; the input must be a file on this machine"),
     (["text.usd"], "text.usd: is not a USD file"),
     (["empty.vtk"], "empty.vtk: is empty"),
     (["words.docx"], "words.docx: unknown format .docx"),

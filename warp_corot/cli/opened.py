@@ -67,6 +67,8 @@ def open_input(name: str) -> Opened:
     """
     if name == "box":
         return Opened(name, "box")
+    if "://" in name:
+        raise InputError(f"{name}: is a web address; the input must be a file on this machine")
     asset = find_asset(name)
     path = asset.path if asset else Path(name)
     if path.is_dir() or is_volume(path):
