@@ -110,7 +110,7 @@ class TestPyTorch:
         one = torch.tensor(500.0)
         for arguments, message in (
             ({}, "nothing is given to differentiate by"),
-            ({"colour": one}, "colour is no argument; they are young"),
+            ({"colour": one}, "colour is not an argument; they are young"),
             ({"loads": torch.zeros(3, 3)}, r"loads has shape \(3, 3\)"),
             ({"gravity": torch.zeros(3), "options": {"gravity": GRAVITY}}, "gravity is given twice"),
         ):

@@ -44,8 +44,7 @@ class Obstacles:
 
     Raises:
         InputError: Something is not an obstacle, another simulation has a tool, an obstacle is given twice, or a tool
-        is
-            too fast for the given step.
+            is too fast for the given step.
     """
 
     def __init__(self, given: Sequence[Obstacle], friction: float, system: System, dt: float | None = None):

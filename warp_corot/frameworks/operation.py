@@ -35,7 +35,7 @@ class StaticOperation:
         wanted = ", ".join(REPLACED)
         for name in names:
             if name not in REPLACED:
-                raise InputError(f"{name} is no argument; they are {wanted}")
+                raise InputError(f"{name} is not an argument; they are {wanted}")
         if not names:
             raise InputError(f"nothing is given to differentiate by; give one or several of {wanted}")
         self.body, self.names, self._options = body, names, dict(options)

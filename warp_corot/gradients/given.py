@@ -25,10 +25,11 @@ def with_values(body: SoftBody, values: Values) -> SoftBody:
     place.
 
     Args:
-        body: The body, which does not change. values: The values by name: "young", "poisson" and "density" as a
-        material takes them; "loads" [N], [worlds * N, 3];
-            "boundary", positions, of which only those of held nodes are read, [worlds * N, 3]; "rest", rest positions
-            [N, 3], with which the mesh is a general one; "activation" [worlds, T] or as ``activate`` takes it.
+        body: The body, which does not change.
+        values: The values by name: "young", "poisson" and "density" as a material takes them; "loads" [N],
+            [worlds * N, 3]; "boundary", positions, of which only those of held nodes are read, [worlds * N, 3]; "rest",
+            rest positions [N, 3], with which the mesh is a general one; "activation" [worlds, T] or as ``activate``
+            takes it.
 
     Raises:
         InputError: A value cannot be used, or the rest shape of a mesh with cut elements is replaced.

@@ -66,7 +66,7 @@ class RunGradient:
 
     def __getitem__(self, name: str) -> Any:
         if name not in NAMES or getattr(self, name) is None:
-            raise InputError(f"{shown(name)} is not among what the gradient was asked for")
+            raise InputError(f"{shown(name)} is not one of the requested derivatives")
         return getattr(self, name)
 
 
@@ -101,7 +101,8 @@ def run_gradient(
         adjoint_tolerance: Tolerance of the linear solve of each implicit step backwards.
 
     Raises:
-        InputError: As ``static_gradient``, or the integrator is none of these, the body is remeshed, or nodes or active
+        InputError: As ``static_gradient``, or the integrator is not one of these, the body is remeshed, or nodes or
+        active
             stress follow keyframes.
         UnstableError: The run does not stay finite.
         ConvergenceError: An adjoint solve does not converge.

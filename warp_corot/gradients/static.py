@@ -60,7 +60,7 @@ class StaticGradient:
 
     def __getitem__(self, name: str) -> Any:
         if name not in parameters.NEEDS or getattr(self, name) is None:
-            raise InputError(f"{shown(name)} is not among what the gradient was asked for")
+            raise InputError(f"{shown(name)} is not one of the requested derivatives")
         return getattr(self, name)
 
 
@@ -130,7 +130,7 @@ def checked_names(wrt: str | Sequence[str]) -> tuple[str, ...]:
     """Names of derivatives.
 
     Raises:
-        InputError: One is none.
+        InputError: A name is not one of them, or there are none.
     """
     given = (wrt,) if isinstance(wrt, str) or not isinstance(wrt, Iterable) else tuple(wrt)
     names = tuple(each for place, each in enumerate(given) if each not in given[:place])

@@ -44,7 +44,7 @@ def checked_numbers(given: npt.ArrayLike | wp.array, name: str, wanted: str) -> 
         wanted: What it must be, for the message: "[10, 3]".
 
     Raises:
-        InputError: It holds something else, or its rows have different lengths.
+        InputError: It contains something else, or its rows have different lengths.
     """
     try:
         return np.asarray(given.numpy() if isinstance(given, wp.array) else given, dtype=np.float64)

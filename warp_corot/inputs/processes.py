@@ -1,15 +1,15 @@
-"""How many processes ``mpirun`` started, as it tells each of them, without a word to the others."""
+"""The number of processes that ``mpirun`` started, read from the environment, without any communication."""
 
 from __future__ import annotations
 
 import os
 
-#: How many there are, and which this is: by Open MPI, MPICH and Intel MPI, and PMIx.
+#: Variables with the number of processes and of this one: of Open MPI, of MPICH and Intel MPI, and of PMIx.
 _NAMES = (("OMPI_COMM_WORLD_SIZE", "OMPI_COMM_WORLD_RANK"), ("PMI_SIZE", "PMI_RANK"), ("PMIX_SIZE", "PMIX_RANK"))
 
 
 def process_count() -> int:
-    """How many processes there are; 1 if nobody says."""
+    """The number of processes; 1 if the environment has none."""
     return max(_number(size) for size, _ in _NAMES) or 1
 
 

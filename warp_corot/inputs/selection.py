@@ -74,8 +74,8 @@ def select_nodes(
     ``none``. Operators: arithmetic, comparisons (also chained), ``and``, ``or``, ``not`` and, between comparisons in
     parentheses, ``&``, ``|``, ``~``. Functions: see ``FUNCTIONS``. Regions: ``sphere(x, y, z, radius)``,
     ``box(x, y, z, x, y, z)`` between two corners, ``nearest(x, y, z)`` for the node that is nearest to a point and
-        ``nearest(x, y, z, n)`` for the n nearest [m]. The right side of ``and`` and ``or`` is evaluated
-        only at nodes where the left side does not decide, so that ``y > 0 and x / y < 1`` never divides by zero.
+    ``nearest(x, y, z, n)`` for the n nearest [m]. The right side of ``and`` and ``or`` is evaluated only at nodes where
+    the left side does not decide, so that ``y > 0 and x / y < 1`` never divides by zero.
 
     Args:
         expression: For example ``"x > 0.1 and not (y < 0.2)"``, ``"hypot(x, y) < 0.02"``, ``"z < zmin + 0.01"``.
