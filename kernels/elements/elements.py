@@ -96,6 +96,16 @@ def mirror_sign(code: int):
 
 
 @wp.func
+def root_of(subtrees: Subtrees, s: int):
+    """Half the edge length of a subtree's root [m], its frame Q, and ``mirror_sign``."""
+    code = subtrees.code[s]
+    h = 0.5 * subtrees.size[(code & LEVEL_MASK) // 3]
+    mirror = mirror_sign(code)
+    q = subtrees.frames[code >> FRAME_SHIFT]
+    return h, q, mirror
+
+
+@wp.func
 def edge_length(elements: ForestElements, t: int):
     return elements.size[(elements.code[t] & LEVEL_MASK) // 3]
 

@@ -19,7 +19,7 @@ from warp_corot.kernels.corotated.algebraic import turned_stress
 from warp_corot.kernels.elements.constitutive import hooke, symmetric
 from warp_corot.kernels.elements.dilatation import VOLUME as VOLUME_CHANGE
 from warp_corot.kernels.elements.dilatation import mean_of
-from warp_corot.kernels.elements.elements import FRAME_SHIFT, LEVEL_MASK, Subtrees, load_node, mirror_sign, store_node
+from warp_corot.kernels.elements.elements import Subtrees, load_node, root_of, store_node
 from warp_corot.kernels.math.matrices import column, identity3
 from warp_corot.kernels.math.quaternion import robust_rotation
 from warp_corot.kernels.modules import unique_kernel
@@ -108,6 +108,23 @@ def _vectors(rows: list) -> wp.Function:
     return look_up
 
 
+def _displacements_of(layout: Layout, part: int, displacement: wp.Function) -> wp.Function:
+    """A function that reads those of a subtree's ten displacements that a part of its leaves needs."""
+    needs = layout.needs(part)
+
+    @wp.func
+    def displacements(words: vec3u):
+        _generated_from = wp.static(fingerprint(needs))
+        x = mat10()
+        for k in range(10):
+            if wp.static(needs[k]):
+                number = number_in(words[k // wp.static(NUMBERS)], k % wp.static(NUMBERS))
+                x[k] = displacement(wp.static(LOAD_BYTES), number, wp.vec3())
+        return x
+
+    return displacements
+
+
 def _left_out_of(layout: Layout, displacement: wp.Function, slot: wp.Function) -> tuple[wp.Function, ...]:
     """The list of left-out leaves, and functions that fill it, compute a leaf of it and collect forces.
 
@@ -154,10 +171,7 @@ def _left_out_of(layout: Layout, displacement: wp.Function, slot: wp.Function) -
         leaf = entry >> wp.static(LEAF_SHIFT)
         warp = (entry & wp.static((1 << LEAF_SHIFT) - 1)) // wp.static(WARP)
         s = (warp // wp.static(layout.parts)) * wp.static(WARP) + entry % wp.static(WARP)
-        code = body.subtrees.code[s]
-        h = 0.5 * body.subtrees.size[(code & LEVEL_MASK) // 3]
-        mirror = mirror_sign(code)
-        q = body.subtrees.frames[code >> FRAME_SHIFT]
+        h, q, mirror = root_of(body.subtrees, s)
         # Left-handed if ``mirror`` is -1.
         maubach = wp.matrix_from_cols(column(q, 0), column(q, 1), column(q, 2) * mirror)
         words = vec3u(body.nodes[0, s], body.nodes[1, s], body.nodes[2, s])
@@ -229,6 +243,7 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
     turned = [shared_forces(shape, uniform, False, layout.leaves(part)) for part in range(parts)]
     needs, places = [layout.needs(part) for part in range(parts)], layout.places
     displacement, velocity = shared_vectors(layout.nodes, "displacements"), shared_vectors(layout.nodes, "velocities")
+    displacements = [_displacements_of(layout, part, displacement) for part in range(parts)]
     slot = shared_vectors(zero_slot + 1, "forces")
     dilating, of = layout.dilating, VOLUME_CHANGE
     slope_of = of.slope
@@ -286,10 +301,7 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
         part = warp % wp.static(parts)
         s = (warp // wp.static(parts)) * wp.static(WARP) + thread % wp.static(WARP)
         mine = wp.min(s, body.subtree_count - 1)
-        code = body.subtrees.code[mine]
-        h = 0.5 * body.subtrees.size[(code & LEVEL_MASK) // 3]
-        mirror = mirror_sign(code)
-        q = body.subtrees.frames[code >> FRAME_SHIFT]
+        h, q, mirror = root_of(body.subtrees, mine)
         material_of_world = world * body.element_count * stride
         material = material_of_world + body.subtrees.first[mine] * stride
         damped = 1.0 / (1.0 + dt * damping)
@@ -308,14 +320,7 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
                 if s < body.subtree_count:
                     for p in range(wp.static(parts)):
                         if part == p:
-                            x = mat10()
-                            for k in range(10):
-                                if wp.static(needs[p][k]):
-                                    x[k] = displacement(
-                                        wp.static(LOAD_BYTES),
-                                        number_in(words[k // wp.static(NUMBERS)], k % wp.static(NUMBERS)),
-                                        wp.vec3(),
-                                    )
+                            x = wp.static(displacements[p])(words)
                             y = turn_in(x, column(q, 0), column(q, 1), column(q, 2) * mirror, 1.0 / h)
                             sum, weight = wp.static(measure[p])(y, shared_lam, material)
                             sums(wp.static(STORE), wp.static(2 * p * capacity) + s, sum)
@@ -324,14 +329,7 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
             if s < body.subtree_count:
                 for p in range(wp.static(parts)):
                     if part == p:
-                        x = mat10()
-                        for k in range(10):
-                            if wp.static(needs[p][k]):
-                                x[k] = displacement(
-                                    wp.static(LOAD_BYTES),
-                                    number_in(words[k // wp.static(NUMBERS)], k % wp.static(NUMBERS)),
-                                    wp.vec3(),
-                                )
+                        x = wp.static(displacements[p])(words)
                         if wp.static(dilating and not at_once):
                             y = turn_in(x, column(q, 0), column(q, 1), column(q, 2) * mirror, 1.0 / h)
                             sum, weight = wp.static(measure[p])(y, shared_lam, material)
@@ -381,14 +379,7 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
                     pressure = slope_of(mean_of(sum, weight))
                     for p in range(wp.static(parts)):
                         if part == p:
-                            x = mat10()
-                            for k in range(10):
-                                if wp.static(needs[p][k]):
-                                    x[k] = displacement(
-                                        wp.static(LOAD_BYTES),
-                                        number_in(words[k // wp.static(NUMBERS)], k % wp.static(NUMBERS)),
-                                        wp.vec3(),
-                                    )
+                            x = wp.static(displacements[p])(words)
                             q0 = column(q, 0)
                             q1 = column(q, 1)
                             q2 = column(q, 2) * mirror

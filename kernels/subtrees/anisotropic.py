@@ -12,22 +12,15 @@ import warp as wp
 
 from warp_corot.kernels.corotated.anisotropic import FibreMaterial, OrthotropicMaterial, filled, listed_stress
 from warp_corot.kernels.corotated.definite import definite_law, definite_strain, is_definite, load_axes
-from warp_corot.kernels.elements.elements import (
-    FRAME_SHIFT,
-    LEVEL_MASK,
-    ForestElements,
-    Subtrees,
-    mirror_sign,
-    scatter_stress,
-)
+from warp_corot.kernels.elements.elements import ForestElements, Subtrees, root_of, scatter_stress
 from warp_corot.kernels.math.rotation import ITERATIONS, byers_xu, column, newton_rotation, quick_rotation
 from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.tables.shapes import VOLUME, fingerprint
 from warp_corot.kernels.tables.subtree import FRAMES, HANDEDNESS, LEAVES
 
-from .cuda import BLOCK, memory_of
 from .forces import columns_of, leaf_forces_of, mat10, turns_of
 from .laws import turn_in, turn_out
+from .memory import BLOCK, memory_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -135,12 +128,10 @@ def scatter_anisotropic_subtrees(
         flagged: wp.array[wp.uint8],
     ):
         s = wp.tid()
-        code = subtrees.code[s]
-        h = 0.5 * subtrees.size[(code & LEVEL_MASK) // 3]
-        q = subtrees.frames[code >> FRAME_SHIFT]
+        h, q, mirror = root_of(subtrees, s)
         q0 = column(q, 0)
         q1 = column(q, 1)
-        q2 = column(q, 2) * mirror_sign(code)
+        q2 = column(q, 2) * mirror
         y = turn_in(load(subtrees, s, u), q0, q1, q2, 1.0 / h)
         frame = wp.matrix_from_cols(q0, q1, q2)
         g, left_out = forces(y, frame, h, material, axes, is_active, activation, subtrees.first[s])

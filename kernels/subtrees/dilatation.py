@@ -14,7 +14,7 @@ from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import VOLUME as VOLUME_CHANGE
 from warp_corot.kernels.elements.dilatation import Dilatation, mean_of, pressure_stress_of
 from warp_corot.kernels.elements.dilatation_lanes import law_of
-from warp_corot.kernels.elements.elements import FRAME_SHIFT, LEVEL_MASK, Subtrees, mirror_sign
+from warp_corot.kernels.elements.elements import Subtrees, root_of
 from warp_corot.kernels.elements.lanes import ISOTROPIC, native, scatter_lanes
 from warp_corot.kernels.elements.shapes import columns_of, leaf_forces_of
 from warp_corot.kernels.math.rotation import column
@@ -22,10 +22,10 @@ from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.tables.shapes import VOLUME, fingerprint
 from warp_corot.kernels.tables.subtree import LEAVES
 
-from .cuda import memory_of
 from .forces import mat10, turns_of
 from .lanes import begin
 from .laws import turn_in, turn_out
+from .memory import memory_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -156,7 +156,7 @@ def dilating_forces_of(shape: int, uniform: bool, chosen: range = range(8)) -> w
 
 @functools.cache
 def scatter_dilatation(shape: int, grouped: bool, uniform: bool, of: Dilatation) -> wp.Kernel:
-    """Add the forces of the shared dilatation of subtrees on CUDA. Launch with block_dim ``cuda.BLOCK``."""
+    """Add the forces of the shared dilatation of subtrees on CUDA. Launch with block_dim ``memory.BLOCK``."""
     load, add = memory_of(shape, grouped)
     sums, forces, slope_of = dilatation_sums_of(shape, uniform, of), pressure_forces_of(shape, uniform, of), of.slope
 
@@ -170,12 +170,10 @@ def scatter_dilatation(shape: int, grouped: bool, uniform: bool, of: Dilatation)
         f: wp.array[wp.vec4],
     ):
         s = wp.tid()
-        code = subtrees.code[s]
-        h = 0.5 * subtrees.size[(code & LEVEL_MASK) // 3]
-        q = subtrees.frames[code >> FRAME_SHIFT]
+        h, q, mirror = root_of(subtrees, s)
         q0 = column(q, 0)
         q1 = column(q, 1)
-        q2 = column(q, 2) * mirror_sign(code)
+        q2 = column(q, 2) * mirror
         y = turn_in(load(subtrees, s, u), q0, q1, q2, 1.0 / h)
         first = wp.where(wp.static(uniform), 0, subtrees.first[s])
         sum, weight = sums(y, lam, first)

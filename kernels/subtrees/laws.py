@@ -10,12 +10,12 @@ import functools
 
 import warp as wp
 
-from warp_corot.kernels.elements.elements import FRAME_SHIFT, LEVEL_MASK, Subtrees, mirror_sign
+from warp_corot.kernels.elements.elements import Subtrees, root_of
 from warp_corot.kernels.math.rotation import column
 from warp_corot.kernels.modules import unique_kernel
 
-from .cuda import memory_of
 from .forces import mat10, turned_forces_of
+from .memory import memory_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -66,12 +66,10 @@ def scatter_subtrees(shape: int, grouped: bool, uniform: bool, stress: wp.Functi
         f: wp.array[wp.vec4],
     ):
         s = wp.tid()
-        code = subtrees.code[s]
-        h = 0.5 * subtrees.size[(code & LEVEL_MASK) // 3]
-        q = subtrees.frames[code >> FRAME_SHIFT]
+        h, q, mirror = root_of(subtrees, s)
         q0 = column(q, 0)
         q1 = column(q, 1)
-        q2 = column(q, 2) * mirror_sign(code)
+        q2 = column(q, 2) * mirror
         y = turn_in(load(subtrees, s, u), q0, q1, q2, 1.0 / h)
         g, _left_out = forces(y, h, mu, lam, wp.where(wp.static(uniform), 0, subtrees.first[s]))
         add(subtrees, s, turn_out(g, q0, q1, q2), f)

@@ -28,8 +28,8 @@ from warp_corot.kernels.elements.forces import scatter_forces
 from warp_corot.kernels.elements.general_cuda import corotated_law
 from warp_corot.kernels.math.rotation import byers_xu, quick_rotation
 from warp_corot.kernels.subtrees.anisotropic import repair_leaves, scatter_anisotropic_subtrees, scatter_flat
-from warp_corot.kernels.subtrees.cuda import BLOCK
 from warp_corot.kernels.subtrees.laws import scatter_subtrees
+from warp_corot.kernels.subtrees.memory import BLOCK
 
 LAWS = {
     "linear": constitutive.linear_stress,

@@ -15,8 +15,9 @@ import warp_corot as wc
 from warp_corot.discretization.planning.fixed import ForcePlan
 from warp_corot.elasticity.corotated.left_out import LeftOutLeaves
 from warp_corot.elasticity.structs import isotropic_material
-from warp_corot.kernels.subtrees.cuda import BLOCK, scatter_subtrees_in_blocks
+from warp_corot.kernels.subtrees.cuda import scatter_subtrees_in_blocks
 from warp_corot.kernels.subtrees.left_out import COUNT_STRIDE, LISTS
+from warp_corot.kernels.subtrees.memory import BLOCK
 
 TOLERANCE = 1e-5  # of the largest force, as in test_miscompile
 

@@ -14,10 +14,9 @@ import warp_corot as wc
 from warp_corot.discretization.planning.fixed import ForcePlan
 from warp_corot.discretization.shear_only import ShearOnly
 from warp_corot.kernels.elements.dilatation import VOLUME, mean_of
-from warp_corot.kernels.elements.elements import FRAME_SHIFT, LEVEL_MASK, Subtrees, mirror_sign
+from warp_corot.kernels.elements.elements import Subtrees, root_of
 from warp_corot.kernels.math.matrices import column
 from warp_corot.kernels.modules import unique_kernel
-from warp_corot.kernels.subtrees.cuda import BLOCK, add_single, load_single
 from warp_corot.kernels.subtrees.dilatation import (
     dilatation_sums_of,
     dilating_forces_of,
@@ -25,6 +24,7 @@ from warp_corot.kernels.subtrees.dilatation import (
     scatter_dilatation,
 )
 from warp_corot.kernels.subtrees.laws import turn_in, turn_out
+from warp_corot.kernels.subtrees.memory import BLOCK, add_single, load_single
 
 wp.set_module_options({"enable_backward": False})
 
@@ -49,12 +49,10 @@ def scatter_halves(shape, uniform):
         f: wp.array[wp.vec4],
     ):
         s = wp.tid()
-        code = subtrees.code[s]
-        h = 0.5 * subtrees.size[(code & LEVEL_MASK) // 3]
-        q = subtrees.frames[code >> FRAME_SHIFT]
+        h, q, mirror = root_of(subtrees, s)
         q0 = column(q, 0)
         q1 = column(q, 1)
-        q2 = column(q, 2) * mirror_sign(code)
+        q2 = column(q, 2) * mirror
         first = wp.where(wp.static(uniform), 0, subtrees.first[s])
         y = turn_in(load_single(subtrees, s, u), q0, q1, q2, 1.0 / h)
         sum, weight = first_sums(y, lam, first)
@@ -84,12 +82,10 @@ def scatter_at_once(shape, uniform):
         left_out: wp.array[wp.int32],
     ):
         s = wp.tid()
-        code = subtrees.code[s]
-        h = 0.5 * subtrees.size[(code & LEVEL_MASK) // 3]
-        q = subtrees.frames[code >> FRAME_SHIFT]
+        h, q, mirror = root_of(subtrees, s)
         q0 = column(q, 0)
         q1 = column(q, 1)
-        q2 = column(q, 2) * mirror_sign(code)
+        q2 = column(q, 2) * mirror
         first = wp.where(wp.static(uniform), 0, subtrees.first[s])
         y = turn_in(load_single(subtrees, s, u), q0, q1, q2, 1.0 / h)
         sum, weight = sums(y, lam, first)

@@ -6,7 +6,8 @@ import warp as wp
 from warp_corot.discretization.planning.fixed import ForcePlan
 from warp_corot.elasticity.corotated.left_out import LeftOutLeaves
 from warp_corot.elasticity.structs import isotropic_material
-from warp_corot.kernels.subtrees.cuda import BLOCK, FLAT, Stretch, scatter_stretches
+from warp_corot.kernels.subtrees.cuda import FLAT, Stretch, scatter_stretches
+from warp_corot.kernels.subtrees.memory import BLOCK
 
 
 class Launches:

@@ -13,7 +13,7 @@ from warp_corot.kernels.clusters.laws import ActiveMaterial, anisotropic_law
 from warp_corot.kernels.corotated.definite import quaternions_of
 from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.kernels.subtrees.anisotropic import repair_leaves, scatter_anisotropic_subtrees, scatter_flat
-from warp_corot.kernels.subtrees.cuda import BLOCK
+from warp_corot.kernels.subtrees.memory import BLOCK
 from warp_corot.kernels.tables.cluster_layout import ANISOTROPIC
 from warp_corot.materials.anisotropic import TransverselyIsotropic
 

@@ -10,8 +10,8 @@ from warp_corot.discretization.elements import Elements
 from warp_corot.discretization.plan import Plan
 from warp_corot.discretization.subtrees import Batch, Sharing
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
-from warp_corot.kernels.subtrees.cuda import BLOCK
 from warp_corot.kernels.subtrees.left_out import COUNT_STRIDE, LIST_BLOCK, LISTS, LeftOut
+from warp_corot.kernels.subtrees.memory import BLOCK
 from warp_corot.kernels.subtrees.repair import repair_listed_own, repair_listed_shared
 
 #: Thread blocks for each multiprocessor: as many as fit at the same time, so that a launch over an empty list ends

@@ -15,7 +15,6 @@ from warp_corot.kernels.clusters.laws import isotropic_law
 from warp_corot.kernels.corotated.algebraic import corotated_stress
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.subtrees.cuda import (
-    BLOCK,
     FLAT,
     Stretch,
     scatter_stretches,
@@ -23,6 +22,7 @@ from warp_corot.kernels.subtrees.cuda import (
     scatter_subtrees_own,
 )
 from warp_corot.kernels.subtrees.left_out import LeftOut
+from warp_corot.kernels.subtrees.memory import BLOCK
 
 #: Number of leaves of a uniform forest from which subtrees have a launch: clusters are faster for fewer leaves, above
 #: all if some are inverted (H200: 73,728 take 6.0 us at rest and 6.3 under their weight; by subtrees 9.6 and 14.4).

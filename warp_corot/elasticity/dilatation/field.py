@@ -21,7 +21,7 @@ from warp_corot.kernels.elements import shared_dilatation as kernels
 from warp_corot.kernels.elements.dilatation import VOLUME, Dilatation
 from warp_corot.kernels.elements.lanes import LANES
 from warp_corot.kernels.subtrees import dilatation as subtrees
-from warp_corot.kernels.subtrees.cuda import BLOCK
+from warp_corot.kernels.subtrees.memory import BLOCK
 from warp_corot.mesh import TetForest
 
 from .clustered import ClusteredGroups
