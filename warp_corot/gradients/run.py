@@ -102,8 +102,7 @@ def run_gradient(
 
     Raises:
         InputError: As ``static_gradient``, or the integrator is not one of these, the body is remeshed, or nodes or
-        active
-            stress follow keyframes.
+            active stress follow keyframes.
         UnstableError: The run does not stay finite.
         ConvergenceError: An adjoint solve does not converge.
     """
