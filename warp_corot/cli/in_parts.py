@@ -101,6 +101,7 @@ def run_in_parts(args: argparse.Namespace) -> int:
 def _simulation(args: argparse.Namespace, duration: float) -> tuple[Simulation, list[Load]]:
     """The simulation of this rank's part, held and moved, and its loads."""
     import warp_corot.distributed as wd
+    from warp_corot.distributed import mpi
     from warp_corot.io.write.animate import steps_per_frame
 
     scale, (x, y, z) = 1.0 if args.scale is None else args.scale, offset_of(args).tolist()
@@ -112,9 +113,14 @@ def _simulation(args: argparse.Namespace, duration: float) -> tuple[Simulation, 
     body = SoftBody(mesh, material, device=args.device)
     for expression in ["z <= zmin"] if args.fix is None else args.fix:
         body.fix(expression)
+    comm = mpi.world()
     for load in loads:
         times, shares = load.curve(ramp_of(args, duration))
+        if not any(comm.allgather(len(body.node_indices(load.patch)) > 0)):
+            raise InputError(f"--{load.kind} {load.patch!r}: there are no nodes in it")
         body.prescribe(load.patch, times=times, displacements=shares[:, None] * load.values)
+    if not any(comm.allgather(len(body.constrained) > np.count_nonzero(body.constrained))):
+        raise InputError("options hold or move all nodes; at least one must be free to move")
     damping = paper.Settings.damping if args.damping is None else args.damping
     dt = args.dt
     SymplecticEuler(dt, damping, args.viscosity or 0.0)  # checks all values
