@@ -332,7 +332,7 @@ def test_a_tool_that_is_too_fast_for_the_given_step_is_refused(device):
         (lambda: wc.Tool(wc.Sphere(0.1)).wrench, "simulation"),
         (lambda: wc.Simulation(block("cpu"), obstacles=["floor"]), "obstacle"),
         (lambda: wc.Simulation(block("cpu"), contact=0.3), "contact"),
-        (lambda: block("cpu").contact_forces, "touches nothing"),
+        (lambda: block("cpu").contact_forces, "is in no simulation with contact"),
     ],
 )
 def test_bad_input_is_refused_in_one_line(make, says):
