@@ -126,6 +126,14 @@ class TestWhatTheBuilderLeftOut:
         assert wn.SolverCorotated(model).stable_dt > 0.0
 
 
+def test_a_step_of_years_is_refused():
+    made = builder()
+    add_grid(made, dims=(1, 1, 1))
+    model = made.finalize(device="cpu")
+    with pytest.raises(wc.InputError, match=r"dt is 1e\+09 s, which takes .* substeps of .* s; take a step"):
+        wn.SolverCorotated(model).step(model.state(), model.state(), None, None, 1e9)
+
+
 class TestBodiesThatAnotherSolverMovesToo:
     """A ball falls beside a block; Newton's own solver steps it between our steps."""
 

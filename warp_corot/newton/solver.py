@@ -26,6 +26,8 @@ from .tetrahedra import Tetrahedra
 
 #: Factor by which a recorded substep may exceed the safe one; below the smallest margin of the safe substep.
 EXCESS = 1.1
+#: A step with more substeps would take minutes.
+MOST_SUBSTEPS = 1_000_000
 
 
 class SolverCorotated(SolverBase, CouplingInterface):
@@ -340,7 +342,11 @@ class SolverCorotated(SolverBase, CouplingInterface):
     def _count_for(self, dt: float) -> int:
         dt = checked_dt(dt)
         if self._following is not None:
-            return self._following.count_for(dt)
+            count = self._following.count_for(dt)
+            if count > MOST_SUBSTEPS:
+                substeps = f"{count:.2g} substeps of {dt / count:.3g} s"
+                raise InputError(f"dt is {dt:g} s, which takes {substeps}; take a step of less time")
+            return count
         count = self._substeps or 1
         if self._is_implicit:
             return count
