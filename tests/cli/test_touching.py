@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from command_line import SHORT, assert_refused, run, simulate
 from input_files import write_vtk
 from PIL import Image
@@ -134,6 +135,17 @@ def test_a_start_inside_is_noted(block, folder, capsys, tool):
     notes = [line for line in capsys.readouterr().err.splitlines() if "pushed apart gently" in line]
     assert len(notes) == 1
     assert "tool 1 starts" in notes[0]
+
+
+def test_tetrahedra_that_reach_beyond_the_surface_are_noted(block, folder, capsys):
+    """Contact acts on them: a coarse ball lands before its surface does."""
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.05)
+    ball.export("ball.stl")
+    for mesh, reaches in ((["ball.stl", "--unit", "m", "--tets", 200], True), (["block.vtk"], False)):
+        assert simulate(*mesh, "--drop", "1cm", "-o", "a.usd", *SHORT) == 0
+        notes = [line for line in capsys.readouterr().err.splitlines() if "contact acts on the tetrahedra" in line]
+        assert len(notes) == reaches
+        assert all("beyond the surface on average" in note for note in notes)
 
 
 def test_tools_are_drawn(block, folder):

@@ -17,7 +17,7 @@ from .pressing import press_patches
 from .probing import Probe
 from .say import complain
 from .stepping import make_simulation
-from .touching import Touched, place_ground, say_overlaps, touched_by
+from .touching import Touched, place_ground, say_overlaps, say_reach, touched_by
 from .waiting import waiting
 
 #: The command warns that a run will take long if a frame has more steps than this.
@@ -73,6 +73,7 @@ def prepared(options: Sequence[argparse.Namespace]) -> Run:
         with waiting("preparing the simulation"):
             sim = make_simulation(shared, bodies, touched)
             say_overlaps(touched, bodies, sim)
+            say_reach(bodies, sim)
         for body in bodies:
             press_patches(sim, body.soft, body.loads, body.patches, ramp_of(shared, duration))
         probes = [Probe(text, body.soft, body.patches) for body in bodies for text in body.probes]

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 AUTO = "auto"
 #: Overlaps below this fraction of a body's height are rounding and are not reported.
 SMALL = 1e-5
+#: Tetrahedra that reach farther than this beyond the surface, relative to the height of the body, are said.
+FAR = 0.01
 
 Floats = np.ndarray
 
@@ -176,6 +178,24 @@ def place_ground(touched: Touched, args: argparse.Namespace, bodies: Sequence[Bo
         height = min(float((body.subject.mesh.points[body.subject.used] @ up).min()) for body in bodies)
         height -= args.drop or 0.0
     touched.obstacles = {"ground": Ground(up, height), **touched.obstacles}
+
+
+def say_reach(bodies: Sequence[Body], sim: Simulation) -> None:
+    """Add a note for each body whose tetrahedra reach far beyond its surface, because contact acts on them."""
+    if sim.contact is None:
+        return
+    for body in bodies:
+        phi = getattr(body.soft.mesh, "phi", None)
+        if phi is None:
+            continue
+        faces, _parents = body.soft.surface_faces
+        beyond = np.maximum(phi[np.unique(faces)], 0.0)
+        mean, most = float(beyond.mean()), float(beyond.max())
+        if mean > FAR * body.subject.height:
+            body.subject.notes.append(
+                f"contact acts on the tetrahedra, which reach {length(mean)} beyond the surface on average and "
+                f"{length(most)} at most; more tetrahedra (--tets) reach less far"
+            )
 
 
 def say_overlaps(touched: Touched, bodies: Sequence[Body], sim: Simulation) -> None:
