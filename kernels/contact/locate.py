@@ -4,7 +4,7 @@ import warp as wp
 
 from .closest import on_segments, on_triangle, point_of
 from .motion import Surface
-from .rows import BAND, BAND_AT_REST, Meeting, Rows, triangle_normal
+from .rows import BAND, BAND_AT_REST, BAND_OF_NEIGHBOURS, Meeting, Rows, triangle_normal
 
 wp.set_module_options({"enable_backward": False})
 
@@ -33,6 +33,16 @@ def deepest(size: float, is_self: bool, apart: wp.vec3):
 
 
 @wp.func
+def are_neighbours(s: int, c: wp.vec3i, meeting: Meeting):
+    """Whether an edge of the surface leads from a node to a corner of a triangle."""
+    for k in range(meeting.corner_starts[s], meeting.corner_starts[s + 1]):
+        q = meeting.triangles[meeting.corners[k] / 3][(meeting.corners[k] + 1) % 3]
+        if q == c[0] or q == c[1] or q == c[2]:
+            return True
+    return False
+
+
+@wp.func
 def locate_node(row: int, s: int, t: int, surface: Surface, meeting: Meeting, rows: Rows):
     """A node at a triangle."""
     c = meeting.triangles[t]
@@ -56,7 +66,10 @@ def locate_node(row: int, s: int, t: int, surface: Surface, meeting: Meeting, ro
     rows.shares[row] = wp.vec4(1.0, -w[0], -w[1], -w[2])
     rows.normal[row] = n
     rows.gap[row] = gap
-    return gap > deepest(size, meeting.body[s] == meeting.body[c[0]], apart)
+    is_self = meeting.body[s] == meeting.body[c[0]]
+    if is_self and gap < -BAND_OF_NEIGHBOURS * wp.length(apart) and are_neighbours(s, c, meeting):
+        return False
+    return gap > deepest(size, is_self, apart)
 
 
 @wp.func

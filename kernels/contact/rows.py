@@ -12,8 +12,8 @@ wp.set_module_options({"enable_backward": False})
 
 #: Overlaps up to this fraction of a triangle's or an edge's size are pushed apart; a deeper one belongs to another part
 #: of the body. In self-contact the limit is also at most this fraction of the distance between the two at rest, so
-#: that neighbours that have passed each other get back.
-BAND, BAND_AT_REST = wp.constant(0.25), wp.constant(0.1)
+#: that neighbours that have passed each other get back; the last fraction is for nodes next to a triangle.
+BAND, BAND_AT_REST, BAND_OF_NEIGHBOURS = wp.constant(0.25), wp.constant(0.1), wp.constant(0.04)
 
 
 @wp.struct
@@ -25,6 +25,8 @@ class Meeting:
     opposite: wp.array[wp.int32]  # [T] the fourth nodes of their tetrahedra, -1 inside the body
     edges: wp.array[wp.vec2i]  # [E] places, -1 where there is none
     sides: wp.array[wp.vec2i]  # [E] their two triangles
+    corner_starts: wp.array[wp.int32]  # [S + 1] triangles around each node, see ``Skin``
+    corners: wp.array[wp.int32]
     reach: wp.array[wp.float32]  # [S] how far a node may move until the next search for pairs [m]
     lower: wp.array2d[wp.vec3]  # [worlds, bodies] bounds of the places that a body may reach [m]
     upper: wp.array2d[wp.vec3]

@@ -215,6 +215,36 @@ def test_a_thin_tool_stabs_an_organ(device, kind, radius, speed, seed, itself):
     assert volume_ratios(mesh, body).min() > 0.5
 
 
+#: Where a stab left six nodes of the ball below, at rest and then [mm]: the fourth lies folded over its neighbours.
+FOLDED = np.array(
+    [
+        ((0.0, -27.165, 27.165), (0.073, -27.55, 27.008)),
+        ((0.0, -18.11, 27.165), (0.129, -18.503, 26.933)),
+        ((-9.055, -18.11, 27.165), (-9.0, -18.287, 27.333)),
+        ((0.0, -18.11, 36.22), (-10.551, -19.202, 28.078)),
+        ((9.055, -27.165, 27.165), (9.192, -27.439, 27.032)),
+        ((9.055, -18.11, 27.165), (9.194, -18.348, 27.06)),
+    ]
+)
+
+
+def test_a_corner_folded_over_its_neighbours_gets_back(device):
+    """The node next to the folded triangles is behind them, and contact must not hold it there."""
+    mesh = wc.TetForest.from_domain(wc.Domain.sphere(0.03, device=device), target_elements=1500, device=device)
+    body = wc.SoftBody(mesh, wc.Isotropic(2e4, 0.4, 1000.0), device=device)
+    body.fix(np.flatnonzero(mesh.points[:, 2] < -0.012))
+    moved = mesh.points.copy()
+    for rest, now in 1e-3 * FOLDED:
+        k = int(np.argmin(np.linalg.norm(mesh.points - rest, axis=1)))
+        np.testing.assert_allclose(mesh.points[k], rest, atol=2e-6)
+        moved[k] = now
+    body.positions = moved
+    contact, integrator = wc.Contact(self_contact=True), wc.SymplecticEuler(viscosity=2e-3)
+    sim = wc.Simulation(body, contact=contact, gravity=(0.0, 0.0, 0.0), integrator=integrator)
+    sim.advance(0.03)
+    assert np.linalg.norm(body.positions.numpy() - mesh.points, axis=1).max() < 1e-3
+
+
 def closest_to_rod(points, tool, half):
     """The largest distance of points from the axis of a rod [m]."""
     pose = tool.present_pose[0]

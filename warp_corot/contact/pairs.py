@@ -62,6 +62,7 @@ class Pairs:
         meeting.body = wp.array(surface.body_of_places(), dtype=wp.int32, device=device)
         meeting.triangles, meeting.edges, meeting.sides = surface.triangles, surface.edges, surface.sides
         meeting.opposite = surface.opposite
+        meeting.corner_starts, meeting.corners = surface.corner_starts, surface.corners
         meeting.reach = self.search.watch.reach
         shape = (surface.worlds, len(surface.parts))
         meeting.lower, meeting.upper = (wp.zeros(shape, dtype=wp.vec3, device=device) for _ in range(2))
