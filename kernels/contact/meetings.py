@@ -12,6 +12,9 @@ from .shapes import Shapes, carried, distance_to
 
 wp.set_module_options({"enable_backward": False})
 
+#: Each obstacle has a bit in the number for those that a node touches.
+BITS = wp.constant(31)
+
 
 @wp.kernel(enable_backward=False)
 def find_meetings(
@@ -28,7 +31,7 @@ def find_meetings(
     surface: Surface,
     kinds: wp.array2d[wp.int32],
     # In and out
-    kinds_before: wp.array2d[wp.int32],
+    met: wp.array[wp.int32],
     # Out
     begins: wp.array[wp.int32],
 ):
@@ -41,11 +44,11 @@ def find_meetings(
     step = float(pace.seconds[DT]) * load_node(v, i)
     world = surface.world[s]
     meets = bool(False)
+    touched = int(0)
     for o in range(kinds.shape[0]):
         kind = kinds[o, s]
-        if kind != kinds_before[o, s]:
-            kinds_before[o, s] = kind
-            meets = True
+        if kind != APART:
+            touched += wp.lshift(1, o % BITS)
         if kind == APART and inverse_mass[i] > 0.0:
             now = motions.now[world, o]
             moved = carried(now, motions.later[world, o], x)
@@ -55,5 +58,6 @@ def find_meetings(
             after, _end = distance_to(shapes, o, motions.later[world, o], x + step, far)
             if gap <= far and wp.min(gap + wp.dot(n, relative), after) < 0.0:
                 meets = True
-    if meets:
+    if meets or touched != met[i]:
         begins[0] = 1
+    met[i] = touched

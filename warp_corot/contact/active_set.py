@@ -35,8 +35,6 @@ class ActiveSet:
         self._rounds = wp.zeros(1, dtype=wp.int32, device=self.device)
         #: Whether other nodes are held than in the last round, int32 [1].
         self.changed = wp.zeros(1, dtype=wp.int32, device=self.device)
-        #: Nonzero for nodes that touched an obstacle after the step before the last one, int32 [obstacles, places].
-        self.kinds_before = wp.zeros((0, 0), dtype=wp.int32, device=self.device)
         self.prepare()
 
     def prepare(self) -> None:
@@ -44,8 +42,6 @@ class ActiveSet:
         rigid, holding = self._rigid, kernels.Holding()
         holding.kinds, holding.forces = rigid.kinds, rigid.forces
         shape, device = rigid.kinds.shape, self.device
-        if self.kinds_before.shape != shape:
-            self.kinds_before = wp.clone(rigid.kinds)
         holding.released = wp.zeros(shape, dtype=wp.int32, device=device)
         holding.normals, holding.multipliers = (wp.zeros(shape, dtype=wp.vec3, device=device) for _ in range(2))
         holding.least, holding.most = (wp.zeros(shape, dtype=wp.float32, device=device) for _ in range(2))
@@ -127,16 +123,18 @@ class ActiveSet:
         """Launch the results of contact for users."""
         self._launch(kernels.end_places, [d, self._holding, self._surface, self.body.state.contact_forces])
 
-    def launch_meetings(self, begins: wp.array) -> None:
+    def launch_meetings(self, met: wp.array, begins: wp.array) -> None:
         """Launch the test whether contact has changed in the last step, or nodes will meet an obstacle in this one.
 
         Args:
+            met: A number for the obstacles that each node touched when the last step began; then for those that it
+                touches now, int32 [worlds * nodes].
             begins: Nonzero afterwards if so, int32 [1].
         """
         state, obstacles, pace = self.body.state, self._contacts.obstacles, self._contacts.system.pace.arrays
         inputs = [self.body.conditions.inverse_mass, state.rest, state.displacements, state.velocities, pace]
         inputs += [obstacles.shapes, obstacles.motions, self._contacts.law, self._surface, self._rigid.kinds]
-        self._launch(find_meetings, [*inputs, self.kinds_before, begins])
+        self._launch(find_meetings, [*inputs, met, begins])
 
     # --- pieces ------------------------------------------------------------------------------------------------------
 

@@ -61,8 +61,7 @@ class ImplicitStepper(Stepper):
         arrays = enumerate(array for body in self._bodies for array in body.history)
         kept = {f"history.{number}": array for number, array in arrays}
         kept |= {f"velocities.{k}": body.before for k, body in enumerate(self._bodies)}
-        schemes = [(k, body.held) for k, body in enumerate(self._bodies) if body.history and body.held is not None]
-        kept |= {f"meetings.{k}": held.kinds_before for k, held in schemes}
+        kept |= {f"meetings.{k}": body.met for k, body in enumerate(self._bodies) if body.met.size}
         lagged = [(k, body.lagged) for k, body in enumerate(self._bodies) if body.lagged is not None]
         return kept | {f"setup.{k}.{name}": array for k, each in lagged for name, array in each.state.items()}
 
@@ -156,6 +155,8 @@ class BodySteps:
         held: What holds nodes, or None.
         history: The vectors that a step keeps for the next one, and the body's state after it, vec4 each.
         before: Velocities before the last step, for the guess of the next one, vec4; NaN before the first.
+        met: A number for the obstacles that each node touched when the last step began, in schemes of second order,
+            else empty, int32.
         lagged: The preconditioner, if it is kept over many steps, else None.
     """
 
@@ -186,6 +187,7 @@ class BodySteps:
         self._left = [wp.full_like(like, np.nan) if wanted else self._none for _ in range(2)]
         self.history = [*self._h[:wanted], *(self._left if wanted else [])]
         self.before = wp.full_like(like, np.nan)
+        self.met = wp.zeros(len(like) if wanted and self.held is not None else 0, dtype=wp.int32, device=self.device)
         self._drift, self._rates = (self._none if self.viscosity is None else wp.zeros_like(like) for _ in range(2))
         self._begins = wp.zeros(1, dtype=wp.int32, device=self.device)
         self._is_prepared = False
@@ -324,7 +326,7 @@ class BodySteps:
             self._launch(kernels.find_changes, inputs, [self._begins])
             if self.held is not None:
                 # Velocities jump when nodes meet obstacles, so schemes of second order begin again.
-                self.held.launch_meetings(self._begins)
+                self.held.launch_meetings(self.met, self._begins)
             system.ranks.take_most(self._begins)
         inputs = [self._begins, self._table, options.damping]
         outputs = [self.operator.scales, newton.inertia]

@@ -29,7 +29,6 @@ class Held(Protocol):
     """
 
     changed: wp.array
-    kinds_before: wp.array
 
     def prepare(self) -> None: ...
 
@@ -53,7 +52,7 @@ class Held(Protocol):
 
     def launch_end(self, d: wp.array) -> None: ...
 
-    def launch_meetings(self, begins: wp.array) -> None: ...
+    def launch_meetings(self, met: wp.array, begins: wp.array) -> None: ...
 
 
 class Rows(Protocol):
