@@ -43,7 +43,8 @@ class Simulation:
 
     Args:
         bodies, model, integrator, gravity: As for ``warp_corot.Simulation``.
-        deterministic: Whether the run must be the same bit for bit for any number of ranks.
+        deterministic: Whether the run must be the same bit for bit for any number of ranks on the CPU. On several cards
+            its last digits still differ.
         costs: The cost of an element on each rank, in any unit, [ranks]; None: the same everywhere.
         device: The device of this rank; None: that of the bodies. With bodies on the CPU and "cuda" here, a card holds
             only this rank's parts.
