@@ -88,7 +88,7 @@ def test_soft_surfaces_need_backward_euler(device):
 
 
 def test_a_saved_run_of_a_remeshed_body_goes_on(device, tmp_path):
-    """To the tolerance of the solves, because the preconditioner is set up again."""
+    """To the tolerance of the solves."""
     body = block(device, origin=(0.0, 0.0, 0.001), material=wc.Isotropic(500.0, 0.4, 1000.0))
     remesh = wc.OnlineRemesh(every=3, refine_above=1.003, simplify_below=1.001, max_level=6)
     sim = wc.Simulation(body, obstacles=wc.Ground(), gravity=DOWN, integrator=wc.BDF2(dt=DT), remesh=remesh)

@@ -36,9 +36,9 @@ def box(
 
     A rank makes only the leaves that it computes: its share along the order of the tree, and the leaves around the
     nodes that it moves. ``SoftBody`` and ``Simulation`` take the part like a whole mesh. A run has the results of the
-    whole mesh; with ``deterministic=True`` they are the same bits. Nodes and elements of the body are those of the
-    part; ``gather`` puts nodal arrays together on rank 0 in the order of the whole mesh. In expressions, ``zmin`` and
-    the other bounds are those of the whole box.
+    whole mesh; with ``deterministic=True`` they are the same bits on the CPU. Nodes and elements of the body are those
+    of the part; ``gather`` puts nodal arrays together on rank 0 in the order of the whole mesh. In expressions,
+    ``zmin`` and the other bounds are those of the whole box.
 
     Args:
         cells, cell_size, origin, up_axis: As for ``TetForest.box``.

@@ -26,8 +26,8 @@ def divided(make: Callable[[], TetForest], *, costs: npt.ArrayLike | None = None
 
     Only rank 0 calls ``make``, and afterwards it keeps only its part. So one machine holds the whole mesh once, not
     once for each rank. ``SoftBody`` and ``Simulation`` take the part like a whole mesh, as they take that of ``box``;
-    the part has the labels of its leaves. A run gives the same results as with the whole mesh, and the same bits with
-    ``deterministic=True``.
+    the part has the labels of its leaves. A run gives the same results as with the whole mesh, and the same bits on the
+    CPU with ``deterministic=True``.
 
     Args:
         make: Makes the forest, for example ``lambda: TetForest.from_domain(domain, target_elements=10**6)``.
