@@ -99,5 +99,6 @@ def test_a_saved_run_of_a_remeshed_body_goes_on(device, tmp_path):
     sim.advance_steps(3)
     later = wc.Simulation.load(tmp_path / "state.npz")
     later.advance_steps(3)
-    error = np.abs(later.body.displacements.numpy() - body.displacements.numpy()).max()
-    assert error < 1e-6
+    # Passes of remeshing on CUDA number nodes in any order.
+    found = [each.displacements.numpy()[np.lexsort(each.mesh.points.T)] for each in (body, later.body)]
+    assert np.abs(found[1] - found[0]).max() < 1e-6

@@ -11,14 +11,15 @@ from warp_corot.errors import depth_of_user
 
 from .library import newton
 
-#: The number of first steps that are checked, each of which waits for the device; and the number of steps in a row
-#: before which bodies must have moved for the warning. (A reset moves them once, and in a new state they are where the
-#: model has them.)
+#: The number of first steps that are checked; and the number of steps in a row before which bodies must have moved for
+#: the warning. (A reset moves them once, and in a new state they are where the model has them.)
 LOOKS, IN_A_ROW = 8, 3
 
 
 class Elsewhere:
     """Compares the bodies at the start of each of the first steps with those at the end of the step before.
+
+    It does so on the CPU only: steps on CUDA do not wait for the device.
 
     Args:
         model: The model.
@@ -27,7 +28,7 @@ class Elsewhere:
 
     def __init__(self, model: newton.Model, has_bodies: bool):
         self._model = model
-        self._left = LOOKS if has_bodies else 0
+        self._left = LOOKS if has_bodies and model.device.is_cpu else 0
         self._in_a_row = 0
         self._poses: npt.NDArray[np.float32] | None = None
 
