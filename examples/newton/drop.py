@@ -1,7 +1,6 @@
 """A ball of soft tissue, meshed adaptively, falls on a rigid box; both come to rest on the ground. Stress is logged.
 
-The ball's surface is drawn and follows its tetrahedra. These extend a little beyond the surface, because cut
-tetrahedra are simulated whole.
+The surface is drawn and follows the tetrahedra, which reach a little beyond it: cut ones are simulated whole.
 
 python examples/newton/drop.py --viewer null --test, or --viewer usd --output-path drop.usd, gl, rerun, viser.
 Without a display and --viewer, frames go to a USD file.

@@ -403,5 +403,5 @@ def test_refusals(device):
         wc.static_gradient(body, nothing, iterations=1, tolerance=1e-12, gravity=(0, -1e5, 0))
     found = wc.static_gradient(body, lambda x: (1.0, np.ones((len(mesh.points), 3))))
     assert found["young"] == found.young
-    with pytest.raises(wc.InputError, match="'loads' is not among"):
+    with pytest.raises(wc.InputError, match="'loads' is not one of the requested"):
         found["loads"]

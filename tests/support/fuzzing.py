@@ -332,7 +332,7 @@ class Cases:
                 SEEDS["usda"](folder)
         else:
             self.seed = SEEDS[form](folder)
-        self.good = {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+        self.good = {folder / name: (folder / name).read_bytes() for name in sorted(files_in(folder))}
         self.sizes = files_in(folder)
         self.broken: Path | None = None
 
