@@ -18,7 +18,7 @@ STIFFNESSES = (1e3, 1e5)
 
 
 def outcome(scene: scenes.Scene, stiffness: float) -> scenes.Outcome:
-    """Run it. Forces are those of Newton's penalty, stiffness times depth, without damping."""
+    """Run the scene. Forces are Newton's penalty: stiffness times depth, without damping."""
     model, sizes = _model(scene, stiffness)
     piled = len(scene.meshes) > 1
     solver = newton.solvers.SolverVBD(

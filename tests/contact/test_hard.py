@@ -320,3 +320,17 @@ def test_a_body_that_is_thrown_faster_than_any_search_reaches_takes_shorter_step
     outside = ((mesh.points == mesh.points.min(axis=0)) | (mesh.points == mesh.points.max(axis=0))).any(axis=1)
     assert body.positions.numpy()[outside, 2].min() > -1e-4
     assert sim.energy().total < before
+
+
+def test_a_given_step_that_no_search_reaches_ends_in_the_last_good_state(device):
+    mesh = wc.TetForest.box((2, 2, 2), 0.05, level=3, origin=(0.0, 0.0, 0.02))
+    body = wc.SoftBody(mesh, wc.Isotropic(50.0, 0.3, 1000.0), device=device)
+    body.velocities = np.tile([0.0, 0.0, -5.0], (body.node_count, 1))
+    euler = wc.SymplecticEuler(dt=0.06)
+    sim = wc.Simulation(body, obstacles=wc.Ground(), gravity=(0.0, 0.0, -9.81), integrator=euler)
+    with pytest.raises(
+        wc.UnstableError, match=r"farther than 55 mm .* take a shorter step.* the state is that of t = 0 s"
+    ):
+        sim.advance(0.3)
+    assert sim.time == 0.0
+    assert not body.displacements.numpy().any()

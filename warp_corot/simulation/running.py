@@ -303,6 +303,7 @@ class Running:
             UnstableError: The user gave the step, or no shorter one helps.
         """
         sim = self._sim
+        restores = sim.integrator.is_implicit or fault.is_want_of_room
         if fault.is_want_of_room:
             too_far = self._grow()
             if too_far is None:
@@ -312,7 +313,7 @@ class Running:
         if sim.safe_step is None or self._returns >= MOST_RETURNS:
             self._returns = 0
             message = fault_message(sim, fault, MOST_RETURNS)
-            if sim.integrator.is_implicit:
+            if restores:
                 sim.guard.go_back()
                 message += f"; the state is that of t = {sim.time:.4g} s again"
             sim.guard.forget()
