@@ -328,9 +328,7 @@ def test_a_given_step_that_no_search_reaches_ends_in_the_last_good_state(device)
     body.velocities = np.tile([0.0, 0.0, -5.0], (body.node_count, 1))
     euler = wc.SymplecticEuler(dt=0.06)
     sim = wc.Simulation(body, obstacles=wc.Ground(), gravity=(0.0, 0.0, -9.81), integrator=euler)
-    with pytest.raises(
-        wc.UnstableError, match=r"farther than 55 mm .*; the state is that of t = 0 s"
-    ):
+    with pytest.raises(wc.UnstableError, match=r"farther than 55 mm .*; the state is that of t = 0 s"):
         sim.advance(0.3)
     assert sim.time == 0.0
     assert not body.displacements.numpy().any()
