@@ -17,7 +17,7 @@ from warp_corot.kernels.stepping.pace import DT, Pace
 from .law import SETTLING, Law, held_back
 from .locate import locate_edge, locate_node
 from .motion import Surface
-from .rows import Meeting, Rows, row_count
+from .rows import Meeting, Rows, row_count, triangle_normal
 from .vertices import across
 
 wp.set_module_options({"enable_backward": False})
@@ -132,6 +132,17 @@ def least_gap(gap: float, law: Law, dt: float):
 
 
 @wp.func
+def is_faced(row: int, s: int, surface: Surface, meeting: Meeting, rows: Rows):
+    """Whether the normal of a node at a triangle points into the node's body: otherwise the two face each other
+    elsewhere. At a rim, where two faces meet, a node need not be above both.
+    """
+    out = wp.vec3()
+    for k in range(meeting.corner_starts[s], meeting.corner_starts[s + 1]):
+        out += triangle_normal(surface, meeting.triangles[meeting.corners[k] / 3])
+    return wp.dot(out, rows.normal[row]) <= 0.0
+
+
+@wp.func
 def locate(
     row: int,
     is_first: int,
@@ -150,6 +161,7 @@ def locate(
         is_near = locate_edge(row, owner - nodes, rows.other[row], surface, meeting, rows)
     elif owner >= 0:
         is_near = locate_node(row, owner, rows.other[row], surface, meeting, rows)
+        is_near = is_near and is_faced(row, owner, surface, meeting, rows)
     was = joined.force[row]
     if is_first != 0:
         was = rows.force[row]
