@@ -207,7 +207,7 @@ def say_overlaps(touched: Touched, bodies: Sequence[Body], sim: Simulation) -> N
         used = body.subject.used
         points = wp.array(body.soft.mesh.points[used].astype(np.float32), dtype=wp.vec3, device=sim.device)
         gaps = wp.zeros((obstacles.count, len(used)), dtype=wp.float32, device=sim.device)
-        inputs = [obstacles.shapes, obstacles.motions, points, float(body.subject.height)]
+        inputs = [obstacles.shapes, obstacles.motions, 0, points, float(body.subject.height)]
         wp.launch(find_gaps, gaps.shape, inputs, [gaps], device=sim.device)
         deepest = -gaps.numpy().min(axis=1)
         poses = obstacles.poses()[0]

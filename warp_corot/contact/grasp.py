@@ -90,6 +90,14 @@ class Grasp:
             self._forces.zero_()
             self._wrenches.zero_()
 
+    def again(self, body: SoftBody) -> Grasp:
+        """The same grasp of a body that continues this one's in a simulation that has taken the tool."""
+        grasp = Grasp(body, self.nodes, tool=self.tool, stiffness=self.stiffness)
+        for array, former in ((grasp._places, self._places), (grasp._forces, self._forces)):
+            if len(array) == len(former):
+                wp.copy(array, former)
+        return grasp
+
     # --- as a constraint -------------------------------------------------------------------------------------------
 
     is_full = False

@@ -72,10 +72,7 @@ class Obstacles:
         self.wrenches: wp.array = wp.zeros((self.count, self.worlds), dtype=wp.spatial_vectorf, device=device)
         self._keys, self._dt = -1, dt
         self.update()
-        for number, tool in enumerate(self.tools):
-            tool.bind(self, number)
-            if isinstance(each := given[number], Shape):
-                each.felt = tool
+        self._bind()
 
     @property
     def count(self) -> int:
@@ -130,6 +127,22 @@ class Obstacles:
         self.system.motion_rates[:1].fill_(max(rates, default=0.0))
         self.revision += 1
 
+    def let_go(self) -> None:
+        """Let another simulation have the tools."""
+        for tool in self.tools:
+            tool.unbind()
+
+    def take_back(self) -> None:
+        """Have the tools again."""
+        self.let_go()
+        self._bind()
+
+    def continue_from(self, former: Obstacles) -> None:
+        """Take the places of another simulation's obstacles, now and after a reset."""
+        wp.copy(self.initial, former.initial)
+        for name in ("now", "later", "target"):
+            wp.copy(getattr(self.motions, name), getattr(former.motions, name))
+
     def send(self, number: int, pose: npt.NDArray[np.float64]) -> None:
         """Send a tool to a place in all worlds."""
         given = wp.array(pose.astype(np.float32).reshape(1, 7), dtype=wp.transform, device=self.device)
@@ -163,12 +176,12 @@ class Obstacles:
             inputs = [chosen, self.initial, self.motions]
             wp.launch(kernels.reset_obstacles, (self.worlds, self.count), inputs, device=self.device)
 
-    def gaps(self, points: npt.NDArray[np.float64], most: float) -> npt.NDArray[np.float32]:
-        """Distances of points [m], [n, 3], from the obstacles of the first world [m], negative inside, [O, n]; only
+    def gaps(self, points: npt.NDArray[np.float64], most: float, world: int = 0) -> npt.NDArray[np.float32]:
+        """Distances of points [m], [n, 3], from the obstacles of one world [m], negative inside, [O, n]; only
         those of less than ``most`` are exact. Waits for the device."""
         found = wp.zeros((self.count, len(points)), dtype=wp.float32, device=self.device)
         asked = wp.array(points, dtype=wp.vec3, device=self.device)
-        wp.launch(find_gaps, found.shape, [self.shapes, self.motions, asked, most], [found], device=self.device)
+        wp.launch(find_gaps, found.shape, [self.shapes, self.motions, world, asked, most], [found], device=self.device)
         return found.numpy()
 
     def poses(self) -> npt.NDArray[np.float64]:
@@ -178,6 +191,12 @@ class Obstacles:
     def wrench(self, number: int) -> wp.array:
         """The wrench on one of them [N, N m], spatial vectors [worlds]."""
         return self.wrenches[number]
+
+    def _bind(self) -> None:
+        for number, tool in enumerate(self.tools):
+            tool.bind(self, number)
+            if isinstance(each := self.given[number], Shape):
+                each.felt = tool
 
     def _shapes(self, shapes: Sequence[Shape], friction: float) -> Shapes:
         device = self.device

@@ -153,6 +153,10 @@ class Tool:
             raise InputError("a tool is in two simulations; make another one of its shape")
         self._bound = (obstacles, number)
 
+    def unbind(self) -> None:
+        """Be in no simulation."""
+        self._bound = None
+
     def released(self) -> Tool:
         """The same tool in no simulation."""
         found = copy.copy(self)

@@ -145,7 +145,7 @@ def _depths(surface: Floats, triangles: npt.NDArray[np.int32], points: Floats, d
     motions.later = wp.array([[[0, 0, 0, 0, 0, 0, 1]]], dtype=wp.transform, device=device)
     found = wp.zeros((1, int(inside.sum())), dtype=wp.float32, device=device)
     asked = wp.array(points[inside], dtype=wp.vec3, device=device)
-    wp.launch(find_gaps, found.shape, [shape, motions, asked, reach], [found], device=device)
+    wp.launch(find_gaps, found.shape, [shape, motions, 0, asked, reach], [found], device=device)
     depths[inside] = np.maximum(-found.numpy()[0], 0.0)
     return depths
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
 import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
-from warp_corot.contact.tool import Tool
+from warp_corot.contact.grasp import Grasp
 from warp_corot.elasticity import Model
 from warp_corot.errors import InputError
 from warp_corot.materials.isotropic import Material
@@ -24,39 +25,58 @@ def remade(
     models: Sequence[Model] | None = None,
     materials: Sequence[Material] | None = None,
     remesh: Sequence[OnlineRemesh | None] | None = None,
+    grasps: Sequence[Grasp] | None = None,
 ) -> Simulation:
     """A new simulation that continues this one: new bodies with the present meshes, states, loads, supports and
     motions, at the same time. The given simulation is not changed, and must not be stepped any further.
 
+    The new simulation takes the tools, which go on as they were going. Grasps hold the same nodes in new ``Grasp``s.
     Hooks are not carried over, nor is the memory of contact, such as where things stick.
 
     Args:
         models: The model of each body; None: the present ones.
         materials: Materials of the present elements of each body; None: the present ones.
         remesh: How each body is remeshed from now on; None: not at all.
+        grasps: The grasps that go on; None: all.
 
     Raises:
-        InputError: There are tools, or a body is remeshed and follows keyframes; or as ``Simulation``. The given
-            simulation is unchanged.
+        InputError: A body is remeshed and follows keyframes; or as ``Simulation``. The given simulation is unchanged.
     """
-    obstacles = () if sim.contact is None else sim.contact.obstacles.given
-    if any(isinstance(each, Tool) for each in obstacles):
-        raise InputError("a tool belongs to one simulation; laws, materials and remeshing stay as they are with tools")
     bodies = [_copy_of(body, None if materials is None else materials[k]) for k, body in enumerate(sim.bodies)]
-    again = Simulation(
-        bodies,
-        model=sim.models if models is None else models,
-        integrator=sim.integrator,
-        gravity=sim.gravity,
-        deterministic=sim.deterministic,
-        remesh=remesh if remesh is not None and any(remesh) else None,
-        obstacles=obstacles,
-        contact=None if sim.contact is None else sim.contact.options,
-    )
+    with tools_lent(sim):
+        again = Simulation(
+            bodies,
+            model=sim.models if models is None else models,
+            integrator=sim.integrator,
+            gravity=sim.gravity,
+            deterministic=sim.deterministic,
+            remesh=remesh if remesh is not None and any(remesh) else None,
+            obstacles=() if sim.contact is None else sim.contact.obstacles.given,
+            contact=None if sim.contact is None else sim.contact.options,
+        )
+        if sim.contact is not None:
+            assert again.contact is not None
+            again.contact.obstacles.continue_from(sim.contact.obstacles)
+        for grasp in sim.grasps if grasps is None else grasps:
+            grasp.again(again.bodies[sim.bodies.index(grasp.body)])
     again.steps_before_reset, again.time_before_reset = sim.steps_before_reset, sim.time_before_reset
     known = again.pace.known
     again.pace.put_back(replace(known, counts=(sim.steps, sim.steps), seconds=(known.seconds[0], sim.time, 0.0)))
     return again
+
+
+@contextmanager
+def tools_lent(sim: Simulation) -> Iterator[None]:
+    """Let another simulation take the tools of this one; if the block raises, they are given back."""
+    obstacles = None if sim.contact is None else sim.contact.obstacles
+    if obstacles is not None:
+        obstacles.let_go()
+    try:
+        yield
+    except BaseException:
+        if obstacles is not None:
+            obstacles.take_back()
+        raise
 
 
 def _copy_of(body: SoftBody, material: Material | None) -> SoftBody:

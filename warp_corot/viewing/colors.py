@@ -52,10 +52,10 @@ class ElementValues:
     """Values of elements, averaged to nodes by volume and carried to the points of a surface, on the device.
 
     Args:
-        values: The values of the first world's elements, float32 [T] or more, on the body's device.
+        values: The values of the shown world's elements, float32 [T], on the body's device.
     """
 
-    def __init__(self, values: Callable[[Simulation, SoftBody], wp.array]):
+    def __init__(self, values: Callable[[Simulation, Shown], wp.array]):
         self._values = values
         self._averages: dict[SoftBody, _Average] = {}
 
@@ -64,7 +64,7 @@ class ElementValues:
         average = self._averages.get(body)
         if average is None or average.version != body.version:
             average = self._averages[body] = _Average(body)
-        return average(self._values(sim, body), shown)
+        return average(self._values(sim, shown), shown)
 
 
 class _Average:
@@ -92,23 +92,26 @@ class _Average:
         return found.numpy()
 
 
-def _stress(sim: Simulation, body: SoftBody) -> wp.array:
+def _stress(sim: Simulation, shown: Shown) -> wp.array:
+    body = shown.body
     field = sim.fields[sim.bodies.index(body)]
     stress = wp.zeros(field.element_count, dtype=wp.float32, device=body.device)
     with field.state_kept():
         field.write_von_mises(body.state.displacements, stress)
-    return stress
+    return stress[shown.world.elements]
 
 
-def _level(sim: Simulation, body: SoftBody) -> wp.array:
-    assert isinstance(body.mesh, TetForest)
-    return wp.array(body.mesh.levels, dtype=wp.float32, device=body.device)
+def _level(sim: Simulation, shown: Shown) -> wp.array:
+    mesh = shown.body.mesh
+    assert isinstance(mesh, TetForest)
+    return wp.array(mesh.levels, dtype=wp.float32, device=shown.body.device)
 
 
 def contact_pressure(sim: Simulation, shown: Shown) -> Values:
     """Contact pressure in the last step [Pa]: triangles' values, averaged to nodes by area."""
     body = shown.body
-    nodal = pressure_at_nodes(body.mesh.points, body.surface_triangles, body.contact_pressure.numpy())
+    pressure = body.contact_pressure.numpy().reshape(body.worlds, -1)[shown.world.index]
+    nodal = pressure_at_nodes(body.mesh.points, body.surface_triangles, pressure)
     return np.einsum("vn,vn->v", shown.binding.weights.numpy(), nodal[shown.binding.nodes.numpy()])
 
 

@@ -28,6 +28,7 @@ class Controls:
         colors: A name in ``Session.sources``; "" for none.
         surface: The name of the surface that is shown; bodies without it show their first.
         plane: Where bodies are cut, if they are.
+        world: The number of the world that is shown.
     """
 
     running: bool = True
@@ -39,6 +40,7 @@ class Controls:
     colors: str = "stress"
     surface: str = ""
     plane: Plane | None = None
+    world: int = 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -70,8 +70,8 @@ class StiffSprings(BodySprings):
 
     @property
     def _places(self) -> list[wp.array]:
-        binding = self.shown.binding
-        return [self._springs, self._patches, self._shares, binding.nodes, binding.weights]
+        shown = self.shown
+        return [self._springs, self._patches, self._shares, shown.nodes, shown.binding.weights]
 
     def _longest_step(self) -> float:
         if self._explicit_dt is None:

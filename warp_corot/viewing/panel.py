@@ -117,6 +117,10 @@ class Panel:
             names = list(dict.fromkeys(name for surfaces in session.surfaces for name in surfaces))
             surface = self._gui.add_dropdown("surface", names, initial_value=names[0])
             surface.on_update(lambda _: self._change(surface=surface.value))
+            if session.sim.worlds > 1:
+                numbers = [str(world) for world in range(session.sim.worlds)]
+                world = self._gui.add_dropdown("world", numbers, initial_value=str(session.controls.world))
+                world.on_update(lambda _: self._change(world=int(world.value)))
             axis = self._gui.add_dropdown("cut", [NOTHING, "x", "y", "z"])
             place = self._gui.add_slider("place", 0.01, 0.99, 0.01, 0.5)
             flipped = self._gui.add_checkbox("other side", False)

@@ -143,7 +143,7 @@ class Saving:
                     path,
                     duration=float(self._seconds.value),
                     fps=FPS,
-                    world=0,
+                    world=session.controls.world,
                     surface=[surfaces.get(INPUT) for surfaces in session.surfaces],
                     progress=progress,
                 )

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from warp_corot.contact.tool import Tool
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.mesh.surfaces.bound import SurfaceMesh
-from warp_corot.simulation.remade import remade
+from warp_corot.simulation.remade import remade, tools_lent
 from warp_corot.simulation.simulation import Simulation
 
 from .colors import Range, Source, colored, sources
@@ -85,9 +85,9 @@ class Session:
 
     def change(self, **values: Any) -> None:
         """Change controls, and the picture with them."""
-        shown = self.controls.surface, self.controls.plane
-        self.controls = replace(self.controls, **values)
-        if (self.controls.surface, self.controls.plane) != shown:
+        before = self.controls
+        self.controls = now = replace(before, **values)
+        if (now.surface, now.plane, now.world) != (before.surface, before.plane, before.world):
             self._show()
 
     def step(self, count: int = 1) -> None:
@@ -113,9 +113,12 @@ class Session:
         """
         self._check_free()
         what.setdefault("remesh", [None if c is None else c.options for c in self.sim.remeshing.changing])
-        again = remade(self.sim, **what)
-        if self._made is not None:
-            self._made(again)
+        held = {grasp for hand in self.hands.values() if isinstance(hand, ToolHand) for grasp in hand.grasps}
+        what.setdefault("grasps", [grasp for grasp in self.sim.grasps if grasp not in held])
+        with tools_lent(self.sim):
+            again = remade(self.sim, **what)
+            if self._made is not None:
+                self._made(again)
         self._close()
         self.sim = again
         self._open()
@@ -155,7 +158,7 @@ class Session:
             raise InputError(f"the {given!r} does not move; a Tool of its shape would")
         self.let_go(owner)
         held = [key for key, hand in self.hands.items() if isinstance(hand, ToolHand) and hand.tool is given]
-        hand = self.hands.pop(held[0]) if held else ToolHand(given)
+        hand = self.hands.pop(held[0]) if held else ToolHand(given, self.controls.world)
         assert isinstance(hand, ToolHand)
         self.hands[owner] = hand
         hand.begin()
@@ -223,7 +226,7 @@ class Session:
             triangles=[shown.triangles for shown in self.shown],
             colors=[colored(v, highest, len(p)) for v, p in zip(values, positions, strict=True)],
             highest=highest,
-            poses=[tool.present_pose[0] for tool in self.tools],
+            poses=[tool.present_pose[self.controls.world] for tool in self.tools],
             time=self.sim.time,
             ratio=self.pace.ratio,
             slow=self.controls.running and self.pace.is_slow(self.controls.speed),
@@ -266,7 +269,7 @@ class Session:
         if not first:
             self._close()
         pairs = zip(self.sim.bodies, self.surfaces, strict=True)
-        self.shown = [Shown(body, self._surface(body.mesh, surfaces)) for body, surfaces in pairs]
+        self.shown = [Shown(body, self._surface(body.mesh, surfaces), self.controls.world) for body, surfaces in pairs]
         self.springs = springs_of(self.sim, self.shown)
         self.number += 1
         for shown in self.shown:

@@ -51,22 +51,23 @@ class Pick:
 
 
 class Shown:
-    """The shown surface of a body, first world.
+    """The shown surface of a body in one world.
 
     Args:
         body: The body.
         surface: Bound to the nodes of its present mesh. Its topology stays; if the body is remeshed, its points are
             bound again to the elements that contain them.
+        world: The number of the world.
 
     Attributes:
         rest: Points at rest [m], float64 [V, 3].
         triangles: int32 [F, 3].
-        binding: The points on the device.
+        binding: The points on the device, bound to the nodes of one world.
         positions: The points at the last reading [m], float32 [V, 3].
     """
 
-    def __init__(self, body: SoftBody, surface: SurfaceMesh):
-        self.body, self.rest, self.triangles = body, surface.points, surface.triangles
+    def __init__(self, body: SoftBody, surface: SurfaceMesh, world: int = 0):
+        self.body, self.world, self.rest, self.triangles = body, body.world(world), surface.points, surface.triangles
         self.binding: DeviceBinding
         if body.changing is not None:
             self.binding = body.bind(surface.points)
@@ -74,6 +75,15 @@ class Shown:
             # Triangles are not needed here, because browsers compute normals themselves.
             self.binding = BoundPoints(surface.points, surface.nodes, surface.weights).on_device(body.device)
         self.positions = surface.points.astype(np.float32)
+        self._nodes: wp.array | None = None
+        if world:
+            nodes = surface.nodes + self.world.nodes.start
+            self._nodes = wp.array(nodes, dtype=wp.vec4i, device=body.device)
+
+    @property
+    def nodes(self) -> wp.array:
+        """The nodes to which each point is bound, among those of all worlds of the body, vec4i [V]."""
+        return self.binding.nodes if self._nodes is None else self._nodes
 
     def close(self) -> None:
         """Release the points: the body no longer keeps them bound."""
@@ -82,7 +92,7 @@ class Shown:
 
     def read(self) -> npt.NDArray[np.float32]:
         """Bring ``positions`` up to date and return them."""
-        self.binding.update(self.body.displacements)
+        self.binding.update(self.world.displacements)
         self.positions = self.binding.positions.numpy().copy()
         return self.positions
 

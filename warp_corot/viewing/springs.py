@@ -172,8 +172,7 @@ class BodySprings:
         count = len(patch.points)
         self._patches[slot, :count].assign(patch.points.astype(np.int32))
         self._shares[slot, :count].assign(patch.shares.astype(np.float32))
-        binding = self.shown.binding
-        inputs = [self._patches[slot], binding.nodes, binding.weights, self.body.state.displacements]
+        inputs = [self._patches[slot], self.shown.nodes, self.shown.binding.weights, self.body.state.displacements]
         wp.launch(kernels.take_hold, count, inputs, [self._starts[slot]], device=self.body.device)
         spring.start = patch.shares @ self._starts[slot].numpy()[:count]
         self._begin(slot)
@@ -213,7 +212,7 @@ class BodySprings:
     def _fit(self, spring: Spring) -> None:
         """The stiffness and the damping that are stable at the time step."""
         # Copied, since a view of a device's array may be the array itself.
-        nodes = np.array(self.shown.binding.nodes.numpy()[spring.patch.points])
+        nodes = np.array(self.shown.nodes.numpy()[spring.patch.points])
         weights = np.array(self.shown.binding.weights.numpy()[spring.patch.points], dtype=np.float64)
         weights *= spring.patch.shares[:, None]
         used, place, visits = np.unique(nodes, return_inverse=True, return_counts=True)
@@ -245,16 +244,16 @@ class ExplicitSprings(BodySprings):
         self._last = wp.zeros((MOST_HANDS, MOST_POINTS), dtype=wp.vec3, device=device)
 
     def launch(self) -> None:
-        system, state, binding = self.sim.system, self.body.state, self.shown.binding
-        inputs = [self._springs, self._patches, self._shares, self._starts, self._parts, binding.nodes]
-        inputs += [binding.weights, system.pace.arrays, system.offset, system.gravity]
+        system, state, shown = self.sim.system, self.body.state, self.shown
+        inputs = [self._springs, self._patches, self._shares, self._starts, self._parts, shown.nodes]
+        inputs += [shown.binding.weights, system.pace.arrays, system.offset, system.gravity]
         inputs += [self.body.conditions.inverse_mass, state.displacements, state.velocities]
         outputs = [self._last, self._counted, state.forces, self._found, system.support_work]
         wp.launch(kernels.pull, MOST_HANDS, inputs, outputs, device=self.body.device)
 
     def launch_completion(self) -> None:
-        system, binding = self.sim.system, self.shown.binding
-        inputs = [self._springs, self._patches, binding.nodes, binding.weights]
+        system, shown = self.sim.system, self.shown
+        inputs = [self._springs, self._patches, shown.nodes, shown.binding.weights]
         inputs += [system.pace.arrays, self.body.state.velocities]
         outputs = [self._last, self._counted, system.support_work]
         wp.launch(kernels.complete_work, MOST_HANDS, inputs, outputs, device=self.body.device)

@@ -21,6 +21,7 @@ class ToolHand:
 
     Args:
         tool: A tool that nothing else moves.
+        world: The world in which it is seen; it moves in all of them.
 
     Raises:
         InputError: The tool follows keyframes or an array.
@@ -28,16 +29,16 @@ class ToolHand:
 
     stays: ClassVar[bool] = True
 
-    def __init__(self, tool: Tool):
+    def __init__(self, tool: Tool, world: int = 0):
         if tool.keys is not None or tool.poses is not None:
             raise InputError("this tool follows keyframes or an array; the mouse moves tools that nothing else moves")
-        self.tool = tool
+        self.tool, self.world = tool, world
         self.grasps: list[Grasp] = []
         self.begin()
 
     def begin(self) -> None:
         """Take hold again: motion counts from here."""
-        self._before = self._target = self.tool.present_pose[0][:3].copy()
+        self._before = self._target = self._place
 
     def grasp(self, bodies: Sequence[SoftBody], reach: float) -> None:
         """Hold the surface nodes of bodies that are nearer to the tool than ``reach`` [m], until ``release``.
@@ -50,8 +51,8 @@ class ToolHand:
         obstacles, number = self.tool.place_among_obstacles()
         for body in bodies:
             nodes = np.unique(body.surface_triangles)
-            places = body.positions.numpy()[nodes].astype(np.float64)
-            near = nodes[obstacles.gaps(places, reach)[number] < reach]
+            places = body.world(self.world).positions.numpy()[nodes].astype(np.float64)
+            near = nodes[obstacles.gaps(places, reach, self.world)[number] < reach]
             if len(near):
                 self.grasps.append(Grasp(body, near, tool=self.tool))
         if not self.grasps:
@@ -72,9 +73,13 @@ class ToolHand:
     def force(self) -> Vector:
         """The force of the tool on the tissue in the last step [N], float64 [3]."""
         felt = [self.tool.wrench, *(grasp.wrench for grasp in self.grasps)]
-        return -np.array([wrench.numpy()[0][:3] for wrench in felt], np.float64).sum(axis=0)
+        return -np.array([wrench.numpy()[self.world][:3] for wrench in felt], np.float64).sum(axis=0)
 
     @property
     def ends(self) -> tuple[Vector, Vector]:
         """Where the tool is and where it is to go [m], float64 [3] each."""
-        return self.tool.present_pose[0][:3], self._target
+        return self._place, self._target
+
+    @property
+    def _place(self) -> Vector:
+        return self.tool.present_pose[self.world][:3].copy()

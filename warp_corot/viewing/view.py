@@ -157,7 +157,7 @@ def view(
     and the simulation runs in a thread: use it only inside ``with page.held() as sim:``.
 
     Args:
-        sim: The simulation. The page shows its first world.
+        sim: The simulation. Of several worlds the page shows one at a time.
         host: The address to listen at; only this computer reaches the loopback address.
         port: The port, 0 for any free one.
         token: The word that visitors need, as in ``http://HOST:PORT/?token=…``. Without one, only browsers on this
