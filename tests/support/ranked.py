@@ -15,7 +15,7 @@ wp.config.quiet = True
 wp.config.enable_backward = False
 
 import warp_corot as wc  # noqa: E402
-from warp_corot.distributed import mpi, simulation  # noqa: E402
+from warp_corot.distributed import front, mpi, simulation  # noqa: E402
 from warp_corot.distributed.patience import Patient, patience  # noqa: E402
 
 
@@ -160,6 +160,34 @@ def forest_divided() -> np.ndarray | None:
     return wd.gather(body.positions)
 
 
+def general_divided() -> np.ndarray | None:
+    """The run "newmark" of a general mesh that rank 0 makes and divides; the positions of all nodes on rank 0."""
+    import warp_corot.distributed as wd
+
+    body = body_of(wd.divided(jittered), 0.3)
+    sim = wd.Simulation(body, deterministic=True, **options_of("newmark"))
+    moved(sim, body)
+    return wd.gather(body.positions)
+
+
+def led() -> np.ndarray | None:
+    """The run "forest" of a body that only rank 0 has whole; other ranks get parts."""
+    everybody = mpi.world()
+    if everybody.rank > 0:
+        front.Crew.joined("cpu").serve()
+        return None
+    body = body_of(graded(), 0.49)
+    sim = front.LedSimulation(body, in_parts=True, deterministic=True)
+    moved(sim, body)
+    positions, called = body.positions.numpy().copy(), []
+    sim.on_step(lambda sim: called.append(sim.time), every=1)
+    sim.advance_steps(2)
+    sim.end()
+    assert len(called) == 2
+    assert called[-1] == sim.time
+    return positions
+
+
 def worlds_in_parts(stage: Path) -> dict[str, np.ndarray | None]:
     """The run "worlds" with a mesh of which each rank holds a part, recorded; and once more with no disk space on the
     last rank."""
@@ -212,7 +240,9 @@ def make_all(folder: Path, size: int, names: list[str]) -> None:
             if path.stem.split(".")[0] in names and path.exists():
                 found |= resumed(path)
         if "forest" in names:
-            found |= made("forest", False, None) | {"divided.x": forest_divided()}
+            found |= made("forest", False, None) | {"divided.x": forest_divided(), "led.x": led()}
+        if "newmark" in names:
+            found["divided.newmark.x"] = general_divided()
         if "worlds" in names:
             found |= worlds_in_parts(folder / f"{size}.usda")
             for path in folder.glob("parts.?.npz"):

@@ -23,7 +23,7 @@ from .bodies import model_of
 from .compiling import compiling_said
 from .loading import Load, loads_of, ramp_of
 from .opened import offset_of
-from .ranks import are_several
+from .ranks import are_several, hands_out
 from .say import complain, kept_so_far
 from .subject import BOX_LEVEL
 from .summary import aligned, length, milliseconds, pressure
@@ -62,7 +62,8 @@ def is_in_parts(options: Sequence[argparse.Namespace]) -> bool:
         others.append("probe")
     others += sorted(words & WHOLE)
     if others:
-        complain(f"every rank makes the whole box, because of {', '.join(others)}", kind="note")
+        who = "rank 0" if hands_out(options) else "every rank"
+        complain(f"{who} makes the whole box, because of {', '.join(others)}", kind="note")
     return not others
 
 
@@ -189,7 +190,7 @@ class _Table:
 
 
 def _summary(args: argparse.Namespace, sim: Simulation, loads: Sequence[Load], done: Recording) -> str:
-    from warp_corot.distributed.parts import ForestPart
+    from warp_corot.distributed.part_meshes import ForestPart
 
     body, mesh = sim.body, sim.body.mesh
     assert isinstance(mesh, ForestPart)

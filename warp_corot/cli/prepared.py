@@ -15,6 +15,7 @@ from .compiling import compiling_said
 from .loading import ramp_of
 from .pressing import press_patches
 from .probing import Probe
+from .ranks import Others
 from .say import complain
 from .stepping import make_simulation
 from .touching import Touched, place_ground, say_overlaps, say_reach, touched_by
@@ -45,11 +46,12 @@ class Run:
     touched: Touched
 
 
-def prepared(options: Sequence[argparse.Namespace]) -> Run:
+def prepared(options: Sequence[argparse.Namespace], others: Others | None = None) -> Run:
     """Read and mesh the bodies, and set up their simulation.
 
     Args:
         options: Options of each input.
+        others: The ranks that get parts of the bodies, if there are any.
     """
     shared = options[0]
     device = checked_device(shared.device)
@@ -71,7 +73,7 @@ def prepared(options: Sequence[argparse.Namespace]) -> Run:
             make_body(body, duration)
         place_ground(touched, shared, bodies, gravity_of(shared, bodies[0].subject))
         with waiting("preparing the simulation"):
-            sim = make_simulation(shared, bodies, touched)
+            sim = make_simulation(shared, bodies, touched, others)
             say_overlaps(touched, bodies, sim)
             say_reach(bodies, sim)
         for body in bodies:

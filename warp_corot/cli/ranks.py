@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+from warp_corot.errors import InputError
 from warp_corot.inputs.processes import process_count, process_number
 
 #: Time for rank 0 to reach the place where another rank failed, and to report it [s].
@@ -50,9 +52,10 @@ def let_others_speak() -> None:
 
 
 @contextmanager
-def one_first() -> Iterator[None]:
-    """Run the block on rank 0 first, then on all other ranks together, which find the kernels that rank 0 compiled."""
-    if not are_several():
+def one_first(others: Others | None) -> Iterator[None]:
+    """Run the block on rank 0 first, then on all other ranks together, which find the kernels that rank 0 compiled;
+    only on rank 0 if the others wait for it."""
+    if others is not None or not are_several():
         yield
         return
     from warp_corot.distributed import mpi
@@ -67,8 +70,53 @@ def one_first() -> Iterator[None]:
             mpi.meet(comm)
 
 
+def hands_out(options: Sequence[argparse.Namespace]) -> bool:
+    """Whether rank 0 makes the bodies and hands out parts; otherwise every rank makes them whole."""
+    args = options[0]
+    touches = (args.tool, args.tool_path, args.drop, args.touch, args.self_contact)
+    whole = any(each.remesh or each.rotation_level is not None for each in options)
+    return are_several() and args.ground is None and not any(touches) and not whole
+
+
+class Others:
+    """On rank 0: the ranks that wait for their parts of the bodies."""
+
+    def __init__(self) -> None:
+        self._are_waiting = True
+        self._sim: Any = None
+
+    def simulation(self, **options: Any) -> Any:
+        """The simulation of the bodies, whose parts these ranks get."""
+        from warp_corot.distributed.front import LedSimulation
+
+        self._are_waiting = False
+        self._sim = LedSimulation(in_parts=True, **options)
+        return self._sim
+
+    def dismiss(self, error: InputError) -> None:
+        """End these ranks, because of an error before the first step."""
+        from warp_corot.distributed import dividing, mpi
+
+        if self._are_waiting:
+            self._are_waiting = False
+            dividing.dismiss(error, mpi.world())
+        elif self._sim is not None:
+            self._sim.end()
+
+
+def serve(device: str | None) -> None:
+    """On other ranks than 0: make the steps of the parts that rank 0 hands out.
+
+    Raises:
+        InputError, UnstableError: As on rank 0.
+    """
+    from warp_corot.distributed.front import Crew
+
+    Crew.joined(device).serve()
+
+
 def led_simulation(**options: Any) -> Any:
-    """The simulation of all ranks, for ``stepping.make_simulation``."""
+    """The simulation of all ranks, each of which has the whole bodies."""
     from warp_corot.distributed.front import LedSimulation
 
     return LedSimulation(**options)

@@ -18,7 +18,7 @@ from .options import add_parser
 from .prepared import Run, prepared
 from .previews import Previews, check_preview
 from .probing import Table, check_table_path
-from .ranks import leads
+from .ranks import Others, hands_out, leads, serve
 from .run_file import bodies_of, check_run_path, write_run
 from .say import complain, interrupt_status, kept_so_far
 from .summary import summary, title_of
@@ -47,8 +47,7 @@ def run(args: argparse.Namespace) -> int:
     if not leading:
         return _serve(args, options)
     shared = options[0]
-    _check_output(args, shared)
-    ready = prepared(options)
+    ready = _prepared(args, options)
     done = Recording(shared.output)
     end = getattr(ready.sim, "end", lambda: None)
     table = Table(shared.csv, ready.sim, ready.probes, ready.touched.obstacles) if shared.csv else None
@@ -75,6 +74,18 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _prepared(args: argparse.Namespace, options: list[argparse.Namespace]) -> Run:
+    """The run of the only rank, or of rank 0, which ends the others if the run cannot be made."""
+    others = Others() if hands_out(options) else None
+    try:
+        _check_output(args, options[0])
+        return prepared(options, others)
+    except InputError as error:
+        if others is not None:
+            others.dismiss(error)
+        raise
+
+
 def simulated(args: argparse.Namespace) -> Recording:
     """``run`` without a summary, for one run of many.
 
@@ -96,10 +107,12 @@ def simulated(args: argparse.Namespace) -> Recording:
 
 def _serve(args: argparse.Namespace, options: list[argparse.Namespace]) -> int:
     """``run`` on a rank that computes its part of the steps, and neither prints nor writes; returns the exit status."""
-    _check_output(args, options[0])
-    ready = prepared(options)
     try:
-        ready.sim.serve()  # type: ignore[attr-defined]
+        if hands_out(options):
+            serve(options[0].device)
+        else:
+            _check_output(args, options[0])
+            prepared(options).sim.serve()  # type: ignore[attr-defined]
     except UnstableError:
         return 3
     return 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -14,13 +15,18 @@ from warp_corot.solvers import INTEGRATORS, Integrator, QuasiStatic, SymplecticE
 
 from .bodies import Body, gravity_of
 from .implicit import IMPLICIT_DT, check_implicit, integrator_name, is_static
-from .ranks import are_several, led_simulation, one_first
+from .ranks import Others, are_several, led_simulation, one_first
 from .remesh import as_remesh_options
 from .touching import Touched
 
 
-def make_simulation(args: argparse.Namespace, bodies: Sequence[Body], touched: Touched) -> Simulation:
-    """The simulation, its kernels compiled; a given step is shortened until a whole number of them makes a frame."""
+def make_simulation(
+    args: argparse.Namespace, bodies: Sequence[Body], touched: Touched, others: Others | None = None
+) -> Simulation:
+    """The simulation, its kernels compiled; a given step is shortened until a whole number of them makes a frame.
+
+    ``others`` are the ranks that get parts of the bodies, if there are any.
+    """
     from warp_corot.io.write.animate import steps_per_frame
 
     check_implicit(args, touches=touched.contact is not None, remeshes=any(body.remesh for body in bodies))
@@ -35,13 +41,13 @@ def make_simulation(args: argparse.Namespace, bodies: Sequence[Body], touched: T
         steps = steps_per_frame(args.fps, args.dt or IMPLICIT_DT)
         integrator = INTEGRATORS[integrator_name(args)](1.0 / (args.fps * steps), damping, viscosity)  # type: ignore[call-arg]
     else:
-        with one_first():
+        with one_first(others):
             tried = min(_tried_step(body, damping, viscosity) for body in bodies)
         steps = steps_per_frame(args.fps, args.dt or tried)  # refuses an excessive number
         integrator = SymplecticEuler(None if args.dt is None else 1.0 / (args.fps * steps), damping, viscosity)
     with as_remesh_options():
-        make = led_simulation if are_several() else Simulation
-        return make(
+        make: Any = led_simulation if are_several() else Simulation
+        made: Simulation = (make if others is None else others.simulation)(
             bodies=[body.soft for body in bodies],
             model=[body.model for body in bodies],
             integrator=integrator,
@@ -50,6 +56,7 @@ def make_simulation(args: argparse.Namespace, bodies: Sequence[Body], touched: T
             obstacles=list(touched.obstacles.values()),
             contact=touched.contact,
         )
+        return made
 
 
 def _tried_step(one: Body, damping: float, viscosity: float) -> float:

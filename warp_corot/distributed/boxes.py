@@ -15,7 +15,7 @@ from warp_corot.mesh.uniform_part import SUBTREE_DEPTH
 
 from . import mpi
 from .cutting import Cut, cut_box
-from .parts import ForestPart, Numbers
+from .part_meshes import ForestPart, Numbers
 
 Longs = npt.NDArray[np.int64]
 

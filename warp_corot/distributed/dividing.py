@@ -8,93 +8,125 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from warp_corot.discretization.elements import Mesh
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import shown
-from warp_corot.mesh import TetForest
-from warp_corot.mesh.surfaces.boundary import boundary_faces
+from warp_corot.mesh import TetForest, TetMesh
+from warp_corot.mesh.surfaces.boundary import boundary_faces, signed_volumes
 
 from . import mpi
+from .part_meshes import ForestPart, MeshPart
 from .partition import Partition
-from .parts import ForestPart, Numbers, part_of_mesh
+from .parts import numbered_part
 
 #: The tag of the messages that bring parts.
 TAG = 77
 
+#: A rank's part on its way: the class, its arguments and its options.
+Piece = tuple[type, tuple[Any, ...], dict[str, Any]]
 
-def divided(make: Callable[[], TetForest], *, costs: npt.ArrayLike | None = None) -> ForestPart:
-    """This rank's part of a forest that rank 0 makes; all ranks must call this.
+
+def divided(make: Callable[[], Mesh], *, costs: npt.ArrayLike | None = None) -> ForestPart | MeshPart:
+    """This rank's part of a mesh that rank 0 makes; all ranks must call this.
 
     Only rank 0 calls ``make``, and afterwards it keeps only its part. So one machine holds the whole mesh once, not
     once for each rank. ``SoftBody`` and ``Simulation`` take the part like a whole mesh, as they take that of ``box``;
-    the part has the labels of its leaves. A run gives the same results as with the whole mesh, and the same bits on the
-    CPU with ``deterministic=True``.
+    the part has the labels of its elements. A run gives the same results as with the whole mesh, and the same bits on
+    the CPU with ``deterministic=True``.
 
     Args:
-        make: Makes the forest, for example ``lambda: TetForest.from_domain(domain, target_elements=10**6)``.
+        make: Makes the mesh, for example ``lambda: TetForest.from_domain(domain, target_elements=10**6)`` or
+            ``lambda: TetMesh.load("organ.vtu")``.
         costs: The cost of an element on each rank, in any unit, [ranks]; None: the same everywhere.
 
     Raises:
-        InputError: On all ranks: MPI is not there, ``make`` raises one or gives no ``TetForest``, or the mesh has fewer
-            groups of elements than ranks.
+        InputError: On all ranks: MPI is not there, ``make`` raises one or gives no mesh, or the mesh has fewer groups
+            of elements than ranks.
     """
     comm = mpi.world()
+
+    def pieces() -> Iterator[Piece]:
+        mesh = make()
+        if not isinstance(mesh, TetForest | TetMesh):
+            raise InputError(f"make gives {shown(mesh)}; it must give a TetForest or a TetMesh")
+        return pieces_of(mesh, dealt(mesh, comm.size, costs))
+
+    kind, place, options = handed_out(pieces, comm)
+    made: ForestPart | MeshPart = kind(*place, **options)
+    return made
+
+
+def handed_out(make: Callable[[], Iterator[Any]], comm: Any) -> Any:
+    """What an iterator on rank 0 yields for this rank; all ranks must call this.
+
+    The other ranks wait as long as rank 0 needs, without keeping cores busy.
+
+    Raises:
+        InputError: On all ranks, if ``make`` or the iterator raises one.
+    """
     mine: Any = None
     if comm.rank == 0:
         try:
-            pieces = _pieces(make, comm.size, costs)
-            mine = next(pieces)
-            for rank, piece in enumerate(pieces, start=1):
+            given = make()
+            mine = next(given)
+            for rank, piece in enumerate(given, start=1):
                 comm.send(piece, rank, TAG)
         except InputError as error:
-            mine = str(error)
-            for rank in range(1, comm.size):
-                comm.send(mine, rank, TAG)
+            mine = error
+            dismiss(error, comm)
     else:
-        with comm.waiting("its part of a mesh"):
-            mine = comm.recv(source=0, tag=TAG)
-    if isinstance(mine, str):
-        raise InputError(mine)
-    place, options = mine
-    return ForestPart(*place, **options)
+        mine = mpi.awaited(comm.unwatched, 0, TAG)
+    if isinstance(mine, InputError):
+        raise mine
+    return mine
 
 
-def _pieces(make: Callable[[], TetForest], ranks: int, costs: npt.ArrayLike | None) -> Iterator[Any]:
-    """The arguments of each rank's part, one rank after another."""
-    mesh = make()
-    if not isinstance(mesh, TetForest):
-        raise InputError(f"make gives {shown(mesh)}; it must give a TetForest")
-    dealt = Partition.of(mesh, ranks, costs)
+def dismiss(error: InputError, comm: Any) -> None:
+    """On rank 0: let ``handed_out`` raise this error on all other ranks."""
+    for rank in range(1, comm.size):
+        comm.send(InputError(str(error)), rank, TAG)
+
+
+def dealt(mesh: Mesh, ranks: int, costs: npt.ArrayLike | None = None) -> Partition:
+    """The division of a mesh that is handed out. Elements that may share their dilatation stay together.
+
+    Raises:
+        InputError: As ``Partition.of``.
+    """
+    return Partition.of(mesh, ranks, costs, grouped=isinstance(mesh, TetMesh))
+
+
+def pieces_of(mesh: Mesh, division: Partition) -> Iterator[Piece]:
+    """Each rank's part, one after another."""
     outer = boundary_faces(mesh.tets)[0]
     used = mesh.points[np.unique(mesh.tets)]
+    volumes = mesh.volumes if isinstance(mesh, TetForest) else signed_volumes(mesh.points, mesh.tets)
     whole = {
         "element_count": len(mesh.tets),
         "bounds": np.stack([used.min(axis=0), used.max(axis=0)]),
-        "smallest_volume": float(np.min(mesh.volumes)),
+        "smallest_volume": float(np.min(volumes)),
         "label_names": mesh.label_names,
+        "up_axis": mesh.up_axis,
     }
-    for rank in range(ranks):
-        kept = dealt.needed(mesh, rank)
-        part, nodes = part_of_mesh(mesh, kept, dealt)
-        assert isinstance(part, TetForest)
-        elements = np.flatnonzero(kept).astype(np.int32)
-        here = [np.arange(len(each), dtype=np.int32) for each in (nodes, elements)]
-        counted = dealt.rank_of_element[elements] == rank
-        numbers = Numbers(nodes, elements, dealt.rank_of_node[nodes], counted, len(mesh.points), *here)
-        place = (part.cells, part.cell_size, part.origin, part.lattice, part.node_ends, part.tree, part.up_axis)
-        yield (
-            place,
-            whole
-            | {
-                "numbers": numbers,
-                "outer": _here(outer, nodes, len(mesh.points)),
-                "fill": part.fill,
-                "labels": None if mesh.labels is None else mesh.labels[kept],
-                "leaf_groups": part.leaf_groups,
-            },
-        )
+    for rank in range(1 + int(division.rank_of_element.max())):
+        part, elements, numbers = numbered_part(mesh, division, rank, prunes=True)
+        given: dict[str, Any] = {
+            "numbers": numbers,
+            "outer": _here(outer, numbers.nodes, len(mesh.points)),
+            "labels": None if mesh.labels is None else mesh.labels[elements],
+        }
+        if isinstance(part, TetForest):
+            place: tuple[Any, ...] = (part.cells, part.cell_size, part.origin, part.lattice, part.node_ends, part.tree)
+            given |= {"fill": part.fill, "leaf_groups": part.leaf_groups}
+            yield ForestPart, place, whole | given
+        else:
+            assert isinstance(mesh, TetMesh)
+            sets = {name: mask[numbers.nodes] for name, mask in mesh.node_sets.items()}
+            given |= {"element_groups": part.element_groups, "node_sets": sets}
+            yield MeshPart, (part.points, part.tets), whole | given
 
 
-def _here(faces: npt.NDArray[np.int32], nodes: npt.NDArray[np.int32], count: int) -> npt.NDArray[np.int32]:
+def _here(faces: npt.NDArray[np.int32], nodes: npt.NDArray[np.integer], count: int) -> npt.NDArray[np.int32]:
     """The triangles with all corners among some nodes, by the numbers that they have there, int32 [F, 3]."""
     number = np.full(count, -1, np.int32)
     number[nodes] = np.arange(len(nodes), dtype=np.int32)

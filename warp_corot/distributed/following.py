@@ -13,7 +13,8 @@ from warp_corot.body.soft_body import SoftBody
 from warp_corot.body.trajectory import NodeKeyframes, Trajectory
 from warp_corot.errors import InputError
 
-from .parts import ForestPart, Part
+from .part_meshes import InParts
+from .parts import Part
 from .places import Places
 
 #: The nodal arrays that a step changes.
@@ -57,7 +58,7 @@ class Following:
     @property
     def is_in_parts(self) -> bool:
         """Whether no rank holds the whole mesh."""
-        return isinstance(self.whole.mesh, ForestPart)
+        return isinstance(self.whole.mesh, InParts)
 
     def take_ghosts(self, completed: Callable[[str], wp.array]) -> None:
         """Copy the state of all nodes of the part, with those that other ranks move, to the body.

@@ -1,9 +1,13 @@
-"""A simulation of whole bodies, as on one process; all ranks make its steps."""
+"""A simulation of whole bodies on rank 0, as on one process; all ranks make its steps."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.reading import ContactPoint
@@ -11,31 +15,155 @@ from warp_corot.errors import InputError, UnstableError
 from warp_corot.simulation.simulation import Simulation as OnOne
 
 from . import mpi
+from .following import STATE
+from .handing import handed_bodies
 from .simulation import Simulation
 
 
+class Crew:
+    """The simulation of all ranks, which rank 0 leads; the others call ``serve``.
+
+    Args:
+        on_all: The simulation of all ranks.
+        wholes: On rank 0, the whole bodies of which ``on_all`` has parts; None: every rank holds the whole bodies.
+        nodes: On rank 0, the nodes of each rank's part of each of these.
+    """
+
+    def __init__(
+        self,
+        on_all: Simulation,
+        wholes: Sequence[SoftBody] | None = None,
+        nodes: Sequence[Sequence[npt.NDArray[np.int64]]] = (),
+    ):
+        self.on_all, self.comm = on_all, on_all.comm
+        self._wholes, self._nodes = wholes, nodes
+        self._in_parts = any(each.is_in_parts for each in on_all.following)
+        #: Callbacks of rank 0, or of all ranks that hold the whole bodies; and how many there are on any rank.
+        self._callbacks: list[Callable[[], None]] = []
+        self._called = 0
+        self._served = False
+
+    @classmethod
+    def joined(cls, device: str | wp.Device | None) -> Crew:
+        """On ranks other than 0: the simulation of parts of the bodies that rank 0 hands out.
+
+        Raises:
+            InputError: As on rank 0.
+        """
+        bodies, options, _ = handed_bodies(None, None, device, mpi.world())
+        return cls(Simulation(bodies, **options))
+
+    def serve(self) -> None:
+        """On ranks other than 0: make the steps that rank 0 asks for until it is done.
+
+        Raises:
+            UnstableError: As on rank 0.
+        """
+        while (told := self.comm.unwatched.bcast(None, root=0)) is not None:
+            self._make(*told)
+
+    def end(self) -> None:
+        """On rank 0: release the other ranks once, whatever has ended the run."""
+        if not self._served:
+            self._served = True
+            self.comm.bcast(None, root=0)
+
+    def lead(self, name: str, amount: float) -> None:
+        """On rank 0: advance on all ranks."""
+        self.comm.bcast((name, amount), root=0)
+        self._make(name, amount)
+
+    def on_step(self, callback: Callable[[], None], every: int) -> None:
+        """On rank 0, or on all ranks that hold the whole bodies: call back after steps, with all nodes up to date."""
+        self._callbacks.append(callback)
+        if self._in_parts:
+            self.lead("_call_back", every)
+        else:
+            self._call_back(every)
+
+    def _call_back(self, every: int) -> None:
+        number = self._called
+        self._called += 1
+
+        def called(_: object) -> None:
+            self.collect()
+            if self._callbacks:
+                self._callbacks[number]()
+            self._hand_out_loads()
+
+        self.on_all.on_step(called, every)
+
+    def collect(self) -> None:
+        """Bring the state of all nodes into the whole bodies; all ranks must call this."""
+        if not self._in_parts:
+            self.on_all.collect()
+            return
+        for k, each in enumerate(self.on_all.following):
+            for name in STATE:
+                found = each.gather(getattr(each.whole.state, name))
+                if self._wholes is not None:
+                    assert found is not None
+                    state = self._wholes[k].state
+                    getattr(state, name)[: len(found)].assign(found)
+            if self._wholes is not None:
+                self._wholes[k].state.publish_positions()
+
+    def _hand_out_loads(self) -> None:
+        """Give the parts the loads of the whole bodies; all ranks must call this."""
+        if not self._in_parts:
+            return
+        given: list[list[npt.NDArray[np.float32] | None]] | None = None
+        if self._wholes is not None:
+            loads = [each.loads.numpy() if each.conditions.has_loads else None for each in self._wholes]
+            given = [[None if a is None else a[n] for a, n in zip(loads, own, strict=True)] for own in self._nodes]
+        for body, values in zip(self.on_all.bodies, self.comm.scatter(given, root=0), strict=True):
+            if values is not None:
+                body.loads.assign(values)
+
+    def _make(self, name: str, amount: float) -> None:
+        if name.startswith("_"):
+            getattr(self, name)(amount)
+            return
+        self._hand_out_loads()
+        try:
+            getattr(self.on_all, name)(amount)
+        except UnstableError:
+            # All ranks have the same error and end without a message.
+            self._served = True
+            raise
+        finally:
+            if not self._served:
+                self.collect()
+
+
 class LedSimulation(OnOne):
-    """A simulation of whole bodies on every rank, for writers and tables; rank 0 leads it.
+    """A simulation of whole bodies, for writers and tables; rank 0 leads it.
 
     Rank 0 uses it like any other simulation. The other ranks call ``serve``, which makes the steps that rank 0 asks
-    for. After each call all nodes are up to date on all ranks.
+    for. After each call all nodes of the whole bodies are up to date.
 
     Args:
         bodies, options: As for ``warp_corot.Simulation``.
+        in_parts: Whether only rank 0 makes this, and hands out parts of the bodies to the others, which call
+            ``Crew.joined``; otherwise every rank makes this with the whole bodies.
 
     Raises:
         InputError: As for ``warp_corot.distributed.Simulation``.
     """
 
-    def __init__(self, bodies: SoftBody | Sequence[SoftBody], **options: Any):
-        self._comm = mpi.world()
+    def __init__(self, bodies: SoftBody | Sequence[SoftBody], *, in_parts: bool = False, **options: Any):
         options = {name: value for name, value in options.items() if value is not None}
-        self._on_all = Simulation(bodies, **options)
+        if in_parts:
+            wholes = [bodies] if isinstance(bodies, SoftBody) else list(bodies)
+            parts, _, nodes = handed_bodies(wholes, options, wholes[0].device, mpi.world())
+            self._crew = Crew(Simulation(parts, **options), wholes, nodes)
+        else:
+            self._crew = Crew(Simulation(bodies, **options))
         touching = {"obstacles", "contact"}
         super().__init__(bodies, **{name: value for name, value in options.items() if name not in touching})
         # Each tool is in one simulation.
-        self.contact = self._on_all.contact
-        self._served = False
+        self.contact = self._crew.on_all.contact
+        self.serve, self.end = self._crew.serve, self._crew.end
 
     # --- stepping --------------------------------------------------------------------------------------------------
 
@@ -46,17 +174,13 @@ class LedSimulation(OnOne):
         self.advance_until(self.total_time + seconds)
 
     def advance_until(self, total_time: float) -> None:
-        self._lead("advance_until", total_time)
+        self._crew.lead("advance_until", total_time)
 
     def advance_steps(self, count: int) -> None:
-        self._lead("advance_steps", count)
+        self._crew.lead("advance_steps", count)
 
     def on_step(self, callback: Callable[[OnOne], None], every: int = 1) -> None:
-        def called(_: object) -> None:
-            self._on_all.collect()
-            callback(self)
-
-        self._on_all.on_step(called, every)
+        self._crew.on_step(lambda: callback(self), every)
 
     def reset(self, worlds: Any = None) -> None:
         raise InputError("reset does not work where rank 0 leads others")
@@ -67,60 +191,28 @@ class LedSimulation(OnOne):
     def save(self, path: Any) -> None:
         raise InputError("save does not work where rank 0 leads others")
 
-    # --- leading ---------------------------------------------------------------------------------------------------
-
-    def serve(self) -> None:
-        """On ranks other than 0: make the steps that rank 0 asks for until it is done.
-
-        Raises:
-            UnstableError: As on rank 0.
-        """
-        while (told := self._comm.unwatched.bcast(None, root=0)) is not None:
-            self._make(*told)
-
-    def end(self) -> None:
-        """On rank 0: release the other ranks once, whatever has ended the run."""
-        if not self._served:
-            self._served = True
-            self._comm.bcast(None, root=0)
-
-    def _lead(self, name: str, amount: float) -> None:
-        self._comm.bcast((name, amount), root=0)
-        self._make(name, amount)
-
-    def _make(self, name: str, amount: float) -> None:
-        try:
-            getattr(self._on_all, name)(amount)
-        except UnstableError:
-            # All ranks have the same error and end without a message.
-            self._served = True
-            raise
-        finally:
-            if not self._served:
-                self._on_all.collect()
-
     # --- the clock -------------------------------------------------------------------------------------------------
 
     @property
     def dt(self) -> float:
-        return self._on_all.dt
+        return self._crew.on_all.dt
 
     @property
     def dt_range(self) -> tuple[float, float]:
-        return self._on_all.dt_range
+        return self._crew.on_all.dt_range
 
     @property
     def steps(self) -> int:
-        return self._on_all.steps
+        return self._crew.on_all.steps
 
     @property
     def total_steps(self) -> int:
-        return self._on_all.total_steps
+        return self._crew.on_all.total_steps
 
     @property
     def time(self) -> float:
-        return self._on_all.time
+        return self._crew.on_all.time
 
     @property
     def total_time(self) -> float:
-        return self._on_all.total_time
+        return self._crew.on_all.total_time

@@ -33,7 +33,7 @@ from .boxes import box
 from .checkpoint import Values, body_of
 from .following import Following
 from .of_parts import SimulationOfParts
-from .parts import ForestPart
+from .part_meshes import ForestPart
 
 Arrays = dict[str, npt.NDArray[Any]]
 

@@ -70,6 +70,13 @@ def meet(comm: Any) -> None:
         time.sleep(REST)
 
 
+def awaited(comm: Any, source: int, tag: int) -> Any:
+    """The next message from a rank, received without keeping a core busy while it is not there."""
+    while (message := comm.improbe(source=source, tag=tag)) is None:
+        time.sleep(REST)
+    return message.recv()
+
+
 def _end_all(comm: Any, kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
     """End all ranks, because they cannot continue without this one."""
     if not isinstance(error, InputError | KeyboardInterrupt):

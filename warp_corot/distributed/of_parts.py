@@ -28,8 +28,9 @@ from warp_corot.simulation.energy import WorldEnergies
 from warp_corot.solvers.ranks import Ranks
 
 from . import mpi
+from .part_meshes import ForestPart, InParts
 from .partition import Partition
-from .parts import ForestPart, Part
+from .parts import Part
 from .ranks import MpiRanks
 
 #: If parts have at most this many elements, one rank tries its own first; larger ones take longer than compiling on
@@ -83,16 +84,18 @@ def part_of(body: SoftBody, model: Model, comm: Any, costs: npt.ArrayLike | None
             elements of several ranks.
     """
     level = getattr(model, "level", None)
-    if isinstance(body.mesh, ForestPart):
+    if isinstance(body.mesh, InParts):
         if costs is not None:
             raise InputError("the mesh is divided already; give costs to warp_corot.distributed.box or divided")
         if level is not None and not body.mesh.is_box:
             raise InputError(f"rotation_level is {level}; of a divided mesh it must be a tolerance or None")
-        if level is not None and level < body.mesh.tree.leaf_levels[0] - SUBTREE_DEPTH:
-            raise InputError(
-                f"rotation_level is {level}; of a box in parts it must be at least "
-                f"{body.mesh.tree.leaf_levels[0] - SUBTREE_DEPTH}, {SUBTREE_DEPTH} levels above the elements"
-            )
+        if level is not None and isinstance(body.mesh, ForestPart):
+            least = int(body.mesh.tree.leaf_levels[0]) - SUBTREE_DEPTH
+            if level < least:
+                raise InputError(
+                    f"rotation_level is {level}; of a box in parts it must be at least {least}, {SUBTREE_DEPTH} levels "
+                    "above the elements"
+                )
         return Part(body, None, comm.rank, device)
     grouped = getattr(model, "dilatation", ELEMENT) == SHARED
     partition = Partition.of(body.mesh, comm.size, costs, grouped=grouped, rotation_level=level)

@@ -12,7 +12,7 @@ from warp_corot.io.write.skins import Skin
 from warp_corot.mesh.surfaces.bound import SurfaceMesh
 
 from .following import Following
-from .parts import ForestPart
+from .part_meshes import InParts
 
 Ints = npt.NDArray[np.int32]
 
@@ -98,7 +98,7 @@ def _outer_faces(following: Following) -> Ints:
     nodes."""
     whole, numbers = following.whole, following.part.numbers
     triangles, parents = whole.surface_faces
-    if isinstance(whole.mesh, ForestPart):
+    if isinstance(whole.mesh, InParts):
         own = numbers.counted[parents] & whole.mesh.are_outer(triangles)
         return triangles[own]
     is_own = np.zeros(whole.world_element_count, bool)

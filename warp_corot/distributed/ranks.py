@@ -23,7 +23,8 @@ from .cards import CardExchange, add_up, take_most
 from .directions import normal_numbers
 from .graphs import keep_priorities
 from .halo import Halo, HostExchange
-from .parts import ForestPart, Part
+from .part_meshes import InParts
+from .parts import Part
 from .settled import settled_sums
 from .surfaces import SurfacePlaces
 
@@ -260,7 +261,7 @@ class MpiRanks(Ranks):
 
     def bounds(self, body: SoftBody) -> Floats:
         mesh = self.whole(body).mesh
-        return mesh.bounds if isinstance(mesh, ForestPart) else super().bounds(self.whole(body))
+        return mesh.bounds if isinstance(mesh, InParts) else super().bounds(self.whole(body))
 
     def bulk(self, body: SoftBody) -> tuple[float, float]:
         return self._bulks[body]
@@ -268,7 +269,7 @@ class MpiRanks(Ranks):
     def _bulk(self, part: Part) -> tuple[float, float]:
         """See ``bulk``; all ranks must call."""
         mesh = self._wholes[part].mesh
-        if not isinstance(mesh, ForestPart):
+        if not isinstance(mesh, InParts):
             return super().bulk(self._wholes[part])
         own = part.numbers.counted
         moduli = (2.0 * part.discretization.mu.numpy() + part.discretization.lam.numpy()).astype(np.float64)

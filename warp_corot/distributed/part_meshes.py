@@ -1,0 +1,168 @@
+"""A rank's part of a mesh that no rank holds whole."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_corot.errors import InputError
+from warp_corot.mesh import TetForest, TetMesh
+from warp_corot.mesh.lattice import LATTICE_BITS
+
+Ints = npt.NDArray[np.int32]
+
+
+@dataclass(frozen=True, eq=False)
+class Numbers:
+    """The numbers that a part's nodes and elements have in the whole mesh.
+
+    Attributes:
+        nodes, elements: int32 or int64 [n] and [t] of one world; elements ascend.
+        owner: The rank that moves each of the nodes, int32 [n].
+        counted: Whether this rank counts the element's energy, bool [t].
+        node_count: Number of nodes of the whole mesh.
+        places, element_places: Places of the nodes and elements in the body that this rank holds, int32 [n] and [t]:
+            the same numbers, or those of its own part if no rank holds the whole mesh.
+        tree, lattice: The numbers that the tetrahedra of all levels and the lattice points of a forest have in the
+            whole one, int32; None: they are not known.
+    """
+
+    nodes: npt.NDArray[Any]
+    elements: npt.NDArray[Any]
+    owner: Ints
+    counted: npt.NDArray[np.bool_]
+    node_count: int
+    places: Ints
+    element_places: Ints
+    tree: Ints | None = None
+    lattice: Ints | None = None
+
+    def in_worlds(self, worlds: int) -> npt.NDArray[np.int64]:
+        """The numbers of the nodes among those of all worlds of the whole mesh, int64 [worlds * n]."""
+        return (self.nodes + self.node_count * np.arange(worlds, dtype=np.int64)[:, None]).ravel()
+
+
+class InParts:
+    """A rank's part of a mesh: the elements around the nodes that the rank moves.
+
+    Elements and nodes are those of this part; some are copies of other ranks' elements, and the nodes of these.
+
+    Attributes:
+        numbers: Their numbers in the whole mesh.
+        element_count: Number of elements of the whole mesh.
+        bounds: Lowest and highest coordinates of the whole mesh [m], float64 [2, 3].
+        smallest_volume: Volume of the smallest element of the whole mesh [m^3].
+        outer: The triangles of the part's nodes on the surface of the whole mesh, int32 [F, 3]; None: the mesh is a
+            box, uniformly bisected.
+    """
+
+    numbers: Numbers
+    element_count: int
+    bounds: npt.NDArray[np.float64]
+    smallest_volume: float
+    outer: Ints | None
+    points: npt.NDArray[np.float64]
+    tets: Ints
+
+    def _belong(
+        self,
+        numbers: Numbers,
+        element_count: int,
+        bounds: npt.NDArray[np.float64],
+        smallest_volume: float,
+        outer: Ints | None,
+    ) -> None:
+        """Set this part's place in the whole mesh."""
+        self.__dict__.update(numbers=numbers, element_count=element_count, bounds=bounds)
+        self.__dict__.update(smallest_volume=smallest_volume, outer=outer)
+
+    @property
+    def is_box(self) -> bool:
+        """Whether the whole mesh is a box, uniformly bisected."""
+        return self.outer is None
+
+    def check_whole(self) -> None:
+        """Check that this part is the whole, as on one rank.
+
+        Raises:
+            InputError: It is not.
+        """
+        if len(self.tets) < self.element_count:
+            raise InputError(
+                f"the mesh is a part, {len(self.tets)} of {self.element_count} elements, of a mesh that several ranks "
+                "hold; only warp_corot.distributed.Simulation can compute it"
+            )
+
+    def are_outer(self, triangles: Ints) -> npt.NDArray[np.bool_]:
+        """Which triangles, int32 [F, 3], lie on the surface of the whole mesh; others are faces to elements
+        elsewhere."""
+        assert self.outer is not None
+        base = np.array([len(self.points) ** 2, len(self.points), 1], np.int64)
+        given, outer = (np.sort(each, axis=1).astype(np.int64) @ base for each in (triangles, self.outer))
+        return np.isin(given, outer)
+
+    def check_expression(self, expression: str) -> None:
+        """Check that an expression can be evaluated at the nodes of one part.
+
+        Raises:
+            InputError: It asks for nearest nodes.
+        """
+        if "nearest" in expression:
+            raise InputError("nearest needs the whole mesh, and this rank holds a part; use sphere or box")
+
+
+class ForestPart(InParts, TetForest):
+    """A rank's part of a forest."""
+
+    def __init__(
+        self,
+        *arrays: Any,
+        numbers: Numbers,
+        element_count: int,
+        bounds: npt.NDArray[np.float64],
+        smallest_volume: float | None = None,
+        outer: Ints | None = None,
+        **others: Any,
+    ):
+        TetForest.__init__(self, *arrays, **others)
+        smallest_volume = float(np.min(self.volumes)) if smallest_volume is None else smallest_volume
+        self._belong(numbers, element_count, bounds, smallest_volume, outer)
+
+    def refine(self, leaves: npt.ArrayLike) -> TetForest:
+        """A forest in parts cannot be refined, because a rank would bisect without its neighbours.
+
+        Raises:
+            InputError: Always.
+        """
+        raise InputError("a forest in parts cannot be refined; make it finer")
+
+    def are_outer(self, triangles: Ints) -> npt.NDArray[np.bool_]:
+        if self.outer is not None:
+            return super().are_outer(triangles)
+        corners = self.lattice[triangles]
+        ends = np.array([np.zeros(3, np.int64), np.array(self.cells) << LATTICE_BITS])
+        return np.any([(corners == end).all(axis=1).any(axis=1) for end in ends], axis=0)
+
+
+class MeshPart(InParts, TetMesh):
+    """A rank's part of a general mesh."""
+
+    def __init__(
+        self,
+        points: npt.NDArray[np.float64],
+        tets: Ints,
+        *,
+        numbers: Numbers,
+        element_count: int,
+        bounds: npt.NDArray[np.float64],
+        smallest_volume: float,
+        outer: Ints,
+        element_groups: Ints | None = None,
+        **others: Any,
+    ):
+        TetMesh.__init__(self, points, tets, **others)
+        self.element_groups = element_groups
+        self._belong(numbers, element_count, bounds, smallest_volume, outer)
