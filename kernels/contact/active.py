@@ -269,6 +269,7 @@ def add_slopes(
     # In
     start: int,
     only_world: int,
+    apart: int,
     motions: Motions,
     surface: Surface,
     holding: Holding,
@@ -278,7 +279,8 @@ def add_slopes(
     # Out
     slopes: wp.array[wp.float64],
 ):
-    """Add the power of friction along a change of motions, at the share that is tried."""
+    """Add the power of friction along a change of motions, at the share that is tried. If ``apart`` is not zero, each
+    place has its own slope."""
     k = wp.tid()
     s = start + k
     if holding.touched[s] != 1:
@@ -296,7 +298,7 @@ def add_slopes(
             size = wp.length(trial)
             if size > most:
                 trial *= most / size
-            wp.atomic_add(slopes, at, wp.dot(wp.vec3d(trial), wp.vec3d(along)))
+            wp.atomic_add(slopes, wp.where(apart != 0, k, at), wp.dot(wp.vec3d(trial), wp.vec3d(along)))
 
 
 @wp.kernel(enable_backward=False)

@@ -10,8 +10,9 @@ from mpirun import needs_mpi, on_ranks
 import warp_corot as wc
 
 SIZES = (1, 2, 3)
-#: Leaves of several levels, worlds with viscosity, contact, and implicit steps of a general mesh with viscosity.
-CASES = ("forest", "worlds", "touched", "newmark")
+#: Leaves of several levels, worlds with viscosity, contact, contact in implicit steps with multigrid, and implicit
+#: steps of a general mesh with viscosity.
+CASES = ("forest", "worlds", "touched", "pressed", "newmark")
 #: On two ranks there is one case.
 SHORT = {2: "forest"}
 
@@ -43,7 +44,7 @@ def sizes_of(case):
 @pytest.mark.parametrize("case", CASES)
 def test_a_deterministic_run_is_the_same_bit_by_bit(runs, case):
     for size in sizes_of(case):
-        for what in ("x", "v", "numbers", *(["wrench1"] if case == "touched" else [])):
+        for what in ("x", "v", "numbers", *(["wrench1"] if case in ranked.TOUCHING else [])):
             np.testing.assert_array_equal(runs[size][f"{case}.True.{what}"], runs[1][f"{case}.True.{what}"])
 
 
@@ -53,6 +54,8 @@ def test_all_cases_are_the_same_on_seven_ranks(tmp_path):
     for case in ranked.CASES:
         for size in (3, 7):
             np.testing.assert_array_equal(found[size][f"{case}.True.x"], found[1][f"{case}.True.x"])
+            if f"{case}.{size}.x" in found[size]:
+                np.testing.assert_array_equal(found[size][f"{case}.{size}.x"], found[1][f"{case}.True.saved.x"])
         assert_as_one_process(case, found[7])
     np.testing.assert_array_equal(found[7]["parts.x"], found[1]["worlds.True.x"])
 
@@ -107,9 +110,16 @@ def test_energies_are_those_of_all_ranks(runs, case):
 
 def assert_as_one_process(case, found):
     body, options = ranked.CASES[case](), ranked.options_of(case)
-    ranked.moved(wc.Simulation(body, **options | {"model": options["model"] or wc.Corotated()}), body)
-    if case == "touched":
-        assert np.abs(found["touched.True.wrench1"]).max() > 0.01
+    sim = wc.Simulation(body, **options | {"model": options["model"] or wc.Corotated()})
+    ranked.moved(sim, body)
+    if case in ranked.TOUCHING:
+        assert np.abs(found[f"{case}.True.wrench1"]).max() > 0.01
+    if case in ("multigrid", "newton"):
+        assert sim.solves is not None
+        assert abs(found[f"{case}.True.iterations"] - np.array(sim.solves)).max() <= 1
+    elif case == "pressed":
+        assert sim.solves is not None
+        assert found[f"{case}.True.iterations"][2] <= 1.1 * sim.solves.linear_iterations
     moved = np.abs(body.displacements.numpy()).max()
     assert moved > 0.01
     np.testing.assert_allclose(found[f"{case}.True.x"], body.positions.numpy(), atol=2e-3 * moved)
@@ -127,7 +137,7 @@ def test_costs_of_all_ranks_are_measured(runs):
         assert (costs > 0.0).all()
 
 
-@pytest.mark.parametrize(("case", "size"), [("forest", 1), ("touched", 3)])
+@pytest.mark.parametrize(("case", "size"), [("forest", 1), ("touched", 3), ("pressed", 3)])
 def test_a_checkpoint_goes_on_with_any_number_of_ranks(runs, case, size):
     """Three ranks go on from their own, and from that of one process."""
     for what in ("x", "numbers"):

@@ -51,18 +51,31 @@ def touched(mesh: wc.TetForest | None = None) -> wc.SoftBody:
     return wc.SoftBody(mesh, wc.Isotropic(2e3, 0.3, 1000.0), device="cpu")
 
 
+#: Cases with contact.
+TOUCHING = ("touched", "pressed", "bdf2")
+#: Cases whose checkpoints several ranks keep.
+KEPT = (*TOUCHING, "multigrid")
+
+
 def obstacles_of(case: str) -> list[wc.Ground | wc.Tool]:
     """The obstacle on which the block falls, and the one that comes down on its edges, between its nodes."""
-    if case != "touched":
+    if case not in TOUCHING:
         return []
-    tool = wc.Tool(wc.Capsule(0.004, 0.06))
-    tool.follow([0.0, 0.02, 0.05], [[0.03, 0.053, 0.04], [0.03, 0.047, 0.044], [0.03, 0.03, 0.05]])
+    # Implicit steps hold nodes only.
+    radius = 0.004 if case == "touched" else 0.015
+    tool = wc.Tool(wc.Capsule(radius, 0.06))
+    heights = radius + np.array([0.049, 0.043, 0.026])
+    tool.follow([0.0, 0.02, 0.05], np.stack([np.full(3, 0.03), heights, [0.04, 0.044, 0.05]], axis=1))
     return [wc.Ground((0.0, 1.0, 0.0), -0.002, friction=0.3), tool]
 
 
 #: Integrators of cases that are not stepped by the default one.
 INTEGRATORS = {
     "implicit": lambda: wc.BackwardEuler(0.01, preconditioner="diagonal"),
+    "multigrid": lambda: wc.BackwardEuler(0.01),
+    "newton": lambda: wc.BackwardEuler(0.01, tolerance=1e-3),
+    "pressed": lambda: wc.BackwardEuler(0.0033),
+    "bdf2": lambda: wc.BDF2(0.0025, preconditioner="diagonal"),
     "newmark": lambda: wc.Newmark(0.01, preconditioner="diagonal", tolerance=1e-3, viscosity=2e-3),
     "worlds": lambda: wc.SymplecticEuler(viscosity=2e-3),
 }
@@ -75,8 +88,12 @@ CASES = {
     "tets": lambda: body_of(jittered(), 0.49),
     "worlds": lambda: body_of(wc.TetForest.box((1, 1, 3), 0.064, level=4), 0.3, worlds=2),
     "touched": touched,
+    "pressed": lambda: touched(wc.TetForest.box((1, 1, 3), 0.05, level=4)),
+    "bdf2": touched,
     "shared": lambda: body_of(graded(), 0.3),
     "implicit": lambda: body_of(graded(), 0.3),
+    "multigrid": lambda: body_of(graded(), 0.3),
+    "newton": lambda: body_of(wc.TetForest.box((1, 1, 3), 0.064, level=4), 0.3, worlds=2),
     "newmark": lambda: body_of(jittered(), 0.3),
 }
 
@@ -103,6 +120,8 @@ def made(case: str, deterministic: bool, kept: Path | None) -> dict[str, np.ndar
     sim = wd.Simulation(body, deterministic=deterministic, **options)
     moved(sim, body)
     found = {"x": wd.gather(body.positions), "v": wd.gather(body.velocities), "energy": np.array(sim.energy())}
+    if sim.solves is not None:
+        found["iterations"] = np.array(sim.solves)
     found["numbers"] = np.array([sim.steps, sim.dt, sim.time, *sim.dt_range])
     found |= {f"wrench{k}": each.wrench.numpy() for k, each in enumerate(options["obstacles"]) if k}
     found["costs"] = np.array(sim.measured_costs(2))
@@ -228,15 +247,15 @@ def kept_in_parts(kept: Path) -> None:
 
 def make_all(folder: Path, size: int, names: list[str]) -> None:
     """Make runs on the present ranks, and write their results. One rank keeps the checkpoint of "forest", from which
-    several ranks resume; these keep that of "touched"."""
+    several ranks resume; these keep those of ``KEPT``."""
     found: dict[str, Any] = {}
     for name in names:
-        keeps = size == 1 or name == "touched"
+        keeps = size == 1 or name in KEPT
         found |= made(name, True, folder / f"{name}.{size}.npz" if keeps else None)
     if size == 1 and "worlds" in names:
         kept_in_parts(folder / "parts.1.npz")
     if size > 2:
-        for path in (folder / "forest.1.npz", folder / f"touched.{size}.npz"):
+        for path in (folder / "forest.1.npz", *(folder / f"{name}.{size}.npz" for name in KEPT)):
             if path.stem.split(".")[0] in names and path.exists():
                 found |= resumed(path)
         if "forest" in names:

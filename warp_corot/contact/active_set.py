@@ -94,12 +94,19 @@ class ActiveSet:
         motions = self._contacts.obstacles.motions
         self._launch(kernels.add_friction, [motions, self._surface, self._holding, d, r])
 
-    def add_slopes(self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array) -> None:
+    @property
+    def count(self) -> int:
+        """Number of surface places of one world."""
+        return self._contacts.surface.parts[self._k].nodes
+
+    def add_slopes(
+        self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array, *, apart: bool = False
+    ) -> None:
         """Launch the power of friction along a change; see ``solvers.implicit.line_search``. If there is only one
         slope,
-        it is that of all worlds together."""
+        it is that of all worlds together. With ``apart`` there is one for each place, [worlds * count]."""
         motions = self._contacts.obstacles.motions
-        inputs = [int(len(slopes) == 1), motions, self._surface, self._holding, d, change, search]
+        inputs = [int(len(search) == 1), int(apart), motions, self._surface, self._holding, d, change, search]
         self._launch(kernels.add_slopes, [*inputs, slopes])
 
     def launch_judgement(self, b: wp.array, q: wp.array, d: wp.array) -> None:

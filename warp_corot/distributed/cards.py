@@ -6,7 +6,7 @@ NCCL is imported here only.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -44,15 +44,16 @@ class CardExchange:
     Args:
         halo: The lists of nodes to send and to receive.
         device: The card.
+        kinds: The types of values that it exchanges.
     """
 
-    def __init__(self, halo: Halo, device: wp.Device):
+    def __init__(self, halo: Halo, device: wp.Device, kinds: Sequence[Any] = kernels.EXCHANGED):
         self._nccl, self._device = nccl_of(device.alias), device
         self._sent, self._received = (_joined(lists, device) for lists in (halo.sent, halo.received))
         #: The stream on which it runs beside other launches, with a higher priority.
         self.aside = wp.Stream(device, priority=-1)
         self.is_under_way = False
-        self._rooms = {kind: self._room_for(kind) for kind in kernels.EXCHANGED}
+        self._rooms = {kind: self._room_for(kind) for kind in kinds}
 
     def launch(self, nodal: wp.array) -> None:
         """Launch the exchange that gives ghosts their values, in a nodal array of float32, vec3 or vec4; may be

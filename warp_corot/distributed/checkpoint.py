@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from warp_corot.simulation.simulation import Simulation
 
 #: The beginnings of the names of kept nodal arrays; other kept arrays are the same on all ranks.
-DIRECTIONS, VELOCITIES, HISTORY = "directions", "velocities.", "history."
+DIRECTIONS, VELOCITIES, HISTORY, MEETINGS, SETUP = "directions", "velocities.", "history.", "meetings.", "setup."
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,9 +92,11 @@ def body_of(name: str, parts: Simulation) -> int | None:
     if name.startswith(HISTORY):
         count = sum(each.startswith(HISTORY) for each in parts.kept)
         return int(name.removeprefix(HISTORY)) * len(parts.bodies) // count
-    for first in (DIRECTIONS, VELOCITIES):
+    for first in (DIRECTIONS, VELOCITIES, MEETINGS):
         if name.startswith(first):
             return int(name.removeprefix(first))
+    if name.startswith(SETUP) and name.endswith(".at"):
+        return int(name.removeprefix(SETUP).removesuffix(".at"))
     return None
 
 

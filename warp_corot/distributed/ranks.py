@@ -23,6 +23,7 @@ from .cards import CardExchange, add_up, take_most
 from .directions import normal_numbers
 from .graphs import keep_priorities
 from .halo import Halo, HostExchange
+from .multigrid import MultigridOfParts, has_multigrid
 from .part_meshes import InParts
 from .parts import Part
 from .settled import settled_sums
@@ -64,7 +65,7 @@ class MpiRanks(Ranks):
         self._parts = parts
         self._bulks: dict[SoftBody, tuple[float, float]] = {part: self._bulk(part) for part in parts}
         self.halos = halos = [Halo.of(part.numbers.nodes, part.numbers.owner, part.worlds, comm) for part in parts]
-        self._exchanges = [self._exchange_of(halo, k) for k, halo in enumerate(halos)]
+        self._exchanges = [self.exchange_of(halo, k) for k, halo in enumerate(halos)]
         for part, exchange in zip(parts, self._exchanges, strict=True):
             if isinstance(exchange, CardExchange) and comm.size > 1:
                 ghosts = np.tile(part.numbers.owner != comm.rank, part.worlds)
@@ -73,8 +74,11 @@ class MpiRanks(Ranks):
         self._ghosts = [self._places_of_ghosts(part) for part in parts]
         self._copied_energies = [self._places_of_copies(part) for part in parts]
 
-    def _exchange_of(self, halo: Halo, tag: int) -> HostExchange | CardExchange:
-        return CardExchange(halo, self.device) if self.device.is_cuda else HostExchange(halo, self.comm, tag)
+    def exchange_of(
+        self, halo: Halo, tag: int, kinds: Sequence[Any] = kernels.EXCHANGED
+    ) -> HostExchange | CardExchange:
+        """The exchange for some lists of places on this rank's device, of values of these types."""
+        return CardExchange(halo, self.device, kinds) if self.device.is_cuda else HostExchange(halo, self.comm, tag)
 
     def _places_of_ghosts(self, part: Part) -> wp.array:
         """Nodes that other ranks move, in all worlds, int32."""
@@ -170,6 +174,12 @@ class MpiRanks(Ranks):
         if self.device.is_cuda:
             parts.assign(values)
 
+    def has_multigrid(self, k: int) -> bool:
+        return has_multigrid(self.whole(self._parts[k]), self._parts[k])
+
+    def multigrid(self, k: int, options: dict[str, Any]) -> MultigridOfParts:
+        return MultigridOfParts(self, k, self._parts[k], **options)
+
     def clear_ghosts(self, k: int, vectors: wp.array) -> None:
         places = self._ghosts[k]
         wp.launch(kernels.clear_vectors, len(places), [places], [vectors], device=self.device)
@@ -181,7 +191,7 @@ class MpiRanks(Ranks):
         starts = [int(start) for start in np.cumsum([0, *sizes[:-1]])]
         numbers = [self._numbers(k) for k in range(len(self._parts))]
         self._places = SurfacePlaces(nodes, places, self._parts, starts, numbers, self.comm)
-        self._on_surface = self._exchange_of(self._places.halo, len(self._parts))
+        self._on_surface = self.exchange_of(self._places.halo, len(self._parts))
         self._yielding = wp.zeros(len(nodes), dtype=wp.float32, device=self.device)
 
     def complete_surface(self, values: wp.array) -> None:

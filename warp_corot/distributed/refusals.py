@@ -10,6 +10,8 @@ from warp_corot.elasticity import Corotated, Linear, Model, NeoHookean, StVenant
 from warp_corot.errors import InputError
 from warp_corot.solvers import Integrator
 
+from .part_meshes import InParts
+
 #: Models whose forces need only the elements around a node.
 MODELS = (Corotated, Linear, NeoHookean, StVenantKirchhoff)
 
@@ -38,20 +40,16 @@ def check_supported(
             "contact of soft surfaces does not work on several ranks yet; use one body without self_contact, or run on "
             "one process"
         )
-    if getattr(integrator, "preconditioner", None) not in (None, DIAGONAL):
+    in_parts = any(isinstance(body.mesh, InParts) for body in bodies)
+    if getattr(integrator, "preconditioner", None) not in (None, DIAGONAL) and in_parts:
         raise InputError(
-            f"the preconditioner {integrator.preconditioner!r} does not work on several ranks yet; "  # type: ignore[attr-defined]
+            f"the preconditioner {integrator.preconditioner!r} does not work yet with meshes that no rank holds whole; "  # type: ignore[attr-defined]
             f"it must be None or {DIAGONAL!r}"
         )
     if cards > 1 and (contact or others.get("obstacles")):
         raise InputError(
             "contact on several cards is not the same bit for bit as on one yet; deterministic must be False, or take "
             "ranks on the CPU, or one card"
-        )
-    if integrator.is_implicit and (contact or others.get("obstacles")):
-        raise InputError(
-            f"contact under {type(integrator).__name__} does not work on several ranks yet; the integrator must be "
-            "SymplecticEuler"
         )
     for model in models:
         if not isinstance(model, MODELS):

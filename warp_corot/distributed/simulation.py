@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from os import PathLike
@@ -24,14 +23,13 @@ from warp_corot.simulation.energy import Energy, WorldEnergies
 from warp_corot.simulation.parts import checked_bodies, checked_gravity, checked_integrator, checked_models
 from warp_corot.simulation.solves import Solves
 from warp_corot.solvers import Integrator, SymplecticEuler
-from warp_corot.solvers.implicit.schemes import ImplicitIntegrator
 
 from . import checkpoint, in_pieces, mpi
 from .following import Following
 from .gathering import register
 from .of_parts import SimulationOfParts, compile_once, of_their_own, part_of, settled_model
 from .ranks import MpiRanks, Together
-from .refusals import DIAGONAL, check_supported
+from .refusals import check_supported
 
 
 class Simulation:
@@ -81,8 +79,6 @@ class Simulation:
         here = None if device is None else checked_device(device)
         cards = comm.size if deterministic and (here or self.bodies[0].device).is_cuda else 0
         check_supported(self.bodies, models, integrator, others, cards)
-        if isinstance(integrator, ImplicitIntegrator):
-            integrator = dataclasses.replace(integrator, preconditioner=DIAGONAL)
         models = tuple(settled_model(m, body, comm) for m, body in zip(models, self.bodies, strict=True))
         self.gravity = checked_gravity(gravity, self.bodies[0].mesh.up_axis)
         parts = [part_of(body, m, comm, costs, here) for body, m in zip(self.bodies, models, strict=True)]

@@ -17,6 +17,9 @@ from .of_parts import SimulationOfParts, of_their_own
 
 Ints = npt.NDArray[np.intp]
 
+#: Arrays of obstacles and surface places that one step leaves for the next.
+NODAL = ("anchors", "kinds", "forces")
+
 
 def gathered_contact(body: SoftBody, parts: SimulationOfParts, following: Following, comm: Any) -> Contacts | None:
     """The state from which contact of the whole body continues, on rank 0; None elsewhere. All ranks must call this.
@@ -34,7 +37,7 @@ def gathered_contact(body: SoftBody, parts: SimulationOfParts, following: Follow
     own, of_nodes, of_triangles = _places(here, following)
     mine = (
         of_nodes[own],
-        here.rigid.anchors.numpy()[:, own],
+        [getattr(here.rigid, name).numpy()[:, own] for name in NODAL],
         of_triangles,
         *(array.numpy()[:, : len(of_triangles)] for array in (touches.normal, touches.force)),
     )
@@ -46,14 +49,15 @@ def gathered_contact(body: SoftBody, parts: SimulationOfParts, following: Follow
     whole = Contacts(system, of_their_own(here.obstacles.given), here.options, stable_dt=parts.stable_dt)
     assert whole.rigid is not None
     body.state.contact_forces.assign(forces)
-    anchors, normal, force = (
-        array.numpy() for array in (whole.rigid.anchors, whole.rigid.touches.normal, whole.rigid.touches.force)
-    )
-    for nodes, their_anchors, triangles, their_normal, their_force in given:
-        anchors[:, nodes] = their_anchors
+    nodal = [getattr(whole.rigid, name).numpy() for name in NODAL]
+    normal, force = (array.numpy() for array in (whole.rigid.touches.normal, whole.rigid.touches.force))
+    for nodes, theirs, triangles, their_normal, their_force in given:
+        for values, their_values in zip(nodal, theirs, strict=True):
+            values[:, nodes] = their_values
         if normal.size:
             normal[:, triangles], force[:, triangles] = their_normal, their_force
-    whole.rigid.anchors.assign(anchors)
+    for name, values in zip(NODAL, nodal, strict=True):
+        getattr(whole.rigid, name).assign(values)
     whole.rigid.touches.normal.assign(normal)
     whole.rigid.touches.force.assign(force)
     _take_common(whole, here)
@@ -72,11 +76,12 @@ def resume_contact(loaded: Contacts, parts: SimulationOfParts, following: Follow
     assert here is not None
     assert here.rigid is not None
     assert loaded.rigid is not None
-    _own, of_nodes, of_triangles = _places(here, following)
-    anchors = here.rigid.anchors.numpy()
-    used = of_nodes >= 0
-    anchors[:, used] = loaded.rigid.anchors.numpy()[:, of_nodes[used]]
-    here.rigid.anchors.assign(anchors)
+    own, of_nodes, of_triangles = _places(here, following)
+    used = own if here.system.is_implicit else of_nodes >= 0
+    for name in NODAL:
+        values = getattr(here.rigid, name).numpy()
+        values[:, used] = getattr(loaded.rigid, name).numpy()[:, of_nodes[used]]
+        getattr(here.rigid, name).assign(values)
     for name in ("normal", "force"):
         array = getattr(here.rigid.touches, name)
         values = array.numpy()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +12,7 @@ import warp as wp
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
     from warp_corot.kernels.stepping.pace import Pace
+    from warp_corot.solvers.implicit.multigrid import Multigrid
 
 
 Floats = npt.NDArray[np.float64]
@@ -84,6 +85,15 @@ class Ranks:
     def take_in_parts(self, parts: wp.array, columns: Sequence[int], most: bool) -> None:
         """Launch the replacement of columns of partial sums, float64 [worlds, parts, columns], by those of all ranks:
         their sums, or the largest values with ``most``."""
+
+    def has_multigrid(self, k: int) -> bool:
+        """Whether multigrid can precondition the solves of the k-th body."""
+        return True
+
+    def multigrid(self, k: int, options: dict[str, Any]) -> Multigrid | None:
+        """The multigrid cycle of the k-th body over all ranks, with the options of ``Multigrid``; None: this process
+        holds all nodes."""
+        return None
 
     def clear_ghosts(self, k: int, vectors: wp.array) -> None:
         """Launch the reset to zero of a nodal array of the k-th body, vec4, at ghosts."""

@@ -7,6 +7,7 @@ from typing import Protocol
 import warp as wp
 
 from warp_corot.kernels.implicit import lagged as kernels
+from warp_corot.solvers.ranks import ALONE, Ranks
 
 from .operator import LinearOperator, Preconditioner
 
@@ -45,12 +46,14 @@ class Lagged:
     Args:
         preconditioner: The preconditioner that is set up now and then.
         operator: The operator of all solves.
+        ranks: The ranks with other nodes of the body.
 
     Attributes:
         state: Arrays by name to be kept with the state of the body, so that a resumed run is the same.
     """
 
-    def __init__(self, preconditioner: CostlySetUp, operator: LinearOperator):
+    def __init__(self, preconditioner: CostlySetUp, operator: LinearOperator, ranks: Ranks = ALONE):
+        self._ranks = ranks
         self.preconditioner, self._operator, self.device = preconditioner, operator, operator.device
         self._counts = wp.zeros(kernels.COUNTS, dtype=wp.int32, device=self.device)
         self._due = wp.zeros(1, dtype=wp.int32, device=self.device)
@@ -82,6 +85,7 @@ class Lagged:
             [operator.inverse_mass, self._held, self._due],
             device=self.device,
         )
+        self._ranks.take_most(self._due)
         wp.capture_if(self._due, self._set_up)
 
     def apply(self, r: wp.array, z: wp.array) -> None:

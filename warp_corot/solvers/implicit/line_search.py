@@ -7,6 +7,7 @@ from typing import Protocol
 import warp as wp
 
 from warp_corot.kernels.implicit import line_search as kernels
+from warp_corot.solvers.ranks import ALONE, Ranks
 
 from .sums import WorldSums
 
@@ -23,6 +24,21 @@ class Contacts(Protocol):
         ...
 
 
+class ContactsApart(Protocol):
+    """Contacts whose power ranks can add up."""
+
+    @property
+    def count(self) -> int:
+        """Number of places of one world."""
+        ...
+
+    def add_slopes(
+        self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array, *, apart: bool = False
+    ) -> None:
+        """As ``Contacts``, or with ``apart`` to one number for each place, float64 [worlds * count]."""
+        ...
+
+
 class LineSearch:
     """Finds how much of a change of the motions to take, in each world.
 
@@ -33,11 +49,16 @@ class LineSearch:
         device: The device.
     """
 
+    _ranks: Ranks = ALONE
+
     def __init__(self, worlds: int, count: int, contacts: Contacts, device: wp.Device):
         self._worlds, self._count, self._contacts, self.device = worlds, count, contacts, device
-        self._power, self._loss = (WorldSums(worlds, count, 1, device) for _ in range(2))
+        self._power, self._loss = (WorldSums(worlds, count, 1, device, self._ranks) for _ in range(2))
         self._search = wp.zeros((worlds, kernels.COLUMNS), dtype=wp.float64, device=device)
         self._slopes = wp.zeros(worlds, dtype=wp.float64, device=device)
+
+    def _add_slopes(self, d: wp.array, change: wp.array) -> None:
+        self._contacts.add_slopes(d, change, self._search, self._slopes)
 
     def launch(self, rest: wp.array, product: wp.array, change: wp.array, d: wp.array) -> None:
         """Launch d += share of the change.
@@ -54,9 +75,30 @@ class LineSearch:
         inputs = [self._power.parts, self._loss.parts, lanes]
         wp.launch(kernels.begin_search, (self._worlds, lanes), inputs, [self._search, self._slopes], device=self.device)
         for number in range(TRIALS):
-            self._contacts.add_slopes(d, change, self._search, self._slopes)
+            self._add_slopes(d, change)
             self._launch(kernels.take_trial, self._worlds, [number, self._search, self._slopes])
         self._launch(kernels.add_share, self._worlds * self._count, [self._search, self._count, change, d])
 
     def _launch(self, kernel: wp.Kernel, dim: int, inputs: list) -> None:
         wp.launch(kernel, dim, inputs, device=self.device)
+
+
+class SharedLineSearch(LineSearch):
+    """A line search of several ranks, all of which find the same share.
+
+    Args:
+        worlds, count, contacts, device: As for ``LineSearch``.
+        ranks: The ranks with the other entries of each world.
+    """
+
+    def __init__(self, worlds: int, count: int, contacts: ContactsApart, device: wp.Device, ranks: Ranks):
+        self._ranks, self._apart = ranks, contacts
+        super().__init__(worlds, count, contacts, device)
+        # The sums of worlds are in the first places.
+        self._addends = wp.zeros((worlds, max(contacts.count, 1), 1), dtype=wp.float64, device=device)
+        self._slopes = self._addends[:, 0, 0]
+
+    def _add_slopes(self, d: wp.array, change: wp.array) -> None:
+        self._addends.zero_()
+        self._apart.add_slopes(d, change, self._search, self._addends.flatten(), apart=True)
+        self._ranks.take_in_parts(self._addends, [0], most=False)

@@ -20,6 +20,8 @@ PLAIN: dict[str, Any] = {"most_lambda": 4.0}
 AT_NODES: dict[str, Any] = {"degree": 2, "rise": 0, **PLAIN}
 #: A short cycle on the CPU: its sweeps, and the number of nodes of a level that is not made coarser.
 SHORT: dict[str, Any] = {"sweeps": 1, "few_nodes": 24}
+#: The smoother's degree on the finest level of several ranks, which cannot sweep: of short cycles, and of others.
+SHORT_DEGREE, DEGREE = 2, 5
 
 
 def _multigrid(operator: TangentOperator, short_cycles: bool) -> Multigrid:
@@ -27,12 +29,20 @@ def _multigrid(operator: TangentOperator, short_cycles: bool) -> Multigrid:
     shares = operator.field.shares_dilatation
     members = operator.field.find_members
     options: dict[str, Any] = {}
+    if not operator.ranks.is_alone:
+        members = None
     if short_cycles and operator.device.is_cpu:
         # Solves that begin near the answer take few iterations, which are worth less than what they cost.
         options, members = SHORT | (PLAIN if shares else {}), None
-    elif shares and members is None:
+    elif shares and operator.field.find_members is None:
         options = AT_NODES
+    elif shares and members is None:
+        options = PLAIN
     is_turned = not operator.field.is_linear
+    over_ranks = {"degree": SHORT_DEGREE if "sweeps" in options else DEGREE, "is_turned": is_turned, **options}
+    found = operator.ranks.multigrid(operator.number, over_ranks | {"stiffening": stiffening})
+    if found is not None:
+        return found
     return Multigrid(operator.body, is_turned=is_turned, stiffening=stiffening, members=members, **options)
 
 
@@ -56,7 +66,8 @@ def preconditioner_of(name: Any, operator: TangentOperator, *, short_cycles: boo
     """
     check_preconditioner(name)
     if name is None:
-        name = "multigrid" if operator.body.discretization.element_kind is ForestElements else "diagonal"
+        is_forest = operator.body.discretization.element_kind is ForestElements
+        name = "multigrid" if is_forest and operator.ranks.has_multigrid(operator.number) else "diagonal"
     return PRECONDITIONERS[name](operator, short_cycles)
 
 

@@ -178,7 +178,7 @@ class BodySteps:
         self._preconditioner = preconditioner_of(options.preconditioner, self.operator, short_cycles=not exact)
         self.lagged: Lagged | None = None
         if not exact and isinstance(self._preconditioner, Multigrid):
-            self._preconditioner = self.lagged = Lagged(self._preconditioner, self.operator)
+            self._preconditioner = self.lagged = Lagged(self._preconditioner, self.operator, system.ranks)
         self._make_solvers()
         like = self.body.state.displacements
         self._none = wp.zeros(1, dtype=wp.vec4, device=self.device)

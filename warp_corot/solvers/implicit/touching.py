@@ -8,7 +8,7 @@ import warp as wp
 
 from warp_corot.kernels.implicit.tangent import find_rest, judge_round
 
-from .line_search import LineSearch
+from .line_search import LineSearch, SharedLineSearch
 from .newton import Newton
 from .operator import LinearOperator, Preconditioner
 
@@ -30,6 +30,9 @@ class Held(Protocol):
 
     changed: wp.array
 
+    @property
+    def count(self) -> int: ...
+
     def prepare(self) -> None: ...
 
     def launch_begin(self, u: wp.array, d: wp.array, blocks: wp.array) -> None: ...
@@ -46,7 +49,9 @@ class Held(Protocol):
 
     def launch_friction(self, d: wp.array, r: wp.array) -> None: ...
 
-    def add_slopes(self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array) -> None: ...
+    def add_slopes(
+        self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array, *, apart: bool = False
+    ) -> None: ...
 
     def launch_judgement(self, b: wp.array, q: wp.array, d: wp.array) -> None: ...
 
@@ -172,7 +177,8 @@ class TouchingSolve:
         like = newton.step
         self._q, self._r, self._rest, self._change = (wp.zeros_like(like) for _ in range(4))
         worlds = self._operator.worlds
-        self._search = LineSearch(worlds, self._operator.node_count, held, self.device)
+        sizes, self._ranks = (worlds, self._operator.node_count, held, self.device), newton.ranks
+        self._search = LineSearch(*sizes) if self._ranks.is_alone else SharedLineSearch(*sizes, self._ranks)
         self.iterations = wp.zeros_like(newton.solver.iterations)
         self._rounds, self._going = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(2))
 
@@ -209,5 +215,6 @@ class TouchingSolve:
         self._search.launch(self._rest, self._q, self._change, d)
         self._operator.apply(d, self._q)
         held.launch_judgement(b, self._q, d)
+        self._ranks.take_most(held.changed)
         inputs = [newton.solver.scalars, newton.solver.iterations, held.changed, SETTLED, ROUNDS]
         wp.launch(judge_round, 1, inputs, [self._rounds, self.iterations, self._going], device=self.device)

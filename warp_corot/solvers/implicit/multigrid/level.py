@@ -110,11 +110,14 @@ class Level:
     def smooth(self, from_step: int = 0) -> None:
         """Continue with ``z`` from a step of the smoother."""
         for step in range(from_step, len(self.factors)):
-            alpha, beta = self.factors[step]
-            inputs: list[Any] = [self.lanes, self.count, self.pattern.entries]
-            inputs += [alpha, beta if step else 0.0, step == from_step, self.rows, self.inverses, self.r, self.z]
-            self.launch(cycle.smooth, self.count * self.lanes, inputs, [self.other])
-            self.z, self.other = self.other, self.z
+            self._make_step(step, is_first=step == from_step)
+
+    def _make_step(self, step: int, *, is_first: bool) -> None:
+        alpha, beta = self.factors[step]
+        inputs: list[Any] = [self.lanes, self.count, self.pattern.entries]
+        inputs += [alpha, beta if step else 0.0, is_first, self.rows, self.inverses, self.r, self.z]
+        self.launch(cycle.smooth, self.count * self.lanes, inputs, [self.other])
+        self.z, self.other = self.other, self.z
 
     def gather_from(self, fine: Level) -> None:
         """Compute the matrix P^T A P from the finer level's matrix A."""
@@ -134,10 +137,10 @@ class Level:
         inputs += [midpoints.starts, midpoints.midpoints, self.inverses, fine.other]
         self.launch(cycle.restrict_residual, self.count, inputs, [self.r, self.z])
 
-    def correct(self, fine: Level, ends: wp.array) -> None:
-        """Add the correction of this level to the finer one's."""
-        inputs = [self.ranks, self.count, fine.count, self.free, ends, self.z]
-        self.launch(cycle.prolongate_correction, fine.count, inputs, [fine.z])
+    def take_correction(self, coarse: Level, ends: wp.array) -> None:
+        """Add the correction of the coarser level to this one's."""
+        inputs = [self.ranks, coarse.count, self.count, self.free, ends, coarse.z]
+        self.launch(cycle.prolongate_correction, self.count, inputs, [self.z])
 
     def launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any]) -> None:
         """Launch a kernel with ``count`` threads for each world."""

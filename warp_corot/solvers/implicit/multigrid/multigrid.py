@@ -104,12 +104,17 @@ class Multigrid:
         if self._version == self.discretization.sizes.version:
             return False
         self._version = self.discretization.sizes.version
-        self._build(self.discretization.levels())
+        self._build(self._find_levels())
         self.revision += 1
         return True
 
     def update(self, operator: LinearOperator) -> None:
         """Launch the computation of all matrices at the operator's displacements and scales."""
+        self.update_finest(operator)
+        self._update_coarser()
+
+    def update_finest(self, operator: LinearOperator) -> None:
+        """Launch the computation of the finest level's matrix."""
         discretization, finest = self.discretization, self.levels[0]
         elements = cast("ForestElements", discretization.elements)
         inverse_mass, scales = operator.inverse_mass, operator.scales
@@ -133,6 +138,8 @@ class Multigrid:
         inputs = [self.count, self._mesh_nodes, found.entries, self._nodes, inverse_mass, scales, self._free]
         inputs += [found.starts, found.columns, found.diagonal, operator.other_blocks(), self._more]
         finest.launch(values.finish_leaves, self.count, inputs, [finest.blocks, finest.inverses])
+
+    def _update_coarser(self) -> None:
         for transfer in self._transfers:
             transfer.coarse.gather_from(transfer.fine)
         for level in self.levels if self._coarsest is None else self.levels[:-1]:
@@ -142,9 +149,7 @@ class Multigrid:
 
     def apply(self, r: wp.array, z: wp.array) -> None:
         """Launch z = B r, one cycle from zero; both vec4 [worlds * nodes]."""
-        finest = self.levels[0]
-        inputs = [self.count, self._mesh_nodes, finest.factors[0][0], self._nodes, self._free, finest.inverses, r]
-        finest.launch(cycle.take_in, self.count, inputs, [finest.r, finest.z])
+        self.take_in(r)
         for transfer in self._transfers:
             transfer.fine.smooth_before()
             transfer.coarse.restrict_from(transfer.fine, transfer.midpoints)
@@ -153,12 +158,26 @@ class Multigrid:
         else:
             self._coarsest.solve()
         for transfer in reversed(self._transfers):
-            transfer.coarse.correct(transfer.fine, self._ends)
+            transfer.fine.take_correction(transfer.coarse, self._ends)
             transfer.fine.smooth_after()
+        self.hand_out(r, z)
+
+    def take_in(self, r: wp.array) -> None:
+        """Launch the finest level's residual and first step from r."""
+        finest = self.levels[0]
+        inputs = [self.count, self._mesh_nodes, finest.factors[0][0], self._nodes, self._free, finest.inverses, r]
+        finest.launch(cycle.take_in, self.count, inputs, [finest.r, finest.z])
+
+    def hand_out(self, r: wp.array, z: wp.array) -> None:
+        """Launch z from the finest level's correction; held nodes keep their r."""
+        finest = self.levels[0]
         inputs = [self.count, self._mesh_nodes, self._nodes, self._free, r, finest.z]
         finest.launch(cycle.hand_out, self.count, inputs, [z])
 
     # --- pieces ------------------------------------------------------------------------------------------------------
+
+    def _find_levels(self) -> Levels:
+        return self.discretization.levels()
 
     def _build(self, levels: Levels) -> None:
         sizes, device = self.discretization.sizes, self.device
