@@ -14,10 +14,10 @@ from warp_corot.kernels.implicit.conjugate_gradients import had_much_to_do
 from warp_corot.kernels.implicit.line_search import TRIED
 from warp_corot.kernels.stepping.pace import DT, Pace
 
+from .facing import locate_facing
 from .law import SETTLING, Law, held_back
-from .locate import locate_edge, locate_node
 from .motion import Surface
-from .rows import Meeting, Rows, row_count, triangle_normal
+from .rows import Meeting, Rows, row_count
 from .vertices import across
 
 wp.set_module_options({"enable_backward": False})
@@ -89,7 +89,9 @@ def begin_places(
     if inverse_mass[i] > 0.0:
         joined.compliance[s] = 3.0 / wp.max(wp.trace(blocks[i]), 1.0e-30)
     else:
+        # It is where the step ends; the motion tells the search how fast it is.
         joined.carried[s] = load_node(increment, i)
+        surface.d[s] = joined.carried[s]
 
 
 @wp.func
@@ -132,17 +134,6 @@ def least_gap(gap: float, law: Law, dt: float):
 
 
 @wp.func
-def is_faced(row: int, s: int, surface: Surface, meeting: Meeting, rows: Rows):
-    """Whether the normal of a node at a triangle points into the node's body: otherwise the two face each other
-    elsewhere. At a rim, where two faces meet, a node need not be above both.
-    """
-    out = wp.vec3()
-    for k in range(meeting.corner_starts[s], meeting.corner_starts[s + 1]):
-        out += triangle_normal(surface, meeting.triangles[meeting.corners[k] / 3])
-    return wp.dot(out, rows.normal[row]) <= 0.0
-
-
-@wp.func
 def locate(
     row: int,
     is_first: int,
@@ -154,14 +145,7 @@ def locate(
     rows: Rows,
     joined: Joined,
 ):
-    nodes = meeting.body.shape[0]
-    owner = rows.owner[row]
-    is_near = bool(False)
-    if owner >= nodes:
-        is_near = locate_edge(row, owner - nodes, rows.other[row], surface, meeting, rows)
-    elif owner >= 0:
-        is_near = locate_node(row, owner, rows.other[row], surface, meeting, rows)
-        is_near = is_near and is_faced(row, owner, surface, meeting, rows)
+    is_near = locate_facing(row, surface, meeting, rows)
     was = joined.force[row]
     if is_first != 0:
         was = rows.force[row]

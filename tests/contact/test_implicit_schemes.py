@@ -81,12 +81,6 @@ def test_integrators_that_cannot_touch_are_refused(device, integrator, refused):
         wc.Simulation(block(device), obstacles=wc.Ground(), integrator=integrator)
 
 
-def test_soft_surfaces_need_backward_euler(device):
-    bodies = [block(device), block(device, origin=(0.0, 0.0, 0.1))]
-    with pytest.raises(wc.InputError, match="BDF2 does not support contact between soft surfaces"):
-        wc.Simulation(bodies, contact=wc.Contact(), integrator=wc.BDF2(dt=DT))
-
-
 def test_a_saved_run_of_a_remeshed_body_goes_on(device, tmp_path):
     """To the tolerance of the solves."""
     body = block(device, origin=(0.0, 0.0, 0.001), material=wc.Isotropic(500.0, 0.4, 1000.0))

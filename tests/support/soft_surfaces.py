@@ -43,3 +43,22 @@ def horseshoe(device):
         wc.Isotropic(young=2e4, poisson=0.4, density=1000.0),
         device=device,
     )
+
+
+def folded(device, integrator, *, itself=True):
+    """A horseshoe whose arms are bent together by more than the gap between them: its simulation, the nodes that bend
+    it, and a function for how far the arms have crossed [m]."""
+    body = horseshoe(device)
+    x = body.mesh.points
+    arms = [np.flatnonzero((np.abs(x[:, 0] - side) < 1e-6) & (x[:, 2] > 0.03)) for side in (0.0, 0.05)]
+    for nodes, sign in zip(arms, (1.0, -1.0), strict=True):
+        body.prescribe(nodes, times=[0.0, 0.1], displacements=[(0, 0, 0), (sign * 0.007, 0, 0)])
+    contact = wc.Contact(self_contact=itself)
+    sim = wc.Simulation(body, contact=contact, gravity=(0.0, 0.0, 0.0), integrator=integrator)
+    left, right = (np.flatnonzero((np.abs(x[:, 0] - side) < 1e-6) & (x[:, 2] > 0.015)) for side in (0.02, 0.03))
+
+    def crossing():
+        now = body.positions.numpy()[:, 0].astype(float)
+        return now[left].max() - now[right].min()
+
+    return sim, np.concatenate(arms), crossing

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import warp as wp
 
 from warp_corot.kernels.contact import joined as kernels
+from warp_corot.kernels.contact import row_meetings
 from warp_corot.kernels.contact.law import Law
 from warp_corot.solvers.system import System
 
@@ -65,8 +66,36 @@ class JoinedRows:
         joined.counts = wp.zeros(3, dtype=wp.int32, device=self.device)
         self._joined = joined
         self._added = wp.zeros(sizes[0], dtype=wp.vec3, device=self.device)
+        self._marked = wp.zeros(sizes[0], dtype=wp.int32, device=self.device)
+
+    def reserve(self, motion: float) -> None:
+        """Search for pairs with a larger margin, if anything may begin to move so far in a step [m]."""
+        self._pairs.search.reserve(motion)
 
     # --- launches ----------------------------------------------------------------------------------------------------
+
+    def launch_meetings(self, offset: int, touched: Sequence[wp.array], begins: wp.array) -> None:
+        """Launch the test whether pairs have begun or ceased to push in the last step, or will meet in this one.
+
+        Args:
+            offset: The number of the step since the clock was last advanced.
+            touched: What the nodes of each body have touched, int32 [worlds * nodes]; see ``launch_touched``.
+            begins: Nonzero afterwards if so, int32 [1].
+        """
+        pace, surface = self._system.pace.arrays, self._pairs.surface.arrays
+        for k, body in enumerate(self._system.bodies):
+            state = body.state
+            inputs = [state.rest, state.displacements, state.velocities, pace, touched[k]]
+            self._on_body(k, row_meetings.foresee_places, inputs, [surface, begins])
+        self.launch_search(offset)
+        inputs = [self._law, surface, self._pairs.meeting, self._pairs.rows, begins]
+        self._on_rows(row_meetings.find_row_meetings, inputs)
+
+    def launch_touched(self, touched: Sequence[wp.array]) -> None:
+        """Launch the record, after a step, of what the nodes of each body have touched."""
+        self._on_rows(row_meetings.mark_acting, [self._pairs.rows, self._marked])
+        for k, array in enumerate(touched):
+            self._on_body(k, row_meetings.note_touched, [self._pairs.surface.arrays], [self._marked, array])
 
     def launch_begin(self, k: int, first: int, blocks: wp.array, increment: wp.array, guess: wp.array) -> None:
         """Launch the state of the k-th body at the beginning of a step.

@@ -137,6 +137,12 @@ class Search:
             raise UnstableError(f"surfaces that are hit go farther than {1e3 * self.farthest:.3g} mm in one step")
         self.watch.least.fill_(least)
 
+    def reserve(self, motion: float) -> None:
+        """Search with a larger margin from now on, if anything may go so far in a step [m]."""
+        motion = min(motion, self.farthest / WIDER)
+        if motion > float(self.watch.least.numpy()[0]):
+            self.watch.least.fill_(motion)
+
     # --- launches --------------------------------------------------------------------------------------------------
 
     def launch(self, offset: int) -> None:

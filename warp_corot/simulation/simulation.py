@@ -115,7 +115,6 @@ class Simulation(Clock, FormerNames):
             check_implicit(
                 self.integrator,
                 touches=touching is not None,
-                joined=touching is not None and (len(self.bodies) > 1 or touching[1].self_contact),
                 remeshes=remesh is not None,
                 ordered=ordered,
             )

@@ -135,12 +135,22 @@ class JoinedSolve:
 
     def launch(self, offset: int) -> None:
         """Launch the solve for the steps of all bodies, from guesses; the residuals must be known."""
+        self.linearise()
+        self.launch_begin(offset)
+        self.launch_rounds()
+        self.launch_end()
+
+    def linearise(self) -> None:
+        """Launch the linearisation at the present displacements."""
+        for newton in self._newtons:
+            newton.operator.take(newton.body.state.displacements)
+            newton.preconditioner.update(newton.operator)
+
+    def launch_begin(self, offset: int) -> None:
+        """Launch the beginning of a step; increments must be zero at free nodes."""
         rows, blocks = self._rows, []
         for k, newton in enumerate(self._newtons):
-            operator = newton.operator
-            operator.take(newton.body.state.displacements)
-            newton.preconditioner.update(operator)
-            blocks.append(operator.diagonal_blocks())
+            blocks.append(newton.operator.diagonal_blocks())
             rows.launch_begin(k, self._parts.starts[k], blocks[k], newton.increment, newton.step)
         rows.launch_search(offset)
         for newton, held, d, own in zip(self._newtons, self._held, self._parts.of(self._d), blocks, strict=True):
@@ -148,16 +158,25 @@ class JoinedSolve:
                 held.launch_begin(newton.body.state.displacements, d, own)
         rows.locates.fill_(1)
         rows.launch_located(self._d, is_first=True)
-        self._rounds.zero_()
-        self._linear.zero_()
-        self._changed.zero_()
-        rows.locates.zero_()
+
+    def launch_again(self) -> None:
+        """Launch the beginning of another linearisation of the same step."""
+        for held, _d in self._each_held(self._d):
+            held.launch_again()
+
+    def launch_rounds(self) -> None:
+        """Launch the linear solves, until contact no longer changes."""
+        for count in (self._rounds, self._linear, self._changed, self._rows.locates):
+            count.zero_()
         self._going.fill_(1)
         wp.capture_while(self._going, self._round)
+        wp.launch(kernels.spread, self._worlds, [self._linear, self._solver.status, self._both], device=self.device)
+
+    def launch_end(self) -> None:
+        """Launch the results of contact for users."""
         for held, d in self._each_held(self._d):
             held.launch_end(d)
-        rows.launch_end(self._d)
-        wp.launch(kernels.spread, self._worlds, [self._linear, self._solver.status, self._both], device=self.device)
+        self._rows.launch_end(self._d)
 
     def _round(self) -> None:
         rows, d = self._rows, self._d

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,13 @@ SHORTEST = 1e-15
 TOLERANCE = 1e-4
 
 Table = npt.NDArray[np.float64]
+
+
+class NewtonOptions(TypedDict):
+    """The options of Newton's method; see ``TouchingNewton``."""
+
+    tolerance: float
+    most: int
 
 
 @dataclass(frozen=True)
@@ -83,6 +90,11 @@ class ImplicitIntegrator(Integrator):
     def stable_step(self, frequency: float) -> float:
         """Infinite: any step is stable."""
         return math.inf
+
+    @property
+    def newton_with_contact(self) -> NewtonOptions:
+        """The options of Newton's method with contact."""
+        return {"tolerance": self.tolerance or 1.0, "most": 1 if self.tolerance is None else self.iterations}
 
     @abstractmethod
     def scheme(self, dt: float) -> Table:

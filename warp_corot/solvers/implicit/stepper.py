@@ -16,6 +16,7 @@ from warp_corot.kernels.stepping.integrate import follow_trajectory
 from warp_corot.solvers.integrator import Stepper
 
 from .joined import JoinedSolve
+from .joined_newton import JoinedNewton
 from .lagged import Lagged
 from .multigrid import Multigrid
 from .newton import Newton
@@ -28,6 +29,9 @@ if TYPE_CHECKING:
     from warp_corot.solvers.system import System
 
     from .schemes import ImplicitIntegrator
+
+#: The search for soft surfaces leaves room for motions of this many times what a body that is let go falls in a step.
+FALLS = 2.0
 
 
 class ImplicitStepper(Stepper):
@@ -53,7 +57,12 @@ class ImplicitStepper(Stepper):
         self.totals = wp.zeros(4, dtype=wp.int64, device=system.device)
         self.touching = cast("list[Touching]", [each for each in system.constraints if hasattr(each, "active_set")])
         self.rows = next((rows for each in self.touching if (rows := each.joined_rows()) is not None), None)
+        if self.rows is not None:
+            self.rows.reserve(FALLS * float(np.linalg.norm(system.gravity)) * integrator.dt**2)
         self._joined: JoinedSolve | None = None
+        self._joined_newton: JoinedNewton | None = None
+        #: Nonzero if all bodies that are solved for together begin again with a first step, int32 [1].
+        self.begins = wp.zeros(1, dtype=wp.int32, device=system.device)
         self._bodies = [BodySteps(self, k) for k in range(len(system.bodies))]
 
     @property
@@ -62,6 +71,7 @@ class ImplicitStepper(Stepper):
         kept = {f"history.{number}": array for number, array in arrays}
         kept |= {f"velocities.{k}": body.before for k, body in enumerate(self._bodies)}
         kept |= {f"meetings.{k}": body.met for k, body in enumerate(self._bodies) if body.met.size}
+        kept |= {f"touched.{k}": body.touched for k, body in enumerate(self._bodies) if body.touched.size}
         lagged = [(k, body.lagged) for k, body in enumerate(self._bodies) if body.lagged is not None]
         return kept | {f"setup.{k}.{name}": array for k, each in lagged for name, array in each.state.items()}
 
@@ -87,34 +97,53 @@ class ImplicitStepper(Stepper):
                 each.launch_motion(offset)
             for hold in self.holds:
                 hold.launch_begin()
-            for body in self._bodies:
-                body.launch_begin(offset)
-                if self._joined is None:
-                    body.launch_residual()
-                    body.launch_solve()
-                    body.launch_end(offset)
             if self._joined is not None:
                 self._launch_joined(offset, self._joined)
+                continue
+            for body in self._bodies:
+                body.launch_changes(offset)
+                body.launch_begin()
+                body.launch_residual()
+                body.launch_solve()
+                body.launch_end(offset)
 
     def _launch_joined(self, offset: int, joined: JoinedSolve) -> None:
-        """Launch a step of all bodies together, once all have begun it."""
+        """Launch a step of all bodies together."""
+        assert self.rows is not None
+        self.begins.zero_()
         for body in self._bodies:
-            body.launch_residual()
-        joined.launch(offset)
+            body.launch_changes(offset)
+        touched = [body.touched for body in self._bodies]
+        if self.integrator.history:
+            self.rows.launch_meetings(offset, touched, self.begins)
         for body in self._bodies:
-            body.take_solved(joined)
+            body.launch_begin()
+        solve: JoinedSolve | JoinedNewton = joined
+        if self._joined_newton is None:
+            for body in self._bodies:
+                body.launch_residual()
+        else:
+            solve = self._joined_newton
+        solve.launch(offset)
+        if self.integrator.history:
+            self.rows.launch_touched(touched)
+        for body in self._bodies:
+            body.take_solved(solve)
             body.launch_end(offset)
 
     def _join(self) -> None:
         assert self.rows is not None
+        options, newtons = self.integrator, [body.newton for body in self._bodies]
         self._joined = JoinedSolve(
-            [body.newton for body in self._bodies],
+            newtons,
             [body.held for body in self._bodies],
             self.rows,
             worlds=self.system.bodies[0].worlds,
-            tolerance=self.integrator.linear_tolerance,
-            most=self.integrator.linear_iterations,
+            tolerance=options.linear_tolerance,
+            most=options.linear_iterations,
         )
+        if not self.in_one_solve:
+            self._joined_newton = JoinedNewton(self._joined, newtons, **options.newton_with_contact)
 
     @property
     def in_one_solve(self) -> bool:
@@ -157,6 +186,8 @@ class BodySteps:
         before: Velocities before the last step, for the guess of the next one, vec4; NaN before the first.
         met: A number for the obstacles that each node touched when the last step began, in schemes of second order,
             else empty, int32.
+        touched: What each node has touched of soft surfaces, in schemes of second order, else empty, int32; see
+            ``kernels.contact.meetings``.
         lagged: The preconditioner, if it is kept over many steps, else None.
     """
 
@@ -170,8 +201,9 @@ class BodySteps:
         self.viscosity = Viscosity(self.body, self.field, options.viscosity) if options.viscosity else None
         sets = [each.active_set(k) for each in stepper.touching]
         self.held: Held | None = next((each for each in sets if each is not None), None)
+        touches = self.held is not None or stepper.rows is not None
         # Contact needs a matrix that is positive definite.
-        exact = options.tolerance is not None and self.held is None
+        exact = options.tolerance is not None and not touches
         self.operator = TangentOperator(
             self.body, self.field, viscosity=self.viscosity, exact=exact, ranks=system.ranks, number=k
         )
@@ -187,13 +219,14 @@ class BodySteps:
         self._left = [wp.full_like(like, np.nan) if wanted else self._none for _ in range(2)]
         self.history = [*self._h[:wanted], *(self._left if wanted else [])]
         self.before = wp.full_like(like, np.nan)
-        self.met = wp.zeros(len(like) if wanted and self.held is not None else 0, dtype=wp.int32, device=self.device)
+        kept = [len(like) if wanted and each is not None else 0 for each in (self.held, stepper.rows)]
+        self.met, self.touched = (wp.zeros(length, dtype=wp.int32, device=self.device) for length in kept)
         self._drift, self._rates = (self._none if self.viscosity is None else wp.zeros_like(like) for _ in range(2))
-        self._begins = wp.zeros(1, dtype=wp.int32, device=self.device)
+        self._begins = wp.zeros(1, dtype=wp.int32, device=self.device) if stepper.rows is None else stepper.begins
         self._is_prepared = False
         self._one = wp.ones(self.body.worlds, dtype=wp.int32, device=self.device)
         tables = np.stack([options.scheme(options.dt), options.start(options.dt)])
-        if self.held is not None:
+        if touches:
             # The increments of a step with contact begin with zero.
             tables[:, int(kernels.STAGE), 1] = 0.0
         self._table = wp.array(tables, dtype=wp.float32, device=self.device)
@@ -216,9 +249,7 @@ class BodySteps:
         if self.held is not None and self.stepper.rows is None:
             self.touching = TouchingSolve(self.newton, self.held)
             if not self.stepper.in_one_solve:
-                most = 1 if options.tolerance is None else options.iterations
-                tolerance = options.tolerance or 1.0
-                self.touching_newton = TouchingNewton(self.touching, tolerance=tolerance, most=most)
+                self.touching_newton = TouchingNewton(self.touching, **options.newton_with_contact)
 
     def prepare(self) -> None:
         """Make everything that launches use, so that they can be recorded."""
@@ -244,11 +275,22 @@ class BodySteps:
         self.field.elastic_forces(u)
         self.field.potentials(u)
 
-    def launch_begin(self, offset: int) -> None:
-        """Launch the beginning of the ``offset``-th step since the clock was last advanced."""
+    def launch_changes(self, offset: int) -> None:
+        """Launch what is given for the ``offset``-th step since the clock was last advanced, and the test whether it is
+        a first step."""
         self.body.conditions.follow_activations(self.system.pace, offset + 1)
         self._follow_trajectories(offset)
-        self._begin()
+        if self.stepper.rows is None:
+            self._begins.zero_()
+        if not self.history:
+            return
+        state = self.body.state
+        inputs = [self.body.conditions.inverse_mass, state.displacements, state.velocities, *self._left]
+        self._launch(kernels.find_changes, inputs, [self._begins])
+        if self.held is not None:
+            # Velocities jump when nodes meet obstacles, so schemes of second order begin again.
+            self.held.launch_meetings(self.met, self._begins)
+        self.system.ranks.take_most(self._begins)
 
     def launch_residual(self) -> None:
         """Launch the forces that are out of balance, if the step is solved for by itself."""
@@ -278,14 +320,20 @@ class BodySteps:
     def _solve_touching(self, solve: TouchingNewton) -> None:
         """Launch the solve for a step with contact by Newton's method."""
         solve.launch()
+        self._take_counts(solve)
+
+    def _take_counts(self, solve: TouchingNewton | JoinedNewton) -> None:
         if self.lagged is not None:
             self.lagged.judge(solve.linear_iterations, solve.status)
         self._counts = [solve.iterations, solve.linear_iterations, solve.status]
         self._good = int(conjugate_gradients.CONVERGED)
 
-    def take_solved(self, joined: JoinedSolve) -> None:
+    def take_solved(self, solve: JoinedSolve | JoinedNewton) -> None:
         """Launch the copy of this body's step from a solve for all bodies."""
-        self._take(joined.iterations, joined.status)
+        if isinstance(solve, JoinedNewton):
+            self._take_counts(solve)
+        else:
+            self._take(solve.iterations, solve.status)
 
     def _take(self, iterations: wp.array, status: wp.array) -> None:
         newton = self.newton
@@ -311,7 +359,7 @@ class BodySteps:
             outputs = [body.state.velocities, system.support_work_of(body)]
             wp.launch(follow_trajectory, len(each.nodes), inputs, outputs, device=self.device)
 
-    def _begin(self) -> None:
+    def launch_begin(self) -> None:
         """Launch the input of the step's solve."""
         system = self.system
         state, conditions, newton, options = (
@@ -320,14 +368,6 @@ class BodySteps:
             self.newton,
             self.stepper.integrator,
         )
-        self._begins.zero_()
-        if self.history:
-            inputs = [conditions.inverse_mass, state.displacements, state.velocities, *self._left]
-            self._launch(kernels.find_changes, inputs, [self._begins])
-            if self.held is not None:
-                # Velocities jump when nodes meet obstacles, so schemes of second order begin again.
-                self.held.launch_meetings(self.met, self._begins)
-            system.ranks.take_most(self._begins)
         inputs = [self._begins, self._table, options.damping]
         outputs = [self.operator.scales, newton.inertia]
         wp.launch(kernels.choose_scales, 1, inputs, outputs, device=self.device)

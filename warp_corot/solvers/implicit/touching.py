@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Protocol
 
 import warp as wp
@@ -71,6 +72,12 @@ class Rows(Protocol):
     def prepare(self) -> None: ...
 
     def launch_begin(self, k: int, first: int, blocks: wp.array, increment: wp.array, guess: wp.array) -> None: ...
+
+    def reserve(self, motion: float) -> None: ...
+
+    def launch_meetings(self, offset: int, touched: Sequence[wp.array], begins: wp.array) -> None: ...
+
+    def launch_touched(self, touched: Sequence[wp.array]) -> None: ...
 
     def launch_search(self, offset: int) -> None: ...
 
