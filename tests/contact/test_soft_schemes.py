@@ -84,7 +84,7 @@ def test_a_soft_block_rests_on_a_soft_slope(device):
 
 
 def test_a_saved_run_goes_on(device, tmp_path):
-    """Blocks of several worlds, saved while they meet: to the tolerance of solves, because multigrid is set up again."""
+    """Blocks of several worlds, saved while they meet; multigrid is set up again, so it is to the tolerance."""
     low, high = (block(device, z, cells=(1, 1, 1), worlds=2) for z in (0.0, 0.0212))
     low.fix("z == zmin")
     sim = wc.Simulation([low, high], contact=wc.Contact(), gravity=DOWN, integrator=wc.BDF2(dt=0.008))
