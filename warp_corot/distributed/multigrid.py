@@ -20,7 +20,7 @@ from warp_corot.kernels.distributed.multigrid import add_correction
 from warp_corot.kernels.implicit.multigrid import values
 from warp_corot.mesh import TetForest
 from warp_corot.solvers.implicit.multigrid import Multigrid
-from warp_corot.solvers.implicit.multigrid.level import Level
+from warp_corot.solvers.implicit.multigrid.level import Level, SmoothedLevel
 from warp_corot.solvers.implicit.multigrid.multigrid import MOST_DENSE
 from warp_corot.solvers.implicit.operator import LinearOperator
 
@@ -128,7 +128,7 @@ class GatheredLevel(Level):
         self._own_rows.to_whole(self.here.other, self.other)
         self._everywhere(self.other)
 
-    def take_correction(self, coarse: Level, ends: wp.array) -> None:
+    def take_correction(self, coarse: SmoothedLevel, ends: wp.array) -> None:
         inputs = [coarse.count, self.here.count, self.here.free, self._ends, coarse.z]
         self.here.launch(add_correction, self.here.count, inputs, [self.here.z])
 

@@ -20,8 +20,11 @@ LANES, MOST_LANES = ((100_000, 4), (5_000, 8)), 32
 def smoothing_factors(degree: int) -> list[tuple[float, float]]:
     """The factors of the preconditioned residual, and of the step before, in each step of Chebyshev's iteration.
 
-    The iteration reduces the upper part of the eigenvalues of D^-1 A; with more steps this part is larger.
+    The iteration reduces the upper part of the eigenvalues of D^-1 A; with more steps this part is larger. Degree zero
+    has none.
     """
+    if degree == 0:
+        return []
     largest, least = LARGEST_EIGENVALUE, LARGEST_EIGENVALUE / max(2.0 * degree**2, 4.0)
     middle, half = 0.5 * (largest + least), 0.5 * (largest - least)
     factors, rho = [(1.0 / middle, 0.0)], half / middle
@@ -32,24 +35,81 @@ def smoothing_factors(degree: int) -> list[tuple[float, float]]:
     return factors
 
 
-class Level:
-    """A level's matrix and vectors.
+class SmoothedLevel:
+    """A level's vectors, and the launches from it to the next coarser one.
 
     Args:
-        pattern: The pattern of its matrix.
+        count: Number of its nodes, n.
         worlds: Number of worlds.
         ranks: Number of nodes of all levels, M.
         free: Nonzero for free nodes, by rank, uint8 [worlds * M].
-        degree: The degree of the smoother.
+        degree: The degree of the smoother; zero: the level does not smooth.
+
+    Attributes:
+        inverses: Inverses of the diagonal blocks, mat33 [worlds * n].
+        r, z, other: Residual, correction, and a vector to work with, vec4 [worlds * n].
+        factors: The factors of the smoother's steps; none: the level only passes its residual on.
+    """
+
+    def __init__(self, count: int, worlds: int, ranks: int, free: wp.array, degree: int):
+        self.count, self.worlds, self.ranks, self.free, self.device = count, worlds, ranks, free, free.device
+        self.inverses = wp.zeros(worlds * count, dtype=wp.mat33, device=self.device)
+        self.r, self.z, self.other = (wp.zeros(worlds * count, dtype=wp.vec4, device=self.device) for _ in range(3))
+        self.factors = smoothing_factors(degree)
+
+    def smooth_before(self) -> None:
+        """Smooth from zero; ``z`` already has the first step."""
+        self.smooth(1)
+
+    def smooth_after(self) -> None:
+        """Smooth ``z`` further, by the transpose of ``smooth_before``."""
+        self.smooth()
+
+    def smooth(self, from_step: int = 0) -> None:
+        """Continue with ``z`` from a step of the smoother."""
+        for step in range(from_step, len(self.factors)):
+            self._make_step(step, is_first=step == from_step)
+
+    def _make_step(self, step: int, *, is_first: bool) -> None:
+        """Launch a step from ``z`` and, unless it is the first, from ``other`` before it; the result is in ``z``."""
+        raise NotImplementedError
+
+    def find_residual(self) -> None:
+        """Launch other = r - A z after ``smooth_before``."""
+        raise NotImplementedError
+
+    def restrict_from(self, fine: SmoothedLevel, midpoints: Midpoints) -> None:
+        """Restrict the finer level's residual, and make the smoother's first step."""
+        if fine.factors:
+            fine.find_residual()
+        residual = fine.other if fine.factors else fine.r
+        first = self.factors[0][0] if self.factors else 0.0
+        inputs: list[Any] = [self.ranks, self.count, fine.count, first, self.free]
+        inputs += [midpoints.starts, midpoints.midpoints, self.inverses, residual]
+        self.launch(cycle.restrict_residual, self.count, inputs, [self.r, self.z])
+
+    def take_correction(self, coarse: SmoothedLevel, ends: wp.array) -> None:
+        """Add the correction of the coarser level to this one's."""
+        inputs = [self.ranks, coarse.count, self.count, self.free, ends, coarse.z]
+        self.launch(cycle.prolongate_correction, self.count, inputs, [self.z])
+
+    def launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any]) -> None:
+        """Launch a kernel with ``count`` threads for each world."""
+        wp.launch(kernel, dim=(self.worlds, count), inputs=inputs, outputs=outputs, device=self.device)
+
+
+class Level(SmoothedLevel):
+    """A level with a matrix.
+
+    Args:
+        pattern: The pattern of its matrix.
+        worlds, ranks, free, degree: As for every level.
         is_bounded: Whether the bound on the eigenvalues of D^-1 A must be kept by smaller inverses, as where groups of
             more than four nodes share a dilatation.
         is_half: Whether the cycle uses the matrix in half precision.
 
     Attributes:
         blocks: Values of the entries, transposed, mat33 [worlds * entries + 1].
-        inverses: Inverses of the diagonal blocks, mat33 [worlds * n].
-        r, z, other: Residual, correction, and a vector to work with, vec4 [worlds * n].
-        factors: The factors of the smoother's steps.
         lanes: Number of threads that share a row.
     """
 
@@ -63,12 +123,10 @@ class Level:
         is_bounded: bool = False,
         is_half: bool = False,
     ):
-        self.pattern, self.worlds, self.ranks, self.free = pattern, worlds, ranks, free
-        self.device = pattern.starts.device
-        self.count = pattern.count
+        super().__init__(pattern.count, worlds, ranks, free, degree)
+        self.pattern = pattern
         # One more, since products read past the last.
         self.blocks = wp.zeros(worlds * pattern.entries + 1, dtype=wp.mat33, device=self.device)
-        self.inverses = wp.zeros(worlds * self.count, dtype=wp.mat33, device=self.device)
         self.rows = cycle.Rows()
         self.rows.starts, self.rows.columns, self.rows.blocks = pattern.starts, pattern.columns, self.blocks
         if is_half:
@@ -77,10 +135,6 @@ class Level:
             self.rows.units = wp.zeros(worlds * self.count, dtype=wp.float32, device=self.device)
         self._is_half = is_half
         self._unbounded = wp.zeros_like(self.inverses) if is_bounded else None
-        self.r, self.z, self.other = (
-            wp.zeros(worlds * self.count, dtype=wp.vec4, device=self.device) for _ in range(3)
-        )
-        self.factors = smoothing_factors(degree)
         rows = worlds * self.count
         self.lanes = next((lanes for most, lanes in LANES if rows > most), MOST_LANES)
         if self.device.is_cpu:
@@ -94,23 +148,9 @@ class Level:
         inputs: list[Any] = [self.lanes, self.count, pattern.entries, pattern.starts, pattern.columns, self.blocks]
         self.launch(cycle.pack_rows, self.count * self.lanes, inputs, [rows.packed, rows.sums, rows.units])
 
-    def smooth_before(self) -> None:
-        """Smooth from zero; ``z`` already has the first step."""
-        self.smooth(1)
-
-    def smooth_after(self) -> None:
-        """Smooth ``z`` further, by the transpose of ``smooth_before``."""
-        self.smooth()
-
     def find_residual(self) -> None:
-        """Launch other = r - A z after ``smooth_before``."""
         inputs = [self.lanes, self.count, self.pattern.entries, self.rows, self.r, self.z]
         self.launch(cycle.find_residual, self.count * self.lanes, inputs, [self.other])
-
-    def smooth(self, from_step: int = 0) -> None:
-        """Continue with ``z`` from a step of the smoother."""
-        for step in range(from_step, len(self.factors)):
-            self._make_step(step, is_first=step == from_step)
 
     def _make_step(self, step: int, *, is_first: bool) -> None:
         alpha, beta = self.factors[step]
@@ -119,29 +159,19 @@ class Level:
         self.launch(cycle.smooth, self.count * self.lanes, inputs, [self.other])
         self.z, self.other = self.other, self.z
 
-    def gather_from(self, fine: Level) -> None:
+    def gather_from(self, fine: SmoothedLevel) -> None:
         """Compute the matrix P^T A P from the finer level's matrix A."""
+        assert isinstance(fine, Level)
         pattern = self.pattern
         inputs = [self.ranks, self.count, pattern.entries, fine.pattern.entries, self.free, pattern.upper]
         inputs += [pattern.sum_starts, pattern.codes, pattern.places, fine.blocks]
+        self.gather(values.gather_products, inputs)
+
+    def gather(self, kernel: wp.Kernel, inputs: list[Any]) -> None:
+        """Launch a kernel that computes blocks and inverses, a thread for each entry of the upper triangle."""
+        pattern = self.pattern
         inverses = self.inverses if self._unbounded is None else self._unbounded
-        self.launch(values.gather_products, len(pattern.upper), inputs, [self.blocks, inverses])
+        self.launch(kernel, len(pattern.upper), inputs, [self.blocks, inverses])
         if self._unbounded is not None:
             inputs = [self.count, pattern.entries, pattern.starts, pattern.columns, self.blocks, inverses]
             self.launch(shared.bound_diagonal, self.count, inputs, [self.inverses])
-
-    def restrict_from(self, fine: Level, midpoints: Midpoints) -> None:
-        """Restrict the finer level's residual, and make the smoother's first step."""
-        fine.find_residual()
-        inputs: list[Any] = [self.ranks, self.count, fine.count, self.factors[0][0], self.free]
-        inputs += [midpoints.starts, midpoints.midpoints, self.inverses, fine.other]
-        self.launch(cycle.restrict_residual, self.count, inputs, [self.r, self.z])
-
-    def take_correction(self, coarse: Level, ends: wp.array) -> None:
-        """Add the correction of the coarser level to this one's."""
-        inputs = [self.ranks, coarse.count, self.count, self.free, ends, coarse.z]
-        self.launch(cycle.prolongate_correction, self.count, inputs, [self.z])
-
-    def launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any]) -> None:
-        """Launch a kernel with ``count`` threads for each world."""
-        wp.launch(kernel, dim=(self.worlds, count), inputs=inputs, outputs=outputs, device=self.device)

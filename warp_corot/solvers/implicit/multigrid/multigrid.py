@@ -12,6 +12,7 @@ import warp as wp
 from warp_corot.discretization.discretization import Discretization, Discretized, discretization_of
 from warp_corot.discretization.levels import Levels
 from warp_corot.discretization.members import Members
+from warp_corot.discretization.subtrees import Batch
 from warp_corot.errors import InputError
 from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.implicit.multigrid import cycle, pattern, shared, values
@@ -19,14 +20,17 @@ from warp_corot.kernels.tables.shapes import GRADIENT
 from warp_corot.solvers.implicit.operator import LinearOperator
 
 from .coarsest import DenseInverse
-from .level import Level
+from .level import Level, SmoothedLevel
 from .pattern import Midpoints, Pattern, PatternFinder
+from .subtrees import RootLevel, SubtreeLevel, suitable_batches
 from .swept import SweptLevel
 
 #: The largest coarsest level that is inverted [nodes].
 MOST_DENSE = 64
 #: By how much degrees are smaller if the second level has more than half as many nodes as the finest one.
 STEPS_LESS = 2
+#: By how much the degree on the finest level is larger if the level of the roots of subtrees does not smooth.
+STEPS_MORE = 2
 #: The smoother's degree or sweeps on a coarsest level that is not inverted, for example of a grid of many cubes.
 COARSEST_DEGREE, COARSEST_SWEEPS = 24, 8
 
@@ -35,7 +39,7 @@ COARSEST_DEGREE, COARSEST_SWEEPS = 24, 8
 class Transfer:
     """Transfers between a level and the next coarser one."""
 
-    fine: Level
+    fine: SmoothedLevel
     coarse: Level
     midpoints: Midpoints
 
@@ -59,6 +63,7 @@ class Multigrid:
         members: Returns the groups of elements, among those below a number, that share their dilatation; None: none do.
         half: Whether the cycle uses matrices in half precision; only where lambda is less than some 64 times mu.
         sweeps: Number of Gauss-Seidel sweeps that smooth, only on the CPU; zero: Chebyshev's iteration.
+        assembled: Whether the finest level has its matrix; False: it goes over subtrees if these are all of the mesh.
 
     Attributes:
         discretization: The body's discretization.
@@ -82,6 +87,7 @@ class Multigrid:
         members: Callable[[int], Members] | None = None,
         half: bool = False,
         sweeps: int = 0,
+        assembled: bool = True,
     ):
         if stride not in (1, 2, 3):
             raise InputError(f"stride is {stride!r}; it must be 1, 2 or 3")
@@ -91,7 +97,7 @@ class Multigrid:
         self.is_turned, self.stride, self.degree, self.stiffening = is_turned, stride, degree, stiffening
         self.most_lambda, self.rise, self.few_nodes = most_lambda, rise, few_nodes
         self._find_members = members
-        self._is_half, self.sweeps = half, sweeps
+        self._is_half, self.sweeps, self._assembled = half, sweeps, assembled
         self.revision, self._version = -1, -1
         self.follow()
 
@@ -115,35 +121,20 @@ class Multigrid:
 
     def update_finest(self, operator: LinearOperator) -> None:
         """Launch the computation of the finest level's matrix."""
-        discretization, finest = self.discretization, self.levels[0]
-        elements = cast("ForestElements", discretization.elements)
-        inverse_mass, scales = operator.inverse_mass, operator.scales
+        finest, inverse_mass, others = self.levels[0], operator.inverse_mass, operator.other_blocks()
         free_inputs = [self.count, self._mesh_nodes, self._nodes, inverse_mass]
         finest.launch(values.find_free, self.count, free_inputs, [self._free])
-        kernel = values.write_frames(self.is_turned)
-        leaves = discretization.sizes.elements
-        inputs: list[Any] = [elements, operator.displacements]
-        wp.launch(kernel, dim=leaves, inputs=inputs, outputs=[self._frames], device=self.device)
-        found = finest.pattern
-        if self._members is not None:
-            inputs = [discretization.sizes.world_elements, self._members.entries, self._members.arrays, elements]
-            inputs += [operator.displacements, discretization.lam, discretization.material_stride]
-            finest.launch(shared.write_rows(self._members.law), self._members.count, inputs, [self._rows])
-        inputs = [discretization.sizes.world_elements, found.entries, elements, self._frames, self._gradients]
-        inputs += [discretization.mu, discretization.lam, discretization.material_stride, scales, self.stiffening]
-        inputs += [self.most_lambda if self._members is None else 0.0]
-        inputs += [found.upper, found.sum_starts, found.codes, found.places, self.count]
-        inputs += [0 if self._members is None else self._members.entries, self._pairs, self._rows]
-        finest.launch(values.gather_leaves, len(found.upper), inputs, [finest.blocks, self._more])
-        inputs = [self.count, self._mesh_nodes, found.entries, self._nodes, inverse_mass, scales, self._free]
-        inputs += [found.starts, found.columns, found.diagonal, operator.other_blocks(), self._more]
-        finest.launch(values.finish_leaves, self.count, inputs, [finest.blocks, finest.inverses])
+        if isinstance(finest, SubtreeLevel):
+            finest.update(operator, self._mesh_nodes, self._nodes, others)
+        else:
+            self._gather_leaves(operator, others)
 
     def _update_coarser(self) -> None:
         for transfer in self._transfers:
             transfer.coarse.gather_from(transfer.fine)
         for level in self.levels if self._coarsest is None else self.levels[:-1]:
-            level.pack()
+            if isinstance(level, Level):
+                level.pack()
         if self._coarsest is not None:
             self._coarsest.update()
 
@@ -187,47 +178,141 @@ class Multigrid:
         self._ends = wp.empty(self.count, dtype=wp.vec2i, device=device)
         wp.launch(pattern.rank_ends, self.count, [levels.ends, rank], [self._ends], device=device)
         self._free = wp.zeros(sizes.worlds * self.count, dtype=wp.uint8, device=device)
+        finder = PatternFinder(self._ends)
+        members = self._members = self._find_members and self._find_members(sizes.world_elements)
+        batches = self._subtrees(members)
+        counts = self._counts(levels, on_roots=batches is not None)
+        self._degrees = self._find_degrees(counts, None if batches is None else levels.depth - 3)
+        self.levels: list[SmoothedLevel] = []
+        self._transfers = []
+        if batches is None:
+            self.levels.append(self._leaf_level(finder, rank, members, counts))
+        else:
+            self._add_subtree_levels(finder, rank, members, counts, batches)
+        for count in counts[len(self.levels) :]:
+            fine = self.levels[-1]
+            assert isinstance(fine, Level)
+            coarse = self._level(finder.of_products(fine.pattern, count), counts)
+            self._transfers.append(Transfer(fine, coarse, finder.midpoints(count, fine.count)))
+            self.levels.append(coarse)
+        coarsest = cast("Level", self.levels[-1])
+        self._coarsest = DenseInverse(coarsest) if counts[-1] <= MOST_DENSE else None
+
+    def _leaf_level(self, finder: PatternFinder, rank: wp.array, members: Members | None, counts: list[int]) -> Level:
+        """The finest level with a matrix, and what it is computed from."""
+        sizes, device = self.discretization.sizes, self.device
+        elements = cast("ForestElements", self.discretization.elements)
         self._frames = wp.zeros(sizes.elements, dtype=wp.mat33, device=device)
         weights = np.swapaxes(np.array(GRADIENT), 1, 2).reshape(12, 3)
         self._gradients = wp.array(weights, dtype=wp.vec3, device=device)
-        finder = PatternFinder(self._ends)
-        elements = cast("ForestElements", self.discretization.elements)
-        counts = self._counts(levels)
-        members = self._members = self._find_members and self._find_members(sizes.world_elements)
         found, self._pairs = finder.of_leaves(elements.nodes, sizes.world_elements, rank, members)
         rows = 0 if members is None else sizes.worlds * members.entries
         # Sweeps need no bound on eigenvalues.
         nodes = 1 if members is None or self.sweeps else sizes.worlds * self.count
         self._rows = wp.zeros(rows, dtype=wp.vec4, device=device)
         self._more = wp.zeros(nodes, dtype=wp.mat33, device=device)
-        self.levels = [self._level(found, counts)]
-        self._transfers = []
-        for count in counts[1:]:
-            fine = self.levels[-1]
-            coarse = self._level(finder.of_products(fine.pattern, count), counts)
-            self._transfers.append(Transfer(fine, coarse, finder.midpoints(count, fine.count)))
-            self.levels.append(coarse)
-        self._coarsest = DenseInverse(self.levels[-1]) if counts[-1] <= MOST_DENSE else None
+        return self._level(found, counts)
+
+    def _gather_leaves(self, operator: LinearOperator, others: wp.array) -> None:
+        """Launch the finest matrix."""
+        discretization, finest = self.discretization, cast("Level", self.levels[0])
+        elements = cast("ForestElements", discretization.elements)
+        inverse_mass, scales = operator.inverse_mass, operator.scales
+        kernel = values.write_frames(self.is_turned)
+        leaves = discretization.sizes.elements
+        inputs: list[Any] = [elements, operator.displacements]
+        wp.launch(kernel, dim=leaves, inputs=inputs, outputs=[self._frames], device=self.device)
+        found = finest.pattern
+        if self._members is not None:
+            inputs = [discretization.sizes.world_elements, self._members.entries, self._members.arrays, elements]
+            inputs += [operator.displacements, discretization.lam, discretization.material_stride]
+            finest.launch(shared.write_rows(self._members.law), self._members.count, inputs, [self._rows])
+        inputs = [discretization.sizes.world_elements, found.entries, elements, self._frames, self._gradients]
+        inputs += [discretization.mu, discretization.lam, discretization.material_stride, scales, self.stiffening]
+        inputs += [self.most_lambda if self._members is None else 0.0]
+        inputs += [found.upper, found.sum_starts, found.codes, found.places, self.count]
+        inputs += [0 if self._members is None else self._members.entries, self._pairs, self._rows]
+        finest.launch(values.gather_leaves, len(found.upper), inputs, [finest.blocks, self._more])
+        inputs = [self.count, self._mesh_nodes, found.entries, self._nodes, inverse_mass, scales, self._free]
+        inputs += [found.starts, found.columns, found.diagonal, others, self._more]
+        finest.launch(values.finish_leaves, self.count, inputs, [finest.blocks, finest.inverses])
+
+    def _subtrees(self, members: Members | None) -> tuple[Batch, ...] | None:
+        """The subtrees of which the finest level consists, if it goes without its matrix."""
+        if self._assembled or self.sweeps or self._is_half or self.stride != 3 or self.count <= self.few_nodes:
+            return None
+        batches = suitable_batches(self.discretization)
+        if members is not None and members.count != sum(batch.count for batch in batches or ()):
+            return None
+        return batches
+
+    def _add_subtree_levels(
+        self,
+        finder: PatternFinder,
+        rank: wp.array,
+        members: Members | None,
+        counts: list[int],
+        batches: tuple[Batch, ...],
+    ) -> None:
+        """Add the level of leaves and that of the roots of subtrees."""
+        fine = SubtreeLevel(
+            self.discretization,
+            batches,
+            rank,
+            self._free,
+            self._degrees[0],
+            is_turned=self.is_turned,
+            stiffening=self.stiffening,
+            most_lambda=self.most_lambda,
+            members=members,
+        )
+        elements = cast("ForestElements", self.discretization.elements)
+        pattern = finder.of_roots(counts[1], batches, fine.roots, elements.nodes, rank)
+        midpoints = finder.midpoints(counts[1], fine.count)
+        coarse = RootLevel(
+            pattern,
+            self.discretization.worlds,
+            self.count,
+            self._free,
+            self._degrees[1],
+            members is not None,
+            midpoints=midpoints,
+            middles=finder.middles(pattern, fine.count),
+        )
+        self._transfers.append(Transfer(fine, coarse, midpoints))
+        self.levels += [fine, coarse]
 
     def _level(self, found: Pattern, counts: list[int]) -> Level:
         """A level with its smoother; the coarsest one's is only used where it is not inverted."""
         k = counts.index(found.count)
-        is_coarsest = k == len(counts) - 1
         worlds, ranks = self.discretization.worlds, self.count
         if self.sweeps:
-            return SweptLevel(found, worlds, ranks, self._free, COARSEST_SWEEPS if is_coarsest else self.sweeps)
-        # A level that is hardly coarser helps the finest one, unless that has couplings of its own.
-        less = STEPS_LESS if len(counts) > 1 and 2 * counts[1] > counts[0] and self._members is None else 0
-        degree = COARSEST_DEGREE if is_coarsest else max(self.degree + self.rise * k - less, 1)
+            sweeps = COARSEST_SWEEPS if k == len(counts) - 1 else self.sweeps
+            return SweptLevel(found, worlds, ranks, self._free, sweeps)
         is_bounded = k > 0 and self._members is not None
-        return Level(found, worlds, ranks, self._free, degree, is_bounded, self._is_half)
+        return Level(found, worlds, ranks, self._free, self._degrees[k], is_bounded, self._is_half)
 
-    def _counts(self, levels: Levels) -> list[int]:
+    def _find_degrees(self, counts: list[int], roots_depth: int | None) -> list[int]:
+        """The degree of each level's smoother. ``roots_depth`` is the level of the roots of subtrees, if the finest
+        level goes over these."""
+        degrees = [self.degree + self.rise * k for k in range(len(counts))]
+        if roots_depth is not None and roots_depth % 3:
+            # Steps on the finest level are cheap there, and take the place of those on the level of roots.
+            degrees = [self.degree + STEPS_MORE, 0, *degrees[1:-1]]
+        elif roots_depth is None and len(counts) > 1 and 2 * counts[1] > counts[0] and self._members is None:
+            # A level that is hardly coarser helps the finest one, unless that has couplings of its own.
+            degrees = [max(degree - STEPS_LESS, 1) for degree in degrees]
+        degrees[-1] = COARSEST_DEGREE
+        return degrees
+
+    def _counts(self, levels: Levels, *, on_roots: bool) -> list[int]:
         """Numbers of nodes of the levels that the cycle has, finest first."""
         counts, level = [levels.node_count], levels.depth
         while level > 0 and counts[-1] > self.few_nodes:
             # Coarser levels are multiples of three: with others conjugate gradients take 10 iterations in place of 6.
             stride = (level % 3 or 3) if self.stride == 3 else self.stride
+            if on_roots and len(counts) == 1:
+                stride = 3
             level = max(level - stride, 0)
             counts.append(levels.starts[level + 1])
         return counts

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import warp as wp
 
 from warp_corot.discretization.members import Members
+from warp_corot.discretization.subtrees import Batch
 from warp_corot.kernels.implicit.multigrid import pattern as kernels
+from warp_corot.kernels.implicit.multigrid import roots as roots_kernels
 from warp_corot.kernels.implicit.multigrid import shared
 from warp_corot.kernels.meshing.growth import gather_flagged
 from warp_corot.kernels.plan.levels import flag_first
@@ -97,6 +100,35 @@ class PatternFinder:
             inputs = [before, self.bits, members.arrays, rank, sums]
             self._launch(shared.list_pairs, members.count, inputs, [found, keys, codes])
         return self._pattern(nodes, before + pairs, keys, codes), found
+
+    def of_roots(self, count: int, batches: Sequence[Batch], roots: int, nodes: wp.array, rank: wp.array) -> Pattern:
+        """The pattern of the level of the roots of subtrees.
+
+        Args:
+            count: Number of nodes of the level.
+            batches: The subtrees, world after world.
+            roots: Number of subtrees in one world.
+            nodes: Node numbers of all leaves, vec4i.
+            rank: The rank of each node number, int32.
+        """
+        entries = len(roots_kernels.PAIRS) * roots
+        keys, codes = self._keys(entries + count)
+        self._launch(kernels.list_diagonal, count, [entries, self.bits], [keys, codes])
+        worlds, first = sum(batch.count for batch in batches) // roots, 0
+        for batch in batches:
+            corners = wp.vec4i(*roots_kernels.CORNERS[batch.shape])
+            inputs = [first, self.bits, batch.subtrees.first, nodes, corners, rank]
+            self._launch(roots_kernels.list_root_pairs, batch.count // worlds, inputs, [keys, codes])
+            first += batch.count // worlds
+        return self._pattern(count, entries + count, keys, codes)
+
+    def middles(self, pattern: Pattern, fine: int) -> wp.array:
+        """The node of the next finer level, of ``fine`` nodes, between the nodes of each entry in the upper triangle;
+        -1: none; int32."""
+        found = wp.full(len(pattern.upper), -1, dtype=wp.int32, device=self.device)
+        inputs = [pattern.count, self.ends, pattern.upper]
+        self._launch(roots_kernels.find_middles, fine - pattern.count, inputs, [found])
+        return found
 
     def of_products(self, fine: Pattern, coarse: int) -> Pattern:
         """The pattern of a level with this number of nodes, from the next finer one."""
