@@ -8,6 +8,17 @@ from newton_scenes import add_grid, builder, contact_parameters, momentum, newto
 FULL = {"enable_rigid_soft_full_surface_contact": True}
 
 
+def ball_mesh():
+    """The sphere as a triangle mesh."""
+    trimesh = pytest.importorskip("trimesh")
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.02)
+    return newton.Mesh(np.asarray(ball.vertices, np.float32), np.asarray(ball.faces, np.int32).ravel())
+
+
+#: Triangle meshes.
+MESHES = {"box": lambda: newton.Mesh.create_box(0.02, 0.02, 0.02), "ball": ball_mesh}
+
+
 def ball_on_block(
     device, shape="sphere", at=(0.067, 0.133), height=0.121, speed=0.0, gravity=-9.81, kd=20.0, held=True, **options
 ):
@@ -24,7 +35,7 @@ def ball_on_block(
     if shape == "sphere":
         made.add_shape_sphere(body, radius=0.02, cfg=config)
     else:
-        made.add_shape_mesh(body, mesh=newton.Mesh.create_box(0.02, 0.02, 0.02), cfg=config)
+        made.add_shape_mesh(body, mesh=MESHES[shape](), cfg=config)
     model = made.finalize(device=device)
     contact_parameters(model, ke=2e3, kd=kd, mu=0.0 if kd == 0.0 else 0.5)
     return model
@@ -51,9 +62,13 @@ def weight_of(model):
     return 9.81 * float(model.body_mass.numpy()[0])
 
 
-def test_a_body_between_the_nodes_is_carried(device):
-    """It falls through without contacts of edges and triangles; with them, the one reported carries its weight."""
-    model = ball_on_block(device, damp=100.0)
+BALL = pytest.param("ball", marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("shape", ["sphere", "box", BALL])
+def test_a_body_between_the_nodes_is_carried(device, shape):
+    """It falls through without contacts of edges and triangles; with them, those reported carry its weight."""
+    model = ball_on_block(device, shape, damp=100.0)
     state, contacts, observables = drop(model, 600, damping=20.0, **FULL)
     assert state.body_q.numpy()[0, 2] == pytest.approx(0.12, abs=0.002)
     first, count = contacts.rigid_contact_max, int(contacts.soft_contact_count.numpy()[0])
@@ -76,12 +91,13 @@ def test_momentum_is_exchanged(device):
     np.testing.assert_allclose(turned[1], first[1], atol=1e-2 * 0.1 * ball)
 
 
+@pytest.mark.parametrize("shape", ["sphere", "box", BALL])
 @pytest.mark.parametrize(
     "at", [(0.06, 0.13), *(pytest.param(at, marks=pytest.mark.slow) for at in ((0.05, 0.1), (0.07, 0.14)))]
 )
-def test_a_bounce_adds_no_energy(device, at):
+def test_a_bounce_adds_no_energy(device, at, shape):
     """Without damping and friction, over a triangle, an edge, and off the middle."""
-    model = ball_on_block(device, at=at, speed=-1.0, gravity=0.0, kd=0.0)
+    model = ball_on_block(device, shape, at=at, speed=-1.0, gravity=0.0, kd=0.0)
     energies = []
 
     def watch(state):
@@ -158,8 +174,20 @@ def test_a_recording_needs_a_step_before(device):
         solver.step(before, after, None, contacts, 1e-4)
 
 
-def test_triangle_meshes_are_refused(device):
-    model = ball_on_block(device, "mesh")
-    contacts = newton.CollisionPipeline(model, **FULL).contacts()
-    with pytest.raises(wc.InputError, match="is a triangle mesh"):
-        wn.SolverCorotated(model).step(model.state(), model.state(), None, contacts, 1e-4)
+def test_a_plate_of_triangles_carries_a_block(device):
+    """The nodes of a flat face carry it, as without full-surface contacts; records across the plate do not push it
+    sideways."""
+    heights = []
+    for options in ({}, FULL):
+        made = builder()
+        made.add_shape_mesh(-1, mesh=newton.Mesh.create_box(0.5, 0.5, 0.02), xform=wp.transform((0.1, 0.1, -0.02)))
+        add_grid(made, dims=(2, 2, 1), pos=(0.0, 0.0, 0.0099), damp=100.0)
+        model = made.finalize(device=device)
+        contact_parameters(model, mu=0.0)
+        state, contacts, observables = drop(model, 1000, damping=20.0, **options)
+        rows = observables.contact_f.numpy()[contacts.rigid_contact_max :].astype(float)
+        weight = 9.81 * float(model.particle_mass.numpy().sum())
+        assert rows[:, 2].sum() == pytest.approx(-weight, rel=0.01)
+        assert np.abs(rows[:, :2]).max() < 1e-6 * weight
+        heights.append(state.particle_q.numpy()[:, 2])
+    np.testing.assert_allclose(heights[1], heights[0], atol=1e-4)

@@ -23,7 +23,7 @@ from warp_corot.kernels.newton.yielding import gather_attachments, gather_soft_c
 from .arguments import Step
 from .library import newton
 from .pairs import SoftPairs
-from .touching import CROWD, Loads, has_surfaces, records_of
+from .touching import CROWD, Loads, MeshRecords, has_surfaces
 
 #: ``newton.BodyFlags.KINEMATIC``, for bodies with prescribed motion.
 KINEMATIC = int(newton.BodyFlags.KINEMATIC)
@@ -72,7 +72,7 @@ class Contacts:
         self._no_wrenches = wp.empty(0, dtype=wp.spatial_vectorf, device=self.device)
         #: Contacts of soft bodies with one another, if they have any.
         self.pairs = None if margin is None else SoftPairs(model, margin)
-        self._loads = Loads(model)
+        self._loads, self._records = Loads(model), MeshRecords(model)
         #: Number of places at which each body is touched or held, int32 [B].
         self._places = wp.zeros(bodies, dtype=wp.int32, device=self.device)
         #: Forces on particles before contact forces [N], which friction uses.
@@ -89,11 +89,7 @@ class Contacts:
         self.refresh()
 
     def has_surfaces(self, contacts: newton.Contacts) -> bool:
-        """Whether contacts may be of edges and triangles while their stiffness is not counted yet.
-
-        Raises:
-            InputError: They may be, with a triangle mesh.
-        """
+        """Whether contacts may be of edges and triangles while their stiffness is not counted yet."""
         there = contacts.soft_contact_max and self.model.shape_count
         return bool(there) and not self.crowded and has_surfaces(self.model, contacts)
 
@@ -165,7 +161,7 @@ class Contacts:
         pairs = None if self.pairs is None or contacts is None else self.pairs.lists_of(contacts)
         if touching is not None or pairs is not None:
             wp.copy(self._before, f)
-        records = [] if touching is None else records_of(touching)
+        records = self._records_of(touching, state, of_bodies)
         touch = Touch(state, of_bodies, touching, records, law, dt)
         self._count_loads(touch, pairs)
         bodies = self._find_bodies(touch)
@@ -192,9 +188,17 @@ class Contacts:
     def count_loads(self, step: Step, of_bodies: newton.State) -> tuple[list[wp.array], wp.array]:
         """Records of contacts with shapes, and the loads of particles that share them, float32 [P] or empty."""
         touching = self.touching(step.contacts)
-        records = [] if touching is None else records_of(touching)
+        records = self._records_of(touching, step.state_in, of_bodies)
         self._count_loads(Touch(step.state_in, of_bodies, touching, records, self.law(), step.dt), None)
         return records, self._loads.array
+
+    def _records_of(
+        self, touching: newton.Contacts | None, state: newton.State, of_bodies: newton.State
+    ) -> list[wp.array]:
+        if touching is None:
+            return []
+        poses = of_bodies.body_q if self.model.body_count else self._no_poses
+        return self._records.records_of(touching, state.particle_q, poses)
 
     def _count_loads(self, touch: Touch, pairs: PairLists | None) -> None:
         """Find how many contacts share each particle, if several may."""

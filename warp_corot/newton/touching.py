@@ -3,10 +3,9 @@
 
 from __future__ import annotations
 
-import numpy as np
 import warp as wp
 
-from warp_corot.errors import InputError
+from warp_corot.kernels.newton import meshes as kernels
 from warp_corot.kernels.newton.touching import count_loads
 
 from .library import newton
@@ -15,31 +14,10 @@ from .library import newton
 CROWD = 4.0
 
 
-#: Types of shapes with contacts of their vertices and edges. Newton does not tell which of these contacts repeat each
-#: other.
-MESHES = [int(newton.GeoType.MESH), int(newton.GeoType.CONVEX_MESH)]
-
-
 def has_surfaces(model: newton.Model, contacts: newton.Contacts) -> bool:
-    """Whether records of contacts with shapes may be of edges and triangles.
-
-    Raises:
-        InputError: They may be, and particles collide with a triangle mesh.
-    """
+    """Whether records of contacts with shapes may be of edges and triangles."""
     # This attribute is private to Newton. Without it, every model with triangles may have such records.
-    if not getattr(contacts, "_enable_rigid_soft_full_surface_contact", model.tri_count > 0):
-        return False
-    if model.device.is_capturing:
-        return True
-    collide = (model.shape_flags.numpy() & int(newton.ShapeFlags.COLLIDE_PARTICLES)) != 0
-    meshes = np.flatnonzero(collide & np.isin(model.shape_type.numpy(), MESHES))
-    if len(meshes):
-        raise InputError(
-            f"shape {model.shape_label[meshes[0]]} is a triangle mesh, which SolverCorotated lets soft bodies touch at "
-            "nodes only: make the CollisionPipeline without enable_rigid_soft_full_surface_contact, or the shape of "
-            "primitives"
-        )
-    return True
+    return bool(getattr(contacts, "_enable_rigid_soft_full_surface_contact", model.tri_count > 0))
 
 
 def records_of(contacts: newton.Contacts) -> list[wp.array]:
@@ -50,6 +28,49 @@ def records_of(contacts: newton.Contacts) -> list[wp.array]:
         contacts.soft_contact_indices,
         contacts.soft_contact_barycentric,
     ]
+
+
+class MeshRecords:
+    """The records that count where a model has triangle meshes; see ``kernels.newton.meshes``.
+
+    Args:
+        model: The model.
+    """
+
+    def __init__(self, model: newton.Model):
+        self.model, self.device = model, model.device
+        self._shapes = kernels.Shapes()
+        if model.shape_count:
+            self._shapes.body, self._shapes.pose = model.shape_body, model.shape_transform
+            self._shapes.scale, self._shapes.mesh = model.shape_scale, model.shape_source_ptr
+        self._copies: list[wp.array] = []
+        self._nearest = wp.empty(0, dtype=wp.int64, device=self.device)
+
+    def records_of(self, contacts: newton.Contacts, q: wp.array, poses: wp.array) -> list[wp.array]:
+        """Number, particles, nodes and weights of contacts with shapes, for the present positions of particles and
+        bodies."""
+        found = records_of(contacts)
+        # These attributes are private to Newton; without features there are no records of meshes.
+        features = getattr(contacts, "_soft_contact_mesh_features", None)
+        data = getattr(contacts, "_soft_contact_mesh_data", None)
+        if features is None or data is None:
+            return found
+        count = contacts.soft_contact_max
+        if not self._copies or len(self._copies[0]) != count:
+            self._copies = [wp.empty(count, dtype=array.dtype, device=self.device) for array in found[1:]]
+        vertices = len(data.rigid_features[0])
+        rivals = vertices + self.model.edge_count
+        if len(self._nearest) != rivals:
+            self._nearest = wp.empty(rivals, dtype=wp.int64, device=self.device)
+        records = kernels.Records()
+        records.count, records.particle, records.nodes, records.weights = found
+        records.features, records.shape = features, contacts.soft_contact_shape
+        records.place = contacts.soft_contact_body_pos
+        inputs = [vertices, records, self._shapes, q, poses, self._nearest]
+        wp.launch(kernels.clear_nearest, rivals, [self._nearest], device=self.device)
+        wp.launch(kernels.find_nearest, count, inputs, device=self.device)
+        wp.launch(kernels.choose_records, count, inputs, self._copies, device=self.device)
+        return [found[0], *self._copies]
 
 
 class Loads:
