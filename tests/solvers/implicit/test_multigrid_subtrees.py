@@ -9,6 +9,7 @@ from tangents import on_device
 import warp_corot as wc
 from warp_corot.solvers.implicit.multigrid import Multigrid
 from warp_corot.solvers.implicit.multigrid.subtrees import RootLevel, SubtreeLevel
+from warp_corot.solvers.implicit.preconditioners import preconditioner_of
 from warp_corot.solvers.implicit.tangent import TangentOperator
 
 WORLDS = 2
@@ -98,3 +99,11 @@ def test_meshes_whose_subtrees_do_not_have_all_midpoints_keep_the_matrix(device)
     for mesh in (wc.TetForest.box((1, 1, 1), 0.064, 8), graded):
         body = wc.SoftBody(mesh, wc.Isotropic(5e3, 0.3, 1000.0), device=device)
         assert not isinstance(Multigrid(body, assembled=False).levels[0], SubtreeLevel)
+
+
+def test_large_bodies_on_cuda_go_over_subtrees(device, monkeypatch):
+    monkeypatch.setattr("warp_corot.solvers.implicit.preconditioners.FEWEST_OVER_SUBTREES", 1)
+    body = wc.SoftBody(wc.TetForest.box((1, 1, 1), 0.064, 6), wc.Isotropic(5e3, 0.3, 1000.0), device=device)
+    operator = TangentOperator(body, wc.Corotated().bind(body))
+    finest = preconditioner_of("multigrid", operator).levels[0]
+    assert isinstance(finest, SubtreeLevel) == operator.device.is_cuda

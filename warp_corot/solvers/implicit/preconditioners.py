@@ -22,6 +22,8 @@ AT_NODES: dict[str, Any] = {"degree": 2, "rise": 0, **PLAIN}
 SHORT: dict[str, Any] = {"sweeps": 1, "few_nodes": 24}
 #: The smoother's degree on the finest level of several ranks, which cannot sweep: of short cycles, and of others.
 SHORT_DEGREE, DEGREE = 2, 5
+#: The number of elements from which on the finest level goes over subtrees on CUDA, where it can.
+FEWEST_OVER_SUBTREES = 1 << 18
 
 
 def _multigrid(operator: TangentOperator, short_cycles: bool) -> Multigrid:
@@ -43,6 +45,8 @@ def _multigrid(operator: TangentOperator, short_cycles: bool) -> Multigrid:
     found = operator.ranks.multigrid(operator.number, over_ranks | {"stiffening": stiffening})
     if found is not None:
         return found
+    if operator.device.is_cuda and operator.body.sizes.elements >= FEWEST_OVER_SUBTREES and not options:
+        options = {"assembled": False}
     return Multigrid(operator.body, is_turned=is_turned, stiffening=stiffening, members=members, **options)
 
 

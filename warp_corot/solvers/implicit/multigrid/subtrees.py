@@ -12,12 +12,13 @@ from typing import Any, cast
 import numpy as np
 import warp as wp
 
-from warp_corot.discretization.discretization import Discretization
+from warp_corot.discretization.discretization import Discretization, FixedMesh
 from warp_corot.discretization.members import Members
 from warp_corot.discretization.subtrees import Batch
-from warp_corot.kernels.elements.elements import LEVEL_MASK, ForestElements, Subtrees
+from warp_corot.kernels.elements.elements import ForestElements, Subtrees
 from warp_corot.kernels.implicit.multigrid import diagonals, roots, subtrees
 from warp_corot.kernels.subtrees.memory import BLOCK
+from warp_corot.mesh import TetForest
 from warp_corot.solvers.implicit.operator import LinearOperator
 
 from .level import Level, SmoothedLevel
@@ -27,11 +28,13 @@ from .pattern import Midpoints, Pattern
 def suitable_batches(discretization: Discretization) -> tuple[Batch, ...] | None:
     """The subtrees of a mesh that does not change, if they have all leaves and are of one level and of a suitable type;
     else None."""
-    plan = discretization.plan()
-    if plan.counts is not None or len(plan.flat) or any(batch.shape not in roots.TYPES for batch in plan.batches):
+    mesh = discretization.mesh if isinstance(discretization, FixedMesh) else None
+    if not isinstance(mesh, TetForest) or np.ptp(mesh.levels) > 0:
         return None
-    levels = [np.unique(batch.subtrees.code.numpy()[: batch.count] & int(LEVEL_MASK)) for batch in plan.batches]
-    return tuple(plan.batches) if levels and len(np.unique(np.concatenate(levels))) == 1 else None
+    plan = discretization.plan()
+    if len(plan.flat) or any(batch.shape not in roots.TYPES for batch in plan.batches):
+        return None
+    return tuple(plan.batches)
 
 
 class SubtreeLevel(SmoothedLevel):
@@ -85,7 +88,7 @@ class SubtreeLevel(SmoothedLevel):
         self.own = subtrees.OwnBlocks()
         self.own.masses = wp.zeros(len(self.r), dtype=wp.float32, device=device)
         self._no_blocks = self.own.blocks = wp.zeros(1, dtype=wp.mat33, device=device)
-        self._blocks = wp.zeros(0, dtype=wp.mat33, device=device)
+        self._blocks = wp.zeros_like(self.inverses)
         self.scales = wp.zeros(3, dtype=wp.float32, device=device)
 
     def update(self, operator: LinearOperator, mesh_nodes: int, nodes: wp.array, others: wp.array) -> None:
@@ -98,8 +101,6 @@ class SubtreeLevel(SmoothedLevel):
             others: Diagonal blocks of other forces, as of ``operator.other_blocks``.
         """
         self.scales = operator.scales
-        if len(others) > 1 and not len(self._blocks):
-            self._blocks = wp.zeros_like(self.inverses)
         self.own.blocks = self._blocks if len(others) > 1 else self._no_blocks
         inputs = [self.ranks, mesh_nodes, nodes, self.free, operator.inverse_mass, operator.scales, others]
         self.launch(subtrees.find_own, self.count, inputs, [self.own])
