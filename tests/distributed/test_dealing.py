@@ -2,6 +2,7 @@
 
 import math
 from contextlib import nullcontext
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -10,12 +11,15 @@ from ranked import graded, jittered
 
 import warp_corot as wc
 from warp_corot.discretization.awaited import Awaited
+from warp_corot.discretization.groups import group_numbers
 from warp_corot.discretization.planning.fixed import ForcePlan
 from warp_corot.distributed.directions import normal_numbers
+from warp_corot.distributed.dividing import dealt, pieces_of
 from warp_corot.distributed.partition import Partition
-from warp_corot.distributed.parts import Part, part_of_mesh
+from warp_corot.distributed.parts import Part, numbered_part, part_of_mesh
 from warp_corot.distributed.places import Places
 from warp_corot.distributed.refusals import check_supported
+from warp_corot.distributed.rejoining import pack_part, rejoined
 from warp_corot.distributed.settled import settled_sums
 
 
@@ -92,6 +96,58 @@ def test_masses_of_parts_are_those_of_the_body(make):
         np.add.at(found, part.numbers.nodes, part.masses)
         np.testing.assert_array_equal(body.mesh.points[part.numbers.nodes], part.mesh.points)
     np.testing.assert_array_equal(found, body.masses)
+
+
+def terms_of(mesh, grouped, elements):
+    """The forces that each node sums in a deterministic run on CUDA, in their order: the first element and the place of
+    each."""
+    plan = ForcePlan.of_forest(mesh, None, wp.get_device("cpu"), grouped=grouped, deterministic=True)
+    given = [(each.subtrees.targets, each.subtrees.first, each.grouped) for each in plan.batches]
+    given += [(plan.flat.elements.targets, plan.flat.leaves, False)] if len(plan.flat) else []
+    found = {}
+    for targets, firsts, of_groups in given:
+        slots, leaves = targets.numpy(), elements[firsts.numpy()[:: 8 if of_groups else 1]]
+        for first, row in zip(leaves, slots, strict=True):
+            found |= {slot: (int(first), place) for place, slot in enumerate(row.tolist())}
+    starts, order = plan.slots.starts.numpy(), plan.slots.order.numpy().tolist()
+    return [[found[slot] for slot in order[a:b]] for a, b in pairwise(starts)]
+
+
+@pytest.mark.parametrize(
+    "make", [graded, lambda: wc.TetForest.box((1, 1, 2), 0.1, level=9)], ids=["leaves of three levels", "box"]
+)
+def test_nodes_of_parts_sum_what_they_sum_in_the_whole(make):
+    mesh = make()
+    division = Partition.of(mesh, 3)
+
+    def differ(grouped):
+        whole, count = terms_of(mesh, grouped, np.arange(len(mesh.tets))), 0
+        for rank in range(3):
+            part, elements, numbers = numbered_part(mesh, division, rank)
+            here = terms_of(part, grouped, elements)
+            count += sum(here[k] != whole[numbers.nodes[k]] for k in np.flatnonzero(numbers.owner == rank))
+        return count
+
+    assert differ(grouped=False) == 0
+    # Parts cut through groups of subtrees, which the box has.
+    assert (differ(grouped=True) > 0) is (len(mesh.tets) > 1000)
+
+
+def test_a_divided_forest_is_made_whole_again():
+    mesh = wc.TetForest.from_domain(wc.Domain.sphere(0.05), target_elements=1000)
+    parts, fewest = [], len(mesh.tree.level)
+    for kind, place, options in pieces_of(mesh, dealt(mesh, 3)):
+        parts.append({})
+        part = kind(*place, **options)
+        told = pack_part(part, "", parts[-1])
+        fewest = min(fewest, len(part.tree.level))
+    whole = rejoined(told, parts)
+    for name in ("tets", "points", "fill", "levels"):
+        np.testing.assert_array_equal(getattr(whole, name), getattr(mesh, name))
+    everywhere = np.arange(len(mesh.tets))
+    np.testing.assert_array_equal(group_numbers(whole, everywhere), group_numbers(mesh, everywhere))
+    # A part does not have the whole tree.
+    assert fewest < 0.6 * len(mesh.tree.level)
 
 
 def test_groups_that_wait_for_nodes_are_separate():

@@ -152,8 +152,8 @@ def touched_in_parts() -> np.ndarray | None:
     return wd.gather(body.positions)
 
 
-def forest_divided() -> np.ndarray | None:
-    """The run "forest" of a mesh that rank 0 makes and divides; the positions of all nodes on rank 0."""
+def forest_divided(kept: Path) -> np.ndarray | None:
+    """The run "forest" of a mesh that rank 0 makes and divides, saved; the positions of all nodes on rank 0."""
     import warp_corot.distributed as wd
 
     def make() -> wc.TetForest:
@@ -176,16 +176,19 @@ def forest_divided() -> np.ndarray | None:
         said = str(error)
     # All ranks learn what was wrong on rank 0.
     assert "level is -1" in said
+    sim.save(kept)
     return wd.gather(body.positions)
 
 
-def general_divided() -> np.ndarray | None:
-    """The run "newmark" of a general mesh that rank 0 makes and divides; the positions of all nodes on rank 0."""
+def general_divided(kept: Path) -> np.ndarray | None:
+    """The run "newmark" of a general mesh that rank 0 makes and divides, saved; the positions of all nodes on rank
+    0."""
     import warp_corot.distributed as wd
 
     body = body_of(wd.divided(jittered), 0.3)
     sim = wd.Simulation(body, deterministic=True, **options_of("newmark"))
     moved(sim, body)
+    sim.save(kept)
     return wd.gather(body.positions)
 
 
@@ -259,9 +262,12 @@ def make_all(folder: Path, size: int, names: list[str]) -> None:
             if path.stem.split(".")[0] in names and path.exists():
                 found |= resumed(path)
         if "forest" in names:
-            found |= made("forest", False, None) | {"divided.x": forest_divided(), "led.x": led()}
+            found |= made("forest", False, None) | {"led.x": led()}
+            found["divided.x"] = forest_divided(folder / "divided.3.npz")
+            found |= resumed(folder / "divided.3.npz")
         if "newmark" in names:
-            found["divided.newmark.x"] = general_divided()
+            found["divided.newmark.x"] = general_divided(folder / "general.3.npz")
+            found |= resumed(folder / "general.3.npz")
         if "worlds" in names:
             found |= worlds_in_parts(folder / f"{size}.usda")
             for path in folder.glob("parts.?.npz"):

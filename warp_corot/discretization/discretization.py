@@ -47,6 +47,8 @@ class Discretization(ABC):
         has_activation: Whether an active stress was set.
         smallest_volume: The volume of the smallest element [m^3].
         awaited: Nodes that other processes move, if some wait for them; else None.
+        sums_by_subtrees: Whether deterministic forces are summed subtree by subtree, never in groups of subtrees
+            (CUDA), so that they are the same bits in a part of the mesh.
     """
 
     worlds: int
@@ -63,6 +65,7 @@ class Discretization(ABC):
     has_activation: bool
     smallest_volume: float
     awaited: Awaited | None = None
+    sums_by_subtrees: bool = False
     _levels: Levels | None = None
 
     @property
@@ -239,8 +242,16 @@ class FixedMesh(Discretization):
     ) -> ForcePlan:
         mesh, elements, device, worlds = self._mesh, self.elements, self.device, self.worlds
         if isinstance(mesh, TetForest) and subtrees:
+            # Parts have all of a subtree's leaves, but not all subtrees of a group.
+            grouped = False if deterministic and self.sums_by_subtrees else None
             return ForcePlan.of_forest(
-                mesh, rotation_level, device, worlds=worlds, elements=elements, deterministic=deterministic
+                mesh,
+                rotation_level,
+                device,
+                worlds=worlds,
+                elements=elements,
+                grouped=grouped,
+                deterministic=deterministic,
             )
         slots = find_units = None
         if isinstance(mesh, TetForest) and rotation_level is not None:

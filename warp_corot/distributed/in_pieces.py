@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
 from types import SimpleNamespace
@@ -27,13 +27,16 @@ from warp_corot.io.checkpoint.archive import (
     rebuilt_body,
     write_archive,
 )
+from warp_corot.mesh import TetForest, TetMesh
 from warp_corot.solvers import INTEGRATORS
 
 from .boxes import box
 from .checkpoint import Values, body_of
+from .dividing import divided
 from .following import Following
 from .of_parts import SimulationOfParts
-from .part_meshes import ForestPart
+from .part_meshes import ForestPart, MeshPart
+from .rejoining import pack_part, rejoined
 
 Arrays = dict[str, npt.NDArray[Any]]
 
@@ -57,8 +60,6 @@ def save(path: str | PathLike[str], parts: SimulationOfParts, following: list[Fo
         raise InputError("checkpoints of bodies in parts with contact do not work yet")
     if not all(each.is_in_parts and not each.whole.discretization.has_activation for each in following):
         raise InputError("checkpoints of bodies in parts beside others or with active stress do not work yet")
-    if not all(each.whole.mesh.is_box for each in following):  # type: ignore[union-attr]
-        raise InputError("checkpoints of divided meshes do not work yet; those of boxes in parts do")
     folder = target.with_name(f"{target.stem}.ranks")
     names = [f"step-{parts.total_steps:012d}-rank-{rank:04d}.npz" for rank in range(comm.size)]
     piece: Arrays = {}
@@ -132,7 +133,7 @@ def _pack(each: Following, model: Model, field: ForceField, k: int, piece: Array
     """Put this rank's part of the k-th body into its piece; returns what is the same on all ranks."""
     body, numbers, prefix = each.whole, each.part.numbers, f"body{k}."
     mesh, arrays = body.mesh, Arrays()
-    assert isinstance(mesh, ForestPart)
+    assert isinstance(mesh, ForestPart | MeshPart)
     described = pack_body(body, model, field, None, prefix, arrays, with_mesh=False)
     described.pop("trajectories")
     owned, counted = each.part.is_own, np.flatnonzero(numbers.counted)
@@ -158,6 +159,9 @@ def _pack(each: Following, model: Model, field: ForceField, k: int, piece: Array
         world, node = np.divmod(motion.host_nodes[mine], len(numbers.nodes))
         for what, values in (("world", world), ("nodes", numbers.nodes[node]), ("times", times), ("to", of_each)):
             piece[f"motion{k}/{number}.{what}"] = values
+    if not mesh.is_box:
+        return described | {"divided": pack_part(mesh, f"mesh{k}/", piece)}
+    assert isinstance(mesh, ForestPart)
     place = {"cells": mesh.cells, "cell_size": mesh.cell_size, "origin": mesh.origin, "up_axis": mesh.up_axis}
     return described | {"box": place | {"level": int(mesh.tree.leaf_levels[0])}}
 
@@ -166,12 +170,14 @@ def _rebuilt_run(
     target: Path, header: dict[str, Any], guard: Arrays, device: str | wp.Device | None
 ) -> SimpleNamespace:
     worlds, bodies = header["worlds"], []
-    meshes = [box(**each["box"] | {"cells": tuple(each["box"]["cells"])}) for each in header["bodies"]]
+    folder = target.with_name(f"{target.stem}.ranks")
+    files = [folder / name for name in header["pieces"]]
+    meshes = [_rebuilt_mesh(each, k, files) for k, each in enumerate(header["bodies"])]
     arrays: Arrays = {}
     counts = [0] * len(meshes)
-    for name in header["pieces"]:
-        with np.load(target.with_name(f"{target.stem}.ranks") / name, allow_pickle=False) as archive:
-            piece = {name: archive[name] for name in archive.files}
+    for file in files:
+        with np.load(file, allow_pickle=False) as archive:
+            piece = {name: archive[name] for name in archive.files if not name.startswith("mesh")}
         for k, mesh in enumerate(meshes):
             _take(piece, mesh, k, worlds, arrays)
             counts[k] += _take_motions(piece, mesh, k, counts[k], arrays)
@@ -198,7 +204,29 @@ def _rebuilt_run(
     )
 
 
-def _take(piece: Arrays, mesh: ForestPart, k: int, worlds: int, arrays: Arrays) -> None:
+def _rebuilt_mesh(described: dict[str, Any], k: int, files: Sequence[Path]) -> ForestPart | MeshPart:
+    """This rank's part of the k-th body's mesh; rank 0 makes a divided one whole again, and divides it."""
+    if "box" in described:
+        return box(**described["box"] | {"cells": tuple(described["box"]["cells"])})
+    prefix = f"mesh{k}/"
+
+    def whole() -> TetForest | TetMesh:
+        parts = []
+        try:
+            for file in files:
+                with np.load(file, allow_pickle=False) as archive:
+                    own = [name for name in archive.files if name.startswith(prefix)]
+                    parts.append({name.removeprefix(prefix): archive[name] for name in own})
+            return rejoined(described["divided"], parts)
+        except InputError:
+            raise
+        except Exception as error:  # any error of NumPy, zip files, or missing names
+            raise InputError(f"{files[0].parent} does not have the parts of a mesh: {error}") from error
+
+    return divided(whole)
+
+
+def _take(piece: Arrays, mesh: ForestPart | MeshPart, k: int, worlds: int, arrays: Arrays) -> None:
     """Copy a piece's values to the arrays of this rank's part of the k-th body."""
     for kind, numbers, copies in (("nodes", mesh.numbers.nodes, worlds), ("elements", mesh.numbers.elements, 1)):
         prefix = f"{kind}{k}/"
@@ -213,7 +241,7 @@ def _take(piece: Arrays, mesh: ForestPart, k: int, worlds: int, arrays: Arrays) 
             by_world[:, here] = values.reshape(copies, len(given), *values.shape[1:])[:, there]
 
 
-def _take_motions(piece: Arrays, mesh: ForestPart, k: int, first: int, arrays: Arrays) -> int:
+def _take_motions(piece: Arrays, mesh: ForestPart | MeshPart, k: int, first: int, arrays: Arrays) -> int:
     """Copy prescribed motions of nodes of this rank's part of the k-th body; returns how many there are."""
     count, nodes = 0, mesh.numbers.nodes
     order = np.argsort(nodes)

@@ -82,6 +82,8 @@ class Simulation:
         models = tuple(settled_model(m, body, comm) for m, body in zip(models, self.bodies, strict=True))
         self.gravity = checked_gravity(gravity, self.bodies[0].mesh.up_axis)
         parts = [part_of(body, m, comm, costs, here) for body, m in zip(self.bodies, models, strict=True)]
+        for part in parts:
+            part.discretization.sums_by_subtrees = bool(deterministic)
         self._following = [Following(body, part, comm) for body, part in zip(self.bodies, parts, strict=True)]
         for each in self._following:
             each.take_over()
