@@ -61,14 +61,6 @@ def box_edges(surface: Surface, meeting: Meeting, lower: wp.array[wp.vec3], uppe
     upper[k] = wp.max(a, b) + beyond
 
 
-@wp.func
-def place_of(i: int, of_edges: int, meeting: Meeting):
-    """A node of a triangle or an edge, or -1 if there is none."""
-    if of_edges != 0:
-        return meeting.edges[i][0]
-    return meeting.triangles[i][0]
-
-
 @wp.kernel(enable_backward=False)
 def clear_bounds(watch: Watch, lower: wp.array2d[wp.vec3], upper: wp.array2d[wp.vec3]):
     """Make the bounds of bodies, [worlds, bodies], empty."""
@@ -91,6 +83,11 @@ def extend_bounds(
         wp.atomic_max(upper, world, body, high)
 
 
+@wp.func
+def longest_side(a: wp.vec3, b: wp.vec3, c: wp.vec3):
+    return wp.max(wp.length(b - a), wp.max(wp.length(c - b), wp.length(a - c)))
+
+
 @wp.kernel(enable_backward=False)
 def bound_bodies(
     # In
@@ -98,39 +95,38 @@ def bound_bodies(
     watch: Watch,
     surface: Surface,
     meeting: Meeting,
-    boxes_lower: wp.array[wp.vec3],
-    boxes_upper: wp.array[wp.vec3],
-    of_edges: int,
     # Out
     lower: wp.array2d[wp.vec3],
     upper: wp.array2d[wp.vec3],
 ):
-    """Extend the bounds of each body to all boxes of its triangles or edges."""
-    i = wp.tid()
+    """Extend the bounds of each body to the boxes of its triangles and of their edges."""
+    t = wp.tid()
     if watch.due[0] == 0:
         return
-    count = meeting.triangles.shape[0]
-    if of_edges != 0:
-        count = meeting.edges.shape[0]
     low = wp.vec3(NOWHERE, NOWHERE, NOWHERE)
     high = -low
     world = int(-1)
     body = int(-1)
-    while i < count:
-        place = place_of(i, of_edges, meeting)
-        if place >= 0:
+    while t < meeting.triangles.shape[0]:
+        c = meeting.triangles[t]
+        if c[0] >= 0:
             # Places are sorted by body, so a thread rarely moves on to another body.
-            if meeting.body[place] != body or surface.world[place] != world:
+            if meeting.body[c[0]] != body or surface.world[c[0]] != world:
                 if body >= 0:
                     extend_bounds(world, body, low, high, lower, upper)
-                body = meeting.body[place]
-                world = surface.world[place]
-                low = boxes_lower[i]
-                high = boxes_upper[i]
-            else:
-                low = wp.min(low, boxes_lower[i])
-                high = wp.max(high, boxes_upper[i])
-        i += threads
+                body = meeting.body[c[0]]
+                world = surface.world[c[0]]
+                low = wp.vec3(NOWHERE, NOWHERE, NOWHERE)
+                high = -low
+            a = surface.x[c[0]]
+            b = surface.x[c[1]]
+            e = surface.x[c[2]]
+            # No side and no triangle needs a larger box.
+            far = triangle_reach(surface, meeting, c) + BAND * longest_side(a, b, e)
+            beyond = wp.vec3(far, far, far)
+            low = wp.min(low, wp.min(a, wp.min(b, e)) - beyond)
+            high = wp.max(high, wp.max(a, wp.max(b, e)) + beyond)
+        t += threads
     if body >= 0:
         extend_bounds(world, body, low, high, lower, upper)
 

@@ -47,21 +47,23 @@ def bend(surface: Surface, meeting: Meeting, k: int):
 
 
 @wp.func
-def may_meet(s: int, r: int, flags: int, surface: Surface, meeting: Meeting):
-    """Whether two places may touch. Inverted elements have passed through their own body and have to get back."""
-    if surface.world[s] != surface.world[r]:
-        return False
-    return meeting.body[s] != meeting.body[r] or (meeting.meets_itself != 0 and (flags & CRUSHED) == 0)
+def may_meet(s: int, r: int, surface: Surface, meeting: Meeting):
+    """Whether two places are in one world, and in two bodies or in one that touches itself."""
+    return surface.world[s] == surface.world[r] and (meeting.meets_itself != 0 or meeting.body[s] != meeting.body[r])
 
 
 @wp.func
 def node_is_near(s: int, t: int, surface: Surface, meeting: Meeting, near: Near):
     c = meeting.triangles[t]
-    if c[0] < 0 or c[0] == s or c[1] == s or c[2] == s or meeting.opposite[t] == s:
+    if c[0] < 0 or not may_meet(s, c[0], surface, meeting):
         return False
-    flags = near.flags[s] | near.flags[c[0]] | near.flags[c[1]] | near.flags[c[2]]
-    if not may_meet(s, c[0], flags, surface, meeting):
+    if c[0] == s or c[1] == s or c[2] == s or meeting.opposite[t] == s:
         return False
+    if meeting.body[s] == meeting.body[c[0]]:
+        # Inverted elements have passed through their own body and have to get back.
+        flags = near.flags[s] | near.flags[c[0]] | near.flags[c[1]] | near.flags[c[2]]
+        if (flags & CRUSHED) != 0:
+            return False
     a = surface.x[c[0]]
     b = surface.x[c[1]]
     e = surface.x[c[2]]
@@ -91,11 +93,14 @@ def is_opposite(e: wp.vec2i, m: int, meeting: Meeting):
 def edge_is_near(k: int, m: int, surface: Surface, meeting: Meeting, near: Near):
     e = meeting.edges[k]
     f = meeting.edges[m]
-    if f[0] < 0 or e[0] == f[0] or e[0] == f[1] or e[1] == f[0] or e[1] == f[1]:
+    if f[0] < 0 or not may_meet(e[0], f[0], surface, meeting):
         return False
-    flags = near.flags[e[0]] | near.flags[e[1]] | near.flags[f[0]] | near.flags[f[1]]
-    if not may_meet(e[0], f[0], flags, surface, meeting):
+    if e[0] == f[0] or e[0] == f[1] or e[1] == f[0] or e[1] == f[1]:
         return False
+    if meeting.body[e[0]] == meeting.body[f[0]]:
+        flags = near.flags[e[0]] | near.flags[e[1]] | near.flags[f[0]] | near.flags[f[1]]
+        if (flags & CRUSHED) != 0:
+            return False
     if is_opposite(e, m, meeting):
         return False
     p = surface.x[e[0]]

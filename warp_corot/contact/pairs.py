@@ -195,10 +195,9 @@ class Pairs:
         watch, meeting, device = self.search.watch, self.meeting, self.device
         bounds = [meeting.lower, meeting.upper]
         wp.launch(boxes.clear_bounds, meeting.lower.shape, [watch], bounds, device=device)
-        for of_edges, (lower, upper) in enumerate(self._boxes):
-            threads = 1 if device.is_cpu else min(len(lower), BOUNDING_THREADS)
-            inputs = [threads, watch, self.surface.arrays, meeting, lower, upper, of_edges]
-            wp.launch(boxes.bound_bodies, threads, inputs, bounds, device=device)
+        threads = 1 if device.is_cpu else min(max(self.surface.triangle_count, 1), BOUNDING_THREADS)
+        inputs = [threads, watch, self.surface.arrays, meeting]
+        wp.launch(boxes.bound_bodies, threads, inputs, bounds, device=device)
 
     def _mark_crushed(self) -> None:
         near, watch = self.search.near, self.search.watch
