@@ -10,9 +10,9 @@ from mpirun import needs_mpi, on_ranks
 import warp_corot as wc
 
 SIZES = (1, 2, 3)
-#: Leaves of several levels, worlds with viscosity, contact, contact in implicit steps with multigrid, and implicit
-#: steps of a general mesh with viscosity.
-CASES = ("forest", "worlds", "touched", "pressed", "newmark")
+#: Leaves of several levels, worlds with viscosity, contact, contact of bodies, contact in implicit steps with
+#: multigrid, and implicit steps of a general mesh with viscosity.
+CASES = ("forest", "worlds", "touched", "meeting", "pressed", "newmark")
 #: On two ranks there is one case.
 SHORT = {2: "forest"}
 
@@ -109,9 +109,9 @@ def test_energies_are_those_of_all_ranks(runs, case):
 
 
 def assert_as_one_process(case, found):
-    body, options = ranked.CASES[case](), ranked.options_of(case)
-    sim = wc.Simulation(body, **options | {"model": options["model"] or wc.Corotated()})
-    ranked.moved(sim, body)
+    bodies, options = ranked.bodies_of(case), ranked.options_of(case)
+    sim = wc.Simulation(bodies, **options | {"model": options["model"] or wc.Corotated()})
+    ranked.moved(sim, bodies[0])
     if case in ranked.TOUCHING:
         assert np.abs(found[f"{case}.True.wrench1"]).max() > 0.01
     if case in ("multigrid", "newton"):
@@ -120,9 +120,10 @@ def assert_as_one_process(case, found):
     elif case == "pressed":
         assert sim.solves is not None
         assert found[f"{case}.True.iterations"][2] <= 1.1 * sim.solves.linear_iterations
-    moved = np.abs(body.displacements.numpy()).max()
+    moved = max(np.abs(body.displacements.numpy()).max() for body in bodies)
     assert moved > 0.01
-    np.testing.assert_allclose(found[f"{case}.True.x"], body.positions.numpy(), atol=2e-3 * moved)
+    everywhere = np.concatenate([body.positions.numpy() for body in bodies])
+    np.testing.assert_allclose(found[f"{case}.True.x"], everywhere, atol=2e-3 * moved)
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -137,7 +138,7 @@ def test_costs_of_all_ranks_are_measured(runs):
         assert (costs > 0.0).all()
 
 
-@pytest.mark.parametrize(("case", "size"), [("forest", 1), ("touched", 3), ("pressed", 3)])
+@pytest.mark.parametrize(("case", "size"), [("forest", 1), ("touched", 3), ("meeting", 3), ("pressed", 3)])
 def test_a_checkpoint_goes_on_with_any_number_of_ranks(runs, case, size):
     """Three ranks go on from their own, and from that of one process."""
     for what in ("x", "numbers"):

@@ -52,7 +52,7 @@ def touched(mesh: wc.TetForest | None = None) -> wc.SoftBody:
 
 
 #: Cases with contact.
-TOUCHING = ("touched", "pressed", "bdf2")
+TOUCHING = ("touched", "meeting", "pressed", "bdf2")
 #: Cases whose checkpoints several ranks keep.
 KEPT = (*TOUCHING, "multigrid")
 
@@ -61,12 +61,23 @@ def obstacles_of(case: str) -> list[wc.Ground | wc.Tool]:
     """The obstacle on which the block falls, and the one that comes down on its edges, between its nodes."""
     if case not in TOUCHING:
         return []
+    ground = wc.Ground((0.0, 1.0, 0.0), -0.002, friction=0.3)
+    if case == "meeting":
+        ball = wc.Tool(wc.Sphere(0.01))
+        ball.follow([0.0, 0.05], [[0.025, 0.093, 0.08], [0.025, 0.068, 0.08]])
+        return [ground, ball]
     # Implicit steps hold nodes only.
     radius = 0.004 if case == "touched" else 0.015
     tool = wc.Tool(wc.Capsule(radius, 0.06))
     heights = radius + np.array([0.049, 0.043, 0.026])
     tool.follow([0.0, 0.02, 0.05], np.stack([np.full(3, 0.03), heights, [0.04, 0.044, 0.05]], axis=1))
-    return [wc.Ground((0.0, 1.0, 0.0), -0.002, friction=0.3), tool]
+    return [ground, tool]
+
+
+def meeting() -> list[wc.SoftBody]:
+    """The same block, and a stiffer one that lies on it and is pressed into it."""
+    mesh = wc.TetForest.box((1, 1, 1), 0.03, level=4, origin=(0.01, 0.0505, 0.065))
+    return [touched(), wc.SoftBody(mesh, wc.Isotropic(5e3, 0.3, 1000.0), device="cpu")]
 
 
 #: Integrators of cases that are not stepped by the default one.
@@ -88,6 +99,7 @@ CASES = {
     "tets": lambda: body_of(jittered(), 0.49),
     "worlds": lambda: body_of(wc.TetForest.box((1, 1, 3), 0.064, level=4), 0.3, worlds=2),
     "touched": touched,
+    "meeting": meeting,
     "pressed": lambda: touched(wc.TetForest.box((1, 1, 3), 0.05, level=4)),
     "bdf2": touched,
     "shared": lambda: body_of(graded(), 0.3),
@@ -109,17 +121,35 @@ def moved(sim: wc.Simulation, body: wc.SoftBody) -> None:
 def options_of(case: str) -> dict[str, Any]:
     """The options with which a case is stepped."""
     integrator = INTEGRATORS.get(case, wc.SymplecticEuler)()
-    return {"model": MODELS.get(case), "obstacles": obstacles_of(case), "integrator": integrator}
+    contact = wc.Contact(friction=0.2, self_contact=True) if case == "meeting" else None
+    touching = {"obstacles": obstacles_of(case), "contact": contact}
+    return {"model": MODELS.get(case), "integrator": integrator, **touching}
+
+
+def bodies_of(case: str) -> list[wc.SoftBody]:
+    """The bodies of a case."""
+    found = CASES[case]()
+    return found if isinstance(found, list) else [found]
+
+
+def gathered(arrays: list[wp.array]) -> np.ndarray | None:
+    """Nodal arrays of all bodies on rank 0, one after another."""
+    import warp_corot.distributed as wd
+
+    found = [wd.gather(each) for each in arrays]
+    return None if found[0] is None else np.concatenate(found)
 
 
 def made(case: str, deterministic: bool, kept: Path | None) -> dict[str, np.ndarray | None]:
     """The results of a run; if a file is given, also those of the same run after a checkpoint in it."""
     import warp_corot.distributed as wd
 
-    body, options = CASES[case](), options_of(case)
-    sim = wd.Simulation(body, deterministic=deterministic, **options)
-    moved(sim, body)
-    found = {"x": wd.gather(body.positions), "v": wd.gather(body.velocities), "energy": np.array(sim.energy())}
+    bodies, options = bodies_of(case), options_of(case)
+    sim = wd.Simulation(bodies, deterministic=deterministic, **options)
+    moved(sim, bodies[0])
+    positions = [body.positions for body in bodies]
+    found = {"x": gathered(positions), "v": gathered([body.velocities for body in bodies])}
+    found["energy"] = np.array(sim.energy())
     if sim.solves is not None:
         found["iterations"] = np.array(sim.solves)
     found["numbers"] = np.array([sim.steps, sim.dt, sim.time, *sim.dt_range])
@@ -128,7 +158,7 @@ def made(case: str, deterministic: bool, kept: Path | None) -> dict[str, np.ndar
     if kept is not None:
         sim.save(kept)
         sim.advance(0.01)
-        found |= {"saved.x": wd.gather(body.positions), "saved.numbers": np.array([sim.steps, sim.time])}
+        found |= {"saved.x": gathered(positions), "saved.numbers": np.array([sim.steps, sim.time])}
     return {f"{case}.{deterministic}.{key}": value for key, value in found.items()}
 
 
@@ -139,7 +169,7 @@ def resumed(path: Path) -> dict[str, np.ndarray | None]:
     sim = wd.Simulation.load(path)
     sim.advance(0.01)
     numbers = np.array([sim.steps, sim.time])
-    return {f"{path.stem}.x": wd.gather(sim.body.positions), f"{path.stem}.numbers": numbers}
+    return {f"{path.stem}.x": gathered([body.positions for body in sim.bodies]), f"{path.stem}.numbers": numbers}
 
 
 def touched_in_parts() -> np.ndarray | None:

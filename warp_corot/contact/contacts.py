@@ -9,6 +9,7 @@ import warp as wp
 
 from warp_corot.kernels.contact import motion, sums, watch
 from warp_corot.kernels.contact.law import Law
+from warp_corot.solvers.ranks import ALONE, Ranks
 from warp_corot.solvers.system import System
 
 from .active_set import ActiveSet
@@ -21,6 +22,7 @@ from .search import Search
 from .surface import ContactSurface
 from .tool import Obstacle
 from .warned import OVERLAP, warn_of_crushed, warn_of_overlaps
+from .whole_surface import WholeSurface
 
 #: Gaps that come from rounding, in roundings of the largest coordinate.
 ROUNDINGS = 16.0
@@ -66,19 +68,23 @@ class Contacts:
     ):
         self.system, self.device, self.options = system, system.device, options
         self.obstacles = Obstacles(obstacles, options.friction, system, dt)
-        self.surface = ContactSurface(system.bodies)
+        meets = len(system.bodies) > 1 or options.self_contact
+        is_whole = meets and not system.ranks.is_alone
+        self.surface = WholeSurface(system) if is_whole else ContactSurface(system.bodies)
+        #: The ranks with other places of the surface.
+        self._ranks: Ranks = ALONE if is_whole else system.ranks
         own = [self.surface.places_of(k) for k in range(len(system.bodies))]
-        system.ranks.take_surface(self.surface.arrays.node, own)
+        self._ranks.take_surface(self.surface.arrays.node, own)
         self.law = self._law(stable_dt)
         self.search = Search(self.surface, self.obstacles, self.smallest, branches=system.ranks.is_alone)
         self.rigid: RigidForces | None = None
         if self.obstacles.count:
-            given = (self.surface, self.obstacles, self.search, self.law, system.pace.arrays, system.ranks)
+            given = (self.surface, self.obstacles, self.search, self.law, system.pace.arrays, self._ranks)
             self.rigid = RigidForces(*given)
         #: Contact between soft surfaces; None if they cannot touch one another.
         self.pairs: Pairs | None = None
-        if len(system.bodies) > 1 or options.self_contact:
-            self.pairs = Pairs(self.surface, self.search, options.friction, options.self_contact)
+        if meets:
+            self.pairs = Pairs(self.surface, self.search, options.friction, options.self_contact, system.ranks)
         self._revision = 0
         self._is_looked_at = self._has_crushed = False
         self._make_arrays()
@@ -149,11 +155,14 @@ class Contacts:
         self._predict(offset, damping)
         self.search.launch(offset)
         self._solve()
-        system.ranks.clear_surface(surface.arrays.f)
+        self._ranks.clear_surface(surface.arrays.f)
+        follows = bool(self.search.finders) and not surface.is_whole
         for k, body in enumerate(system.bodies):
-            inputs = [surface.parts[k].start, surface.arrays, int(bool(self.search.finders))]
+            inputs = [surface.parts[k].start, surface.own, int(follows)]
             outputs = [self.search.watch, body.state.forces, body.state.contact_forces]
             self._launch(watch.add_contact_forces, self._count(k), inputs, outputs)
+        if surface.is_whole:
+            self.search.launch_after()
 
     def launch_motion(self, offset: int) -> None:
         """Launch the motion of obstacles in an implicit step."""
@@ -175,7 +184,7 @@ class Contacts:
         if not np.isfinite(thinnest):
             return
         for k, body in enumerate(self.system.bodies):
-            inputs = [self.surface.parts[k].start, self.surface.arrays.node, body.state.velocities, thinnest]
+            inputs = [self.surface.parts[k].start, self.surface.own.node, body.state.velocities, thinnest]
             self._launch(motion.measure_rates, self._count(k), inputs, [self.system.motion_rates])
 
     def publish(self) -> None:
@@ -183,21 +192,21 @@ class Contacts:
         if self.rigid is not None:
             forces = self.rigid.launch_totals()
             for number in range(obstacles.count if self.rigid.have_edges else 0):
-                self.system.ranks.clear_surface(forces[number])
+                self._ranks.clear_surface(forces[number])
             threads = self._parts.shape[2] * self._lanes
             for part in surface.parts:
                 inputs = [part.start, part.nodes, self._lanes, threads, surface.arrays, obstacles.motions, forces]
                 wp.launch(
                     sums.sum_wrenches, (*obstacles.wrenches.shape, threads), inputs, [self._parts], device=self.device
                 )
-            self.system.ranks.add_up_wrenches(self._parts)
+            self._ranks.add_up_wrenches(self._parts)
             wp.launch(
                 sums.fold_wrenches, obstacles.wrenches.shape, [self._parts], [obstacles.wrenches], device=self.device
             )
         self.search.launch_report()
         inputs = [surface.arrays, surface.triangles, surface.corner_starts, surface.corners]
         self._launch(sums.node_pressures, surface.count, inputs, [self._pressures])
-        self.system.ranks.complete_surface(self._pressures)
+        self._ranks.complete_surface(self._pressures)
         for k, part in enumerate(surface.parts):
             inputs = [part.triangle_start, surface.arrays, surface.triangles, self._pressures]
             outputs = [self._triangle_pressures[k]]
@@ -241,7 +250,7 @@ class Contacts:
         law = Law()
         law.tolerance = ROUNDINGS * 2.0**-24 * max(*points, 1e-3)
         law.recovery = RECOVERY * self.smallest / stable_dt if np.isfinite(stable_dt) else 0.1
-        heaviest = max(float(body.masses.max()) for body in self.system.bodies)
+        heaviest = self.system.ranks.most(max(float(body.masses.max()) for body in self.system.bodies))
         step = stable_dt if np.isfinite(stable_dt) else 1.0
         law.grain = heaviest * self.smallest / step**2 / GRAINS
         return law
@@ -255,8 +264,10 @@ class Contacts:
             inputs += [int(conditions.has_loads), conditions.loads, system.pace.arrays, offset]
             inputs += [state.rest, state.forces, state.displacements, state.velocities]
             kernel = motion.PREDICT_MOTION[conditions.loads.dtype]
-            self._launch(kernel, self._count(k), inputs, [surface.arrays])
-        if self.rigid is not None and self.rigid.have_edges:
+            self._launch(kernel, self._count(k), inputs, [surface.own])
+        if isinstance(surface, WholeSurface):
+            surface.complete(surface.arrays.x, surface.arrays.d, surface.arrays.yielding)
+        elif self.rigid is not None and self.rigid.have_edges:
             system.ranks.complete_surface(surface.arrays.d)
 
     def _solve(self) -> None:
@@ -281,7 +292,7 @@ class Contacts:
         count, obstacles = surface.count, self.obstacles.count
         self._lanes = 1 if device.is_cpu else WARP
         # Ranks add these arrays up, so they must be of one size.
-        most = int(self.system.ranks.most(float(max(part.nodes for part in surface.parts))))
+        most = int(self._ranks.most(float(max(part.nodes for part in surface.parts))))
         warps = 1 if device.is_cpu else max(min(most // WARP, MOST_WARPS), 1)
         self._parts = wp.zeros((obstacles, self.system.worlds, warps), dtype=wp.spatial_vectord, device=device)
         self._pressures = wp.zeros(count, dtype=wp.vec3, device=device)

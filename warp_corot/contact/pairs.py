@@ -13,6 +13,7 @@ from warp_corot.kernels.contact.crushed import mark_crushed
 from warp_corot.kernels.contact.law import Law
 from warp_corot.kernels.contact.rows import Meeting, Rows
 from warp_corot.kernels.stepping.pace import Pace
+from warp_corot.solvers.ranks import ALONE, Ranks
 
 from .search import Search
 from .surface import ContactSurface
@@ -34,6 +35,7 @@ class Pairs:
         search: The search for nearby surfaces.
         friction: Coulomb's coefficient.
         meets_itself: Whether a body touches itself.
+        ranks: The processes that compute other elements.
 
     Attributes:
         rows: The pairs, as a struct for kernels.
@@ -41,7 +43,10 @@ class Pairs:
         revision: Changes whenever launches do.
     """
 
-    def __init__(self, surface: ContactSurface, search: Search, friction: float, meets_itself: bool):
+    def __init__(
+        self, surface: ContactSurface, search: Search, friction: float, meets_itself: bool, ranks: Ranks = ALONE
+    ):
+        self._ranks = ranks
         self.surface, self.search, self.device = surface, search, surface.device
         self.friction, self.meets_itself = friction, meets_itself
         self.revision, self._room, self._taken, self._built = 0, 0, -1, 0
@@ -201,10 +206,11 @@ class Pairs:
 
     def _mark_crushed(self) -> None:
         near, watch = self.search.near, self.search.watch
-        for body, places in zip(self.surface.bodies, self.surface.places, strict=True):
+        for body, places in self.surface.solids:
             kernel, elements = mark_crushed(body.discretization.element_kind), body.discretization.elements
             inputs = [watch, elements, body.state.displacements, places]
             wp.launch(kernel, body.sizes.launch_elements, inputs, [near], device=self.device)
+        self._ranks.take_most(near.flags)
 
     def _on_rows(self, kernel: wp.Kernel, inputs: list) -> None:
         threads = self.search.threads(self._room)

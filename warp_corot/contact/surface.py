@@ -102,11 +102,25 @@ class ContactSurface:
         revision: Changes whenever arrays are replaced.
     """
 
+    #: Whether places of nodes that other ranks move are among them, with all values.
+    is_whole = False
+
     def __init__(self, bodies: Sequence[SoftBody]):
         self.bodies, self.worlds, self.device = tuple(bodies), bodies[0].worlds, bodies[0].device
         self.revision = 0
         self.parts: list[Part] = []
         self._make_room([Skin.of(body) for body in bodies])
+
+    @property
+    def own(self) -> Surface:
+        """The nodes that this process moves, as a struct for kernels."""
+        return self.arrays
+
+    @property
+    def solids(self) -> list[tuple[SoftBody, wp.array]]:
+        """The bodies whose elements this process computes, and the place of each of their nodes, int32 [nodes]; -1
+        inside."""
+        return list(zip(self.bodies, self.places, strict=True))
 
     @property
     def count(self) -> int:

@@ -16,6 +16,7 @@ from warp_corot.kernels.contact import sums
 from warp_corot.kernels.contact.crushed import count_crushed
 from warp_corot.kernels.contact.motion import Motions
 from warp_corot.kernels.contact.overlaps import find_gaps
+from warp_corot.solvers.ranks import ALONE
 
 from .sampled import SignedDistance, TriangleMesh
 from .shapes import Capsule, Cylinder, Ground
@@ -47,7 +48,7 @@ def warn_of_overlaps(contacts: Contacts, least: float) -> None:
         depths = wp.zeros(contacts.surface.count, dtype=wp.float32, device=contacts.device)
         inputs = [contacts.obstacles.shapes, contacts.obstacles.motions, contacts.surface.arrays]
         wp.launch(sums.find_depths, contacts.surface.count, inputs, [depths], device=contacts.device)
-        deep, ranks = depths.numpy(), contacts.system.ranks
+        deep, ranks = depths.numpy(), ALONE if contacts.surface.is_whole else contacts.system.ranks
         count, deepest = int(ranks.together(int((deep > least).sum()))), ranks.most(float(deep.max(initial=0.0)))
         if count:
             _warn(f"{count} surface nodes begin inside obstacles, by up to {1e3 * deepest:.3g} mm; they are {speed}")
@@ -62,7 +63,7 @@ def _own_surfaces(contacts: Contacts) -> Iterator[tuple[Floats, npt.NDArray[np.i
     places = contacts.surface.arrays.x.numpy().astype(float)
     for body, part in zip(contacts.system.bodies, contacts.surface.parts, strict=True):
         whole = contacts.system.ranks.whole(body)
-        if whole is body:
+        if whole is body or contacts.surface.is_whole:
             yield places[part.start : part.start + len(part.skin.nodes)], part.skin.triangles
         else:
             triangles = whole.surface_triangles

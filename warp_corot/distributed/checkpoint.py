@@ -64,7 +64,7 @@ def save(
         kept[name] = Values(values)
     contact = None
     if parts.contact is not None:
-        contact = gathered_contact(bodies[0], parts, following[0], comm)
+        contact = gathered_contact(parts, following, comm)
     guard, failed = parts.guard.state, None
     if comm.rank == 0:
         told = SimpleNamespace(
@@ -117,7 +117,7 @@ def resume(loaded: Simulation | SimpleNamespace, parts: SimulationOfParts, follo
     parts.steps_before_reset, parts.time_before_reset = loaded.steps_before_reset, loaded.time_before_reset
     parts.stable_dt = loaded.stable_dt
     if loaded.contact is not None:
-        resume_contact(loaded.contact, parts, following[0])
+        resume_contact(loaded.contact, parts, following)
     parts.guard.resume(**loaded.guard.state)
     parts.running.resume(**loaded.running.state)
     wp.synchronize_device(parts.device)

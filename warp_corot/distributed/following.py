@@ -105,7 +105,8 @@ class Following:
             here = self.part.surface_here
             shift = np.arange(self.whole.worlds, dtype=np.int32)[:, None]
             everywhere = (here + len(self.whole.surface_triangles) * shift).ravel()
-            own = np.arange(len(everywhere), dtype=np.int32)
+            is_whole = len(self.part.state.contact_pressures) == count
+            own = everywhere if is_whole else np.arange(len(everywhere), dtype=np.int32)
             self._triangles = Places(everywhere, own, self.whole.device, self.part.device)
         self._own.to_whole(part.contact_forces, whole.contact_forces)
         self._triangles.to_whole(part.contact_pressures, whole.contact_pressures)
@@ -169,7 +170,14 @@ class Following:
     def owns(self, array: wp.array) -> bool:
         """Whether an array is one of the whole body's nodal ones."""
         state, conditions = self.whole.state, self.whole.conditions
-        arrays = (state.positions, state.displacements, state.velocities, state.reactions, state.rest)
+        arrays = (
+            state.positions,
+            state.displacements,
+            state.velocities,
+            state.reactions,
+            state.rest,
+            state.contact_forces,
+        )
         return array.ptr in {each.ptr for each in (*arrays, conditions.loads, conditions.mass)}
 
     # --- pieces ----------------------------------------------------------------------------------------------------

@@ -53,6 +53,21 @@ class Halo:
                 sent[rank] = _in_worlds(own, worlds, len(nodes))
         return cls(sent, received)
 
+    @classmethod
+    def to_all(cls, own: Ints, comm: Any) -> Halo:
+        """The lists with which every rank gets all values of an array whose places all ranks number alike.
+
+        All ranks must call this.
+
+        Args:
+            own: The places of this rank's values, int32.
+            comm: The ranks.
+        """
+        everybody = comm.allgather(own)
+        received = {r: places for r, places in enumerate(everybody) if r != comm.rank and len(places)}
+        sent = {r: own for r in range(comm.size) if r != comm.rank and len(own)}
+        return cls(sent, received)
+
     @property
     def sent_bytes(self) -> int:
         """Bytes that one exchange of nodal vectors sends."""

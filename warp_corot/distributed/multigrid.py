@@ -235,12 +235,9 @@ class MultigridOfParts(Multigrid):
             length: The number of values of a world.
             options: As for ``MpiRanks.exchange_of``.
         """
-        ranks, worlds = self._ranks, self._part.worlds
-        everybody = [_in_worlds(places, worlds, length) for places in ranks.comm.allgather(own)]
-        others = [r for r in range(ranks.comm.size) if r != ranks.comm.rank]
-        sent = {r: everybody[ranks.comm.rank] for r in others if len(own)}
-        received = {r: everybody[r] for r in others if len(everybody[r])}
-        return ranks.exchange_of(Halo(sent, received), TAGS + self._k, **options).launch
+        ranks = self._ranks
+        halo = Halo.to_all(_in_worlds(own, self._part.worlds, length), ranks.comm)
+        return ranks.exchange_of(halo, TAGS + self._k, **options).launch
 
 
 def has_multigrid(whole: SoftBody, part: Part) -> bool:

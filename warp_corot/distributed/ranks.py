@@ -17,7 +17,7 @@ from warp_corot.kernels.distributed import exchange as kernels
 from warp_corot.kernels.stepping import balance
 from warp_corot.kernels.stepping import pace as clock
 from warp_corot.kernels.stepping.pace import Pace
-from warp_corot.solvers.ranks import Floats, Ranks
+from warp_corot.solvers.ranks import Floats, Ints, Ranks
 
 from .cards import CardExchange, add_up, take_most
 from .directions import normal_numbers
@@ -193,6 +193,14 @@ class MpiRanks(Ranks):
         self._places = SurfacePlaces(nodes, places, self._parts, starts, numbers, self.comm)
         self._on_surface = self.exchange_of(self._places.halo, len(self._parts))
         self._yielding = wp.zeros(len(nodes), dtype=wp.float32, device=self.device)
+
+    def take_whole_surface(self, own: Ints) -> None:
+        self._on_surface = self.exchange_of(Halo.to_all(own, self.comm), len(self._parts))
+
+    def numbers(self, k: int) -> tuple[Ints, npt.NDArray[np.bool_]]:
+        part = self._parts[k]
+        shift = self.whole(part).world_node_count * np.arange(part.worlds, dtype=np.int32)[:, None]
+        return (part.numbers.places + shift).ravel(), part.is_own
 
     def complete_surface(self, values: wp.array) -> None:
         self._on_surface.launch(values)

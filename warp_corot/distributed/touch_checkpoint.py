@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.contacts import Contacts
+from warp_corot.contact.keeping import keep_again, kept_arrays
 from warp_corot.solvers.system import System
 
 from .following import Following
@@ -21,17 +24,22 @@ Ints = npt.NDArray[np.intp]
 NODAL = ("anchors", "kinds", "forces")
 
 
-def gathered_contact(body: SoftBody, parts: SimulationOfParts, following: Following, comm: Any) -> Contacts | None:
+def gathered_contact(parts: SimulationOfParts, everything: Sequence[Following], comm: Any) -> Contacts | None:
     """The state from which contact of the whole body continues, on rank 0; None elsewhere. All ranks must call this.
 
     Args:
-        body: The whole body, with contact forces of all nodes.
-        parts: This rank's simulation of its part.
-        following: The ``Following`` of the body.
+        parts: This rank's simulation of its parts.
+        everything: The ``Following`` of each body; the whole bodies have contact forces of all nodes.
         comm: The ranks.
     """
     here = parts.contact
     assert here is not None
+    if here.surface.is_whole:
+        # All ranks have all of it.
+        kept = copy.copy(here)
+        kept.system = SimpleNamespace(bodies=[each.whole for each in everything])  # type: ignore[assignment]
+        return kept if comm.rank == 0 else None
+    following, body = everything[0], everything[0].whole
     assert here.rigid is not None
     touches = here.rigid.touches
     own, of_nodes, of_triangles = _places(here, following)
@@ -64,16 +72,23 @@ def gathered_contact(body: SoftBody, parts: SimulationOfParts, following: Follow
     return whole
 
 
-def resume_contact(loaded: Contacts, parts: SimulationOfParts, following: Following) -> None:
+def resume_contact(loaded: Contacts, parts: SimulationOfParts, everything: Sequence[Following]) -> None:
     """Continue from the contact of the whole body.
 
     Args:
         loaded: That contact.
-        parts: This rank's simulation of its part.
-        following: The ``Following`` of the body.
+        parts: This rank's simulation of its parts.
+        everything: The ``Following`` of each body.
     """
-    here = parts.contact
+    here, following = parts.contact, everything[0]
     assert here is not None
+    if here.surface.is_whole:
+        kept = {name: array.numpy() for name, array in kept_arrays(loaded).items()}
+        keep_again(here, loaded.surface.rooms, 0 if loaded.pairs is None else loaded.pairs.room, kept)
+        _take_common(here, loaded)
+        for each in everything:
+            each.take_contact_forces()
+        return
     assert here.rigid is not None
     assert loaded.rigid is not None
     own, of_nodes, of_triangles = _places(here, following)

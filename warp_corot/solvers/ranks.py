@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 
 Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int32]
 
 
 class Ranks:
@@ -107,6 +108,20 @@ class Ranks:
             nodes: The node of its body at each place, in all worlds, int32; -1 at places that are not in use.
             places: The places of each body.
         """
+
+    def take_whole_surface(self, own: Ints) -> None:
+        """Take the whole surfaces of the bodies, whose places all ranks number alike.
+
+        After ``complete_surface`` every rank has the values of all places.
+
+        Args:
+            own: The places of nodes that this rank moves, int32.
+        """
+
+    def numbers(self, k: int) -> tuple[Ints, npt.NDArray[np.bool_]]:
+        """The number in the k-th whole body of each node that this rank holds, in all worlds, int32; and whether this
+        rank moves it."""
+        raise NotImplementedError
 
     def complete_surface(self, values: wp.array) -> None:
         """Launch the exchange that gives ghosts their values in an array over the surface's places, float32 or vec3."""
