@@ -31,6 +31,7 @@ class Meeting:
     lower: wp.array2d[wp.vec3]  # [worlds, bodies] bounds of the places that a body may reach [m]
     upper: wp.array2d[wp.vec3]
     meets_itself: int
+    flat_edges: int  # whether flat edges may touch flat edges
     friction: float
 
 

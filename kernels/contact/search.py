@@ -4,6 +4,7 @@ import warp as wp
 
 from .boxes import edge_reach, may_reach_others, triangle_reach, triangle_size
 from .closest import on_segments, on_triangle, point_of
+from .locate import ENDS, edge_normal
 from .motion import Surface
 from .near import CRUSHED, PAIRED, Near, mark
 from .rows import BAND, Meeting, Rows, row_count, triangle_normal
@@ -17,6 +18,8 @@ Kept = wp.types.vector(length=16, dtype=wp.int32)
 
 #: Edges with a larger sine of the bend are sharp.
 SHARP = wp.constant(0.15)
+#: The largest cosine between the normals of two surfaces that face each other.
+FACING = wp.constant(-0.5)
 
 
 @wp.struct
@@ -90,7 +93,28 @@ def is_opposite(e: wp.vec2i, m: int, meeting: Meeting):
 
 
 @wp.func
-def edge_is_near(k: int, m: int, surface: Surface, meeting: Meeting, near: Near):
+def flat_edges_cross(k: int, m: int, s: float, t: float, way: wp.vec3, surface: Surface, meeting: Meeting):
+    """Whether flat edges k and m of surfaces that face each other may cross before the next search.
+
+    Args:
+        s, t: Where they are closest, as shares of their lengths.
+        way: From there on m to there on k [m].
+    """
+    e = meeting.edges[k]
+    f = meeting.edges[m]
+    out = edge_normal(surface, meeting, m)
+    if wp.dot(out, edge_normal(surface, meeting, k)) > FACING:
+        return False
+    far = edge_reach(meeting, e) + edge_reach(meeting, f)
+    if wp.length(way - wp.dot(way, out) * out) > far:
+        return False
+    of_first = ENDS - far / wp.length(surface.x[e[1]] - surface.x[e[0]])
+    of_second = ENDS - far / wp.length(surface.x[f[1]] - surface.x[f[0]])
+    return wp.min(s, 1.0 - s) >= of_first and wp.min(t, 1.0 - t) >= of_second
+
+
+@wp.func
+def edge_is_near(k: int, m: int, is_sharp: bool, surface: Surface, meeting: Meeting, near: Near):
     e = meeting.edges[k]
     f = meeting.edges[m]
     if f[0] < 0 or not may_meet(e[0], f[0], surface, meeting):
@@ -108,13 +132,17 @@ def edge_is_near(k: int, m: int, surface: Surface, meeting: Meeting, near: Near)
     a = surface.x[f[0]]
     b = surface.x[f[1]]
     s, t = on_segments(p, q, a, b)
-    far = wp.length(p + s * (q - p) - a - t * (b - a))
+    way = p + s * (q - p) - a - t * (b - a)
     band = BAND * wp.min(wp.length(q - p), wp.length(b - a))
-    if not (far <= edge_reach(meeting, e) + edge_reach(meeting, f) + band):
+    if not (wp.length(way) <= edge_reach(meeting, e) + edge_reach(meeting, f) + band):
         return False
     other = bend(surface, meeting, m)
-    # The first of two sharp edges finds the pair.
-    return not (other < -SHARP or (other > SHARP and m < k))
+    # Sharp edges find flat ones; the first of two sharp or flat edges finds the pair.
+    if other < -SHARP:
+        return False
+    if is_sharp:
+        return other <= SHARP or m > k
+    return other <= SHARP and m > k and flat_edges_cross(k, m, s, t, way, surface, meeting)
 
 
 @wp.func
@@ -153,7 +181,7 @@ def near_node(
 def near_edge(
     k: int, start: int, of_edges: wp.uint64, surface: Surface, meeting: Meeting, near: Near, rows: Rows, kept: Kept
 ):
-    """Count the edges near a sharp one and keep the first ones, or write all if a start is given."""
+    """Count the edges near one that is sharp, or flat, and keep the first ones, or write all if a start is given."""
     count = int(0)
     e = meeting.edges[k]
     a = surface.x[e[0]]
@@ -162,12 +190,13 @@ def near_edge(
     beyond = wp.vec3(reach, reach, reach)
     if not may_reach_others(e[0], wp.min(a, b) - beyond, wp.max(a, b) + beyond, surface, meeting):
         return 0, kept
-    if bend(surface, meeting, k) <= SHARP:
+    own = bend(surface, meeting, k)
+    if own <= SHARP and (own < -SHARP or meeting.flat_edges == 0):
         return 0, kept
     query = wp.bvh_query_aabb(of_edges, wp.min(a, b) - beyond, wp.max(a, b) + beyond)
     m = int(0)
     while wp.bvh_query_next(query, m):
-        if edge_is_near(k, m, surface, meeting, near):
+        if edge_is_near(k, m, own > SHARP, surface, meeting, near):
             if start >= 0:
                 add_other(start, count, m, rows)
             elif count < KEPT:

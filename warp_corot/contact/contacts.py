@@ -84,7 +84,7 @@ class Contacts:
         #: Contact between soft surfaces; None if they cannot touch one another.
         self.pairs: Pairs | None = None
         if meets:
-            self.pairs = Pairs(self.surface, self.search, options.friction, options.self_contact, system.ranks)
+            self.pairs = Pairs(self.surface, self.search, options, system.ranks)
         self._revision = 0
         self._is_looked_at = self._has_crushed = False
         self._make_arrays()

@@ -16,6 +16,8 @@ class Contact:
     Attributes:
         friction: Coulomb's coefficient of friction >= 0 of all contacts; an obstacle may have its own.
         self_contact: Whether bodies touch themselves, too. They touch one another in any case.
+        flat_edges: Whether soft surfaces also touch where flat edges of both cross. Then pressure passes evenly between
+            any two meshes, however coarse; there are several times as many pairs.
 
     Raises:
         InputError: A value out of its range.
@@ -23,10 +25,12 @@ class Contact:
 
     friction: float = 0.3
     self_contact: bool = False
+    flat_edges: bool = False
 
     def __post_init__(self) -> None:
         checked_friction(self.friction)
         checked_flag(self.self_contact, "self_contact")
+        checked_flag(self.flat_edges, "flat_edges")
 
 
 def checked_friction(given: float) -> float:

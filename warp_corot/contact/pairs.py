@@ -15,6 +15,7 @@ from warp_corot.kernels.contact.rows import Meeting, Rows
 from warp_corot.kernels.stepping.pace import Pace
 from warp_corot.solvers.ranks import ALONE, Ranks
 
+from .options import Contact
 from .search import Search
 from .surface import ContactSurface
 
@@ -33,8 +34,7 @@ class Pairs:
     Args:
         surface: The bodies' surfaces.
         search: The search for nearby surfaces.
-        friction: Coulomb's coefficient.
-        meets_itself: Whether a body touches itself.
+        options: The options of contact.
         ranks: The processes that compute other elements.
 
     Attributes:
@@ -43,12 +43,10 @@ class Pairs:
         revision: Changes whenever launches do.
     """
 
-    def __init__(
-        self, surface: ContactSurface, search: Search, friction: float, meets_itself: bool, ranks: Ranks = ALONE
-    ):
+    def __init__(self, surface: ContactSurface, search: Search, options: Contact, ranks: Ranks = ALONE):
         self._ranks = ranks
         self.surface, self.search, self.device = surface, search, surface.device
-        self.friction, self.meets_itself = friction, meets_itself
+        self.friction, self.meets_itself, self._flat_edges = options.friction, options.self_contact, options.flat_edges
         self.revision, self._room, self._taken, self._built = 0, 0, -1, 0
         search.finders.append(self._find)
         self.follow()
@@ -72,6 +70,7 @@ class Pairs:
         shape = (surface.worlds, len(surface.parts))
         meeting.lower, meeting.upper = (wp.zeros(shape, dtype=wp.vec3, device=device) for _ in range(2))
         meeting.meets_itself, meeting.friction = int(self.meets_itself), self.friction
+        meeting.flat_edges = int(self._flat_edges)
         self.meeting = meeting
         self._crowd = wp.zeros(count, dtype=wp.int32, device=device)
         self._added = wp.zeros(count, dtype=wp.vec3l, device=device)

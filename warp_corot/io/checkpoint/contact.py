@@ -51,6 +51,7 @@ def pack_contact(contacts: Contacts | None, grasps: Sequence[Grasp], arrays: Arr
     return {
         "friction": options.friction,
         "self_contact": options.self_contact,
+        "flat_edges": options.flat_edges,
         "law": [law.tolerance, law.recovery],
         "obstacles": [_pack_tool(tool, each is tool, f"tool{k}.", arrays) for k, (each, tool) in enumerate(given)],
         "rooms": contacts.surface.rooms,
@@ -64,7 +65,12 @@ def obstacles_of(described: dict[str, Any] | None, arrays: Arrays) -> dict[str, 
     if described is None:
         return {}
     obstacles = [_unpacked_tool(each, f"tool{k}.", arrays) for k, each in enumerate(described["obstacles"])]
-    return {"obstacles": obstacles, "contact": Contact(described["friction"], bool(described["self_contact"]))}
+    return {
+        "obstacles": obstacles,
+        "contact": Contact(
+            described["friction"], bool(described["self_contact"]), bool(described.get("flat_edges", False))
+        ),
+    }
 
 
 def unpack_contact(contacts: Contacts | None, described: dict[str, Any] | None, arrays: Arrays) -> None:
