@@ -17,6 +17,7 @@ wp.config.enable_backward = False
 import warp_corot as wc  # noqa: E402
 from warp_corot.distributed import front, mpi, simulation  # noqa: E402
 from warp_corot.distributed.patience import Patient, patience  # noqa: E402
+from warp_corot.mesh.surfaces.boundary import boundary_faces  # noqa: E402
 
 
 def graded() -> wc.TetForest:
@@ -222,6 +223,42 @@ def general_divided(kept: Path) -> np.ndarray | None:
     return wd.gather(body.positions)
 
 
+def general_loaded(file: Path) -> np.ndarray | None:
+    """The run "newmark" of a mesh of whose file each rank reads a piece; the positions of all nodes on rank 0."""
+    import h5py
+
+    import warp_corot.distributed as wd
+
+    everybody, mesh = mpi.world(), jittered()
+    if everybody.rank == 0:
+        counts = {"Points": len(mesh.points), "Cells": len(mesh.tets), "ConnectivityIds": mesh.tets.size}
+        with h5py.File(file, "w") as opened:
+            grid = opened.create_group("VTKHDF")
+            for name, count in counts.items():
+                grid[f"NumberOf{name}"] = [count]
+            grid["Points"], grid["Connectivity"] = mesh.points, mesh.tets.ravel().astype(np.int64)
+            grid["Types"] = np.full(len(mesh.tets), 10, np.uint8)
+    everybody.Barrier()
+    part = wd.load(file, up_axis="Y")
+    np.testing.assert_array_equal(mesh.points[part.numbers.nodes], part.points)
+    outer = sum(everybody.allgather(len(part.outer)))
+    assert outer == len(boundary_faces(mesh.tets)[0])
+    body = body_of(part, 0.3)
+    sim = wd.Simulation(body, deterministic=True, **options_of("newmark"))
+    moved(sim, body)
+    for name, model, said in (
+        (file.name, wc.Corotated(dilatation="shared"), "read in parts"),
+        ("no.hdf", None, "no.hdf"),
+    ):
+        found = ""
+        try:
+            wd.Simulation(body_of(wd.load(file.with_name(name)), 0.3), model=model)
+        except wc.InputError as error:
+            found = str(error)
+        assert said in found
+    return wd.gather(body.positions)
+
+
 def led() -> np.ndarray | None:
     """The run "forest" of a body that only rank 0 has whole; other ranks get parts."""
     everybody = mpi.world()
@@ -298,6 +335,7 @@ def make_all(folder: Path, size: int, names: list[str]) -> None:
         if "newmark" in names:
             found["divided.newmark.x"] = general_divided(folder / "general.3.npz")
             found |= resumed(folder / "general.3.npz")
+            found["loaded.newmark.x"] = general_loaded(folder / "general.vtkhdf")
         if "worlds" in names:
             found |= worlds_in_parts(folder / f"{size}.usda")
             for path in folder.glob("parts.?.npz"):

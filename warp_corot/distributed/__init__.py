@@ -8,10 +8,11 @@ from . import mpi
 from .boxes import box
 from .dividing import divided
 from .gathering import gather
+from .reading import load
 from .recording import record
 from .simulation import Simulation
 from .sweeping import sweep
 
-__all__ = ["Simulation", "box", "divided", "gather", "record", "sweep"]
+__all__ = ["Simulation", "box", "divided", "gather", "load", "record", "sweep"]
 
 mpi.choose_device()

@@ -28,7 +28,7 @@ from warp_corot.simulation.energy import WorldEnergies
 from warp_corot.solvers.ranks import Ranks
 
 from . import mpi
-from .part_meshes import ForestPart, InParts
+from .part_meshes import ForestPart, InParts, MeshPart
 from .partition import Partition
 from .parts import Part
 from .ranks import MpiRanks
@@ -85,6 +85,12 @@ def part_of(body: SoftBody, model: Model, comm: Any, costs: npt.ArrayLike | None
     """
     level = getattr(model, "level", None)
     if isinstance(body.mesh, InParts):
+        ungrouped = isinstance(body.mesh, MeshPart) and body.mesh.element_groups is None
+        if ungrouped and getattr(model, "dilatation", ELEMENT) == SHARED:
+            raise InputError(
+                "the mesh was read in parts, so its elements cannot share their dilatation; dilatation must be "
+                "'element', or take warp_corot.distributed.divided"
+            )
         if costs is not None:
             raise InputError("the mesh is divided already; give costs to warp_corot.distributed.box or divided")
         if level is not None and not body.mesh.is_box:
