@@ -106,7 +106,7 @@ CASES = {
     "shared": lambda: body_of(graded(), 0.3),
     "implicit": lambda: body_of(graded(), 0.3),
     "multigrid": lambda: body_of(graded(), 0.3),
-    "newton": lambda: body_of(wc.TetForest.box((1, 1, 3), 0.064, level=4), 0.3, worlds=2),
+    "newton": lambda: body_of(graded(), 0.49, worlds=2),
     "newmark": lambda: body_of(jittered(), 0.3),
 }
 

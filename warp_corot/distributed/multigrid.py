@@ -16,6 +16,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
+from warp_corot.discretization.members import Members
 from warp_corot.kernels.distributed.multigrid import add_correction
 from warp_corot.kernels.implicit.multigrid import values
 from warp_corot.mesh import TetForest
@@ -26,6 +27,7 @@ from warp_corot.solvers.implicit.operator import LinearOperator
 
 from .halo import Halo
 from .part_meshes import InParts
+from .partition import sharing_groups
 from .parts import Part
 from .places import Places
 
@@ -141,13 +143,24 @@ class MultigridOfParts(Multigrid):
         k: The number of the body.
         part: This rank's part.
         degree: The degree of the smoother on the finest level.
+        members: As for ``Multigrid``, of the part's elements.
         options: As for ``Multigrid``, whose sweeps smooth only the coarser levels.
     """
 
-    def __init__(self, ranks: MpiRanks, k: int, part: Part, *, degree: int, **options: Any):
+    def __init__(
+        self,
+        ranks: MpiRanks,
+        k: int,
+        part: Part,
+        *,
+        degree: int,
+        members: Callable[[int], Members] | None = None,
+        **options: Any,
+    ):
         self._ranks, self._k, self._part = ranks, k, part
-        self._options = options | {"degree": degree, "sweeps": 0}
-        super().__init__(ranks.whole(part), degree=degree, **options)
+        self._options = options | {"degree": degree, "sweeps": 0, "members": members}
+        everywhere = None if members is None else self._members_everywhere
+        super().__init__(ranks.whole(part), degree=degree, members=everywhere, **options)
 
     def update_finest(self, operator: LinearOperator) -> None:
         ranks, k = self._ranks, self._k
@@ -175,6 +188,18 @@ class MultigridOfParts(Multigrid):
             return super()._level(found, counts)
         self._finest = GatheredLevel(found, self.discretization.worlds, self.count, self._free, degree=1)
         return self._finest
+
+    def _members_everywhere(self, below: int) -> Members:
+        """The groups of the whole mesh's elements that share their dilatation."""
+        whole, own = self._ranks.whole(self._part), self._options["members"]
+        numbers = sharing_groups(whole.mesh, True)
+        order = np.argsort(numbers, kind="stable")
+        sizes = np.unique(numbers, return_counts=True)[1]
+        starts = np.concatenate([[0], np.cumsum(sizes)])
+        ints = [wp.array(each, dtype=wp.int32, device=self.device) for each in (starts, order, np.zeros(0, np.int32))]
+        batch = (ints[0], ints[1], ints[2], len(sizes))
+        law = own(self._part.discretization.sizes.world_elements).law
+        return Members.of(law, [batch], whole.discretization.elements.nodes, below)
 
     def _build(self, levels: Any) -> None:
         super()._build(levels)

@@ -69,7 +69,7 @@ class Partition:
             InputError: Fewer groups than ranks, or costs that are not positive.
         """
         shares = checked_shares(ranks, costs)
-        groups = sharing = _groups(mesh, grouped)
+        groups = sharing = sharing_groups(mesh, grouped)
         if rotation_level is not None and isinstance(mesh, TetForest):
             groups = _merged(groups, mesh.ancestors(rotation_level))
         order, sizes = _ordered(groups)
@@ -112,7 +112,8 @@ def checked_shares(ranks: int, costs: npt.ArrayLike | None) -> npt.NDArray[np.fl
     return (1.0 / given) / np.sum(1.0 / given)
 
 
-def _groups(mesh: Mesh, grouped: bool) -> Ints:
+def sharing_groups(mesh: Mesh, grouped: bool) -> Ints:
+    """The group in which each element may share its dilatation, int32 [T]; see ``Partition``."""
     count = len(mesh.tets)
     if not isinstance(mesh, TetForest):
         return neighbour_groups(mesh.points, mesh.tets) if grouped else np.arange(count, dtype=np.int32)

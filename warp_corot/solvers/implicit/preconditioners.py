@@ -31,18 +31,14 @@ def _multigrid(operator: TangentOperator, short_cycles: bool) -> Multigrid:
     shares = operator.field.shares_dilatation
     members = operator.field.find_members
     options: dict[str, Any] = {}
-    if not operator.ranks.is_alone:
-        members = None
     if short_cycles and operator.device.is_cpu:
         # Solves that begin near the answer take few iterations, which are worth less than what they cost.
         options, members = SHORT | (PLAIN if shares else {}), None
-    elif shares and operator.field.find_members is None:
-        options = AT_NODES
     elif shares and members is None:
-        options = PLAIN
+        options = AT_NODES
     is_turned = not operator.field.is_linear
     over_ranks = {"degree": SHORT_DEGREE if "sweeps" in options else DEGREE, "is_turned": is_turned, **options}
-    found = operator.ranks.multigrid(operator.number, over_ranks | {"stiffening": stiffening})
+    found = operator.ranks.multigrid(operator.number, over_ranks | {"stiffening": stiffening, "members": members})
     if found is not None:
         return found
     if operator.device.is_cuda and operator.body.sizes.elements >= FEWEST_OVER_SUBTREES and not options:

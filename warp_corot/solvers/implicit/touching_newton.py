@@ -71,7 +71,7 @@ class TouchingNewton:
         outputs = [newton.increment, body.state.displacements, self._sizes]
         self._launch(kernels.take_increments, inputs, outputs)
         newton.ranks.complete(newton.operator.number, body.state.displacements)
-        newton.ranks.take_most(self._sizes)
+        newton.ranks.take_most(self._sizes.flatten())
         self._going.zero_()
         inputs = [self._sizes, touching.iterations, newton.solver.status, self._tolerance, self._most]
         outputs = [self.iterations, self.linear_iterations, self.status, self._going]
