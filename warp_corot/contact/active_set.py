@@ -8,7 +8,10 @@ import numpy as np
 import warp as wp
 
 from warp_corot.kernels.contact import active as kernels
+from warp_corot.kernels.contact import spans
 from warp_corot.kernels.contact.meetings import find_meetings
+
+from .spans import Spans
 
 if TYPE_CHECKING:
     from .contacts import Contacts
@@ -35,6 +38,12 @@ class ActiveSet:
         self._rounds = wp.zeros(1, dtype=wp.int32, device=self.device)
         #: Whether other nodes are held than in the last round, int32 [1].
         self.changed = wp.zeros(1, dtype=wp.int32, device=self.device)
+        #: Obstacles between the nodes; None if there are none, or with ranks.
+        self._spans: Spans | None = None
+        if contacts.rigid.have_edges and contacts.system.ranks.is_alone:
+            pace = contacts.system.pace.arrays
+            self._spans = Spans(contacts.rigid, k, self._thickness, contacts.law, pace)
+        self._forces = wp.zeros_like(self.body.state.displacements)
         self.prepare()
 
     def prepare(self) -> None:
@@ -50,6 +59,8 @@ class ActiveSet:
         holding.projectors, holding.drag = (wp.zeros(shape[1], dtype=wp.mat33, device=device) for _ in range(2))
         holding.given = wp.zeros(shape[1], dtype=wp.vec3, device=device)
         self._holding = holding
+        if self._spans is not None:
+            self._spans.prepare()
 
     # --- launches ----------------------------------------------------------------------------------------------------
 
@@ -67,6 +78,8 @@ class ActiveSet:
         self._rounds.zero_()
         self._find_bounds(d, int(kernels.THOSE_TOUCHED), at_end=False)
         self._hold()
+        if self._spans is not None:
+            self._locate(spans.FIRST, d)
 
     def launch_again(self) -> None:
         """Launch the beginning of another linearisation of the same step."""
@@ -82,15 +95,22 @@ class ActiveSet:
         self._launch(kernels.leave_yielding, [self._surface, self._holding, v])
 
     def launch_imposed(self, d: wp.array) -> None:
-        """Launch the assignment of the given motion to d in these directions."""
+        """Launch the beginning of a solve: the assignment of the given motion to d in these directions."""
         self._launch(kernels.impose, [self._surface, self._holding, d])
+        if self._spans is not None:
+            self._locate(spans.AGAIN, d)
 
     def launch_drag(self, x: wp.array, y: wp.array) -> None:
-        """Launch y = S (y + D x) with the drag D of friction, x in the range of S."""
+        """Launch y = S (y + D x) with the drag D of friction and of obstacles between nodes, x in the range of S."""
+        if self._spans is not None:
+            self._spans.add_products(x, y)
         self._launch(kernels.add_drag, [self._surface, self._holding, x, y])
 
     def launch_friction(self, d: wp.array, r: wp.array) -> None:
-        """Launch r = S (r + friction) for the motion d."""
+        """Launch r = S (r + friction and forces of obstacles between nodes) for the motion d."""
+        if self._spans is not None:
+            self._spans.update(d)
+            self._spans.add_forces(r)
         motions = self._contacts.obstacles.motions
         self._launch(kernels.add_friction, [motions, self._surface, self._holding, d, r])
 
@@ -108,6 +128,8 @@ class ActiveSet:
         motions = self._contacts.obstacles.motions
         inputs = [int(len(search) == 1), int(apart), motions, self._surface, self._holding, d, change, search]
         self._launch(kernels.add_slopes, [*inputs, slopes])
+        if self._spans is not None:
+            self._spans.add_slopes(d, change, search, slopes)
 
     def launch_judgement(self, b: wp.array, q: wp.array, d: wp.array) -> None:
         """Launch the choice of the nodes that are held from now on, and ``changed``.
@@ -119,16 +141,41 @@ class ActiveSet:
         """
         contacts = self._contacts
         self.changed.zero_()
+        if self._spans is not None:
+            wp.copy(self._forces, b)
+            self._spans.update(d)
+            self._spans.add_forces(self._forces)
+            b = self._forces
         self._find_bounds(d, int(kernels.THOSE_APART), at_end=True)
         inputs = [contacts.obstacles.shapes, contacts.obstacles.motions, contacts.law, self._surface]
         self._launch(kernels.judge_places, [*inputs, b, q, d, self._rounds, self._holding, self.changed])
         wp.launch(kernels.count_round, 1, [self._rounds], device=self.device)
         self._find_bounds(d, int(kernels.THOSE_TOUCHED), at_end=True)
         self._hold()
+        if self._spans is not None:
+            self._locate(spans.MISSING, d)
+
+    def launch_going(
+        self, scalars: wp.array, near: float, changed: wp.array, rounds: wp.array, most: int, going: wp.array
+    ) -> None:
+        """Launch the decision whether obstacles between nodes are looked for again, and another solve follows for that.
+
+        Args:
+            scalars: Of the last linear solve; see ``kernels.implicit.conjugate_gradients``.
+            near: They are if it began at less than this many times the tolerance.
+            changed: Whether contact has changed, int32 [1].
+            rounds, most: The number of solves in the step, int32 [1], and its maximum.
+            going: Whether another solve follows, int32 [1].
+        """
+        if self._spans is not None:
+            self._spans.launch_judgement(scalars, near, changed, rounds, most, going)
 
     def launch_end(self, d: wp.array) -> None:
         """Launch the results of contact for users."""
         self._launch(kernels.end_places, [d, self._holding, self._surface, self.body.state.contact_forces])
+        if self._spans is not None:
+            self._spans.update(d)
+            self._spans.launch_end(self.body.state.contact_forces)
 
     def launch_meetings(self, met: wp.array, begins: wp.array) -> None:
         """Launch the test whether contact has changed in the last step, or nodes will meet an obstacle in this one.
@@ -154,6 +201,10 @@ class ActiveSet:
         obstacles, pace = contacts.obstacles, contacts.system.pace.arrays
         inputs = [int(at_end), which, obstacles.shapes, self._thickness, obstacles.motions, contacts.law, pace]
         self._launch(kernels.find_bounds, [*inputs, self._surface, d, self._holding])
+
+    def _locate(self, which: int, d: wp.array) -> None:
+        assert self._spans is not None
+        self._spans.launch_located(which, d, self._holding.stiffness, self.changed)
 
     def _hold(self) -> None:
         self._launch(kernels.hold_places, [self._contacts.obstacles.motions, self._surface, self._holding])

@@ -13,12 +13,10 @@ from .conjugate_gradients import ConjugateGradients
 from .line_search import LineSearch
 from .newton import Newton
 from .operator import LinearOperator, Preconditioner
-from .touching import SETTLED, SHARE, FreePreconditioner, Held, Rows
+from .touching import NEAR, SETTLED, SHARE, FreePreconditioner, Held, Rows
 
 #: Maximum number of linear solves in a step.
 ROUNDS = 40
-#: Pairs are located again once the residual of a solve begins at less than this many times the tolerance.
-NEAR = 100.0
 
 
 class Parts:
@@ -216,6 +214,8 @@ class JoinedSolve:
         inputs = [self._solver.scalars, self._solver.iterations, self._changed, rows.total, ROUNDS, SETTLED, NEAR]
         outputs = [rows.locates, self._rounds, self._linear, self._going]
         wp.launch(kernels.judge_round, 1, inputs, outputs, device=self.device)
+        for held, _d in self._each_held(d):
+            held.launch_going(self._solver.scalars, NEAR, held.changed, self._rounds, ROUNDS, self._going)
 
     def _each_held(self, vector: wp.array) -> list[tuple[Held, wp.array]]:
         """The contacts of bodies with obstacles, and these bodies' parts of a vector."""

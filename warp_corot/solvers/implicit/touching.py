@@ -22,6 +22,8 @@ ROUNDS = 16
 SHARE = 0.15
 #: A step is solved for if the residual of a solve begins at less than this many times the tolerance.
 SETTLED = 10.0
+#: Places of contact are found again once the residual of a solve begins at less than this many times the tolerance.
+NEAR = 100.0
 
 
 class Held(Protocol):
@@ -55,6 +57,10 @@ class Held(Protocol):
     ) -> None: ...
 
     def launch_judgement(self, b: wp.array, q: wp.array, d: wp.array) -> None: ...
+
+    def launch_going(
+        self, scalars: wp.array, near: float, changed: wp.array, rounds: wp.array, most: int, going: wp.array
+    ) -> None: ...
 
     def launch_end(self, d: wp.array) -> None: ...
 
@@ -225,3 +231,4 @@ class TouchingSolve:
         self._ranks.take_most(held.changed)
         inputs = [newton.solver.scalars, newton.solver.iterations, held.changed, SETTLED, ROUNDS]
         wp.launch(judge_round, 1, inputs, [self._rounds, self.iterations, self._going], device=self.device)
+        held.launch_going(newton.solver.scalars, NEAR, held.changed, self._rounds, ROUNDS, self._going)

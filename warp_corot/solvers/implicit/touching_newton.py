@@ -44,7 +44,7 @@ class TouchingNewton:
         self.linear_iterations.zero_()
         newton.launch_residual()
         touching.linearise()
-        held.launch_begin(newton.base, newton.step, self._operator.diagonal_blocks())
+        held.launch_begin(newton.body.state.displacements, newton.step, self._operator.diagonal_blocks())
         self._finish()
         wp.capture_while(self._going, self._go_on)
         held.launch_end(newton.step)
