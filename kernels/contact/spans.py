@@ -1,9 +1,9 @@
 """Obstacles at the edges and the interiors of triangles in an implicit step: springs with multipliers; see ``joined``.
 
-Where an obstacle is closer to a triangle than to its corners, the triangle's point is pushed with p = max(l - k (g - t),
-0): its gap g at the end of the step, where that must come to, t, a stiffness k like that of the corners, and a
-multiplier l. Friction is the same across the normal, bounded by Coulomb's law. Each time the step has been solved for,
-points and normals are found again, and forces become the multipliers; in between, spans that are missing are added.
+Where an obstacle is closer to a triangle than to its corners, p = max(l - k (g - t), 0) pushes the triangle's point: g
+is its gap at the end of the step, t where it must come to, k a stiffness like that of the corners, l a multiplier.
+Friction is the same across the normal, bounded by Coulomb's law. Each time the step has been solved for, points and
+normals are found again, and forces become the multipliers; in between, spans that are missing are added.
 """
 
 import warp as wp
