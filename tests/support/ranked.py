@@ -173,13 +173,14 @@ def resumed(path: Path) -> dict[str, np.ndarray | None]:
     return {f"{path.stem}.x": gathered([body.positions for body in sim.bodies]), f"{path.stem}.numbers": numbers}
 
 
-def touched_in_parts() -> np.ndarray | None:
-    """The run "touched" with a mesh of which each rank holds a part; the positions of all nodes on rank 0."""
+def touched_in_parts(kept: Path) -> np.ndarray | None:
+    """The run "touched" with a mesh of which each rank holds a part, saved; the positions of all nodes on rank 0."""
     import warp_corot.distributed as wd
 
     body = touched(wd.box((1, 1, 2), 0.05, level=4))
     sim = wd.Simulation(body, deterministic=True, obstacles=obstacles_of("touched"))
     moved(sim, body)
+    sim.save(kept)
     return wd.gather(body.positions)
 
 
@@ -341,7 +342,8 @@ def make_all(folder: Path, size: int, names: list[str]) -> None:
             for path in folder.glob("parts.?.npz"):
                 found |= resumed(path)
         if "touched" in names:
-            found["parts.touched.x"] = touched_in_parts()
+            found["parts.touched.x"] = touched_in_parts(folder / "touches.3.npz")
+            found |= resumed(folder / "touches.3.npz")
     if mpi.world().rank == 0:
         np.savez(folder / f"{size}.npz", **found)
     else:

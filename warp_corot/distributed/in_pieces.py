@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 from collections.abc import Callable, Sequence
 from os import PathLike
@@ -37,6 +38,7 @@ from .following import Following
 from .of_parts import SimulationOfParts
 from .part_meshes import ForestPart, MeshPart
 from .rejoining import pack_part, rejoined
+from .touch_pieces import obstacles_in, pack_touch, resume_touch
 
 Arrays = dict[str, npt.NDArray[Any]]
 
@@ -53,11 +55,9 @@ def save(path: str | PathLike[str], parts: SimulationOfParts, following: list[Fo
     The files of a former checkpoint of this name are removed once all are written.
 
     Raises:
-        InputError: On all ranks: contact, active stress, bodies that are not in parts, or a rank cannot write.
+        InputError: On all ranks: active stress, bodies that are not in parts, or a rank cannot write.
     """
     target = checked_path(path, "path")
-    if parts.contact is not None:
-        raise InputError("checkpoints of bodies in parts with contact do not work yet")
     if not all(each.is_in_parts and not each.whole.discretization.has_activation for each in following):
         raise InputError("checkpoints of bodies in parts beside others or with active stress do not work yet")
     folder = target.with_name(f"{target.stem}.ranks")
@@ -74,8 +74,9 @@ def save(path: str | PathLike[str], parts: SimulationOfParts, following: list[Fo
             piece[f"same/kept.{name}"] = rows
         else:
             piece[f"nodes{body}/kept.{name}"] = rows[following[body].part.is_own]
+    contact = None if parts.contact is None else pack_touch(parts.contact, following[0], piece)
     guard = {f"guard.{name}": values for name, values in parts.guard.state.items()}
-    header = _header(parts) | {"bodies": bodies, "pieces": names}
+    header = _header(parts) | {"bodies": bodies, "contact": contact, "pieces": names}
 
     def write_piece() -> None:
         folder.mkdir(exist_ok=True)
@@ -174,13 +175,14 @@ def _rebuilt_run(
     files = [folder / name for name in header["pieces"]]
     meshes = [_rebuilt_mesh(each, k, files) for k, each in enumerate(header["bodies"])]
     arrays: Arrays = {}
-    counts = [0] * len(meshes)
+    counts, touched = [0] * len(meshes), []
     for file in files:
         with np.load(file, allow_pickle=False) as archive:
             piece = {name: archive[name] for name in archive.files if not name.startswith("mesh")}
         for k, mesh in enumerate(meshes):
             _take(piece, mesh, k, worlds, arrays)
             counts[k] += _take_motions(piece, mesh, k, counts[k], arrays)
+        touched.append({name: values for name, values in piece.items() if name.startswith("touched/")})
         arrays |= {name.removeprefix("same/"): values for name, values in piece.items() if name.startswith("same/")}
     if device is None:
         device = "cpu" if header["device"] == "cpu" else wp.get_device()
@@ -199,6 +201,8 @@ def _rebuilt_run(
         integrator=rebuilt(header["integrator"], INTEGRATORS),
         kept=kept,
         contact=None,
+        touching=obstacles_in(header.get("contact"), arrays),
+        resume_touch=functools.partial(resume_touch, header.get("contact") or {}, arrays, touched),
         guard=SimpleNamespace(state=guard),
         running=SimpleNamespace(state=header["running"]),
     )

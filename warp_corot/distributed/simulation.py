@@ -303,7 +303,7 @@ class Simulation:
         number of ranks can resume from these files.
 
         Raises:
-            InputError: On all ranks, if one cannot write to the folder; or bodies in parts with contact.
+            InputError: On all ranks, if one cannot write to the folder.
         """
         self._take_over()
         if any(each.is_in_parts for each in self._following):
@@ -329,8 +329,10 @@ class Simulation:
         in_parts = in_pieces.load(path, device)
         if in_parts is not None:
             options = {name: getattr(in_parts, name) for name in ("integrator", "gravity", "deterministic")}
-            made = cls(in_parts.bodies, model=in_parts.models, **options)
+            made = cls(in_parts.bodies, model=in_parts.models, **options, **in_parts.touching)
             checkpoint.resume(in_parts, made._parts, made._following)
+            if in_parts.touching:
+                in_parts.resume_touch(made._parts, made._following[0])
             return made
         loaded = on_one.Simulation.load(path, device=device)
         touching: dict[str, Any] = {}

@@ -60,6 +60,20 @@ def pack_contact(contacts: Contacts | None, grasps: Sequence[Grasp], arrays: Arr
     }
 
 
+def pack_obstacles(contacts: Contacts, arrays: Arrays) -> dict[str, Any]:
+    """Put the obstacles of contact into arrays; returns the remaining data for JSON, with the options of contact.
+
+    Raises:
+        InputError: A shape of a class of your own.
+    """
+    options, given = contacts.options, zip(contacts.obstacles.given, contacts.obstacles.tools, strict=True)
+    return {
+        "friction": options.friction,
+        "self_contact": options.self_contact,
+        "obstacles": [_pack_tool(tool, each is tool, f"tool{k}.", arrays) for k, (each, tool) in enumerate(given)],
+    }
+
+
 def obstacles_of(described: dict[str, Any] | None, arrays: Arrays) -> dict[str, Any]:
     """The arguments ``obstacles`` and ``contact`` of a simulation."""
     if described is None:
