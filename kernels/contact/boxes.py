@@ -132,18 +132,47 @@ def bound_bodies(
 
 
 @wp.func
+def may_reach(world: int, k: int, low: wp.vec3, high: wp.vec3, meeting: Meeting):
+    """Whether a box overlaps the bounds of body k."""
+    a = meeting.lower[world, k]
+    b = meeting.upper[world, k]
+    is_apart = a[0] > high[0] or a[1] > high[1] or a[2] > high[2]
+    return not (is_apart or b[0] < low[0] or b[1] < low[1] or b[2] < low[2])
+
+
+@wp.func
 def may_reach_others(s: int, low: wp.vec3, high: wp.vec3, surface: Surface, meeting: Meeting):
     """Whether the box of an item at place ``s`` overlaps the bounds of another body; always true if a body may touch
     itself.
     """
     if meeting.meets_itself != 0:
         return True
-    world = surface.world[s]
     for k in range(meeting.lower.shape[1]):
-        if k != meeting.body[s]:
-            a = meeting.lower[world, k]
-            b = meeting.upper[world, k]
-            is_apart = a[0] > high[0] or a[1] > high[1] or a[2] > high[2]
-            if not (is_apart or b[0] < low[0] or b[1] < low[1] or b[2] < low[2]):
-                return True
+        if k != meeting.body[s] and may_reach(surface.world[s], k, low, high, meeting):
+            return True
     return False
+
+
+@wp.func
+def root_of(of_edges: int, g: int, s: int, low: wp.vec3, high: wp.vec3, surface: Surface, meeting: Meeting):
+    """The root of the boxes of group g in the world of place ``s``; -1 if the box of an item there meets none of them.
+
+    A group is a body, or all bodies if there are many.
+    """
+    world = surface.world[s]
+    if meeting.groups == 1:
+        if not may_reach_others(s, low, high, surface, meeting):
+            return -1
+    elif g == meeting.body[s]:
+        if meeting.meets_itself == 0:
+            return -1
+    elif not may_reach(world, g, low, high, meeting):
+        return -1
+    return meeting.roots[of_edges, world * meeting.groups + g]
+
+
+@wp.kernel(enable_backward=False)
+def find_roots(tree: wp.uint64, roots: wp.array[wp.int32]):
+    """Find the root of each group of a tree."""
+    g = wp.tid()
+    roots[g] = wp.bvh_get_group_root(tree, g)

@@ -30,6 +30,8 @@ class Meeting:
     reach: wp.array[wp.float32]  # [S] how far a node may move until the next search for pairs [m]
     lower: wp.array2d[wp.vec3]  # [worlds, bodies] bounds of the places that a body may reach [m]
     upper: wp.array2d[wp.vec3]
+    groups: int  # groups of boxes in a world: one for each body, or one for all of them
+    roots: wp.array2d[wp.int32]  # [2, worlds * groups] the groups' roots in the trees of triangles and of edges
     meets_itself: int
     flat_edges: int  # whether flat edges may touch flat edges
     friction: float

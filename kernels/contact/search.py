@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from .boxes import edge_reach, may_reach_others, triangle_reach, triangle_size
+from .boxes import edge_reach, root_of, triangle_reach, triangle_size
 from .closest import on_segments, on_triangle, point_of
 from .locate import ENDS, edge_normal
 from .motion import Surface
@@ -163,17 +163,20 @@ def near_node(
     count = int(0)
     reach = meeting.reach[i]
     beyond = wp.vec3(reach, reach, reach)
-    if not may_reach_others(i, surface.x[i] - beyond, surface.x[i] + beyond, surface, meeting):
-        return 0, kept
-    query = wp.bvh_query_aabb(of_triangles, surface.x[i] - beyond, surface.x[i] + beyond)
-    t = int(0)
-    while wp.bvh_query_next(query, t):
-        if node_is_near(i, t, surface, meeting, near):
-            if start >= 0:
-                add_other(start, count, t, rows)
-            elif count < KEPT:
-                kept[count] = t
-            count += 1
+    low = surface.x[i] - beyond
+    high = surface.x[i] + beyond
+    for g in range(meeting.groups):
+        root = root_of(0, g, i, low, high, surface, meeting)
+        if root >= 0:
+            query = wp.bvh_query_aabb(of_triangles, low, high, root)
+            t = int(0)
+            while wp.bvh_query_next(query, t):
+                if node_is_near(i, t, surface, meeting, near):
+                    if start >= 0:
+                        add_other(start, count, t, rows)
+                    elif count < KEPT:
+                        kept[count] = t
+                    count += 1
     return count, kept
 
 
@@ -188,20 +191,23 @@ def near_edge(
     b = surface.x[e[1]]
     reach = edge_reach(meeting, e)
     beyond = wp.vec3(reach, reach, reach)
-    if not may_reach_others(e[0], wp.min(a, b) - beyond, wp.max(a, b) + beyond, surface, meeting):
-        return 0, kept
     own = bend(surface, meeting, k)
     if own <= SHARP and (own < -SHARP or meeting.flat_edges == 0):
         return 0, kept
-    query = wp.bvh_query_aabb(of_edges, wp.min(a, b) - beyond, wp.max(a, b) + beyond)
-    m = int(0)
-    while wp.bvh_query_next(query, m):
-        if edge_is_near(k, m, own > SHARP, surface, meeting, near):
-            if start >= 0:
-                add_other(start, count, m, rows)
-            elif count < KEPT:
-                kept[count] = m
-            count += 1
+    low = wp.min(a, b) - beyond
+    high = wp.max(a, b) + beyond
+    for g in range(meeting.groups):
+        root = root_of(1, g, e[0], low, high, surface, meeting)
+        if root >= 0:
+            query = wp.bvh_query_aabb(of_edges, low, high, root)
+            m = int(0)
+            while wp.bvh_query_next(query, m):
+                if edge_is_near(k, m, own > SHARP, surface, meeting, near):
+                    if start >= 0:
+                        add_other(start, count, m, rows)
+                    elif count < KEPT:
+                        kept[count] = m
+                    count += 1
     return count, kept
 
 

@@ -24,6 +24,8 @@ PAIRS_EACH = 2
 GROWTH = 2.0
 #: Number of searches after which trees of boxes are built again, because neighbours may have changed by then.
 REBUILT = 100
+#: Up to this many bodies have trees of boxes of their own.
+OWN_TREES = 16
 #: Threads that find the bounds of bodies on CUDA, at most: each ends with atomic minima.
 BOUNDING_THREADS = 4096
 
@@ -71,6 +73,9 @@ class Pairs:
         meeting.lower, meeting.upper = (wp.zeros(shape, dtype=wp.vec3, device=device) for _ in range(2))
         meeting.meets_itself, meeting.friction = int(self.meets_itself), self.friction
         meeting.flat_edges = int(self._flat_edges)
+        meeting.groups = len(surface.parts) if len(surface.parts) <= OWN_TREES else 1
+        roots = (2, surface.worlds * meeting.groups)
+        meeting.roots = wp.zeros(roots, dtype=wp.int32, device=device)
         self.meeting = meeting
         self._crowd = wp.zeros(count, dtype=wp.int32, device=device)
         self._added = wp.zeros(count, dtype=wp.vec3l, device=device)
@@ -144,14 +149,24 @@ class Pairs:
         """Make everything that launches need."""
         if not self._trees:
             self._box()
-            self._trees = [wp.Bvh(lower, upper) for lower, upper in self._boxes]
-            self._built = self.search.count
+            self._trees = [
+                wp.Bvh(lower, upper, groups=groups)
+                for (lower, upper), groups in zip(self._boxes, self._groups(), strict=True)
+            ]
+            self._find_roots()
             self.revision += 1
         elif self.search.count >= self._built + REBUILT:
             # Pairs are the same, and in the same order.
             for tree in self._trees:
                 tree.rebuild()
-            self._built = self.search.count
+            self._find_roots()
+
+    def _find_roots(self) -> None:
+        """Find the roots of trees that have just been built."""
+        self._built = self.search.count
+        roots = self.meeting.roots
+        for number, tree in enumerate(self._trees):
+            wp.launch(boxes.find_roots, roots.shape[1], [tree.id], [roots[number]], device=self.device)
 
     def forget(self) -> None:
         """Forget the forces of the last step."""
@@ -183,7 +198,7 @@ class Pairs:
         if self.meets_itself:
             self._mark_crushed()
         self._box()
-        if not self.meets_itself:
+        if not self.meets_itself or self.meeting.groups > 1:
             self._bound()
         for tree in self._trees:
             tree.refit()
@@ -193,6 +208,19 @@ class Pairs:
         inputs = [watch, *(tree.id for tree in self._trees), self.surface.arrays, self.meeting, old]
         wp.launch(search_kernels.find_pairs, owners, inputs, [rows, self.search.near], device=device)
         wp.launch(search_kernels.end_rows, 1, [watch, rows], [self.search.most], device=device)
+
+    def _groups(self) -> list[wp.array]:
+        """The group of each triangle and of each edge: its body in its world, or its world; see ``Meeting``."""
+        parts, worlds, each = self.surface.parts, self.surface.worlds, self.meeting.groups
+        found = []
+        for name, (lower, _) in zip(("triangles", "edges"), self._boxes, strict=True):
+            of_parts = [
+                np.repeat(each * np.arange(worlds) + min(k, each - 1), getattr(part, name))
+                for k, part in enumerate(parts)
+            ]
+            groups = np.concatenate(of_parts).astype(np.int32)
+            found.append(wp.array(np.resize(groups, len(lower)), dtype=wp.int32, device=self.device))
+        return found
 
     def _bound(self) -> None:
         """Launch the bounds of what each body may reach; no pairs are searched for outside."""
