@@ -24,11 +24,13 @@ def find_nodes_beside(
     near: Near,
     forces: wp.array2d[wp.vec3],
     anchors: wp.array2d[wp.vec4],
+    crowd: wp.array[wp.float32],
 ):
     """Mark nodes that may touch an obstacle before the next search. Obstacles exert no forces on other nodes."""
     s = wp.tid()
     if watch.due[0] == 0:
         return
+    crowd[s] = 0.0
     if surface.node[s] >= 0:
         world = surface.world[s]
         for o in range(forces.shape[0]):

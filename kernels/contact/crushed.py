@@ -8,6 +8,7 @@ import warp as wp
 from warp_corot.kernels.elements.elements import frame, local_gradient
 from warp_corot.kernels.modules import unique_kernel
 
+from .motion import Surface
 from .near import CRUSHED, Near
 from .watch import Watch
 
@@ -41,10 +42,19 @@ def count_crushed(Elements: type) -> wp.Kernel:
 
 @functools.cache
 def mark_crushed(Elements: type) -> wp.Kernel:
-    """Mark the surface nodes of elements that are inverted or nearly so; ``places`` maps nodes to places, [nodes]."""
+    """Mark the surface at elements that are inverted or nearly so; ``places`` maps nodes to places, or to places among
+    bearers, [nodes]."""
 
     @unique_kernel()
-    def mark_crushed(watch: Watch, elements: Elements, u: wp.array[wp.vec4], places: wp.array[wp.int32], near: Near):
+    def mark_crushed(
+        watch: Watch,
+        elements: Elements,
+        u: wp.array[wp.vec4],
+        places: wp.array[wp.int32],
+        are_borne: int,
+        surface: Surface,
+        near: Near,
+    ):
         t = wp.tid()
         if watch.due[0] == 0:
             return
@@ -52,7 +62,10 @@ def mark_crushed(Elements: type) -> wp.Kernel:
             nodes = elements.nodes[t]
             for k in range(4):
                 place = places[nodes[k]]
-                if place >= 0:
+                if place >= 0 and are_borne == 0:
                     wp.atomic_or(near.flags, place, CRUSHED)
+                elif place >= 0:
+                    for m in range(surface.bearing.starts[place], surface.bearing.starts[place + 1]):
+                        wp.atomic_or(near.flags, surface.bearing.places[m], CRUSHED)
 
     return mark_crushed

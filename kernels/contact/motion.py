@@ -15,16 +15,31 @@ FIXED, KEYED, SENT = (wp.constant(k) for k in range(3))
 
 
 @wp.struct
-class Surface:
-    """The surface nodes of all bodies in all worlds, one place each; unused places have node -1."""
+class Bearing:
+    """The places that other nodes bear, [S], or empty if there are none, and these nodes, [B]; see ``bearing``."""
 
-    node: wp.array[wp.int32]  # [S] index among the nodes of all worlds of its body
+    bearers: wp.array[wp.vec4i]  # [S] places among the bearers; -1: the place is a node itself
+    weights: wp.array[wp.vec4]  # [S] their weights
+    loose: wp.array[wp.float32]  # [S] the share of the weights that free nodes have
+    gathered: wp.array[wp.vec3]  # [S] forces that have not moved the places yet [N]
+    yielding: wp.array[wp.float32]  # [B] additional motion per force [m/N]
+    starts: wp.array[wp.int32]  # [B + 1] the places that a node bears, from one start to the next
+    places: wp.array[wp.int32]
+    shares: wp.array[wp.float32]  # its weights there
+
+
+@wp.struct
+class Surface:
+    """The surface of all bodies in all worlds: places, which are nodes or points that nodes bear."""
+
+    node: wp.array[wp.int32]  # [S] index among the nodes of all worlds of its body, or of one that bears it; -1: unused
     world: wp.array[wp.int32]  # [S]
     rest: wp.array[wp.vec3]  # [S] rest position [m]
     x: wp.array[wp.vec3]  # [S] where it is [m]
     d: wp.array[wp.vec3]  # [S] its motion in this step [m]
     yielding: wp.array[wp.float32]  # [S] additional motion per force [m/N]; zero for held nodes
     f: wp.array[wp.vec3]  # [S] contact force [N]
+    bearing: Bearing
 
 
 @wp.struct

@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from .bearing import forget_forces
 from .motion import Motions, Surface
 from .watch import Watch, reserve_obstacle, reserved
 
@@ -42,6 +43,7 @@ def reserve(surface: Surface, motions: Motions, obstacles: int, watch: Watch, ne
     if s < surface.node.shape[0]:
         watch.places[s] = surface.x[s]
         watch.reach[s] = reserved(wp.length(surface.d[s]), watch)
+        forget_forces(s, surface)
         near.flags[s] = 0
     if s == 0:
         near.count[0] = 0

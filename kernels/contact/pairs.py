@@ -8,6 +8,7 @@ import warp as wp
 
 from warp_corot.kernels.stepping.pace import DT, Pace
 
+from .bearing import ease, forget_forces, give_way, is_borne, loose_share
 from .law import Law, held_back, least_motion, left_to_held
 from .locate import locate_edge, locate_node
 from .motion import Surface
@@ -105,9 +106,9 @@ def solve_row(
     share = float(0.0)
     free = wp.vec3()
     for k in range(4):
-        yielding += wp.abs(w[k]) * (float(crowd[p[k]]) / SHARES) * surface.yielding[p[k]]
+        yielding += wp.abs(w[k]) * ease(p[k], crowd, surface.yielding, surface) / SHARES
         if surface.yielding[p[k]] > 0.0:
-            share += wp.abs(w[k])
+            share += wp.abs(w[k]) * loose_share(p[k], surface)
             free += w[k] * surface.d[p[k]]
     if yielding <= 0.0:
         return
@@ -173,10 +174,14 @@ def solve_rows(
 def apply(s: int, law: Law, surface: Surface, added: wp.array[wp.vec3l], crowd: wp.array[wp.int32]):
     crowd[s] = 0
     grains = added[s]
+    forget_forces(s, surface)
     if grains[0] != wp.int64(0) or grains[1] != wp.int64(0) or grains[2] != wp.int64(0):
         force = law.grain * wp.vec3(float(grains[0]), float(grains[1]), float(grains[2]))
         surface.f[s] = surface.f[s] + force
-        surface.d[s] = surface.d[s] + surface.yielding[s] * force
+        if is_borne(s, surface):
+            surface.bearing.gathered[s] = force
+        else:
+            surface.d[s] = surface.d[s] + surface.yielding[s] * force
         added[s] = wp.vec3l()
 
 
@@ -192,3 +197,17 @@ def apply_added(
         k += threads
         if (near.flags[s] & PAIRED) != 0:
             apply(s, law, surface, added, crowd)
+        else:
+            forget_forces(s, surface)
+
+
+@wp.kernel(enable_backward=False)
+def settle_pairs(threads: int, near: Near, surface: Surface):
+    """Move borne places by these forces."""
+    k = wp.tid()
+    count = near.count[0]
+    while k < count:
+        s = near.nodes[k]
+        k += threads
+        if is_borne(s, surface):
+            give_way(s, surface)

@@ -3,6 +3,7 @@
 import warp as wp
 
 from .boxes import edge_reach, root_of, triangle_reach, triangle_size
+from .bearing import share_bearers
 from .closest import on_segments, on_triangle, point_of
 from .locate import ENDS, edge_normal
 from .motion import Surface
@@ -67,6 +68,9 @@ def node_is_near(s: int, t: int, surface: Surface, meeting: Meeting, near: Near)
         flags = near.flags[s] | near.flags[c[0]] | near.flags[c[1]] | near.flags[c[2]]
         if (flags & CRUSHED) != 0:
             return False
+        for k in range(3):
+            if share_bearers(s, c[k], surface):
+                return False
     a = surface.x[c[0]]
     b = surface.x[c[1]]
     e = surface.x[c[2]]
@@ -125,6 +129,9 @@ def edge_is_near(k: int, m: int, is_sharp: bool, surface: Surface, meeting: Meet
         flags = near.flags[e[0]] | near.flags[e[1]] | near.flags[f[0]] | near.flags[f[1]]
         if (flags & CRUSHED) != 0:
             return False
+        for n in range(2):
+            if share_bearers(e[n], f[0], surface) or share_bearers(e[n], f[1], surface):
+                return False
     if is_opposite(e, m, meeting):
         return False
     p = surface.x[e[0]]

@@ -15,7 +15,7 @@ from .motion import Motions, Surface
 from .near import Near
 from .shapes import Shapes
 from .touches import Touches, find_among
-from .triangles import ADD, BEGIN, END, Skin, crowd_among, push_among, solve_among
+from .triangles import ADD, BEGIN, END, Skin, crowd_among, push_among, settle_among, solve_among
 
 wp.set_module_options({"enable_backward": False})
 
@@ -31,6 +31,7 @@ def push_together(
     before: int,
     rounds: int,
     parts: int,
+    are_borne: int,
     skin: Skin,
     shapes: Shapes,
     motions: Motions,
@@ -50,6 +51,7 @@ def push_together(
         before: Parts of ``push_nodes`` before the first round. BEGIN also finds the points on triangles.
         rounds: The number of rounds.
         parts: Parts of ``push_nodes`` after each round, END only after the last one.
+        are_borne: Whether any places are.
     """
     thread = wp.tid()
     dt = float(pace.seconds[DT])
@@ -62,13 +64,18 @@ def push_together(
     number = int(0)
     while number <= rounds:
         if number > 0:
-            crowd_among(thread, threads, near, law, dt, surface, skin, touches, crowd)
+            crowd_among(thread, threads, near, shapes, motions, law, dt, surface, skin, touches, forces, anchors, crowd)
             synchronize_block()
             solve_among(thread, threads, near, law, dt, surface, skin.triangles, crowd, surface.yielding, touches)
             synchronize_block()
             doing = parts | ADD
             if number < rounds:
                 doing = doing & ~END
-        push_among(thread, threads, near, doing, skin, shapes, motions, law, dt, touches, surface, forces, anchors)
+        push_among(
+            thread, threads, near, doing, skin, shapes, motions, law, dt, touches, crowd, surface, forces, anchors
+        )
         synchronize_block()
+        if are_borne != 0 and (doing & ADD) != 0:
+            settle_among(thread, threads, near, doing, shapes, motions, surface, forces, anchors)
+            synchronize_block()
         number += 1

@@ -9,12 +9,13 @@ import warp as wp
 
 from warp_corot.kernels.stepping.pace import DT, Pace
 
+from .bearing import ease, give_way, is_borne, loose_share
 from .law import Law, held_back, least_motion, left_to_held
 from .motion import Motions, Surface
 from .near import AROUND, BESIDE, Near
 from .shapes import Shapes
 from .touches import Touches
-from .vertices import across, anchor, touch
+from .vertices import across, anchor, begin_borne, push_borne, touch
 
 wp.set_module_options({"enable_backward": False})
 
@@ -69,11 +70,15 @@ def crowd_among(
     thread: int,
     threads: int,
     near: Near,
+    shapes: Shapes,
+    motions: Motions,
     law: Law,
     dt: float,
     surface: Surface,
     skin: Skin,
     touches: Touches,
+    forces: wp.array2d[wp.vec3],
+    anchors: wp.array2d[wp.vec4],
     crowd: wp.array[wp.float32],
 ):
     k = thread
@@ -81,8 +86,13 @@ def crowd_among(
     while k < count:
         s = near.nodes[k]
         k += threads
+        total = float(0.0)
         if (near.flags[s] & AROUND) != 0:
-            crowd[s] = crowd_at(s, law, dt, surface, skin, touches)
+            total = crowd_at(s, law, dt, surface, skin, touches)
+        if (near.flags[s] & BESIDE) != 0 and is_borne(s, surface):
+            _more, pushing = push_borne(s, 0.0, shapes, motions, law, dt, anchors, surface, forces)
+            total += pushing
+        crowd[s] = total
 
 
 @wp.kernel(enable_backward=False)
@@ -90,17 +100,22 @@ def crowd_nodes(
     # In
     threads: int,
     near: Near,
+    shapes: Shapes,
+    motions: Motions,
     law: Law,
     pace: Pace,
     surface: Surface,
     skin: Skin,
+    forces: wp.array2d[wp.vec3],
+    anchors: wp.array2d[wp.vec4],
     # In and out
     touches: Touches,
     # Out
     crowd: wp.array[wp.float32],
 ):
-    """Find the contacts that act, and sum their weights at each node. All corners of a triangle find the same."""
-    crowd_among(wp.tid(), threads, near, law, float(pace.seconds[DT]), surface, skin, touches, crowd)
+    """Find the contacts that act, and sum their weights at each place. All corners of a triangle find the same."""
+    dt = float(pace.seconds[DT])
+    crowd_among(wp.tid(), threads, near, shapes, motions, law, dt, surface, skin, touches, forces, anchors, crowd)
 
 
 @wp.func
@@ -121,9 +136,9 @@ def solve_touch(
     free = wp.vec3()
     for k in range(3):
         s = corners[k]
-        yielding += w[k] * crowd[s] * corner_yielding[s]
+        yielding += w[k] * ease(s, crowd, corner_yielding, surface)
         if corner_yielding[s] > 0.0:
-            share += w[k]
+            share += w[k] * loose_share(s, surface)
             free += w[k] * surface.d[s]
     before = touches.force[o, t]
     touches.more[o, t] = wp.vec3()
@@ -187,8 +202,8 @@ def solve_touches(
 
 
 @wp.func
-def add_touches(s: int, skin: Skin, touches: Touches, surface: Surface):
-    """Give a node its share of the changes, summed in a fixed order."""
+def share_of(s: int, skin: Skin, touches: Touches):
+    """A place's share of the changes, summed in a fixed order."""
     total = wp.vec3()
     for k in range(skin.corner_starts[s], skin.corner_starts[s + 1]):
         t = skin.corners[k] / 3
@@ -196,9 +211,69 @@ def add_touches(s: int, skin: Skin, touches: Touches, surface: Surface):
         for o in range(touches.acts.shape[0]):
             if touches.acts[o, t] != 0:
                 total += touches.shares[o, t][corner] * touches.more[o, t]
-    if wp.dot(total, total) > 0.0:
+    return total
+
+
+@wp.func
+def push_node(
+    s: int,
+    flags: int,
+    parts: int,
+    skin: Skin,
+    shapes: Shapes,
+    motions: Motions,
+    law: Law,
+    dt: float,
+    touches: Touches,
+    surface: Surface,
+    forces: wp.array2d[wp.vec3],
+    anchors: wp.array2d[wp.vec4],
+):
+    """Some of the parts of ``push_nodes`` for a place that is a node."""
+    if (parts & ADD) != 0 and (flags & AROUND) != 0:
+        total = share_of(s, skin, touches)
+        if wp.dot(total, total) > 0.0:
+            surface.f[s] = surface.f[s] + total
+            surface.d[s] = surface.d[s] + surface.yielding[s] * total
+    if (flags & BESIDE) != 0:
+        if (parts & (BEGIN | CORRECT)) != 0:
+            touch(s, (parts & BEGIN) != 0, shapes, motions, law, dt, anchors, surface, forces)
+        if (parts & END) != 0:
+            anchor(s, shapes, motions, surface, forces, anchors)
+
+
+@wp.func
+def gather_borne(
+    s: int,
+    flags: int,
+    parts: int,
+    skin: Skin,
+    shapes: Shapes,
+    motions: Motions,
+    law: Law,
+    dt: float,
+    touches: Touches,
+    crowd: wp.array[wp.float32],
+    surface: Surface,
+    forces: wp.array2d[wp.vec3],
+    anchors: wp.array2d[wp.vec4],
+):
+    """The same for a borne place: its own forces are corrected together with those on triangles."""
+    if (parts & ADD) != 0:
+        total = wp.vec3()
+        if (flags & AROUND) != 0:
+            total = share_of(s, skin, touches)
+        if (flags & BESIDE) != 0:
+            if (parts & BEGIN) != 0:
+                total += begin_borne(s, shapes, motions, surface, forces)
+            else:
+                yielding = ease(s, crowd, surface.yielding, surface)
+                more, _count = push_borne(s, yielding, shapes, motions, law, dt, anchors, surface, forces)
+                total += more
+        surface.bearing.gathered[s] = total
         surface.f[s] = surface.f[s] + total
-        surface.d[s] = surface.d[s] + surface.yielding[s] * total
+    elif (parts & END) != 0 and (flags & BESIDE) != 0:
+        anchor(s, shapes, motions, surface, forces, anchors)
 
 
 @wp.func
@@ -213,6 +288,7 @@ def push_among(
     law: Law,
     dt: float,
     touches: Touches,
+    crowd: wp.array[wp.float32],
     surface: Surface,
     forces: wp.array2d[wp.vec3],
     anchors: wp.array2d[wp.vec4],
@@ -222,12 +298,33 @@ def push_among(
     while k < count:
         s = near.nodes[k]
         k += threads
-        if (parts & ADD) != 0 and (near.flags[s] & AROUND) != 0:
-            add_touches(s, skin, touches, surface)
-        if (near.flags[s] & BESIDE) != 0:
-            if (parts & (BEGIN | CORRECT)) != 0:
-                touch(s, (parts & BEGIN) != 0, shapes, motions, law, dt, anchors, surface, forces)
-            if (parts & END) != 0:
+        flags = near.flags[s]
+        if is_borne(s, surface):
+            gather_borne(s, flags, parts, skin, shapes, motions, law, dt, touches, crowd, surface, forces, anchors)
+        else:
+            push_node(s, flags, parts, skin, shapes, motions, law, dt, touches, surface, forces, anchors)
+
+
+@wp.func
+def settle_among(
+    thread: int,
+    threads: int,
+    near: Near,
+    parts: int,
+    shapes: Shapes,
+    motions: Motions,
+    surface: Surface,
+    forces: wp.array2d[wp.vec3],
+    anchors: wp.array2d[wp.vec4],
+):
+    k = thread
+    count = near.count[0]
+    while k < count:
+        s = near.nodes[k]
+        k += threads
+        if is_borne(s, surface):
+            give_way(s, surface)
+            if (parts & END) != 0 and (near.flags[s] & BESIDE) != 0:
                 anchor(s, shapes, motions, surface, forces, anchors)
 
 
@@ -243,12 +340,14 @@ def push_nodes(
     law: Law,
     pace: Pace,
     touches: Touches,
+    crowd: wp.array[wp.float32],
     # In and out
     surface: Surface,
     forces: wp.array2d[wp.vec3],
     anchors: wp.array2d[wp.vec4],
 ):
-    """Do the work on nodes one by one, without their neighbours.
+    """Do the work on nodes one by one, without their neighbours. Borne places are moved afterwards, by
+    ``settle_places``.
 
     Args:
         parts: A sum. ADD: give each node its share of the changes of forces on triangles. BEGIN: find the forces [O, S]
@@ -256,4 +355,21 @@ def push_nodes(
             other forces have moved nodes since. END: update the anchors of sticking nodes.
     """
     dt = float(pace.seconds[DT])
-    push_among(wp.tid(), threads, near, parts, skin, shapes, motions, law, dt, touches, surface, forces, anchors)
+    push_among(wp.tid(), threads, near, parts, skin, shapes, motions, law, dt, touches, crowd, surface, forces, anchors)
+
+
+@wp.kernel(enable_backward=False)
+def settle_places(
+    # In
+    threads: int,
+    near: Near,
+    parts: int,
+    shapes: Shapes,
+    motions: Motions,
+    # In and out
+    surface: Surface,
+    forces: wp.array2d[wp.vec3],
+    anchors: wp.array2d[wp.vec4],
+):
+    """Move borne places by the forces that were gathered; with END in ``parts``, update their anchors."""
+    settle_among(wp.tid(), threads, near, parts, shapes, motions, surface, forces, anchors)

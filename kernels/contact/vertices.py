@@ -2,7 +2,8 @@
 
 import warp as wp
 
-from .law import SETTLING, Law, held_back, least_motion
+from .bearing import loose_share
+from .law import SETTLING, Law, held_back, least_motion, left_to_held
 from .motion import Motions, Surface
 from .shapes import Shapes, carried, distance_to
 
@@ -79,6 +80,70 @@ def touch(
         total += forces[o, s]
     surface.d[s] = d
     surface.f[s] = surface.f[s] + total
+
+
+@wp.func
+def begin_borne(s: int, shapes: Shapes, motions: Motions, surface: Surface, forces: wp.array2d[wp.vec3]):
+    """Begin a step at a borne place with the forces of the last one; returns their sum."""
+    total = wp.vec3()
+    world = surface.world[s]
+    for o in range(forces.shape[0]):
+        was = forces[o, s]
+        if wp.dot(was, was) > 0.0:
+            _gap, n = distance_to(shapes, o, motions.now[world, o], surface.x[s], 1.0)
+            push = wp.max(wp.dot(was, n), 0.0)
+            force = push * n + held_back(across(was, n), push, shapes.friction[o])
+            forces[o, s] = force
+            total += force
+    return total
+
+
+@wp.func
+def push_borne(
+    s: int,
+    yielding: float,
+    shapes: Shapes,
+    motions: Motions,
+    law: Law,
+    dt: float,
+    anchors: wp.array2d[wp.vec4],
+    surface: Surface,
+    forces: wp.array2d[wp.vec3],
+):
+    """Correct the forces of obstacles on a borne place, if its ``yielding`` is positive.
+
+    Returns:
+        The change of their sum, and the number of obstacles that push.
+    """
+    world = surface.world[s]
+    x = surface.x[s]
+    d = surface.d[s]
+    more = wp.vec3()
+    count = float(0.0)
+    for o in range(forces.shape[0]):
+        now = motions.now[world, o]
+        moved = carried(now, motions.later[world, o], x)
+        far = wp.length(d) + law.tolerance + wp.length(moved)
+        gap, n = distance_to(shapes, o, now, x, far)
+        before = forces[o, s]
+        if gap <= far or wp.dot(before, before) > 0.0:
+            relative = d - moved
+            wanted = least_motion(gap, law, dt) - wp.dot(relative, n)
+            wanted -= left_to_held(wanted + wp.dot(d, n), loose_share(s, surface))
+            if wanted > 0.0 or wp.dot(before, n) > 0.0:
+                count += 1.0
+                if yielding > 0.0:
+                    normal_force = wp.max(wp.dot(before, n) + wanted / yielding, 0.0)
+                    slip = across(relative, n)
+                    anchor = anchors[o, s]
+                    if anchor[3] > 0.0:
+                        held = wp.transform_point(now, wp.vec3(anchor[0], anchor[1], anchor[2]))
+                        slip += SETTLING * across(x - held, n)
+                    sideways = held_back(across(before, n) - slip / yielding, normal_force, shapes.friction[o])
+                    force = normal_force * n + sideways
+                    forces[o, s] = force
+                    more += force - before
+    return more, count
 
 
 @wp.func

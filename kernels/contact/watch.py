@@ -74,9 +74,9 @@ def follow_node(s: int, surface: Surface, watch: Watch):
 
 
 @wp.kernel(enable_backward=False)
-def follow_nodes(surface: Surface, watch: Watch):
-    """Check the same for all nodes."""
-    s = wp.tid()
+def follow_nodes(start: int, surface: Surface, watch: Watch):
+    """Check the same for all places of a body."""
+    s = start + wp.tid()
     if surface.node[s] >= 0:
         follow_node(s, surface, watch)
 

@@ -20,6 +20,7 @@ from warp_corot.inputs.turns import TURN, in_turn
 from warp_corot.kernels.stepping.integrate import RESET_NODES
 from warp_corot.materials.isotropic import Material
 from warp_corot.mesh import TetForest
+from warp_corot.mesh.surfaces.bodies import boundary_surface
 from warp_corot.mesh.surfaces.boundary import boundary_faces
 
 from .conditions import Conditions
@@ -32,7 +33,7 @@ from .worlds import World
 
 if TYPE_CHECKING:
     from warp_corot.discretization.changing.following import FollowingBinding
-    from warp_corot.mesh.surfaces.bound import DeviceBinding
+    from warp_corot.mesh.surfaces.bound import DeviceBinding, SurfaceMesh
 
 
 class SoftBody(Controls, SharedArrays, NodeArrays):
@@ -213,7 +214,7 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
 
     @property
     def contact_pressure(self) -> wp.array:
-        """Contact pressure on ``surface_triangles`` in the last step [Pa], float32 [worlds * F].
+        """Contact pressure on the triangles of ``contact_surface`` in the last step [Pa], float32 [worlds * F].
 
         Pressure times area adds up to the force along the normals. The array is live until the mesh changes.
 
@@ -224,9 +225,22 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
         return self._views.hand_out(self.state.contact_pressures[:])
 
     @property
+    def contact_surface(self) -> SurfaceMesh:
+        """The surface on which contact acts, bound to the nodes of a world.
+
+        It is the body's own surface if its mesh was made from a domain, a little coarser than ``mesh.surface()``;
+        otherwise the boundary of the tetrahedra, ``surface_triangles``. See ``Contact(on=...)``.
+
+        Raises:
+            InputError: The body is in no simulation with contact.
+        """
+        self._check_touched()
+        return self.state.contact_surface or boundary_surface(self.mesh)
+
+    @property
     def surface_triangles(self) -> npt.NDArray[np.int32]:
-        """The boundary faces of the tetrahedra, on which contact acts: nodes within a world, int32 [F, 3],
-        counter-clockwise seen from outside."""
+        """The boundary faces of the tetrahedra: nodes within a world, int32 [F, 3], counter-clockwise seen from
+        outside."""
         return self.surface_faces[0]
 
     @property

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import numpy.typing as npt
 import warp as wp
@@ -9,6 +11,9 @@ import warp as wp
 from warp_corot.discretization.nodal import padded, same_array
 from warp_corot.discretization.sizes import Sizes
 from warp_corot.kernels.stepping.integrate import ADOPT_POSITIONS, PUBLISH_POSITIONS
+
+if TYPE_CHECKING:
+    from warp_corot.mesh.surfaces.bound import SurfaceMesh
 
 
 class State:
@@ -30,6 +35,7 @@ class State:
         reactions: Forces of the supports in the last step [N].
         contact_forces: Contact forces in the last step [N]; one entry until the body may have contact.
         contact_pressures: Contact pressures on the triangles of the surface [Pa], float32; empty until then.
+        contact_surface: That surface; None: the boundary of the tetrahedra.
         is_touched: Whether the body may have contact.
         initial: Displacements and velocities that a reset restores; None for rest.
         revision: Changes whenever ``positions`` becomes another array.
@@ -42,6 +48,7 @@ class State:
         self.displacements, self.velocities, self.forces, self.reactions = (wp.zeros_like(self.rest) for _ in range(4))
         self.contact_forces, self.is_touched = wp.zeros(1, dtype=wp.vec4, device=device), False
         self.contact_pressures = wp.zeros(0, dtype=wp.float32, device=device)
+        self.contact_surface: SurfaceMesh | None = None
         self.initial: tuple[wp.array, wp.array] | None = None
         self.revision = 0
 

@@ -14,12 +14,16 @@ import warp as wp
 
 from warp_corot.contact.options import Contact, checked_friction
 from warp_corot.contact.shapes import Capsule, Cylinder, Ground
+from warp_corot.contact.skin import own_surface
 from warp_corot.contact.tool import Obstacle, Tool
 from warp_corot.errors import InputError
 from warp_corot.kernels.contact.overlaps import find_gaps
+from warp_corot.solvers import INTEGRATORS
 
 from .holding import up_of
+from .implicit import integrator_name, is_static
 from .quantities import metres, number
+from .ranks import are_several
 from .summary import length
 from .tool_paths import make_tool, tool_shape
 
@@ -175,18 +179,25 @@ def place_ground(touched: Touched, args: argparse.Namespace, bodies: Sequence[Bo
     up = up_of(bodies[0].subject, gravity)
     height = args.ground
     if height in (None, AUTO):
-        height = min(float((body.subject.mesh.points[body.subject.used] @ up).min()) for body in bodies)
+        height = min(float((_touched_points(body, args) @ up).min()) for body in bodies)
         height -= args.drop or 0.0
     touched.obstacles = {"ground": Ground(up, height), **touched.obstacles}
 
 
+def _touched_points(body: Body, args: argparse.Namespace) -> Floats:
+    """The points of a body on which contact will act [m], [n, 3]."""
+    are_own = not are_several() and not is_static(args) and not INTEGRATORS[integrator_name(args)].is_implicit
+    own = own_surface(body.subject.mesh) if are_own else None
+    return body.subject.mesh.points[body.subject.used] if own is None else own.points
+
+
 def say_reach(bodies: Sequence[Body], sim: Simulation) -> None:
-    """Add a note for each body whose tetrahedra reach far beyond its surface, because contact acts on them."""
+    """Add a note for each body whose tetrahedra reach far beyond its surface, if contact acts on them."""
     if sim.contact is None:
         return
-    for body in bodies:
+    for body, part in zip(bodies, sim.contact.surface.parts, strict=True):
         phi = getattr(body.soft.mesh, "phi", None)
-        if phi is None:
+        if phi is None or part.skin.own is not None:
             continue
         faces, _parents = body.soft.surface_faces
         beyond = np.maximum(phi[np.unique(faces)], 0.0)
@@ -203,10 +214,11 @@ def say_overlaps(touched: Touched, bodies: Sequence[Body], sim: Simulation) -> N
     if sim.contact is None or not touched.obstacles:
         return
     obstacles = sim.contact.obstacles
-    for body in bodies:
-        used = body.subject.used
-        points = wp.array(body.soft.mesh.points[used].astype(np.float32), dtype=wp.vec3, device=sim.device)
-        gaps = wp.zeros((obstacles.count, len(used)), dtype=wp.float32, device=sim.device)
+    for body, part in zip(bodies, sim.contact.surface.parts, strict=True):
+        own = part.skin.own
+        at = body.soft.mesh.points[body.subject.used] if own is None else own.points
+        points = wp.array(at.astype(np.float32), dtype=wp.vec3, device=sim.device)
+        gaps = wp.zeros((obstacles.count, len(at)), dtype=wp.float32, device=sim.device)
         inputs = [obstacles.shapes, obstacles.motions, 0, points, float(body.subject.height)]
         wp.launch(find_gaps, gaps.shape, inputs, [gaps], device=sim.device)
         deepest = -gaps.numpy().min(axis=1)

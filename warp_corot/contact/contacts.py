@@ -7,19 +7,20 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from warp_corot.kernels.contact import motion, sums, watch
+from warp_corot.kernels.contact import bearing, motion, sums, watch
 from warp_corot.kernels.contact.law import Law
+from warp_corot.kernels.contact.motion import Surface
 from warp_corot.solvers.ranks import ALONE, Ranks
 from warp_corot.solvers.system import System
 
 from .active_set import ActiveSet
 from .joined_rows import JoinedRows
 from .obstacles import Obstacles
-from .options import Contact
+from .options import SURFACE, Contact
 from .pairs import Pairs, smallest_size
 from .rigid_forces import RigidForces
 from .search import Search
-from .surface import ContactSurface
+from .surface import ContactSurface, Part
 from .tool import Obstacle
 from .warned import OVERLAP, warn_of_crushed, warn_of_overlaps
 from .whole_surface import WholeSurface
@@ -28,8 +29,8 @@ from .whole_surface import WholeSurface
 ROUNDINGS = 16.0
 #: Overlapping surfaces are pushed apart at this fraction of the speed of waves.
 RECOVERY = 0.05
-#: Number of rounds for obstacles between the nodes.
-ROUNDS = 3
+#: Number of rounds for obstacles between the nodes, and with places that nodes bear.
+ROUNDS, ROUNDS_OF_BORNE = 3, 4
 #: Number of grains in the force that moves the heaviest node across the smallest element in a step; the maximum is
 #: 2^63.
 GRAINS = 2.0**48
@@ -46,6 +47,8 @@ class Contacts:
         options: The options of contact.
         stable_dt: Largest stable step of the bodies at rest [s], from which the speed of waves follows.
         dt: The length of a step, if it was given [s].
+        on_surfaces: Whether contact acts on the bodies' own surfaces, if ``options`` say so; implicit steps and ranks
+            support the boundary of the tetrahedra only.
 
     Attributes:
         surface: The surface nodes and triangles of all bodies.
@@ -65,12 +68,14 @@ class Contacts:
         *,
         stable_dt: float,
         dt: float | None = None,
+        on_surfaces: bool = False,
     ):
         self.system, self.device, self.options = system, system.device, options
         self.obstacles = Obstacles(obstacles, options.friction, system, dt)
         meets = len(system.bodies) > 1 or options.self_contact
         is_whole = meets and not system.ranks.is_alone
-        self.surface = WholeSurface(system) if is_whole else ContactSurface(system.bodies)
+        are_own = on_surfaces and options.on == SURFACE
+        self.surface = WholeSurface(system) if is_whole else ContactSurface(system.bodies, are_own=are_own)
         #: The ranks with other places of the surface.
         self._ranks: Ranks = ALONE if is_whole else system.ranks
         own = [self.surface.places_of(k) for k in range(len(system.bodies))]
@@ -157,10 +162,16 @@ class Contacts:
         self._solve()
         self._ranks.clear_surface(surface.arrays.f)
         follows = bool(self.search.finders) and not surface.is_whole
-        for k, body in enumerate(system.bodies):
-            inputs = [surface.parts[k].start, surface.own, int(follows)]
+        for k, (body, part) in enumerate(zip(system.bodies, surface.parts, strict=True)):
             outputs = [self.search.watch, body.state.forces, body.state.contact_forces]
-            self._launch(watch.add_contact_forces, self._count(k), inputs, outputs)
+            start, count, arrays = self._nodes_of(part)
+            if part.bearers:
+                self._launch(bearing.divide_forces, count, [start, surface.arrays, arrays], [])
+                if follows:
+                    inputs = [part.start, surface.arrays, self.search.watch]
+                    self._launch(watch.follow_nodes, self._count(k), inputs, [])
+            inputs = [start, arrays, int(follows and not part.bearers)]
+            self._launch(watch.add_contact_forces, count, inputs, outputs)
         if surface.is_whole:
             self.search.launch_after()
 
@@ -183,9 +194,10 @@ class Contacts:
             thinnest = min(thinnest, 0.5 * self.smallest)
         if not np.isfinite(thinnest):
             return
-        for k, body in enumerate(self.system.bodies):
-            inputs = [self.surface.parts[k].start, self.surface.own.node, body.state.velocities, thinnest]
-            self._launch(motion.measure_rates, self._count(k), inputs, [self.system.motion_rates])
+        for body, part in zip(self.system.bodies, self.surface.parts, strict=True):
+            start, count, arrays = self._nodes_of(part)
+            inputs = [start, arrays.node, body.state.velocities, thinnest]
+            self._launch(motion.measure_rates, count, inputs, [self.system.motion_rates])
 
     def publish(self) -> None:
         surface, obstacles = self.surface, self.obstacles
@@ -260,11 +272,15 @@ class Contacts:
         system, surface = self.system, self.surface
         for k, body in enumerate(system.bodies):
             state, conditions = body.state, body.conditions
-            inputs = [surface.parts[k].start, damping, system.gravity, conditions.inverse_mass]
+            start, count, arrays = self._nodes_of(surface.parts[k])
+            inputs = [start, damping, system.gravity, conditions.inverse_mass]
             inputs += [int(conditions.has_loads), conditions.loads, system.pace.arrays, offset]
             inputs += [state.rest, state.forces, state.displacements, state.velocities]
             kernel = motion.PREDICT_MOTION[conditions.loads.dtype]
-            self._launch(kernel, self._count(k), inputs, [surface.own])
+            self._launch(kernel, count, inputs, [arrays])
+            if surface.parts[k].bearers:
+                inputs = [surface.parts[k].start, surface.bearers, surface.arrays]
+                self._launch(bearing.place_borne, self._count(k), inputs, [])
         if isinstance(surface, WholeSurface):
             surface.complete(surface.arrays.x, surface.arrays.d, surface.arrays.yielding)
         elif self.rigid is not None and self.rigid.have_edges:
@@ -274,6 +290,8 @@ class Contacts:
         """Launch the forces in turn: of obstacles on nodes, of obstacles between these, and of soft surfaces."""
         rigid, pairs = self.rigid, self.pairs
         rounds = ROUNDS if self.obstacles.have_edges or pairs is not None else 0
+        if self.surface.is_borne:
+            rounds = ROUNDS_OF_BORNE
         if pairs is not None:
             pairs.launch_begin(self.law)
         if rigid is not None:
@@ -309,6 +327,13 @@ class Contacts:
             body.state.contact_forces.zero_()
             triangles = len(part.skin.triangles)
             body.state.contact_pressures = pressures if self.system.worlds > 1 else pressures[:triangles]
+            body.state.contact_surface = part.skin.own
+
+    def _nodes_of(self, part: Part) -> tuple[int, int, Surface]:
+        """The nodes that carry a body's surface: the first one, how many there are, and their arrays."""
+        if part.bearers:
+            return part.bearer_start, self.system.worlds * part.bearers, self.surface.bearers
+        return part.start, self.system.worlds * part.nodes, self.surface.own
 
     def _count(self, k: int) -> int:
         """Number of places of a body in all worlds."""

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from warp_corot.mesh.surfaces.bound import SurfaceMesh
+
 if TYPE_CHECKING:
     from .contacts import Contacts
 
@@ -25,20 +27,24 @@ def contact_at_nodes(contacts: Contacts, k: int, world: int) -> tuple[npt.NDArra
         return np.zeros((count, 3), np.float32), np.zeros(count, np.float32)
     forces = body.contact_forces.numpy()[world * count : (world + 1) * count]
     pressures = body.contact_pressure.numpy().reshape(body.worlds, -1)[world]
-    nodal = pressure_at_nodes(body.mesh.points, body.surface_triangles, pressures)
+    nodal = pressure_at_nodes(body.contact_surface, count, pressures)
     return forces.astype(np.float32), nodal.astype(np.float32)
 
 
-def pressure_at_nodes(points: Floats, triangles: npt.NDArray[np.int32], pressures: npt.NDArray[np.float32]) -> Floats:
-    """Pressures of triangles [Pa], averaged at nodes by areas at rest, [N]; zero at inner nodes.
+def pressure_at_nodes(surface: SurfaceMesh, count: int, pressures: npt.NDArray[np.float32]) -> Floats:
+    """Pressures of triangles [Pa], averaged at nodes by areas at rest, [N]; zero at nodes that carry no surface.
 
     Args:
-        points: Nodes at rest [m], [N, 3].
-        triangles: The surface, int32 [F, 3].
+        surface: The surface, F triangles.
+        count: Number of nodes N.
         pressures: [F], or more, of which the first ones count.
     """
-    a, b, c = np.moveaxis(points[triangles], 1, 0)
+    triangles = surface.triangles
+    a, b, c = np.moveaxis(surface.points[triangles], 1, 0)
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    corners, count = triangles.ravel(), len(points)
-    weighted = np.bincount(corners, np.repeat(areas * pressures[: len(triangles)], 3), count)
-    return weighted / np.maximum(np.bincount(corners, np.repeat(areas, 3), count), 1e-300)
+    corners, points = triangles.ravel(), len(surface.points)
+    around = np.bincount(corners, np.repeat(areas, 3), points)
+    loads = np.bincount(corners, np.repeat(areas * pressures[: len(triangles)], 3), points)
+    nodes, weights = surface.nodes.ravel(), np.abs(surface.weights)
+    weighted = np.bincount(nodes, (weights * loads[:, None]).ravel(), count)
+    return weighted / np.maximum(np.bincount(nodes, (weights * around[:, None]).ravel(), count), 1e-300)

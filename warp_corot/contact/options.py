@@ -6,7 +6,10 @@ import math
 from dataclasses import dataclass
 
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_flag, checked_number
+from warp_corot.inputs.checks import checked_choice, checked_flag, checked_number
+
+#: What contact acts on.
+SURFACE, TETRAHEDRA = "surface", "tetrahedra"
 
 
 @dataclass(frozen=True)
@@ -18,6 +21,9 @@ class Contact:
         self_contact: Whether bodies touch themselves, too. They touch one another in any case.
         flat_edges: Whether soft surfaces also touch where flat edges of both cross. Then pressure passes evenly between
             any two meshes, however coarse; there are several times as many pairs.
+        on: What contact acts on. "surface": a body's own surface, if its mesh was made from a domain. "tetrahedra": the
+            boundary of its tetrahedra, which reaches beyond that surface. Implicit steps and ranks always use the
+            boundary, and so do meshes that have no other surface.
 
     Raises:
         InputError: A value out of its range.
@@ -26,11 +32,13 @@ class Contact:
     friction: float = 0.3
     self_contact: bool = False
     flat_edges: bool = False
+    on: str = SURFACE
 
     def __post_init__(self) -> None:
         checked_friction(self.friction)
         checked_flag(self.self_contact, "self_contact")
         checked_flag(self.flat_edges, "flat_edges")
+        checked_choice(self.on, "on", (SURFACE, TETRAHEDRA))
 
 
 def checked_friction(given: float) -> float:

@@ -233,9 +233,10 @@ class Pairs:
 
     def _mark_crushed(self) -> None:
         near, watch = self.search.near, self.search.watch
-        for body, places in self.surface.solids:
+        surface = self.surface
+        for (body, places), part in zip(surface.solids, surface.parts, strict=True):
             kernel, elements = mark_crushed(body.discretization.element_kind), body.discretization.elements
-            inputs = [watch, elements, body.state.displacements, places]
+            inputs = [watch, elements, body.state.displacements, places, int(part.bearers > 0), surface.arrays]
             wp.launch(kernel, body.sizes.launch_elements, inputs, [near], device=self.device)
         self._ranks.take_most(near.flags)
 
@@ -248,6 +249,8 @@ class Pairs:
         among = self.search.at_nodes
         inputs = [*among, law, self.surface.arrays, self._added, self._crowd]
         wp.launch(kernels.apply_added, among[0], inputs, device=self.device)
+        if self.surface.is_borne:
+            wp.launch(kernels.settle_pairs, among[0], [*among, self.surface.arrays], device=self.device)
 
 
 def smallest_size(volumes: list[float]) -> float:

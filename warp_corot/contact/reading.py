@@ -30,9 +30,9 @@ class ContactPoint:
         body: The soft body.
         other: The other side: an obstacle as it was given, or a soft body, which may be the same.
         world: The world.
-        nodes: The body's nodes at that place: one, the ends of an edge, or the corners of a triangle; numbered within
-            the world.
-        shares: The weight of each of them in the point, [1], [2] or [3].
+        nodes: The body's nodes at that place, numbered within the world: one, the ends of an edge, or the corners of a
+            triangle; on a body's own surface those of the tetrahedra that carry the place.
+        shares: The weight of each of them in the point.
         point: The place [m], [3].
         normal: From the other to the body, [3].
         gap: The gap at the beginning of the step, negative for an overlap [m].
@@ -80,16 +80,17 @@ def _of_pairs(contacts: Contacts, pairs: Pairs) -> list[ContactPoint]:
     found = []
     for row in np.flatnonzero((acts != 0) & force.any(axis=1)):
         size = 1 if owner[row] < nodes else 2
-        k, world, own = contacts.surface.nodes_at(places[row, :size])
-        m, _, others = contacts.surface.nodes_at(places[row, size:])
-        along, w = float(force[row] @ normal[row]), shares[row, :size]
+        w = shares[row, :size]
+        k, world, own, own_shares = contacts.surface.nodes_at(places[row, :size], w)
+        m, _, others, _ = contacts.surface.nodes_at(places[row, size:], shares[row, size:])
+        along = float(force[row] @ normal[row])
         found.append(
             ContactPoint(
                 bodies[k],
                 bodies[m],
                 world,
                 own,
-                w,
+                own_shares,
                 w @ x[places[row, :size]],
                 normal[row],
                 float(gap[row]),
@@ -142,7 +143,7 @@ def _point(
     gap: float,
     force: Floats,
 ) -> ContactPoint:
-    k, world, nodes = contacts.surface.nodes_at(places)
+    k, world, nodes, shares = contacts.surface.nodes_at(places, shares)
     along = float(force @ normal)
     other = contacts.obstacles.given[o]
     return ContactPoint(

@@ -39,6 +39,7 @@ class RigidForces:
         kinds: The state of each surface node with each obstacle in implicit steps; see
             ``kernels.contact.active``, [O, S].
         have_edges: Whether any of the obstacles can pass between the nodes.
+        has_rounds: Whether forces depend on one another, so that they are found in rounds.
         together: Whether one block makes all rounds; None: chosen by the number of nodes and triangles that are near.
         revision: Changes whenever launches do.
     """
@@ -55,6 +56,7 @@ class RigidForces:
         self.surface, self.obstacles, self.search, self.device = surface, obstacles, search, surface.device
         self._law, self._pace, self._ranks, self._taken = law, pace, ranks, -1
         self.have_edges = obstacles.have_edges
+        self.has_rounds = obstacles.have_edges or surface.is_borne
         self.together: bool | None = None
         self.revision, self._is_together = 0, False
         search.finders.append(self._find)
@@ -89,7 +91,7 @@ class RigidForces:
         together = self.together
         if together is None:
             most = MOST_EACH * BLOCK * (1.0 if self._is_together else 0.5)
-            is_short = self.have_edges and self.search.most_near <= most
+            is_short = self.has_rounds and self.search.most_near <= most
             together = (self.device.is_cpu or is_short) and self._ranks.is_alone
         self.revision += int(together != self._is_together)
         self._is_together = together
@@ -99,6 +101,9 @@ class RigidForces:
         self.anchors.zero_()
         self.kinds.zero_()
         self.touches.force.zero_()
+        if self.surface.is_borne:
+            # Borne places begin with the forces of the last step.
+            self.forces.zero_()
 
     @property
     def state(self) -> dict[str, wp.array]:
@@ -123,10 +128,10 @@ class RigidForces:
         for number in range(rounds):
             self._launch_round()
             if between is not None:
-                if self.have_edges:
+                if self.has_rounds:
                     self._push(triangles.ADD)
                 between()
-            added = triangles.ADD if self.have_edges and between is None else 0
+            added = triangles.ADD if self.has_rounds and between is None else 0
             self._push(triangles.CORRECT | added | (triangles.END if number == rounds - 1 else 0))
 
     def _launch_together(self, rounds: int, between: Callable[[], None] | None) -> None:
@@ -147,19 +152,22 @@ class RigidForces:
             rigid = [self.obstacles.shapes, self.obstacles.motions]
             inputs = [*rigid, self._law, self.surface.arrays, self.surface.triangles, self.touches]
             self._on_touches(touches.find_touches, inputs)
+        if self.has_rounds:
             parts |= triangles.ADD
         self._push(parts)
 
     def _launch_round(self) -> None:
         """Launch one round of the forces between nodes; their sums at the nodes follow."""
-        if not self.have_edges:
+        if not self.has_rounds:
             return
-        step = [self._law, self._pace, self.surface.arrays]
+        step, rigid = [self._law, self._pace, self.surface.arrays], [self.obstacles.shapes, self.obstacles.motions]
         self._ranks.complete_surface(self.surface.arrays.d)
-        self._on_nodes(triangles.crowd_nodes, [*step, self._skin, self.touches, self._crowd])
+        inputs = [*rigid, *step, self._skin, self.forces, self.anchors, self.touches, self._crowd]
+        self._on_nodes(triangles.crowd_nodes, inputs)
         self._ranks.complete_surface(self._crowd)
-        inputs = [*step, self.surface.triangles, self._crowd, self._yielding, self.touches]
-        self._on_touches(triangles.solve_touches, inputs)
+        if self.have_edges:
+            inputs = [*step, self.surface.triangles, self._crowd, self._yielding, self.touches]
+            self._on_touches(triangles.solve_touches, inputs)
 
     def launch_totals(self) -> wp.array:
         """Launch the sums of all forces of each obstacle on each node, [O, S]."""
@@ -173,7 +181,7 @@ class RigidForces:
         """Launch the search for nodes and triangles near obstacles."""
         watch, near, arrays = self.search.watch, self.search.near, self.surface.arrays
         inputs = [watch, self.obstacles.shapes, self.obstacles.motions, self._law, arrays]
-        outputs = [near, self.forces, self.anchors]
+        outputs = [near, self.forces, self.anchors, self._crowd]
         wp.launch(beside.find_nodes_beside, self.surface.count, inputs, outputs, device=self.device)
         if self.have_edges:
             inputs += [self.surface.triangles]
@@ -183,14 +191,18 @@ class RigidForces:
     def _push(self, parts: int) -> None:
         """Launch some of the parts that act on one node at a time."""
         rigid = [self.obstacles.shapes, self.obstacles.motions]
-        inputs = [parts, self._skin, *rigid, self._law, self._pace, self.touches, self.surface.arrays]
-        self._on_nodes(triangles.push_nodes, [*inputs, self.forces, self.anchors])
+        inputs = [parts, self._skin, *rigid, self._law, self._pace, self.touches, self._crowd]
+        own = [self.surface.arrays, self.forces, self.anchors]
+        self._on_nodes(triangles.push_nodes, [*inputs, *own])
+        if parts & triangles.ADD and self.surface.is_borne:
+            self._on_nodes(triangles.settle_places, [parts, *rigid, *own])
 
     def _push_together(self, before: int, rounds: int, parts: int) -> None:
         """Launch some of these parts, and rounds, in one block."""
         threads = 1 if self.device.is_cpu else BLOCK
         rigid = [self.obstacles.shapes, self.obstacles.motions]
-        inputs = [threads, self.search.near, before, rounds, parts, self._skin, *rigid, self._law, self._pace]
+        inputs = [threads, self.search.near, before, rounds, parts, int(self.surface.is_borne), self._skin]
+        inputs += [*rigid, self._law, self._pace]
         outputs = [self.touches, self._crowd, self.surface.arrays, self.forces, self.anchors]
         wp.launch(push_together, threads, inputs, outputs, device=self.device, block_dim=threads)
 

@@ -10,7 +10,9 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.kernels.contact.motion import Surface
+from warp_corot.kernels.contact.motion import Bearing, Surface
+
+from .skin import Skin
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
@@ -22,55 +24,13 @@ NO_NODE = -1
 Ints = npt.NDArray[np.int32]
 
 
-@dataclass(frozen=True)
-class Skin:
-    """The surface of one world of a body.
-
-    Attributes:
-        nodes: Its nodes, int32 [n].
-        triangles: Their places in ``nodes``, int32 [t, 3], counter-clockwise seen from outside.
-        edges: The same for their edges, int32 [e, 2].
-        sides: The two triangles at each edge, int32 [e, 2].
-        opposite: The place of the fourth node of each triangle's tetrahedron, int32 [t]; -1 inside the body.
-    """
-
-    nodes: Ints
-    triangles: Ints
-    edges: Ints
-    sides: Ints
-    opposite: Ints
-
-    @classmethod
-    def of(cls, body: SoftBody) -> Skin:
-        """The surface of a body's present mesh."""
-        tets = body.mesh.tets
-        faces, parents = body.surface_faces
-        nodes, places = np.unique(faces, return_inverse=True)
-        triangles = places.reshape(-1, 3).astype(np.int32)
-        fourth = tets[parents].sum(axis=1) - faces.sum(axis=1)
-        found = np.minimum(np.searchsorted(nodes, fourth), len(nodes) - 1)
-        opposite = np.where(nodes[found] == fourth, found, -1).astype(np.int32)
-        return cls(nodes.astype(np.int32), triangles, *_edges_of(triangles), opposite)
-
-
-def _edges_of(triangles: Ints) -> tuple[Ints, Ints]:
-    """The edges of a closed surface, and two triangles at each."""
-    ends = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    order = np.lexsort((ends[:, 1], ends[:, 0]))
-    edges, first = np.unique(ends[order], axis=0, return_index=True)
-    owners = order // 3
-    # If more than two triangles meet in an edge, as where two bodies share one, the first two of them count.
-    sides = np.column_stack([owners[first], owners[np.minimum(first + 1, len(owners) - 1)]])
-    return edges.astype(np.int32), sides.astype(np.int32)
-
-
 @dataclass
 class Part:
     """The place of a body's surface in the common arrays, world after world, and its room in each world.
 
     Attributes:
-        start, triangle_start, edge_start: Its first place, its first triangle and its first edge.
-        nodes, triangles, edges: Number of places for one world.
+        start, triangle_start, edge_start, bearer_start: Its first place, triangle, edge and bearer.
+        nodes, triangles, edges, bearers: Number of places for one world; no bearers: places are nodes.
         skin: The surface.
         version: The version of the mesh.
     """
@@ -78,11 +38,17 @@ class Part:
     start: int
     triangle_start: int
     edge_start: int
+    bearer_start: int
     nodes: int
     triangles: int
     edges: int
+    bearers: int
     skin: Skin
     version: int
+
+    @property
+    def sizes(self) -> list[int]:
+        return [self.nodes, self.triangles, self.edges, self.bearers]
 
 
 class ContactSurface:
@@ -90,26 +56,31 @@ class ContactSurface:
 
     Args:
         bodies: All bodies, with the same number of worlds.
+        are_own: Whether contact acts on bodies' own surfaces, where they have one; otherwise on the boundary of their
+            tetrahedra.
 
     Attributes:
-        arrays: The nodes, as a struct for kernels.
+        arrays: The places, as a struct for kernels.
+        bearers: The nodes that bear places between nodes, as such a struct.
         triangles: Places of their corners, vec3i [T]; -1 where there is none.
         opposite: For each triangle the fourth node of its tetrahedron, int32 [T]; -1 inside the body.
         edges, sides: Places of the ends of edges, and the two triangles of each, vec2i [E]; -1 where there is none.
         corner_starts, corners: For each node, from one start to the next: three times a triangle and which corner.
         parts: The place of each body.
-        places: For each body the place of each node, int32 [nodes]; -1 inside.
+        places: For each body the place of each node, or its place among the bearers if the body has these, int32
+            [nodes]; -1 for others.
         revision: Changes whenever arrays are replaced.
     """
 
     #: Whether places of nodes that other ranks move are among them, with all values.
     is_whole = False
 
-    def __init__(self, bodies: Sequence[SoftBody]):
+    def __init__(self, bodies: Sequence[SoftBody], *, are_own: bool = False):
         self.bodies, self.worlds, self.device = tuple(bodies), bodies[0].worlds, bodies[0].device
+        self.are_own = are_own
         self.revision = 0
         self.parts: list[Part] = []
-        self._make_room([Skin.of(body) for body in bodies])
+        self._make_room([self._skin(body) for body in bodies])
 
     @property
     def own(self) -> Surface:
@@ -140,6 +111,17 @@ class ContactSurface:
         last = self.parts[-1]
         return last.edge_start + self.worlds * last.edges
 
+    @property
+    def bearer_count(self) -> int:
+        """Number of places for bearers."""
+        last = self.parts[-1]
+        return last.bearer_start + self.worlds * last.bearers
+
+    @property
+    def is_borne(self) -> bool:
+        """Whether any places lie between nodes."""
+        return self.bearer_count > 0
+
     def body_of_places(self) -> Ints:
         """The number of the body at each place for a node, int32 [S]."""
         return np.repeat(np.arange(len(self.parts)), [self.worlds * part.nodes for part in self.parts]).astype(np.int32)
@@ -149,11 +131,12 @@ class ContactSurface:
         changed = [k for k, body in enumerate(self.bodies) if body.version != self.parts[k].version]
         if not changed:
             return False
-        skins = [Skin.of(body) if k in changed else self.parts[k].skin for k, body in enumerate(self.bodies)]
+        skins = [self._skin(body) if k in changed else self.parts[k].skin for k, body in enumerate(self.bodies)]
         fits = all(len(body.state.rest) == len(own) for body, own in zip(self.bodies, self.places, strict=True))
         fits = fits and all(
-            len(skin.nodes) <= part.nodes and len(skin.triangles) <= part.triangles and len(skin.edges) <= part.edges
+            size <= room
             for skin, part in zip(skins, self.parts, strict=True)
+            for size, room in zip(_sizes(skin), part.sizes, strict=True)
         )
         if not fits:
             self._make_room(skins)
@@ -165,48 +148,60 @@ class ContactSurface:
 
     @property
     def rooms(self) -> list[list[int]]:
-        """Number of places for nodes, triangles and edges of each body in a world."""
-        return [[part.nodes, part.triangles, part.edges] for part in self.parts]
+        """Number of places for nodes, triangles, edges and bearers of each body in a world."""
+        return [part.sizes for part in self.parts]
 
     def make_room(self, rooms: Sequence[Sequence[int]]) -> None:
         """Update to the present meshes, with the room of a former ``rooms``."""
-        self._make_room([Skin.of(body) for body in self.bodies], rooms)
+        self._make_room([self._skin(body) for body in self.bodies], rooms)
 
     def places_of(self, k: int) -> slice:
         """The places of a body's nodes."""
         part = self.parts[k]
         return slice(part.start, part.start + self.worlds * part.nodes)
 
-    def nodes_at(self, places: npt.NDArray[np.integer]) -> tuple[int, int, tuple[int, ...]]:
-        """The body at some places of one world, that world, and their nodes numbered within it."""
+    def nodes_at(
+        self, places: npt.NDArray[np.integer], shares: npt.NDArray[np.float64]
+    ) -> tuple[int, int, tuple[int, ...], npt.NDArray[np.float64]]:
+        """The body at some places of one world, that world, their nodes numbered within it, and the nodes' shares.
+
+        Args:
+            shares: The share of each place.
+        """
         k = max(number for number, part in enumerate(self.parts) if part.start <= places[0])
         part = self.parts[k]
         world = (int(places[0]) - part.start) // part.nodes
-        own = places - part.start - world * part.nodes
-        return k, world, tuple(int(node) for node in part.skin.nodes[own])
+        at = places - part.start - world * part.nodes
+        if part.skin.own is None:
+            return k, world, tuple(part.skin.nodes[at].tolist()), shares
+        nodes, which = np.unique(part.skin.own.nodes[at], return_inverse=True)
+        found = np.bincount(which.ravel(), (shares[:, None] * part.skin.own.weights[at]).ravel(), len(nodes))
+        used = found != 0.0
+        return k, world, tuple(nodes[used].tolist()), found[used]
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
     def _make_room(self, skins: Sequence[Skin], rooms: Sequence[Sequence[int]] | None = None) -> None:
         self.parts = []
-        start = triangle_start = edge_start = 0
+        start = triangle_start = edge_start = bearer_start = 0
         for k, (body, skin) in enumerate(zip(self.bodies, skins, strict=True)):
             more = ROOM if body.changing is not None else 1.0
-            sizes = (len(skin.nodes), len(skin.triangles), len(skin.edges))
-            nodes, triangles, edges = (int(more * max(size, 1)) for size in sizes)
+            least = _sizes(skin)
+            sizes = [int(more * size) for size in least]
             if rooms is not None:
-                nodes, triangles, edges = (max(int(room), size) for room, size in zip(rooms[k], sizes, strict=True))
-            self.parts.append(Part(start, triangle_start, edge_start, nodes, triangles, edges, skin, body.version))
+                # Files of former versions know no bearers.
+                sizes = [max(int(room), size) for room, size in zip([*rooms[k], 0], least, strict=False)]
+            nodes, triangles, edges, bearers = sizes
+            starts = (start, triangle_start, edge_start, bearer_start)
+            self.parts.append(Part(*starts, nodes, triangles, edges, bearers, skin, body.version))
             start += self.worlds * nodes
             triangle_start += self.worlds * triangles
             edge_start += self.worlds * edges
+            bearer_start += self.worlds * bearers
         count, device = start, self.device
-        arrays = Surface()
-        arrays.node, arrays.world = (wp.empty(count, dtype=wp.int32, device=device) for _ in range(2))
-        for name in ("rest", "x", "d", "f"):
-            setattr(arrays, name, wp.zeros(count, dtype=wp.vec3, device=device))
-        arrays.yielding = wp.zeros(count, dtype=wp.float32, device=device)
-        self.arrays = arrays
+        self.bearers = _places(bearer_start, device)
+        self.arrays = _places(count, device)
+        self.arrays.bearing = self._room_for_bearing(count)
         self.triangles = wp.empty(triangle_start, dtype=wp.vec3i, device=device)
         self.opposite = wp.empty(triangle_start, dtype=wp.int32, device=device)
         self.edges, self.sides = (wp.empty(edge_start, dtype=wp.vec2i, device=device) for _ in range(2))
@@ -216,9 +211,57 @@ class ContactSurface:
         self.revision += 1
         self._fill()
 
+    def _skin(self, body: SoftBody) -> Skin:
+        return Skin.of(body, is_own=self.are_own)
+
+    def _room_for_bearing(self, count: int) -> Bearing:
+        """Room for the bearing of a number of places: up to four nodes bear each."""
+        bearing, device, bearers = Bearing(), self.device, len(self.bearers.node)
+        borne = count if bearers else 0
+        bearing.bearers = wp.empty(borne, dtype=wp.vec4i, device=device)
+        bearing.loose = wp.zeros(borne, dtype=wp.float32, device=device)
+        bearing.gathered = wp.zeros(borne, dtype=wp.vec3, device=device)
+        bearing.yielding = self.bearers.yielding
+        bearing.starts = wp.zeros(bearers + 1, dtype=wp.int32, device=device)
+        bearing.weights = wp.zeros(borne, dtype=wp.vec4, device=device)
+        bearing.places = wp.zeros(4 * borne, dtype=wp.int32, device=device)
+        bearing.shares = wp.zeros(4 * borne, dtype=wp.float32, device=device)
+        return bearing
+
+    def _fill_bearing(self) -> None:
+        """Copy which nodes bear which places to the device."""
+        if not self.is_borne:
+            return
+        node, world = (np.full(self.bearer_count, NO_NODE, np.int32) for _ in range(2))
+        bearers, weights = np.full((self.count, 4), -1, np.int32), np.zeros((self.count, 4))
+        for body, part in zip(self.bodies, self.parts, strict=True):
+            if part.skin.own is None:
+                continue
+            nodes = part.skin.bearers
+            at = np.minimum(np.searchsorted(nodes, part.skin.own.nodes), len(nodes) - 1)
+            for w in range(self.worlds):
+                first, start = part.start + w * part.nodes, part.bearer_start + w * part.bearers
+                node[start : start + len(nodes)] = nodes + w * body.world_node_count
+                world[start : start + part.bearers] = w
+                bearers[first : first + len(at)] = at + start
+                weights[first : first + len(at)] = part.skin.own.weights
+        places, which = np.nonzero(weights)
+        order = np.argsort(bearers[places, which], kind="stable")
+        places, which = places[order], which[order]
+        starts = np.searchsorted(bearers[places, which], np.arange(self.bearer_count + 1))
+        bearing = self.arrays.bearing
+        bearing.bearers.assign(bearers)
+        bearing.weights.assign(weights.astype(np.float32))
+        bearing.starts.assign(starts.astype(np.int32))
+        bearing.places[: len(places)].assign(places.astype(np.int32))
+        bearing.shares[: len(places)].assign(weights[places, which].astype(np.float32))
+        self.bearers.node.assign(node)
+        self.bearers.world.assign(world)
+
     def _fill(self) -> None:
         """Copy the surfaces to the device."""
         node, world = (np.full(self.count, NO_NODE, np.int32) for _ in range(2))
+        self._fill_bearing()
         triangles = np.full((self.triangle_count, 3), -1, np.int32)
         opposite = np.full(self.triangle_count, -1, np.int32)
         edges, sides = (np.full((self.edge_count, 2), -1, np.int32) for _ in range(2))
@@ -235,8 +278,14 @@ class ContactSurface:
                 edges[own], sides[own] = skin.edges + first, skin.sides + first_triangle
         for k, own in enumerate(self.places):
             places = np.full(len(own), -1, np.int32)
-            used = np.flatnonzero(node[self.places_of(k)] >= 0) + self.parts[k].start
-            places[node[used]] = used
+            part = self.parts[k]
+            if part.skin.own is None:
+                used = np.flatnonzero(node[self.places_of(k)] >= 0) + part.start
+                places[node[used]] = used
+            else:
+                for w in range(self.worlds):
+                    bearers = part.skin.bearers + w * self.bodies[k].world_node_count
+                    places[bearers] = part.bearer_start + w * part.bearers + np.arange(len(bearers))
             own.assign(places)
         self.arrays.node.assign(node)
         self.arrays.world.assign(world)
@@ -250,3 +299,19 @@ class ContactSurface:
         starts = np.searchsorted(ends[order], np.arange(self.count + 1))
         self.corner_starts.assign(starts.astype(np.int32))
         self.corners[: len(order)].assign(order.astype(np.int32))
+
+
+def _sizes(skin: Skin) -> list[int]:
+    """Numbers of places, triangles, edges and bearers."""
+    counts = [max(len(each), 1) for each in (skin.nodes, skin.triangles, skin.edges)]
+    return [*counts, len(skin.bearers)]
+
+
+def _places(count: int, device: wp.Device) -> Surface:
+    """Arrays for a number of places."""
+    arrays = Surface()
+    arrays.node, arrays.world = (wp.empty(count, dtype=wp.int32, device=device) for _ in range(2))
+    for name in ("rest", "x", "d", "f"):
+        setattr(arrays, name, wp.zeros(count, dtype=wp.vec3, device=device))
+    arrays.yielding = wp.zeros(count, dtype=wp.float32, device=device)
+    return arrays

@@ -111,7 +111,7 @@ def contact_pressure(sim: Simulation, shown: Shown) -> Values:
     """Contact pressure in the last step [Pa]: triangles' values, averaged to nodes by area."""
     body = shown.body
     pressure = body.contact_pressure.numpy().reshape(body.worlds, -1)[shown.world.index]
-    nodal = pressure_at_nodes(body.mesh.points, body.surface_triangles, pressure)
+    nodal = pressure_at_nodes(body.contact_surface, body.world_node_count, pressure)
     return np.einsum("vn,vn->v", shown.binding.weights.numpy(), nodal[shown.binding.nodes.numpy()])
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from warp_corot.contact.contacts import Contacts
 from warp_corot.contact.grasp import Grasp
 from warp_corot.contact.keeping import keep_again, kept_arrays
-from warp_corot.contact.options import Contact
+from warp_corot.contact.options import TETRAHEDRA, Contact
 from warp_corot.contact.sampled import SignedDistance, TriangleMesh
 from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, Shape, Sphere
 from warp_corot.contact.tool import Obstacle, Tool
@@ -52,6 +52,7 @@ def pack_contact(contacts: Contacts | None, grasps: Sequence[Grasp], arrays: Arr
         "friction": options.friction,
         "self_contact": options.self_contact,
         "flat_edges": options.flat_edges,
+        "on": options.on,
         "law": [law.tolerance, law.recovery],
         "obstacles": [_pack_tool(tool, each is tool, f"tool{k}.", arrays) for k, (each, tool) in enumerate(given)],
         "rooms": contacts.surface.rooms,
@@ -79,12 +80,14 @@ def obstacles_of(described: dict[str, Any] | None, arrays: Arrays) -> dict[str, 
     if described is None:
         return {}
     obstacles = [_unpacked_tool(each, f"tool{k}.", arrays) for k, each in enumerate(described["obstacles"])]
-    return {
-        "obstacles": obstacles,
-        "contact": Contact(
-            described["friction"], bool(described["self_contact"]), bool(described.get("flat_edges", False))
-        ),
-    }
+    # Files of former versions do not say on what contact acts.
+    contact = Contact(
+        described["friction"],
+        bool(described["self_contact"]),
+        bool(described.get("flat_edges", False)),
+        described.get("on", TETRAHEDRA),
+    )
+    return {"obstacles": obstacles, "contact": contact}
 
 
 def unpack_contact(contacts: Contacts | None, described: dict[str, Any] | None, arrays: Arrays) -> None:

@@ -1,0 +1,97 @@
+"""The surface of one body that contact acts on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_corot.mesh.forest import TetForest
+from warp_corot.mesh.surfaces.bound import SurfaceMesh
+from warp_corot.mesh.surfaces.clustering import clustered
+
+if TYPE_CHECKING:
+    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.mesh import TetMesh
+
+#: The distance between points of a body's own surface, over the edge of a cube of six of the elements there: with
+#: fewer points surfaces lose their shape, with more they touch in more places than the nodes can follow.
+APART = 1.0
+
+Ints = npt.NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class Skin:
+    """The surface of one world of a body.
+
+    Attributes:
+        nodes: The node at each place, or the first of those that bear it, int32 [n].
+        own: The body's own surface, whose points are the places; None: the places are nodes of the tetrahedra.
+        triangles: Their corners, as places, int32 [t, 3], counter-clockwise seen from outside.
+        edges: The same for their edges, int32 [e, 2].
+        sides: The two triangles at each edge, int32 [e, 2].
+        opposite: The place of the fourth node of each triangle's tetrahedron, int32 [t]; -1 inside the body, and for
+            places that are not nodes.
+    """
+
+    nodes: Ints
+    own: SurfaceMesh | None
+    triangles: Ints
+    edges: Ints
+    sides: Ints
+    opposite: Ints
+
+    @classmethod
+    def of(cls, body: SoftBody, *, is_own: bool) -> Skin:
+        """The surface of a body's present mesh: the body's own if there is one and ``is_own``, or the boundary of the
+        tetrahedra."""
+        own = own_surface(body.mesh) if is_own else None
+        if own is not None:
+            opposite = np.full(len(own.triangles), -1, np.int32)
+            return cls(own.nodes[:, 0], own, own.triangles, *_edges_of(own.triangles), opposite)
+        tets = body.mesh.tets
+        faces, parents = body.surface_faces
+        nodes, places = np.unique(faces, return_inverse=True)
+        triangles = places.reshape(-1, 3).astype(np.int32)
+        fourth = tets[parents].sum(axis=1) - faces.sum(axis=1)
+        found = np.minimum(np.searchsorted(nodes, fourth), len(nodes) - 1)
+        opposite = np.where(nodes[found] == fourth, found, -1).astype(np.int32)
+        return cls(nodes.astype(np.int32), None, triangles, *_edges_of(triangles), opposite)
+
+    @property
+    def bearers(self) -> Ints:
+        """The nodes that bear places, int32 [b]."""
+        if self.own is None:
+            return np.zeros(0, np.int32)
+        return np.unique(self.own.nodes[self.own.weights != 0.0]).astype(np.int32)
+
+
+def has_own_surface(mesh: TetForest | TetMesh) -> bool:
+    """Whether a mesh has another surface than the boundary of its tetrahedra: it was made from a domain."""
+    return isinstance(mesh, TetForest) and mesh.phi is not None
+
+
+def own_surface(mesh: TetForest | TetMesh) -> SurfaceMesh | None:
+    """The marched surface of a mesh, with points about as far apart as its nodes; None without such a surface."""
+    if not isinstance(mesh, TetForest) or mesh.phi is None:
+        return None
+    whole = mesh.surface()
+    level = np.zeros(mesh.node_count)
+    np.maximum.at(level, mesh.tets.ravel(), np.repeat(mesh.levels, 4))
+    nearest = np.take_along_axis(whole.nodes, np.argmax(whole.weights, axis=1)[:, None], axis=1)[:, 0]
+    found = clustered(whole, APART * mesh.cell_size * 2.0 ** (-level[nearest] / 3.0))
+    return found if len(found.triangles) else None
+
+
+def _edges_of(triangles: Ints) -> tuple[Ints, Ints]:
+    """The edges of a closed surface, and two triangles at each."""
+    ends = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    order = np.lexsort((ends[:, 1], ends[:, 0]))
+    edges, first = np.unique(ends[order], axis=0, return_index=True)
+    owners = order // 3
+    # If more than two triangles meet in an edge, as where two bodies share one, the first two of them count.
+    sides = np.column_stack([owners[first], owners[np.minimum(first + 1, len(owners) - 1)]])
+    return edges.astype(np.int32), sides.astype(np.int32)

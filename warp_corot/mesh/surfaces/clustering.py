@@ -1,0 +1,80 @@
+"""Coarser surfaces: vertices that are close together become one of them (vertex clustering, Rossignac and Borrel 1993).
+
+Marched surfaces have triangles of all sizes, many far smaller than the elements that carry them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from .bound import SurfaceMesh
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.integer]
+
+
+def clustered(surface: SurfaceMesh, sizes: Floats) -> SurfaceMesh:
+    """A surface with vertices about a size apart; each is a vertex of the given one.
+
+    Vertices become one if they are in the same cube of that size and a path of edges within it connects them, so that
+    the two sides of a sheet stay two. A closed surface stays closed. Parts smaller than a cube vanish.
+
+    Args:
+        surface: The surface.
+        sizes: The size at each of its vertices [m], [V]; vertices of different sizes stay apart.
+    """
+    found = _clustered(surface, sizes, 0.0)
+    # Vertices on both sides of a cube's wall may still be close together.
+    sizes = sizes[found[1]]
+    return _clustered(found[0], 0.5 * sizes, 0.5)[0]
+
+
+def _clustered(surface: SurfaceMesh, sizes: Floats, shift: float) -> tuple[SurfaceMesh, Ints]:
+    """One pass with cubes that are shifted by a fraction of their size; and the vertices that are left."""
+    points, triangles = surface.points, surface.triangles
+    cubes = np.column_stack([np.floor(points / sizes[:, None] + shift), sizes])
+    _, cube = np.unique(cubes, axis=0, return_inverse=True)
+    cube = cube.ravel()
+    ends = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    ends = ends[cube[ends[:, 0]] == cube[ends[:, 1]]]
+    links = coo_array((np.ones(len(ends), np.int8), ends.T), shape=(len(points),) * 2)
+    count, cluster = connected_components(links, directed=False)
+    members = np.bincount(cluster, minlength=count)
+    middles = np.column_stack([np.bincount(cluster, points[:, axis], count) for axis in range(3)]) / members[:, None]
+    far = np.linalg.norm(points - middles[cluster], axis=1)
+    order = np.lexsort((far, cluster))
+    kept = order[np.searchsorted(cluster[order], np.arange(count))]
+    triangles = _distinct(cluster[triangles])
+    used, corners = np.unique(triangles, return_inverse=True)
+    kept = kept[used]
+    coarse = replace(
+        surface,
+        points=points[kept],
+        nodes=surface.nodes[kept],
+        weights=surface.weights[kept],
+        triangles=corners.reshape(-1, 3).astype(np.int32),
+        sides=None,
+    )
+    return coarse, kept
+
+
+def _distinct(triangles: Ints) -> Ints:
+    """Triangles with three corners, without pairs that lie back to back on one another."""
+    a, b, c = triangles.T
+    triangles = triangles[(a != b) & (b != c) & (c != a)]
+    if not len(triangles):
+        return triangles
+    # Begin each with its lowest corner, so that the last two say which way it faces.
+    first = np.argmin(triangles, axis=1)
+    a, b, c = np.take_along_axis(triangles, (first[:, None] + np.arange(3)) % 3, axis=1).T
+    faces, which = np.unique(np.column_stack([a, np.minimum(b, c), np.maximum(b, c)]), axis=0, return_inverse=True)
+    facing = np.bincount(which.ravel(), np.where(b < c, 1.0, -1.0), len(faces)).astype(int)
+    found = np.repeat(faces, np.abs(facing), axis=0)
+    turned = np.repeat(facing < 0, np.abs(facing))
+    found[turned] = found[turned][:, [0, 2, 1]]
+    return found
