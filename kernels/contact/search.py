@@ -2,8 +2,8 @@
 
 import warp as wp
 
-from .boxes import edge_reach, root_of, triangle_reach, triangle_size
 from .bearing import share_bearers
+from .boxes import edge_reach, root_of, triangle_reach, triangle_size
 from .closest import on_segments, on_triangle, point_of
 from .locate import ENDS, edge_normal
 from .motion import Surface
