@@ -39,6 +39,34 @@ def test_two_ranks_make_a_box_in_parts(folder):
 
 
 @pytest.mark.slow
+def test_rank_0_hands_out_parts_of_other_bodies(folder):
+    """The table is that of one process, whose pressure changes with time."""
+    bear = (
+        "warp:bear",
+        "--duration",
+        "0.1",
+        "--press",
+        "top",
+        "300",
+        "--ramp",
+        "0.05",
+        "--probe",
+        "top",
+        "--device",
+        "cpu",
+    )
+    on_two = on_ranks(2, "-m", "warp_corot", "simulate", *bear, "--csv", "two.csv", "-o", "two.usda")
+    assert on_two.returncode == 0, on_two.stderr
+    assert "2 ranks" in on_two.stdout
+    assert simulate(*bear, "--csv", "one.csv", "-o", "one.usda") == 0
+    # The bear's top sinks by 3 cm.
+    np.testing.assert_allclose(last_row("two.csv")[:4], last_row("one.csv")[:4], rtol=1e-3, atol=1e-5)
+    wrong = on_ranks(2, "-m", "warp_corot", "simulate", *bear, "--fix", "nonsense", "-o", "out.usda", timeout=120.0)
+    assert wrong.returncode != 0
+    assert sum(line.startswith("warp-corot: error:") for line in wrong.stderr.splitlines()) == 1
+
+
+@pytest.mark.slow
 def test_what_does_not_work_is_refused_in_one_line(folder):
     done = on_ranks(2, "-m", "warp_corot", "simulate", "box", "--level", "3", "--remesh", "-o", "out.usda")
     assert done.returncode != 0
