@@ -288,6 +288,7 @@ class Running:
         if fault is not None:
             self._go_back(fault)
             return False
+        sim.stepper.recover()
         if self._returns and sim.time > self._wrong_until:
             self._returns = 0
         if whole:
@@ -310,6 +311,11 @@ class Running:
                 sim.guard.go_back()
                 return
             fault = too_far
+        elif sim.stepper.fall_back():
+            wrong = sim.time
+            sim.guard.go_back()
+            self._warn(fault, wrong, "steps of backward Euler")
+            return
         if sim.safe_step is None or self._returns >= MOST_RETURNS:
             self._returns = 0
             message = fault_message(sim, fault, MOST_RETURNS)
@@ -323,11 +329,15 @@ class Running:
         self._returns += 1
         sim.guard.go_back()
         self._energies.halve(sim.steps)
+        self._warn(fault, self._wrong_until, "half the step")
+
+    def _warn(self, fault: Fault, wrong: float, how: str) -> None:
+        """Warn once that the simulation has gone back from a time [s]."""
         if not self._has_warned and not fault.is_slight:
             self._has_warned = True
             message = (
-                f"the state went wrong by t = {self._wrong_until:.4g} s ({fault.what}); the simulation continues from "
-                f"t = {sim.time:.4g} s with half the step, and will do so again without a warning"
+                f"the state went wrong by t = {wrong:.4g} s ({fault.what}); the simulation continues from "
+                f"t = {self._sim.time:.4g} s with {how}, and will do so again without a warning"
             )
             warnings.warn(message, StabilityWarning, stacklevel=depth_of_user())
 

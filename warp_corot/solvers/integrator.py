@@ -36,6 +36,13 @@ class Stepper(ABC):
     def prepare(self) -> None:  # noqa: B027 (most need nothing)
         """Copy what launches read of the bodies' conditions to the device; called before steps are recorded."""
 
+    def fall_back(self) -> bool:
+        """Make steps sturdier until ``recover`` is called; whether they can be."""
+        return False
+
+    def recover(self) -> None:  # noqa: B027 (most need nothing)
+        """Make steps as usual again."""
+
     @abstractmethod
     def forces(self, offset: int = 0) -> None:
         """Launch the elastic forces of the ``offset``-th step since the clock was last advanced."""

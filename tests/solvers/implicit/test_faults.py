@@ -56,6 +56,21 @@ def test_steps_end_in_a_finite_state(device, name, integrator):
     assert finite(body)
 
 
+@pytest.mark.parametrize("integrator", [wc.GeneralizedAlpha(dt=0.06), wc.Newmark(dt=0.03)], ids=["alpha", "newmark"])
+def test_what_gains_energy_goes_on_with_backward_euler(device, integrator):
+    """A block that is thrown onto its own support at 10 m/s turns elements over, and schemes that keep energy then gain
+    it."""
+    mesh = wc.TetForest.box(cells=(1, 1, 2), cell_size=0.02, level=0)
+    body = wc.SoftBody(mesh, wc.Isotropic(1e4, 0.3, 1000.0), device=device)
+    body.fix("z == zmin")
+    body.velocities = np.tile((3.0, 0.0, -10.0), (body.node_count, 1))
+    sim = wc.Simulation(body, model=wc.NeoHookean(), integrator=integrator, gravity=(0.0, 0.0, -9.81))
+    with pytest.warns(wc.StabilityWarning, match=r"continues from t = 0 s with steps of backward Euler"):
+        sim.advance_steps(24)
+    assert np.abs(body.displacements.numpy()).max() < 0.002
+    assert np.abs(body.velocities.numpy()).max() < 0.1
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_static_answers_are_finite_or_say_why_not(device, name):
     body = beam(device, **CASES[name][0])

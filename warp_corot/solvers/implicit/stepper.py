@@ -63,6 +63,8 @@ class ImplicitStepper(Stepper):
         self._joined_newton: JoinedNewton | None = None
         #: Nonzero if all bodies that are solved for together begin again with a first step, int32 [1].
         self.begins = wp.zeros(1, dtype=wp.int32, device=system.device)
+        #: Nonzero while each step is a first step, of backward Euler, int32 [1].
+        self.sturdy, self._is_sturdy = wp.zeros(1, dtype=wp.int32, device=system.device), False
         self._bodies = [BodySteps(self, k) for k in range(len(system.bodies))]
 
     @property
@@ -83,6 +85,18 @@ class ImplicitStepper(Stepper):
             self.rows.prepare()
             if self._joined is None or before != [body.newton for body in self._bodies]:
                 self._join()
+
+    def fall_back(self) -> bool:
+        falls = bool(self.integrator.history) and not self._is_sturdy
+        if falls:
+            self.sturdy.fill_(1)
+            self._is_sturdy = True
+        return falls
+
+    def recover(self) -> None:
+        if self._is_sturdy:
+            self.sturdy.zero_()
+            self._is_sturdy = False
 
     def forces(self, offset: int = 0) -> None:
         for k in range(len(self._bodies)):
@@ -110,7 +124,7 @@ class ImplicitStepper(Stepper):
     def _launch_joined(self, offset: int, joined: JoinedSolve) -> None:
         """Launch a step of all bodies together."""
         assert self.rows is not None
-        self.begins.zero_()
+        wp.copy(self.begins, self.sturdy)
         for body in self._bodies:
             body.launch_changes(offset)
         touched = [body.touched for body in self._bodies]
@@ -281,7 +295,7 @@ class BodySteps:
         self.body.conditions.follow_activations(self.system.pace, offset + 1)
         self._follow_trajectories(offset)
         if self.stepper.rows is None:
-            self._begins.zero_()
+            wp.copy(self._begins, self.stepper.sturdy)
         if not self.history:
             return
         state = self.body.state
