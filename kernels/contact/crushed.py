@@ -15,7 +15,7 @@ from .watch import Watch
 wp.set_module_options({"enable_backward": False})
 
 #: The surface of elements below this volume ratio ignores contact with its own body.
-FLAT = wp.constant(0.05)
+FLAT = wp.constant(0.25)
 
 
 @wp.func
