@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
 from warp_corot.kernels.stepping.integrate import by_vectors, count_support_work, is_finite, vector_at
-from warp_corot.kernels.stepping.pace import DONE, Pace
+from warp_corot.kernels.stepping.pace import DONE, DT, Pace
 
 from .conjugate_gradients import BROKEN
 from .tangent import DAMPING, MASS, STIFFNESS
@@ -173,6 +173,7 @@ def end_step(
     inverse_mass: wp.array[wp.float32],
     base: wp.array[wp.vec4],
     increment: wp.array[wp.vec4],
+    contact_forces: wp.array[wp.vec4],
     pace: Pace,
     offset: int,
     # In and out
@@ -187,6 +188,9 @@ def end_step(
 ):
     """Find the state after the step. If the solve has broken down, displacements become NaN, and ``bad_step`` records
     the step.
+
+    Nodes with ``contact_forces`` take the velocity and the acceleration h1 of backward Euler: contact decides how far
+    they go, and schemes that damp nothing would alternate about that. The array has one entry if this is not needed.
     """
     i = wp.tid()
     which = begins[0]
@@ -204,6 +208,12 @@ def end_step(
             store_node(h1, i, table[which, FIRST, 0] * d + combined(table, FIRST, which, velocity, first, second))
         if h2.shape[0] > 1:
             store_node(h2, i, table[which, SECOND, 0] * d + combined(table, SECOND, which, velocity, first, second))
+        if contact_forces.shape[0] > 1:
+            push = load_node(contact_forces, i)
+            if wp.dot(push, push) > 0.0:
+                dt = float(pace.seconds[DT])
+                after = d / dt
+                store_node(h1, i, (after - velocity) / dt)
         velocity = after
     d = d / table[which, STAGE, 0]
     if status[i / world_nodes] == BROKEN:

@@ -18,7 +18,7 @@ from warp_corot.elasticity import Model
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, checked_things, shown
 from warp_corot.inputs.indices import checked_indices
-from warp_corot.solvers import GeneralizedAlpha, Integrator, Newmark, QuasiStatic, Stepper
+from warp_corot.solvers import GeneralizedAlpha, Integrator, QuasiStatic, Stepper
 from warp_corot.solvers.ranks import ALONE, Ranks
 from warp_corot.solvers.system import System
 
@@ -113,11 +113,6 @@ def check_implicit(integrator: Integrator, *, touches: bool, remeshes: bool, ord
     if not integrator.is_implicit:
         return
     name = type(integrator).__name__
-    if touches and isinstance(integrator, Newmark):
-        raise InputError(
-            f"{name} does not support contact, because it keeps the vibrations that impacts start; BackwardEuler, BDF2 "
-            "and GeneralizedAlpha(spectral_radius=0) damp them"
-        )
     if touches and isinstance(integrator, GeneralizedAlpha) and integrator.spectral_radius > 0.0:
         raise InputError(
             f"{name} supports contact only with spectral_radius=0, where forces are those at the end of a step; it is "

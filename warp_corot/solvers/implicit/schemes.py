@@ -71,6 +71,8 @@ class ImplicitIntegrator(Integrator):
     is_implicit: ClassVar[bool] = True
     #: The number of vectors that a step keeps for the next one.
     history: ClassVar[int] = 0
+    #: Whether nodes that are touched take velocities of backward Euler.
+    settles_contact: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if self.dt is None or not SHORTEST <= checked_number(self.dt, "dt", "s") < math.inf:
@@ -183,6 +185,7 @@ class Newmark(ImplicitIntegrator):
     gamma: float = 0.5
 
     history: ClassVar[int] = 1
+    settles_contact: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         super().__post_init__()

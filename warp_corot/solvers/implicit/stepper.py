@@ -410,7 +410,9 @@ class BodySteps:
         body, system, newton = self.body, self.system, self.newton
         state, conditions = body.state, body.conditions
         inputs = [self._begins, self._table, self.operator.node_count, status, conditions.inverse_mass]
-        inputs += [newton.base, newton.increment, system.pace.arrays, offset]
+        rests = self.stepper.integrator.settles_contact and (self.held is not None or self.stepper.rows is not None)
+        inputs += [newton.base, newton.increment, state.contact_forces if rests else self._none]
+        inputs += [system.pace.arrays, offset]
         outputs = [state.velocities, *self._h, state.displacements, *self._left, system.bad_step]
         self._launch(kernels.end_step, inputs, outputs)
         system.ranks.complete(self.k, state.displacements)
