@@ -67,6 +67,24 @@ def test_rank_0_hands_out_parts_of_other_bodies(folder):
 
 
 @pytest.mark.slow
+def test_two_ranks_draw_the_contact_of_the_whole_body(folder):
+    from pxr import Usd, UsdGeom
+
+    box = ("box", "--level", "3", "--ground", "--duration", "0.05", "--device", "cpu")
+    done = on_ranks(2, "-m", "warp_corot", "simulate", *box, "-o", "two.usda")
+    assert done.returncode == 0, done.stderr
+    assert simulate(*box, "-o", "one.usda") == 0
+    found = []
+    for name in ("one.usda", "two.usda"):
+        stage = Usd.Stage.Open(name)
+        mesh = stage.GetPrimAtPath("/SoftBody/surface")
+        found.append(np.array(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("contactForce").Get(1.0)))
+    assert found[0][:, 1].sum() > 0.01
+    # Both runs choose their own steps, and the body has just landed.
+    np.testing.assert_allclose(found[1][:, 1].sum(), found[0][:, 1].sum(), rtol=0.2)
+
+
+@pytest.mark.slow
 def test_what_does_not_work_is_refused_in_one_line(folder):
     done = on_ranks(2, "-m", "warp_corot", "simulate", "box", "--level", "3", "--remesh", "-o", "out.usda")
     assert done.returncode != 0

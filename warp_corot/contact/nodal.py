@@ -10,20 +10,29 @@ import numpy.typing as npt
 from warp_corot.mesh.surfaces.bound import SurfaceMesh
 
 if TYPE_CHECKING:
+    from warp_corot.body.soft_body import SoftBody
+
     from .contacts import Contacts
 
 Floats = npt.NDArray[np.float64]
 
 
-def contact_at_nodes(contacts: Contacts, k: int, world: int) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+def contact_at_nodes(
+    contacts: Contacts, k: int, body: SoftBody, world: int
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
     """Contact of a body in the last step; waits for the device. Zero if the mesh has changed since.
+
+    Args:
+        contacts: Contact of the simulation.
+        k: The number of the body there.
+        body: The body; on several ranks the whole one, of which ``contacts`` has this rank's part.
+        world: The world.
 
     Returns:
         The forces on the nodes of one world [N], float32 [N, 3], and the pressure averaged at them [Pa], float32 [N].
     """
-    body, part = contacts.system.bodies[k], contacts.surface.parts[k]
     count = body.world_node_count
-    if body.version != part.version:
+    if contacts.system.bodies[k].version != contacts.surface.parts[k].version:
         return np.zeros((count, 3), np.float32), np.zeros(count, np.float32)
     forces = body.contact_forces.numpy()[world * count : (world + 1) * count]
     pressures = body.contact_pressure.numpy().reshape(body.worlds, -1)[world]

@@ -294,7 +294,8 @@ def _touched(sim: Simulation, joined: _Joined) -> Touched | None:
 
     if sim.contact is None:
         return None
-    found = [contact_at_nodes(sim.contact, k, world.index) for k, world in enumerate(joined.worlds)]
+    drawn = zip(sim.bodies, joined.worlds, strict=True)
+    found = [contact_at_nodes(sim.contact, k, body, world.index) for k, (body, world) in enumerate(drawn)]
     return Touched(*(np.concatenate(each) for each in zip(*found, strict=True)))
 
 
