@@ -29,7 +29,7 @@ def pressed(device):
     sim = wc.Simulation(
         [low, high],
         obstacles=[floor, wc.Ground((0.1, 0.0, 1.0), -0.001), probe, pincers, ball],
-        contact=wc.Contact(friction=0.4, self_contact=True),
+        contact=wc.Contact(friction=0.4, self_contact=True, flat_edges=True),
         gravity=DOWN,
         integrator=wc.SymplecticEuler(viscosity=1e-3),
     )
@@ -46,7 +46,8 @@ def remeshed(device):
     probe = wc.Tool(wc.Sphere(0.008))
     probe.follow([0.0, 0.04], [(0.02, 0.02, 0.0281), (0.02, 0.02, 0.023)])
     options = wc.OnlineRemesh(refine_above=1.005, simplify_below=1.001, max_level=5, every=16)
-    return wc.Simulation(body, obstacles=[probe], gravity=(0, 0, 0), remesh=options)
+    contact = wc.Contact(flat_edges=True)
+    return wc.Simulation(body, obstacles=[probe], contact=contact, gravity=(0, 0, 0), remesh=options)
 
 
 @pytest.mark.parametrize("make", [pytest.param(pressed, marks=pytest.mark.slow), remeshed])
@@ -59,6 +60,7 @@ def test_a_resumed_run_is_the_uninterrupted_one(tmp_path, make):
     resumed = wc.Simulation.load(tmp_path / "state.npz")
     assert [type(each) for each in resumed.obstacles] == [type(each) for each in whole.obstacles]
     assert len(resumed.grasps) == len(whole.grasps)
+    assert resumed.contact.options == whole.contact.options
     for one, other in zip(parted.bodies, resumed.bodies, strict=True):
         np.testing.assert_array_equal(one.contact_forces.numpy(), other.contact_forces.numpy())
         np.testing.assert_array_equal(one.contact_pressure.numpy(), other.contact_pressure.numpy())
