@@ -161,6 +161,30 @@ def test_two_organs_collide(ball, device):
     assert now.kinetic + now.elastic < 1.001 * (energy.kinetic + energy.elastic)
 
 
+def test_the_prongs_of_a_fork_touch_each_other(device):
+    """Two plates press them together. The tetrahedra around them would have crossed by 6 mm."""
+    base = wc.Domain.capsule((-0.012, 0, 0), (0.012, 0, 0), 0.006)
+    prongs = [wc.Domain.capsule((x, 0, 0), (x, 0, 0.05), 0.005) for x in (-0.012, 0.012)]
+    mesh = wc.TetForest.from_domain(base | prongs[0] | prongs[1], target_elements=500)
+    body = wc.SoftBody(mesh, SOFT, device=device)
+    body.fix("z < 0.002")
+    plates = [wc.Tool(wc.Box((0.01, 0.04, 0.012), position=(x, 0.0, 0.042)), speed=0.2) for x in (-0.024, 0.024)]
+    integrator = wc.SymplecticEuler(damping=20.0, viscosity=3e-3)
+    contact = wc.Contact(friction=0.3, self_contact=True)
+    sim = wc.Simulation(body, obstacles=plates, contact=contact, integrator=integrator, gravity=(0, 0, 0))
+    for sign, plate in zip((-1, 1), plates, strict=True):
+        plate.move((sign * 0.0135, 0.0, 0.042))
+    sim.advance(0.08)
+    own = [point for point in sim.contacts() if point.other is body]
+    assert own
+    assert min(point.gap for point in own) > -1e-4
+    rest, now = body.contact_surface.points, body.contact_surface.moved(body.displacements.numpy())
+    tips = rest[:, 2] > 0.03
+    left, right = (now[tips & (sign * rest[:, 0] > 0.0), 0] for sign in (-1, 1))
+    assert left.max() - right.min() < 1e-3
+    assert -plates[0].wrench.numpy()[0][0] == pytest.approx(plates[1].wrench.numpy()[0][0], rel=0.2)
+
+
 def test_a_needle_does_not_pass_between_the_points(ball, device):
     body = wc.SoftBody(ball, SOFT, device=device)
     body.fix("z < -0.012")
