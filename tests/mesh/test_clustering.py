@@ -42,6 +42,12 @@ def test_the_two_sides_of_a_sheet_stay_two():
     assert coarse.volume == pytest.approx(surface.volume, rel=0.25)
 
 
-def test_what_is_smaller_than_a_cube_vanishes():
-    surface = wc.TetForest.from_domain(wc.Domain.sphere(0.01), target_elements=500).surface()
-    assert len(clustered(surface, np.full(len(surface.points), 1.0)).triangles) == 0
+def test_a_piece_that_is_smaller_than_a_cube_stays_as_it_is():
+    near, far = wc.Domain.sphere(0.01), wc.Domain.sphere(0.003, (0.02, 0.0, 0.0))
+    surface = wc.TetForest.from_domain(near | far, cell_size=0.004, max_level=6).surface()
+    coarse = clustered(surface, np.full(len(surface.points), 0.01))
+    small, left = (each.points[:, 0] > 0.015 for each in (surface, coarse))
+    assert 0 < left.sum() == small.sum()
+    assert (~left).sum() < 0.5 * (~small).sum()
+    np.testing.assert_array_equal(*edges_of(coarse))
+    assert coarse.euler_characteristic == 4

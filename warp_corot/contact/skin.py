@@ -82,8 +82,7 @@ def own_surface(mesh: TetForest | TetMesh) -> SurfaceMesh | None:
     level = np.zeros(mesh.node_count)
     np.maximum.at(level, mesh.tets.ravel(), np.repeat(mesh.levels, 4))
     nearest = np.take_along_axis(whole.nodes, np.argmax(whole.weights, axis=1)[:, None], axis=1)[:, 0]
-    found = clustered(whole, APART * mesh.cell_size * 2.0 ** (-level[nearest] / 3.0))
-    return found if len(found.triangles) else None
+    return clustered(whole, APART * mesh.cell_size * 2.0 ** (-level[nearest] / 3.0))
 
 
 def _edges_of(triangles: Ints) -> tuple[Ints, Ints]:

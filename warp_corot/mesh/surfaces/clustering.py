@@ -22,45 +22,61 @@ def clustered(surface: SurfaceMesh, sizes: Floats) -> SurfaceMesh:
     """A surface with vertices about a size apart; each is a vertex of the given one.
 
     Vertices become one if they are in the same cube of that size and a path of edges within it connects them, so that
-    the two sides of a sheet stay two. A closed surface stays closed. Parts smaller than a cube vanish.
+    the two sides of a sheet stay two. A closed surface stays closed. Parts smaller than a cube vanish, but a piece of
+    the surface that would vanish as a whole stays as it is.
 
     Args:
         surface: The surface.
         sizes: The size at each of its vertices [m], [V]; vertices of different sizes stay apart.
     """
-    found = _clustered(surface, sizes, 0.0)
+    kept, triangles = _merged(surface.points, surface.triangles, sizes, 0.0)
     # Vertices on both sides of a cube's wall may still be close together.
-    sizes = sizes[found[1]]
-    return _clustered(found[0], 0.5 * sizes, 0.5)[0]
+    again, triangles = _merged(surface.points[kept], triangles, 0.5 * sizes[kept], 0.5)
+    kept = kept[again]
+    pieces = _connected(_edges(surface.triangles), len(surface.points))
+    lost = np.zeros(len(surface.points), bool)
+    lost[surface.triangles] = True
+    lost &= ~np.isin(pieces, pieces[kept])
+    if lost.any():
+        places = np.cumsum(lost) - 1 + len(kept)
+        whole = surface.triangles[lost[surface.triangles].all(axis=1)]
+        triangles, kept = np.concatenate([triangles, places[whole]]), np.append(kept, np.flatnonzero(lost))
+    return replace(
+        surface,
+        points=surface.points[kept],
+        nodes=surface.nodes[kept],
+        weights=surface.weights[kept],
+        triangles=triangles.astype(np.int32),
+        sides=None,
+    )
 
 
-def _clustered(surface: SurfaceMesh, sizes: Floats, shift: float) -> tuple[SurfaceMesh, Ints]:
-    """One pass with cubes that are shifted by a fraction of their size; and the vertices that are left."""
-    points, triangles = surface.points, surface.triangles
+def _merged(points: Floats, triangles: Ints, sizes: Floats, shift: float) -> tuple[Ints, Ints]:
+    """One pass with cubes that are shifted by a fraction of their size: the vertices that are left, and triangles of
+    these."""
     cubes = np.column_stack([np.floor(points / sizes[:, None] + shift), sizes])
     _, cube = np.unique(cubes, axis=0, return_inverse=True)
     cube = cube.ravel()
-    ends = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    ends = ends[cube[ends[:, 0]] == cube[ends[:, 1]]]
-    links = coo_array((np.ones(len(ends), np.int8), ends.T), shape=(len(points),) * 2)
-    count, cluster = connected_components(links, directed=False)
+    ends = _edges(triangles)
+    cluster = _connected(ends[cube[ends[:, 0]] == cube[ends[:, 1]]], len(points))
+    count = int(cluster.max(initial=-1)) + 1
     members = np.bincount(cluster, minlength=count)
     middles = np.column_stack([np.bincount(cluster, points[:, axis], count) for axis in range(3)]) / members[:, None]
     far = np.linalg.norm(points - middles[cluster], axis=1)
     order = np.lexsort((far, cluster))
-    kept = order[np.searchsorted(cluster[order], np.arange(count))]
-    triangles = _distinct(cluster[triangles])
-    used, corners = np.unique(triangles, return_inverse=True)
-    kept = kept[used]
-    coarse = replace(
-        surface,
-        points=points[kept],
-        nodes=surface.nodes[kept],
-        weights=surface.weights[kept],
-        triangles=corners.reshape(-1, 3).astype(np.int32),
-        sides=None,
-    )
-    return coarse, kept
+    nearest = order[np.searchsorted(cluster[order], np.arange(count))]
+    used, corners = np.unique(_distinct(cluster[triangles]), return_inverse=True)
+    return nearest[used], corners.reshape(-1, 3)
+
+
+def _edges(triangles: Ints) -> Ints:
+    return triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+
+
+def _connected(ends: Ints, count: int) -> Ints:
+    """The number of the connected part that each vertex belongs to."""
+    links = coo_array((np.ones(len(ends), np.int8), ends.T), shape=(count, count))
+    return connected_components(links, directed=False)[1]
 
 
 def _distinct(triangles: Ints) -> Ints:
