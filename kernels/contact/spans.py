@@ -107,10 +107,13 @@ def find_span(
     if gap > far or wp.max(w) > CORNER:
         return found
     corners = wp.matrix_from_rows(a, b, c)
-    for k in range(3):
+    # This loop is not unrolled, so that there is one distance function to compile.
+    k = int(0)
+    while k < 3:
         there, _normal = distance_to(shapes, o, pose, corners[k], most)
         if there <= gap + CLOSER * law.tolerance:
             return found
+        k += 1
     found.is_near = True
     found.shares = w
     found.gap = gap
