@@ -14,6 +14,7 @@ from warp_corot.kernels.subtrees.memory import memory_of
 from warp_corot.kernels.tables.shapes import VOLUME, fingerprint
 from warp_corot.kernels.tables.subtree import HANDEDNESS, LEAVES
 
+from .shared import kept_share
 from .subtrees import LeafMaterial, OwnBlocks, leaf_axes, own_block
 from .values import inverse_block
 
@@ -35,8 +36,10 @@ def keep_rows(shape: int, of: Dilatation) -> wp.Kernel:
         leaf_numbers: wp.array[wp.int32],
         elements: ForestElements,
         u: wp.array[wp.vec4],
+        mu: wp.array[float],
         lam: wp.array[float],
         stride: int,
+        most: float,
         # Out
         rows: wp.array[wp.vec4],
     ):
@@ -46,6 +49,7 @@ def keep_rows(shape: int, of: Dilatation) -> wp.Kernel:
         row = mat10()
         sum = float(0.0)
         total = float(0.0)
+        shear = float(0.0)
         for leaf in range(8):
             t = first + leaf
             theta, slope = measure(own_gradient(elements, t, u))
@@ -53,6 +57,7 @@ def keep_rows(shape: int, of: Dilatation) -> wp.Kernel:
             weight = modulus * rest_volume(elements, t)
             sum += weight * theta
             total += weight
+            shear += mu[t * stride] * rest_volume(elements, t)
             f0, f1, f2, f3 = nodal_forces(elements, t, in_local_frame(elements, t, -modulus * slope))
             row[wp.static(leaves[leaf][0])] += f0
             row[wp.static(leaves[leaf][1])] += f1
@@ -60,7 +65,7 @@ def keep_rows(shape: int, of: Dilatation) -> wp.Kernel:
             row[wp.static(leaves[leaf][3])] += f3
         factor = float(0.0)
         if total > 0.0:
-            factor = wp.sqrt(wp.max(curvature_of(sum / total), 0.0) / total)
+            factor = wp.sqrt(kept_share(total, shear, most) * wp.max(curvature_of(sum / total), 0.0) / total)
         size = float(0.0)
         for n in range(10):
             size += wp.length(row[n])

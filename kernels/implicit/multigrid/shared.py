@@ -75,9 +75,18 @@ def add_row(rows: wp.array[wp.vec4], place: int, part: wp.vec3):
     rows[place] = rows[place] + wp.vec4(part[0], part[1], part[2], 0.0)
 
 
+@wp.func
+def kept_share(lam: float, mu: float, most: float):
+    """The share of a group's lambda that is left if it is ``most`` mu at most."""
+    share = float(1.0)
+    if lam > most * mu:
+        share = most * mu / lam
+    return share
+
+
 @functools.cache
 def write_rows(of: Dilatation) -> wp.Kernel:
-    """Write the rows at displacements u, with w - 1 in the fourth lane."""
+    """Write the rows at displacements u, with w - 1 in the fourth lane; lambda counts as ``most`` mu at most."""
     measure, curvature_of = of.measure, of.curvature
 
     @unique_kernel()
@@ -88,8 +97,10 @@ def write_rows(of: Dilatation) -> wp.Kernel:
         groups: GroupNodes,
         elements: ForestElements,
         u: wp.array[wp.vec4],
+        mu: wp.array[float],
         lam: wp.array[float],
         stride: int,
+        most: float,
         # Out
         rows: wp.array[wp.vec4],
     ):
@@ -100,6 +111,7 @@ def write_rows(of: Dilatation) -> wp.Kernel:
             rows[k] = wp.vec4()
         sum = float(0.0)
         total = float(0.0)
+        shear = float(0.0)
         for i in range(groups.ranges[g][0], groups.ranges[g][1]):
             t = world * world_elements + groups.members[i]
             theta, slope = measure(own_gradient(elements, t, u))
@@ -107,6 +119,7 @@ def write_rows(of: Dilatation) -> wp.Kernel:
             weight = modulus * rest_volume(elements, t)
             sum += weight * theta
             total += weight
+            shear += mu[t * stride] * rest_volume(elements, t)
             f0, f1, f2, f3 = nodal_forces(elements, t, in_local_frame(elements, t, -modulus * slope))
             corners = groups.corners[i]
             add_row(rows, first + (corners & 255), f0)
@@ -115,7 +128,7 @@ def write_rows(of: Dilatation) -> wp.Kernel:
             add_row(rows, first + ((corners >> 24) & 255), f3)
         factor = float(0.0)
         if total > 0.0:
-            factor = wp.sqrt(wp.max(curvature_of(sum / total), 0.0) / total)
+            factor = wp.sqrt(kept_share(total, shear, most) * wp.max(curvature_of(sum / total), 0.0) / total)
         size = float(0.0)
         for k in range(first, end):
             row = factor * row_at(rows, k)

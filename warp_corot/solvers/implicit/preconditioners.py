@@ -18,6 +18,9 @@ from .tangent import TangentOperator
 PLAIN: dict[str, Any] = {"most_lambda": 4.0}
 #: The same where they share it at nodes. As the two differ, better smoothing saves no iterations there.
 AT_NODES: dict[str, Any] = {"degree": 2, "rise": 0, **PLAIN}
+#: Elements that share their dilatation in groups. A larger lambda would take smoothers that multigrid does not have.
+#: Left to conjugate gradients, it costs fewer iterations.
+IN_GROUPS: dict[str, Any] = {"most_shared": 40.0}
 #: A short cycle on the CPU: its sweeps, and the number of nodes of a level that is not made coarser.
 SHORT: dict[str, Any] = {"sweeps": 1, "few_nodes": 24}
 #: The smoother's degree on the finest level of several ranks, which cannot sweep: of short cycles, and of others.
@@ -34,15 +37,15 @@ def _multigrid(operator: TangentOperator, short_cycles: bool) -> Multigrid:
     if short_cycles and operator.device.is_cpu:
         # Solves that begin near the answer take few iterations, which are worth less than what they cost.
         options, members = SHORT | (PLAIN if shares else {}), None
-    elif shares and members is None:
-        options = AT_NODES
+    elif shares:
+        options = AT_NODES if members is None else IN_GROUPS
     is_turned = not operator.field.is_linear
     over_ranks = {"degree": SHORT_DEGREE if "sweeps" in options else DEGREE, "is_turned": is_turned, **options}
     found = operator.ranks.multigrid(operator.number, over_ranks | {"stiffening": stiffening, "members": members})
     if found is not None:
         return found
-    if operator.device.is_cuda and operator.body.sizes.elements >= FEWEST_OVER_SUBTREES and not options:
-        options = {"assembled": False}
+    if operator.device.is_cuda and operator.body.sizes.elements >= FEWEST_OVER_SUBTREES and options in ({}, IN_GROUPS):
+        options = options | {"assembled": False}
     return Multigrid(operator.body, is_turned=is_turned, stiffening=stiffening, members=members, **options)
 
 

@@ -60,6 +60,7 @@ class Multigrid:
         few_nodes: Levels with more nodes than this get a coarser one, if there is one.
         stiffening: Viscous over elastic stress at one strain [s], as in the operator's D.
         most_lambda: Lambda is at most this many times mu.
+        most_shared: The same for groups that share their dilatation.
         members: Returns the groups of elements, among those below a number, that share their dilatation; None: none do.
         half: Whether the cycle uses matrices in half precision; only where lambda is less than some 64 times mu.
         sweeps: Number of Gauss-Seidel sweeps that smooth, only on the CPU; zero: Chebyshev's iteration.
@@ -84,6 +85,7 @@ class Multigrid:
         few_nodes: int = MOST_DENSE,
         stiffening: float = 0.0,
         most_lambda: float = np.inf,
+        most_shared: float = np.inf,
         members: Callable[[int], Members] | None = None,
         half: bool = False,
         sweeps: int = 0,
@@ -95,6 +97,7 @@ class Multigrid:
             raise InputError(f"degree is {degree!r}; it must be 1 or more")
         self.discretization = discretization_of(body)
         self.is_turned, self.stride, self.degree, self.stiffening = is_turned, stride, degree, stiffening
+        self.most_shared = min(most_shared, 1e30)
         self.most_lambda, self.rise, self.few_nodes = most_lambda, rise, few_nodes
         self._find_members = members
         self._is_half, self.sweeps, self._assembled = half, sweeps, assembled
@@ -225,7 +228,8 @@ class Multigrid:
         found = finest.pattern
         if self._members is not None:
             inputs = [discretization.sizes.world_elements, self._members.entries, self._members.arrays, elements]
-            inputs += [operator.displacements, discretization.lam, discretization.material_stride]
+            inputs += [operator.displacements, discretization.mu, discretization.lam, discretization.material_stride]
+            inputs += [self.most_shared]
             finest.launch(shared.write_rows(self._members.law), self._members.count, inputs, [self._rows])
         inputs = [discretization.sizes.world_elements, found.entries, elements, self._frames, self._gradients]
         inputs += [discretization.mu, discretization.lam, discretization.material_stride, scales, self.stiffening]
@@ -265,6 +269,7 @@ class Multigrid:
             stiffening=self.stiffening,
             most_lambda=self.most_lambda,
             members=members,
+            most_shared=self.most_shared,
         )
         elements = cast("ForestElements", self.discretization.elements)
         pattern = finder.of_roots(counts[1], batches, fine.roots, elements.nodes, rank)

@@ -46,7 +46,7 @@ class SubtreeLevel(SmoothedLevel):
         rank: The rank of each node number, int32 [M].
         free: As for every level.
         degree: The degree of the smoother.
-        is_turned, stiffening, most_lambda: As for ``Multigrid``.
+        is_turned, stiffening, most_lambda, most_shared: As for ``Multigrid``.
         members: The subtrees as groups that share their dilatation, or None.
 
     Attributes:
@@ -68,10 +68,12 @@ class SubtreeLevel(SmoothedLevel):
         stiffening: float,
         most_lambda: float,
         members: Members | None,
+        most_shared: float,
     ):
         worlds, device = discretization.worlds, discretization.device
         super().__init__(len(rank), worlds, len(rank), free, degree)
         self.stiffening, self._discretization, self._batches = stiffening, discretization, tuple(batches)
+        self._most_shared = min(most_shared, 1e30)
         self._keep_turns, self._law = subtrees.keep_turns(is_turned), None if members is None else members.law
         self._material = subtrees.LeafMaterial()
         self._material.mu, self._material.lam = discretization.mu, discretization.lam
@@ -141,7 +143,7 @@ class SubtreeLevel(SmoothedLevel):
         inputs: list[Any] = [count, leaves, elements, u]
         wp.launch(self._keep_turns, (8, count), inputs, [self._turns[k]], device=self.device)
         if self._law is not None:
-            inputs += [discretization.lam, discretization.material_stride]
+            inputs += [discretization.mu, discretization.lam, discretization.material_stride, self._most_shared]
             kernel = diagonals.keep_rows(batch.shape, self._law)
             wp.launch(kernel, count, inputs, [self._rows[k]], device=self.device)
         given = [self._material, self._turns[k], self._rows[k]]
