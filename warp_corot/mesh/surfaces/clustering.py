@@ -55,10 +55,11 @@ def _merged(points: Floats, triangles: Ints, sizes: Floats, shift: float) -> tup
     """One pass with cubes that are shifted by a fraction of their size: the vertices that are left, and triangles of
     these."""
     cubes = np.column_stack([np.floor(points / sizes[:, None] + shift), sizes])
-    _, cube = np.unique(cubes, axis=0, return_inverse=True)
-    cube = cube.ravel()
-    ends = _edges(triangles)
-    cluster = _connected(ends[cube[ends[:, 0]] == cube[ends[:, 1]]], len(points))
+    first, second = _edges(triangles).T
+    together = np.ones(len(first), bool)
+    for numbers in cubes.T:
+        together &= numbers[first] == numbers[second]
+    cluster = _connected(np.column_stack([first[together], second[together]]), len(points))
     count = int(cluster.max(initial=-1)) + 1
     members = np.bincount(cluster, minlength=count)
     middles = np.column_stack([np.bincount(cluster, points[:, axis], count) for axis in range(3)]) / members[:, None]
@@ -70,7 +71,9 @@ def _merged(points: Floats, triangles: Ints, sizes: Floats, shift: float) -> tup
 
 
 def _edges(triangles: Ints) -> Ints:
-    return triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    """The edges of a closed surface, each once [E, 2]."""
+    ends = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    return ends[ends[:, 0] < ends[:, 1]]
 
 
 def _connected(ends: Ints, count: int) -> Ints:
@@ -88,9 +91,11 @@ def _distinct(triangles: Ints) -> Ints:
     # Begin each with its lowest corner, so that the last two say which way it faces.
     first = np.argmin(triangles, axis=1)
     a, b, c = np.take_along_axis(triangles, (first[:, None] + np.arange(3)) % 3, axis=1).T
-    faces, which = np.unique(np.column_stack([a, np.minimum(b, c), np.maximum(b, c)]), axis=0, return_inverse=True)
-    facing = np.bincount(which.ravel(), np.where(b < c, 1.0, -1.0), len(faces)).astype(int)
-    found = np.repeat(faces, np.abs(facing), axis=0)
+    low, high = np.minimum(b, c), np.maximum(b, c)
+    _, of_pair = np.unique(a.astype(np.int64) << 32 | low, return_inverse=True)
+    _, one, which = np.unique(of_pair.astype(np.int64) << 32 | high, return_index=True, return_inverse=True)
+    facing = np.bincount(which.ravel(), np.where(b < c, 1.0, -1.0), len(one)).astype(int)
+    found = np.repeat(np.column_stack([a, low, high])[one], np.abs(facing), axis=0)
     turned = np.repeat(facing < 0, np.abs(facing))
     found[turned] = found[turned][:, [0, 2, 1]]
     return found
