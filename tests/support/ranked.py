@@ -67,10 +67,14 @@ def obstacles_of(case: str) -> list[wc.Ground | wc.Tool]:
         ball = wc.Tool(wc.Sphere(0.01))
         ball.follow([0.0, 0.05], [[0.025, 0.093, 0.08], [0.025, 0.068, 0.08]])
         return [ground, ball]
-    # Implicit steps hold nodes only.
-    radius = 0.004 if case == "touched" else 0.015
-    tool = wc.Tool(wc.Capsule(radius, 0.06))
-    heights = radius + np.array([0.049, 0.043, 0.026])
+    heights = np.array([0.049, 0.043, 0.026])
+    if case == "touched":
+        radius = 0.004
+        tool = wc.Tool(wc.Capsule(radius, 0.06))
+        heights += radius
+    else:
+        # On several ranks, implicit steps hold nodes only. A plate is never between nodes.
+        tool = wc.Tool(wc.Ground((0.0, -1.0, 0.0), 0.0))
     tool.follow([0.0, 0.02, 0.05], np.stack([np.full(3, 0.03), heights, [0.04, 0.044, 0.05]], axis=1))
     return [ground, tool]
 
