@@ -105,6 +105,7 @@ CASES = {
     "worlds": lambda: body_of(wc.TetForest.box((1, 1, 3), 0.064, level=4), 0.3, worlds=2),
     "touched": touched,
     "meeting": meeting,
+    "stretched": lambda: stretched(),
     "pressed": lambda: touched(wc.TetForest.box((1, 1, 3), 0.05, level=4)),
     "bdf2": touched,
     "shared": lambda: body_of(graded(), 0.3),
@@ -123,12 +124,25 @@ def moved(sim: wc.Simulation, body: wc.SoftBody) -> None:
     sim.advance(0.01)
 
 
+def stretched() -> wc.SoftBody:
+    """A bar whose elements are bisected where a load stretches it, and merged elsewhere."""
+    body = wc.SoftBody(wc.TetForest.box((4, 1, 1), 0.05, level=5), wc.Isotropic(6e3, 0.49, 1000.0), device="cpu")
+    body.fix("x < 1e-9")
+    body.load("x > 0.19", [0.1, 0.0, 0.0])
+    return body
+
+
 def options_of(case: str) -> dict[str, Any]:
     """The options with which a case is stepped."""
     integrator = INTEGRATORS.get(case, wc.SymplecticEuler)()
     contact = wc.Contact(friction=0.2, self_contact=True) if case == "meeting" else None
     touching = {"obstacles": obstacles_of(case), "contact": contact}
-    return {"model": MODELS.get(case), "integrator": integrator, **touching}
+    made: dict[str, Any] = {"model": MODELS.get(case), "integrator": integrator, **touching}
+    if case == "stretched":
+        made["remesh"] = wc.OnlineRemesh(
+            refine_above=1.05, simplify_below=1.01, min_level=3, max_level=8, every=30, capacity=4000
+        )
+    return made
 
 
 def bodies_of(case: str) -> list[wc.SoftBody]:
@@ -155,6 +169,7 @@ def made(case: str, deterministic: bool, kept: Path | None) -> dict[str, np.ndar
     positions = [body.positions for body in bodies]
     found = {"x": gathered(positions), "v": gathered([body.velocities for body in bodies])}
     found["energy"] = np.array(sim.energy())
+    found["elements"] = np.array([body.element_count for body in bodies])
     if sim.solves is not None:
         found["iterations"] = np.array(sim.solves)
     found["numbers"] = np.array([sim.steps, sim.dt, sim.time, *sim.dt_range])
@@ -325,7 +340,7 @@ def make_all(folder: Path, size: int, names: list[str]) -> None:
     several ranks resume; these keep those of ``KEPT``."""
     found: dict[str, Any] = {}
     for name in names:
-        keeps = size == 1 or name in KEPT
+        keeps = name != "stretched" and (size == 1 or name in KEPT)
         found |= made(name, True, folder / f"{name}.{size}.npz" if keeps else None)
     if size == 1 and "worlds" in names:
         kept_in_parts(folder / "parts.1.npz")

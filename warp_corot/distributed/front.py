@@ -153,6 +153,11 @@ class LedSimulation(OnOne):
 
     def __init__(self, bodies: SoftBody | Sequence[SoftBody], *, in_parts: bool = False, **options: Any):
         options = {name: value for name, value in options.items() if value is not None}
+        if options.get("remesh"):
+            raise InputError(
+                "remeshing does not work on several ranks yet where rank 0 leads others; run on one process, or use "
+                "warp_corot.distributed.Simulation"
+            )
         if in_parts:
             wholes = [bodies] if isinstance(bodies, SoftBody) else list(bodies)
             parts, _, nodes = handed_bodies(wholes, options, wholes[0].device, mpi.world())

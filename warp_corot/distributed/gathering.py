@@ -23,6 +23,12 @@ def register(following: Iterable[Following]) -> None:
         _all.add(each)
 
 
+def forget(following: Iterable[Following]) -> None:
+    """Forget bodies and their former parts."""
+    for each in following:
+        _all.discard(each)
+
+
 def gather(array: wp.array) -> npt.NDArray[Any] | None:
     """A nodal array of a body, such as ``body.positions``, with the values of all ranks. All ranks must call.
 

@@ -7,7 +7,7 @@ import dataclasses
 import statistics
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -23,6 +23,7 @@ from warp_corot.elasticity.dilatation.options import ELEMENT, SHARED, shares_dil
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.uniform_part import SUBTREE_DEPTH
+from warp_corot.remesh.remeshing import Remeshing
 from warp_corot.simulation import simulation as on_one
 from warp_corot.simulation.energy import WorldEnergies
 from warp_corot.solvers.ranks import Ranks
@@ -33,6 +34,8 @@ from .partition import Partition
 from .parts import Part
 from .ranks import MpiRanks
 
+#: The attributes of a simulation that belong to its parts.
+CHANGED = ("ranks", "bodies", "fields", "pace", "system", "stable_dt", "safe_step", "guard", "stepper", "recorded")
 #: If parts have at most this many elements, one rank tries its own first; larger ones take longer than compiling on
 #: several ranks.
 FEW_ELEMENTS = 200_000
@@ -45,6 +48,36 @@ class SimulationOfParts(on_one.Simulation):
     def __init__(self, ranks: MpiRanks, parts: Sequence[Part], **options: Any):
         self.ranks: MpiRanks = ranks
         super().__init__(parts, **options)
+
+    def take_remeshing(self, remeshing: Remeshing, after: Callable[[], None]) -> None:
+        """Take passes over the whole bodies.
+
+        Args:
+            remeshing: The passes.
+            after: Is called when a pass is due; it makes the pass, and calls ``become`` if the meshes have changed.
+        """
+        self.remeshing, self._pass = remeshing, after
+
+    def follow_motion(self) -> None:
+        self._pass()
+
+    def _find_stable_steps(self) -> list[float]:
+        #: The largest stable step of each part's body at rest [s].
+        self.stable_steps = super()._find_stable_steps()
+        return self.stable_steps
+
+    def become(self, other: SimulationOfParts) -> None:
+        """Go on with the parts of another simulation, at the same time and with the same hooks."""
+        self.guard.forget()
+        known, guard = self.pace.known, self.guard.state
+        guard["counted"] = np.full_like(guard["counted"], np.nan)
+        for name in CHANGED:
+            setattr(self, name, getattr(other, name))
+        self.pace.put_back(known)
+        if self.safe_step is not None:
+            self.safe_step.find_rest(other.stable_steps)
+        self.guard.resume(**guard)
+        self.running.begin_again()
 
     def measured_costs(self, count: int) -> list[float]:
         """``Simulation.measured_costs``, for displacements that are up to date."""

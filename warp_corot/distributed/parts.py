@@ -58,7 +58,10 @@ class Part(SoftBody):
     @property
     def masses(self) -> npt.NDArray[np.float64]:
         """Lumped masses of the nodes that this rank moves [kg], float64 [worlds * n]; zero for ghosts."""
-        return np.where(self.is_own, super().masses, 0.0)
+        if isinstance(self._whole.mesh, InParts):
+            return np.where(self.is_own, super().masses, 0.0)
+        # Nodes of a remeshed body have what they carry.
+        return np.where(self.is_own, self._whole.masses[self.numbers.in_worlds(self._whole.worlds)], 0.0)
 
     @property
     def surface_faces(self) -> tuple[Ints, Ints]:

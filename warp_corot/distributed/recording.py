@@ -57,6 +57,7 @@ def record(
     """
     if not isinstance(sim, Simulation):
         raise InputError("sim must be a Simulation of warp_corot.distributed; warp_corot.record takes others")
+    sim.check_not_remeshed("a recording")
     checked_path(path, "path")
     count = frame_count(duration, fps)
     if world is None and sim.worlds > 1:

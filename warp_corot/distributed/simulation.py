@@ -18,6 +18,7 @@ from warp_corot.elasticity import Corotated, Model
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_count
 from warp_corot.inputs.device import checked_device
+from warp_corot.remesh.remeshing import Remeshing
 from warp_corot.simulation import simulation as on_one
 from warp_corot.simulation.energy import Energy, WorldEnergies
 from warp_corot.simulation.parts import checked_bodies, checked_gravity, checked_integrator, checked_models
@@ -26,8 +27,9 @@ from warp_corot.solvers import Integrator, SymplecticEuler
 
 from . import checkpoint, in_pieces, mpi
 from .following import Following
-from .gathering import register
+from .gathering import forget, register
 from .of_parts import SimulationOfParts, compile_once, of_their_own, part_of, settled_model
+from .parts import Part
 from .ranks import MpiRanks, Together
 from .refusals import check_supported
 
@@ -46,8 +48,8 @@ class Simulation:
         costs: The cost of an element on each rank, in any unit, [ranks]; None: the same everywhere.
         device: The device of this rank; None: that of the bodies. With bodies on the CPU and "cuda" here, a card holds
             only this rank's parts.
-        others: ``obstacles`` and ``contact`` as for ``warp_corot.Simulation``; its further arguments do not work on
-            several ranks yet.
+        others: ``obstacles``, ``contact`` and ``remesh`` as for ``warp_corot.Simulation``. After a pass of remeshing
+            the meshes are divided anew.
 
     Attributes:
         bodies: Tuple of the whole bodies.
@@ -81,26 +83,54 @@ class Simulation:
         check_supported(self.bodies, models, integrator, others, cards)
         models = tuple(settled_model(m, body, comm) for m, body in zip(models, self.bodies, strict=True))
         self.gravity = checked_gravity(gravity, self.bodies[0].mesh.up_axis)
+        self._division = costs, here
+        self._remeshing: Remeshing | None = None
+        if (remesh := others.pop("remesh", None)) is not None:
+            self._remeshing = Remeshing(self.bodies, models, remesh, deterministic=deterministic)
+            bound = zip(models, self.bodies, strict=True)
+            self._remeshing.serve([model.bind(body, deterministic=deterministic) for model, body in bound])
+        self._options: dict[str, Any] = {"model": models, "integrator": integrator, "gravity": self.gravity} | others
+        self._options["deterministic"] = deterministic
+        parts = self._divided(models, deterministic)
+        compile_once(comm, parts, **{name: value for name, value in self._options.items() if name != "deterministic"})
+        self._parts = self._made(parts)
+        if self._remeshing is not None:
+            self._parts.take_remeshing(self._remeshing, self._remesh)
+        register(self._following)
+
+    def _divided(self, models: Sequence[Model], deterministic: bool) -> list[Part]:
+        """This rank's parts of the bodies as they are now."""
+        comm, (costs, here) = self._comm, self._division
         parts = [part_of(body, m, comm, costs, here) for body, m in zip(self.bodies, models, strict=True)]
         for part in parts:
             part.discretization.sums_by_subtrees = bool(deterministic)
         self._following = [Following(body, part, comm) for body, part in zip(self.bodies, parts, strict=True)]
         for each in self._following:
             each.take_over()
-        compile_once(comm, parts, model=models, integrator=integrator, gravity=self.gravity, **others)
+        return parts
+
+    def _made(self, parts: list[Part]) -> SimulationOfParts:
+        """The simulation of these parts."""
         for each in self._following:
             each.take_over()
-        records = not integrator.is_implicit
-        ranks = MpiRanks(comm, self.bodies, parts, settled=bool(deterministic), records=records)
-        self._parts: SimulationOfParts = SimulationOfParts(
-            ranks,
-            parts,
-            model=models,
-            integrator=integrator,
-            gravity=self.gravity,
-            deterministic=deterministic,
-            **others,
-        )
+        settled, records = bool(self._options["deterministic"]), not self._options["integrator"].is_implicit
+        ranks = MpiRanks(self._comm, self.bodies, parts, settled=settled, records=records)
+        return SimulationOfParts(ranks, parts, **self._options)
+
+    def _remesh(self) -> None:
+        """Make the passes that are due over the whole bodies, on all ranks alike, and divide the new meshes."""
+        remeshing = self._remeshing
+        assert remeshing is not None
+        self._publish()
+        self.collect()
+        before = [body.version for body in self.bodies]
+        remeshing.run(self._parts.steps)
+        remeshing.step_may_change()
+        if before == [body.version for body in self.bodies]:
+            return
+        forget(self._following)
+        parts = self._divided(self._options["model"], self._options["deterministic"])
+        self._parts.become(self._made(parts))
         register(self._following)
 
     def __getattr__(self, name: str) -> Any:
@@ -152,6 +182,7 @@ class Simulation:
 
     def reset(self, worlds: npt.ArrayLike | wp.array | None = None) -> None:
         """Reset worlds to their initial state, like ``warp_corot.Simulation.reset``."""
+        self.check_not_remeshed("reset")
         self._take_over()
         for each in self._following:
             each.take_initial()
@@ -305,6 +336,7 @@ class Simulation:
         Raises:
             InputError: On all ranks, if one cannot write to the folder.
         """
+        self.check_not_remeshed("save")
         self._take_over()
         if any(each.is_in_parts for each in self._following):
             in_pieces.save(path, self._parts, self._following, self._comm)
@@ -351,6 +383,15 @@ class Simulation:
         return made
 
     # --- pieces ----------------------------------------------------------------------------------------------------
+
+    def check_not_remeshed(self, what: str) -> None:
+        """Check that no body is remeshed, for what does not work with those.
+
+        Raises:
+            InputError: One is.
+        """
+        if self._remeshing is not None:
+            raise InputError(f"{what} of bodies that are remeshed does not work on several ranks yet")
 
     def _take_over(self) -> None:
         for k, each in enumerate(self._following):

@@ -93,6 +93,12 @@ class Running:
         """Continue from what ``state`` gave."""
         self._returns, self._wrong_until, self._judged = int(returns), float(wrong_until), int(judged)
 
+    def begin_again(self) -> None:
+        """Go on with other launches and another guard, at the same time."""
+        sim = self._sim
+        self._energies = EnergyControl(sim.guard, sim.recorded, sim.safe_step)
+        self._energies.begin()
+
     def make(self, count: int) -> None:
         """Make a number of steps, with hooks and passes."""
         sim = self._sim

@@ -68,9 +68,11 @@ class DilatationField(ForceField):
         self._make_room()
 
     def plan_of(self, discretization: Discretization) -> Plan:
-        """The given plan if it has subtrees, or if the mesh changes, because only one plan is kept up to date."""
+        """The given plan if it has subtrees, or leaves outside of these, or if the mesh changes, because only one plan
+        is kept up to date."""
         plan = self.shear.plan
-        if plan.kinds or plan.counts is not None or not isinstance(discretization.mesh, TetForest):
+        has_leaves = bool(plan.kinds) or len(plan.flat) > 0
+        if has_leaves or plan.counts is not None or not isinstance(discretization.mesh, TetForest):
             return plan
         return discretization.plan(deterministic=self.deterministic)
 
