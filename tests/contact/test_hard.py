@@ -213,7 +213,8 @@ def test_a_thin_tool_stabs_an_organ(device, kind, radius, speed, seed, itself):
         if kind == "capsule":
             assert closest_to_rod(surface_of(body), tool, 0.03) > 0.95 * radius
     assert 0.1 < felt < 1e3
-    sim.advance(taken + 0.2)
+    # A blow at 50 m/s makes the whole ball ring for longer.
+    sim.advance(taken + (0.4 if speed > 10.0 else 0.2))
     assert np.linalg.norm(body.positions.numpy() - points, axis=1).max() < 2e-3
     assert volume_ratios(mesh, body).min() > 0.5
 

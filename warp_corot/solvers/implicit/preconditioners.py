@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -25,8 +26,9 @@ IN_GROUPS: dict[str, Any] = {"most_shared": 40.0}
 SHORT: dict[str, Any] = {"sweeps": 1, "few_nodes": 24}
 #: The smoother's degree on the finest level of several ranks, which cannot sweep: of short cycles, and of others.
 SHORT_DEGREE, DEGREE = 2, 5
-#: The number of elements from which on the finest level goes over subtrees on CUDA, where it can.
-FEWEST_OVER_SUBTREES = 1 << 18
+#: The number of elements from which on the finest level goes over subtrees on CUDA, where it can: none, until this has
+#: run on a card. By counting bytes, 262,144 or fewer.
+FEWEST_OVER_SUBTREES = math.inf
 
 
 def _multigrid(operator: TangentOperator, short_cycles: bool) -> Multigrid:
