@@ -17,7 +17,7 @@ DEEPER = wp.constant(2.0)
 #: Distances are compared with this relative tolerance, and this absolute one [m].
 NEARLY, TINY = wp.constant(1.0e-4), wp.constant(1.0e-7)
 #: Families of Newton's records, its bits for the family, and its flags for a place inside and for a side that is not
-#: known; see ``newton._src.geometry.soft_contacts_mesh``.
+#: known; see Newton's ``soft_contacts_mesh``.
 OF_PARTICLE, OF_VERTEX, FAMILY, INSIDE, UNKNOWN = (wp.constant(k) for k in (0, 1, 7, 8, 32))
 #: Unit of distances as whole numbers [m], and how many times it a number of a feature counts.
 GRAIN, NUMBERS = wp.constant(1.0e-9), wp.constant(wp.int64(4294967296))

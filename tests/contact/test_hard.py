@@ -206,13 +206,16 @@ def test_a_thin_tool_stabs_an_organ(device, kind, radius, speed, seed, itself):
     integrator = wc.SymplecticEuler(viscosity=2e-3)
     contact = wc.Contact(self_contact=itself)
     sim = wc.Simulation(body, obstacles=tool, contact=contact, gravity=(0.0, 0.0, 0.0), integrator=integrator)
-    felt = 0.0
+    felt = moved = 0.0
     for _ in range(10):
         sim.advance(0.1 * (taken + 0.01))
         felt = max(felt, float(np.linalg.norm(tool.wrench.numpy()[0][:3])))
+        moved = max(moved, float(np.linalg.norm(body.displacements.numpy(), axis=1).max()))
         if kind == "capsule":
             assert closest_to_rod(surface_of(body), tool, 0.03) > 0.95 * radius
-    assert 0.1 < felt < 1e3
+    # After a blow at 50 m/s the ball is ahead of the tool whenever we look.
+    assert felt < 1e3
+    assert moved > 0.1 * (begins - ends)
     # A blow at 50 m/s makes the whole ball ring for longer.
     sim.advance(taken + (0.4 if speed > 10.0 else 0.2))
     assert np.linalg.norm(body.positions.numpy() - points, axis=1).max() < 2e-3

@@ -110,7 +110,8 @@ class RigidForces:
         """The arrays that it keeps from step to step."""
         touches = self.touches
         sides = {"touch_normals": touches.normal.flatten(), "touch_forces": touches.force.flatten()}
-        return {"anchors": self.anchors.flatten(), **sides}
+        borne = {"forces": self.forces.flatten()} if self.surface.is_borne else {}
+        return {"anchors": self.anchors.flatten(), **sides, **borne}
 
     # --- launches --------------------------------------------------------------------------------------------------
 

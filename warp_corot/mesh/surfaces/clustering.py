@@ -9,8 +9,6 @@ from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from .bound import SurfaceMesh
 
@@ -78,6 +76,9 @@ def _edges(triangles: Ints) -> Ints:
 
 def _connected(ends: Ints, count: int) -> Ints:
     """The number of the connected part that each vertex belongs to."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     links = coo_array((np.ones(len(ends), np.int8), ends.T), shape=(count, count))
     return connected_components(links, directed=False)[1]
 
