@@ -12,9 +12,6 @@ from typing import Any
 
 from warp_corot.errors import InputError
 from warp_corot.inputs.processes import process_count, process_number
-from warp_corot.solvers import INTEGRATORS
-
-from .implicit import integrator_name, is_static
 
 #: Time for rank 0 to reach the place where another rank failed, and to report it [s].
 WAIT = 5.0
@@ -76,6 +73,10 @@ def one_first(others: Others | None) -> Iterator[None]:
 def hands_out(options: Sequence[argparse.Namespace]) -> bool:
     """Whether rank 0 makes the bodies and hands out parts; otherwise every rank makes them whole, as contact, shared
     rotations and multigrid require."""
+    from warp_corot.solvers import INTEGRATORS
+
+    from .implicit import integrator_name, is_static
+
     args = options[0]
     touches = (args.tool, args.tool_path, args.drop, args.touch, args.self_contact)
     whole = any(each.remesh or each.rotation_level is not None for each in options)
