@@ -217,6 +217,7 @@ def test_surfaces_have_velocities(folder):
     np.testing.assert_allclose(velocities[:, 1], -9.81 / c * (1 - np.exp(-c * t)), rtol=0.01)
 
 
+@pytest.mark.slow
 def test_an_output_goes_into_a_scene(bar, folder):
     pytest.importorskip("newton")
     pytest.importorskip("newton_usd_schemas")

@@ -67,6 +67,7 @@ def test_reading_and_meshing_show_since_when_and_lines_stay_whole(tmp_path):
     assert said.rpartition("meshing box")[2].count("\r") >= 1
 
 
+@pytest.mark.slow
 def test_a_run_of_many_worlds_shows_how_far_it_is(tmp_path):
     said = on_terminal(MANY_WORLDS, tmp_path)
     assert "simulating" in said

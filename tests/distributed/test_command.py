@@ -93,7 +93,7 @@ def test_what_does_not_work_is_refused_in_one_line(folder):
     assert "does not work on several ranks yet" in said[0]
 
 
-@pytest.mark.parametrize("how", [pytest.param("killed", marks=pytest.mark.slow), "failed", "hung"])
+@pytest.mark.parametrize("how", ["failed", *(pytest.param(how, marks=pytest.mark.slow) for how in ("killed", "hung"))])
 def test_a_rank_that_ends_takes_the_others_along(how, monkeypatch):
     if how == "hung":
         monkeypatch.setenv("WARP_COROT_PATIENCE", "5")

@@ -65,7 +65,7 @@ def weight_of(model):
 BALL = pytest.param("ball", marks=pytest.mark.slow)
 
 
-@pytest.mark.parametrize("shape", ["sphere", "box", BALL])
+@pytest.mark.parametrize("shape", ["sphere", pytest.param("box", marks=pytest.mark.slow), BALL])
 def test_a_body_between_the_nodes_is_carried(device, shape):
     """It falls through without contacts of edges and triangles; with them, those reported carry its weight."""
     model = ball_on_block(device, shape, damp=100.0)

@@ -267,6 +267,7 @@ def test_states(run, device, poisson, tmp_path):
             assert row["flagged"] == 0.0
 
 
+@pytest.mark.slow
 def test_bodies(run, tmp_path):
     """A body that is meshed, one that is refused, and an earlier run for comparison."""
     pytest.importorskip("trimesh")
@@ -326,7 +327,8 @@ def test_preconditioners_are_compared(run, tmp_path):
 
 
 @needs_mpi
-@pytest.mark.parametrize("strong", ["", pytest.param("6", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("strong", ["", "6"])
 def test_scaling(strong, run, monkeypatch, tmp_path):
     """Weak scaling and its predictions; strong scaling takes as many processes again."""
     monkeypatch.setenv("OMPI_MCA_mpi_yield_when_idle", "1")  # ranks that wait leave the cores to other tests

@@ -12,7 +12,8 @@ from warp_corot.discretization.changing.pools import DeviceForest
 from warp_corot.experiments.remeshing import CELL, SCENES, TISSUE, run, table
 from warp_corot.kernels.remesh.criteria import nearness, strain, von_mises_stress
 
-CASES = [pytest.param("bar", "elongation", marks=pytest.mark.slow), ("bar", "strain"), ("slab", "nearness")]
+SLOW = [pytest.param("bar", each, marks=pytest.mark.slow) for each in ("elongation", "strain")]
+CASES = [*SLOW, ("slab", "nearness")]
 LEVELS = [9, pytest.param(10, marks=pytest.mark.slow), pytest.param(11, marks=pytest.mark.slow)]
 
 
