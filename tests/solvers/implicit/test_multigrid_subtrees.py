@@ -78,6 +78,7 @@ def check(level, dilatation, poisson, device, rng):
     return with_matrix, over_subtrees
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(*short)
 def test_the_level_is_the_same_as_with_its_matrix(level, dilatation, poisson, device, rng):
     """Diagonal, residual and coarser matrices: two worlds, held nodes anywhere, mass, damping, and other forces."""
