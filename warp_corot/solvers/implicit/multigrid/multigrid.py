@@ -303,7 +303,8 @@ class Multigrid:
         degrees = [self.degree + self.rise * k for k in range(len(counts))]
         if roots_depth is not None and roots_depth % 3:
             # Steps on the finest level are cheap there, and take the place of those on the level of roots.
-            degrees = [self.degree + STEPS_MORE, 0, *degrees[1:-1]]
+            coarser = degrees[1:-1] if self._members is None else degrees[2:]
+            degrees = [self.degree + STEPS_MORE, 0, *coarser]
         elif roots_depth is None and len(counts) > 1 and 2 * counts[1] > counts[0] and self._members is None:
             # A level that is hardly coarser helps the finest one, unless that has couplings of its own.
             degrees = [max(degree - STEPS_LESS, 1) for degree in degrees]
