@@ -45,6 +45,20 @@ def test_two_elastic_balls_touch_as_hertz_says(device):
     np.testing.assert_allclose(low, -high, atol=1e-6 * force)
 
 
+def test_a_moving_plate_does_not_sink_into_the_upper_block(device):
+    """It moves by 0.4 mm in each step."""
+    low, high = block(device, 0.0), block(device, 0.0201)
+    low.fix("z == zmin")
+    top = float(high.positions.numpy()[:, 2].max()) + 0.0101
+    plate = wc.Tool(wc.Box((0.1, 0.1, 0.02), position=(0.02, 0.02, top)))
+    plate.follow([0.0, 0.16], [(0.02, 0.02, top), (0.02, 0.02, top - 0.004)])
+    sim = wc.Simulation([low, high], obstacles=plate, gravity=(0.0, 0.0, 0.0), integrator=EULER)
+    sim.advance_steps(5)
+    above = sim.contact.obstacles.poses()[0, 0, 2] - 0.01 - high.positions.numpy()[:, 2].max()
+    assert plate.wrench.numpy()[0, 2] > 0.1
+    assert abs(above) < 1e-6
+
+
 @pytest.mark.parametrize("speed", [1.0, 5.0])
 def test_nothing_passes(device, speed):
     """A block that moves by up to four times its own height in a step falls on another one of the same height."""

@@ -9,6 +9,7 @@ import warp as wp
 from warp_corot.kernels.contact import joined as kernels
 from warp_corot.kernels.contact import row_meetings
 from warp_corot.kernels.contact.law import Law
+from warp_corot.kernels.contact.motion import Surface
 from warp_corot.solvers.system import System
 
 from .pairs import Pairs
@@ -47,6 +48,7 @@ class JoinedRows:
         self._system, self._pairs, self._law, self.device = system, pairs, law, system.device
         self.locates = wp.zeros(1, dtype=wp.int32, device=self.device)
         self._made = (-1, -1)
+        self._places: Surface | None = None
         self.prepare()
 
     @property
@@ -55,6 +57,7 @@ class JoinedRows:
 
     def prepare(self) -> None:
         """Take the present surfaces and rooms; not while launches are recorded."""
+        self._take_surface()
         sizes = (self._pairs.surface.count, self._pairs.room)
         if sizes == self._made:
             return
@@ -67,6 +70,16 @@ class JoinedRows:
         self._joined = joined
         self._added = wp.zeros(sizes[0], dtype=wp.vec3, device=self.device)
         self._marked = wp.zeros(sizes[0], dtype=wp.int32, device=self.device)
+
+    def _take_surface(self) -> None:
+        """Places of their own, where pairs are located: obstacles find the places where they are when a step begins."""
+        arrays = self._pairs.surface.arrays
+        if self._places is not None and self._places.rest.ptr == arrays.rest.ptr:
+            return
+        self._places = Surface()
+        for name in ("node", "world", "rest", "d", "yielding", "f", "bearing"):
+            setattr(self._places, name, getattr(arrays, name))
+        self._places.x = wp.zeros_like(arrays.x)
 
     def reserve(self, motion: float) -> None:
         """Search for pairs with a larger margin, if anything may begin to move so far in a step [m]."""
@@ -119,7 +132,7 @@ class JoinedRows:
     def launch_located(self, d: wp.array, *, is_first: bool) -> None:
         """Launch the search for the closest points of pairs, at the beginning of the step or after motions d, if it is
         due."""
-        surface, joined = self._pairs.surface.arrays, self._joined
+        surface, joined = self._places, self._joined
         inputs = [int(is_first), d, joined, surface]
         wp.launch(kernels.place_nodes, self._pairs.surface.count, inputs, device=self.device)
         inputs = [int(is_first), self._law, self._system.pace.arrays, d, surface, self._pairs.meeting]
