@@ -187,6 +187,20 @@ def test_a_given_step_ends_with_an_error_where_energy_comes_from_nowhere(device)
     assert np.isfinite(sim.body.positions.numpy()).all()
 
 
+def test_energy_from_nowhere_in_some_worlds_is_an_error_as_in_one(device, rng):
+    mesh = wc.TetForest.box(cells=(1, 1, 1), cell_size=0.1, level=0)
+    body = wc.SoftBody(mesh, wc.Isotropic(1e5, 0.4, 1e3), worlds=3, device=device)
+    limit = wc.Simulation(body).stable_dt
+    velocities = 0.1 * rng.standard_normal((body.node_count, 3))
+    velocities[: len(mesh.points)] = 0.0
+    body.velocities = velocities
+    with pytest.warns(wc.StabilityWarning, match="beyond the largest stable"):
+        sim = wc.Simulation(body, integrator=wc.SymplecticEuler(dt=1.1 * limit))
+    sim.on_step(lambda s: None, every=4)
+    with pytest.raises(wc.UnstableError, match="J of energy came from nowhere"):
+        sim.advance(1.0)
+
+
 def test_no_step_helps_against_forces_without_bounds(device):
     sim = wc.Simulation(beam(device))
     sim.body.load([sim.body.node_count - 1], [0.0, 3e38, 0.0])

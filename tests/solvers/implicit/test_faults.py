@@ -7,6 +7,7 @@ import pytest
 import warp_corot as wc
 
 DOWN = (0.0, -9.81, 0.0)
+WORLDS = 8
 
 
 def beam(device, young=5e3, poisson=0.45, held=True):
@@ -59,14 +60,16 @@ def test_steps_end_in_a_finite_state(device, name, integrator):
 @pytest.mark.parametrize("integrator", [wc.GeneralizedAlpha(dt=0.06), wc.Newmark(dt=0.03)], ids=["alpha", "newmark"])
 def test_what_gains_energy_goes_on_with_backward_euler(device, integrator):
     """A block that is thrown onto its own support at 10 m/s turns elements over, and schemes that keep energy then gain
-    it."""
+    it. When is chaotic: of blocks that differ by a millionth, one in ten has not been seen to gain it in 48 steps. So
+    there are eight worlds; if one gains energy, all go back."""
     mesh = wc.TetForest.box(cells=(1, 1, 2), cell_size=0.02, level=0)
-    body = wc.SoftBody(mesh, wc.Isotropic(1e4, 0.3, 1000.0), device=device)
+    body = wc.SoftBody(mesh, wc.Isotropic(1e4, 0.3, 1000.0), worlds=WORLDS, device=device)
     body.fix("z == zmin")
-    body.velocities = np.tile((3.0, 0.0, -10.0), (body.node_count, 1))
+    speeds = np.repeat(np.linspace(1.0, 1.1, WORLDS), len(mesh.points))[:, None]
+    body.velocities = speeds * (3.0, 0.0, -10.0)
     sim = wc.Simulation(body, model=wc.NeoHookean(), integrator=integrator, gravity=(0.0, 0.0, -9.81))
     with pytest.warns(wc.StabilityWarning, match=r"continues from t = 0 s with steps of backward Euler"):
-        sim.advance_steps(24)
+        sim.advance_steps(48)
     assert np.abs(body.displacements.numpy()).max() < 0.002
     assert np.abs(body.velocities.numpy()).max() < 0.1
 

@@ -354,7 +354,7 @@ class Guard:
         worlds = np.flatnonzero(bad)
         worst = worlds[np.argmax(gain[worlds])]
         most = f"gravity, loads and supports have moved {scale[worst]:.3g} J at most"
-        is_slight = bool((gain[worlds] <= GAIN * self._leave * scale[worlds] + floor).all())
+        is_slight = bool((gain[worlds] <= GAIN * self._leave * scale[worlds] + floor[worlds]).all())
         return Fault(f"{gain[worst]:.3g} J of energy came from nowhere ({most})", worlds, is_slight=is_slight)
 
     def _rounding(self) -> Floats:
