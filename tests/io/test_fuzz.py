@@ -22,7 +22,7 @@ SCRIPT = Path(fuzzing.__file__)
 SOME, MANY = 100, 10_000
 #: Formats with fewer in the short run. A binary stage is tried in a fork of this process (30 ms), a series of ten files
 #: and some surfaces of VTK ask for gigabytes (200 and 15 ms), and bodies are made (10 ms).
-FEWER = {"usdc": 20, "usdc-tets": 20, "dicom": 5, "vtp": 25, "checkpoint-remesh": 20, "obj": 50, "options": 50}
+FEWER = {"usdc": 20, "usdc-tets": 20, "dicom": 1, "vtp": 25, "checkpoint-remesh": 20, "obj": 50, "options": 50}
 #: Formats whose reader is tested by another format in the short run.
 LONG_ONLY = {
     *("ply-text", "off", "stl-text", "usdz", "usda-tets", "scene", "nii", "mgh", "mgz", "nrrd-gz", "mhd", "checkpoint"),

@@ -87,14 +87,17 @@ class View:
 
     def run(self) -> None:
         """Run until ``close`` or an exception, for example Ctrl-C's."""
+        due = time.perf_counter()
         while not self._over.is_set():
-            started = time.perf_counter()
             with self._lock:
                 if self._over.is_set():
                     break
                 self._show()
                 period = 1.0 / self.session.controls.fps
-            self._over.wait(max(period - (time.perf_counter() - started), 0.0))
+            # Waits end late by a fraction of a millisecond, which would add up from frame to frame.
+            now = time.perf_counter()
+            due = max(due + period, now)
+            self._over.wait(due - now)
 
     def start(self) -> None:
         """Run the simulation in the page's own thread."""
