@@ -3,6 +3,7 @@
 import math
 from contextlib import nullcontext
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -173,6 +174,11 @@ def test_a_divided_forest_is_made_whole_again():
     np.testing.assert_array_equal(group_numbers(whole, everywhere), group_numbers(mesh, everywhere))
     # A part does not have the whole tree.
     assert fewest < 0.6 * len(mesh.tree.level)
+    # Nor does any rank have the ball's own surface.
+    body, touching = SimpleNamespace(mesh=part, changing=None), {"obstacles": [wc.Ground()]}
+    with pytest.raises(wc.InputError, match="no rank has the surface"):
+        check_supported([body], [], wc.SymplecticEuler(), touching)
+    check_supported([body], [], wc.SymplecticEuler(), touching | {"contact": wc.Contact(on="tetrahedra")})
 
 
 def test_groups_that_wait_for_nodes_are_separate():

@@ -10,8 +10,9 @@ from mpirun import needs_mpi, on_ranks
 import warp_corot as wc
 
 SIZES = (1, 2, 3)
-#: Leaves of several levels, worlds with viscosity, contact, and implicit steps of a general mesh with viscosity.
-CASES = ("forest", "worlds", "touched", "newmark")
+#: Leaves of several levels, worlds with viscosity, contact of a block and of an organ, and implicit steps of a general
+#: mesh with viscosity.
+CASES = ("forest", "worlds", "touched", "organ", "newmark")
 #: On two ranks there is one case.
 SHORT = {2: "forest"}
 
@@ -140,7 +141,7 @@ def test_costs_of_all_ranks_are_measured(runs):
         assert (costs > 0.0).all()
 
 
-@pytest.mark.parametrize(("case", "size"), [("forest", 1), ("touched", 3)])
+@pytest.mark.parametrize(("case", "size"), [("forest", 1), ("touched", 3), ("organ", 3)])
 def test_a_checkpoint_goes_on_with_any_number_of_ranks(runs, case, size):
     """Three ranks go on from their own, and from that of one process."""
     for what in ("x", "numbers"):

@@ -5,6 +5,7 @@ Three ranks make the runs of one rank, two and three, one after another: every p
 
 import resource
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -52,8 +53,14 @@ def touched(mesh: wc.TetForest | None = None) -> wc.SoftBody:
     return wc.SoftBody(mesh, wc.Isotropic(2e3, 0.3, 1000.0), device="cpu")
 
 
+def organ() -> wc.SoftBody:
+    """A ball whose surface lies within its tetrahedra, soft in one world and stiffer in another."""
+    mesh = wc.TetForest.from_domain(wc.Domain.sphere(0.02, centre=(0.0, 0.0, 0.085)), target_elements=400)
+    return wc.SoftBody(mesh, wc.Isotropic(np.array([[5e3], [1e4]]), 0.3, 1000.0), worlds=2, device="cpu")
+
+
 #: Cases with contact.
-TOUCHING = ("touched", "meeting", "pressed", "bdf2")
+TOUCHING = ("touched", "organ", "meeting", "organs", "pressed", "bdf2")
 #: Cases whose checkpoints several ranks keep.
 KEPT = (*TOUCHING, "multigrid")
 
@@ -63,6 +70,10 @@ def obstacles_of(case: str) -> list[wc.Ground | wc.Tool]:
     if case not in TOUCHING:
         return []
     ground = wc.Ground((0.0, 1.0, 0.0), -0.002, friction=0.3)
+    if case.startswith("organ"):
+        probe = wc.Tool(wc.Sphere(0.006))
+        probe.follow([0.0, 0.04], [[0.002, 0.0, 0.1125], [0.003, 0.0, 0.104]])
+        return [wc.Ground((0.0, 0.0, 1.0), 0.0648), probe]
     if case == "meeting":
         ball = wc.Tool(wc.Sphere(0.01))
         ball.follow([0.0, 0.05], [[0.025, 0.093, 0.08], [0.025, 0.068, 0.08]])
@@ -85,6 +96,14 @@ def meeting() -> list[wc.SoftBody]:
     return [touched(), wc.SoftBody(mesh, wc.Isotropic(5e3, 0.3, 1000.0), device="cpu")]
 
 
+def organs() -> list[wc.SoftBody]:
+    """The ball, and a block beside it, which it is pressed against."""
+    mesh = wc.TetForest.box((1, 1, 1), 0.02, level=4, origin=(0.0202, -0.01, 0.075))
+    block = wc.SoftBody(mesh, wc.Isotropic(5e3, 0.3, 1000.0), worlds=2, device="cpu")
+    block.fix("x > 0.039")
+    return [organ(), block]
+
+
 #: Integrators of cases that are not stepped by the default one.
 INTEGRATORS = {
     "implicit": lambda: wc.BackwardEuler(0.01, preconditioner="diagonal"),
@@ -101,12 +120,14 @@ INTEGRATORS = {
 #: Models of cases that have another than the default one.
 MODELS = {"shared": wc.Corotated(rotation_level=2)}
 
-CASES = {
+CASES: dict[str, Callable[[], wc.SoftBody | list[wc.SoftBody]]] = {
     "forest": lambda: body_of(graded(), 0.49),
     "tets": lambda: body_of(jittered(), 0.49),
     "worlds": lambda: body_of(wc.TetForest.box((1, 1, 3), 0.064, level=4), 0.3, worlds=2),
     "touched": touched,
+    "organ": organ,
     "meeting": meeting,
+    "organs": organs,
     "stretched": lambda: stretched(),
     "pressed": lambda: touched(wc.TetForest.box((1, 1, 3), 0.05, level=4)),
     "bdf2": touched,
@@ -137,7 +158,7 @@ def stretched() -> wc.SoftBody:
 def options_of(case: str) -> dict[str, Any]:
     """The options with which a case is stepped."""
     integrator = INTEGRATORS.get(case, wc.SymplecticEuler)()
-    contact = wc.Contact(friction=0.2, self_contact=True) if case == "meeting" else None
+    contact = wc.Contact(friction=0.2, self_contact=True) if case in ("meeting", "organs") else None
     touching = {"obstacles": obstacles_of(case), "contact": contact}
     made: dict[str, Any] = {"model": MODELS.get(case), "integrator": integrator, **touching}
     if case == "stretched":
@@ -175,7 +196,7 @@ def made(case: str, deterministic: bool, kept: Path | None) -> dict[str, np.ndar
     if sim.solves is not None:
         found["iterations"] = np.array(sim.solves)
     found["numbers"] = np.array([sim.steps, sim.dt, sim.time, *sim.dt_range])
-    found |= {f"wrench{k}": each.wrench.numpy() for k, each in enumerate(options["obstacles"]) if k}
+    found |= {f"wrench{k}": each.wrench.numpy().copy() for k, each in enumerate(options["obstacles"]) if k}
     found["costs"] = np.array(sim.measured_costs(2))
     if kept is not None:
         sim.save(kept)

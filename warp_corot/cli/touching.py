@@ -23,7 +23,6 @@ from warp_corot.solvers import INTEGRATORS
 from .holding import up_of
 from .implicit import integrator_name, is_static
 from .quantities import metres, number
-from .ranks import are_several
 from .summary import length
 from .tool_paths import make_tool, tool_shape
 
@@ -186,7 +185,7 @@ def place_ground(touched: Touched, args: argparse.Namespace, bodies: Sequence[Bo
 
 def _touched_points(body: Body, args: argparse.Namespace) -> Floats:
     """The points of a body on which contact will act [m], [n, 3]."""
-    are_own = not are_several() and not is_static(args) and not INTEGRATORS[integrator_name(args)].is_implicit
+    are_own = not is_static(args) and not INTEGRATORS[integrator_name(args)].is_implicit
     own = own_surface(body.subject.mesh) if are_own else None
     return body.subject.mesh.points[body.subject.used] if own is None else own.points
 

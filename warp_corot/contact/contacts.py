@@ -20,6 +20,7 @@ from .options import SURFACE, Contact
 from .pairs import Pairs, smallest_size
 from .rigid_forces import RigidForces
 from .search import Search
+from .skin import has_own_surface
 from .surface import ContactSurface, Part
 from .tool import Obstacle
 from .warned import OVERLAP, warn_of_crushed, warn_of_overlaps
@@ -47,8 +48,8 @@ class Contacts:
         options: The options of contact.
         stable_dt: Largest stable step of the bodies at rest [s], from which the speed of waves follows.
         dt: The length of a step, if it was given [s].
-        on_surfaces: Whether contact acts on the bodies' own surfaces, if ``options`` say so; implicit steps and ranks
-            support the boundary of the tetrahedra only.
+        on_surfaces: Whether contact acts on the bodies' own surfaces, if ``options`` say so; implicit steps support the
+            boundary of the tetrahedra only.
 
     Attributes:
         surface: The surface nodes and triangles of all bodies.
@@ -73,9 +74,11 @@ class Contacts:
         self.system, self.device, self.options = system, system.device, options
         self.obstacles = Obstacles(obstacles, options.friction, system, dt)
         meets = len(system.bodies) > 1 or options.self_contact
-        is_whole = meets and not system.ranks.is_alone
         are_own = on_surfaces and options.on == SURFACE
-        self.surface = WholeSurface(system) if is_whole else ContactSurface(system.bodies, are_own=are_own)
+        have_own = are_own and any(has_own_surface(system.ranks.whole(body).mesh) for body in system.bodies)
+        is_whole = (meets or have_own) and not system.ranks.is_alone
+        made = WholeSurface(system, are_own=are_own) if is_whole else ContactSurface(system.bodies, are_own=are_own)
+        self.surface: ContactSurface = made
         #: The ranks with other places of the surface.
         self._ranks: Ranks = ALONE if is_whole else system.ranks
         own = [self.surface.places_of(k) for k in range(len(system.bodies))]
@@ -278,13 +281,13 @@ class Contacts:
             inputs += [state.rest, state.forces, state.displacements, state.velocities]
             kernel = motion.PREDICT_MOTION[conditions.loads.dtype]
             self._launch(kernel, count, inputs, [arrays])
-            if surface.parts[k].bearers:
-                inputs = [surface.parts[k].start, surface.bearers, surface.arrays]
-                self._launch(bearing.place_borne, self._count(k), inputs, [])
         if isinstance(surface, WholeSurface):
-            surface.complete(surface.arrays.x, surface.arrays.d, surface.arrays.yielding)
+            surface.complete()
         elif self.rigid is not None and self.rigid.have_edges:
             system.ranks.complete_surface(surface.arrays.d)
+        for k, part in enumerate(surface.parts):
+            if part.bearers:
+                self._launch(bearing.place_borne, self._count(k), [part.start, surface.bearers, surface.arrays], [])
 
     def _solve(self) -> None:
         """Launch the forces in turn: of obstacles on nodes, of obstacles between these, and of soft surfaces."""
@@ -332,7 +335,7 @@ class Contacts:
     def _nodes_of(self, part: Part) -> tuple[int, int, Surface]:
         """The nodes that carry a body's surface: the first one, how many there are, and their arrays."""
         if part.bearers:
-            return part.bearer_start, self.system.worlds * part.bearers, self.surface.bearers
+            return part.bearer_start, self.system.worlds * part.bearers, self.surface.own_bearers
         return part.start, self.system.worlds * part.nodes, self.surface.own
 
     def _count(self, k: int) -> int:

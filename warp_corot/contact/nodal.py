@@ -32,7 +32,7 @@ def contact_at_nodes(
         The forces on the nodes of one world [N], float32 [N, 3], and the pressure averaged at them [Pa], float32 [N].
     """
     count = body.world_node_count
-    if contacts.system.bodies[k].version != contacts.surface.parts[k].version:
+    if contacts.surface.bodies[k].version != contacts.surface.parts[k].version:
         return np.zeros((count, 3), np.float32), np.zeros(count, np.float32)
     forces = body.contact_forces.numpy()[world * count : (world + 1) * count]
     pressures = body.contact_pressure.numpy().reshape(body.worlds, -1)[world]

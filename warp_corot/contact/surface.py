@@ -58,6 +58,7 @@ class ContactSurface:
         bodies: All bodies, with the same number of worlds.
         are_own: Whether contact acts on bodies' own surfaces, where they have one; otherwise on the boundary of their
             tetrahedra.
+        device: The device of the surfaces; None: that of the bodies.
 
     Attributes:
         arrays: The places, as a struct for kernels.
@@ -75,8 +76,8 @@ class ContactSurface:
     #: Whether places of nodes that other ranks move are among them, with all values.
     is_whole = False
 
-    def __init__(self, bodies: Sequence[SoftBody], *, are_own: bool = False):
-        self.bodies, self.worlds, self.device = tuple(bodies), bodies[0].worlds, bodies[0].device
+    def __init__(self, bodies: Sequence[SoftBody], *, are_own: bool = False, device: wp.Device | None = None):
+        self.bodies, self.worlds, self.device = tuple(bodies), bodies[0].worlds, device or bodies[0].device
         self.are_own = are_own
         self.revision = 0
         self.parts: list[Part] = []
@@ -84,8 +85,13 @@ class ContactSurface:
 
     @property
     def own(self) -> Surface:
-        """The nodes that this process moves, as a struct for kernels."""
+        """The places at nodes that this process moves, as a struct for kernels."""
         return self.arrays
+
+    @property
+    def own_bearers(self) -> Surface:
+        """The bearers that this process moves, as a struct for kernels."""
+        return self.bearers
 
     @property
     def solids(self) -> list[tuple[SoftBody, wp.array]]:

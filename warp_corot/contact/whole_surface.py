@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 import warp as wp
 
-from warp_corot.errors import InputError
 from warp_corot.kernels.contact.motion import Surface
 from warp_corot.solvers.system import System
 
@@ -18,62 +18,98 @@ if TYPE_CHECKING:
 
 #: What a surface's struct has besides the nodes.
 SHARED = ("world", "rest", "x", "d", "yielding", "f")
+#: The arrays of places, or of bearers, that ranks exchange.
+EXCHANGED = ("x", "d", "yielding")
 
 
 class WholeSurface(ContactSurface):
-    """The whole surfaces, of which each rank moves some nodes. All ranks do the same with them.
+    """The whole surfaces, of which each rank moves some nodes or bearers. All ranks do the same with them.
 
     Args:
         system: The parts of the bodies that this rank computes.
-
-    Raises:
-        InputError: The bodies are on another device than their parts.
+        are_own: As for ``ContactSurface``.
     """
 
     is_whole = True
 
-    def __init__(self, system: System):
+    def __init__(self, system: System, *, are_own: bool = False):
         self._system = system
         wholes = [system.ranks.whole(body) for body in system.bodies]
-        if wholes[0].device != system.device:
-            raise InputError(
-                f"the bodies are on {wholes[0].device}, and their parts on {system.device}; for contact of soft "
-                "surfaces on several ranks both must be on one device"
-            )
-        super().__init__(wholes)
+        super().__init__(wholes, are_own=are_own, device=system.device)
 
     @property
     def own(self) -> Surface:
         return self._own
 
     @property
+    def own_bearers(self) -> Surface:
+        return self._own_bearers
+
+    @property
     def solids(self) -> list[tuple[SoftBody, wp.array]]:
         return self._solids
 
-    def complete(self, *values: wp.array) -> None:
-        """Launch the exchange after which every rank has the values of all places."""
-        for each in values:
-            self._system.ranks.complete_surface(each)
+    def complete(self) -> None:
+        """Launch the exchange after which every rank has the motion of all places at nodes, and of all bearers."""
+        self._system.ranks.complete_whole_surface(
+            [getattr(self.arrays, name) for name in EXCHANGED], [getattr(self.bearers, name) for name in EXCHANGED]
+        )
 
     def _fill(self) -> None:
         super()._fill()
-        ranks, node = self._system.ranks, self.arrays.node.numpy()
-        found, rest = np.full(len(node), NO_NODE, np.int32), self.arrays.rest.numpy()
-        self._solids = []
+        ranks, self._solids = self._system.ranks, []
+        at_places, at_bearers = (_Held(each) for each in (self.arrays, self.bearers))
         for k, (part, whole) in enumerate(zip(self._system.bodies, self.bodies, strict=True)):
             numbers, is_own = ranks.numbers(k)
             number = np.full(whole.node_count, NO_NODE, np.int32)
             number[numbers[is_own]] = np.flatnonzero(is_own)
-            places = np.arange(len(node))[self.places_of(k)]
-            used = places[node[places] >= 0]
-            found[used] = number[node[used]]
-            rest[used] = whole.state.rest.numpy()[node[used], :3]
+            rest = whole.state.rest.numpy()[:, :3]
+            here = self.parts[k]
+            if here.bearers:
+                at_bearers.take(here.bearer_start, self.worlds * here.bearers, number, rest)
+            else:
+                at_places.take(here.start, self.worlds * here.nodes, number, rest)
             of_nodes = np.full(len(part.state.rest), -1, np.int32)
             of_nodes[: len(numbers)] = self.places[k].numpy()[numbers]
             self._solids.append((part, wp.array(of_nodes, dtype=wp.int32, device=self.device)))
-        self.arrays.rest.assign(rest)
-        self._own = Surface()
+        self._own, self._own_bearers = at_places.own(self.device), at_bearers.own(self.device)
+        ranks.take_whole_surface(at_places.moved, at_bearers.moved)
+
+
+class _Held:
+    """Places of a surface, or its bearers, and which of them this rank moves.
+
+    Args:
+        whole: All of them.
+    """
+
+    def __init__(self, whole: Surface):
+        self._whole, self._node = whole, whole.node.numpy()
+        self._found = np.full(len(self._node), NO_NODE, np.int32)
+        self._rest = whole.rest.numpy()
+
+    def take(self, start: int, count: int, number: npt.NDArray[np.int32], rest: npt.NDArray[np.float32]) -> None:
+        """Take those of a body.
+
+        Args:
+            start, count: Where they are.
+            number: The number in this rank's part of each node of the whole body, -1 for those of other ranks.
+            rest: The rest positions of the nodes [m].
+        """
+        used = start + np.flatnonzero(self._node[start : start + count] >= 0)
+        self._found[used] = number[self._node[used]]
+        self._rest[used] = rest[self._node[used]]
+
+    @property
+    def moved(self) -> npt.NDArray[np.int32]:
+        """Those that this rank moves, int32."""
+        return np.flatnonzero(self._found >= 0).astype(np.int32)
+
+    def own(self, device: wp.Device) -> Surface:
+        """The same arrays with only the nodes that this rank moves, by their numbers in its parts."""
+        self._whole.rest.assign(self._rest)
+        made = Surface()
         for name in SHARED:
-            setattr(self._own, name, getattr(self.arrays, name))
-        self._own.node = wp.array(found, dtype=wp.int32, device=self.device)
-        ranks.take_whole_surface(np.flatnonzero(found >= 0).astype(np.int32))
+            setattr(made, name, getattr(self._whole, name))
+        made.node = wp.array(self._found, dtype=wp.int32, device=device)
+        return made

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from warp_corot.contact.skin import has_own_surface
 from warp_corot.discretization.elements import Mesh
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import shown
@@ -117,7 +118,7 @@ def pieces_of(mesh: Mesh, division: Partition) -> Iterator[Piece]:
         }
         if isinstance(part, TetForest):
             place: tuple[Any, ...] = (part.cells, part.cell_size, part.origin, part.lattice, part.node_ends, part.tree)
-            given |= {"fill": part.fill, "leaf_groups": part.leaf_groups}
+            given |= {"fill": part.fill, "leaf_groups": part.leaf_groups, "is_embedded": has_own_surface(mesh)}
             yield ForestPart, place, whole | given
         else:
             assert isinstance(mesh, TetMesh)

@@ -100,11 +100,15 @@ class Following:
         whole, part = self.whole.state, self.part.state
         if self._triangles is None:
             whole.make_contact_forces()
-            count = self.whole.worlds * len(self.whole.surface_triangles)
+            own_surface = self.part.state.contact_surface
+            triangles = self.whole.surface_triangles if own_surface is None else own_surface.triangles
+            count = self.whole.worlds * len(triangles)
             whole.contact_pressures = wp.zeros(count, dtype=wp.float32, device=self.whole.device)
-            here = self.part.surface_here
+            # All ranks find the pressure on all of a body's own surface.
+            here = self.part.surface_here if own_surface is None else np.arange(len(triangles), dtype=np.int32)
+            whole.contact_surface = own_surface
             shift = np.arange(self.whole.worlds, dtype=np.int32)[:, None]
-            everywhere = (here + len(self.whole.surface_triangles) * shift).ravel()
+            everywhere = (here + len(triangles) * shift).ravel()
             is_whole = len(self.part.state.contact_pressures) == count
             own = everywhere if is_whole else np.arange(len(everywhere), dtype=np.int32)
             self._triangles = Places(everywhere, own, self.whole.device, self.part.device)

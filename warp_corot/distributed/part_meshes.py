@@ -57,6 +57,7 @@ class InParts:
         smallest_volume: Volume of the smallest element of the whole mesh [m^3].
         outer: The triangles of the part's nodes on the surface of the whole mesh, int32 [F, 3]; None: the mesh is a
             box, uniformly bisected.
+        is_embedded: Whether the whole mesh was made from a domain, whose surface lies within the tetrahedra.
     """
 
     numbers: Numbers
@@ -64,6 +65,7 @@ class InParts:
     bounds: npt.NDArray[np.float64]
     smallest_volume: float
     outer: Ints | None
+    is_embedded: bool = False
     points: npt.NDArray[np.float64]
     tets: Ints
 
@@ -125,11 +127,13 @@ class ForestPart(InParts, TetForest):
         bounds: npt.NDArray[np.float64],
         smallest_volume: float | None = None,
         outer: Ints | None = None,
+        is_embedded: bool = False,
         **others: Any,
     ):
         TetForest.__init__(self, *arrays, **others)
         smallest_volume = float(np.min(self.volumes)) if smallest_volume is None else smallest_volume
         self._belong(numbers, element_count, bounds, smallest_volume, outer)
+        self.__dict__["is_embedded"] = is_embedded
 
     def refine(self, leaves: npt.ArrayLike) -> TetForest:
         """A forest in parts cannot be refined, because a rank would bisect without its neighbours.

@@ -194,8 +194,15 @@ class MpiRanks(Ranks):
         self._on_surface = self.exchange_of(self._places.halo, len(self._parts))
         self._yielding = wp.zeros(len(nodes), dtype=wp.float32, device=self.device)
 
-    def take_whole_surface(self, own: Ints) -> None:
-        self._on_surface = self.exchange_of(Halo.to_all(own, self.comm), len(self._parts))
+    def take_whole_surface(self, own: Ints, bearers: Ints) -> None:
+        tag = len(self._parts)
+        self._on_whole_surface = [self.exchange_of(Halo.to_all(each, self.comm), tag) for each in (own, bearers)]
+
+    def complete_whole_surface(self, of_places: Sequence[wp.array], of_bearers: Sequence[wp.array]) -> None:
+        for exchange, arrays in zip(self._on_whole_surface, (of_places, of_bearers), strict=True):
+            for values in arrays:
+                if len(values):
+                    exchange.launch(values)
 
     def numbers(self, k: int) -> tuple[Ints, npt.NDArray[np.bool_]]:
         part = self._parts[k]

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from warp_corot.body.soft_body import SoftBody
+from warp_corot.contact.options import SURFACE, TETRAHEDRA
 from warp_corot.elasticity import Corotated, Linear, Model, NeoHookean, StVenantKirchhoff
 from warp_corot.errors import InputError
 from warp_corot.solvers import Integrator
@@ -42,12 +43,19 @@ def check_supported(
             "contact of soft surfaces does not work on several ranks yet in implicit steps, or with meshes that no "
             "rank holds whole; use one body without self_contact, or explicit steps of whole meshes, or one process"
         )
+    touches = bool(contact or others.get("obstacles"))
+    embedded = any(isinstance(body.mesh, InParts) and body.mesh.is_embedded for body in bodies)
+    if touches and embedded and not integrator.is_implicit and getattr(contact, "on", SURFACE) == SURFACE:
+        raise InputError(
+            f"no rank has the surface of a divided mesh; contact must be Contact(on={TETRAHEDRA!r}), which touches the "
+            "tetrahedra around it, or every rank must make the whole mesh"
+        )
     if getattr(integrator, "preconditioner", None) not in (None, DIAGONAL) and in_parts:
         raise InputError(
             f"the preconditioner {integrator.preconditioner!r} does not work yet with meshes that no rank holds whole; "  # type: ignore[attr-defined]
             f"it must be None or {DIAGONAL!r}"
         )
-    if cards > 1 and (contact or others.get("obstacles")):
+    if cards > 1 and touches:
         raise InputError(
             "contact on several cards is not the same bit for bit as on one yet; deterministic must be False, or take "
             "ranks on the CPU, or one card"

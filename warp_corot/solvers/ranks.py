@@ -109,14 +109,17 @@ class Ranks:
             places: The places of each body.
         """
 
-    def take_whole_surface(self, own: Ints) -> None:
-        """Take the whole surfaces of the bodies, whose places all ranks number alike.
-
-        After ``complete_surface`` every rank has the values of all places.
+    def take_whole_surface(self, own: Ints, bearers: Ints) -> None:
+        """Take the whole surfaces of the bodies, whose places and bearers all ranks number alike.
 
         Args:
             own: The places of nodes that this rank moves, int32.
+            bearers: The bearers that this rank moves, int32.
         """
+
+    def complete_whole_surface(self, of_places: Sequence[wp.array], of_bearers: Sequence[wp.array]) -> None:
+        """Launch the exchange that gives every rank the values of all places at nodes, and of all bearers; arrays of
+        float32 or vec3."""
 
     def numbers(self, k: int) -> tuple[Ints, npt.NDArray[np.bool_]]:
         """The number in the k-th whole body of each node that this rank holds, in all worlds, int32; and whether this

@@ -71,6 +71,7 @@ def pack_obstacles(contacts: Contacts, arrays: Arrays) -> dict[str, Any]:
     return {
         "friction": options.friction,
         "self_contact": options.self_contact,
+        "on": options.on,
         "obstacles": [_pack_tool(tool, each is tool, f"tool{k}.", arrays) for k, (each, tool) in enumerate(given)],
     }
 
