@@ -23,6 +23,9 @@ AT_NODES: dict[str, Any] = {"degree": 2, "rise": 0, **PLAIN}
 IN_GROUPS: dict[str, Any] = {"most_shared": 40.0}
 #: A short cycle on the CPU: its sweeps, and the number of nodes of a level that is not made coarser.
 SHORT: dict[str, Any] = {"sweeps": 1, "few_nodes": 24}
+#: Cycles on the CPU for solves that need few digits: two pairs of sweeps cost half as much as Chebyshev's iteration of
+#: degree 5, and take a third to a half more iterations.
+SWEPT: dict[str, Any] = {"sweeps": 2}
 #: The smoother's degree on the finest level of several ranks, which cannot sweep: of short cycles, and of others.
 SHORT_DEGREE, DEGREE = 2, 5
 #: The number of elements from which on the finest level goes over subtrees on CUDA, where it can. On an H200 a Newton
@@ -31,18 +34,21 @@ SHORT_DEGREE, DEGREE = 2, 5
 FEWEST_OVER_SUBTREES = 1 << 17
 
 
-def _multigrid(operator: TangentOperator, short_cycles: bool) -> Multigrid:
+def _multigrid(operator: TangentOperator, short_cycles: bool, few_digits: bool) -> Multigrid:
     stiffening = 0.0 if operator.viscosity is None else operator.viscosity.seconds
     shares = operator.field.shares_dilatation
     members = operator.field.find_members
     options: dict[str, Any] = {}
-    if short_cycles and operator.device.is_cpu:
+    is_short = short_cycles and operator.device.is_cpu
+    if is_short:
         # Solves that begin near the answer take few iterations, which are worth less than what they cost.
         options, members = SHORT | (PLAIN if shares else {}), None
     elif shares:
         options = AT_NODES if members is None else IN_GROUPS
+    elif few_digits and operator.device.is_cpu:
+        options = SWEPT
     is_turned = not operator.field.is_linear
-    over_ranks = {"degree": SHORT_DEGREE if "sweeps" in options else DEGREE, "is_turned": is_turned, **options}
+    over_ranks = {"degree": SHORT_DEGREE if is_short else DEGREE, "is_turned": is_turned, **options}
     found = operator.ranks.multigrid(operator.number, over_ranks | {"stiffening": stiffening, "members": members})
     if found is not None:
         return found
@@ -52,19 +58,22 @@ def _multigrid(operator: TangentOperator, short_cycles: bool) -> Multigrid:
 
 
 #: The preconditioners by name.
-PRECONDITIONERS: dict[str, Callable[[TangentOperator, bool], Preconditioner]] = {
+PRECONDITIONERS: dict[str, Callable[[TangentOperator, bool, bool], Preconditioner]] = {
     "multigrid": _multigrid,
-    "diagonal": lambda operator, _: BlockDiagonal(operator),
+    "diagonal": lambda operator, *_: BlockDiagonal(operator),
 }
 
 
-def preconditioner_of(name: Any, operator: TangentOperator, *, short_cycles: bool = False) -> Preconditioner:
+def preconditioner_of(
+    name: Any, operator: TangentOperator, *, short_cycles: bool = False, few_digits: bool = False
+) -> Preconditioner:
     """A preconditioner by its name; for None, multigrid if the mesh is a forest, else the block diagonal.
 
     Args:
         name: One of ``PRECONDITIONERS``, or None.
         operator: The operator.
         short_cycles: Whether solves begin near the answer and need few digits.
+        few_digits: Whether solves need few digits.
 
     Raises:
         InputError: There is none with this name, or it is multigrid and the mesh is not a forest.
@@ -73,7 +82,7 @@ def preconditioner_of(name: Any, operator: TangentOperator, *, short_cycles: boo
     if name is None:
         is_forest = operator.body.discretization.element_kind is ForestElements
         name = "multigrid" if is_forest and operator.ranks.has_multigrid(operator.number) else "diagonal"
-    return PRECONDITIONERS[name](operator, short_cycles)
+    return PRECONDITIONERS[name](operator, short_cycles, few_digits)
 
 
 def check_preconditioner(name: Any) -> None:

@@ -58,7 +58,7 @@ class StaticSolver:
     ):
         self.body, self.field, self._load_steps = body, field, load_steps
         self.operator = TangentOperator(body, field, exact=True)
-        chosen = preconditioner_of(preconditioner, self.operator)
+        chosen = preconditioner_of(preconditioner, self.operator, few_digits=True)
         self.newton = Newton(self.operator, chosen, gravity, tolerance=tolerance, most=most)
         self.iterations = self.linear_iterations = 0
         self.share = 0.0

@@ -221,7 +221,9 @@ class BodySteps:
         self.operator = TangentOperator(
             self.body, self.field, viscosity=self.viscosity, exact=exact, ranks=system.ranks, number=k
         )
-        self._preconditioner = preconditioner_of(options.preconditioner, self.operator, short_cycles=not exact)
+        self._preconditioner = preconditioner_of(
+            options.preconditioner, self.operator, short_cycles=not exact, few_digits=True
+        )
         self.lagged: Lagged | None = None
         if not exact and isinstance(self._preconditioner, Multigrid):
             self._preconditioner = self.lagged = Lagged(self._preconditioner, self.operator, system.ranks)
