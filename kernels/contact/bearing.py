@@ -8,7 +8,7 @@ from typing import Any
 
 import warp as wp
 
-from .motion import Surface
+from .motion import Foreseen, Surface
 
 wp.set_module_options({"enable_backward": False})
 
@@ -90,6 +90,18 @@ def give_way(s: int, surface: Surface):
     surface.d[s] = surface.d[s] + d
 
 
+@wp.func
+def place_among(place: Foreseen, weight: float, own: Foreseen):
+    """Add a bearer with a weight to a place."""
+    place.rest += weight * own.rest
+    place.x += weight * own.x
+    place.d += weight * own.d
+    place.yielding += weight * weight * own.yielding
+    if own.yielding > 0.0:
+        place.loose += weight
+    return place
+
+
 @wp.kernel(enable_backward=False)
 def place_borne(start: int, bearers: Surface, surface: Surface):
     """Find the positions of borne places of a body, and their motion in this step without contact."""
@@ -100,31 +112,26 @@ def place_borne(start: int, bearers: Surface, surface: Surface):
         return
     b = surface.bearing.bearers[s]
     w = surface.bearing.weights[s]
-    rest = wp.vec3()
-    x = wp.vec3()
-    d = wp.vec3()
-    yielding = float(0.0)
-    loose = float(0.0)
+    place = Foreseen()
     for k in range(4):
         if w[k] != 0.0:
-            rest += w[k] * bearers.rest[b[k]]
-            x += w[k] * bearers.x[b[k]]
-            d += w[k] * bearers.d[b[k]]
-            yielding += w[k] * w[k] * bearers.yielding[b[k]]
-            if bearers.yielding[b[k]] > 0.0:
-                loose += w[k]
-    surface.rest[s] = rest
-    surface.x[s] = x
-    surface.d[s] = d
-    surface.yielding[s] = yielding
-    surface.bearing.loose[s] = wp.clamp(loose, 0.0, 1.0)
+            own = Foreseen()
+            own.rest = bearers.rest[b[k]]
+            own.x = bearers.x[b[k]]
+            own.d = bearers.d[b[k]]
+            own.yielding = bearers.yielding[b[k]]
+            place = place_among(place, w[k], own)
+    surface.rest[s] = place.rest
+    surface.x[s] = place.x
+    surface.d[s] = place.d
+    surface.yielding[s] = place.yielding
+    surface.bearing.loose[s] = wp.clamp(place.loose, 0.0, 1.0)
 
 
-@wp.kernel(enable_backward=False)
-def divide_forces(start: int, surface: Surface, bearers: Surface):
-    """Sum the forces that a body's bearers get from the places that they bear, in a fixed order."""
-    b = start + wp.tid()
+@wp.func
+def borne_force(b: int, surface: Surface):
+    """The force that a bearer gets from the places that it bears, summed in a fixed order."""
     force = wp.vec3()
     for m in range(surface.bearing.starts[b], surface.bearing.starts[b + 1]):
         force += surface.bearing.shares[m] * surface.f[surface.bearing.places[m]]
-    bearers.f[b] = force
+    return force

@@ -1,12 +1,9 @@
-"""The input of contact for a step: the motion of nodes without contact, and the motion of obstacles."""
-
-from typing import Any
+"""The input of contact for a step: places on the surfaces, and the motion of obstacles."""
 
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node
-from warp_corot.kernels.stepping.integrate import by_vectors, symplectic_euler_velocity, vector_at
-from warp_corot.kernels.stepping.pace import DT, Pace, length_before, time_after
+from warp_corot.kernels.stepping.pace import DT, Pace, time_after
 
 wp.set_module_options({"enable_backward": False})
 
@@ -23,6 +20,8 @@ class Bearing:
     loose: wp.array[wp.float32]  # [S] the share of the weights that free nodes have
     gathered: wp.array[wp.vec3]  # [S] forces that have not moved the places yet [N]
     yielding: wp.array[wp.float32]  # [B] additional motion per force [m/N]
+    crowd: wp.array[wp.int32]  # [B] the sum of the weights of contacts that push, in multiples; see ``together``
+    pushed: wp.array[wp.vec3l]  # [B] forces that have not moved the places yet, in grains
     starts: wp.array[wp.int32]  # [B + 1] the places that a node bears, from one start to the next
     places: wp.array[wp.int32]
     shares: wp.array[wp.float32]  # its weights there
@@ -58,50 +57,15 @@ class Motions:
     later: wp.array2d[wp.transform]  # at the end of the step
 
 
-@wp.kernel(enable_backward=False)
-def predict_motion(
-    # In
-    start: int,
-    damping: float,
-    gravity: wp.vec3,
-    inverse_mass: wp.array[wp.float32],
-    has_load: int,
-    load: wp.array[Any],
-    pace: Pace,
-    offset: int,
-    rest: wp.array[wp.vec4],
-    f: wp.array[wp.vec4],
-    u: wp.array[wp.vec4],
-    v: wp.array[wp.vec4],
-    # Out
-    surface: Surface,
-):
-    """Find the positions of a body's surface nodes and their motion in this step without contact, as the step computes
-    it.
-    """
-    s = start + wp.tid()
-    i = surface.node[s]
-    surface.f[s] = wp.vec3()
-    if i < 0:
-        surface.yielding[s] = 0.0
-        return
-    dt = float(pace.seconds[DT])
-    kick = dt
-    if offset == 0:
-        kick = 0.5 * (float(length_before(pace)) + dt)
-    damped = 1.0 / (1.0 + dt * damping)
-    force = load_node(f, i)
-    if has_load != 0:
-        force += vector_at(load, i)
-    w = inverse_mass[i]
-    velocity = load_node(v, i)
-    if w > 0.0:
-        velocity = symplectic_euler_velocity(velocity, force, w, gravity, kick, damped)
-    home = load_node(rest, i)
-    surface.rest[s] = home
-    surface.x[s] = home + load_node(u, i)
-    surface.d[s] = dt * velocity
-    surface.yielding[s] = dt * kick * w * damped
+@wp.struct
+class Foreseen:
+    """A place without contact; see ``Surface``."""
+
+    rest: wp.vec3
+    x: wp.vec3
+    d: wp.vec3
+    yielding: float
+    loose: float  # share of the weights that free nodes have
 
 
 @wp.func
@@ -199,6 +163,3 @@ def measure_rates(
         rate = wp.length(load_node(v, i)) / thinnest
         if rate > rates[1]:
             wp.atomic_max(rates, 1, rate)
-
-
-PREDICT_MOTION = by_vectors(predict_motion, "load")

@@ -94,19 +94,18 @@ def solve_row(
     dt: float,
     surface: Surface,
     friction: float,
-    crowd: wp.array[wp.int32],
+    eases: wp.vec4,
     rows: Rows,
     added: wp.array[wp.vec3l],
 ):
-    if rows.acts[row] == 0:
-        return
+    """Correct the force of a pair, whose places give way by ``eases`` for each unit of their share [m/N]."""
     p = rows.places[row]
     w = rows.shares[row]
     yielding = float(0.0)
     share = float(0.0)
     free = wp.vec3()
     for k in range(4):
-        yielding += wp.abs(w[k]) * ease(p[k], crowd, surface.yielding, surface) / SHARES
+        yielding += wp.abs(w[k]) * eases[k]
         if surface.yielding[p[k]] > 0.0:
             share += wp.abs(w[k]) * loose_share(p[k], surface)
             free += w[k] * surface.d[p[k]]
@@ -166,7 +165,12 @@ def solve_rows(
     count = row_count(rows)
     dt = float(pace.seconds[DT])
     while row < count:
-        solve_row(row, law, dt, surface, friction, crowd, rows, added)
+        if rows.acts[row] != 0:
+            p = rows.places[row]
+            eases = wp.vec4()
+            for k in range(4):
+                eases[k] = ease(p[k], crowd, surface.yielding, surface) / SHARES
+            solve_row(row, law, dt, surface, friction, eases, rows, added)
         row += threads
 
 

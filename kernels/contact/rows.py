@@ -57,6 +57,8 @@ class Rows:
 
 @wp.func
 def row_count(rows: Rows):
+    if rows.owner.shape[0] == 0:
+        return 0
     return wp.min(rows.total[0], rows.owner.shape[0])
 
 

@@ -126,17 +126,17 @@ def solve_touch(
     dt: float,
     surface: Surface,
     corners: wp.vec3i,
-    crowd: wp.array[wp.float32],
+    eases: wp.vec3,
     corner_yielding: wp.array[wp.float32],
     touches: Touches,
 ):
+    """Correct the force on a triangle, whose corners give way by ``eases`` for each unit of their share [m/N]."""
     w = touches.shares[o, t]
-    yielding = float(0.0)
+    yielding = wp.dot(w, eases)
     share = float(0.0)
     free = wp.vec3()
     for k in range(3):
         s = corners[k]
-        yielding += w[k] * ease(s, crowd, corner_yielding, surface)
         if corner_yielding[s] > 0.0:
             share += w[k] * loose_share(s, surface)
             free += w[k] * surface.d[s]
@@ -175,7 +175,10 @@ def solve_among(
         t = near.touches[k] % triangles.shape[0]
         k += threads
         if touches.acts[o, t] != 0:
-            solve_touch(o, t, law, dt, surface, triangles[t], crowd, corner_yielding, touches)
+            eases = wp.vec3()
+            for n in range(3):
+                eases[n] = ease(triangles[t][n], crowd, corner_yielding, surface)
+            solve_touch(o, t, law, dt, surface, triangles[t], eases, corner_yielding, touches)
 
 
 @wp.kernel(enable_backward=False)

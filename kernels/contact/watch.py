@@ -2,7 +2,6 @@
 
 import warp as wp
 
-from warp_corot.kernels.elements.elements import load_node, store_node
 from warp_corot.kernels.stepping.pace import Pace
 
 from .motion import Motions, Surface, distance_between, move_obstacle
@@ -74,51 +73,31 @@ def follow_node(s: int, surface: Surface, watch: Watch):
 
 
 @wp.kernel(enable_backward=False)
-def follow_nodes(start: int, surface: Surface, watch: Watch):
-    """Check the same for all places of a body."""
-    s = start + wp.tid()
+def follow_nodes(surface: Surface, watch: Watch):
+    """Check the same for all places."""
+    s = wp.tid()
     if surface.node[s] >= 0:
         follow_node(s, surface, watch)
 
 
-@wp.kernel(enable_backward=False)
-def add_contact_forces(
-    # In
-    start: int,
-    surface: Surface,
-    follows: int,
-    # In and out
-    watch: Watch,
-    f: wp.array[wp.vec4],
-    # Out
-    contact_forces: wp.array[wp.vec4],
-):
-    """Add the contact forces to a body's forces; follow its nodes if there is a search."""
-    s = start + wp.tid()
-    i = surface.node[s]
-    if i < 0:
-        return
-    force = surface.f[s]
-    store_node(contact_forces, i, force)
-    if wp.dot(force, force) > 0.0:
-        store_node(f, i, load_node(f, i) + force)
-    if follows != 0:
-        follow_node(s, surface, watch)
+@wp.func
+def pair_of(k: int, watch: Watch):
+    """The world and the obstacle of a number below that of pairs of them."""
+    return k // watch.poses.shape[1], k % watch.poses.shape[1]
 
 
-@wp.kernel(enable_backward=False)
-def move_obstacles(
-    # In
+@wp.func
+def begin_obstacle(
+    world: int,
+    o: int,
     motions: Motions,
     pace: Pace,
     world_starts: wp.array[wp.float64],
     offset: int,
     watches: int,
-    # In and out
     watch: Watch,
 ):
-    """Begin the obstacles' step; ``watches``: check whether they move too far in it."""
-    world, o = wp.tid()
+    """Begin an obstacle's step; ``watches``: check whether it moves too far in it."""
     move_obstacle(world, o, motions, pace, world_starts, offset)
     if watches != 0:
         reach = motions.reach[o]
@@ -128,10 +107,11 @@ def move_obstacles(
             watch.due[0] = 1
 
 
-@wp.func
-def pair_of(k: int, watch: Watch):
-    """The world and the obstacle of a number below that of pairs of them."""
-    return k // watch.poses.shape[1], k % watch.poses.shape[1]
+@wp.kernel(enable_backward=False)
+def move_obstacles(motions: Motions, pace: Pace, world_starts: wp.array[wp.float64], offset: int, watch: Watch):
+    """Begin the obstacles' step, without a search."""
+    world, o = wp.tid()
+    begin_obstacle(world, o, motions, pace, world_starts, offset, 0, watch)
 
 
 @wp.kernel(enable_backward=False)

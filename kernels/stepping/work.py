@@ -71,6 +71,48 @@ def count_work(
     add_work(account, i, 0.5 * wp.dot(force, before * velocity + dt * later))
 
 
+@wp.func
+def count_constraint(
+    i: int,
+    force: wp.vec3,
+    total: wp.vec3,
+    damping: float,
+    gravity: wp.vec3,
+    inverse_mass: wp.array[wp.float32],
+    has_load: int,
+    load: wp.array[Any],
+    pace: Pace,
+    offset: int,
+    v: wp.array[wp.vec4],
+    account: wp.array2d[wp.float64],
+):
+    """Count the work of the force C of constraints on a node, which is part of its ``total`` force.
+
+    Let b and d be the lengths of the last step and of this one, and v and w the velocities before and after the kick.
+    Let F be all other forces: elastic ones, gravity and loads. All forces act for (b + d) / 2, so they add the kinetic
+    energy (b + d) / 2 (F + C) . (v + w) / 2. The work of F is counted elsewhere, along half of the motion before and
+    half of the motion after: F . (b v + d w) / 2. Constraints decide where a node goes, so the rest is their work:
+    (b + d) / 2 C . (v + w) / 2 + (b - d) / 4 F . (w - v).
+    """
+    dt = float(pace.seconds[DT])
+    before = dt
+    if offset == 0:
+        before = float(length_before(pace))
+    kick = 0.5 * (before + dt)
+    velocity = load_node(v, i)
+    w = inverse_mass[i]
+    if w == 0.0:
+        add_work(account, i, kick * wp.dot(force, velocity))
+        return
+    all_forces = total
+    if has_load != 0:
+        all_forces += vector_at(load, i)
+    later = symplectic_euler_velocity(velocity, all_forces, w, gravity, kick, 1.0 / (1.0 + dt * damping))
+    others = all_forces - force + gravity / w
+    work = 0.5 * kick * wp.dot(force, velocity + later)
+    add_work(account, i, work + 0.25 * (before - dt) * wp.dot(others, later - velocity))
+
+
 @wp.kernel(enable_backward=False)
 def count_constraints(
     # In
@@ -87,35 +129,13 @@ def count_constraints(
     # In and out
     account: wp.array2d[wp.float64],
 ):
-    """Count the work of the forces C of constraints, which are part of f.
-
-    Let b and d be the lengths of the last step and of this one, and v and w the velocities before and after the kick.
-    Let F be all other forces: elastic ones, gravity and loads. All forces act for (b + d) / 2, so they add the kinetic
-    energy (b + d) / 2 (F + C) . (v + w) / 2. The work of F is counted elsewhere, along half of the motion before and
-    half of the motion after: F . (b v + d w) / 2. Constraints decide where a node goes, so the rest is their work:
-    (b + d) / 2 C . (v + w) / 2 + (b - d) / 4 F . (w - v).
-    """
+    """Count the work of the forces of constraints, which are part of f."""
     i = wp.tid()
     force = load_node(constrained, i)
     if wp.dot(force, force) == 0.0:
         return
-    dt = float(pace.seconds[DT])
-    before = dt
-    if offset == 0:
-        before = float(length_before(pace))
-    kick = 0.5 * (before + dt)
-    velocity = load_node(v, i)
-    w = inverse_mass[i]
-    if w == 0.0:
-        add_work(account, i, kick * wp.dot(force, velocity))
-        return
     total = load_node(f, i)
-    if has_load != 0:
-        total += vector_at(load, i)
-    later = symplectic_euler_velocity(velocity, total, w, gravity, kick, 1.0 / (1.0 + dt * damping))
-    others = total - force + gravity / w
-    work = 0.5 * kick * wp.dot(force, velocity + later)
-    add_work(account, i, work + 0.25 * (before - dt) * wp.dot(others, later - velocity))
+    count_constraint(i, force, total, damping, gravity, inverse_mass, has_load, load, pace, offset, v, account)
 
 
 COUNT_WORK = by_vectors(count_work, "load")

@@ -7,7 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from warp_corot.kernels.contact import bearing, motion, sums, watch
+from warp_corot.kernels.contact import bearing, motion, sums
+from warp_corot.kernels.contact.begin import BEGIN_STEP
+from warp_corot.kernels.contact.end import END_CONTACT
 from warp_corot.kernels.contact.law import Law
 from warp_corot.kernels.contact.motion import Surface
 from warp_corot.solvers.ranks import ALONE, Ranks
@@ -85,14 +87,12 @@ class Contacts:
         self._ranks.take_surface(self.surface.arrays.node, own)
         self.law = self._law(stable_dt)
         self.search = Search(self.surface, self.obstacles, self.smallest, branches=system.ranks.is_alone)
+        #: Contact between soft surfaces; None if they cannot touch one another.
+        self.pairs = Pairs(self.surface, self.search, options, system.ranks) if meets else None
         self.rigid: RigidForces | None = None
         if self.obstacles.count:
-            given = (self.surface, self.obstacles, self.search, self.law, system.pace.arrays, self._ranks)
+            given = (self.surface, self.obstacles, self.search, self.law, system.pace.arrays, self._ranks, self.pairs)
             self.rigid = RigidForces(*given)
-        #: Contact between soft surfaces; None if they cannot touch one another.
-        self.pairs: Pairs | None = None
-        if meets:
-            self.pairs = Pairs(self.surface, self.search, options, system.ranks)
         self._revision = 0
         self._is_looked_at = self._has_crushed = False
         self._make_arrays()
@@ -158,30 +158,37 @@ class Contacts:
 
     def launch(self, offset: int, damping: float) -> None:
         system, surface = self.system, self.surface
-        if self.obstacles.count:
-            self.obstacles.launch_motion(offset, self.search.watch, watches=True)
-        self._predict(offset, damping)
+        self._predict(offset, damping, moves=True)
         self.search.launch(offset)
         self._solve()
         self._ranks.clear_surface(surface.arrays.f)
         follows = bool(self.search.finders) and not surface.is_whole
         for k, (body, part) in enumerate(zip(system.bodies, surface.parts, strict=True)):
-            outputs = [self.search.watch, body.state.forces, body.state.contact_forces]
+            state, conditions, accounts = body.state, body.conditions, system.constraint_accounts(k)
+            counts = bool(accounts) and self.counts_work
+            if part.bearers and len(system.constraints) > 1:
+                # Grasps add to the forces of nodes that bear nothing, too.
+                state.contact_forces.zero_()
             start, count, arrays = self._nodes_of(part)
-            if part.bearers:
-                self._launch(bearing.divide_forces, count, [start, surface.arrays, arrays], [])
-                if follows:
-                    inputs = [part.start, surface.arrays, self.search.watch]
-                    self._launch(watch.follow_nodes, self._count(k), inputs, [])
-            inputs = [start, arrays, int(follows and not part.bearers)]
-            self._launch(watch.add_contact_forces, count, inputs, outputs)
+            places = self._count(k) if follows else 0
+            inputs = [start, count, part.start, places, int(part.bearers > 0), arrays, surface.arrays]
+            inputs += [int(counts), damping, system.gravity, conditions.inverse_mass, int(conditions.has_loads)]
+            inputs += [conditions.loads, system.pace.arrays, offset, state.velocities]
+            outputs = [self.search.watch, state.forces, accounts[0] if counts else None, state.contact_forces]
+            self._launch(END_CONTACT[conditions.loads.dtype], max(count, places), inputs, outputs)
         if surface.is_whole:
             self.search.launch_after()
+
+    @property
+    def counts_work(self) -> bool:
+        """Whether it counts the work of its forces itself, at the nodes of the surface, as no other constraint adds to
+        them."""
+        return len(self.system.constraints) == 1 and self.system.ranks.is_alone
 
     def launch_motion(self, offset: int) -> None:
         """Launch the motion of obstacles in an implicit step."""
         if self.obstacles.count:
-            self.obstacles.launch_motion(offset, self.search.watch, watches=False)
+            self.obstacles.launch_motion(offset, self.search.watch)
 
     def active_set(self, k: int) -> ActiveSet | None:
         """The contact of a body with obstacles in implicit steps; None without obstacles."""
@@ -270,23 +277,31 @@ class Contacts:
         law.grain = heaviest * self.smallest / step**2 / GRAINS
         return law
 
-    def _predict(self, offset: int, damping: float) -> None:
-        """Launch the motion of the surfaces without contact."""
-        system, surface = self.system, self.surface
+    def _predict(self, offset: int, damping: float, *, moves: bool = False) -> None:
+        """Launch the motion of the surfaces without contact; ``moves``: and that of obstacles."""
+        system, surface, obstacles = self.system, self.surface, self.obstacles
+        if moves:
+            obstacles.launch_targets()
+        world_starts = system.bodies[0].conditions.world_starts
+        # On CUDA a launch takes longer than the work: places find the nodes that bear them by themselves.
+        finds_borne = self.device.is_cuda and not surface.is_whole
         for k, body in enumerate(system.bodies):
-            state, conditions = body.state, body.conditions
-            start, count, arrays = self._nodes_of(surface.parts[k])
-            inputs = [start, damping, system.gravity, conditions.inverse_mass]
+            state, conditions, part = body.state, body.conditions, surface.parts[k]
+            start, count, arrays = self._nodes_of(part)
+            borne = self._count(k) if part.bearers and finds_borne else 0
+            moved = system.worlds * obstacles.count if moves and k == 0 else 0
+            inputs = [start, count, part.start, borne, damping, system.gravity, conditions.inverse_mass]
             inputs += [int(conditions.has_loads), conditions.loads, system.pace.arrays, offset]
-            inputs += [state.rest, state.forces, state.displacements, state.velocities]
-            kernel = motion.PREDICT_MOTION[conditions.loads.dtype]
-            self._launch(kernel, count, inputs, [arrays])
+            inputs += [state.rest, state.forces, state.displacements, state.velocities, surface.bearers]
+            inputs += [moved, obstacles.motions, world_starts, int(moves)]
+            outputs = [self.search.watch, arrays, surface.arrays]
+            self._launch(BEGIN_STEP[conditions.loads.dtype], max(count, borne, moved), inputs, outputs)
         if isinstance(surface, WholeSurface):
             surface.complete()
         elif self.rigid is not None and self.rigid.have_edges:
             system.ranks.complete_surface(surface.arrays.d)
         for k, part in enumerate(surface.parts):
-            if part.bearers:
+            if part.bearers and not finds_borne:
                 self._launch(bearing.place_borne, self._count(k), [part.start, surface.bearers, surface.arrays], [])
 
     def _solve(self) -> None:
@@ -295,18 +310,12 @@ class Contacts:
         rounds = ROUNDS if self.obstacles.have_edges or pairs is not None else 0
         if self.surface.is_borne:
             rounds = ROUNDS_OF_BORNE
-        if pairs is not None:
-            pairs.launch_begin(self.law)
         if rigid is not None:
-            rigid.launch(rounds, None if pairs is None else self._solve_pairs)
-        else:
+            rigid.launch(rounds)
+        elif pairs is not None:
+            pairs.launch_begin(self.law)
             for _ in range(rounds):
-                self._solve_pairs()
-
-    def _solve_pairs(self) -> None:
-        """Launch a round of the forces of soft surfaces."""
-        assert self.pairs is not None
-        self.pairs.launch_round(self.law, self.system.pace.arrays)
+                pairs.launch_round(self.law, self.system.pace.arrays)
 
     def _make_arrays(self) -> None:
         surface, device = self.surface, self.device

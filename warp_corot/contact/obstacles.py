@@ -149,14 +149,8 @@ class Obstacles:
         inputs = [given, number, self.motions.target]
         wp.launch(kernels.take_targets, self.worlds, inputs, device=self.device)
 
-    def launch_motion(self, offset: int, watch: Watch, *, watches: bool) -> None:
-        """Launch the motion of obstacles in this step.
-
-        Args:
-            offset: The number of steps since the clock was last advanced.
-            watch: The motion since the last search, as far as it is known.
-            watches: Whether a search becomes due if they move too far.
-        """
+    def launch_targets(self) -> None:
+        """Launch the targets of tools that follow an array on the device."""
         for number, tool in enumerate(self.tools):
             if tool.poses is not None:
                 if tool.poses.device != self.device or len(tool.poses) not in (1, self.worlds):
@@ -166,8 +160,17 @@ class Obstacles:
                     )
                 inputs = [tool.poses, number, self.motions.target]
                 wp.launch(kernels.take_targets, self.worlds, inputs, device=self.device)
+
+    def launch_motion(self, offset: int, watch: Watch) -> None:
+        """Launch the motion of obstacles in an implicit step.
+
+        Args:
+            offset: The number of steps since the clock was last advanced.
+            watch: The motion since the last search.
+        """
+        self.launch_targets()
         pace, starts = self.system.pace.arrays, self.system.bodies[0].conditions.world_starts
-        inputs = [self.motions, pace, starts, offset, int(watches), watch]
+        inputs = [self.motions, pace, starts, offset, watch]
         wp.launch(move_obstacles, (self.worlds, self.count), inputs, device=self.device)
 
     def reset(self, chosen: wp.array) -> None:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import warp as wp
 
 from warp_corot.kernels.contact import beside, sums, touches, triangles
 from warp_corot.kernels.contact.law import Law
-from warp_corot.kernels.contact.together import BLOCK, push_together
+from warp_corot.kernels.contact.rows import Meeting, Rows
+from warp_corot.kernels.contact.together import BLOCK, Sums, push_together
 from warp_corot.kernels.stepping.pace import Pace
 from warp_corot.solvers.ranks import ALONE, Ranks
 
 from .obstacles import Obstacles
+from .pairs import Pairs
 from .search import Search
 from .surface import ContactSurface
 
@@ -31,6 +34,7 @@ class RigidForces:
         law: The law of contact: how far gaps may close in a step.
         pace: The clock.
         ranks: The processes that move the other nodes of the triangles here.
+        pairs: The pairs of soft surfaces; None if these cannot touch.
 
     Attributes:
         forces: The force of each obstacle on each surface node itself in the last step [N], vec3 [O, S].
@@ -52,9 +56,11 @@ class RigidForces:
         law: Law,
         pace: Pace,
         ranks: Ranks = ALONE,
+        pairs: Pairs | None = None,
     ):
         self.surface, self.obstacles, self.search, self.device = surface, obstacles, search, surface.device
         self._law, self._pace, self._ranks, self._taken = law, pace, ranks, -1
+        self._pairs = pairs
         self.have_edges = obstacles.have_edges
         self.has_rounds = obstacles.have_edges or surface.is_borne
         self.together: bool | None = None
@@ -81,6 +87,9 @@ class RigidForces:
             setattr(self.touches, name, wp.zeros(shape, dtype=wp.float32, device=device))
         self.touches.acts = wp.zeros(shape, dtype=wp.int32, device=device)
         self._crowd = wp.zeros(count, dtype=wp.float32, device=device)
+        self._sums = Sums()
+        self._sums.crowd = wp.zeros(count, dtype=wp.int32, device=device)
+        self._sums.added = wp.zeros(count, dtype=wp.vec3l, device=device)
         self._skin = triangles.Skin()
         self._skin.triangles, self._skin.corners = self.surface.triangles, self.surface.corners
         self._skin.corner_starts = self.surface.corner_starts
@@ -91,7 +100,7 @@ class RigidForces:
         together = self.together
         if together is None:
             most = MOST_EACH * BLOCK * (1.0 if self._is_together else 0.5)
-            is_short = self.has_rounds and self.search.most_near <= most
+            is_short = (self.has_rounds or self._pairs is not None) and self.search.most_near <= most
             together = (self.device.is_cpu or is_short) and self._ranks.is_alone
         self.revision += int(together != self._is_together)
         self._is_together = together
@@ -115,16 +124,20 @@ class RigidForces:
 
     # --- launches --------------------------------------------------------------------------------------------------
 
-    def launch(self, rounds: int, between: Callable[[], None] | None) -> None:
-        """Launch the forces of a step.
+    def launch(self, rounds: int) -> None:
+        """Launch the forces of a step, with those of soft surfaces.
 
         Args:
-            rounds: The number of rounds, in each of which forces between nodes and then those on nodes are corrected.
-            between: Launches other forces in each round, between the two.
+            rounds: The number of rounds, in each of which forces between nodes, then those of soft surfaces, and then
+                those on nodes are corrected.
         """
         if self._is_together:
-            self._launch_together(rounds, between)
+            self._launch_together(rounds)
             return
+        between: Callable[[], None] | None = None
+        if self._pairs is not None:
+            self._pairs.launch_begin(self._law)
+            between = partial(self._pairs.launch_round, self._law, self._pace)
         self._launch_begin(is_end=rounds == 0)
         for number in range(rounds):
             self._launch_round()
@@ -135,15 +148,15 @@ class RigidForces:
             added = triangles.ADD if self.has_rounds and between is None else 0
             self._push(triangles.CORRECT | added | (triangles.END if number == rounds - 1 else 0))
 
-    def _launch_together(self, rounds: int, between: Callable[[], None] | None) -> None:
-        """Launch them from one block of threads, which takes many parts in one launch."""
-        if between is None:
-            self._push_together(triangles.BEGIN, rounds, triangles.CORRECT | triangles.END)
-            return
-        for number in range(rounds):
-            self._push_together(triangles.CORRECT if number else triangles.BEGIN, 1, 0)
-            between()
-        self._push_together(triangles.CORRECT | triangles.END, 0, 0)
+    def _launch_together(self, rounds: int) -> None:
+        """Launch them in one block of threads."""
+        threads = 1 if self.device.is_cpu else BLOCK
+        pairs = self._pairs
+        meeting, rows = (Meeting(), Rows()) if pairs is None else (pairs.meeting, pairs.rows)
+        inputs = [threads, self.search.near, rounds, int(self.surface.is_borne), self.surface.triangles]
+        inputs += [self.obstacles.shapes, self.obstacles.motions, self._law, self._pace, meeting]
+        outputs = [rows, self.touches, self.surface.arrays, self.forces, self.anchors, self._sums]
+        wp.launch(push_together, threads, inputs, outputs, device=self.device, block_dim=threads)
 
     def _launch_begin(self, *, is_end: bool) -> None:
         """Launch the first forces: those between nodes from the last step, and those on nodes."""
@@ -197,15 +210,6 @@ class RigidForces:
         self._on_nodes(triangles.push_nodes, [*inputs, *own])
         if parts & triangles.ADD and self.surface.is_borne:
             self._on_nodes(triangles.settle_places, [parts, *rigid, *own])
-
-    def _push_together(self, before: int, rounds: int, parts: int) -> None:
-        """Launch some of these parts, and rounds, in one block."""
-        threads = 1 if self.device.is_cpu else BLOCK
-        rigid = [self.obstacles.shapes, self.obstacles.motions]
-        inputs = [threads, self.search.near, before, rounds, parts, int(self.surface.is_borne), self._skin]
-        inputs += [*rigid, self._law, self._pace]
-        outputs = [self.touches, self._crowd, self.surface.arrays, self.forces, self.anchors]
-        wp.launch(push_together, threads, inputs, outputs, device=self.device, block_dim=threads)
 
     def _on_nodes(self, kernel: wp.Kernel, inputs: list) -> None:
         among = self.search.at_nodes

@@ -159,7 +159,7 @@ class Search:
     def launch_after(self) -> None:
         """Launch the test after a step whether a search is due."""
         if self.finders:
-            self._on_nodes(kernels.follow_nodes, [0, self.surface.arrays, self.watch])
+            self._on_nodes(kernels.follow_nodes, [self.surface.arrays, self.watch])
 
     def launch_report(self) -> None:
         """Launch the report to the host after a run."""

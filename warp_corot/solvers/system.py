@@ -41,7 +41,8 @@ class Forces(Protocol):
 class Constraint(Protocol):
     """Forces that react to the motion that all other forces would cause in a step, such as contact.
 
-    Its forces are part of ``state.forces`` and, alone, of ``state.contact_forces``, from which their work is counted.
+    Its forces are part of ``state.forces`` and, alone, of ``state.contact_forces``, from which their work is counted. A
+    constraint that counts it itself says ``counts_work = True``.
 
     Attributes:
         launch_revision: Changes whenever its launches do, so that steps must be recorded again.
@@ -213,7 +214,8 @@ class System:
             each.launch(offset, damping)
         if counted:
             self._work.launch_count(offset, damping)
-        self._work.launch_constraints(offset, damping)
+        if not any(getattr(each, "counts_work", False) for each in self.constraints):
+            self._work.launch_constraints(offset, damping)
 
     def support_work_of(self, body: SoftBody) -> wp.array:
         """Where steps add up the work of a body's supports: ``support_work``, or two places for each node, which add up
