@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from warp_corot.kernels.stepping.threads import least_of_lanes, same_in_lanes
+
 from .motion import Surface
 from .rows import BAND, Meeting
 from .watch import Watch
@@ -10,6 +12,8 @@ wp.set_module_options({"enable_backward": False})
 
 #: Coordinate of empty boxes [m].
 NOWHERE = wp.constant(1.0e6)
+#: Number of threads of a warp.
+LANES = wp.constant(32)
 
 
 @wp.func
@@ -127,7 +131,14 @@ def bound_bodies(
             low = wp.min(low, wp.min(a, wp.min(b, e)) - beyond)
             high = wp.max(high, wp.max(a, wp.max(b, e)) + beyond)
         t += threads
-    if body >= 0:
+    # Nearly all warps have one body only, and one of their threads is enough.
+    first = wp.tid() % LANES == 0
+    if same_in_lanes(world * lower.shape[1] + body):
+        low = least_of_lanes(low)
+        high = -least_of_lanes(-high)
+    else:
+        first = True
+    if first and body >= 0:
         extend_bounds(world, body, low, high, lower, upper)
 
 

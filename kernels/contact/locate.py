@@ -61,12 +61,14 @@ def locate_node(row: int, s: int, t: int, surface: Surface, meeting: Meeting, ro
             return False
         n = way / length
         gap = length
-    apart = surface.rest[s] - point_of(w, surface.rest[c[0]], surface.rest[c[1]], surface.rest[c[2]])
     rows.places[row] = wp.vec4i(s, c[0], c[1], c[2])
     rows.shares[row] = wp.vec4(1.0, -w[0], -w[1], -w[2])
     rows.normal[row] = n
     rows.gap[row] = gap
     is_self = meeting.body[s] == meeting.body[c[0]]
+    apart = wp.vec3()
+    if is_self:
+        apart = surface.rest[s] - point_of(w, surface.rest[c[0]], surface.rest[c[1]], surface.rest[c[2]])
     if is_self and gap < -BAND_OF_NEIGHBOURS * wp.length(apart) and are_neighbours(s, c, meeting):
         return False
     return gap > deepest(size, is_self, apart)
@@ -98,10 +100,13 @@ def locate_edge(row: int, first: int, second: int, surface: Surface, meeting: Me
     if wp.dot(n, out_of_second) < 0.1 or wp.dot(n, out_of_first) > -0.1:
         return False
     gap = wp.dot(n, p + s * (q - p) - a - t * (b - a))
-    apart = surface.rest[f[0]] + s * (surface.rest[f[1]] - surface.rest[f[0]])
-    apart -= surface.rest[g[0]] + t * (surface.rest[g[1]] - surface.rest[g[0]])
+    is_self = meeting.body[f[0]] == meeting.body[g[0]]
+    apart = wp.vec3()
+    if is_self:
+        apart = surface.rest[f[0]] + s * (surface.rest[f[1]] - surface.rest[f[0]])
+        apart -= surface.rest[g[0]] + t * (surface.rest[g[1]] - surface.rest[g[0]])
     rows.places[row] = wp.vec4i(f[0], f[1], g[0], g[1])
     rows.shares[row] = wp.vec4(1.0 - s, s, -(1.0 - t), -t)
     rows.normal[row] = n
     rows.gap[row] = gap
-    return gap > deepest(size, meeting.body[f[0]] == meeting.body[g[0]], apart)
+    return gap > deepest(size, is_self, apart)

@@ -3,8 +3,7 @@
 Few nodes, triangles and pairs are near a tool. A round is then a chain of loads that wait for one another, and a launch
 for each of its parts takes longer than its work. In one block the data stays in the cache of a multiprocessor, and the
 parts wait for the block's threads only. The forces are those of the launches in ``touches``, ``triangles`` and
-``pairs``. Each triangle and each pair adds to its places as integers, so the order of threads does not matter, and
-places between nodes add to the nodes that bear them.
+``pairs``.
 """
 
 import warp as wp
@@ -16,12 +15,23 @@ from .bearing import is_borne
 from .law import Law
 from .motion import Motions, Surface
 from .near import BESIDE, Near
-from .pairs import SHARES, judge_row, locate_row, solve_row
+from .pairs import judge_row, locate_row
 from .rows import Meeting, Rows, row_count
 from .shapes import Shapes
-from .touches import Touches, find_touch
-from .triangles import BEGIN, CORRECT, END, judge_touch, solve_touch
-from .vertices import anchor, begin_borne, push_borne, touch
+from .together_items import (
+    Sums,
+    begin_touch,
+    correct_row,
+    correct_touch,
+    crowd_bearers,
+    move_borne,
+    press_borne,
+    push_place,
+    weigh_touch,
+)
+from .touches import Touches
+from .triangles import BEGIN, CORRECT, END
+from .vertices import anchor
 
 wp.set_module_options({"enable_backward": False})
 
@@ -33,194 +43,12 @@ WARP = wp.constant(32)
 LOCATE, FIND = wp.constant(0), wp.constant(1)
 
 
-@wp.struct
-class Sums:
-    """What contacts add up at places, zero between steps."""
-
-    crowd: wp.array[wp.int32]  # [S] weights of those that push, in multiples of one over SHARES
-    added: wp.array[wp.vec3l]  # [S] forces, in grains
-
-
 @wp.func
 def padded(count: int, threads: int):
     """The number of threads for some items, so that those of a warp have items of one kind."""
     if threads == 1:
         return count
     return (count + WARP - 1) / WARP * WARP
-
-
-@wp.func
-def grains_of(force: wp.vec3, grain: float):
-    g = force / grain
-    return wp.vec3l(wp.int64(g[0]), wp.int64(g[1]), wp.int64(g[2]))
-
-
-@wp.func
-def force_of(grains: wp.vec3l, grain: float):
-    return grain * wp.vec3(float(grains[0]), float(grains[1]), float(grains[2]))
-
-
-@wp.func
-def push_corners(w: wp.vec3, force: wp.vec3, corners: wp.vec3i, law: Law, sums: Sums):
-    for k in range(3):
-        wp.atomic_add(sums.added, corners[k], grains_of(w[k] * force, law.grain))
-
-
-@wp.func
-def ease_of(s: int, sums: Sums, surface: Surface):
-    """``bearing.ease`` from the sums at the nodes that bear a place."""
-    if not is_borne(s, surface):
-        return float(sums.crowd[s]) * surface.yielding[s] / SHARES
-    b = surface.bearing.bearers[s]
-    w = surface.bearing.weights[s]
-    total = float(0.0)
-    for k in range(4):
-        if w[k] != 0.0:
-            total += wp.abs(w[k]) * surface.bearing.yielding[b[k]] * float(surface.bearing.crowd[b[k]])
-    return total / SHARES
-
-
-@wp.func
-def begin_touch(
-    o: int,
-    t: int,
-    shapes: Shapes,
-    motions: Motions,
-    law: Law,
-    surface: Surface,
-    triangles: wp.array[wp.vec3i],
-    touches: Touches,
-    sums: Sums,
-):
-    """Find a contact on a triangle, with the force with which it begins."""
-    find_touch(o, t, shapes, motions, law, surface, triangles, touches)
-    if touches.acts[o, t] != 0:
-        push_corners(touches.shares[o, t], touches.force[o, t], triangles[t], law, sums)
-
-
-@wp.func
-def weigh_touch(o: int, t: int, law: Law, dt: float, surface: Surface, corners: wp.vec3i, touches: Touches, sums: Sums):
-    if judge_touch(o, t, law, dt, surface, corners, touches) != 0:
-        w = touches.shares[o, t]
-        for k in range(3):
-            wp.atomic_add(sums.crowd, corners[k], int(SHARES * w[k]))
-
-
-@wp.func
-def correct_touch(
-    o: int, t: int, law: Law, dt: float, surface: Surface, corners: wp.vec3i, touches: Touches, sums: Sums
-):
-    if touches.acts[o, t] == 0:
-        return
-    eases = wp.vec3(ease_of(corners[0], sums, surface), ease_of(corners[1], sums, surface), 0.0)
-    eases[2] = ease_of(corners[2], sums, surface)
-    solve_touch(o, t, law, dt, surface, corners, eases, surface.yielding, touches)
-    push_corners(touches.shares[o, t], touches.more[o, t], corners, law, sums)
-
-
-@wp.func
-def correct_row(row: int, law: Law, dt: float, surface: Surface, friction: float, rows: Rows, sums: Sums):
-    if rows.acts[row] == 0:
-        return
-    p = rows.places[row]
-    eases = wp.vec4()
-    for k in range(4):
-        eases[k] = ease_of(p[k], sums, surface)
-    solve_row(row, law, dt, surface, friction, eases, rows, sums.added)
-
-
-@wp.func
-def press_borne(
-    s: int,
-    number: int,
-    solves: int,
-    shapes: Shapes,
-    motions: Motions,
-    law: Law,
-    dt: float,
-    surface: Surface,
-    forces: wp.array2d[wp.vec3],
-    anchors: wp.array2d[wp.vec4],
-    sums: Sums,
-):
-    """The forces of obstacles on a borne place itself: the first ones, or which push, or their corrections."""
-    if number == FIND:
-        force = begin_borne(s, shapes, motions, surface, forces)
-        wp.atomic_add(sums.added, s, grains_of(force, law.grain))
-        return
-    yielding = float(0.0)
-    if solves != 0:
-        yielding = ease_of(s, sums, surface)
-    more, pushing = push_borne(s, yielding, shapes, motions, law, dt, anchors, surface, forces)
-    if solves != 0:
-        wp.atomic_add(sums.added, s, grains_of(more, law.grain))
-    else:
-        wp.atomic_add(sums.crowd, s, int(SHARES * pushing))
-
-
-@wp.func
-def crowd_bearers(s: int, surface: Surface, sums: Sums):
-    """Add the weights at a borne place to its bearers, whose forces have moved it already."""
-    b = surface.bearing.bearers[s]
-    w = surface.bearing.weights[s]
-    crowd = float(sums.crowd[s])
-    for k in range(4):
-        if w[k] != 0.0:
-            surface.bearing.pushed[b[k]] = wp.vec3l()
-            if crowd > 0.0:
-                wp.atomic_add(surface.bearing.crowd, b[k], int(wp.abs(w[k]) * crowd))
-
-
-@wp.func
-def push_place(
-    s: int,
-    flags: int,
-    parts: int,
-    shapes: Shapes,
-    motions: Motions,
-    law: Law,
-    dt: float,
-    surface: Surface,
-    forces: wp.array2d[wp.vec3],
-    anchors: wp.array2d[wp.vec4],
-    sums: Sums,
-):
-    """Give a place what was added: a node moves, and its own contacts follow; a borne place pushes its bearers."""
-    grains = sums.added[s]
-    sums.crowd[s] = 0
-    is_pushed = grains[0] != wp.int64(0) or grains[1] != wp.int64(0) or grains[2] != wp.int64(0)
-    force = force_of(grains, law.grain)
-    if is_pushed:
-        sums.added[s] = wp.vec3l()
-        surface.f[s] = surface.f[s] + force
-    if is_borne(s, surface):
-        if is_pushed:
-            b = surface.bearing.bearers[s]
-            w = surface.bearing.weights[s]
-            for k in range(4):
-                if w[k] != 0.0:
-                    wp.atomic_add(surface.bearing.pushed, b[k], grains_of(w[k] * force, law.grain))
-        return
-    if is_pushed:
-        surface.d[s] = surface.d[s] + surface.yielding[s] * force
-    if (flags & BESIDE) != 0:
-        if (parts & (BEGIN | CORRECT)) != 0:
-            touch(s, (parts & BEGIN) != 0, shapes, motions, law, dt, anchors, surface, forces)
-        if (parts & END) != 0:
-            anchor(s, shapes, motions, surface, forces, anchors)
-
-
-@wp.func
-def move_borne(s: int, law: Law, surface: Surface):
-    """Move a borne place by what pushes its bearers."""
-    b = surface.bearing.bearers[s]
-    w = surface.bearing.weights[s]
-    d = wp.vec3()
-    for k in range(4):
-        if w[k] != 0.0:
-            d += (w[k] * surface.bearing.yielding[b[k]]) * force_of(surface.bearing.pushed[b[k]], law.grain)
-            surface.bearing.crowd[b[k]] = 0
-    surface.d[s] = surface.d[s] + d
 
 
 @wp.func
@@ -276,7 +104,7 @@ def act(
         elif k >= first:
             s = near.nodes[k - first]
             if (near.flags[s] & BESIDE) != 0 and is_borne(s, surface):
-                press_borne(s, number, solves, shapes, motions, law, dt, surface, forces, anchors, sums)
+                press_borne(s, number == FIND, solves, shapes, motions, law, dt, surface, forces, anchors, sums)
         k += threads
 
 

@@ -26,8 +26,8 @@ GROWTH = 2.0
 REBUILT = 100
 #: Up to this many bodies have trees of boxes of their own.
 OWN_TREES = 16
-#: Threads that find the bounds of bodies on CUDA, at most: each ends with atomic minima.
-BOUNDING_THREADS = 4096
+#: Threads that find the bounds of bodies on CUDA, at most: each warp ends with atomic minima.
+BOUNDING_THREADS = 1 << 15
 
 
 class Pairs:
@@ -227,7 +227,8 @@ class Pairs:
         watch, meeting, device = self.search.watch, self.meeting, self.device
         bounds = [meeting.lower, meeting.upper]
         wp.launch(boxes.clear_bounds, meeting.lower.shape, [watch], bounds, device=device)
-        threads = 1 if device.is_cpu else min(max(self.surface.triangle_count, 1), BOUNDING_THREADS)
+        warps = -(-min(self.surface.triangle_count, BOUNDING_THREADS) // boxes.LANES)
+        threads = 1 if device.is_cpu else boxes.LANES * max(warps, 1)
         inputs = [threads, watch, self.surface.arrays, meeting]
         wp.launch(boxes.bound_bodies, threads, inputs, bounds, device=device)
 

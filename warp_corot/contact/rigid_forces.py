@@ -10,7 +10,8 @@ import warp as wp
 from warp_corot.kernels.contact import beside, sums, touches, triangles
 from warp_corot.kernels.contact.law import Law
 from warp_corot.kernels.contact.rows import Meeting, Rows
-from warp_corot.kernels.contact.together import BLOCK, Sums, push_together
+from warp_corot.kernels.contact.together import BLOCK, push_together
+from warp_corot.kernels.contact.together_items import Sums
 from warp_corot.kernels.stepping.pace import Pace
 from warp_corot.solvers.ranks import ALONE, Ranks
 
