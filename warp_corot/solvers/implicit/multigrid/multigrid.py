@@ -16,6 +16,7 @@ from warp_corot.discretization.subtrees import Batch
 from warp_corot.errors import InputError
 from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.implicit.multigrid import cycle, pattern, shared, values
+from warp_corot.kernels.implicit.multigrid.leaves_cpu import gather_leaves_on_cpu
 from warp_corot.kernels.tables.shapes import GRADIENT
 from warp_corot.solvers.implicit.operator import LinearOperator
 
@@ -236,7 +237,11 @@ class Multigrid:
         inputs += [self.most_lambda if self._members is None else 0.0]
         inputs += [found.upper, found.sum_starts, found.codes, found.places, self.count]
         inputs += [0 if self._members is None else self._members.entries, self._pairs, self._rows]
-        finest.launch(values.gather_leaves, len(found.upper), inputs, [finest.blocks, self._more])
+        outputs = [finest.blocks, self._more]
+        if self.device.is_cpu:
+            wp.launch(gather_leaves_on_cpu, self.discretization.worlds, inputs, outputs, device=self.device)
+        else:
+            finest.launch(values.gather_leaves, len(found.upper), inputs, outputs)
         inputs = [self.count, self._mesh_nodes, found.entries, self._nodes, inverse_mass, scales, self._free]
         inputs += [found.starts, found.columns, found.diagonal, others, self._more]
         finest.launch(values.finish_leaves, self.count, inputs, [finest.blocks, finest.inverses])
