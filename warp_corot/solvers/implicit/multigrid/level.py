@@ -57,6 +57,22 @@ class SmoothedLevel:
         self.r, self.z, self.other = (wp.zeros(worlds * count, dtype=wp.vec4, device=self.device) for _ in range(3))
         self.factors = smoothing_factors(degree)
 
+    def take_in(self, mesh_nodes: int, nodes: wp.array, given: wp.array) -> None:
+        """Launch the finest level's residual, and the smoother's first step.
+
+        Args:
+            mesh_nodes: Number of nodes of the mesh.
+            nodes: The node number of each rank, int32.
+            given: The residual by number, vec4.
+        """
+        inputs = [self.count, mesh_nodes, self.factors[0][0], nodes, self.free, self.inverses, given]
+        self.launch(cycle.take_in, self.count, inputs, [self.r, self.z])
+
+    def hand_out(self, mesh_nodes: int, nodes: wp.array, given: wp.array, result: wp.array) -> None:
+        """Launch the finest level's correction by number; held nodes have what is given."""
+        inputs = [self.count, mesh_nodes, nodes, self.free, given, self.z]
+        self.launch(cycle.hand_out, self.count, inputs, [result])
+
     def smooth_before(self) -> None:
         """Smooth from zero; ``z`` already has the first step."""
         self.smooth(1)

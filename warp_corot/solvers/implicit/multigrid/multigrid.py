@@ -15,7 +15,7 @@ from warp_corot.discretization.members import Members
 from warp_corot.discretization.subtrees import Batch
 from warp_corot.errors import InputError
 from warp_corot.kernels.elements.elements import ForestElements
-from warp_corot.kernels.implicit.multigrid import cycle, pattern, shared, values
+from warp_corot.kernels.implicit.multigrid import pattern, shared, values
 from warp_corot.kernels.implicit.multigrid.leaves_cpu import gather_leaves_on_cpu
 from warp_corot.kernels.tables.shapes import GRADIENT
 from warp_corot.solvers.implicit.operator import LinearOperator
@@ -159,15 +159,11 @@ class Multigrid:
 
     def take_in(self, r: wp.array) -> None:
         """Launch the finest level's residual and first step from r."""
-        finest = self.levels[0]
-        inputs = [self.count, self._mesh_nodes, finest.factors[0][0], self._nodes, self._free, finest.inverses, r]
-        finest.launch(cycle.take_in, self.count, inputs, [finest.r, finest.z])
+        self.levels[0].take_in(self._mesh_nodes, self._nodes, r)
 
     def hand_out(self, r: wp.array, z: wp.array) -> None:
         """Launch z from the finest level's correction; held nodes keep their r."""
-        finest = self.levels[0]
-        inputs = [self.count, self._mesh_nodes, self._nodes, self._free, r, finest.z]
-        finest.launch(cycle.hand_out, self.count, inputs, [z])
+        self.levels[0].hand_out(self._mesh_nodes, self._nodes, r, z)
 
     # --- pieces ------------------------------------------------------------------------------------------------------
 
