@@ -70,6 +70,7 @@ def begin_step(
     u: wp.array[wp.vec4],
     v: wp.array[wp.vec4],
     bearers: Surface,
+    frames: int,
     obstacles: int,
     motions: Motions,
     world_starts: wp.array[wp.float64],
@@ -85,10 +86,13 @@ def begin_step(
     Args:
         start, count: The first of the ``nodes``, which are places or bear them, and how many there are.
         borne_start, borne: The first place that nodes bear, and how many of them to find here.
+        frames: Number of worlds in which the frame of the watch moves.
         obstacles: Number of obstacles of all worlds to move.
         watches: Whether a search becomes due if they move too far.
     """
     k = wp.tid()
+    if k < frames:
+        watch.drift[k] = watch.drift[k] + watch.common[k]
     if k < obstacles:
         world, o = pair_of(k, watch)
         begin_obstacle(world, o, motions, pace, world_starts, offset, watches, watch)

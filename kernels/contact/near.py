@@ -4,7 +4,7 @@ import warp as wp
 
 from .bearing import forget_forces
 from .motion import Motions, Surface
-from .watch import Watch, reserve_obstacle, reserved
+from .watch import ALONE, ASKED, FARTHEST, PARTS, Watch, common_motion, reserve_node, reserve_obstacle
 
 wp.set_module_options({"enable_backward": False})
 
@@ -32,17 +32,37 @@ def mark(near: Near, s: int, flag: int):
 
 
 @wp.kernel(enable_backward=False)
+def find_common_motion(surface: Surface, near: Near, watch: Watch):
+    """Sum the motion of nodes that were near other surfaces."""
+    s = ASKED * wp.tid()
+    if watch.due[0] == 0 or surface.node[s] < 0 or (near.flags[s] & PAIRED) == 0:
+        return
+    world = surface.world[s]
+    motion = surface.d[s] / watch.size
+    # False if a number is not finite.
+    if wp.length(motion) <= FARTHEST:
+        for axis in range(3):
+            wp.atomic_add(watch.asked, world, axis, wp.int64(PARTS * motion[axis]))
+        wp.atomic_add(watch.asked, world, 3, wp.int64(1))
+
+
+@wp.kernel(enable_backward=False)
 def reserve(surface: Surface, motions: Motions, obstacles: int, watch: Watch, near: Near):
     """Begin a search: record the positions of nodes and the poses of obstacles, and how far they may move from there,
-    with a thread for each of either."""
+    with a thread for each of either, and for each world."""
     s = wp.tid()
     if watch.due[0] == 0:
         return
     if s < obstacles:
         reserve_obstacle(s, motions, watch)
+    if s < watch.drift.shape[0]:
+        watch.common[s] = common_motion(s, watch)
+        watch.drift[s] = common_motion(s, watch)
     if s < surface.node.shape[0]:
-        watch.places[s] = surface.x[s]
-        watch.reach[s] = reserved(wp.length(surface.d[s]), watch)
+        farther = float(1.0)
+        if obstacles == 0 and (near.flags[s] & SOMETHING) == 0:
+            farther = ALONE
+        reserve_node(s, farther, surface, watch)
         forget_forces(s, surface)
         near.flags[s] = 0
     if s == 0:

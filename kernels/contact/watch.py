@@ -16,19 +16,30 @@ FAST = wp.constant(2.0)
 FARTHEST = wp.constant(64.0)
 #: An item that is hit moves as far as the item that hits it; this many times that motion is reserved.
 HIT = wp.constant(2.0)
+#: Nodes with nothing near may move this many times as far, and as many elements: few of them come near anything.
+ALONE = wp.constant(4.0)
+#: Only one of so many nodes is asked for the common motion; that is summed in multiples of an element's size over this.
+ASKED, PARTS = wp.constant(16), wp.constant(1048576.0)
 #: A new search is due after this fraction of the limit. The rest is for the effect of contact on a step.
 SKIN = wp.constant(0.5)
 
 
 @wp.struct
 class Watch:
-    """Positions of surface nodes and obstacles at the last search, and how far they may move from there [m]."""
+    """Positions of surface nodes and obstacles at the last search, and how far they may move from there [m].
+
+    Where there are no obstacles, only motion relative to a frame counts, which moves along with the nodes that have
+    something near them.
+    """
 
     places: wp.array[wp.vec3]  # [S]
     reach: wp.array[wp.float32]  # [S]
     poses: wp.array2d[wp.transform]  # [W, O]
     reach_of: wp.array2d[wp.float32]  # [W, O]
     least: wp.array[wp.float32]  # [1]
+    drift: wp.array[wp.vec3]  # [W] how far the frame has moved since the search, and moves in a step [m]
+    common: wp.array[wp.vec3]
+    asked: wp.array2d[wp.int64]  # [W, 4] sum of motions in the step of the search, and the number of nodes
     size: float  # size of the smallest element [m]
     fastest: wp.array[wp.float32]  # [1] largest motion in the step of the search
     due: wp.array[wp.int32]  # [1] whether a search is due
@@ -45,10 +56,20 @@ def stays(gone: float, next_step: float, reach: float):
 
 
 @wp.func
-def reserved(step: float, watch: Watch):
-    """How far an item may move, given its motion in the present step."""
-    ahead = wp.min(AHEAD * step, wp.max(watch.size, FAST * step)) + HIT * watch.fastest[0]
+def reserved(step: float, farther: float, watch: Watch):
+    """How far an item may move, given its motion in the present step; ``farther``: so many times as far."""
+    ahead = wp.min(farther * AHEAD * step, wp.max(farther * watch.size, FAST * step)) + HIT * watch.fastest[0]
     return watch.least[0] + wp.min(ahead, FARTHEST * watch.size)
+
+
+@wp.func
+def common_motion(world: int, watch: Watch):
+    """The mean motion of the nodes that were asked [m]."""
+    count = watch.asked[world, 3]
+    if count == wp.int64(0):
+        return wp.vec3()
+    sums = wp.vec3(float(watch.asked[world, 0]), float(watch.asked[world, 1]), float(watch.asked[world, 2]))
+    return (watch.size / (PARTS * float(count))) * sums
 
 
 @wp.kernel(enable_backward=False)
@@ -57,16 +78,20 @@ def watch_nodes(surface: Surface, watch: Watch):
     s = wp.tid()
     if surface.node[s] < 0:
         return
-    if not stays(wp.length(surface.x[s] - watch.places[s]), wp.length(surface.d[s]), watch.reach[s]):
+    world = surface.world[s]
+    common = watch.common[world]
+    gone = surface.x[s] - watch.places[s] - (watch.drift[world] - common)
+    if not stays(wp.length(gone), wp.length(surface.d[s] - common), watch.reach[s]):
         watch.due[0] = 1
 
 
 @wp.func
 def follow_node(s: int, surface: Surface, watch: Watch):
     """Check after a step whether the next one could move the node too far, or this one has."""
+    world = surface.world[s]
     step = surface.d[s]
-    gone = wp.length(surface.x[s] + step - watch.places[s])
-    if not stays(gone, wp.length(step), watch.reach[s]):
+    gone = wp.length(surface.x[s] + step - watch.places[s] - watch.drift[world])
+    if not stays(gone, wp.length(step - watch.common[world]), watch.reach[s]):
         watch.due[0] = 1
         if gone > watch.reach[s]:
             wp.atomic_add(watch.missed, 0, 1)
@@ -124,7 +149,7 @@ def find_fastest(threads: int, surface: Surface, motions: Motions, obstacles: in
     s = int(thread)
     while s < surface.node.shape[0]:
         if surface.node[s] >= 0:
-            fastest = wp.max(fastest, wp.length(surface.d[s]))
+            fastest = wp.max(fastest, wp.length(surface.d[s] - common_motion(surface.world[s], watch)))
         s += threads
     k = int(thread)
     while k < obstacles:
@@ -142,7 +167,15 @@ def reserve_obstacle(k: int, motions: Motions, watch: Watch):
     now = motions.now[world, o]
     watch.poses[world, o] = now
     step = distance_between(now, motions.later[world, o], motions.reach[o])
-    watch.reach_of[world, o] = reserved(step, watch)
+    watch.reach_of[world, o] = reserved(step, 1.0, watch)
+
+
+@wp.func
+def reserve_node(s: int, farther: float, surface: Surface, watch: Watch):
+    """Record the place of a node and how far it may move from there."""
+    watch.places[s] = surface.x[s]
+    step = wp.length(surface.d[s] - common_motion(surface.world[s], watch))
+    watch.reach[s] = reserved(step, farther, watch)
 
 
 @wp.kernel(enable_backward=False)
@@ -152,3 +185,6 @@ def end_search(watch: Watch):
         watch.due[0] = 0
         watch.fastest[0] = 0.0
         watch.searches[0] = watch.searches[0] + 1
+        for world in range(watch.asked.shape[0]):
+            for k in range(4):
+                watch.asked[world, k] = wp.int64(0)

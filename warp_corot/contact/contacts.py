@@ -159,7 +159,7 @@ class Contacts:
     def launch(self, offset: int, damping: float) -> None:
         system, surface = self.system, self.surface
         self._predict(offset, damping, moves=True)
-        self.search.launch(offset)
+        self.search.launch(offset, follows=True)
         self._solve()
         self._ranks.clear_surface(surface.arrays.f)
         follows = bool(self.search.finders) and not surface.is_whole
@@ -293,9 +293,10 @@ class Contacts:
             inputs = [start, count, part.start, borne, damping, system.gravity, conditions.inverse_mass]
             inputs += [int(conditions.has_loads), conditions.loads, system.pace.arrays, offset]
             inputs += [state.rest, state.forces, state.displacements, state.velocities, surface.bearers]
-            inputs += [moved, obstacles.motions, world_starts, int(moves)]
+            frames = system.worlds if moves and k == 0 else 0
+            inputs += [frames, moved, obstacles.motions, world_starts, int(moves)]
             outputs = [self.search.watch, arrays, surface.arrays]
-            self._launch(BEGIN_STEP[conditions.loads.dtype], max(count, borne, moved), inputs, outputs)
+            self._launch(BEGIN_STEP[conditions.loads.dtype], max(count, borne, moved, frames), inputs, outputs)
         if isinstance(surface, WholeSurface):
             surface.complete()
         elif self.rigid is not None and self.rigid.have_edges:

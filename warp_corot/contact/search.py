@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import warp as wp
 
@@ -58,6 +59,8 @@ class Search:
         watch.fastest = wp.zeros(1, dtype=wp.float32, device=device)
         watch.size = size
         watch.due, watch.missed, watch.searches = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(3))
+        watch.drift, watch.common = (wp.zeros(surface.worlds, dtype=wp.vec3, device=device) for _ in range(2))
+        watch.asked = wp.zeros((surface.worlds, 4), dtype=wp.int64, device=device)
         shape = (surface.worlds, obstacles.count)
         watch.poses = wp.zeros(shape, dtype=wp.transform, device=device)
         watch.reach_of = wp.zeros(shape, dtype=wp.float32, device=device)
@@ -145,16 +148,22 @@ class Search:
 
     # --- launches --------------------------------------------------------------------------------------------------
 
-    def launch(self, offset: int) -> None:
-        """Launch a search, if it is due in this step."""
+    def launch(self, offset: int, *, follows: bool = False) -> None:
+        """Launch a search, if it is due in this step.
+
+        Args:
+            offset: The number of steps since the clock was last advanced.
+            follows: Whether margins count motion relative to a frame, which the steps move; not with obstacles.
+        """
         if not self.finders:
             return
         if offset == 0:
             self._on_nodes(kernels.watch_nodes, [self.surface.arrays, self.watch])
+        search = partial(self._search, follows and not self.obstacles.count)
         if self._branches:
-            wp.capture_if(self.watch.due, self._search)
+            wp.capture_if(self.watch.due, search)
         else:
-            self._search()
+            search()
 
     def launch_after(self) -> None:
         """Launch the test after a step whether a search is due."""
@@ -167,11 +176,14 @@ class Search:
             near_kernels.report_search, 1, [self.watch, self.near, self.most, self._report.array], device=self.device
         )
 
-    def _search(self) -> None:
+    def _search(self, is_framed: bool) -> None:
         arrays, obstacles = self.surface.arrays, self.watch.poses.size
         inputs = [arrays, self.obstacles.motions, obstacles, self.watch]
-        dim = max(self.surface.count, obstacles)
+        dim = max(self.surface.count, obstacles, self.surface.worlds)
         threads = 1 if self.device.is_cpu else min(dim, MEASURING_THREADS)
+        if is_framed:
+            few = -(-self.surface.count // kernels.ASKED)
+            wp.launch(near_kernels.find_common_motion, few, [arrays, self.near, self.watch], device=self.device)
         wp.launch(kernels.find_fastest, threads, [threads, *inputs], device=self.device)
         wp.launch(near_kernels.reserve, dim, [*inputs, self.near], device=self.device)
         for find in self.finders:
