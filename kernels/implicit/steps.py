@@ -185,9 +185,10 @@ def end_step(
     left_u: wp.array[wp.vec4],
     left_v: wp.array[wp.vec4],
     bad_step: wp.array[wp.int64],
+    moves: wp.array[wp.int32],
 ):
     """Find the state after the step. If the solve has broken down, displacements become NaN, and ``bad_step`` records
-    the step.
+    the step. ``moves`` becomes nonzero if a held node moves.
 
     Nodes with ``contact_forces`` take the velocity and the acceleration h1 of backward Euler: contact decides how far
     they go, and schemes that damp nothing would alternate about that. The array has one entry if this is not needed.
@@ -215,6 +216,8 @@ def end_step(
                 after = d / dt
                 store_node(h1, i, (after - velocity) / dt)
         velocity = after
+    elif wp.dot(d, d) > 0.0:
+        moves[0] = 1
     d = d / table[which, STAGE, 0]
     if status[i / world_nodes] == BROKEN:
         d = wp.vec3(wp.nan, wp.nan, wp.nan)

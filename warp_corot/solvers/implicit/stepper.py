@@ -14,6 +14,7 @@ from warp_corot.kernels.implicit import newton as kernels_of_newton
 from warp_corot.kernels.implicit import steps as kernels
 from warp_corot.kernels.stepping.integrate import follow_trajectory
 from warp_corot.solvers.integrator import Stepper
+from warp_corot.solvers.ranks import ALONE
 
 from .joined import JoinedSolve
 from .joined_newton import JoinedNewton
@@ -119,7 +120,7 @@ class ImplicitStepper(Stepper):
                 body.launch_begin()
                 body.launch_residual()
                 body.launch_solve()
-                body.launch_end(offset)
+                body.launch_end(offset, is_last=offset == count - 1)
 
     def _launch_joined(self, offset: int, joined: JoinedSolve) -> None:
         """Launch a step of all bodies together."""
@@ -143,7 +144,7 @@ class ImplicitStepper(Stepper):
             self.rows.launch_touched(touched)
         for body in self._bodies:
             body.take_solved(solve)
-            body.launch_end(offset)
+            body.launch_end(offset, is_last=True)
 
     def _join(self) -> None:
         assert self.rows is not None
@@ -238,6 +239,7 @@ class BodySteps:
         kept = [len(like) if wanted and each is not None else 0 for each in (self.held, stepper.rows)]
         self.met, self.touched = (wp.zeros(length, dtype=wp.int32, device=self.device) for length in kept)
         self._drift, self._rates = (self._none if self.viscosity is None else wp.zeros_like(like) for _ in range(2))
+        self._moves = wp.zeros(1, dtype=wp.int32, device=self.device)
         self._begins = wp.zeros(1, dtype=wp.int32, device=self.device) if stepper.rows is None else stepper.begins
         self._is_prepared = False
         self._one = wp.ones(self.body.worlds, dtype=wp.int32, device=self.device)
@@ -359,9 +361,18 @@ class BodySteps:
         self.system.ranks.complete(self.k, self.body.state.displacements)
         self._counts, self._good = [self._one, iterations, status], int(conjugate_gradients.CONVERGED)
 
-    def launch_end(self, offset: int) -> None:
-        """Launch the state after the step, and the count of its iterations."""
+    def launch_end(self, offset: int, *, is_last: bool) -> None:
+        """Launch the state after the step, and the count of its iterations.
+
+        Args:
+            offset: As for ``launch_changes``.
+            is_last: Whether this may be the last step of a run, whose reactions a user may read.
+        """
         self._end(offset, self._counts[-1])
+        if is_last or not self._can_leave_out_reactions:
+            self._find_reactions()
+        else:
+            wp.capture_if(self._moves, self._find_reactions)
         wp.launch(kernels.count_solves, 1, [*self._counts, self._good], [self.stepper.totals], device=self.device)
 
     # --- pieces ------------------------------------------------------------------------------------------------------
@@ -408,14 +419,15 @@ class BodySteps:
             self.viscosity.scatter(state.displacements, self._rates, state.forces)
 
     def _end(self, offset: int, status: wp.array) -> None:
-        """Launch the state after the step, reactions, and the work of supports and forces."""
+        """Launch the state after the step, and the work of forces."""
         body, system, newton = self.body, self.system, self.newton
         state, conditions = body.state, body.conditions
         inputs = [self._begins, self._table, self.operator.node_count, status, conditions.inverse_mass]
         rests = self.stepper.integrator.settles_contact and (self.held is not None or self.stepper.rows is not None)
         inputs += [newton.base, newton.increment, state.contact_forces if rests else self._none]
         inputs += [system.pace.arrays, offset]
-        outputs = [state.velocities, *self._h, state.displacements, *self._left, system.bad_step]
+        outputs = [state.velocities, *self._h, state.displacements, *self._left, system.bad_step, self._moves]
+        self._moves.zero_()
         self._launch(kernels.end_step, inputs, outputs)
         system.ranks.complete(self.k, state.displacements)
         self.field.complete_step(state.displacements, system.pace.arrays)
@@ -430,6 +442,19 @@ class BodySteps:
         for account in system.constraint_accounts(self.k):
             inputs = [conditions.inverse_mass, state.contact_forces, newton.increment]
             self._launch(kernels.count_work, inputs, [account])
+
+    @property
+    def _can_leave_out_reactions(self) -> bool:
+        """Whether reactions matter only at the end of a run, or if held nodes move: evaluating the forces changes
+        nothing else. On CUDA the condition costs more than the forces."""
+        system = self.system
+        others = system.forces or system.constraints or system.counted
+        return self.device.is_cpu and system.ranks is ALONE and not others and not self.field.state
+
+    def _find_reactions(self) -> None:
+        """Launch the reactions after the step, and the work of supports."""
+        body, system, newton = self.body, self.system, self.newton
+        state, conditions = body.state, body.conditions
         self.field.add_forces(state.displacements, newton.forces)
         self.stepper.add_other_forces()
         inputs = [system.gravity, conditions.mass, conditions.inverse_mass, int(conditions.has_loads)]
