@@ -20,6 +20,8 @@ wp.set_module_options({"enable_backward": False})
 
 #: Weights are summed in multiples of one over this.
 SHARES = wp.constant(1048576.0)
+#: Number of threads of a warp.
+LANES = wp.constant(32)
 
 
 @wp.func
@@ -31,19 +33,60 @@ def opened(row: int, surface: Surface, rows: Rows):
     return d + w[2] * surface.d[p[2]] + w[3] * surface.d[p[3]]
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const int lane = threadIdx.x & 31, axis = lane & 3;
+    for (int k = 0; k < 4; ++k) {
+        const int from = (lane & ~3) | k;
+        const int p = __shfl_sync(0xffffffffu, place, from);
+        const long long x = __shfl_sync(0xffffffffu, (long long)grains[0], from);
+        const long long y = __shfl_sync(0xffffffffu, (long long)grains[1], from);
+        const long long z = __shfl_sync(0xffffffffu, (long long)grains[2], from);
+        const long long own = axis == 0 ? x : axis == 1 ? y : z;
+        if (p >= 0 && axis < 3 && own != 0)
+            atomicAdd(reinterpret_cast<unsigned long long*>(&wp::index(added, p)) + axis, (unsigned long long)own);
+    }
+#else
+    if (place >= 0)
+        for (int axis = 0; axis < 3; ++axis) wp::index(added, place)[axis] += grains[axis];
+#endif
+""")
+def add_by_warp(added: wp.array[wp.vec3l], place: int, grains: wp.vec3l):
+    """Add grains at a place, or none if it is negative. All threads of a warp must call it: they add the components of
+    one place side by side, which the memory does at once.
+    """
+    ...
+
+
+@wp.func
+def grains_of(force: wp.vec3, grain: float):
+    g = force / grain
+    return wp.vec3l(wp.int64(g[0]), wp.int64(g[1]), wp.int64(g[2]))
+
+
 @wp.func
 def push(row: int, force: wp.vec3, law: Law, rows: Rows, added: wp.array[wp.vec3l]):
     p = rows.places[row]
     w = rows.shares[row]
-    grains = force / law.grain
     for k in range(4):
-        wp.atomic_add(
-            added, p[k], wp.vec3l(wp.int64(w[k] * grains[0]), wp.int64(w[k] * grains[1]), wp.int64(w[k] * grains[2]))
-        )
+        wp.atomic_add(added, p[k], grains_of(w[k] * force, law.grain))
 
 
 @wp.func
-def locate_row(row: int, law: Law, surface: Surface, meeting: Meeting, rows: Rows, added: wp.array[wp.vec3l]):
+def push_by_warp(row: int, force: wp.vec3, law: Law, rows: Rows, added: wp.array[wp.vec3l]):
+    """The same by all threads of a warp, some of which may have no force."""
+    p = wp.vec4i(-1, -1, -1, -1)
+    w = wp.vec4()
+    if wp.dot(force, force) > 0.0:
+        p = rows.places[row]
+        w = rows.shares[row]
+    for k in range(4):
+        add_by_warp(added, p[k], grains_of(w[k] * force, law.grain))
+
+
+@wp.func
+def locate_row(row: int, surface: Surface, meeting: Meeting, rows: Rows):
+    """Where a pair is closest, and the force with which it begins."""
     nodes = meeting.body.shape[0]
     owner = rows.owner[row]
     is_near = bool(False)
@@ -56,15 +99,16 @@ def locate_row(row: int, law: Law, surface: Surface, meeting: Meeting, rows: Row
     rows.acts[row] = 0
     if not is_near:
         rows.shares[row] = wp.vec4()
-        return
+        return wp.vec3()
     n = rows.normal[row]
     # Keep all of it: if each step lost a part, surfaces would sink in until the overlap replaces that part, and would
     # creep.
     normal_force = wp.max(wp.dot(was, n), 0.0)
+    force = wp.vec3()
     if normal_force > 0.0:
         force = normal_force * n + held_back(across(was, n), normal_force, meeting.friction)
         rows.force[row] = force
-        push(row, force, law, rows, added)
+    return force
 
 
 @wp.func
@@ -96,9 +140,9 @@ def solve_row(
     friction: float,
     eases: wp.vec4,
     rows: Rows,
-    added: wp.array[wp.vec3l],
 ):
-    """Correct the force of a pair, whose places give way by ``eases`` for each unit of their share [m/N]."""
+    """Correct the force of a pair, whose places give way by ``eases`` for each unit of their share [m/N]; returns the
+    change."""
     p = rows.places[row]
     w = rows.shares[row]
     yielding = float(0.0)
@@ -110,7 +154,7 @@ def solve_row(
             share += wp.abs(w[k]) * loose_share(p[k], surface)
             free += w[k] * surface.d[p[k]]
     if yielding <= 0.0:
-        return
+        return wp.vec3()
     n = rows.normal[row]
     before = rows.force[row]
     wanted = missing(row, law, dt, surface, rows)
@@ -119,7 +163,7 @@ def solve_row(
     slip = across(opened(row, surface, rows), n)
     force = normal_force * n + held_back(across(before, n) - slip / yielding, normal_force, friction)
     rows.force[row] = force
-    push(row, force - before, law, rows, added)
+    return force - before
 
 
 # --- all of them, however many threads there are --------------------------------------------------------------------
@@ -129,9 +173,13 @@ def solve_row(
 def locate_rows(threads: int, law: Law, surface: Surface, meeting: Meeting, rows: Rows, added: wp.array[wp.vec3l]):
     """Where each pair is closest, and the force with which it begins: that of the last step."""
     row = wp.tid()
-    count = row_count(rows)
-    while row < count:
-        locate_row(row, law, surface, meeting, rows, added)
+    # Warps stay together.
+    beyond = row_count(rows) + row % wp.min(threads, LANES)
+    while row < beyond:
+        force = wp.vec3()
+        if row < row_count(rows):
+            force = locate_row(row, surface, meeting, rows)
+        push_by_warp(row, force, law, rows, added)
         row += threads
 
 
@@ -162,15 +210,17 @@ def solve_rows(
 ):
     """Correct the force of each pair that acts."""
     row = wp.tid()
-    count = row_count(rows)
     dt = float(pace.seconds[DT])
-    while row < count:
-        if rows.acts[row] != 0:
+    beyond = row_count(rows) + row % wp.min(threads, LANES)
+    while row < beyond:
+        more = wp.vec3()
+        if row < row_count(rows) and rows.acts[wp.min(row, rows.acts.shape[0] - 1)] != 0:
             p = rows.places[row]
             eases = wp.vec4()
             for k in range(4):
                 eases[k] = ease(p[k], crowd, surface.yielding, surface) / SHARES
-            solve_row(row, law, dt, surface, friction, eases, rows, added)
+            more = solve_row(row, law, dt, surface, friction, eases, rows)
+        push_by_warp(row, more, law, rows, added)
         row += threads
 
 

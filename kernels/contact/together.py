@@ -15,11 +15,12 @@ from .bearing import is_borne
 from .law import Law
 from .motion import Motions, Surface
 from .near import BESIDE, Near
-from .pairs import judge_row, locate_row
+from .pairs import judge_row
 from .rows import Meeting, Rows, row_count
 from .shapes import Shapes
 from .together_items import (
     Sums,
+    begin_row,
     begin_touch,
     correct_row,
     correct_touch,
@@ -81,7 +82,7 @@ def act(
         pairs = row_count(rows)
         while k < pairs:
             if number == LOCATE:
-                locate_row(k, law, surface, meeting, rows, sums.added)
+                begin_row(k, law, surface, meeting, rows, sums)
             elif solves != 0:
                 correct_row(k, law, dt, surface, meeting.friction, rows, sums)
             else:

@@ -10,8 +10,8 @@ from .bearing import is_borne
 from .law import Law
 from .motion import Motions, Surface
 from .near import BESIDE
-from .pairs import SHARES, solve_row
-from .rows import Rows
+from .pairs import SHARES, grains_of, locate_row, push, solve_row
+from .rows import Meeting, Rows
 from .shapes import Shapes
 from .touches import Touches, find_touch
 from .triangles import BEGIN, CORRECT, END, judge_touch, solve_touch
@@ -26,12 +26,6 @@ class Sums:
 
     crowd: wp.array[wp.int32]  # [S] weights of those that push, in multiples of one over SHARES
     added: wp.array[wp.vec3l]  # [S] forces, in grains
-
-
-@wp.func
-def grains_of(force: wp.vec3, grain: float):
-    g = force / grain
-    return wp.vec3l(wp.int64(g[0]), wp.int64(g[1]), wp.int64(g[2]))
 
 
 @wp.func
@@ -98,6 +92,13 @@ def correct_touch(
 
 
 @wp.func
+def begin_row(row: int, law: Law, surface: Surface, meeting: Meeting, rows: Rows, sums: Sums):
+    force = locate_row(row, surface, meeting, rows)
+    if wp.dot(force, force) > 0.0:
+        push(row, force, law, rows, sums.added)
+
+
+@wp.func
 def correct_row(row: int, law: Law, dt: float, surface: Surface, friction: float, rows: Rows, sums: Sums):
     if rows.acts[row] == 0:
         return
@@ -105,7 +106,7 @@ def correct_row(row: int, law: Law, dt: float, surface: Surface, friction: float
     eases = wp.vec4()
     for k in range(4):
         eases[k] = ease_of(p[k], sums, surface)
-    solve_row(row, law, dt, surface, friction, eases, rows, sums.added)
+    push(row, solve_row(row, law, dt, surface, friction, eases, rows), law, rows, sums.added)
 
 
 @wp.func

@@ -243,6 +243,8 @@ class Pairs:
 
     def _on_rows(self, kernel: wp.Kernel, inputs: list) -> None:
         threads = self.search.threads(self._room)
+        if not self.device.is_cpu:
+            threads = -(-threads // kernels.LANES) * kernels.LANES
         wp.launch(kernel, threads, [threads, *inputs], device=self.device)
 
     def _apply(self, law: Law) -> None:
