@@ -15,7 +15,7 @@ from warp_corot.kernels.implicit.line_search import TRIED
 from warp_corot.kernels.stepping.pace import DT, Pace
 
 from .facing import locate_facing
-from .law import SETTLING, Law, held_back
+from .law import Law, held_back
 from .motion import Surface
 from .rows import Meeting, Rows, row_count
 from .vertices import across
@@ -130,7 +130,7 @@ def least_gap(gap: float, law: Law, dt: float):
     """Where a gap must be at the end of the step; overlaps open slowly."""
     if gap > -law.tolerance:
         return 0.0
-    return gap + wp.min(-SETTLING * gap, law.recovery * dt)
+    return gap + wp.min(-law.settling * gap, law.recovery * dt)
 
 
 @wp.func

@@ -20,6 +20,7 @@ SETTLING = wp.constant(0.1)
 class Law:
     tolerance: float  # gaps of the size of rounding errors [m]
     recovery: float  # speed at which overlapping surfaces are pushed apart [m/s]
+    settling: float  # share of an overlap by which they are pushed apart in a step at most
     grain: float  # forces on nodes are summed in multiples of this, so that the order does not matter [N]
 
 
@@ -27,8 +28,8 @@ class Law:
 def least_motion(gap: float, law: Law, dt: float):
     """How far a contact must open in this step [m]; if negative, how far it may close."""
     if gap > law.tolerance:
-        return -(gap - (1.0 - SETTLING) * law.tolerance)
-    return wp.min(-SETTLING * gap, law.recovery * dt)
+        return -(gap - (1.0 - law.settling) * law.tolerance)
+    return wp.min(-law.settling * gap, law.recovery * dt)
 
 
 @wp.func

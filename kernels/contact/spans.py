@@ -15,7 +15,7 @@ from warp_corot.kernels.stepping.pace import DT, Pace
 
 from .active import NEAR_END
 from .active import STIFF as STIFF_NODES
-from .law import SETTLING, Law, held_back
+from .law import Law, held_back
 from .motion import Motions, Surface
 from .shapes import CAPSULE, GROUND, Shapes, carried, distance_to
 from .touches import CORNER, SKEWERED, Touches, nearest
@@ -64,7 +64,7 @@ def least_gap(gap: float, law: Law, dt: float):
     """Where a gap must be at the end of the step; overlaps open slowly."""
     if gap > -law.tolerance:
         return 0.0
-    return gap + wp.min(-SETTLING * gap, law.recovery * dt)
+    return gap + wp.min(-law.settling * gap, law.recovery * dt)
 
 
 @wp.struct

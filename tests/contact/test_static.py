@@ -57,3 +57,21 @@ def test_worlds_and_what_is_refused(device):
     report = wc.solve_static(body, gravity=(0.0, 0.0, 9.81), obstacles=ground, iterations=5)
     assert not report.converged
     assert np.abs(body.displacements.numpy()).max() < 0.01
+
+
+def test_a_ball_that_begins_inside_is_met_where_it_is(device):
+    """Nothing but the ball loads the block."""
+    mesh = wc.TetForest.box(cells=(2, 2, 1), cell_size=0.03, level=3)
+    body = wc.SoftBody(mesh, wc.Isotropic(5e3, 0.4, 1000.0), device=device)
+    body.fix(mesh.points[:, 2] == 0.0)
+    ball = wc.Sphere(0.02, position=(0.031, 0.024, 0.045), friction=0.0)
+    report = wc.solve_static(body, gravity=(0.0, 0.0, 0.0), obstacles=ball)
+    assert report.converged
+    assert report.iterations < 40
+    assert report.residual < 1e-4
+    wrench = ball.wrench.numpy()[0].astype(float)[:3]
+    np.testing.assert_allclose(body.reactions.numpy().astype(float).sum(axis=0), wrench, atol=1e-3 * wrench[2])
+    pushed = sum(contact.force for contact in report.contacts)
+    np.testing.assert_allclose(pushed, -wrench, atol=1e-3 * wrench[2])
+    for contact in report.contacts:
+        assert abs(contact.gap) < 1e-6

@@ -10,7 +10,7 @@ import warp as wp
 from warp_corot.kernels.contact import bearing, motion, sums
 from warp_corot.kernels.contact.begin import BEGIN_STEP
 from warp_corot.kernels.contact.end import END_CONTACT
-from warp_corot.kernels.contact.law import Law
+from warp_corot.kernels.contact.law import SETTLING, Law
 from warp_corot.kernels.contact.motion import Surface
 from warp_corot.solvers.ranks import ALONE, Ranks
 from warp_corot.solvers.system import System
@@ -148,6 +148,11 @@ class Contacts:
             self._predict(0, 0.0)
             warn_of_overlaps(self, OVERLAP * self.smallest)
 
+    def settle(self, share: float) -> None:
+        """Let surfaces be pushed apart by this share of an overlap in each step, without a warning: steps that seek a
+        state of rest may begin inside obstacles. Before the first step."""
+        self.law.settling, self._is_looked_at = share, True
+
     def look(self) -> None:
         """Check whether elements are turned inside out, until the first time; waits for the device.
 
@@ -270,6 +275,7 @@ class Contacts:
     def _law(self, stable_dt: float) -> Law:
         points = [np.abs(self.system.ranks.bounds(body)).max() for body in self.system.bodies]
         law = Law()
+        law.settling = float(SETTLING)
         law.tolerance = ROUNDINGS * 2.0**-24 * max(*points, 1e-3)
         law.recovery = RECOVERY * self.smallest / stable_dt if np.isfinite(stable_dt) else 0.1
         heaviest = self.system.ranks.most(max(float(body.masses.max()) for body in self.system.bodies))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -59,14 +60,38 @@ class ContactPoint:
         return self.normal_force * self.normal + self.friction_force
 
 
+class Touch(NamedTuple):
+    """A place at which an obstacle pushed in the last step.
+
+    Attributes:
+        obstacle: Its number.
+        places: Numbers of places of the contact surface: one, or a triangle's three.
+        shares: The weight of each in the point.
+        point, normal, gap: As of a ``ContactPoint``.
+        force: The force on the body [N], [3].
+    """
+
+    obstacle: int
+    places: npt.NDArray[np.integer]
+    shares: Floats
+    point: Floats
+    normal: Floats
+    gap: float
+    force: Floats
+
+
 def contact_points(contacts: Contacts) -> list[ContactPoint]:
     """All contacts of the last step; waits for the device."""
     found = [] if contacts.pairs is None else _of_pairs(contacts, contacts.pairs)
+    return found + [_point(contacts, touch) for touch in obstacle_touches(contacts)]
+
+
+def obstacle_touches(contacts: Contacts) -> Iterator[Touch]:
+    """All contacts of the last step with obstacles; waits for the device."""
     if contacts.rigid is not None:
-        found += _at_nodes(contacts, contacts.rigid)
+        yield from _at_nodes(contacts, contacts.rigid)
         if contacts.rigid.have_edges:
-            found += _at_triangles(contacts, contacts.rigid)
-    return found
+            yield from _at_triangles(contacts, contacts.rigid)
 
 
 def _of_pairs(contacts: Contacts, pairs: Pairs) -> list[ContactPoint]:
@@ -102,7 +127,7 @@ def _of_pairs(contacts: Contacts, pairs: Pairs) -> list[ContactPoint]:
     return found
 
 
-def _at_nodes(contacts: Contacts, rigid: RigidForces) -> list[ContactPoint]:
+def _at_nodes(contacts: Contacts, rigid: RigidForces) -> Iterator[Touch]:
     surface, obstacles = contacts.surface, contacts.obstacles
     gaps = wp.zeros(rigid.forces.shape, dtype=wp.float32, device=contacts.device)
     normals = wp.zeros(rigid.forces.shape, dtype=wp.vec3, device=contacts.device)
@@ -110,14 +135,11 @@ def _at_nodes(contacts: Contacts, rigid: RigidForces) -> list[ContactPoint]:
     wp.launch(sums.describe_touches, rigid.forces.shape, inputs, [gaps, normals], device=contacts.device)
     forces = rigid.forces.numpy().astype(float)
     gap, normal, x = gaps.numpy(), normals.numpy().astype(float), surface.arrays.x.numpy().astype(float)
-    found = []
     for o, s in np.argwhere(forces.any(axis=2)):
-        places = np.array([s])
-        found.append(_point(contacts, o, places, np.ones(1), x[s], normal[o, s], gap[o, s], forces[o, s]))
-    return found
+        yield Touch(int(o), np.array([s]), np.ones(1), x[s], normal[o, s], float(gap[o, s]), forces[o, s])
 
 
-def _at_triangles(contacts: Contacts, rigid: RigidForces) -> list[ContactPoint]:
+def _at_triangles(contacts: Contacts, rigid: RigidForces) -> Iterator[Touch]:
     touches, surface = rigid.touches, contacts.surface
     acts, force = touches.acts.numpy(), touches.force.numpy().astype(float)
     shares, normal, gap = (
@@ -126,26 +148,23 @@ def _at_triangles(contacts: Contacts, rigid: RigidForces) -> list[ContactPoint]:
         touches.gap.numpy(),
     )
     corners, x = surface.triangles.numpy(), surface.arrays.x.numpy().astype(float)
-    found = []
     for o, t in np.argwhere((acts != 0) & force.any(axis=2)):
         w, places = shares[o, t], corners[t]
-        found.append(_point(contacts, o, places, w, w @ x[places], normal[o, t], gap[o, t], force[o, t]))
-    return found
+        yield Touch(int(o), places, w, w @ x[places], normal[o, t], float(gap[o, t]), force[o, t])
 
 
-def _point(
-    contacts: Contacts,
-    o: int,
-    places: npt.NDArray[np.integer],
-    shares: Floats,
-    point: Floats,
-    normal: Floats,
-    gap: float,
-    force: Floats,
-) -> ContactPoint:
-    k, world, nodes, shares = contacts.surface.nodes_at(places, shares)
-    along = float(force @ normal)
-    other = contacts.obstacles.given[o]
+def _point(contacts: Contacts, touch: Touch) -> ContactPoint:
+    k, world, nodes, shares = contacts.surface.nodes_at(touch.places, touch.shares)
+    along = float(touch.force @ touch.normal)
     return ContactPoint(
-        contacts.system.bodies[k], other, world, nodes, shares, point, normal, float(gap), along, force - along * normal
+        contacts.system.bodies[k],
+        contacts.obstacles.given[touch.obstacle],
+        world,
+        nodes,
+        shares,
+        touch.point,
+        touch.normal,
+        touch.gap,
+        along,
+        touch.force - along * touch.normal,
     )

@@ -80,7 +80,8 @@ def own_surface(mesh: TetForest | TetMesh) -> SurfaceMesh | None:
         return None
     whole = mesh.surface()
     level = np.zeros(mesh.node_count)
-    np.maximum.at(level, mesh.tets.ravel(), np.repeat(mesh.levels, 4))
+    for each in np.unique(mesh.levels):
+        level[mesh.tets[mesh.levels == each]] = each  # the finest comes last
     nearest = np.take_along_axis(whole.nodes, np.argmax(whole.weights, axis=1)[:, None], axis=1)[:, 0]
     return clustered(whole, APART * mesh.cell_size * 2.0 ** (-level[nearest] / 3.0))
 

@@ -12,8 +12,11 @@ from warp_corot.discretization.nodal import padded
 from warp_corot.elasticity import ForceField
 from warp_corot.errors import ConvergenceError
 from warp_corot.solvers.implicit.conjugate_gradients import ConjugateGradients
+from warp_corot.solvers.implicit.operator import LinearOperator
 from warp_corot.solvers.implicit.preconditioners import preconditioner_of
 from warp_corot.solvers.implicit.tangent import TangentOperator
+
+from .touching import RestingContact, RestingOperator, RestingPreconditioner
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
@@ -32,17 +35,31 @@ class Adjoint:
         field: Its elastic forces.
         preconditioner: As for ``solve_static``.
         tolerance: Norm of g - (K + s M) a over that of g.
+        contact: The contacts that the motion keeps to, if there are any.
 
     Attributes:
         iterations: Number of iterations of conjugate gradients in the world that needed most.
         residual: Norm of g - (K + s M) a over that of g, the largest of all worlds.
+        multipliers: With contact, the shares of the contacts' normals in g - K a, float64 [contacts].
     """
 
-    def __init__(self, body: SoftBody, field: ForceField, preconditioner: str | None, tolerance: float):
+    def __init__(
+        self,
+        body: SoftBody,
+        field: ForceField,
+        preconditioner: str | None,
+        tolerance: float,
+        contact: RestingContact | None = None,
+    ):
         self.body, self.operator, self._tolerance = body, TangentOperator(body, field, exact=True), tolerance
-        self._preconditioner = preconditioner_of(preconditioner, self.operator)
+        operator: LinearOperator = self.operator
+        self._preconditioner, self._contact = preconditioner_of(preconditioner, self.operator), contact
+        if contact is not None:
+            operator = RestingOperator(operator, contact)  # type: ignore[assignment]
+            self._preconditioner = RestingPreconditioner(self._preconditioner, contact)
         u = body.state.displacements
-        self._solver = ConjugateGradients(self.operator, len(u), most=MOST)
+        self._solver = ConjugateGradients(operator, len(u), most=MOST)
+        self.multipliers = np.zeros(0)
         self._solver.tolerance.fill_(tolerance)
         self._held = body.conditions.held_mask()[:, None]
         self._masses, self._share = body.masses[:, None], 0.0
@@ -58,7 +75,8 @@ class Adjoint:
         self._preconditioner.update(self.operator)
 
     def solve(self, right: npt.NDArray[np.float64]) -> tuple[wp.array, npt.NDArray[np.float64]]:
-        """The adjoint motion a, vec4 [worlds * N], and K a at all nodes, held ones too, float64 [worlds * N, 3].
+        """The adjoint motion a, vec4 [worlds * N], and K a at all nodes, held ones too, float64 [worlds * N, 3]; with
+        contact, K a and the contacts' forces on it.
 
         Args:
             right: g, zero at held nodes, [worlds * N, 3].
@@ -74,13 +92,17 @@ class Adjoint:
         found = self._refined((of_worlds / scale[:, None]).reshape(-1, 3))
         adjoint = (found.reshape(body.worlds, -1) * scale[:, None]).reshape(-1, 3)
         motion = wp.array(padded(adjoint), dtype=wp.vec4, device=body.device)
-        return motion, self._product(motion)
+        product = self._product(motion)
+        if self._contact is not None:
+            self.multipliers = self._contact.multipliers(np.where(self._held, 0.0, right - product))
+            product = product + self._contact.reactions(self.multipliers)
+        return motion, product
 
     def _refined(self, right: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """The solution in float64, as accurate as products with K."""
         worlds, device = self.body.worlds, self.body.device
         x = wp.zeros(len(right), dtype=wp.vec4, device=device)
-        solution, left = np.zeros_like(right), right
+        solution, left = np.zeros_like(right), self._free(right)
         wanted = np.linalg.norm(right.reshape(worlds, -1), axis=1)
         best = np.inf
         for _ in range(REFINEMENTS):
@@ -94,7 +116,7 @@ class Adjoint:
             trial = solution + x.numpy()[:, :3]
             rest = wp.array(padded(trial), dtype=wp.vec4, device=device)
             product = self._product(rest) + self._share * self._masses * trial
-            left = np.where(self._held, 0.0, right - product)
+            left = self._free(np.where(self._held, 0.0, right - product))
             norms = np.linalg.norm(left.reshape(worlds, -1), axis=1)
             residual = float((norms / np.where(wanted > 0.0, wanted, 1.0)).max())
             if not residual < best:
@@ -107,8 +129,13 @@ class Adjoint:
             raise ConvergenceError(f"the adjoint solve did not converge: its residual is {best:.2g}")
         return solution
 
+    def _free(self, x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """x without what contacts do not let nodes follow."""
+        return x if self._contact is None else self._contact.free(x)
+
     def _product(self, x: wp.array) -> npt.NDArray[np.float64]:
-        """K x at all nodes, held ones too."""
+        """K x at all nodes, held ones too, and the turning of contacts' normals."""
         y = wp.zeros_like(x)
         self.operator.tangent.add_product(x, y)
-        return y.numpy()[:, :3].astype(np.float64)
+        product = y.numpy()[:, :3].astype(np.float64)
+        return product if self._contact is None else product + self._contact.turning(x.numpy()[:, :3].astype(float))

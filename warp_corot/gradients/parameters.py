@@ -23,6 +23,7 @@ NEEDS = {
     "loads": None,
     "boundary": None,
     "gravity": None,
+    "obstacles": None,
 }
 
 

@@ -10,16 +10,20 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
+from warp_corot.contact.options import Contact
+from warp_corot.contact.shapes import Shape
 from warp_corot.elasticity import Corotated, ForceField, Model
 from warp_corot.errors import ConvergenceError, InputError
 from warp_corot.inputs.checks import checked_number, shown
 from warp_corot.simulation.parts import checked_gravity, checked_models
+from warp_corot.simulation.resting import checked_obstacles
 from warp_corot.simulation.static import solve_static
 
 from . import parameters
 from .adjoint import Adjoint
 from .element_work import ElementWork
 from .sums import derivatives
+from .touching import RestingContact
 
 Array = npt.NDArray[np.float64]
 
@@ -29,7 +33,7 @@ class RestState:
 
     Args:
         body: The body; some nodes of each world must be held.
-        model, gravity, preconditioner: As for ``solve_static``.
+        model, gravity, preconditioner, obstacles, contact: As for ``solve_static``.
         names: Names of the possible derivatives, keys of ``parameters.NEEDS``.
         adjoint_tolerance: As for ``static_gradient``.
         options: Other arguments of ``solve_static``.
@@ -53,11 +57,14 @@ class RestState:
         names: Sequence[str],
         adjoint_tolerance: float = 1e-6,
         preconditioner: str | None = None,
+        obstacles: Shape | Sequence[Shape] = (),
+        contact: Contact | None = None,
         **options: Any,
     ):
         if not isinstance(body, SoftBody):
             raise InputError(f"body is {shown(body)}; it must be a SoftBody")
         check_held(body)
+        check_smooth(checked_obstacles(obstacles), contact)
         if not 0.0 < checked_number(adjoint_tolerance, "adjoint_tolerance") < 1.0:
             raise InputError(f"adjoint_tolerance is {adjoint_tolerance}; it must be between 0 and 1")
         (law,) = checked_models(Corotated() if model is None else model, 1)
@@ -65,9 +72,13 @@ class RestState:
         self.field, needs = bound(body, law, names)
         self.field.relax_fully()
         ElementWork(self.field, needs)
-        self.report = solve_static(body, model=law, gravity=gravity, preconditioner=preconditioner, **options)
+        options |= {"preconditioner": preconditioner, "obstacles": obstacles, "contact": contact}
+        self.report = solve_static(body, model=law, gravity=gravity, **options)
         if not self.report.converged:
             raise ConvergenceError(f"there is no gradient: {self.report.message}")
+        touched = None if self.report._contact is None else RestingContact(body, self.report._contact)
+        self._contact = touched if touched is not None and touched.pushes else None
+        self._obstacle_count = len(checked_obstacles(obstacles))
         self.law, self._preconditioner, self._tolerance = law, preconditioner, adjoint_tolerance
         self._adjoint: Adjoint | None = None
         self.adjoint_iterations, self.adjoint_residual = 0, 0.0
@@ -85,7 +96,8 @@ class RestState:
             names: Some of the names that the state was made with.
         """
         if self._adjoint is None:
-            self._adjoint = Adjoint(self.body, self.field, self._preconditioner, self._tolerance)
+            options = (self._preconditioner, self._tolerance, self._contact)
+            self._adjoint = Adjoint(self.body, self.field, *options)
             self._adjoint.take(self.body.state.displacements)
         adjoint, count = self._adjoint, self.body.sizes.nodes
         given = np.asarray(derivative, np.float64)
@@ -109,6 +121,10 @@ class RestState:
             found["rest"] = found["rest"] + boundary
         if "boundary" in names:
             found["boundary"] = boundary
+        if "obstacles" in names:
+            found["obstacles"] = np.zeros((self._obstacle_count, 3))
+            if self._contact is not None and self._adjoint is not None:
+                found["obstacles"] = self._contact.of_obstacles(moved, self._adjoint.multipliers)
         return found
 
 
@@ -126,6 +142,23 @@ def bound(body: SoftBody, law: Model, names: Sequence[str]) -> tuple[ForceField,
             "the model shares rotations, and has no exact stiffness; for gradients each element needs its own"
         )
     return law.bind(body), parameters.needed(names)
+
+
+def check_smooth(obstacles: Sequence[Shape], contact: Contact | None) -> None:
+    """Check that contact has a gradient.
+
+    Raises:
+        InputError: There is friction, or the body touches itself.
+    """
+    contact = Contact() if contact is None else contact
+    if contact.self_contact:
+        raise InputError("the body may touch itself; gradients are of contact with obstacles only")
+    for number, shape in enumerate(obstacles):
+        friction = contact.friction if shape.friction is None else shape.friction
+        if friction > 0.0:
+            raise InputError(
+                f"obstacle {number} has friction {friction:g}; gradients need contact without: give friction=0.0"
+            )
 
 
 def check_held(body: SoftBody) -> None:

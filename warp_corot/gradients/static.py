@@ -11,6 +11,8 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
+from warp_corot.contact.options import Contact
+from warp_corot.contact.shapes import Shape
 from warp_corot.elasticity import Model
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import shown
@@ -43,6 +45,7 @@ class StaticGradient:
             elements and directions of fibres stay as they are.
         activation: dJ/ds of each element's active stress [1/Pa], [worlds, T].
         gravity: dJ/dg [s^2/m], [3].
+        obstacles: dJ/dp of each obstacle's place [1/m], [obstacles, 3]: of the same motion in all worlds.
     """
 
     value: float
@@ -57,6 +60,7 @@ class StaticGradient:
     rest: Array | None = None
     activation: Array | None = None
     gravity: Array | None = None
+    obstacles: Array | None = None
 
     def __getitem__(self, name: str) -> Any:
         if name not in parameters.NEEDS or getattr(self, name) is None:
@@ -77,6 +81,8 @@ def static_gradient(
     load_steps: int = 1,
     preconditioner: str | None = None,
     adjoint_tolerance: float = 1e-6,
+    obstacles: Shape | Sequence[Shape] = (),
+    contact: Contact | None = None,
     precision: str = FLOAT32,
 ) -> StaticGradient:
     """The derivatives of an objective of a body's positions at rest, by one adjoint solve for all of them.
@@ -92,9 +98,11 @@ def static_gradient(
             number and its derivative with respect to positions, [worlds * N, 3], for example from
             ``positions.numpy()``.
         wrt: Names of derivatives of ``StaticGradient``: "young", "poisson", "density", "loads", "boundary", "rest",
-            "activation", "gravity".
+            "activation", "gravity", "obstacles".
         model, gravity, tolerance, iterations, load_steps, preconditioner: As for ``solve_static``.
         adjoint_tolerance: Tolerance of the adjoint solve, its residual over the right side.
+        obstacles, contact: As for ``solve_static``, without friction and self-contact. The gradient is that of the
+            contacts at rest: it jumps where a contact begins or ends.
         precision: "float32": everything is computed on the body's device. "float64": the answer is refined on the host,
             by Newton's method with a sparse direct solver, and the adjoint is solved there; positions are vec3d. For
             the models ``Corotated``, ``Linear``, ``StVenantKirchhoff`` and ``NeoHookean`` with isotropic materials, and
@@ -115,6 +123,8 @@ def static_gradient(
         precision=precision,
         adjoint_tolerance=adjoint_tolerance,
         preconditioner=preconditioner,
+        obstacles=obstacles,
+        contact=contact,
         tolerance=tolerance,
         iterations=iterations,
         load_steps=load_steps,

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_corot.body.soft_body import SoftBody
+from warp_corot.contact.contacts import Contacts
 from warp_corot.contact.options import Contact
 from warp_corot.contact.shapes import Shape
 from warp_corot.elasticity import ForceField, Model
@@ -18,8 +19,9 @@ from warp_corot.solvers import BackwardEuler
 
 from .simulation import Simulation
 
-#: Lengths of steps that are tried, over the time of a wave through the body.
-LENGTHS = (1e3, 1e1, 1.0)
+#: Lengths of steps that are tried, over the time of a wave through the body, and the share of an overlap by which
+#: surfaces are pushed apart in one of them.
+LENGTHS = ((1e3, 0.5), (1e1, 0.5), (1.0, 0.1))
 #: Residual of each linear solve, and of forces that are in balance.
 LINEAR, BALANCED = 1e-5, 1e-3
 
@@ -32,8 +34,9 @@ class Rest(NamedTuple):
             [worlds].
         iterations, linear_iterations: Steps, and iterations of conjugate gradients.
         correction: The largest motion of the last step over the largest displacement.
-        residual: The norm of forces that are out of balance, contact included, over that of the loads, of the world
-            where it is largest.
+        residual: The norm of forces that are out of balance, contact included, over that of the loads or of
+            contact, of the world where it is largest.
+        contact: The contact of the last step; None if the search did not end.
     """
 
     converged: npt.NDArray[np.bool_]
@@ -41,6 +44,7 @@ class Rest(NamedTuple):
     linear_iterations: int
     correction: float
     residual: float
+    contact: Contacts | None
 
 
 def checked_obstacles(given: Shape | Sequence[Shape]) -> tuple[Shape, ...]:
@@ -86,10 +90,12 @@ def rest_on(
     start = body.displacements.numpy().copy()
     steps = linear = 0
     correction, converged = np.full(body.worlds, np.inf), np.zeros(body.worlds, bool)
-    for length in LENGTHS:
+    for length, settling in LENGTHS:
         dt = length * _wave_time(body)
         euler = BackwardEuler(dt=dt, linear_tolerance=LINEAR, preconditioner=preconditioner)
         sim = Simulation(body, model=law, integrator=euler, gravity=gravity, obstacles=obstacles, contact=contact)
+        if sim.contact is not None:
+            sim.contact.settle(settling)
         still = np.zeros_like(start)
         try:
             for _ in range(most):
@@ -107,7 +113,9 @@ def rest_on(
         if converged.all():
             break
         body.displacements = start
-    return Rest(converged, steps, linear, float(correction.max()), float(_residuals(body, field, loads).max()))
+    contact_then = sim.contact if converged.all() else None
+    residual = float(_residuals(body, field, loads).max())
+    return Rest(converged, steps, linear, float(correction.max()), residual, contact_then)
 
 
 def _wave_time(body: SoftBody) -> float:
@@ -127,10 +135,12 @@ def _correction(body: SoftBody, dt: float) -> npt.NDArray[np.float64]:
 
 
 def _residuals(body: SoftBody, field: ForceField, loads: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """The norm of forces that are out of balance over that of the loads, of each world."""
+    """The norm of forces that are out of balance over that of the loads or of contact, whichever is larger, of each
+    world."""
     state, count, worlds = body.state, body.sizes.nodes, body.worlds
-    forces = field.elastic_forces(state.displacements).numpy()[:count, :3] + loads
-    forces = forces + state.contact_forces.numpy()[:count, :3]
+    pushes = state.contact_forces.numpy()[:count, :3]
+    forces = field.elastic_forces(state.displacements).numpy()[:count, :3] + loads + pushes
     forces[body.conditions.held_mask()] = 0.0
-    rest, scale = (np.linalg.norm(each.reshape(worlds, -1), axis=1) for each in (forces, loads))
+    rest, load, push = (np.linalg.norm(each.reshape(worlds, -1), axis=1) for each in (forces, loads, pushes))
+    scale = np.maximum(load, push)
     return np.asarray(rest / np.where(scale > 0.0, scale, 1.0))

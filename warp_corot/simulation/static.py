@@ -5,13 +5,15 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from warp_corot.body.soft_body import SoftBody
+from warp_corot.contact.contacts import Contacts
 from warp_corot.contact.options import Contact
+from warp_corot.contact.reading import ContactPoint, contact_points
 from warp_corot.contact.shapes import Shape
 from warp_corot.elasticity import Corotated, ForceField, Model
 from warp_corot.errors import ConvergenceError, InputError
@@ -49,6 +51,7 @@ class StaticReport:
         load_share: Share of loads and gravity that the state carries; less than 1 if the solve did not converge.
         world_converged: Whether each world is at rest, bool [worlds].
         displacements: With ``precision="float64"`` those of the answer [m], float64 [worlds * N, 3]; else None.
+        contacts: The places where obstacles or the body itself push it.
     """
 
     converged: bool
@@ -62,6 +65,9 @@ class StaticReport:
     load_share: float
     world_converged: npt.NDArray[np.bool_]
     displacements: npt.NDArray[np.float64] | None = None
+    contacts: tuple[ContactPoint, ...] = field(default=(), repr=False)
+    #: What the contacts were read from, for gradients.
+    _contact: Contacts | None = field(default=None, repr=False)
 
 
 @in_turn
@@ -127,9 +133,9 @@ def solve_static(
         raise InputError(f"all {body.node_count} nodes of the body are held; at least one must be free to move")
 
     body.state.adopt_positions()
-    field = law.bind(body)
-    field.relax_fully()
-    answer = _Answer(body, field, down)
+    forces = law.bind(body)
+    forces.relax_fully()
+    answer = _Answer(body, forces, down)
     things = checked_obstacles(obstacles)
     _check_precision(precision, body, law, touches=bool(things) or contact is not None)
     if things or contact is not None:
@@ -140,7 +146,7 @@ def solve_static(
         message = "no node is held, and the loads do not balance: the body has no state of rest; fix some nodes"
         return answer.report(began, message)
     solver = StaticSolver(
-        body, field, down, tolerance=tolerance, most=most, load_steps=steps, preconditioner=preconditioner
+        body, forces, down, tolerance=tolerance, most=most, load_steps=steps, preconditioner=preconditioner
     )
     found = solver.solve()
     answer.finish()
@@ -231,7 +237,7 @@ def _rest_on(
     )
     answer.finish()
     message = "the body is at rest" if found.converged.all() else "not converged: the steps were not enough"
-    return answer.report(
+    report = answer.report(
         began,
         message,
         iterations=found.iterations,
@@ -241,6 +247,8 @@ def _rest_on(
         load_share=1.0 if found.converged.all() else 0.0,
         world_converged=found.converged,
     )
+    points = () if found.contact is None else tuple(contact_points(found.contact))
+    return replace(report, contacts=points, _contact=found.contact)
 
 
 class _Answer:
