@@ -148,7 +148,8 @@ def add_row(rows: wp.array[wp.vec4], place: int, row: wp.vec3):
 
 @functools.cache
 def write_rows(Elements: type, of: Dilatation) -> wp.Kernel:
-    """A thread a group, which also leaves (0, w', 0, 0) to its elements as ``shared_dilatation`` takes it."""
+    """A thread a group, which also leaves (lambda_e h'', w', 0, 0) to its elements: the first for
+    ``add_held``, the others as ``shared_dilatation`` and ``shared_diagonal`` take them."""
     measure, slope_of, curvature_of, holding = of.measure, of.slope, of.curvature, of.holding
 
     @unique_kernel()
@@ -176,7 +177,9 @@ def write_rows(Elements: type, of: Dilatation) -> wp.Kernel:
             weight = lam * rest_volume(elements, t)
             sum += weight * theta
             total += weight
-            held = wp.max(held, holding(theta)[2])
+            change = holding(theta)[2]
+            held = wp.max(held, change)
+            shared[t] = wp.vec4(lam * change, 0.0, 0.0, 0.0)
             # Forces are minus the derivative of the energy, and this is that of the sum.
             f0, f1, f2, f3 = nodal_forces(elements, t, in_local_frame(elements, t, -lam * slope))
             corners = groups.corners[i]
@@ -187,7 +190,8 @@ def write_rows(Elements: type, of: Dilatation) -> wp.Kernel:
         theta = mean_of(sum, total)
         found.factors[g] = wp.vec2(mean_of(curvature_of(theta), total), held)
         for i in range(groups.ranges[g][0], groups.ranges[g][1]):
-            shared[groups.members[i]] = wp.vec4(0.0, slope_of(theta), 0.0, 0.0)
+            t = groups.members[i]
+            shared[t] = wp.vec4(shared[t][0], slope_of(theta), 0.0, 0.0)
 
     return write_rows
 
@@ -259,17 +263,17 @@ def add_row_products(
 @functools.cache
 def add_held(Elements: type, of: Dilatation) -> wp.Kernel:
     """y += K p of the elements that are held from turning over. Each thread does one group; most groups have none."""
-    measure, holding = of.measure, of.holding
+    measure = of.measure
 
     @unique_kernel()
     def add_held(
         # In
         elements: Elements,
-        material: IsotropicMaterial,
         u: wp.array[wp.vec4],
         p: wp.array[wp.vec4],
         groups: GroupNodes,
         found: GroupRows,
+        shared: wp.array[wp.vec4],
         # In and out
         y: wp.array[wp.vec4],
     ):
@@ -278,11 +282,11 @@ def add_held(Elements: type, of: Dilatation) -> wp.Kernel:
             return
         for i in range(groups.ranges[g][0], groups.ranges[g][1]):
             t = groups.members[i]
-            theta, slope = measure(own_gradient(elements, t, u))
-            change = holding(theta)[2] * wp.ddot(slope, own_gradient(elements, t, p))
-            if change != 0.0:
-                stress = (material.lam[t * material.stride] * change) * slope
-                scatter(elements, elements.nodes[t], t, -stress, y)
+            stiffness = shared[t][0]
+            if stiffness != 0.0:
+                _, slope = measure(own_gradient(elements, t, u))
+                change = stiffness * wp.ddot(slope, own_gradient(elements, t, p))
+                scatter(elements, elements.nodes[t], t, -change * slope, y)
 
     return add_held
 

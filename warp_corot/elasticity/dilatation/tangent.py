@@ -65,7 +65,7 @@ class SharedTangent(Tangent):
             kernel = shared_dilatation.add_product(field.kind, field.of)
             field.launch(kernel, field.element_count, inputs, [y])
         elif self._holds:
-            inputs = [field.elements, field.isotropic, u, p, *groups]
+            inputs = [field.elements, u, p, *groups, self._shared]
             field.launch(kernels.add_held(field.kind, field.of), count, inputs, [y])
 
     def add_diagonal(self, blocks: wp.array) -> None:
