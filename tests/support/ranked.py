@@ -116,7 +116,9 @@ INTEGRATORS = {
     "bdf2": lambda: wc.BDF2(0.0025, preconditioner="diagonal"),
     "newmark": lambda: wc.Newmark(0.01, preconditioner="diagonal", tolerance=1e-3, viscosity=2e-3),
     "worlds": lambda: wc.SymplecticEuler(viscosity=2e-3),
-    # Passes come at the same times then.
+    # Steps and passes come at the same times then.
+    "organ": lambda: wc.SymplecticEuler(dt=1e-3),
+    "organs": lambda: wc.SymplecticEuler(dt=1e-3),
     "stretched": lambda: wc.SymplecticEuler(dt=3e-4),
 }
 
