@@ -62,10 +62,17 @@ def organ() -> wc.SoftBody:
     return wc.SoftBody(mesh, wc.Isotropic(np.array([[5e3], [1e4]]), 0.3, 1000.0), worlds=2, device="cpu")
 
 
+def dented() -> wc.SoftBody:
+    """The ball in one world, of elements that are bisected where a tool presses it."""
+    return wc.SoftBody(organ().mesh, wc.Isotropic(5e3, 0.3, 1000.0), device="cpu")
+
+
 #: Cases with contact.
-TOUCHING = ("touched", "organ", "meeting", "organs", "pressed", "bdf2")
+TOUCHING = ("touched", "organ", "meeting", "organs", "pressed", "bdf2", "dented")
+#: Cases whose meshes change.
+REMESHED = ("stretched", "dented")
 #: Cases whose checkpoints several ranks keep.
-KEPT = (*TOUCHING, "multigrid")
+KEPT = (*(case for case in TOUCHING if case not in REMESHED), "multigrid")
 
 
 def obstacles_of(case: str) -> list[wc.Ground | wc.Tool]:
@@ -73,7 +80,7 @@ def obstacles_of(case: str) -> list[wc.Ground | wc.Tool]:
     if case not in TOUCHING:
         return []
     ground = wc.Ground((0.0, 1.0, 0.0), -0.002, friction=0.3)
-    if case.startswith("organ"):
+    if case.startswith("organ") or case == "dented":
         probe = wc.Tool(wc.Sphere(0.006))
         probe.follow([0.0, 0.04], [[0.002, 0.0, 0.1125], [0.003, 0.0, 0.104]])
         return [wc.Ground((0.0, 0.0, 1.0), 0.0648), probe]
@@ -120,6 +127,7 @@ INTEGRATORS = {
     "organ": lambda: wc.SymplecticEuler(dt=1e-3),
     "organs": lambda: wc.SymplecticEuler(dt=1e-3),
     "stretched": lambda: wc.SymplecticEuler(dt=3e-4),
+    "dented": lambda: wc.SymplecticEuler(dt=4e-4),
 }
 
 #: Models of cases that have another than the default one.
@@ -134,6 +142,7 @@ CASES: dict[str, Callable[[], wc.SoftBody | list[wc.SoftBody]]] = {
     "meeting": meeting,
     "organs": organs,
     "stretched": lambda: stretched(),
+    "dented": dented,
     "pressed": lambda: touched(wc.TetForest.box((1, 1, 3), 0.05, level=4)),
     "bdf2": touched,
     "shared": lambda: body_of(graded(), 0.3),
@@ -166,7 +175,7 @@ def options_of(case: str) -> dict[str, Any]:
     contact = wc.Contact(friction=0.2, self_contact=True) if case in ("meeting", "organs") else None
     touching = {"obstacles": obstacles_of(case), "contact": contact}
     made: dict[str, Any] = {"model": MODELS.get(case), "integrator": integrator, **touching}
-    if case == "stretched":
+    if case in REMESHED:
         made["remesh"] = wc.OnlineRemesh(
             refine_above=1.05, simplify_below=1.01, min_level=3, max_level=8, every=30, capacity=4000
         )
@@ -368,7 +377,7 @@ def make_all(folder: Path, size: int, names: list[str]) -> None:
     several ranks resume; these keep those of ``KEPT``."""
     found: dict[str, Any] = {}
     for name in names:
-        keeps = name != "stretched" and (size == 1 or name in KEPT)
+        keeps = name not in REMESHED and (size == 1 or name in KEPT)
         found |= made(name, True, folder / f"{name}.{size}.npz" if keeps else None)
     if size == 1 and "worlds" in names:
         kept_in_parts(folder / "parts.1.npz")

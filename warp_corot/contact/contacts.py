@@ -254,6 +254,15 @@ class Contacts:
         if self.pairs is not None:
             self.pairs.take_room(room)
 
+    def continue_from(self, former: Contacts) -> None:
+        """Go on from the contact of the same bodies before their meshes changed. Forces are forgotten."""
+        for name in ("tolerance", "recovery", "grain"):
+            setattr(self.law, name, getattr(former.law, name))
+        self.obstacles.continue_from(former.obstacles)
+        wp.copy(self.obstacles.wrenches, former.obstacles.wrenches)
+        self.search.continue_from(former.search)
+        self._is_looked_at, self._has_crushed = former._is_looked_at, former._has_crushed
+
     # --- pieces ----------------------------------------------------------------------------------------------------
 
     def _follow(self, revision: int) -> None:

@@ -146,6 +146,11 @@ class Search:
         if motion > float(self.watch.least.numpy()[0]):
             self.watch.least.fill_(motion)
 
+    def continue_from(self, former: Search) -> None:
+        """Take the margins of another search."""
+        self.watch.size, self.farthest = former.watch.size, former.farthest
+        wp.copy(self.watch.least, former.watch.least)
+
     # --- launches --------------------------------------------------------------------------------------------------
 
     def launch(self, offset: int, *, follows: bool = False) -> None:

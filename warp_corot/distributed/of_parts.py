@@ -35,7 +35,10 @@ from .parts import Part
 from .ranks import MpiRanks
 
 #: The attributes of a simulation that belong to its parts.
-CHANGED = ("ranks", "bodies", "fields", "pace", "system", "stable_dt", "safe_step", "guard", "stepper", "recorded")
+CHANGED = (
+    *("ranks", "bodies", "fields", "pace", "system", "contact", "stable_dt", "safe_step", "guard", "stepper"),
+    "recorded",
+)
 #: If parts have at most this many elements, one rank tries its own first; larger ones take longer than compiling on
 #: several ranks.
 FEW_ELEMENTS = 200_000
@@ -69,6 +72,9 @@ class SimulationOfParts(on_one.Simulation):
     def become(self, other: SimulationOfParts) -> None:
         """Go on with the parts of another simulation, at the same time and with the same hooks."""
         self.guard.forget()
+        if self.contact is not None:
+            assert other.contact is not None
+            other.contact.continue_from(self.contact)
         known, guard = self.pace.known, self.guard.state
         guard["counted"] = np.full_like(guard["counted"], np.nan)
         for name in CHANGED:

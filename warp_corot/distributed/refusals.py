@@ -35,7 +35,7 @@ def check_supported(
     """
     in_parts = any(isinstance(body.mesh, InParts) for body in bodies)
     if others.get("remesh"):
-        _check_remeshed(bodies, integrator, others, in_parts=in_parts)
+        _check_remeshed(bodies, integrator, in_parts=in_parts)
     contact = others.get("contact")
     meets = getattr(contact, "self_contact", False) or (len(bodies) > 1 and (contact or others.get("obstacles")))
     if meets and (in_parts or integrator.is_implicit):
@@ -70,16 +70,13 @@ def check_supported(
             raise InputError("a body that is remeshed does not work on several ranks yet")
 
 
-def _check_remeshed(
-    bodies: Sequence[SoftBody], integrator: Integrator, others: dict[str, Any], *, in_parts: bool
-) -> None:
+def _check_remeshed(bodies: Sequence[SoftBody], integrator: Integrator, *, in_parts: bool) -> None:
     """Check that bodies can be remeshed on several ranks.
 
     Raises:
         InputError: They cannot.
     """
     refused = {
-        "with contact": bool(others.get("contact") or others.get("obstacles")),
         "in implicit steps": integrator.is_implicit,
         "of meshes that no rank holds whole": in_parts,
         "of bodies that follow keyframes": any(body.conditions.trajectories for body in bodies),

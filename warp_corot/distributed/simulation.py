@@ -129,7 +129,13 @@ class Simulation:
         if before == [body.version for body in self.bodies]:
             return
         forget(self._following)
+        for body in self.bodies:
+            if body.state.is_touched:
+                body.state.make_contact_forces()
+                body.state.contact_forces.zero_()
         parts = self._divided(self._options["model"], self._options["deterministic"])
+        if self._parts.contact is not None:
+            self._parts.contact.obstacles.let_go()
         self._parts.become(self._made(parts))
         register(self._following)
 
