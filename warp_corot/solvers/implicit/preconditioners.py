@@ -29,9 +29,9 @@ SWEPT: dict[str, Any] = {"sweeps": 2}
 #: The smoother's degree on the finest level of several ranks, which cannot sweep: of short cycles, and of others.
 SHORT_DEGREE, DEGREE = 2, 5
 #: The number of elements from which on the finest level goes over subtrees on CUDA, where it can. On an H200 a Newton
-#: step of 147,456 elements takes 2.3 ms in place of 2.4 (2.8 and 4.2 with a shared dilatation); smaller bodies were
-#: not measured.
-FEWEST_OVER_SUBTREES = 1 << 17
+#: step of 73,728 elements takes 1.90 ms in place of 1.86 (2.16 and 2.67 with a shared dilatation), one of 147,456
+#: elements 2.3 and 2.4 (2.8 and 4.2); smaller bodies were not measured.
+FEWEST_OVER_SUBTREES = 1 << 16
 
 
 def _multigrid(operator: TangentOperator, short_cycles: bool, few_digits: bool) -> Multigrid:
