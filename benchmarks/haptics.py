@@ -50,7 +50,7 @@ def main() -> int:
     report = loop.report
     print(report)
     print(f"simulated  {share:.3g} times real time, {len(mesh.tets)} tetrahedra on {device}")
-    felt = np.array(hand.felt)[:, 4:7] if hand.felt else np.zeros((1, 3))
+    felt = hand.felt[:, 4:7] if len(hand.felt) else np.zeros((1, 3))
     print(f"force      {np.linalg.norm(felt, axis=1).max():.3g} N at most")
     wrong = []
     if not np.linalg.norm(felt, axis=1).max() > 0.0:

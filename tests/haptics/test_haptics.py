@@ -129,7 +129,7 @@ def test_a_slow_simulation_puts_out_no_more_energy_than_the_bound(device, every)
     hand = ScriptedDevice(times, presses(0.003 * np.sin(3 * np.pi * times) ** 2, times)[0], clock=clock)
     loop = HapticLoop(sim, tool, hand, energy_bound=BOUND)
     run_slowly(sim, loop, clock, 1.0, every, pace=0.5)
-    felt = np.array(hand.felt)
+    felt = hand.felt
     assert (work_of(felt) <= BOUND * (1.0 + felt[1:, 0]) + 1e-12).all()
     assert felt[:, 6].max() > 0.1
     assert loop.report.beyond == 0
@@ -157,7 +157,7 @@ def test_the_rendered_stiffness_is_that_of_the_tissue(device):
     hand = ScriptedDevice([0.0, 1.0], presses([0.0, 0.0022], None)[0], clock=clock)
     loop = HapticLoop(sim, tool, hand)
     run_slowly(sim, loop, clock, 1.0, 0.005)
-    felt = np.array(hand.felt)
+    felt = hand.felt
     depth = TOP + RADIUS - felt[:, 3]
     at = np.array([felt[np.abs(depth - each) < 3e-5, 6].mean() for each in depths])
     np.testing.assert_allclose(at, held, rtol=0.03)

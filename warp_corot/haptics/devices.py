@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from array import array
 from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import Protocol, runtime_checkable
@@ -18,6 +19,9 @@ from warp_corot.inputs.keys import checked_times
 
 Vector = Sequence[float] | npt.NDArray[np.floating]
 Floats = npt.NDArray[np.float64]
+
+#: Numbers of a record: a time, a position, a force and a torque.
+RECORDED = 10
 
 
 @runtime_checkable
@@ -45,9 +49,6 @@ class ScriptedDevice:
         quaternions: (x, y, z, w), [K, 4]; None: no rotation.
         clock: A function that returns the seconds of a clock.
 
-    Attributes:
-        felt: The record: time [s], position [m], force [N] and torque [N m], ten numbers each.
-
     Raises:
         InputError: As ``Tool.follow``.
     """
@@ -74,18 +75,29 @@ class ScriptedDevice:
         self._poses = np.hstack([places, turns])
         self._clock, self._start = clock, math.nan
         self._now, self._place = 0.0, self._poses[0]
-        self.felt: list[tuple[float, ...]] = []
+        # Not a list of tuples: Python's collector would look through all of them, for longer and longer.
+        self._felt = array("d")
+
+    @property
+    def felt(self) -> Floats:
+        """The record so far: time [s], position [m], force [N] and torque [N m], float64 [readings, 10]."""
+        # At once, since the loop's thread may be adding to it.
+        found = np.frombuffer(self._felt.tobytes())
+        return found[: len(found) // RECORDED * RECORDED].reshape(-1, RECORDED)
 
     def read(self) -> tuple[Floats, Floats]:
         now = self._clock()
         if math.isnan(self._start):
             self._start = now
         self._now = now - self._start
-        self._place = np.array([np.interp(self._now, self._times, column) for column in self._poses.T])
+        k = int(np.clip(np.searchsorted(self._times, self._now), 1, len(self._times) - 1))
+        begun = (self._now - self._times[k - 1]) / (self._times[k] - self._times[k - 1])
+        share = min(max(begun, 0.0), 1.0)
+        self._place = (1.0 - share) * self._poses[k - 1] + share * self._poses[k]
         return self._place[:3], self._place[3:] / np.linalg.norm(self._place[3:])
 
     def write(self, force: Floats, torque: Floats) -> None:
-        self.felt.append((self._now, *self._place[:3].tolist(), *map(float, force), *map(float, torque)))
+        self._felt.extend((self._now, *self._place[:3].tolist(), *map(float, force), *map(float, torque)))
 
 
 class MouseDevice:
