@@ -21,7 +21,7 @@ class Bearing:
     gathered: wp.array[wp.vec3]  # [S] forces that have not moved the places yet [N]
     yielding: wp.array[wp.float32]  # [B] additional motion per force [m/N]
     crowd: wp.array[wp.int32]  # [B] the sum of the weights of contacts that push, in multiples; see ``together``
-    pushed: wp.array[wp.vec3l]  # [B] forces that have not moved the places yet, in grains
+    pushed: wp.array2d[wp.vec3l]  # [2, B] forces that move the places, by turns, in grains
     starts: wp.array[wp.int32]  # [B + 1] the places that a node bears, from one start to the next
     places: wp.array[wp.int32]
     shares: wp.array[wp.float32]  # its weights there

@@ -65,16 +65,8 @@ def grains_of(force: wp.vec3, grain: float):
 
 
 @wp.func
-def push(row: int, force: wp.vec3, law: Law, rows: Rows, added: wp.array[wp.vec3l]):
-    p = rows.places[row]
-    w = rows.shares[row]
-    for k in range(4):
-        wp.atomic_add(added, p[k], grains_of(w[k] * force, law.grain))
-
-
-@wp.func
 def push_by_warp(row: int, force: wp.vec3, law: Law, rows: Rows, added: wp.array[wp.vec3l]):
-    """The same by all threads of a warp, some of which may have no force."""
+    """Add a pair's force to its places, by all threads of a warp, some of which may have none."""
     p = wp.vec4i(-1, -1, -1, -1)
     w = wp.vec4()
     if wp.dot(force, force) > 0.0:
@@ -118,17 +110,15 @@ def missing(row: int, law: Law, dt: float, surface: Surface, rows: Rows):
 
 
 @wp.func
-def judge_row(row: int, law: Law, dt: float, surface: Surface, rows: Rows, crowd: wp.array[wp.int32]):
-    w = rows.shares[row]
+def judge_row(row: int, law: Law, dt: float, surface: Surface, rows: Rows):
+    """Find whether a pair acts in this round."""
     acts = int(0)
-    if w[0] > 0.0:
+    if rows.shares[row][0] > 0.0:
         force = wp.dot(rows.force[row], rows.normal[row])
         if force > 0.0 or missing(row, law, dt, surface, rows) > 0.0:
             acts = 1
-            p = rows.places[row]
-            for k in range(4):
-                wp.atomic_add(crowd, p[k], int(SHARES * wp.abs(w[k])))
     rows.acts[row] = acts
+    return acts
 
 
 @wp.func
@@ -190,7 +180,11 @@ def judge_rows(threads: int, law: Law, pace: Pace, surface: Surface, rows: Rows,
     count = row_count(rows)
     dt = float(pace.seconds[DT])
     while row < count:
-        judge_row(row, law, dt, surface, rows, crowd)
+        if judge_row(row, law, dt, surface, rows) != 0:
+            p = rows.places[row]
+            w = rows.shares[row]
+            for k in range(4):
+                wp.atomic_add(crowd, p[k], int(SHARES * wp.abs(w[k])))
         row += threads
 
 

@@ -15,24 +15,22 @@ from .bearing import is_borne
 from .law import Law
 from .motion import Motions, Surface
 from .near import BESIDE, Near
-from .pairs import judge_row
 from .rows import Meeting, Rows, row_count
 from .shapes import Shapes
 from .together_items import (
     Sums,
     begin_row,
     begin_touch,
+    clear_bearers,
     correct_row,
     correct_touch,
-    crowd_bearers,
-    move_borne,
     press_borne,
     push_place,
+    weigh_row,
     weigh_touch,
 )
 from .touches import Touches
 from .triangles import BEGIN, CORRECT, END
-from .vertices import anchor
 
 wp.set_module_options({"enable_backward": False})
 
@@ -72,6 +70,7 @@ def act(
     surface: Surface,
     forces: wp.array2d[wp.vec3],
     anchors: wp.array2d[wp.vec4],
+    turn: int,
     sums: Sums,
 ):
     """All pairs, or all triangles near obstacles and all borne places beside these: find them, see which push, or
@@ -82,11 +81,11 @@ def act(
         pairs = row_count(rows)
         while k < pairs:
             if number == LOCATE:
-                begin_row(k, law, surface, meeting, rows, sums)
+                begin_row(k, law, surface, meeting, rows, turn, sums)
             elif solves != 0:
-                correct_row(k, law, dt, surface, meeting.friction, rows, sums)
+                correct_row(k, law, dt, surface, meeting.friction, rows, turn, sums)
             else:
-                judge_row(k, law, dt, surface, rows, sums.crowd)
+                weigh_row(k, law, dt, surface, rows, sums)
             k += threads
         return
     count = near.touch_count[0]
@@ -97,15 +96,15 @@ def act(
             o = near.touches[k] // triangles.shape[0]
             t = near.touches[k] % triangles.shape[0]
             if number == FIND:
-                begin_touch(o, t, shapes, motions, law, surface, triangles, touches, sums)
+                begin_touch(o, t, shapes, motions, law, surface, triangles, touches, turn, sums)
             elif solves != 0:
-                correct_touch(o, t, law, dt, surface, triangles[t], touches, sums)
+                correct_touch(o, t, law, dt, surface, triangles[t], touches, turn, sums)
             else:
                 weigh_touch(o, t, law, dt, surface, triangles[t], touches, sums)
         elif k >= first:
             s = near.nodes[k - first]
             if (near.flags[s] & BESIDE) != 0 and is_borne(s, surface):
-                press_borne(s, number == FIND, solves, shapes, motions, law, dt, surface, forces, anchors, sums)
+                press_borne(s, number == FIND, solves, shapes, motions, law, dt, surface, forces, anchors, turn, sums)
         k += threads
 
 
@@ -141,6 +140,7 @@ def push_together(
     dt = float(pace.seconds[DT])
     have_rows = row_count(rows) > 0
     last = wp.max(2 * rounds, FIND) + wp.where(have_rows, 1, 0)
+    turn = int(0)
     # One loop, so that the code of each part is there once.
     number = int(FIND)
     if have_rows:
@@ -177,39 +177,24 @@ def push_together(
                     surface,
                     forces,
                     anchors,
+                    turn,
                     sums,
                 )
-                synchronize_block()
-            if solves == 0 and are_borne != 0:
-                k = int(thread)
-                while k < near.count[0]:
-                    if is_borne(near.nodes[k], surface):
-                        crowd_bearers(near.nodes[k], surface, sums)
-                    k += threads
                 synchronize_block()
             solves += 1
         k = int(thread)
         while k < near.count[0]:
             s = near.nodes[k]
-            push_place(s, near.flags[s], parts, shapes, motions, law, dt, surface, forces, anchors, sums)
+            push_place(s, near.flags[s], parts, shapes, motions, law, dt, surface, forces, anchors, turn, sums)
             k += threads
         synchronize_block()
-        if are_borne != 0:
-            k = int(thread)
-            while k < near.count[0]:
-                s = near.nodes[k]
-                if is_borne(s, surface):
-                    move_borne(s, law, surface)
-                    if (parts & END) != 0 and (near.flags[s] & BESIDE) != 0:
-                        anchor(s, shapes, motions, surface, forces, anchors)
-                k += threads
-            synchronize_block()
+        turn = 1 - turn
         number += 1
         if not have_rows and number % 2 == 1:
             number += 1
-    # The last forces have moved all places.
+    # The last pass has left what moved the places.
     k = int(thread)
     while are_borne != 0 and k < near.count[0]:
         if is_borne(near.nodes[k], surface):
-            crowd_bearers(near.nodes[k], surface, sums)
+            clear_bearers(near.nodes[k], 1 - turn, surface)
         k += threads

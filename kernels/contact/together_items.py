@@ -10,7 +10,7 @@ from .bearing import is_borne
 from .law import Law
 from .motion import Motions, Surface
 from .near import BESIDE
-from .pairs import SHARES, grains_of, locate_row, push, solve_row
+from .pairs import SHARES, grains_of, judge_row, locate_row, solve_row
 from .rows import Meeting, Rows
 from .shapes import Shapes
 from .touches import Touches, find_touch
@@ -34,9 +34,42 @@ def force_of(grains: wp.vec3l, grain: float):
 
 
 @wp.func
-def push_corners(w: wp.vec3, force: wp.vec3, corners: wp.vec3i, law: Law, sums: Sums):
+def add_crowd(s: int, weight: float, surface: Surface, sums: Sums):
+    """Count a contact that pushes a place with a weight, or the nodes that bear the place."""
+    if is_borne(s, surface):
+        b = surface.bearing.bearers[s]
+        w = surface.bearing.weights[s]
+        for k in range(4):
+            if w[k] != 0.0:
+                wp.atomic_add(surface.bearing.crowd, b[k], int(SHARES * weight * wp.abs(w[k])))
+    else:
+        wp.atomic_add(sums.crowd, s, int(SHARES * weight))
+
+
+@wp.func
+def add_force(s: int, force: wp.vec3, law: Law, turn: int, surface: Surface, sums: Sums):
+    """Add a force at a place, and to the nodes that bear it."""
+    wp.atomic_add(sums.added, s, grains_of(force, law.grain))
+    if is_borne(s, surface):
+        b = surface.bearing.bearers[s]
+        w = surface.bearing.weights[s]
+        for k in range(4):
+            if w[k] != 0.0:
+                wp.atomic_add(surface.bearing.pushed, turn, b[k], grains_of(w[k] * force, law.grain))
+
+
+@wp.func
+def push_corners(w: wp.vec3, force: wp.vec3, corners: wp.vec3i, law: Law, turn: int, surface: Surface, sums: Sums):
     for k in range(3):
-        wp.atomic_add(sums.added, corners[k], grains_of(w[k] * force, law.grain))
+        add_force(corners[k], w[k] * force, law, turn, surface, sums)
+
+
+@wp.func
+def push_row(row: int, force: wp.vec3, law: Law, turn: int, surface: Surface, rows: Rows, sums: Sums):
+    p = rows.places[row]
+    w = rows.shares[row]
+    for k in range(4):
+        add_force(p[k], w[k] * force, law, turn, surface, sums)
 
 
 @wp.func
@@ -63,12 +96,13 @@ def begin_touch(
     surface: Surface,
     triangles: wp.array[wp.vec3i],
     touches: Touches,
+    turn: int,
     sums: Sums,
 ):
     """Find a contact on a triangle, with the force with which it begins."""
     find_touch(o, t, shapes, motions, law, surface, triangles, touches)
     if touches.acts[o, t] != 0:
-        push_corners(touches.shares[o, t], touches.force[o, t], triangles[t], law, sums)
+        push_corners(touches.shares[o, t], touches.force[o, t], triangles[t], law, turn, surface, sums)
 
 
 @wp.func
@@ -76,37 +110,55 @@ def weigh_touch(o: int, t: int, law: Law, dt: float, surface: Surface, corners: 
     if judge_touch(o, t, law, dt, surface, corners, touches) != 0:
         w = touches.shares[o, t]
         for k in range(3):
-            wp.atomic_add(sums.crowd, corners[k], int(SHARES * w[k]))
+            add_crowd(corners[k], w[k], surface, sums)
 
 
 @wp.func
 def correct_touch(
-    o: int, t: int, law: Law, dt: float, surface: Surface, corners: wp.vec3i, touches: Touches, sums: Sums
+    o: int,
+    t: int,
+    law: Law,
+    dt: float,
+    surface: Surface,
+    corners: wp.vec3i,
+    touches: Touches,
+    turn: int,
+    sums: Sums,
 ):
     if touches.acts[o, t] == 0:
         return
     eases = wp.vec3(ease_of(corners[0], sums, surface), ease_of(corners[1], sums, surface), 0.0)
     eases[2] = ease_of(corners[2], sums, surface)
     solve_touch(o, t, law, dt, surface, corners, eases, surface.yielding, touches)
-    push_corners(touches.shares[o, t], touches.more[o, t], corners, law, sums)
+    push_corners(touches.shares[o, t], touches.more[o, t], corners, law, turn, surface, sums)
 
 
 @wp.func
-def begin_row(row: int, law: Law, surface: Surface, meeting: Meeting, rows: Rows, sums: Sums):
+def begin_row(row: int, law: Law, surface: Surface, meeting: Meeting, rows: Rows, turn: int, sums: Sums):
     force = locate_row(row, surface, meeting, rows)
     if wp.dot(force, force) > 0.0:
-        push(row, force, law, rows, sums.added)
+        push_row(row, force, law, turn, surface, rows, sums)
 
 
 @wp.func
-def correct_row(row: int, law: Law, dt: float, surface: Surface, friction: float, rows: Rows, sums: Sums):
+def weigh_row(row: int, law: Law, dt: float, surface: Surface, rows: Rows, sums: Sums):
+    if judge_row(row, law, dt, surface, rows) != 0:
+        p = rows.places[row]
+        w = rows.shares[row]
+        for k in range(4):
+            add_crowd(p[k], wp.abs(w[k]), surface, sums)
+
+
+@wp.func
+def correct_row(row: int, law: Law, dt: float, surface: Surface, friction: float, rows: Rows, turn: int, sums: Sums):
     if rows.acts[row] == 0:
         return
     p = rows.places[row]
     eases = wp.vec4()
     for k in range(4):
         eases[k] = ease_of(p[k], sums, surface)
-    push(row, solve_row(row, law, dt, surface, friction, eases, rows), law, rows, sums.added)
+    more = solve_row(row, law, dt, surface, friction, eases, rows)
+    push_row(row, more, law, turn, surface, rows, sums)
 
 
 @wp.func
@@ -121,34 +173,45 @@ def press_borne(
     surface: Surface,
     forces: wp.array2d[wp.vec3],
     anchors: wp.array2d[wp.vec4],
+    turn: int,
     sums: Sums,
 ):
     """The forces of obstacles on a borne place itself: the first ones, or which push, or their corrections."""
     if begins:
         force = begin_borne(s, shapes, motions, surface, forces)
-        wp.atomic_add(sums.added, s, grains_of(force, law.grain))
+        add_force(s, force, law, turn, surface, sums)
         return
     yielding = float(0.0)
     if solves != 0:
         yielding = ease_of(s, sums, surface)
     more, pushing = push_borne(s, yielding, shapes, motions, law, dt, anchors, surface, forces)
     if solves != 0:
-        wp.atomic_add(sums.added, s, grains_of(more, law.grain))
-    else:
-        wp.atomic_add(sums.crowd, s, int(SHARES * pushing))
+        add_force(s, more, law, turn, surface, sums)
+    elif pushing > 0.0:
+        add_crowd(s, pushing, surface, sums)
 
 
 @wp.func
-def crowd_bearers(s: int, surface: Surface, sums: Sums):
-    """Add the weights at a borne place to its bearers, whose forces have moved it already."""
+def move_borne(s: int, law: Law, turn: int, surface: Surface):
+    """Move a borne place by what pushes its bearers, and clear these for the next pass."""
     b = surface.bearing.bearers[s]
     w = surface.bearing.weights[s]
-    crowd = float(sums.crowd[s])
+    d = wp.vec3()
     for k in range(4):
         if w[k] != 0.0:
-            surface.bearing.pushed[b[k]] = wp.vec3l()
-            if crowd > 0.0:
-                wp.atomic_add(surface.bearing.crowd, b[k], int(wp.abs(w[k]) * crowd))
+            d += (w[k] * surface.bearing.yielding[b[k]]) * force_of(surface.bearing.pushed[turn, b[k]], law.grain)
+            surface.bearing.pushed[1 - turn, b[k]] = wp.vec3l()
+            surface.bearing.crowd[b[k]] = 0
+    surface.d[s] = surface.d[s] + d
+
+
+@wp.func
+def clear_bearers(s: int, turn: int, surface: Surface):
+    b = surface.bearing.bearers[s]
+    w = surface.bearing.weights[s]
+    for k in range(4):
+        if w[k] != 0.0:
+            surface.bearing.pushed[turn, b[k]] = wp.vec3l()
 
 
 @wp.func
@@ -163,41 +226,24 @@ def push_place(
     surface: Surface,
     forces: wp.array2d[wp.vec3],
     anchors: wp.array2d[wp.vec4],
+    turn: int,
     sums: Sums,
 ):
-    """Give a place what was added: a node moves, and its own contacts follow; a borne place pushes its bearers."""
+    """Give a place what was added: it moves, and the contacts of a node follow."""
     grains = sums.added[s]
-    sums.crowd[s] = 0
-    is_pushed = grains[0] != wp.int64(0) or grains[1] != wp.int64(0) or grains[2] != wp.int64(0)
-    force = force_of(grains, law.grain)
-    if is_pushed:
+    if grains[0] != wp.int64(0) or grains[1] != wp.int64(0) or grains[2] != wp.int64(0):
+        force = force_of(grains, law.grain)
         sums.added[s] = wp.vec3l()
         surface.f[s] = surface.f[s] + force
+        if not is_borne(s, surface):
+            surface.d[s] = surface.d[s] + surface.yielding[s] * force
+    corrects = (parts & (BEGIN | CORRECT)) != 0
     if is_borne(s, surface):
-        if is_pushed:
-            b = surface.bearing.bearers[s]
-            w = surface.bearing.weights[s]
-            for k in range(4):
-                if w[k] != 0.0:
-                    wp.atomic_add(surface.bearing.pushed, b[k], grains_of(w[k] * force, law.grain))
-        return
-    if is_pushed:
-        surface.d[s] = surface.d[s] + surface.yielding[s] * force
+        move_borne(s, law, turn, surface)
+        corrects = False
+    sums.crowd[s] = 0
     if (flags & BESIDE) != 0:
-        if (parts & (BEGIN | CORRECT)) != 0:
+        if corrects:
             touch(s, (parts & BEGIN) != 0, shapes, motions, law, dt, anchors, surface, forces)
         if (parts & END) != 0:
             anchor(s, shapes, motions, surface, forces, anchors)
-
-
-@wp.func
-def move_borne(s: int, law: Law, surface: Surface):
-    """Move a borne place by what pushes its bearers."""
-    b = surface.bearing.bearers[s]
-    w = surface.bearing.weights[s]
-    d = wp.vec3()
-    for k in range(4):
-        if w[k] != 0.0:
-            d += (w[k] * surface.bearing.yielding[b[k]]) * force_of(surface.bearing.pushed[b[k]], law.grain)
-            surface.bearing.crowd[b[k]] = 0
-    surface.d[s] = surface.d[s] + d

@@ -20,9 +20,10 @@ from .pairs import Pairs
 from .search import Search
 from .surface import ContactSurface
 
-#: With more near nodes or near triangles than this for each thread of a block, the whole device is faster than the
-#: block.
+#: With more near nodes or near triangles, or more pairs of soft surfaces, than this for each thread of a block, the
+#: whole device is faster than the block.
 MOST_EACH = 4
+MOST_PAIRS_EACH = 2
 
 
 class RigidForces:
@@ -100,8 +101,10 @@ class RigidForces:
         """Choose how forces are launched, by the number of nodes and triangles that were near in the last run."""
         together = self.together
         if together is None:
-            most = MOST_EACH * BLOCK * (1.0 if self._is_together else 0.5)
-            is_short = (self.has_rounds or self._pairs is not None) and self.search.most_near <= most
+            most = BLOCK * (1.0 if self._is_together else 0.5)
+            is_short = (self.has_rounds or self._pairs is not None) and self.search.most_near <= MOST_EACH * most
+            # A pair takes longer than a place.
+            is_short = is_short and self.search.pairs <= MOST_PAIRS_EACH * most
             together = (self.device.is_cpu or is_short) and self._ranks.is_alone
         self.revision += int(together != self._is_together)
         self._is_together = together

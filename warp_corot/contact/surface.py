@@ -229,7 +229,7 @@ class ContactSurface:
         bearing.gathered = wp.zeros(borne, dtype=wp.vec3, device=device)
         bearing.yielding = self.bearers.yielding
         bearing.crowd = wp.zeros(bearers, dtype=wp.int32, device=device)
-        bearing.pushed = wp.zeros(bearers, dtype=wp.vec3l, device=device)
+        bearing.pushed = wp.zeros((2, bearers), dtype=wp.vec3l, device=device)
         bearing.starts = wp.zeros(bearers + 1, dtype=wp.int32, device=device)
         bearing.weights = wp.zeros(borne, dtype=wp.vec4, device=device)
         bearing.places = wp.zeros(4 * borne, dtype=wp.int32, device=device)
