@@ -37,7 +37,9 @@ def record_block(path: Path) -> None:
     wc.record(wc.Simulation(body), path, duration=0.05)
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+@pytest.mark.parametrize(
+    ("number", "status"), [pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow), (signal.SIGINT, 130)]
+)
 def test_signals_keep_frames(tmp_path, number, status):
     command = ["simulate", "box", "-o", "a.usd", "--duration", "1000", "--device", "cpu"]
     # Background processes ignore SIGINT, and so would their children.

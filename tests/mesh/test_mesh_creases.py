@@ -30,7 +30,12 @@ BODIES = {
 
 @pytest.mark.parametrize(
     ("name", "nearer"),
-    [pytest.param("cube", 0.2, marks=pytest.mark.slow), ("cylinder", 0.7), ("notched ball", 0.7), ("ball", 1.0)],
+    [
+        pytest.param("cube", 0.2, marks=pytest.mark.slow),
+        pytest.param("cylinder", 0.7, marks=pytest.mark.slow),
+        ("notched ball", 0.7),
+        ("ball", 1.0),
+    ],
 )
 def test_edges_are_followed_and_smooth_bodies_lose_nothing(name, nearer):
     domain = BODIES[name]()

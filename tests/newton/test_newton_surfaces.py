@@ -91,7 +91,7 @@ def test_momentum_is_exchanged(device):
     np.testing.assert_allclose(turned[1], first[1], atol=1e-2 * 0.1 * ball)
 
 
-@pytest.mark.parametrize("shape", ["sphere", "box", BALL])
+@pytest.mark.parametrize("shape", ["sphere", pytest.param("box", marks=pytest.mark.slow), BALL])
 @pytest.mark.parametrize(
     "at", [(0.06, 0.13), *(pytest.param(at, marks=pytest.mark.slow) for at in ((0.05, 0.1), (0.07, 0.14)))]
 )
