@@ -1,23 +1,23 @@
 """Soft surfaces against one another in an implicit step: the pairs of ``pairs`` as springs with multipliers.
 
-A pair that must not overlap pushes with p = max(l - k (g - t), 0): its gap g at the end of the step, where that must
-come to, t, a stiffness k like that of the nodes around it, and a multiplier l. Friction is the same across the normal,
-bounded by Coulomb's law. Each time the step has been solved for, forces become the multipliers, so that gaps close
-whatever k is (augmented Lagrangians), and pairs are located again where they have come to. Multipliers begin with the
-forces of the last step. While a step is solved for, a pair stays what it was located as, a plane that nothing passes.
+See ``springs`` for the force of a pair, with a stiffness like that of the nodes around it. Each time the step has been
+solved for, forces become the multipliers, and pairs are located again where they have come to. Multipliers begin with
+the forces of the last step. While a step is solved for, a pair stays what it was located as, a plane that nothing
+passes.
 """
 
 import warp as wp
 
-from warp_corot.kernels.elements.elements import add_force, load_node, store_node
 from warp_corot.kernels.implicit.conjugate_gradients import had_much_to_do
 from warp_corot.kernels.implicit.line_search import TRIED
 from warp_corot.kernels.stepping.pace import DT, Pace
 
+from .carriers import Carriers, crowd_at, ease_at, gone_at, is_held_at, motion_at, push_at
 from .facing import locate_facing
 from .law import Law, held_back
 from .motion import Surface
 from .rows import Meeting, Rows, row_count
+from .springs import kept_gap, spring_state
 from .vertices import across
 
 wp.set_module_options({"enable_backward": False})
@@ -32,10 +32,7 @@ NEAR, PUSHING, REACHED = (wp.constant(k) for k in range(3))
 class Joined:
     """The places [S] and pairs [P] of an implicit step. Entries number the nodes of all bodies in one vector."""
 
-    entry: wp.array[wp.int32]  # [S]
     start: wp.array[wp.vec3]  # [S] where the step begins [m]
-    carried: wp.array[wp.vec3]  # [S] how far held nodes have gone in the step [m]
-    compliance: wp.array[wp.float32]  # [S] of the node alone [m/N]; zero: it is held
     base: wp.array[wp.vec3]  # [P] how much the pair has opened where it is located [m]
     given: wp.array[wp.vec3]  # [P] how much held nodes open it [m]
     target: wp.array[wp.float32]  # [P] the least gap at the end [m]
@@ -44,7 +41,6 @@ class Joined:
     most: wp.array[wp.float32]  # [P] most of friction [N]
     force: wp.array[wp.vec3]  # [P] on the first [N]
     derivative: wp.array[wp.mat33]  # [P] [N/m]
-    crowd: wp.array[wp.float32]  # [S] the sum of shares in pairs that push
     locates: wp.array[wp.int32]  # [1] whether pairs are to be located
     near: wp.array[wp.int32]  # [P] the pairs that may meet, as they were located
     pushing: wp.array[wp.int32]  # [P] those that push
@@ -53,84 +49,48 @@ class Joined:
 
 
 @wp.kernel(enable_backward=False)
-def begin_places(
-    # In
-    start: int,
-    first: int,
-    inverse_mass: wp.array[wp.float32],
-    blocks: wp.array[wp.mat33],
-    rest: wp.array[wp.vec4],
-    u: wp.array[wp.vec4],
-    increment: wp.array[wp.vec4],
-    guess: wp.array[wp.vec4],
-    # Out
-    surface: Surface,
-    joined: Joined,
-):
-    """Where a body's surface nodes are, and how far they may go; entries are from ``first`` on."""
-    s = start + wp.tid()
-    i = surface.node[s]
-    surface.f[s] = wp.vec3()
-    surface.d[s] = wp.vec3()
-    surface.yielding[s] = 0.0
-    joined.compliance[s] = 0.0
-    joined.entry[s] = -1
-    if i < 0:
-        return
-    home = load_node(rest, i)
-    x = home + load_node(u, i)
-    surface.rest[s] = home
-    surface.x[s] = x
-    surface.d[s] = load_node(guess, i)
-    joined.start[s] = x
-    joined.entry[s] = first + i
-    joined.carried[s] = wp.vec3()
-    joined.crowd[s] = 0.0
-    if inverse_mass[i] > 0.0:
-        joined.compliance[s] = 3.0 / wp.max(wp.trace(blocks[i]), 1.0e-30)
-    else:
-        # It is where the step ends; the motion tells the search how fast it is.
-        joined.carried[s] = load_node(increment, i)
-        surface.d[s] = joined.carried[s]
+def begin_places(surface: Surface, joined: Joined):
+    """Keep where places are when the step begins."""
+    s = wp.tid()
+    joined.start[s] = surface.x[s]
 
 
 @wp.func
-def opened_by(row: int, d: wp.array[wp.vec4], rows: Rows, joined: Joined):
+def opened_by(row: int, d: wp.array[wp.vec4], rows: Rows, surface: Surface, carriers: Carriers):
     """How much farther apart the two are after motions d [m]."""
     p = rows.places[row]
     w = rows.shares[row]
     e = wp.vec3()
-    for k in range(4):
-        e += w[k] * load_node(d, joined.entry[p[k]])
+    # This loop is not unrolled, so that there is one motion to compile.
+    k = int(0)
+    while k < 4:
+        e += w[k] * motion_at(p[k], surface, carriers, d)
+        k += 1
     return e
 
 
 @wp.kernel(enable_backward=False)
-def place_nodes(is_first: int, d: wp.array[wp.vec4], joined: Joined, surface: Surface):
-    """Put surface nodes where pairs are to be located: at the beginning of the step, or after motions d. Pairs that
-    were near are forgotten.
+def place_nodes(is_first: int, d: wp.array[wp.vec4], joined: Joined, carriers: Carriers, surface: Surface):
+    """Put places where pairs are to be located: where the step begins, or after motions d. Pairs that were near are
+    forgotten.
     """
     s = wp.tid()
-    i = joined.entry[s]
     if joined.locates[0] == 0:
         return
     if s == 0:
         joined.counts[NEAR] = 0
-    if i < 0:
+    if surface.node[s] < 0:
         return
     x = joined.start[s]
     if is_first == 0:
-        x += load_node(d, i)
+        x += motion_at(s, surface, carriers, d)
     surface.x[s] = x
-    joined.crowd[s] = 0.0
 
 
-@wp.func
-def least_gap(gap: float, law: Law, dt: float):
-    """Where a gap must be at the end of the step; overlaps open slowly."""
-    if gap > -law.tolerance:
-        return 0.0
-    return gap + wp.min(-law.settling * gap, law.recovery * dt)
+@wp.kernel(enable_backward=False)
+def empty_crowds(joined: Joined, carriers: Carriers):
+    if joined.locates[0] != 0:
+        carriers.crowd[wp.tid()] = 0.0
 
 
 @wp.func
@@ -142,14 +102,21 @@ def locate(
     d: wp.array[wp.vec4],
     surface: Surface,
     meeting: Meeting,
+    carriers: Carriers,
     rows: Rows,
     joined: Joined,
 ):
-    is_near = locate_facing(row, surface, meeting, rows)
     was = joined.force[row]
+    pushed = wp.dot(was, was) > 0.0
     if is_first != 0:
         was = rows.force[row]
+        pushed = wp.dot(was, was) > 0.0
         joined.target[row] = 0.0
+    elif pushed:
+        e = opened_by(row, d, rows, surface, carriers) - joined.base[row]
+        if wp.abs(rows.gap[row] + wp.dot(rows.normal[row], e) - joined.target[row]) <= law.slack:
+            was = joined.multiplier[row]
+    is_near = locate_facing(row, surface, meeting, rows)
     joined.multiplier[row] = wp.vec3()
     joined.force[row] = wp.vec3()
     joined.stiffness[row] = 0.0
@@ -157,27 +124,32 @@ def locate(
         return
     p = rows.places[row]
     w = rows.shares[row]
-    yielding = float(0.0)
+    is_free = bool(False)
     given = wp.vec3()
-    for k in range(4):
-        yielding += joined.compliance[p[k]]
-        given += w[k] * joined.carried[p[k]]
-    if yielding == 0.0:
+    k = int(0)
+    while k < 4:
+        is_free = is_free or not is_held_at(p[k], surface, carriers)
+        given += w[k] * gone_at(p[k], surface, carriers)
+        k += 1
+    if not is_free:
         return
     joined.stiffness[row] = 1.0
     joined.given[row] = given
     joined.base[row] = wp.vec3()
+    opened = opened_by(row, d, rows, surface, carriers)
     if is_first != 0:
-        joined.target[row] = least_gap(rows.gap[row], law, dt)
+        joined.target[row] = kept_gap(rows.gap[row], pushed, law, dt)
     else:
-        joined.base[row] = opened_by(row, d, rows, joined)
+        joined.base[row] = opened
     n = rows.normal[row]
     push = wp.max(wp.dot(was, n), 0.0)
     joined.multiplier[row] = push * n + held_back(across(was, n), push, meeting.friction)
-    gap = rows.gap[row] + wp.dot(n, opened_by(row, d, rows, joined) - joined.base[row])
+    gap = rows.gap[row] + wp.dot(n, opened - joined.base[row])
     if push > 0.0 or gap < joined.target[row]:
-        for k in range(4):
-            wp.atomic_add(joined.crowd, p[k], wp.abs(w[k]))
+        k = int(0)
+        while k < 4:
+            crowd_at(p[k], w[k], surface, carriers)
+            k += 1
 
 
 @wp.kernel(enable_backward=False)
@@ -191,6 +163,7 @@ def locate_rows(
     surface: Surface,
     meeting: Meeting,
     # Out
+    carriers: Carriers,
     rows: Rows,
     joined: Joined,
 ):
@@ -201,12 +174,12 @@ def locate_rows(
     if joined.locates[0] == 0:
         count = 0
     while row < count:
-        locate(row, is_first, law, dt, d, surface, meeting, rows, joined)
+        locate(row, is_first, law, dt, d, surface, meeting, carriers, rows, joined)
         row += threads
 
 
 @wp.kernel(enable_backward=False)
-def stiffen_rows(threads: int, rows: Rows, joined: Joined):
+def stiffen_rows(threads: int, surface: Surface, carriers: Carriers, rows: Rows, joined: Joined):
     """Stiffness of the pairs that have been located: those that share nodes share it. Only these may meet until
     pairs are located again.
     """
@@ -219,47 +192,22 @@ def stiffen_rows(threads: int, rows: Rows, joined: Joined):
             p = rows.places[row]
             w = rows.shares[row]
             yielding = float(0.0)
-            for k in range(4):
-                yielding += wp.abs(w[k]) * wp.max(joined.crowd[p[k]], wp.abs(w[k])) * joined.compliance[p[k]]
+            k = int(0)
+            while k < 4:
+                yielding += ease_at(p[k], w[k], surface, carriers)
+                k += 1
             joined.stiffness[row] = STIFF / wp.max(yielding, 1.0e-30)
             joined.near[wp.atomic_add(joined.counts, NEAR, 1)] = row
         row += threads
 
 
-@wp.struct
-class RowState:
-    """The force of a pair on its first side [N], the derivative of that [N/m], and its push along the normal [N]."""
-
-    force: wp.vec3
-    derivative: wp.mat33
-    push: float
-
-
 @wp.func
 def row_state(row: int, e: wp.vec3, most: float, rows: Rows, joined: Joined):
-    """A pair that has opened by e, with friction of at most ``most``."""
-    made = RowState()
-    k = joined.stiffness[row]
+    """A pair that has opened by e, with friction of at most ``most``; its force is that on the first side."""
     n = rows.normal[row]
-    first = joined.multiplier[row]
-    gap = rows.gap[row] + wp.dot(n, e - joined.base[row])
-    whole = wp.outer(n, n)
-    made.push = wp.max(wp.dot(first, n) - k * (gap - joined.target[row]), 0.0)
-    if made.push > 0.0:
-        made.force = made.push * n
-        made.derivative = k * whole
-    if most > 0.0:
-        sideways = across(first - k * (e + joined.given[row]), n)
-        size = wp.length(sideways)
-        plane = wp.identity(3, dtype=wp.float32) - whole
-        share = float(1.0)
-        if size > most:
-            # What slides has no stiffness in the direction in which it slides.
-            share = most / size
-            plane -= wp.outer(sideways, sideways) / (size * size)
-        made.force += share * sideways
-        made.derivative += (k * share) * plane
-    return made
+    short = rows.gap[row] + wp.dot(n, e - joined.base[row]) - joined.target[row]
+    slip = e + joined.given[row]
+    return spring_state(short, slip, joined.stiffness[row], joined.multiplier[row], n, most)
 
 
 @wp.kernel(enable_backward=False)
@@ -268,12 +216,20 @@ def empty_list(which: int, joined: Joined):
 
 
 @wp.kernel(enable_backward=False)
-def update_rows(threads: int, friction: float, d: wp.array[wp.vec4], rows: Rows, joined: Joined):
+def update_rows(
+    threads: int,
+    friction: float,
+    d: wp.array[wp.vec4],
+    surface: Surface,
+    carriers: Carriers,
+    rows: Rows,
+    joined: Joined,
+):
     """Forces and derivatives after motions d, with the friction that the push there allows, and the pairs that push."""
     k = wp.tid()
     while k < joined.counts[NEAR]:
         row = joined.near[k]
-        e = opened_by(row, d, rows, joined)
+        e = opened_by(row, d, rows, surface, carriers)
         push = row_state(row, e, 0.0, rows, joined).push
         joined.most[row] = friction * push
         joined.force[row] = wp.vec3()
@@ -286,13 +242,21 @@ def update_rows(threads: int, friction: float, d: wp.array[wp.vec4], rows: Rows,
 
 
 @wp.kernel(enable_backward=False)
-def find_reached(threads: int, d: wp.array[wp.vec4], change: wp.array[wp.vec4], rows: Rows, joined: Joined):
+def find_reached(
+    threads: int,
+    d: wp.array[wp.vec4],
+    change: wp.array[wp.vec4],
+    surface: Surface,
+    carriers: Carriers,
+    rows: Rows,
+    joined: Joined,
+):
     """The pairs that push after motions d or with the change: as gaps change in proportion, no others push between."""
     k = wp.tid()
     while k < joined.counts[NEAR]:
         row = joined.near[k]
-        e = opened_by(row, d, rows, joined)
-        after = e + opened_by(row, change, rows, joined)
+        e = opened_by(row, d, rows, surface, carriers)
+        after = e + opened_by(row, change, rows, surface, carriers)
         push = wp.max(row_state(row, e, 0.0, rows, joined).push, row_state(row, after, 0.0, rows, joined).push)
         if push > 0.0:
             joined.reached[wp.atomic_add(joined.counts, REACHED, 1)] = row
@@ -300,31 +264,45 @@ def find_reached(threads: int, d: wp.array[wp.vec4], change: wp.array[wp.vec4], 
 
 
 @wp.func
-def add_to_entries(row: int, force: wp.vec3, rows: Rows, joined: Joined, y: wp.array[wp.vec4]):
+def add_to_entries(row: int, force: wp.vec3, rows: Rows, surface: Surface, carriers: Carriers, y: wp.array[wp.vec4]):
     p = rows.places[row]
     w = rows.shares[row]
-    for k in range(4):
-        if joined.compliance[p[k]] > 0.0:
-            add_force(y, joined.entry[p[k]], w[k] * force)
+    k = int(0)
+    while k < 4:
+        push_at(p[k], w[k] * force, surface, carriers, y)
+        k += 1
 
 
 @wp.kernel(enable_backward=False)
-def add_row_forces(threads: int, rows: Rows, joined: Joined, y: wp.array[wp.vec4]):
+def add_row_forces(
+    threads: int, surface: Surface, carriers: Carriers, rows: Rows, joined: Joined, y: wp.array[wp.vec4]
+):
     """Add the forces of pairs on nodes that are free [N]."""
     k = wp.tid()
     while k < joined.counts[PUSHING]:
         row = joined.pushing[k]
-        add_to_entries(row, joined.force[row], rows, joined, y)
+        add_to_entries(row, joined.force[row], rows, surface, carriers, y)
         k += threads
 
 
 @wp.kernel(enable_backward=False)
-def add_row_products(threads: int, rows: Rows, joined: Joined, x: wp.array[wp.vec4], y: wp.array[wp.vec4]):
+def add_row_products(
+    # In
+    threads: int,
+    surface: Surface,
+    carriers: Carriers,
+    rows: Rows,
+    joined: Joined,
+    x: wp.array[wp.vec4],
+    # Out
+    y: wp.array[wp.vec4],
+):
     """Add the derivative times x."""
     k = wp.tid()
     while k < joined.counts[PUSHING]:
         row = joined.pushing[k]
-        add_to_entries(row, joined.derivative[row] * opened_by(row, x, rows, joined), rows, joined, y)
+        product = joined.derivative[row] * opened_by(row, x, rows, surface, carriers)
+        add_to_entries(row, product, rows, surface, carriers, y)
         k += threads
 
 
@@ -332,6 +310,8 @@ def add_row_products(threads: int, rows: Rows, joined: Joined, x: wp.array[wp.ve
 def add_row_slopes(
     # In
     threads: int,
+    surface: Surface,
+    carriers: Carriers,
     rows: Rows,
     joined: Joined,
     d: wp.array[wp.vec4],
@@ -346,8 +326,8 @@ def add_row_slopes(
     total = wp.float64(0.0)
     while k < joined.counts[REACHED]:
         row = joined.reached[k]
-        along = opened_by(row, change, rows, joined)
-        e = opened_by(row, d, rows, joined) + share * along
+        along = opened_by(row, change, rows, surface, carriers)
+        e = opened_by(row, d, rows, surface, carriers) + share * along
         made = row_state(row, e, joined.most[row], rows, joined)
         total += wp.dot(wp.vec3d(made.force), wp.vec3d(along))
         k += threads
@@ -379,25 +359,22 @@ def end_rows(threads: int, rows: Rows, joined: Joined, added: wp.array[wp.vec3])
 @wp.kernel(enable_backward=False)
 def end_places(
     # In
-    start: int,
     d: wp.array[wp.vec4],
     joined: Joined,
+    carriers: Carriers,
     # In and out
     added: wp.array[wp.vec3],
     # Out
     surface: Surface,
-    contact_forces: wp.array[wp.vec4],
 ):
-    """What has come of the step at a body's surface nodes: places at its beginning, motions and forces."""
-    s = start + wp.tid()
-    i = surface.node[s]
-    if i < 0:
+    """What has come of the step at the places: where they began, motions and forces."""
+    s = wp.tid()
+    if surface.node[s] < 0:
         return
     surface.x[s] = joined.start[s]
-    surface.d[s] = load_node(d, joined.entry[s])
+    surface.d[s] = motion_at(s, surface, carriers, d)
     surface.f[s] = surface.f[s] + added[s]
     added[s] = wp.vec3()
-    store_node(contact_forces, i, surface.f[s])
 
 
 @wp.kernel(enable_backward=False)

@@ -21,6 +21,7 @@ class Law:
     tolerance: float  # gaps of the size of rounding errors [m]
     recovery: float  # speed at which overlapping surfaces are pushed apart [m/s]
     settling: float  # share of an overlap by which they are pushed apart in a step at most
+    slack: float  # gaps at own surfaces of up to this size may stay as they are in implicit steps [m]
     grain: float  # forces on nodes are summed in multiples of this, so that the order does not matter [N]
 
 

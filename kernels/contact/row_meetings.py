@@ -9,6 +9,7 @@ import warp as wp
 from warp_corot.kernels.elements.elements import load_node
 from warp_corot.kernels.stepping.pace import DT, Pace
 
+from .carriers import mark_carriers
 from .facing import locate_facing
 from .law import Law
 from .motion import Surface
@@ -33,7 +34,7 @@ def foresee_places(
     surface: Surface,
     begins: wp.array[wp.int32],
 ):
-    """Where a body's surface nodes are, and how far their velocities lead; whether what they touch has changed."""
+    """Where a body's carriers are, and how far their velocities lead; whether what they touch has changed."""
     s = start + wp.tid()
     i = surface.node[s]
     if i < 0:
@@ -75,14 +76,16 @@ def find_row_meetings(
 
 
 @wp.kernel(enable_backward=False)
-def mark_acting(threads: int, rows: Rows, marked: wp.array[wp.int32]):
-    """Mark the places of pairs that push."""
+def mark_acting(threads: int, surface: Surface, rows: Rows, marked: wp.array[wp.int32]):
+    """Mark the carriers of the places of pairs that push."""
     row = wp.tid()
     while row < row_count(rows):
         if rows.acts[row] != 0:
             p = rows.places[row]
-            for k in range(4):
-                marked[p[k]] = 1
+            k = int(0)
+            while k < 4:
+                mark_carriers(p[k], surface, marked)
+                k += 1
         row += threads
 
 
@@ -90,16 +93,17 @@ def mark_acting(threads: int, rows: Rows, marked: wp.array[wp.int32]):
 def note_touched(
     # In
     start: int,
+    offset: int,
     surface: Surface,
     # In and out
     marked: wp.array[wp.int32],
     touched: wp.array[wp.int32],
 ):
-    """What the nodes of a body have touched in the step; no place is marked afterwards."""
+    """What the carriers of a body, from ``offset`` on, have touched in the step; none is marked afterwards."""
     s = start + wp.tid()
     i = surface.node[s]
-    now = marked[s]
-    marked[s] = 0
+    now = marked[offset + s]
+    marked[offset + s] = 0
     if i < 0:
         return
     changed = int(0)

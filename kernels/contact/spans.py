@@ -1,23 +1,23 @@
-"""Obstacles at the edges and the interiors of triangles in an implicit step: springs with multipliers; see ``joined``.
+"""Obstacles at triangles, and at places that nodes bear, in an implicit step: springs with multipliers.
 
-Where an obstacle is closer to a triangle than to its corners, p = max(l - k (g - t), 0) pushes the triangle's point: g
-is its gap at the end of the step, t where it must come to, k a stiffness like that of the corners, l a multiplier.
-Friction is the same across the normal, bounded by Coulomb's law. Each time the step has been solved for, points and
-normals are found again, and forces become the multipliers; in between, spans that are missing are added.
+A span is an obstacle at a point of an item: one that is closer to a triangle than to its corners, or to a place between
+nodes, which counts as a triangle whose corners are all there. See ``springs`` for its force, with a stiffness like that
+of the corners. Each time the step has been solved for, points and normals are found again, and forces become the
+multipliers; in between, spans that are missing are added.
 """
 
 import warp as wp
 
-from warp_corot.kernels.elements.elements import add_force, load_node, store_node
 from warp_corot.kernels.implicit.conjugate_gradients import had_much_to_do
 from warp_corot.kernels.implicit.line_search import TRIED
 from warp_corot.kernels.stepping.pace import DT, Pace
 
 from .active import NEAR_END
-from .active import STIFF as STIFF_NODES
+from .carriers import Carriers, crowd_at, ease_at, is_held_at, motion_at, push_at
 from .law import Law, held_back
 from .motion import Motions, Surface
 from .shapes import CAPSULE, GROUND, Shapes, carried, distance_to
+from .springs import kept_gap, spring_state
 from .touches import CORNER, SKEWERED, Touches, nearest
 from .vertices import across
 
@@ -25,8 +25,6 @@ wp.set_module_options({"enable_backward": False})
 
 #: Which spans are found: all at the beginning of the step, all again if that is due, or those that are missing.
 FIRST, AGAIN, MISSING = (wp.constant(k) for k in range(3))
-#: The stiffness of a span over that of its point.
-STIFF = wp.constant(32.0)
 #: An obstacle may sink into triangles by this fraction of half its thickness. Otherwise all triangles around a ball are
 #: tangent to it, hold off the nodes, and make bodies much too stiff. So nodes less than 1.26 radii apart need no spans.
 ALLOWED = wp.constant(0.2)
@@ -36,7 +34,7 @@ CLOSER = wp.constant(4.0)
 
 @wp.struct
 class Spans:
-    """Obstacles at triangles in an implicit step, [O, T], besides what ``Touches`` has."""
+    """Obstacles at items in an implicit step, [O, T], besides what ``Touches`` has."""
 
     listed: wp.array2d[wp.int32]  # whether it may push
     base: wp.array2d[wp.float32]  # how much it has opened where it is found [m]
@@ -45,36 +43,34 @@ class Spans:
     multiplier: wp.array2d[wp.vec3]  # [N]
     most: wp.array2d[wp.float32]  # most of friction [N]
     derivative: wp.array2d[wp.mat33]  # [N/m]
-    crowd: wp.array[wp.float32]  # [S] the sum of shares in spans that push
     count: wp.array[wp.int32]  # [1] how many are listed
     due: wp.array[wp.int32]  # [1] whether all are to be found again
+    stiff: float  # the stiffness of a span over that of its point
 
 
 @wp.func
-def motion_of(w: wp.vec3, corners: wp.vec3i, surface: Surface, d: wp.array[wp.vec4]):
-    """The motion of a triangle's point [m]."""
+def motion_of(w: wp.vec3, corners: wp.vec3i, surface: Surface, carriers: Carriers, d: wp.array[wp.vec4]):
+    """The motion of an item's point [m]."""
     e = wp.vec3()
     for k in range(3):
-        e += w[k] * load_node(d, surface.node[corners[k]])
+        if w[k] != 0.0:
+            e += w[k] * motion_at(corners[k], surface, carriers, d)
     return e
-
-
-@wp.func
-def least_gap(gap: float, law: Law, dt: float):
-    """Where a gap must be at the end of the step; overlaps open slowly."""
-    if gap > -law.tolerance:
-        return 0.0
-    return gap + wp.min(-law.settling * gap, law.recovery * dt)
 
 
 @wp.struct
 class Found:
-    """Where an obstacle is close to a triangle."""
+    """Where an obstacle is close to an item."""
 
     is_near: wp.bool
     shares: wp.vec3
     gap: float
     normal: wp.vec3
+    moved: wp.vec3  # how far the obstacle goes there in the step [m]
+    opened: float  # how far the gap opens in the step [m]
+    is_at_end: wp.bool  # whether the gap is that at the end of the step
+    allowed: float  # how far the obstacle may sink in [m]
+    friction: float
 
 
 @wp.func
@@ -121,6 +117,62 @@ def find_span(
     return found
 
 
+@wp.func
+def take_span(
+    o: int,
+    t: int,
+    which: int,
+    found: Found,
+    e: wp.vec3,
+    corners: wp.vec3i,
+    law: Law,
+    pace: Pace,
+    surface: Surface,
+    carriers: Carriers,
+    touches: Touches,
+    spans: Spans,
+    changed: wp.array[wp.int32],
+):
+    """List a span where an obstacle is near; its force becomes its multiplier."""
+    was = touches.force[o, t]
+    was_listed = spans.listed[o, t] != 0 and which != FIRST
+    pushed = wp.dot(was, was) > 0.0
+    spans.listed[o, t] = 0
+    touches.force[o, t] = wp.vec3()
+    touches.acts[o, t] = 0
+    if not found.is_near:
+        return
+    n = found.normal
+    if was_listed:
+        short = touches.gap[o, t] + wp.dot(touches.normal[o, t], e) - spans.base[o, t] - spans.target[o, t]
+        if wp.abs(short) <= law.slack:
+            was = spans.multiplier[o, t]
+    base = wp.where(found.is_at_end, found.opened, 0.0)
+    target = wp.where(was_listed, spans.target[o, t], -found.allowed)
+    if which == FIRST:
+        target = kept_gap(found.gap + found.allowed, pushed, law, float(pace.seconds[DT])) - found.allowed
+    is_passed = found.gap + found.opened - base < target - law.tolerance
+    if which == MISSING:
+        if not is_passed:
+            return
+        changed[0] = 1
+    push = wp.max(wp.dot(was, n), 0.0)
+    touches.shares[o, t] = found.shares
+    touches.normal[o, t] = n
+    touches.gap[o, t] = found.gap
+    touches.friction[o, t] = found.friction
+    touches.moved[o, t] = found.moved
+    spans.listed[o, t] = 1
+    spans.base[o, t] = base
+    spans.target[o, t] = target
+    spans.multiplier[o, t] = push * n + held_back(across(was, n), push, found.friction)
+    wp.atomic_add(spans.count, 0, 1)
+    if push > 0.0 or is_passed:
+        for k in range(3):
+            if found.shares[k] != 0.0:
+                crowd_at(corners[k], found.shares[k], surface, carriers)
+
+
 @wp.kernel(enable_backward=False)
 def locate_spans(
     # In
@@ -135,6 +187,7 @@ def locate_spans(
     triangles: wp.array[wp.vec3i],
     d: wp.array[wp.vec4],
     # In and out
+    carriers: Carriers,
     touches: Touches,
     spans: Spans,
     # Out
@@ -150,70 +203,113 @@ def locate_spans(
         return
     world = surface.world[corners[0]]
     way = float(0.0)
+    x = wp.mat33()
+    e = wp.mat33()
     for k in range(3):
-        way = wp.max(way, wp.length(load_node(d, surface.node[corners[k]])))
-    x = wp.matrix_from_rows(surface.x[corners[0]], surface.x[corners[1]], surface.x[corners[2]])
+        e[k] = motion_at(corners[k], surface, carriers, d)
+        x[k] = surface.x[corners[k]]
+        way = wp.max(way, wp.length(e[k]))
     for o in range(touches.force.shape[0]):
-        was_listed = spans.listed[o, t] != 0 and which != FIRST
-        if shapes.kind[o] == GROUND or (which == MISSING and was_listed):
+        if shapes.kind[o] == GROUND or (which == MISSING and spans.listed[o, t] != 0):
             continue
         was = touches.force[o, t]
         now = motions.now[world, o]
         later = motions.later[world, o]
-        at = wp.matrix_from_rows(x[0], x[1], x[2])
-        pose = now
         is_at_end = which != FIRST and way <= NEAR_END * thickness[o]
+        pose = now
+        at = x
         if is_at_end:
             pose = later
-            for k in range(3):
-                at[k] = x[k] + load_node(d, surface.node[corners[k]])
+            at = x + e
         middle = (x[0] + x[1] + x[2]) / 3.0
         far = 2.0 * way + wp.length(carried(now, later, middle)) + 2.0 * law.tolerance
         found = find_span(o, pose, at[0], at[1], at[2], far, was, touches.normal[o, t], shapes, law)
-        spans.listed[o, t] = 0
-        touches.force[o, t] = wp.vec3()
-        touches.acts[o, t] = 0
-        if not found.is_near:
-            continue
-        w = found.shares
-        n = found.normal
-        moved = carried(now, later, w * x)
-        opened = wp.dot(n, motion_of(w, corners, surface, d) - moved)
-        base = wp.where(is_at_end, opened, 0.0)
-        allowed = ALLOWED * thickness[o]
-        target = wp.where(was_listed, spans.target[o, t], -allowed)
-        if which == FIRST:
-            target = least_gap(found.gap + allowed, law, float(pace.seconds[DT])) - allowed
-        is_passed = found.gap + opened - base < target - law.tolerance
-        if which == MISSING:
-            if not is_passed:
-                continue
-            changed[0] = 1
-        friction = wp.where(found.gap < -(SKEWERED + ALLOWED) * thickness[o], 0.0, shapes.friction[o])
-        push = wp.max(wp.dot(was, n), 0.0)
-        touches.shares[o, t] = w
-        touches.normal[o, t] = n
-        touches.gap[o, t] = found.gap
-        touches.friction[o, t] = friction
-        touches.moved[o, t] = moved
-        spans.listed[o, t] = 1
-        spans.base[o, t] = base
-        spans.target[o, t] = target
-        spans.multiplier[o, t] = push * n + held_back(across(was, n), push, friction)
-        wp.atomic_add(spans.count, 0, 1)
-        if push > 0.0 or is_passed:
-            for k in range(3):
-                wp.atomic_add(spans.crowd, corners[k], w[k])
+        found.moved = carried(now, later, found.shares * x)
+        found.opened = wp.dot(found.normal, found.shares * e - found.moved)
+        found.is_at_end = is_at_end
+        found.allowed = ALLOWED * thickness[o]
+        found.friction = shapes.friction[o]
+        if found.gap < -(SKEWERED + ALLOWED) * thickness[o]:
+            found.friction = 0.0
+        take_span(
+            o,
+            t,
+            which,
+            found,
+            found.shares * e - found.moved,
+            corners,
+            law,
+            pace,
+            surface,
+            carriers,
+            touches,
+            spans,
+            changed,
+        )
 
 
 @wp.kernel(enable_backward=False)
-def empty_spans(start: int, which: int, spans: Spans):
-    """Begin to find spans."""
-    s = wp.tid()
+def locate_points(
+    # In
+    start: int,
+    which: int,
+    shapes: Shapes,
+    thickness: wp.array[wp.float32],
+    motions: Motions,
+    law: Law,
+    pace: Pace,
+    surface: Surface,
+    points: wp.array[wp.vec3i],
+    d: wp.array[wp.vec4],
+    # In and out
+    carriers: Carriers,
+    touches: Touches,
+    spans: Spans,
+    # Out
+    changed: wp.array[wp.int32],
+):
+    """The same at a body's places that nodes bear; nothing sinks in there."""
+    s = start + wp.tid()
+    if points[s][0] < 0 or (which == AGAIN and spans.due[0] == 0) or is_held_at(s, surface, carriers):
+        return
+    world = surface.world[s]
+    x = surface.x[s]
+    e = motion_at(s, surface, carriers, d)
+    way = wp.length(e)
+    for o in range(touches.force.shape[0]):
+        if which == MISSING and spans.listed[o, s] != 0:
+            continue
+        now = motions.now[world, o]
+        later = motions.later[world, o]
+        found = Found()
+        found.is_at_end = which != FIRST and way <= NEAR_END * thickness[o]
+        pose = now
+        at = x
+        if found.is_at_end:
+            pose = later
+            at = x + e
+        found.moved = carried(now, later, x)
+        far = 2.0 * way + wp.length(found.moved) + 2.0 * law.tolerance
+        gap, n = distance_to(shapes, o, pose, at, far)
+        found.is_near = gap <= far
+        found.shares = wp.vec3(1.0, 0.0, 0.0)
+        found.gap = gap
+        found.normal = n
+        found.opened = wp.dot(n, e - found.moved)
+        found.allowed = 0.0
+        found.friction = shapes.friction[o]
+        take_span(o, s, which, found, e - found.moved, points[s], law, pace, surface, carriers, touches, spans, changed)
+
+
+@wp.kernel(enable_backward=False)
+def empty_spans(start: int, which: int, carriers: Carriers, spans: Spans):
+    """Begin to find spans of a body whose carriers begin at ``start``."""
+    c = wp.tid()
     if which == FIRST or spans.due[0] != 0:
-        spans.crowd[start + s] = 0.0
-        if s == 0:
+        carriers.crowd[start + c] = 0.0
+        if c == 0:
             spans.count[0] = 0
+            spans.due[0] = 1
 
 
 @wp.kernel(enable_backward=False)
@@ -221,8 +317,8 @@ def stiffen_spans(
     # In
     start: int,
     surface: Surface,
-    node_stiffness: wp.array[wp.float32],
     triangles: wp.array[wp.vec3i],
+    carriers: Carriers,
     touches: Touches,
     # In and out
     spans: Spans,
@@ -234,13 +330,11 @@ def stiffen_spans(
             w = touches.shares[o, t]
             yielding = float(0.0)
             for k in range(3):
-                s = triangles[t][k]
-                if surface.yielding[s] > 0.0:
-                    stiffness = wp.max(node_stiffness[s] / STIFF_NODES, 1.0e-30)
-                    yielding += w[k] * wp.max(spans.crowd[s], w[k]) / stiffness
+                if w[k] != 0.0:
+                    yielding += ease_at(triangles[t][k], w[k], surface, carriers)
             spans.stiffness[o, t] = 0.0
             if yielding > 0.0:
-                spans.stiffness[o, t] = STIFF / yielding
+                spans.stiffness[o, t] = spans.stiff / yielding
 
 
 @wp.kernel(enable_backward=False)
@@ -267,40 +361,13 @@ def judge_spans(
     due[0] = wp.where(is_near, 1, 0)
 
 
-@wp.struct
-class SpanState:
-    """The force of a span on the triangle [N], the derivative of that [N/m], and its push along the normal [N]."""
-
-    force: wp.vec3
-    derivative: wp.mat33
-    push: float
-
-
 @wp.func
 def span_state(o: int, t: int, e: wp.vec3, most: float, touches: Touches, spans: Spans):
-    """A span after a motion e relative to the obstacle, with friction of at most ``most``."""
-    made = SpanState()
-    k = spans.stiffness[o, t]
+    """A span after a motion e relative to the obstacle, with friction of at most ``most``; its force is that on the
+    triangle."""
     n = touches.normal[o, t]
-    first = spans.multiplier[o, t]
-    gap = touches.gap[o, t] + wp.dot(n, e) - spans.base[o, t]
-    whole = wp.outer(n, n)
-    made.push = wp.max(wp.dot(first, n) - k * (gap - spans.target[o, t]), 0.0)
-    if made.push > 0.0:
-        made.force = made.push * n
-        made.derivative = k * whole
-    if most > 0.0:
-        sideways = across(first - k * e, n)
-        size = wp.length(sideways)
-        plane = wp.identity(3, dtype=wp.float32) - whole
-        share = float(1.0)
-        if size > most:
-            # What slides has no stiffness in the direction in which it slides.
-            share = most / size
-            plane -= wp.outer(sideways, sideways) / (size * size)
-        made.force += share * sideways
-        made.derivative += (k * share) * plane
-    return made
+    short = touches.gap[o, t] + wp.dot(n, e) - spans.base[o, t] - spans.target[o, t]
+    return spring_state(short, e, spans.stiffness[o, t], spans.multiplier[o, t], n, most)
 
 
 @wp.kernel(enable_backward=False)
@@ -309,6 +376,7 @@ def update_spans(
     start: int,
     surface: Surface,
     triangles: wp.array[wp.vec3i],
+    carriers: Carriers,
     d: wp.array[wp.vec4],
     # In and out
     touches: Touches,
@@ -321,7 +389,7 @@ def update_spans(
         touches.force[o, t] = wp.vec3()
         spans.most[o, t] = 0.0
         if spans.listed[o, t] != 0:
-            e = motion_of(touches.shares[o, t], triangles[t], surface, d) - touches.moved[o, t]
+            e = motion_of(touches.shares[o, t], triangles[t], surface, carriers, d) - touches.moved[o, t]
             push = span_state(o, t, e, 0.0, touches, spans).push
             most = touches.friction[o, t] * push
             spans.most[o, t] = most
@@ -333,22 +401,28 @@ def update_spans(
 
 
 @wp.func
-def add_to_corners(w: wp.vec3, force: wp.vec3, corners: wp.vec3i, surface: Surface, y: wp.array[wp.vec4]):
+def add_to_corners(
+    w: wp.vec3, force: wp.vec3, corners: wp.vec3i, surface: Surface, carriers: Carriers, y: wp.array[wp.vec4]
+):
     for k in range(3):
-        s = corners[k]
-        if surface.yielding[s] > 0.0:
-            add_force(y, surface.node[s], w[k] * force)
+        if w[k] != 0.0:
+            push_at(corners[k], w[k] * force, surface, carriers, y)
 
 
 @wp.kernel(enable_backward=False)
 def add_span_forces(
-    start: int, surface: Surface, triangles: wp.array[wp.vec3i], touches: Touches, y: wp.array[wp.vec4]
+    start: int,
+    surface: Surface,
+    triangles: wp.array[wp.vec3i],
+    carriers: Carriers,
+    touches: Touches,
+    y: wp.array[wp.vec4],
 ):
     """Add the forces of spans on nodes that are free [N]."""
     t = start + wp.tid()
     for o in range(touches.acts.shape[0]):
         if touches.acts[o, t] != 0:
-            add_to_corners(touches.shares[o, t], touches.force[o, t], triangles[t], surface, y)
+            add_to_corners(touches.shares[o, t], touches.force[o, t], triangles[t], surface, carriers, y)
 
 
 @wp.kernel(enable_backward=False)
@@ -357,6 +431,7 @@ def add_span_products(
     start: int,
     surface: Surface,
     triangles: wp.array[wp.vec3i],
+    carriers: Carriers,
     touches: Touches,
     spans: Spans,
     x: wp.array[wp.vec4],
@@ -368,8 +443,8 @@ def add_span_products(
     for o in range(touches.acts.shape[0]):
         if touches.acts[o, t] != 0:
             w = touches.shares[o, t]
-            product = spans.derivative[o, t] * motion_of(w, triangles[t], surface, x)
-            add_to_corners(w, product, triangles[t], surface, y)
+            product = spans.derivative[o, t] * motion_of(w, triangles[t], surface, carriers, x)
+            add_to_corners(w, product, triangles[t], surface, carriers, y)
 
 
 @wp.kernel(enable_backward=False)
@@ -379,6 +454,7 @@ def add_span_slopes(
     only_world: int,
     surface: Surface,
     triangles: wp.array[wp.vec3i],
+    carriers: Carriers,
     touches: Touches,
     spans: Spans,
     d: wp.array[wp.vec4],
@@ -396,8 +472,8 @@ def add_span_slopes(
     for o in range(touches.acts.shape[0]):
         if spans.listed[o, t] != 0:
             w = touches.shares[o, t]
-            along = motion_of(w, corners, surface, change)
-            e = motion_of(w, corners, surface, d) + float(search[world, TRIED]) * along - touches.moved[o, t]
+            along = motion_of(w, corners, surface, carriers, change)
+            e = motion_of(w, corners, surface, carriers, d) + float(search[world, TRIED]) * along - touches.moved[o, t]
             made = span_state(o, t, e, spans.most[o, t], touches, spans)
             power = wp.dot(wp.vec3d(made.force), wp.vec3d(along))
             if power != wp.float64(0.0):
@@ -413,12 +489,10 @@ def gather_spans(
     touches: Touches,
     # Out
     surface: Surface,
-    contact_forces: wp.array[wp.vec4],
 ):
-    """Add the shares of spans' forces at a body's surface nodes to those of contact [N]."""
+    """Add the shares of the forces at triangles to those of contact at a body's places [N]."""
     s = start + wp.tid()
-    i = surface.node[s]
-    if i < 0:
+    if surface.node[s] < 0:
         return
     total = surface.f[s]
     for k in range(corner_starts[s], corner_starts[s + 1]):
@@ -427,4 +501,16 @@ def gather_spans(
             if touches.acts[o, t] != 0:
                 total += touches.shares[o, t][corners[k] % 3] * touches.force[o, t]
     surface.f[s] = total
-    store_node(contact_forces, i, total)
+
+
+@wp.kernel(enable_backward=False)
+def end_points(start: int, carriers: Carriers, d: wp.array[wp.vec4], touches: Touches, surface: Surface):
+    """Write the motions of a body's places that nodes bear, and the forces on them."""
+    s = start + wp.tid()
+    if surface.node[s] < 0:
+        return
+    total = wp.vec3()
+    for o in range(touches.force.shape[0]):
+        total += touches.force[o, s]
+    surface.d[s] = motion_at(s, surface, carriers, d)
+    surface.f[s] = total

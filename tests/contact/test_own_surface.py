@@ -264,12 +264,6 @@ def test_worlds_and_remeshed_bodies(ball, device):
     assert min(point.gap for point in points) > -2e-4
 
 
-def test_implicit_steps_use_the_tetrahedra(ball, device):
-    body = wc.SoftBody(ball, SOFT, device=device)
-    sim = wc.Simulation(body, obstacles=[ground()], integrator=wc.BackwardEuler(0.01))
-    assert not sim.contact.surface.is_borne
-
-
 def test_what_contact_acts_on_is_checked():
     with pytest.raises(wc.InputError, match="on is 'skin'; it must be 'surface' or 'tetrahedra'"):
         wc.Contact(on="skin")

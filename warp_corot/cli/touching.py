@@ -21,8 +21,9 @@ from warp_corot.kernels.contact.overlaps import find_gaps
 from warp_corot.solvers import INTEGRATORS
 
 from .holding import up_of
-from .implicit import integrator_name, is_static
+from .implicit import integrator_name
 from .quantities import metres, number
+from .ranks import are_several
 from .summary import length
 from .tool_paths import make_tool, tool_shape
 
@@ -185,8 +186,8 @@ def place_ground(touched: Touched, args: argparse.Namespace, bodies: Sequence[Bo
 
 def _touched_points(body: Body, args: argparse.Namespace) -> Floats:
     """The points of a body on which contact will act [m], [n, 3]."""
-    are_own = not is_static(args) and not INTEGRATORS[integrator_name(args)].is_implicit
-    own = own_surface(body.subject.mesh) if are_own else None
+    is_implicit = INTEGRATORS[integrator_name(args)].is_implicit
+    own = None if are_several() and is_implicit else own_surface(body.subject.mesh)
     return body.subject.mesh.points[body.subject.used] if own is None else own.points
 
 

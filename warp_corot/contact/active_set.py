@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
 import warp as wp
 
 from warp_corot.kernels.contact import active as kernels
@@ -16,9 +15,6 @@ from .spans import Spans
 if TYPE_CHECKING:
     from .contacts import Contacts
 
-#: Stands for an infinite thickness [m].
-THICK = 1e6
-
 
 class ActiveSet:
     """Contact of a body with obstacles in implicit steps.
@@ -28,13 +24,13 @@ class ActiveSet:
         k: The number of the body.
     """
 
+    rounds = 16
+
     def __init__(self, contacts: Contacts, k: int):
         assert contacts.rigid is not None
         self._contacts, self._rigid, self._k = contacts, contacts.rigid, k
         self.body, self.device = contacts.system.bodies[k], contacts.device
-        shapes = [tool.shape for tool in contacts.obstacles.tools]
-        thickness = np.array([min(shape.thickness, THICK) for shape in shapes], np.float32)
-        self._thickness = wp.array(thickness, dtype=wp.float32, device=self.device)
+        self._thickness = contacts.obstacles.shapes.thickness
         self._rounds = wp.zeros(1, dtype=wp.int32, device=self.device)
         #: Whether other nodes are held than in the last round, int32 [1].
         self.changed = wp.zeros(1, dtype=wp.int32, device=self.device)
@@ -79,6 +75,7 @@ class ActiveSet:
         self._find_bounds(d, int(kernels.THOSE_TOUCHED), at_end=False)
         self._hold()
         if self._spans is not None:
+            self._spans.launch_begin(blocks, d)
             self._locate(spans.FIRST, d)
 
     def launch_again(self) -> None:
@@ -175,7 +172,7 @@ class ActiveSet:
         self._launch(kernels.end_places, [d, self._holding, self._surface, self.body.state.contact_forces])
         if self._spans is not None:
             self._spans.update(d)
-            self._spans.launch_end(self.body.state.contact_forces)
+            self._spans.launch_end(d)
 
     def launch_meetings(self, met: wp.array, begins: wp.array) -> None:
         """Launch the test whether contact has changed in the last step, or nodes will meet an obstacle in this one.
@@ -204,7 +201,7 @@ class ActiveSet:
 
     def _locate(self, which: int, d: wp.array) -> None:
         assert self._spans is not None
-        self._spans.launch_located(which, d, self._holding.stiffness, self.changed)
+        self._spans.launch_located(which, d, self.changed)
 
     def _hold(self) -> None:
         self._launch(kernels.hold_places, [self._contacts.obstacles.motions, self._surface, self._holding])

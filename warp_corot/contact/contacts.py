@@ -16,6 +16,7 @@ from warp_corot.solvers.ranks import ALONE, Ranks
 from warp_corot.solvers.system import System
 
 from .active_set import ActiveSet
+from .borne_set import BorneSet
 from .joined_rows import JoinedRows
 from .obstacles import Obstacles
 from .options import SURFACE, Contact
@@ -32,6 +33,9 @@ from .whole_surface import WholeSurface
 ROUNDINGS = 16.0
 #: Overlapping surfaces are pushed apart at this fraction of the speed of waves.
 RECOVERY = 0.05
+#: Gaps at bodies' own surfaces of up to this fraction of the smallest element may stay as they are in implicit steps:
+#: places share nodes, so that forces that close all gaps exactly take many solves. In static answers times ``FINE``.
+SLACK, FINE = 0.002, 0.05
 #: Number of rounds for obstacles between the nodes, and with places that nodes bear.
 ROUNDS, ROUNDS_OF_BORNE = 3, 4
 #: Number of grains in the force that moves the heaviest node across the smallest element in a step; the maximum is
@@ -50,8 +54,8 @@ class Contacts:
         options: The options of contact.
         stable_dt: Largest stable step of the bodies at rest [s], from which the speed of waves follows.
         dt: The length of a step, if it was given [s].
-        on_surfaces: Whether contact acts on the bodies' own surfaces, if ``options`` say so; implicit steps support the
-            boundary of the tetrahedra only.
+        on_surfaces: Whether contact acts on the bodies' own surfaces, if ``options`` say so; implicit steps over
+            ranks support the boundary of the tetrahedra only.
 
     Attributes:
         surface: The surface nodes and triangles of all bodies.
@@ -149,9 +153,10 @@ class Contacts:
             warn_of_overlaps(self, OVERLAP * self.smallest)
 
     def settle(self, share: float) -> None:
-        """Let surfaces be pushed apart by this share of an overlap in each step, without a warning: steps that seek a
-        state of rest may begin inside obstacles. Before the first step."""
+        """Let surfaces be pushed apart by this share of an overlap in each step, and more exactly, without a warning:
+        steps that seek a state of rest may begin inside obstacles. Before the first step."""
         self.law.settling, self._is_looked_at = share, True
+        self.law.slack *= FINE
 
     def look(self) -> None:
         """Check whether elements are turned inside out, until the first time; waits for the device.
@@ -195,9 +200,11 @@ class Contacts:
         if self.obstacles.count:
             self.obstacles.launch_motion(offset, self.search.watch)
 
-    def active_set(self, k: int) -> ActiveSet | None:
+    def active_set(self, k: int) -> ActiveSet | BorneSet | None:
         """The contact of a body with obstacles in implicit steps; None without obstacles."""
-        return None if self.rigid is None else ActiveSet(self, k)
+        if self.rigid is None:
+            return None
+        return BorneSet(self.system, self.rigid, self.law, k) if self.surface.parts[k].bearers else ActiveSet(self, k)
 
     def joined_rows(self) -> JoinedRows | None:
         """The contact of soft surfaces in implicit steps, if they may touch."""
@@ -289,6 +296,7 @@ class Contacts:
         law.recovery = RECOVERY * self.smallest / stable_dt if np.isfinite(stable_dt) else 0.1
         heaviest = self.system.ranks.most(max(float(body.masses.max()) for body in self.system.bodies))
         step = stable_dt if np.isfinite(stable_dt) else 1.0
+        law.slack = SLACK * self.smallest if self.surface.is_borne else 0.0
         law.grain = heaviest * self.smallest / step**2 / GRAINS
         return law
 

@@ -12,10 +12,11 @@ from warp_corot.kernels.contact.law import Law
 from warp_corot.kernels.contact.motion import Surface
 from warp_corot.solvers.system import System
 
+from .carriers import PlaceCarriers
 from .pairs import Pairs
 
 #: Fields of ``Joined`` for places and for pairs.
-OF_PLACES = {"entry": wp.int32, "start": wp.vec3, "carried": wp.vec3, "compliance": wp.float32, "crowd": wp.float32}
+OF_PLACES = {"start": wp.vec3}
 OF_PAIRS = {
     "base": wp.vec3,
     "given": wp.vec3,
@@ -47,7 +48,8 @@ class JoinedRows:
     def __init__(self, system: System, pairs: Pairs, law: Law):
         self._system, self._pairs, self._law, self.device = system, pairs, law, system.device
         self.locates = wp.zeros(1, dtype=wp.int32, device=self.device)
-        self._made = (-1, -1)
+        self._made = (-1, -1, -1)
+        self._carriers = PlaceCarriers(pairs.surface, system.bodies)
         self._places: Surface | None = None
         self.prepare()
 
@@ -58,7 +60,8 @@ class JoinedRows:
     def prepare(self) -> None:
         """Take the present surfaces and rooms; not while launches are recorded."""
         self._take_surface()
-        sizes = (self._pairs.surface.count, self._pairs.room)
+        self._carriers.follow()
+        sizes = (self._pairs.surface.count, self._pairs.room, self._pairs.surface.bearer_count)
         if sizes == self._made:
             return
         self._made, joined = sizes, kernels.Joined()
@@ -69,7 +72,8 @@ class JoinedRows:
         joined.counts = wp.zeros(3, dtype=wp.int32, device=self.device)
         self._joined = joined
         self._added = wp.zeros(sizes[0], dtype=wp.vec3, device=self.device)
-        self._marked = wp.zeros(sizes[0], dtype=wp.int32, device=self.device)
+        carriers = len(self._carriers.arrays.entry)
+        self._marked = wp.zeros(carriers, dtype=wp.int32, device=self.device)
 
     def _take_surface(self) -> None:
         """Places of their own, where pairs are located: obstacles find the places where they are when a step begins."""
@@ -99,16 +103,20 @@ class JoinedRows:
         for k, body in enumerate(self._system.bodies):
             state = body.state
             inputs = [state.rest, state.displacements, state.velocities, pace, touched[k]]
-            self._on_body(k, row_meetings.foresee_places, inputs, [surface, begins])
+            self._on_carriers(k, row_meetings.foresee_places, inputs, [begins])
+            self._carriers.launch_places(k)
         self.launch_search(offset)
         inputs = [self._law, surface, self._pairs.meeting, self._pairs.rows, begins]
         self._on_rows(row_meetings.find_row_meetings, inputs)
 
     def launch_touched(self, touched: Sequence[wp.array]) -> None:
         """Launch the record, after a step, of what the nodes of each body have touched."""
-        self._on_rows(row_meetings.mark_acting, [self._pairs.rows, self._marked])
+        surface = self._pairs.surface.arrays
+        self._on_rows(row_meetings.mark_acting, [surface, self._pairs.rows, self._marked])
         for k, array in enumerate(touched):
-            self._on_body(k, row_meetings.note_touched, [self._pairs.surface.arrays], [self._marked, array])
+            start, offset, count, own = self._carriers.nodes_of(k)
+            inputs = [start, offset, own, self._marked, array]
+            wp.launch(row_meetings.note_touched, count, inputs, device=self.device)
 
     def launch_begin(self, k: int, first: int, blocks: wp.array, increment: wp.array, guess: wp.array) -> None:
         """Launch the state of the k-th body at the beginning of a step.
@@ -120,10 +128,7 @@ class JoinedRows:
             increment: How far held nodes have gone in the step [m], vec4.
             guess: How far nodes may go [m], vec4.
         """
-        body = self._system.bodies[k]
-        state = body.state
-        inputs = [first, body.conditions.inverse_mass, blocks, state.rest, state.displacements, increment, guess]
-        self._on_body(k, kernels.begin_places, inputs, [self._pairs.surface.arrays, self._joined])
+        self._carriers.launch_begin(k, first, blocks, increment, guess)
 
     def launch_search(self, offset: int) -> None:
         """Launch a search for pairs, if it is due."""
@@ -132,40 +137,50 @@ class JoinedRows:
     def launch_located(self, d: wp.array, *, is_first: bool) -> None:
         """Launch the search for the closest points of pairs, at the beginning of the step or after motions d, if it is
         due."""
-        surface, joined = self._places, self._joined
-        inputs = [int(is_first), d, joined, surface]
-        wp.launch(kernels.place_nodes, self._pairs.surface.count, inputs, device=self.device)
+        surface, joined, count = self._places, self._joined, self._pairs.surface.count
+        carriers = self._carriers.arrays
+        if is_first:
+            inputs = [self._pairs.surface.arrays, joined]
+            wp.launch(kernels.begin_places, count, inputs, device=self.device)
+        inputs = [int(is_first), d, joined, carriers, surface]
+        wp.launch(kernels.place_nodes, count, inputs, device=self.device)
+        wp.launch(kernels.empty_crowds, len(carriers.crowd), [joined, carriers], device=self.device)
         inputs = [int(is_first), self._law, self._system.pace.arrays, d, surface, self._pairs.meeting]
-        self._on_rows(kernels.locate_rows, [*inputs, self._pairs.rows, joined])
-        self._on_rows(kernels.stiffen_rows, [self._pairs.rows, joined])
+        self._on_rows(kernels.locate_rows, [*inputs, carriers, self._pairs.rows, joined])
+        self._on_rows(kernels.stiffen_rows, self._springs)
 
     def update(self, d: wp.array) -> None:
         """Launch forces and their derivatives after motions d."""
         self._empty(kernels.PUSHING)
-        self._on_rows(kernels.update_rows, [self._pairs.friction, d, self._pairs.rows, self._joined])
+        self._on_rows(kernels.update_rows, [self._pairs.friction, d, *self._springs])
 
     def find_reached(self, d: wp.array, change: wp.array) -> None:
         """Launch the list of pairs that may push along a change of the motions d; ``add_slopes`` visits only these."""
         self._empty(kernels.REACHED)
-        self._on_rows(kernels.find_reached, [d, change, self._pairs.rows, self._joined])
+        self._on_rows(kernels.find_reached, [d, change, *self._springs])
 
     def add_forces(self, y: wp.array) -> None:
-        self._on_rows(kernels.add_row_forces, [self._pairs.rows, self._joined, y])
+        self._on_rows(kernels.add_row_forces, [*self._springs, y])
 
     def add_products(self, x: wp.array, y: wp.array) -> None:
-        self._on_rows(kernels.add_row_products, [self._pairs.rows, self._joined, x, y])
+        self._on_rows(kernels.add_row_products, [*self._springs, x, y])
 
     def add_slopes(self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array) -> None:
         """Launch the power along a change; see ``solvers.implicit.line_search``."""
-        self._on_rows(kernels.add_row_slopes, [self._pairs.rows, self._joined, d, change, search, slopes])
+        self._on_rows(kernels.add_row_slopes, [*self._springs, d, change, search, slopes])
 
     def launch_end(self, d: wp.array) -> None:
         """Launch the update of what users read about contact, and of whether a new search is due."""
         self._on_rows(kernels.end_rows, [self._pairs.rows, self._joined, self._added])
-        for k, body in enumerate(self._system.bodies):
-            outputs = [self._added, self._pairs.surface.arrays, body.state.contact_forces]
-            self._on_body(k, kernels.end_places, [d, self._joined], outputs)
+        inputs = [d, self._joined, self._carriers.arrays, self._added, self._pairs.surface.arrays]
+        wp.launch(kernels.end_places, self._pairs.surface.count, inputs, device=self.device)
+        for k in range(len(self._system.bodies)):
+            self._carriers.launch_end(k)
         self._pairs.search.launch_after()
+
+    @property
+    def _springs(self) -> list:
+        return [self._places, self._carriers.arrays, self._pairs.rows, self._joined]
 
     def _empty(self, which: int) -> None:
         wp.launch(kernels.empty_list, 1, [int(which), self._joined], device=self.device)
@@ -174,7 +189,6 @@ class JoinedRows:
         threads = self._pairs.search.threads(self._pairs.room)
         wp.launch(kernel, threads, [threads, *inputs], device=self.device)
 
-    def _on_body(self, k: int, kernel: wp.Kernel, inputs: Sequence, outputs: Sequence) -> None:
-        part = self._pairs.surface.parts[k]
-        count = self._system.worlds * part.nodes
-        wp.launch(kernel, count, [part.start, *inputs], list(outputs), device=self.device)
+    def _on_carriers(self, k: int, kernel: wp.Kernel, inputs: Sequence, outputs: Sequence) -> None:
+        start, _offset, count, own = self._carriers.nodes_of(k)
+        wp.launch(kernel, count, [start, *inputs], [own, *outputs], device=self.device)

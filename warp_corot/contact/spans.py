@@ -1,18 +1,23 @@
-"""Obstacles at the triangles of one body in implicit steps; see ``kernels.contact.spans``."""
+"""Obstacles at the triangles and at the borne places of one body in implicit steps; see ``kernels.contact.spans``."""
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
 
+import numpy as np
 import warp as wp
 
 from warp_corot.kernels.contact import spans as kernels
 from warp_corot.kernels.contact.law import Law
+from warp_corot.kernels.contact.touches import Touches
 from warp_corot.kernels.stepping.pace import Pace
 
+from .carriers import PlaceCarriers
 from .rigid_forces import RigidForces
 
-#: Types of the arrays of ``Spans``.
+#: The stiffness of a span over that of its point; places of an own surface are many, and share nodes.
+STIFF, STIFF_OF_BORNE = 32.0, 8.0
+#: Types of the arrays of ``Spans``, and of those of ``Touches`` that points need.
 FIELDS = {
     "listed": wp.int32,
     "base": wp.float32,
@@ -22,10 +27,38 @@ FIELDS = {
     "most": wp.float32,
     "derivative": wp.mat33,
 }
+OF_POINTS = {
+    "shares": wp.vec3,
+    "normal": wp.vec3,
+    "moved": wp.vec3,
+    "more": wp.vec3,
+    "gap": wp.float32,
+    "friction": wp.float32,
+    "acts": wp.int32,
+}
+
+
+@dataclass(frozen=True)
+class Items:
+    """Things that obstacles may touch: triangles, or places as triangles whose corners are all there.
+
+    Attributes:
+        locate: The kernel that finds obstacles there.
+        corners: The corners of all items, as places, vec3i.
+        start, count: The items of the body.
+        touches, spans: What is known about obstacles there, as structs for kernels.
+    """
+
+    locate: wp.Kernel
+    corners: wp.array
+    start: int
+    count: int
+    touches: Touches
+    spans: kernels.Spans
 
 
 class Spans:
-    """Springs between obstacles and the triangles of a body.
+    """Springs between obstacles and the triangles of a body, and its places if nodes bear them.
 
     Args:
         rigid: Forces of obstacles.
@@ -38,80 +71,116 @@ class Spans:
     def __init__(self, rigid: RigidForces, k: int, thickness: wp.array, law: Law, pace: Pace):
         self._rigid, self._k, self._thickness, self._law, self._pace = rigid, k, thickness, law, pace
         self.device = rigid.device
+        self._carriers = PlaceCarriers(rigid.surface, rigid.surface.bodies)
         self.prepare()
 
     def prepare(self) -> None:
         """Update to the present surface; not while launches are recorded."""
-        shape = self._rigid.touches.force.shape
-        self._spans = kernels.Spans()
-        for name, dtype in FIELDS.items():
-            setattr(self._spans, name, wp.zeros(shape, dtype=dtype, device=self.device))
-        self._spans.crowd = wp.zeros(self._rigid.surface.count, dtype=wp.float32, device=self.device)
-        self._spans.count, self._spans.due = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(2))
+        surface, rigid = self._rigid.surface, self._rigid
+        part, device = surface.parts[self._k], self.device
+        self._is_borne = part.bearers > 0
+        self._carriers.follow()
+        self._count, self._due = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
+        self._items: list[Items] = []
+        if rigid.have_edges:
+            spans, count = self._made(rigid.touches), surface.worlds * part.triangles
+            each = Items(kernels.locate_spans, surface.triangles, part.triangle_start, count, rigid.touches, spans)
+            self._items.append(each)
+        if part.bearers:
+            touches = self._touches_of_points()
+            spans, count = self._made(touches), surface.worlds * part.nodes
+            used = np.where(surface.arrays.node.numpy() < 0, -1, np.arange(surface.count))
+            corners = wp.array(np.repeat(used[:, None], 3, axis=1), dtype=wp.vec3i, device=device)
+            self._items.append(Items(kernels.locate_points, corners, part.start, count, touches, spans))
 
     # --- launches ----------------------------------------------------------------------------------------------------
 
-    def launch_located(self, which: int, d: wp.array, stiffness: wp.array, changed: wp.array) -> None:
-        """Launch the search for obstacles at triangles.
+    def launch_begin(self, blocks: wp.array, d: wp.array) -> None:
+        """Launch the beginning of a step; see ``PlaceCarriers``. Motions d are a guess [m], vec4."""
+        self._carriers.launch_begin(self._k, 0, blocks, d, d)
+
+    def launch_located(self, which: int, d: wp.array, changed: wp.array) -> None:
+        """Launch the search for obstacles at items.
 
         Args:
             which: ``kernels.FIRST`` at the beginning of the step, ``AGAIN`` to find them again after motions d if that
                 is due, or ``MISSING`` to add those that are missing then.
             d: Motions [m], vec4; a guess at the beginning.
-            stiffness: That of friction at surface places [N/m]; see ``kernels.contact.active``.
             changed: Nonzero afterwards if some are added, int32 [1].
         """
-        obstacles, surface = self._rigid.obstacles, self._rigid.surface
-        part = surface.parts[self._k]
+        obstacles, arrays = self._rigid.obstacles, self._rigid.surface.arrays
         if which != kernels.MISSING:
-            count = surface.worlds * part.nodes
-            wp.launch(kernels.empty_spans, count, [part.start, int(which), self._spans], device=self.device)
-        inputs = [int(which), obstacles.shapes, self._thickness, obstacles.motions, self._law, self._pace]
-        inputs += [*self._surface, d]
-        self._launch(kernels.locate_spans, [*inputs, self._rigid.touches, self._spans, changed])
-        inputs = [surface.arrays, stiffness, surface.triangles, self._rigid.touches]
-        self._launch(kernels.stiffen_spans, [*inputs, self._spans])
+            start, offset, count, _nodes = self._carriers.nodes_of(self._k)
+            inputs = [start + offset, int(which), self._carriers.arrays, self._items[0].spans]
+            wp.launch(kernels.empty_spans, count, inputs, device=self.device)
+        rigid = [int(which), obstacles.shapes, self._thickness, obstacles.motions, self._law, self._pace, arrays]
+        for each in self._items:
+            inputs = [*rigid, each.corners, d, self._carriers.arrays, each.touches, each.spans, changed]
+            self._launch(each.locate, each, inputs)
+        for each in self._items:
+            self._launch(kernels.stiffen_spans, each, [*self._places(each), each.touches, each.spans])
 
     def launch_judgement(
         self, scalars: wp.array, near: float, changed: wp.array, rounds: wp.array, most: int, going: wp.array
     ) -> None:
         """Launch the decision whether they are found again; see ``kernels.judge_spans``."""
-        inputs = [scalars, wp.float64(near), self._spans.count, changed, rounds, most]
-        wp.launch(kernels.judge_spans, 1, [*inputs, self._spans.due, going], device=self.device)
+        inputs = [scalars, wp.float64(near), self._count, changed, rounds, most]
+        wp.launch(kernels.judge_spans, 1, [*inputs, self._due, going], device=self.device)
 
     def update(self, d: wp.array) -> None:
         """Launch forces and their derivatives after motions d."""
-        self._launch(kernels.update_spans, [*self._surface, d, self._rigid.touches, self._spans])
+        for each in self._items:
+            self._launch(kernels.update_spans, each, [*self._places(each), d, each.touches, each.spans])
 
     def add_forces(self, y: wp.array) -> None:
         """Launch the addition of their forces at free nodes [N]."""
-        self._launch(kernels.add_span_forces, [*self._surface, self._rigid.touches, y])
+        for each in self._items:
+            self._launch(kernels.add_span_forces, each, [*self._places(each), each.touches, y])
 
     def add_products(self, x: wp.array, y: wp.array) -> None:
         """Launch the addition of their derivative times x."""
-        self._launch(kernels.add_span_products, [*self._surface, self._rigid.touches, self._spans, x, y])
+        for each in self._items:
+            self._launch(kernels.add_span_products, each, [*self._places(each), each.touches, each.spans, x, y])
 
     def add_slopes(self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array) -> None:
         """Launch the power along a change; see ``solvers.implicit.line_search``."""
-        inputs = [int(len(search) == 1), *self._surface, self._rigid.touches, self._spans, d, change, search]
-        self._launch(kernels.add_span_slopes, [*inputs, slopes])
+        for each in self._items:
+            inputs = [int(len(search) == 1), *self._places(each), each.touches, each.spans, d, change, search, slopes]
+            self._launch(kernels.add_span_slopes, each, inputs)
 
-    def launch_end(self, contact_forces: wp.array) -> None:
-        """Launch the addition of their forces to those of contact at nodes."""
-        surface = self._rigid.surface
+    def launch_end(self, d: wp.array) -> None:
+        """Launch the motions of borne places and the forces on them, and the addition of forces on triangles."""
+        surface, device = self._rigid.surface, self.device
         part = surface.parts[self._k]
-        inputs = [part.start, surface.corner_starts, surface.corners, self._rigid.touches]
-        outputs = [surface.arrays, contact_forces]
-        count = surface.worlds * part.nodes
-        wp.launch(kernels.gather_spans, count, inputs, outputs, device=self.device)
+        for each in self._items:
+            if each.locate is kernels.locate_points:
+                inputs = [self._carriers.arrays, d, each.touches, surface.arrays]
+                self._launch(kernels.end_points, each, inputs)
+        if self._rigid.have_edges:
+            inputs = [part.start, surface.corner_starts, surface.corners, self._rigid.touches, surface.arrays]
+            wp.launch(kernels.gather_spans, surface.worlds * part.nodes, inputs, device=device)
+        self._carriers.launch_end(self._k)
 
     # --- pieces ------------------------------------------------------------------------------------------------------
 
-    @property
-    def _surface(self) -> list[Any]:
-        return [self._rigid.surface.arrays, self._rigid.surface.triangles]
+    def _made(self, touches: Touches) -> kernels.Spans:
+        spans = kernels.Spans()
+        for name, dtype in FIELDS.items():
+            setattr(spans, name, wp.zeros(touches.force.shape, dtype=dtype, device=self.device))
+        spans.count, spans.due = self._count, self._due
+        spans.stiff = STIFF_OF_BORNE if self._is_borne else STIFF
+        return spans
 
-    def _launch(self, kernel: wp.Kernel, inputs: list) -> None:
-        part = self._rigid.surface.parts[self._k]
-        count = self._rigid.surface.worlds * part.triangles
-        wp.launch(kernel, count, [part.triangle_start, *inputs], device=self.device)
+    def _touches_of_points(self) -> Touches:
+        """Those of places, whose forces are those of obstacles on nodes in explicit steps."""
+        touches = Touches()
+        touches.force = self._rigid.forces
+        for name, dtype in OF_POINTS.items():
+            setattr(touches, name, wp.zeros(touches.force.shape, dtype=dtype, device=self.device))
+        return touches
+
+    def _places(self, each: Items) -> list:
+        return [self._rigid.surface.arrays, each.corners, self._carriers.arrays]
+
+    def _launch(self, kernel: wp.Kernel, each: Items, inputs: list) -> None:
+        wp.launch(kernel, each.count, [each.start, *inputs], device=self.device)

@@ -132,7 +132,7 @@ class Simulation(Clock, FormerNames):
             #: Keeps bodies out of obstacles and out of one another; None without contact.
             self.contact: Contacts | None = None
             if touching is not None:
-                own = not self.integrator.is_implicit
+                own = self.ranks.is_alone or not self.integrator.is_implicit
                 self.contact = Contacts(self.system, *touching, stable_dt=self.stable_dt, dt=given, on_surfaces=own)
                 self.system.constraints.append(self.contact)
             #: Chooses the step, if none was given.

@@ -16,8 +16,6 @@ from .operator import LinearOperator, Preconditioner
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
 
-#: Maximum number of linear solves in a step.
-ROUNDS = 16
 #: A solve ends at this share of its first residual, because contact may change after it.
 SHARE = 0.15
 #: A step is solved for if the residual of a solve begins at less than this many times the tolerance.
@@ -32,6 +30,8 @@ class Held(Protocol):
     """
 
     changed: wp.array
+    #: Maximum number of linear solves in a step.
+    rounds: int
 
     @property
     def count(self) -> int: ...
@@ -229,6 +229,6 @@ class TouchingSolve:
         self._operator.apply(d, self._q)
         held.launch_judgement(b, self._q, d)
         self._ranks.take_most(held.changed)
-        inputs = [newton.solver.scalars, newton.solver.iterations, held.changed, SETTLED, ROUNDS]
+        inputs = [newton.solver.scalars, newton.solver.iterations, held.changed, SETTLED, held.rounds]
         wp.launch(judge_round, 1, inputs, [self._rounds, self.iterations, self._going], device=self.device)
-        held.launch_going(newton.solver.scalars, NEAR, held.changed, self._rounds, ROUNDS, self._going)
+        held.launch_going(newton.solver.scalars, NEAR, held.changed, self._rounds, held.rounds, self._going)

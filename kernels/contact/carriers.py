@@ -1,0 +1,189 @@
+"""Carriers: the nodes that move places of contact in implicit steps, and take the forces there.
+
+A place that is a node carries itself; one between nodes has its bearers, see ``bearing``. Carriers are numbered, first
+all places and then all bearers.
+"""
+
+import warp as wp
+
+from warp_corot.kernels.elements.elements import add_force, load_node, store_node
+
+from .bearing import borne_force, is_borne
+from .motion import Surface
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Carriers:
+    """Carriers of places, [C] = [S + B]; see ``Surface`` and ``Bearing``."""
+
+    entry: wp.array[wp.int32]  # of the node in the vectors of the step; -1: unused
+    compliance: wp.array[wp.float32]  # of the node alone [m/N]; zero: it is held
+    crowd: wp.array[wp.float32]  # the sum of shares in contacts that push
+    gone: wp.array[wp.vec3]  # how far a held node has gone in the step [m]
+
+
+@wp.kernel(enable_backward=False)
+def begin_carriers(
+    # In
+    start: int,
+    offset: int,
+    first: int,
+    inverse_mass: wp.array[wp.float32],
+    blocks: wp.array[wp.mat33],
+    rest: wp.array[wp.vec4],
+    u: wp.array[wp.vec4],
+    increment: wp.array[wp.vec4],
+    guess: wp.array[wp.vec4],
+    # Out
+    surface: Surface,
+    carriers: Carriers,
+):
+    """Where a body's carriers are when a step begins, and how far they may go; held nodes are where it ends.
+
+    Args:
+        start: The first one in ``surface``, the places or their bearers.
+        offset: The number of the first carrier there.
+        first: The first entry of the body.
+        blocks: The blocks on the diagonal of the body's matrix [N/m].
+        increment: How far held nodes have gone in the step [m].
+        guess: How far free nodes may go [m].
+    """
+    s = start + wp.tid()
+    c = offset + s
+    i = surface.node[s]
+    surface.f[s] = wp.vec3()
+    surface.d[s] = wp.vec3()
+    surface.yielding[s] = 0.0
+    carriers.compliance[c] = 0.0
+    carriers.crowd[c] = 0.0
+    carriers.gone[c] = wp.vec3()
+    carriers.entry[c] = -1
+    if i < 0:
+        return
+    home = load_node(rest, i)
+    surface.rest[s] = home
+    surface.x[s] = home + load_node(u, i)
+    surface.d[s] = load_node(guess, i)
+    carriers.entry[c] = first + i
+    if inverse_mass[i] > 0.0:
+        surface.yielding[s] = 1.0
+        carriers.compliance[c] = 3.0 / wp.max(wp.trace(blocks[i]), 1.0e-30)
+    else:
+        # The motion tells the search how fast it is.
+        surface.d[s] = load_node(increment, i)
+        carriers.gone[c] = surface.d[s]
+
+
+@wp.func
+def motion_at(s: int, surface: Surface, carriers: Carriers, d: wp.array[wp.vec4]):
+    """The motion of a place after motions d [m]."""
+    if is_borne(s, surface):
+        e = wp.vec3()
+        first = surface.node.shape[0]
+        b = surface.bearing.bearers[s]
+        w = surface.bearing.weights[s]
+        for k in range(4):
+            if w[k] != 0.0:
+                e += w[k] * load_node(d, carriers.entry[first + b[k]])
+        return e
+    return load_node(d, carriers.entry[s])
+
+
+@wp.func
+def gone_at(s: int, surface: Surface, carriers: Carriers):
+    """How far held nodes have moved a place in the step [m]."""
+    if is_borne(s, surface):
+        e = wp.vec3()
+        first = surface.node.shape[0]
+        b = surface.bearing.bearers[s]
+        w = surface.bearing.weights[s]
+        for k in range(4):
+            if w[k] != 0.0:
+                e += w[k] * carriers.gone[first + b[k]]
+        return e
+    return carriers.gone[s]
+
+
+@wp.func
+def push_at(s: int, force: wp.vec3, surface: Surface, carriers: Carriers, y: wp.array[wp.vec4]):
+    """Add a force at a place to its carriers that are free [N]."""
+    if is_borne(s, surface):
+        first = surface.node.shape[0]
+        b = surface.bearing.bearers[s]
+        w = surface.bearing.weights[s]
+        for k in range(4):
+            c = first + b[k]
+            if w[k] != 0.0 and carriers.compliance[c] > 0.0:
+                add_force(y, carriers.entry[c], w[k] * force)
+    elif carriers.compliance[s] > 0.0:
+        add_force(y, carriers.entry[s], force)
+
+
+@wp.func
+def crowd_at(s: int, share: float, surface: Surface, carriers: Carriers):
+    """Count a contact that pushes at a place with a share of its force."""
+    if is_borne(s, surface):
+        first = surface.node.shape[0]
+        b = surface.bearing.bearers[s]
+        w = surface.bearing.weights[s]
+        for k in range(4):
+            if w[k] != 0.0:
+                wp.atomic_add(carriers.crowd, first + b[k], wp.abs(w[k] * share))
+    else:
+        wp.atomic_add(carriers.crowd, s, wp.abs(share))
+
+
+@wp.func
+def ease_at(s: int, share: float, surface: Surface, carriers: Carriers):
+    """How far a contact moves with a place that has this share in it, for each unit of force, if all contacts around
+    push alike [m/N].
+    """
+    share = wp.abs(share)
+    if is_borne(s, surface):
+        total = float(0.0)
+        first = surface.node.shape[0]
+        b = surface.bearing.bearers[s]
+        w = surface.bearing.weights[s]
+        for k in range(4):
+            part = share * wp.abs(w[k])
+            c = first + b[k]
+            if part > 0.0:
+                total += part * wp.max(carriers.crowd[c], part) * carriers.compliance[c]
+        return total
+    return share * wp.max(carriers.crowd[s], share) * carriers.compliance[s]
+
+
+@wp.func
+def is_held_at(s: int, surface: Surface, carriers: Carriers):
+    """Whether all carriers of a place are held."""
+    if is_borne(s, surface):
+        return surface.yielding[s] == 0.0
+    return carriers.compliance[s] == 0.0
+
+
+@wp.func
+def mark_carriers(s: int, surface: Surface, marked: wp.array[wp.int32]):
+    """Mark the carriers of a place."""
+    if is_borne(s, surface):
+        first = surface.node.shape[0]
+        b = surface.bearing.bearers[s]
+        w = surface.bearing.weights[s]
+        for k in range(4):
+            if w[k] != 0.0:
+                marked[first + b[k]] = 1
+    else:
+        marked[s] = 1
+
+
+@wp.kernel(enable_backward=False)
+def end_carriers(start: int, are_bearers: int, nodes: Surface, surface: Surface, contact_forces: wp.array[wp.vec4]):
+    """Write the forces at a body's carriers, the ``nodes``, for users: those at the places of ``surface``."""
+    s = start + wp.tid()
+    i = nodes.node[s]
+    if i < 0:
+        return
+    if are_bearers != 0:
+        nodes.f[s] = borne_force(s, surface)
+    store_node(contact_forces, i, nodes.f[s])

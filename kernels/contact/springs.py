@@ -1,0 +1,73 @@
+"""The force of a contact in an implicit step: a spring with a multiplier, the same for obstacles and soft surfaces.
+
+A contact pushes with p = max(l - k (g - t), 0): its gap g at the end of the step, where that must come to, t, a
+stiffness k, and a multiplier l. Friction is the same across the normal, bounded by Coulomb's law. Each time the step
+has been solved for, forces become the multipliers, so that gaps close whatever k is (augmented Lagrangians, Alart and
+Curnier 1991).
+"""
+
+import warp as wp
+
+from .law import Law
+from .vertices import across
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class SpringState:
+    """The force of a contact on its first side [N], the derivative of that [N/m], and its push along the normal [N]."""
+
+    force: wp.vec3
+    derivative: wp.mat33
+    push: float
+
+
+@wp.func
+def least_gap(gap: float, law: Law, dt: float):
+    """Where a gap must be at the end of the step; overlaps open slowly."""
+    if gap > -law.tolerance:
+        return 0.0
+    return gap + wp.min(-law.settling * gap, law.recovery * dt)
+
+
+@wp.func
+def kept_gap(gap: float, pushed: bool, law: Law, dt: float):
+    """The same where a contact that pushed in the last step may have left a gap or an overlap of up to the law's slack:
+    that stays, so that what rests is at rest.
+    """
+    if pushed and wp.abs(gap) <= law.slack:
+        return gap
+    return least_gap(gap, law, dt)
+
+
+@wp.func
+def spring_state(short: float, slip: wp.vec3, k: float, multiplier: wp.vec3, n: wp.vec3, most: float):
+    """The state of a contact.
+
+    Args:
+        short: How far the gap is from where it must come to, g - t [m].
+        slip: The motion of the first side beyond the second in the step [m].
+        k: The stiffness [N/m].
+        multiplier: [N].
+        n: The normal, to the first side.
+        most: The most of friction [N].
+    """
+    made = SpringState()
+    whole = wp.outer(n, n)
+    made.push = wp.max(wp.dot(multiplier, n) - k * short, 0.0)
+    if made.push > 0.0:
+        made.force = made.push * n
+        made.derivative = k * whole
+    if most > 0.0:
+        sideways = across(multiplier - k * slip, n)
+        size = wp.length(sideways)
+        plane = wp.identity(3, dtype=wp.float32) - whole
+        share = float(1.0)
+        if size > most:
+            # What slides has no stiffness in the direction in which it slides.
+            share = most / size
+            plane -= wp.outer(sideways, sideways) / (size * size)
+        made.force += share * sideways
+        made.derivative += (k * share) * plane
+    return made
