@@ -85,8 +85,20 @@ def test_two_ranks_draw_the_contact_of_the_whole_body(folder):
 
 
 @pytest.mark.slow
+def test_two_ranks_remesh_as_one_process_does(folder):
+    bar = ("box", "--level", "5", "--remesh", "--refine-above", "1.03", "--simplify-below", "1.01", "--dt", "0.2ms")
+    bar += ("--duration", "0.09", "--probe", "z == zmax", "--device", "cpu")
+    done = on_ranks(2, "-m", "warp_corot", "simulate", *bar, "--csv", "two.csv", "-o", "two.usda")
+    assert done.returncode == 0, done.stderr
+    assert "652 in the last" in done.stdout
+    assert simulate(*bar, "--csv", "one.csv", "-o", "one.usda") == 0
+    # The bar's end has moved by centimetres.
+    np.testing.assert_allclose(last_row("two.csv")[1:4], last_row("one.csv")[1:4], atol=1e-6)
+
+
+@pytest.mark.slow
 def test_what_does_not_work_is_refused_in_one_line(folder):
-    done = on_ranks(2, "-m", "warp_corot", "simulate", "box", "--level", "3", "--remesh", "-o", "out.usda")
+    done = on_ranks(2, "-m", "warp_corot", "simulate", "box", "--level", "3", "--model", "edge-stvk", "-o", "out.usda")
     assert done.returncode != 0
     said = [line for line in done.stderr.splitlines() if line.startswith("warp-corot: error:")]
     assert len(said) == 1

@@ -10,6 +10,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
+from warp_corot.contact.contacts import Contacts
 from warp_corot.contact.reading import ContactPoint
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.simulation.simulation import Simulation as OnOne
@@ -153,21 +154,19 @@ class LedSimulation(OnOne):
 
     def __init__(self, bodies: SoftBody | Sequence[SoftBody], *, in_parts: bool = False, **options: Any):
         options = {name: value for name, value in options.items() if value is not None}
-        if options.get("remesh"):
-            raise InputError(
-                "remeshing does not work on several ranks yet where rank 0 leads others; run on one process, or use "
-                "warp_corot.distributed.Simulation"
-            )
+        if in_parts and options.get("remesh"):
+            raise InputError("remeshing does not work where rank 0 hands out parts; every rank must make the body")
+        elsewhere = {"obstacles", "contact", "remesh"}
+        # Each tool is in one simulation, and one simulation changes a mesh.
+        super().__init__(bodies, **{name: value for name, value in options.items() if name not in elsewhere})
         if in_parts:
             wholes = [bodies] if isinstance(bodies, SoftBody) else list(bodies)
             parts, _, nodes = handed_bodies(wholes, options, wholes[0].device, mpi.world())
             self._crew = Crew(Simulation(parts, **options), wholes, nodes)
         else:
             self._crew = Crew(Simulation(bodies, **options))
-        touching = {"obstacles", "contact"}
-        super().__init__(bodies, **{name: value for name, value in options.items() if name not in touching})
-        # Each tool is in one simulation.
-        self.contact = self._crew.on_all.contact
+        if (remeshing := self._crew.on_all.remeshing) is not None:
+            self.remeshing, self.fields = remeshing
         self.serve, self.end = self._crew.serve, self._crew.end
 
     # --- stepping --------------------------------------------------------------------------------------------------
@@ -195,6 +194,15 @@ class LedSimulation(OnOne):
 
     def save(self, path: Any) -> None:
         raise InputError("save does not work where rank 0 leads others")
+
+    @property
+    def contact(self) -> Contacts | None:
+        """The contact of all ranks, which is another one after the mesh has changed."""
+        return self._crew.on_all.contact
+
+    @contact.setter
+    def contact(self, given: Contacts | None) -> None:
+        assert given is None
 
     # --- the clock -------------------------------------------------------------------------------------------------
 

@@ -14,7 +14,7 @@ import warp as wp
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.contacts import Contacts
 from warp_corot.contact.tool import Obstacle
-from warp_corot.elasticity import Corotated, Model
+from warp_corot.elasticity import Corotated, ForceField, Model
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_count
 from warp_corot.inputs.device import checked_device
@@ -85,10 +85,12 @@ class Simulation:
         self.gravity = checked_gravity(gravity, self.bodies[0].mesh.up_axis)
         self._division = costs, here
         self._remeshing: Remeshing | None = None
+        self._fields: tuple[ForceField, ...] = ()
         if (remesh := others.pop("remesh", None)) is not None:
             self._remeshing = Remeshing(self.bodies, models, remesh, deterministic=deterministic)
             bound = zip(models, self.bodies, strict=True)
-            self._remeshing.serve([model.bind(body, deterministic=deterministic) for model, body in bound])
+            self._fields = tuple(model.bind(body, deterministic=deterministic) for model, body in bound)
+            self._remeshing.serve(self._fields)
         self._options: dict[str, Any] = {"model": models, "integrator": integrator, "gravity": self.gravity} | others
         self._options["deterministic"] = deterministic
         parts = self._divided(models, deterministic)
@@ -308,6 +310,11 @@ class Simulation:
     def following(self) -> list[Following]:
         """The bodies, each with this rank's part of it."""
         return self._following
+
+    @property
+    def remeshing(self) -> tuple[Remeshing, tuple[ForceField, ...]] | None:
+        """The passes over the whole bodies, and the force fields of these; None without remeshing."""
+        return None if self._remeshing is None else (self._remeshing, self._fields)
 
     def von_mises(self) -> list[npt.NDArray[np.float32]]:
         """Von Mises stress of each element of this rank's part of each body [Pa], float32 [worlds * t]."""
