@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.elements import GeneralElements, local_gradient
-from warp_corot.kernels.elements.lanes import ELEMENTS, ISOTROPIC_PART, native, scatter_lanes
+from warp_corot.kernels.elements.lanes import ELEMENTS, ISOTROPIC_PART, constants, native, scatter_lanes
 from warp_corot.kernels.elements.law_lanes import LAWS, ROTATION
 from warp_corot.kernels.math.matrices import identity3
 from warp_corot.kernels.math.rotation import quick_rotation
@@ -40,7 +40,7 @@ def turn_gradients() -> wp.Kernel:
 @functools.cache
 def add_kept_product() -> wp.Kernel:
     """y += K p; a thread is eight elements."""
-    code = LAWS["linear"] + ISOTROPIC_PART
+    code = constants(PLACES=PLACES) + LAWS["linear"] + ISOTROPIC_PART
     code += native("eights", "kept_elements", "elements", "isotropic_elements", "element_forces")
     return scatter_lanes(code, GeneralElements, KeptGradients, wp.int32)
 

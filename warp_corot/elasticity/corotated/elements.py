@@ -36,7 +36,7 @@ from warp_corot.kernels.elements.forces import element_energies, element_von_mis
 from warp_corot.kernels.elements.general_cpu import scatter_law_elements
 from warp_corot.kernels.math.rotation import byers_xu, quick_rotation
 
-from .tangents import ExactTangent, KeptTangent, RotatedTangent
+from .tangents import ExactTangent, KeptExactTangent, KeptTangent, RotatedTangent
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
@@ -194,6 +194,8 @@ class CorotatedField(ForceField):
         """
         if exact and self.model.rotation_level is None:
             rotation = byers_xu if self.model.rotation == "warm" else self.model.own_rotation
+            if self.device.is_cpu and self.plan.counts is None:
+                return KeptExactTangent(self, rotation)
             return ExactTangent(self, rotation)
         own = self.model.level is None and self.model.tolerance is None and self.model.rotation != "warm"
         if own and self.device.is_cpu and self.plan.counts is None:

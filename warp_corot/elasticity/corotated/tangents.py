@@ -10,6 +10,7 @@ from warp_corot.elasticity.paths.lanes import as_general
 from warp_corot.elasticity.stiffness import ElementStiffness
 from warp_corot.elasticity.structs import Kept
 from warp_corot.elasticity.tangent import Tangent
+from warp_corot.kernels.corotated import kept_exact
 from warp_corot.kernels.corotated.kept_gradients import (
     PLACES,
     KeptGradients,
@@ -147,3 +148,44 @@ class ExactTangent(Tangent):
             self._strains,
         )
         return material
+
+
+class KeptExactTangent(Tangent):
+    """The same on the CPU, with all that products need of an element kept, eight elements side by side.
+
+    Args:
+        field: The field.
+        rotation: As for ``ExactTangent``, which finds the diagonal: solvers with multigrid never need it.
+    """
+
+    field: CorotatedField
+
+    def __init__(self, field: CorotatedField, rotation: wp.Function):
+        super().__init__(field)
+        self._exact = ExactTangent(field, rotation)
+        self._keep, self._product = kept_exact.keep_elements(rotation), kept_exact.add_exact_product()
+        elements = field.elements
+        is_forest = field.discretization.element_kind is ForestElements
+        self._general = as_general(elements, rest_matrices, [elements]) if is_forest else elements
+        self._count = field.element_count
+        self._blocks = -(-self._count // LANES)
+        self._kept = wp.zeros(kept_exact.PLACES * self._blocks, dtype=wp.vec4, device=field.device)
+        self._numbers = wp.array(ptr=self._kept.ptr, dtype=wp.float32, shape=4 * len(self._kept), device=field.device)
+        self._none = wp.zeros(0, dtype=wp.int32, device=field.device)
+        self._material = Kept(_kept_gradients)
+
+    def prepare(self, u: wp.array) -> None:
+        super().prepare(u)
+        self._exact.prepare(u)
+
+    def take(self, u: wp.array) -> None:
+        super().take(u)
+        self.field.launch(self._keep, self._count, [self._general, u], [self._numbers])
+
+    def add_product(self, p: wp.array, y: wp.array) -> None:
+        material = self._material(self.field.isotropic, self._kept)
+        self.field.launch(self._product, self._blocks, [self._general, self._count, material, p], [y, self._none])
+
+    def add_diagonal(self, blocks: wp.array) -> None:
+        self._exact.take(self.displacements)
+        self._exact.add_diagonal(blocks)
