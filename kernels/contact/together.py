@@ -31,6 +31,7 @@ from .together_items import (
 )
 from .touches import Touches
 from .triangles import BEGIN, CORRECT, END
+from .vertices import Beside
 
 wp.set_module_options({"enable_backward": False})
 
@@ -69,7 +70,7 @@ def act(
     touches: Touches,
     surface: Surface,
     forces: wp.array2d[wp.vec3],
-    anchors: wp.array2d[wp.vec4],
+    beside: Beside,
     turn: int,
     sums: Sums,
 ):
@@ -104,7 +105,7 @@ def act(
         elif k >= first:
             s = near.nodes[k - first]
             if (near.flags[s] & BESIDE) != 0 and is_borne(s, surface):
-                press_borne(s, number == FIND, solves, shapes, motions, law, dt, surface, forces, anchors, turn, sums)
+                press_borne(s, number == FIND, solves, shapes, motions, law, dt, surface, forces, beside, turn, sums)
         k += threads
 
 
@@ -126,7 +127,7 @@ def push_together(
     touches: Touches,
     surface: Surface,
     forces: wp.array2d[wp.vec3],
-    anchors: wp.array2d[wp.vec4],
+    beside: Beside,
     sums: Sums,
 ):
     """Make all rounds of a step: in each the forces on triangles, those of pairs, and those on nodes.
@@ -176,7 +177,7 @@ def push_together(
                     touches,
                     surface,
                     forces,
-                    anchors,
+                    beside,
                     turn,
                     sums,
                 )
@@ -185,7 +186,7 @@ def push_together(
         k = int(thread)
         while k < near.count[0]:
             s = near.nodes[k]
-            push_place(s, near.flags[s], parts, shapes, motions, law, dt, surface, forces, anchors, turn, sums)
+            push_place(s, near.flags[s], parts, shapes, motions, law, dt, surface, forces, beside, turn, sums)
             k += threads
         synchronize_block()
         turn = 1 - turn

@@ -15,7 +15,7 @@ from .rows import Meeting, Rows
 from .shapes import Shapes
 from .touches import Touches, find_touch
 from .triangles import BEGIN, CORRECT, END, judge_touch, solve_touch
-from .vertices import anchor, begin_borne, push_borne, touch
+from .vertices import Beside, anchor, begin_borne, push_borne, touch
 
 wp.set_module_options({"enable_backward": False})
 
@@ -172,19 +172,19 @@ def press_borne(
     dt: float,
     surface: Surface,
     forces: wp.array2d[wp.vec3],
-    anchors: wp.array2d[wp.vec4],
+    beside: Beside,
     turn: int,
     sums: Sums,
 ):
     """The forces of obstacles on a borne place itself: the first ones, or which push, or their corrections."""
     if begins:
-        force = begin_borne(s, shapes, motions, surface, forces)
+        force = begin_borne(s, shapes, motions, law, beside, surface, forces)
         add_force(s, force, law, turn, surface, sums)
         return
     yielding = float(0.0)
     if solves != 0:
         yielding = ease_of(s, sums, surface)
-    more, pushing = push_borne(s, yielding, shapes, motions, law, dt, anchors, surface, forces)
+    more, pushing = push_borne(s, yielding, shapes, motions, law, dt, beside, surface, forces)
     if solves != 0:
         add_force(s, more, law, turn, surface, sums)
     elif pushing > 0.0:
@@ -225,7 +225,7 @@ def push_place(
     dt: float,
     surface: Surface,
     forces: wp.array2d[wp.vec3],
-    anchors: wp.array2d[wp.vec4],
+    beside: Beside,
     turn: int,
     sums: Sums,
 ):
@@ -244,6 +244,6 @@ def push_place(
     sums.crowd[s] = 0
     if (flags & BESIDE) != 0:
         if corrects:
-            touch(s, (parts & BEGIN) != 0, shapes, motions, law, dt, anchors, surface, forces)
+            touch(s, (parts & BEGIN) != 0, shapes, motions, law, dt, beside, surface, forces)
         if (parts & END) != 0:
-            anchor(s, shapes, motions, surface, forces, anchors)
+            anchor(s, shapes, motions, surface, forces, beside)

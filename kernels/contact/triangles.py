@@ -15,7 +15,7 @@ from .motion import Motions, Surface
 from .near import AROUND, BESIDE, Near
 from .shapes import Shapes
 from .touches import Touches
-from .vertices import across, anchor, begin_borne, push_borne, touch
+from .vertices import Beside, across, anchor, begin_borne, push_borne, touch
 
 wp.set_module_options({"enable_backward": False})
 
@@ -78,7 +78,7 @@ def crowd_among(
     skin: Skin,
     touches: Touches,
     forces: wp.array2d[wp.vec3],
-    anchors: wp.array2d[wp.vec4],
+    beside: Beside,
     crowd: wp.array[wp.float32],
 ):
     k = thread
@@ -90,7 +90,7 @@ def crowd_among(
         if (near.flags[s] & AROUND) != 0:
             total = crowd_at(s, law, dt, surface, skin, touches)
         if (near.flags[s] & BESIDE) != 0 and is_borne(s, surface):
-            _more, pushing = push_borne(s, 0.0, shapes, motions, law, dt, anchors, surface, forces)
+            _more, pushing = push_borne(s, 0.0, shapes, motions, law, dt, beside, surface, forces)
             total += pushing
         crowd[s] = total
 
@@ -107,7 +107,7 @@ def crowd_nodes(
     surface: Surface,
     skin: Skin,
     forces: wp.array2d[wp.vec3],
-    anchors: wp.array2d[wp.vec4],
+    beside: Beside,
     # In and out
     touches: Touches,
     # Out
@@ -115,7 +115,7 @@ def crowd_nodes(
 ):
     """Find the contacts that act, and sum their weights at each place. All corners of a triangle find the same."""
     dt = float(pace.seconds[DT])
-    crowd_among(wp.tid(), threads, near, shapes, motions, law, dt, surface, skin, touches, forces, anchors, crowd)
+    crowd_among(wp.tid(), threads, near, shapes, motions, law, dt, surface, skin, touches, forces, beside, crowd)
 
 
 @wp.func
@@ -230,7 +230,7 @@ def push_node(
     touches: Touches,
     surface: Surface,
     forces: wp.array2d[wp.vec3],
-    anchors: wp.array2d[wp.vec4],
+    beside: Beside,
 ):
     """Some of the parts of ``push_nodes`` for a place that is a node."""
     if (parts & ADD) != 0 and (flags & AROUND) != 0:
@@ -240,9 +240,9 @@ def push_node(
             surface.d[s] = surface.d[s] + surface.yielding[s] * total
     if (flags & BESIDE) != 0:
         if (parts & (BEGIN | CORRECT)) != 0:
-            touch(s, (parts & BEGIN) != 0, shapes, motions, law, dt, anchors, surface, forces)
+            touch(s, (parts & BEGIN) != 0, shapes, motions, law, dt, beside, surface, forces)
         if (parts & END) != 0:
-            anchor(s, shapes, motions, surface, forces, anchors)
+            anchor(s, shapes, motions, surface, forces, beside)
 
 
 @wp.func
@@ -259,7 +259,7 @@ def gather_borne(
     crowd: wp.array[wp.float32],
     surface: Surface,
     forces: wp.array2d[wp.vec3],
-    anchors: wp.array2d[wp.vec4],
+    beside: Beside,
 ):
     """The same for a borne place: its own forces are corrected together with those on triangles."""
     if (parts & ADD) != 0:
@@ -268,15 +268,15 @@ def gather_borne(
             total = share_of(s, skin, touches)
         if (flags & BESIDE) != 0:
             if (parts & BEGIN) != 0:
-                total += begin_borne(s, shapes, motions, surface, forces)
+                total += begin_borne(s, shapes, motions, law, beside, surface, forces)
             else:
                 yielding = ease(s, crowd, surface.yielding, surface)
-                more, _count = push_borne(s, yielding, shapes, motions, law, dt, anchors, surface, forces)
+                more, _count = push_borne(s, yielding, shapes, motions, law, dt, beside, surface, forces)
                 total += more
         surface.bearing.gathered[s] = total
         surface.f[s] = surface.f[s] + total
     elif (parts & END) != 0 and (flags & BESIDE) != 0:
-        anchor(s, shapes, motions, surface, forces, anchors)
+        anchor(s, shapes, motions, surface, forces, beside)
 
 
 @wp.func
@@ -294,7 +294,7 @@ def push_among(
     crowd: wp.array[wp.float32],
     surface: Surface,
     forces: wp.array2d[wp.vec3],
-    anchors: wp.array2d[wp.vec4],
+    beside: Beside,
 ):
     k = thread
     count = near.count[0]
@@ -303,9 +303,9 @@ def push_among(
         k += threads
         flags = near.flags[s]
         if is_borne(s, surface):
-            gather_borne(s, flags, parts, skin, shapes, motions, law, dt, touches, crowd, surface, forces, anchors)
+            gather_borne(s, flags, parts, skin, shapes, motions, law, dt, touches, crowd, surface, forces, beside)
         else:
-            push_node(s, flags, parts, skin, shapes, motions, law, dt, touches, surface, forces, anchors)
+            push_node(s, flags, parts, skin, shapes, motions, law, dt, touches, surface, forces, beside)
 
 
 @wp.func
@@ -318,7 +318,7 @@ def settle_among(
     motions: Motions,
     surface: Surface,
     forces: wp.array2d[wp.vec3],
-    anchors: wp.array2d[wp.vec4],
+    beside: Beside,
 ):
     k = thread
     count = near.count[0]
@@ -328,7 +328,7 @@ def settle_among(
         if is_borne(s, surface):
             give_way(s, surface)
             if (parts & END) != 0 and (near.flags[s] & BESIDE) != 0:
-                anchor(s, shapes, motions, surface, forces, anchors)
+                anchor(s, shapes, motions, surface, forces, beside)
 
 
 @wp.kernel(enable_backward=False)
@@ -347,7 +347,7 @@ def push_nodes(
     # In and out
     surface: Surface,
     forces: wp.array2d[wp.vec3],
-    anchors: wp.array2d[wp.vec4],
+    beside: Beside,
 ):
     """Do the work on nodes one by one, without their neighbours. Borne places are moved afterwards, by
     ``settle_places``.
@@ -358,7 +358,7 @@ def push_nodes(
             other forces have moved nodes since. END: update the anchors of sticking nodes.
     """
     dt = float(pace.seconds[DT])
-    push_among(wp.tid(), threads, near, parts, skin, shapes, motions, law, dt, touches, crowd, surface, forces, anchors)
+    push_among(wp.tid(), threads, near, parts, skin, shapes, motions, law, dt, touches, crowd, surface, forces, beside)
 
 
 @wp.kernel(enable_backward=False)
@@ -372,7 +372,7 @@ def settle_places(
     # In and out
     surface: Surface,
     forces: wp.array2d[wp.vec3],
-    anchors: wp.array2d[wp.vec4],
+    beside: Beside,
 ):
     """Move borne places by the forces that were gathered; with END in ``parts``, update their anchors."""
-    settle_among(wp.tid(), threads, near, parts, shapes, motions, surface, forces, anchors)
+    settle_among(wp.tid(), threads, near, parts, shapes, motions, surface, forces, beside)

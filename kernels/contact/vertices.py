@@ -5,7 +5,7 @@ import warp as wp
 from .bearing import loose_share
 from .law import SETTLING, Law, held_back, least_motion, left_to_held
 from .motion import Motions, Surface
-from .shapes import Shapes, carried, distance_to
+from .shapes import MESH, Shapes, carried, distance_to
 
 wp.set_module_options({"enable_backward": False})
 
@@ -13,9 +13,32 @@ wp.set_module_options({"enable_backward": False})
 ROUNDS = wp.constant(8)
 
 
+@wp.struct
+class Beside:
+    """Obstacles at places, [O, S]."""
+
+    anchors: wp.array2d[wp.vec4]  # in the obstacle's frame; the fourth number is 1 if the place sticks
+    away: wp.array2d[wp.vec4]  # the direction out of the obstacle, and the gap [m]
+    moved: wp.array2d[wp.vec3]  # motion of the obstacle's point in this step [m]
+
+
 @wp.func
 def across(a: wp.vec3, normal: wp.vec3):
     return a - wp.dot(a, normal) * normal
+
+
+@wp.func
+def find_beside(
+    s: int, o: int, far: float, shapes: Shapes, motions: Motions, law: Law, surface: Surface, beside: Beside
+):
+    """Find where an obstacle is in this step; ``far`` is how far the place goes [m]."""
+    world = surface.world[s]
+    now = motions.now[world, o]
+    x = surface.x[s]
+    moved = carried(now, motions.later[world, o], x)
+    gap, n = distance_to(shapes, o, now, x, far + law.tolerance + wp.length(moved))
+    beside.away[o, s] = wp.vec4(n[0], n[1], n[2], gap)
+    beside.moved[o, s] = moved
 
 
 @wp.func
@@ -26,7 +49,7 @@ def touch(
     motions: Motions,
     law: Law,
     dt: float,
-    anchors: wp.array2d[wp.vec4],
+    beside: Beside,
     surface: Surface,
     forces: wp.array2d[wp.vec3],
 ):
@@ -50,11 +73,16 @@ def touch(
     while going > 0:
         touched = int(0)
         for o in range(count):
+            far = wp.length(d)
+            # Meshes look for points no farther away than asked.
+            if (is_first and going == ROUNDS) or shapes.kind[o] == MESH:
+                find_beside(s, o, far, shapes, motions, law, surface, beside)
             now = motions.now[world, o]
-            far = wp.length(d) + law.tolerance
-            moved = carried(now, motions.later[world, o], x)
-            far += wp.length(moved)
-            gap, n = distance_to(shapes, o, now, x, far)
+            moved = beside.moved[o, s]
+            found = beside.away[o, s]
+            n = wp.vec3(found[0], found[1], found[2])
+            gap = found[3]
+            far += law.tolerance + wp.length(moved)
             before = forces[o, s]
             if gap <= far or wp.dot(before, before) > 0.0:
                 relative = d - moved
@@ -65,7 +93,7 @@ def touch(
                 if normal_force > 0.0:
                     touched += 1
                     slip = across(relative, n)
-                    anchor = anchors[o, s]
+                    anchor = beside.anchors[o, s]
                     if anchor[3] > 0.0:
                         held = wp.transform_point(now, wp.vec3(anchor[0], anchor[1], anchor[2]))
                         slip += SETTLING * across(x - held, n)
@@ -83,14 +111,20 @@ def touch(
 
 
 @wp.func
-def begin_borne(s: int, shapes: Shapes, motions: Motions, surface: Surface, forces: wp.array2d[wp.vec3]):
+def begin_borne(
+    s: int, shapes: Shapes, motions: Motions, law: Law, beside: Beside, surface: Surface, forces: wp.array2d[wp.vec3]
+):
     """Begin a step at a borne place with the forces of the last one; returns their sum."""
     total = wp.vec3()
-    world = surface.world[s]
     for o in range(forces.shape[0]):
         was = forces[o, s]
+        far = wp.length(surface.d[s])
         if wp.dot(was, was) > 0.0:
-            _gap, n = distance_to(shapes, o, motions.now[world, o], surface.x[s], 1.0)
+            far = 1.0
+        find_beside(s, o, far, shapes, motions, law, surface, beside)
+        if wp.dot(was, was) > 0.0:
+            found = beside.away[o, s]
+            n = wp.vec3(found[0], found[1], found[2])
             push = wp.max(wp.dot(was, n), 0.0)
             force = push * n + held_back(across(was, n), push, shapes.friction[o])
             forces[o, s] = force
@@ -106,7 +140,7 @@ def push_borne(
     motions: Motions,
     law: Law,
     dt: float,
-    anchors: wp.array2d[wp.vec4],
+    beside: Beside,
     surface: Surface,
     forces: wp.array2d[wp.vec3],
 ):
@@ -121,10 +155,15 @@ def push_borne(
     more = wp.vec3()
     count = float(0.0)
     for o in range(forces.shape[0]):
+        far = wp.length(d)
+        if shapes.kind[o] == MESH:
+            find_beside(s, o, far, shapes, motions, law, surface, beside)
         now = motions.now[world, o]
-        moved = carried(now, motions.later[world, o], x)
-        far = wp.length(d) + law.tolerance + wp.length(moved)
-        gap, n = distance_to(shapes, o, now, x, far)
+        moved = beside.moved[o, s]
+        found = beside.away[o, s]
+        n = wp.vec3(found[0], found[1], found[2])
+        gap = found[3]
+        far += law.tolerance + wp.length(moved)
         before = forces[o, s]
         if gap <= far or wp.dot(before, before) > 0.0:
             relative = d - moved
@@ -135,7 +174,7 @@ def push_borne(
                 if yielding > 0.0:
                     normal_force = wp.max(wp.dot(before, n) + wanted / yielding, 0.0)
                     slip = across(relative, n)
-                    anchor = anchors[o, s]
+                    anchor = beside.anchors[o, s]
                     if anchor[3] > 0.0:
                         held = wp.transform_point(now, wp.vec3(anchor[0], anchor[1], anchor[2]))
                         slip += SETTLING * across(x - held, n)
@@ -153,7 +192,7 @@ def anchor(
     motions: Motions,
     surface: Surface,
     forces: wp.array2d[wp.vec3],
-    anchors: wp.array2d[wp.vec4],
+    beside: Beside,
 ):
     """Set an anchor if the node begins to stick, drag it along with a slipping node, remove it without contact."""
     if surface.yielding[s] == 0.0:
@@ -164,12 +203,15 @@ def anchor(
     for o in range(forces.shape[0]):
         force = forces[o, s]
         if wp.dot(force, force) == 0.0:
-            anchors[o, s] = wp.vec4()
+            beside.anchors[o, s] = wp.vec4()
         else:
             pose = motions.later[world, o]
-            _gap, n = distance_to(shapes, o, motions.now[world, o], x, 1.0)
+            found = beside.away[o, s]
+            n = wp.vec3(found[0], found[1], found[2])
+            if shapes.kind[o] == MESH:
+                _gap, n = distance_to(shapes, o, motions.now[world, o], x, 1.0)
             normal_force = wp.dot(force, n)
             slips = wp.length(across(force, n)) >= 0.9999 * shapes.friction[o] * normal_force
-            if slips or anchors[o, s][3] == 0.0:
+            if slips or beside.anchors[o, s][3] == 0.0:
                 p = wp.quat_rotate_inv(wp.transform_get_rotation(pose), end - wp.transform_get_translation(pose))
-                anchors[o, s] = wp.vec4(p[0], p[1], p[2], 1.0)
+                beside.anchors[o, s] = wp.vec4(p[0], p[1], p[2], 1.0)

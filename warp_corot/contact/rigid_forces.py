@@ -12,6 +12,7 @@ from warp_corot.kernels.contact.law import Law
 from warp_corot.kernels.contact.rows import Meeting, Rows
 from warp_corot.kernels.contact.together import BLOCK, push_together
 from warp_corot.kernels.contact.together_items import Sums
+from warp_corot.kernels.contact.vertices import Beside
 from warp_corot.kernels.stepping.pace import Pace
 from warp_corot.solvers.ranks import ALONE, Ranks
 
@@ -81,6 +82,9 @@ class RigidForces:
         self.totals = wp.zeros_like(self.forces)
         self.kinds = wp.zeros((obstacles, count), dtype=wp.int32, device=device)
         self.anchors = wp.zeros((obstacles, count), dtype=wp.vec4, device=device)
+        self._beside = Beside()
+        self._beside.anchors, self._beside.moved = self.anchors, wp.zeros_like(self.forces)
+        self._beside.away = wp.zeros_like(self.anchors)
         self.touches = touches.Touches()
         shape = (obstacles, self.surface.triangle_count if self.have_edges else 0)
         for name in ("shares", "normal", "moved", "force", "more"):
@@ -159,7 +163,7 @@ class RigidForces:
         meeting, rows = (Meeting(), Rows()) if pairs is None else (pairs.meeting, pairs.rows)
         inputs = [threads, self.search.near, rounds, int(self.surface.is_borne), self.surface.triangles]
         inputs += [self.obstacles.shapes, self.obstacles.motions, self._law, self._pace, meeting]
-        outputs = [rows, self.touches, self.surface.arrays, self.forces, self.anchors, self._sums]
+        outputs = [rows, self.touches, self.surface.arrays, self.forces, self._beside, self._sums]
         wp.launch(push_together, threads, inputs, outputs, device=self.device, block_dim=threads)
 
     def _launch_begin(self, *, is_end: bool) -> None:
@@ -180,7 +184,7 @@ class RigidForces:
             return
         step, rigid = [self._law, self._pace, self.surface.arrays], [self.obstacles.shapes, self.obstacles.motions]
         self._ranks.complete_surface(self.surface.arrays.d)
-        inputs = [*rigid, *step, self._skin, self.forces, self.anchors, self.touches, self._crowd]
+        inputs = [*rigid, *step, self._skin, self.forces, self._beside, self.touches, self._crowd]
         self._on_nodes(triangles.crowd_nodes, inputs)
         self._ranks.complete_surface(self._crowd)
         if self.have_edges:
@@ -210,7 +214,7 @@ class RigidForces:
         """Launch some of the parts that act on one node at a time."""
         rigid = [self.obstacles.shapes, self.obstacles.motions]
         inputs = [parts, self._skin, *rigid, self._law, self._pace, self.touches, self._crowd]
-        own = [self.surface.arrays, self.forces, self.anchors]
+        own = [self.surface.arrays, self.forces, self._beside]
         self._on_nodes(triangles.push_nodes, [*inputs, *own])
         if parts & triangles.ADD and self.surface.is_borne:
             self._on_nodes(triangles.settle_places, [parts, *rigid, *own])
