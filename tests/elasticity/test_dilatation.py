@@ -1,5 +1,7 @@
 """Dilatation that elements share: energies and forces against float64, stiffness, no locking, rigid motions, worlds."""
 
+import functools
+
 import numpy as np
 import oracle
 import pytest
@@ -9,6 +11,7 @@ from cases import CUBE, jittered, mixed_forest
 from shortened import crossed
 
 import warp_corot as wc
+from warp_corot.discretization.discretization import FixedMesh
 from warp_corot.discretization.shear_only import ShearOnly
 from warp_corot.elasticity.dilatation.field import DilatationField
 
@@ -267,6 +270,28 @@ def test_a_run_with_remeshing_keeps_its_energy(device):
 def test_invalid_options_are_refused(model):
     with pytest.raises(wc.InputError, match="dilatation is 'nodal'"):
         model(dilatation="nodal")
+
+
+def test_forces_of_separate_dilatations_have_slots_of_their_own(device, rng, monkeypatch):
+    """In a deterministic run, which has slots on CUDA only, the plan's slots are those of subtrees and groups."""
+    mesh = mixed_forest()
+    body = wc.SoftBody(mesh, wc.Isotropic(YOUNG, POISSON, 1000.0), worlds=2, device=device)
+    count = body.node_count
+    u, found = vec4(rng.uniform(-1e-3, 1e-3, (count, 3)), device), []
+    for deterministic in (False, True):
+        plan = functools.partial(FixedMesh.plan, deterministic=deterministic)
+        monkeypatch.setattr(FixedMesh, "plan", lambda self, *a, plan=plan, deterministic, **o: plan(self, *a, **o))
+        field = wc.Corotated(dilatation="shared").bind(body)
+        monkeypatch.undo()
+        assert (field.slots is not None) == deterministic
+        f = wp.zeros(64 * count, dtype=wp.vec4, device=device)
+
+        field.unshare(u, f[:count])
+        assert not f.numpy()[count:].any()
+        found.append(f.numpy()[:count])
+    scale = np.abs(found[0]).max()
+    assert scale > 0.0
+    np.testing.assert_allclose(found[1], found[0], atol=1e-5 * scale)
 
 
 def test_springs_and_fibres_have_no_dilatation_to_share(device):

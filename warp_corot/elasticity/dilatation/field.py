@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
 from warp_corot.discretization.discretization import Discretization
+from warp_corot.discretization.elements import with_targets
 from warp_corot.discretization.members import Members
 from warp_corot.discretization.plan import Plan
 from warp_corot.discretization.shear_only import ShearOnly
+from warp_corot.discretization.slots import Slots
 from warp_corot.discretization.subtrees import Batch
 from warp_corot.elasticity.model import ForceField, SmallForces
 from warp_corot.elasticity.paths.dilating import Dilating
@@ -66,6 +69,8 @@ class DilatationField(ForceField):
         self._clustered: ClusteredGroups | None = None
         self.join_launches()
         self._make_room()
+        #: All elements, and slots for the forces of each by itself; the plan's own slots are those of its units.
+        self._by_itself = (self.elements, None) if self.slots is None else _with_slots(discretization)
 
     def plan_of(self, discretization: Discretization) -> Plan:
         """The given plan if it has subtrees, or leaves outside of these, or if the mesh changes, because only one plan
@@ -231,8 +236,14 @@ class DilatationField(ForceField):
         """Change the forces f of displacements u to those of separate dilatations."""
         shared = self._share(u, self._still)
         self.launch(kernels.unshare(self.kind, self.of), self.element_count, [self.elements, u], [shared])
-        inputs = [self.elements, self._all, self._all, self.isotropic, u, shared]
-        self.launch(kernels.scatter_pressures(self.kind, self.of), self.element_count, inputs, [f])
+        elements, slots = self._by_itself
+        if slots is not None:
+            slots.values.zero_()
+        inputs = [elements, self._all, self._all, self.isotropic, u, shared]
+        outputs = [f if slots is None else slots.values]
+        self.launch(kernels.scatter_pressures(self.kind, self.of), self.element_count, inputs, outputs)
+        if slots is not None:
+            slots.gather(f)
 
     # --- energies and stresses ---------------------------------------------------------------------------------------
 
@@ -321,6 +332,14 @@ class DilatationField(ForceField):
             self.launch(kernel, count, [starts, members, live, self.elements, self.isotropic], [shared])
         self._others.share_at_nodes(self.isotropic, len(u), shared, law)
         return shared
+
+
+def _with_slots(discretization: Discretization) -> tuple[Any, Slots]:
+    """All elements, of which each has slots of its own."""
+    mesh = discretization.mesh
+    slots, targets = Slots.of_units(mesh.tets, len(mesh.points), discretization.device, discretization.worlds)
+    numbers = wp.array(targets, dtype=wp.vec4i, device=discretization.device)
+    return with_targets(discretization.elements, numbers), slots
 
 
 def law_of(field: ForceField) -> tuple[ForceField, DilatationField | None]:
