@@ -22,6 +22,8 @@ from .simulation import Simulation
 #: Lengths of steps that are tried, over the time of a wave through the body, and the share of an overlap by which
 #: surfaces are pushed apart in one of them.
 LENGTHS = ((1e3, 0.5), (1e1, 0.5), (1.0, 0.1))
+#: Motion that rounding may cause, over the largest coordinate.
+ROUNDING = 8.0 * 2.0**-24
 #: Residual of each linear solve, and of forces that are in balance.
 LINEAR, BALANCED = 1e-5, 1e-3
 
@@ -101,9 +103,9 @@ def rest_on(
             for _ in range(most):
                 body.state.set_velocities(still)
                 sim.advance_steps(1)
-                correction = _correction(body, dt)
+                correction, least = _correction(body, dt)
                 steps += 1
-                if (correction <= tolerance).all():
+                if (correction <= np.maximum(tolerance, least)).all():
                     converged = _residuals(body, field, loads) <= BALANCED
                     if converged.all():
                         break
@@ -126,12 +128,14 @@ def _wave_time(body: SoftBody) -> float:
     return size * float(np.sqrt(density / stiffness))
 
 
-def _correction(body: SoftBody, dt: float) -> npt.NDArray[np.float64]:
-    """The largest motion of the last step over the largest displacement, of each world."""
+def _correction(body: SoftBody, dt: float) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """The largest motion of the last step over the largest displacement, of each world, and as much as rounding of gaps
+    makes of it: a body that hardly moves is at rest before it is still to the last digit."""
     worlds = body.worlds
     moved = dt * np.linalg.norm(body.velocities.numpy().reshape(worlds, -1, 3).astype(np.float64), axis=2).max(axis=1)
     reach = np.linalg.norm(body.displacements.numpy().reshape(worlds, -1, 3).astype(np.float64), axis=2).max(axis=1)
-    return np.asarray(moved / np.where(reach > 0.0, reach, 1.0))
+    reach = np.where(reach > 0.0, reach, 1.0)
+    return moved / reach, ROUNDING * float(np.abs(body.mesh.points).max()) / reach
 
 
 def _residuals(body: SoftBody, field: ForceField, loads: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
