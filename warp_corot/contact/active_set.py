@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from warp_corot.kernels.contact import active as kernels
-from warp_corot.kernels.contact import spans
+from warp_corot.kernels.contact import span_places as spans
 from warp_corot.kernels.contact.meetings import find_meetings
 
 from .spans import Spans

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warp as wp
 
 from warp_corot.kernels.contact import borne_meetings as meetings
-from warp_corot.kernels.contact import spans as kernels
+from warp_corot.kernels.contact import span_places as kernels
 from warp_corot.kernels.contact.law import Law
 from warp_corot.solvers.system import System
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import warp as wp
 
 from warp_corot.kernels.contact import joined as kernels
+from warp_corot.kernels.contact import joined_places as finding
 from warp_corot.kernels.contact import row_meetings
 from warp_corot.kernels.contact.law import Law
 from warp_corot.kernels.contact.motion import Surface
@@ -141,13 +142,13 @@ class JoinedRows:
         carriers = self._carriers.arrays
         if is_first:
             inputs = [self._pairs.surface.arrays, joined]
-            wp.launch(kernels.begin_places, count, inputs, device=self.device)
+            wp.launch(finding.begin_places, count, inputs, device=self.device)
         inputs = [int(is_first), d, joined, carriers, surface]
-        wp.launch(kernels.place_nodes, count, inputs, device=self.device)
-        wp.launch(kernels.empty_crowds, len(carriers.crowd), [joined, carriers], device=self.device)
+        wp.launch(finding.place_nodes, count, inputs, device=self.device)
+        wp.launch(finding.empty_crowds, len(carriers.crowd), [joined, carriers], device=self.device)
         inputs = [int(is_first), self._law, self._system.pace.arrays, d, surface, self._pairs.meeting]
-        self._on_rows(kernels.locate_rows, [*inputs, carriers, self._pairs.rows, joined])
-        self._on_rows(kernels.stiffen_rows, self._springs)
+        self._on_rows(finding.locate_rows, [*inputs, carriers, self._pairs.rows, joined])
+        self._on_rows(finding.stiffen_rows, self._springs)
 
     def update(self, d: wp.array) -> None:
         """Launch forces and their derivatives after motions d."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
+from warp_corot.kernels.contact import span_places as finding
 from warp_corot.kernels.contact import spans as kernels
 from warp_corot.kernels.contact.law import Law
 from warp_corot.kernels.contact.touches import Touches
@@ -84,14 +85,14 @@ class Spans:
         self._items: list[Items] = []
         if rigid.have_edges:
             spans, count = self._made(rigid.touches), surface.worlds * part.triangles
-            each = Items(kernels.locate_spans, surface.triangles, part.triangle_start, count, rigid.touches, spans)
+            each = Items(finding.locate_spans, surface.triangles, part.triangle_start, count, rigid.touches, spans)
             self._items.append(each)
         if part.bearers:
             touches = self._touches_of_points()
             spans, count = self._made(touches), surface.worlds * part.nodes
             used = np.where(surface.arrays.node.numpy() < 0, -1, np.arange(surface.count))
             corners = wp.array(np.repeat(used[:, None], 3, axis=1), dtype=wp.vec3i, device=device)
-            self._items.append(Items(kernels.locate_points, corners, part.start, count, touches, spans))
+            self._items.append(Items(finding.locate_points, corners, part.start, count, touches, spans))
 
     # --- launches ----------------------------------------------------------------------------------------------------
 
@@ -103,22 +104,22 @@ class Spans:
         """Launch the search for obstacles at items.
 
         Args:
-            which: ``kernels.FIRST`` at the beginning of the step, ``AGAIN`` to find them again after motions d if that
+            which: ``finding.FIRST`` at the beginning of the step, ``AGAIN`` to find them again after motions d if that
                 is due, or ``MISSING`` to add those that are missing then.
             d: Motions [m], vec4; a guess at the beginning.
             changed: Nonzero afterwards if some are added, int32 [1].
         """
         obstacles, arrays = self._rigid.obstacles, self._rigid.surface.arrays
-        if which != kernels.MISSING:
+        if which != finding.MISSING:
             start, offset, count, _nodes = self._carriers.nodes_of(self._k)
             inputs = [start + offset, int(which), self._carriers.arrays, self._items[0].spans]
-            wp.launch(kernels.empty_spans, count, inputs, device=self.device)
+            wp.launch(finding.empty_spans, count, inputs, device=self.device)
         rigid = [int(which), obstacles.shapes, self._thickness, obstacles.motions, self._law, self._pace, arrays]
         for each in self._items:
             inputs = [*rigid, each.corners, d, self._carriers.arrays, each.touches, each.spans, changed]
             self._launch(each.locate, each, inputs)
         for each in self._items:
-            self._launch(kernels.stiffen_spans, each, [*self._places(each), each.touches, each.spans])
+            self._launch(finding.stiffen_spans, each, [*self._places(each), each.touches, each.spans])
 
     def launch_judgement(
         self, scalars: wp.array, near: float, changed: wp.array, rounds: wp.array, most: int, going: wp.array
@@ -153,7 +154,7 @@ class Spans:
         surface, device = self._rigid.surface, self.device
         part = surface.parts[self._k]
         for each in self._items:
-            if each.locate is kernels.locate_points:
+            if each.locate is finding.locate_points:
                 inputs = [self._carriers.arrays, d, each.touches, surface.arrays]
                 self._launch(kernels.end_points, each, inputs)
         if self._rigid.have_edges:

@@ -1,0 +1,155 @@
+"""Where pairs of soft surfaces are closest in an implicit step; see ``joined``."""
+
+import warp as wp
+
+from warp_corot.kernels.stepping.pace import DT, Pace
+
+from .carriers import Carriers, crowd_at, ease_at, gone_at, is_held_at, motion_at
+from .facing import locate_facing
+from .joined import NEAR, STIFF, Joined, opened_by
+from .law import Law, held_back
+from .motion import Surface
+from .rows import Meeting, Rows, row_count
+from .springs import kept_gap
+from .vertices import across
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel(enable_backward=False)
+def begin_places(surface: Surface, joined: Joined):
+    """Keep where places are when the step begins."""
+    s = wp.tid()
+    joined.start[s] = surface.x[s]
+
+
+@wp.kernel(enable_backward=False)
+def place_nodes(is_first: int, d: wp.array[wp.vec4], joined: Joined, carriers: Carriers, surface: Surface):
+    """Put places where pairs are to be located: where the step begins, or after motions d. Pairs that were near are
+    forgotten.
+    """
+    s = wp.tid()
+    if joined.locates[0] == 0:
+        return
+    if s == 0:
+        joined.counts[NEAR] = 0
+    if surface.node[s] < 0:
+        return
+    x = joined.start[s]
+    if is_first == 0:
+        x += motion_at(s, surface, carriers, d)
+    surface.x[s] = x
+
+
+@wp.kernel(enable_backward=False)
+def empty_crowds(joined: Joined, carriers: Carriers):
+    if joined.locates[0] != 0:
+        carriers.crowd[wp.tid()] = 0.0
+
+
+@wp.func
+def locate(
+    row: int,
+    is_first: int,
+    law: Law,
+    dt: float,
+    d: wp.array[wp.vec4],
+    surface: Surface,
+    meeting: Meeting,
+    carriers: Carriers,
+    rows: Rows,
+    joined: Joined,
+):
+    was = joined.force[row]
+    pushed = wp.dot(was, was) > 0.0
+    if is_first != 0:
+        was = rows.force[row]
+        pushed = wp.dot(was, was) > 0.0
+        joined.target[row] = 0.0
+    elif pushed:
+        e = opened_by(row, d, rows, surface, carriers) - joined.base[row]
+        if wp.abs(rows.gap[row] + wp.dot(rows.normal[row], e) - joined.target[row]) <= law.slack:
+            was = joined.multiplier[row]
+    is_near = locate_facing(row, surface, meeting, rows)
+    joined.multiplier[row] = wp.vec3()
+    joined.force[row] = wp.vec3()
+    joined.stiffness[row] = 0.0
+    if not is_near:
+        return
+    p = rows.places[row]
+    w = rows.shares[row]
+    is_free = bool(False)
+    given = wp.vec3()
+    k = int(0)
+    while k < 4:
+        is_free = is_free or not is_held_at(p[k], surface, carriers)
+        given += w[k] * gone_at(p[k], surface, carriers)
+        k += 1
+    if not is_free:
+        return
+    joined.stiffness[row] = 1.0
+    joined.given[row] = given
+    joined.base[row] = wp.vec3()
+    opened = opened_by(row, d, rows, surface, carriers)
+    if is_first != 0:
+        joined.target[row] = kept_gap(rows.gap[row], pushed, law, dt)
+    else:
+        joined.base[row] = opened
+    n = rows.normal[row]
+    push = wp.max(wp.dot(was, n), 0.0)
+    joined.multiplier[row] = push * n + held_back(across(was, n), push, meeting.friction)
+    gap = rows.gap[row] + wp.dot(n, opened - joined.base[row])
+    if push > 0.0 or gap < joined.target[row]:
+        k = int(0)
+        while k < 4:
+            crowd_at(p[k], w[k], surface, carriers)
+            k += 1
+
+
+@wp.kernel(enable_backward=False)
+def locate_rows(
+    # In
+    threads: int,
+    is_first: int,
+    law: Law,
+    pace: Pace,
+    d: wp.array[wp.vec4],
+    surface: Surface,
+    meeting: Meeting,
+    # Out
+    carriers: Carriers,
+    rows: Rows,
+    joined: Joined,
+):
+    """Where each pair is closest; its forces become its multipliers."""
+    row = wp.tid()
+    count = row_count(rows)
+    dt = float(pace.seconds[DT])
+    if joined.locates[0] == 0:
+        count = 0
+    while row < count:
+        locate(row, is_first, law, dt, d, surface, meeting, carriers, rows, joined)
+        row += threads
+
+
+@wp.kernel(enable_backward=False)
+def stiffen_rows(threads: int, surface: Surface, carriers: Carriers, rows: Rows, joined: Joined):
+    """Stiffness of the pairs that have been located: those that share nodes share it. Only these may meet until
+    pairs are located again.
+    """
+    row = wp.tid()
+    count = row_count(rows)
+    if joined.locates[0] == 0:
+        count = 0
+    while row < count:
+        if joined.stiffness[row] > 0.0:
+            p = rows.places[row]
+            w = rows.shares[row]
+            yielding = float(0.0)
+            k = int(0)
+            while k < 4:
+                yielding += ease_at(p[k], w[k], surface, carriers)
+                k += 1
+            joined.stiffness[row] = STIFF / wp.max(yielding, 1.0e-30)
+            joined.near[wp.atomic_add(joined.counts, NEAR, 1)] = row
+        row += threads

@@ -1,0 +1,304 @@
+"""Where obstacles are close to the triangles of a body and to its places between nodes; see ``spans``."""
+
+import warp as wp
+
+from warp_corot.kernels.stepping.pace import DT, Pace
+
+from .active import NEAR_END
+from .carriers import Carriers, crowd_at, ease_at, is_held_at, motion_at
+from .law import Law, held_back
+from .motion import Motions, Surface
+from .shapes import CAPSULE, GROUND, Shapes, carried, distance_to
+from .spans import Spans
+from .springs import kept_gap
+from .touches import CORNER, SKEWERED, Touches, nearest
+from .vertices import across
+
+wp.set_module_options({"enable_backward": False})
+
+#: Which spans are found: all at the beginning of the step, all again if that is due, or those that are missing.
+FIRST, AGAIN, MISSING = (wp.constant(k) for k in range(3))
+#: An obstacle may sink into triangles by this fraction of half its thickness. Otherwise all triangles around a ball are
+#: tangent to it, hold off the nodes, and make bodies much too stiff. So nodes less than 1.26 radii apart need no spans.
+ALLOWED = wp.constant(0.2)
+#: An obstacle must be closer to a triangle than to its corners by this many times the size of rounding errors.
+CLOSER = wp.constant(4.0)
+
+
+@wp.struct
+class Found:
+    """Where an obstacle is close to an item."""
+
+    is_near: wp.bool
+    shares: wp.vec3
+    gap: float
+    normal: wp.vec3
+    moved: wp.vec3  # how far the obstacle goes there in the step [m]
+    opened: float  # how far the gap opens in the step [m]
+    is_at_end: wp.bool  # whether the gap is that at the end of the step
+    allowed: float  # how far the obstacle may sink in [m]
+    friction: float
+
+
+@wp.func
+def find_span(
+    o: int,
+    pose: wp.transform,
+    a: wp.vec3,
+    b: wp.vec3,
+    c: wp.vec3,
+    far: float,
+    was: wp.vec3,
+    side: wp.vec3,
+    shapes: Shapes,
+    law: Law,
+):
+    """The point of a triangle that is closest to an obstacle, if that is within reach and closer than the corners."""
+    found = Found()
+    found.is_near = False
+    middle = (a + b + c) / 3.0
+    size = wp.max(wp.length(a - middle), wp.max(wp.length(b - middle), wp.length(c - middle)))
+    most = size + far
+    distance, _away = distance_to(shapes, o, pose, middle, most)
+    if distance > most:
+        return found
+    w, gap, n = nearest(shapes, o, pose, most, a, b, c)
+    if wp.dot(was, was) > 0.0 and wp.dot(n, side) < 0.0 and shapes.kind[o] == CAPSULE:
+        # The axis has passed through since the last time.
+        n = -n
+        gap = -2.0 * shapes.size[o][0] - gap
+    if gap > far or wp.max(w) > CORNER:
+        return found
+    corners = wp.matrix_from_rows(a, b, c)
+    # This loop is not unrolled, so that there is one distance function to compile.
+    k = int(0)
+    while k < 3:
+        there, _normal = distance_to(shapes, o, pose, corners[k], most)
+        if there <= gap + CLOSER * law.tolerance:
+            return found
+        k += 1
+    found.is_near = True
+    found.shares = w
+    found.gap = gap
+    found.normal = n
+    return found
+
+
+@wp.func
+def take_span(
+    o: int,
+    t: int,
+    which: int,
+    found: Found,
+    e: wp.vec3,
+    corners: wp.vec3i,
+    law: Law,
+    pace: Pace,
+    surface: Surface,
+    carriers: Carriers,
+    touches: Touches,
+    spans: Spans,
+    changed: wp.array[wp.int32],
+):
+    """List a span where an obstacle is near; its force becomes its multiplier."""
+    was = touches.force[o, t]
+    was_listed = spans.listed[o, t] != 0 and which != FIRST
+    pushed = wp.dot(was, was) > 0.0
+    spans.listed[o, t] = 0
+    touches.force[o, t] = wp.vec3()
+    touches.acts[o, t] = 0
+    if not found.is_near:
+        return
+    n = found.normal
+    if was_listed:
+        short = touches.gap[o, t] + wp.dot(touches.normal[o, t], e) - spans.base[o, t] - spans.target[o, t]
+        if wp.abs(short) <= law.slack:
+            was = spans.multiplier[o, t]
+    base = wp.where(found.is_at_end, found.opened, 0.0)
+    target = wp.where(was_listed, spans.target[o, t], -found.allowed)
+    if which == FIRST:
+        target = kept_gap(found.gap + found.allowed, pushed, law, float(pace.seconds[DT])) - found.allowed
+    is_passed = found.gap + found.opened - base < target - law.tolerance
+    if which == MISSING:
+        if not is_passed:
+            return
+        changed[0] = 1
+    push = wp.max(wp.dot(was, n), 0.0)
+    touches.shares[o, t] = found.shares
+    touches.normal[o, t] = n
+    touches.gap[o, t] = found.gap
+    touches.friction[o, t] = found.friction
+    touches.moved[o, t] = found.moved
+    spans.listed[o, t] = 1
+    spans.base[o, t] = base
+    spans.target[o, t] = target
+    spans.multiplier[o, t] = push * n + held_back(across(was, n), push, found.friction)
+    wp.atomic_add(spans.count, 0, 1)
+    if push > 0.0 or is_passed:
+        for k in range(3):
+            if found.shares[k] != 0.0:
+                crowd_at(corners[k], found.shares[k], surface, carriers)
+
+
+@wp.kernel(enable_backward=False)
+def locate_spans(
+    # In
+    start: int,
+    which: int,
+    shapes: Shapes,
+    thickness: wp.array[wp.float32],
+    motions: Motions,
+    law: Law,
+    pace: Pace,
+    surface: Surface,
+    triangles: wp.array[wp.vec3i],
+    d: wp.array[wp.vec4],
+    # In and out
+    carriers: Carriers,
+    touches: Touches,
+    spans: Spans,
+    # Out
+    changed: wp.array[wp.int32],
+):
+    """Find spans of a body's triangles at the beginning of the step, or after motions d; forces become multipliers.
+
+    If a motion is fast, its path may lead through the obstacle, so the span stays where the step begins.
+    """
+    t = start + wp.tid()
+    corners = triangles[t]
+    if corners[0] < 0 or (which == AGAIN and spans.due[0] == 0):
+        return
+    world = surface.world[corners[0]]
+    way = float(0.0)
+    x = wp.mat33()
+    e = wp.mat33()
+    for k in range(3):
+        e[k] = motion_at(corners[k], surface, carriers, d)
+        x[k] = surface.x[corners[k]]
+        way = wp.max(way, wp.length(e[k]))
+    for o in range(touches.force.shape[0]):
+        if shapes.kind[o] == GROUND or (which == MISSING and spans.listed[o, t] != 0):
+            continue
+        was = touches.force[o, t]
+        now = motions.now[world, o]
+        later = motions.later[world, o]
+        is_at_end = which != FIRST and way <= NEAR_END * thickness[o]
+        pose = now
+        at = x
+        if is_at_end:
+            pose = later
+            at = x + e
+        middle = (x[0] + x[1] + x[2]) / 3.0
+        far = 2.0 * way + wp.length(carried(now, later, middle)) + 2.0 * law.tolerance
+        found = find_span(o, pose, at[0], at[1], at[2], far, was, touches.normal[o, t], shapes, law)
+        found.moved = carried(now, later, found.shares * x)
+        found.opened = wp.dot(found.normal, found.shares * e - found.moved)
+        found.is_at_end = is_at_end
+        found.allowed = ALLOWED * thickness[o]
+        found.friction = shapes.friction[o]
+        if found.gap < -(SKEWERED + ALLOWED) * thickness[o]:
+            found.friction = 0.0
+        take_span(
+            o,
+            t,
+            which,
+            found,
+            found.shares * e - found.moved,
+            corners,
+            law,
+            pace,
+            surface,
+            carriers,
+            touches,
+            spans,
+            changed,
+        )
+
+
+@wp.kernel(enable_backward=False)
+def locate_points(
+    # In
+    start: int,
+    which: int,
+    shapes: Shapes,
+    thickness: wp.array[wp.float32],
+    motions: Motions,
+    law: Law,
+    pace: Pace,
+    surface: Surface,
+    points: wp.array[wp.vec3i],
+    d: wp.array[wp.vec4],
+    # In and out
+    carriers: Carriers,
+    touches: Touches,
+    spans: Spans,
+    # Out
+    changed: wp.array[wp.int32],
+):
+    """The same at a body's places that nodes bear; nothing sinks in there."""
+    s = start + wp.tid()
+    if points[s][0] < 0 or (which == AGAIN and spans.due[0] == 0) or is_held_at(s, surface, carriers):
+        return
+    world = surface.world[s]
+    x = surface.x[s]
+    e = motion_at(s, surface, carriers, d)
+    way = wp.length(e)
+    for o in range(touches.force.shape[0]):
+        if which == MISSING and spans.listed[o, s] != 0:
+            continue
+        now = motions.now[world, o]
+        later = motions.later[world, o]
+        found = Found()
+        found.is_at_end = which != FIRST and way <= NEAR_END * thickness[o]
+        pose = now
+        at = x
+        if found.is_at_end:
+            pose = later
+            at = x + e
+        found.moved = carried(now, later, x)
+        far = 2.0 * way + wp.length(found.moved) + 2.0 * law.tolerance
+        gap, n = distance_to(shapes, o, pose, at, far)
+        found.is_near = gap <= far
+        found.shares = wp.vec3(1.0, 0.0, 0.0)
+        found.gap = gap
+        found.normal = n
+        found.opened = wp.dot(n, e - found.moved)
+        found.allowed = 0.0
+        found.friction = shapes.friction[o]
+        take_span(o, s, which, found, e - found.moved, points[s], law, pace, surface, carriers, touches, spans, changed)
+
+
+@wp.kernel(enable_backward=False)
+def empty_spans(start: int, which: int, carriers: Carriers, spans: Spans):
+    """Begin to find spans of a body whose carriers begin at ``start``."""
+    c = wp.tid()
+    if which == FIRST or spans.due[0] != 0:
+        carriers.crowd[start + c] = 0.0
+        if c == 0:
+            spans.count[0] = 0
+            spans.due[0] = 1
+
+
+@wp.kernel(enable_backward=False)
+def stiffen_spans(
+    # In
+    start: int,
+    surface: Surface,
+    triangles: wp.array[wp.vec3i],
+    carriers: Carriers,
+    touches: Touches,
+    # In and out
+    spans: Spans,
+):
+    """Stiffness of spans: those that share nodes share it. A span whose corners are all held does nothing."""
+    t = start + wp.tid()
+    for o in range(touches.force.shape[0]):
+        if spans.listed[o, t] != 0:
+            w = touches.shares[o, t]
+            yielding = float(0.0)
+            for k in range(3):
+                if w[k] != 0.0:
+                    yielding += ease_at(triangles[t][k], w[k], surface, carriers)
+            spans.stiffness[o, t] = 0.0
+            if yielding > 0.0:
+                spans.stiffness[o, t] = spans.stiff / yielding
