@@ -44,6 +44,9 @@ def keep_again(contacts: Contacts, rooms: list[list[int]], room: int, kept: dict
     contacts.take_rooms(rooms, room)
     arrays = kept_arrays(contacts)
     for name, array in arrays.items():
+        if name not in kept:
+            # Files of former versions do not have what is found again in every step.
+            continue
         values = kept[name]
         if values.shape[: array.ndim] != array.shape:
             raise InputError(f"{name} has shape {list(values.shape)}; it must begin with {list(array.shape)}")

@@ -53,7 +53,7 @@ def pack_contact(contacts: Contacts | None, grasps: Sequence[Grasp], arrays: Arr
         "self_contact": options.self_contact,
         "flat_edges": options.flat_edges,
         "on": options.on,
-        "law": [law.tolerance, law.recovery],
+        "law": [law.tolerance, law.recovery, law.grain],
         "obstacles": [_pack_tool(tool, each is tool, f"tool{k}.", arrays) for k, (each, tool) in enumerate(given)],
         "rooms": contacts.surface.rooms,
         "room": 0 if contacts.pairs is None else contacts.pairs.room,
@@ -96,7 +96,9 @@ def unpack_contact(contacts: Contacts | None, described: dict[str, Any] | None, 
     if described is None or contacts is None:
         return
     kept = {name.removeprefix("contact."): values for name, values in arrays.items() if name.startswith("contact.")}
-    contacts.law.tolerance, contacts.law.recovery = described["law"]
+    # Files of former versions do not say in which grains forces are added up.
+    for name, value in zip(("tolerance", "recovery", "grain"), described["law"], strict=False):
+        setattr(contacts.law, name, value)
     keep_again(contacts, described["rooms"], described["room"], kept)
     bodies = contacts.system.bodies
     for number, body in enumerate(bodies):
