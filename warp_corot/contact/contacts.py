@@ -152,11 +152,13 @@ class Contacts:
             self._predict(0, 0.0)
             warn_of_overlaps(self, OVERLAP * self.smallest)
 
-    def settle(self, share: float) -> None:
-        """Let surfaces be pushed apart by this share of an overlap in each step, and more exactly, without a warning:
-        steps that seek a state of rest may begin inside obstacles. Before the first step."""
+    def settle(self, share: float, *, exactly: bool) -> None:
+        """Let surfaces be pushed apart by this share of an overlap in each step, without a warning: steps that seek a
+        state of rest may begin inside obstacles. Before the first step. ``exactly``: own surfaces keep smaller gaps,
+        which many contacts may not come to."""
         self.law.settling, self._is_looked_at = share, True
-        self.law.slack *= FINE
+        if exactly:
+            self.law.slack *= FINE
 
     def look(self) -> None:
         """Check whether elements are turned inside out, until the first time; waits for the device.

@@ -92,12 +92,12 @@ def rest_on(
     start = body.displacements.numpy().copy()
     steps = linear = 0
     correction, converged = np.full(body.worlds, np.inf), np.zeros(body.worlds, bool)
-    for length, settling in LENGTHS:
+    for number, (length, settling) in enumerate(LENGTHS):
         dt = length * _wave_time(body)
         euler = BackwardEuler(dt=dt, linear_tolerance=LINEAR, preconditioner=preconditioner)
         sim = Simulation(body, model=law, integrator=euler, gravity=gravity, obstacles=obstacles, contact=contact)
         if sim.contact is not None:
-            sim.contact.settle(settling)
+            sim.contact.settle(settling, exactly=number == 0)
         still = np.zeros_like(start)
         try:
             for _ in range(most):
