@@ -68,7 +68,7 @@ def test_signals_keep_frames(tmp_path, number, status):
     [
         ("warp", signal.SIGINT, 130),
         ("warp_corot.body.soft_body", signal.SIGTERM, 143),
-        ("pxr", signal.SIGINT, 130),
+        pytest.param("pxr", signal.SIGINT, 130, marks=pytest.mark.slow),
         pytest.param("warp", signal.SIGTERM, 143, marks=pytest.mark.slow),
         pytest.param("warp_corot.body.soft_body", signal.SIGINT, 130, marks=pytest.mark.slow),
         pytest.param("pxr", signal.SIGTERM, 143, marks=pytest.mark.slow),

@@ -19,6 +19,7 @@ def last_row(path):
         return np.array(list(csv.reader(file))[-1], float)
 
 
+@pytest.mark.slow
 def test_two_ranks_make_a_box_in_parts(folder):
     """They have the table of one process, and write two pieces of one stage."""
     from pxr import Usd, UsdGeom

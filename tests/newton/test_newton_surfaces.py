@@ -174,6 +174,7 @@ def test_a_recording_needs_a_step_before(device):
         solver.step(before, after, None, contacts, 1e-4)
 
 
+@pytest.mark.slow
 def test_a_plate_of_triangles_carries_a_block(device):
     """The nodes of a flat face carry it, as without full-surface contacts; records across the plate do not push it
     sideways."""

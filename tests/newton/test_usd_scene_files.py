@@ -295,7 +295,7 @@ def test_a_state_that_is_not_finite_leaves_the_frames_before(tmp_path, monkeypat
     [
         pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow),
         pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow),
-        (signal.SIGKILL, -9),
+        pytest.param(signal.SIGKILL, -9, marks=pytest.mark.slow),
     ],
 )
 def test_the_stage_opens_however_a_run_ends(tmp_path, number, status):

@@ -199,6 +199,7 @@ def test_claims_that_do_not_hold_are_reported(device):
     assert report.table(swapped).count("DOES NOT HOLD") >= 3
 
 
+@pytest.mark.slow
 def test_command(device, tmp_path, capsys):
     folder = tmp_path / "out"
     arguments = ["-o", folder, "--duration", 0.3, "--level", 2, "--device", device]
