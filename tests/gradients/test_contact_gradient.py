@@ -72,7 +72,7 @@ def test_derivatives_are_those_of_other_answers(device, scene, rng):
 
 
 def test_boundary_rest_and_worlds(device, rng):
-    """In each of two worlds, with held nodes moved and the rest shape changed."""
+    """In two worlds. Who moves the rest shape along the floor moves everything; towards it, all but the floor."""
     mesh, held, obstacle, gravity = on_floor(device)
     weights = rng.normal(size=(2 * len(mesh.points), 3)) / len(mesh.points)
     young = np.array([[5e3], [6e3]])
@@ -86,7 +86,7 @@ def test_boundary_rest_and_worlds(device, rng):
         return body, wc.static_gradient(
             body,
             lambda x: (float(np.sum(weights * x.numpy())), weights),
-            wrt=("boundary", "young", "obstacles"),
+            wrt=("boundary", "rest", "young", "obstacles"),
             gravity=gravity,
             obstacles=obstacle(np.zeros(3)),
             contact=CONTACT,
@@ -100,6 +100,8 @@ def test_boundary_rest_and_worlds(device, rng):
     everything = found.boundary[:, 1].sum() + found.obstacles[0, 1]
     assert everything == pytest.approx(weights[:, 1].sum(), rel=1e-3, abs=1e-4)
     assert found.young.shape == (2, 1)
+    moved = weights.sum(axis=0) - found.obstacles[0] * (0.0, 1.0, 0.0)
+    np.testing.assert_allclose(found.rest.sum(axis=0), moved, atol=1e-3 * np.abs(found.obstacles).max())
 
 
 def test_what_has_no_gradient_is_refused(device):
@@ -113,6 +115,8 @@ def test_what_has_no_gradient_is_refused(device):
 
     with pytest.raises(wc.InputError, match=r"obstacle 0 has friction 0\.3; gradients need contact without"):
         wc.static_gradient(body, objective, **given)
+    with pytest.raises(wc.InputError, match="it must be a Contact"):
+        wc.static_gradient(body, objective, contact="none", **given)
     with pytest.raises(wc.InputError, match="contact with obstacles only"):
         wc.static_gradient(body, objective, contact=wc.Contact(friction=0.0, self_contact=True), **given)
     far = wc.static_gradient(

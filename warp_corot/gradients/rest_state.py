@@ -17,7 +17,7 @@ from warp_corot.errors import ConvergenceError, InputError
 from warp_corot.inputs.checks import checked_number, shown
 from warp_corot.simulation.parts import checked_gravity, checked_models
 from warp_corot.simulation.resting import checked_obstacles
-from warp_corot.simulation.static import solve_static
+from warp_corot.simulation.static import static_answer
 
 from . import parameters
 from .adjoint import Adjoint
@@ -73,10 +73,10 @@ class RestState:
         self.field.relax_fully()
         ElementWork(self.field, needs)
         options |= {"preconditioner": preconditioner, "obstacles": obstacles, "contact": contact}
-        self.report = solve_static(body, model=law, gravity=gravity, **options)
+        self.report, touching = static_answer(body, model=law, gravity=gravity, **options)
         if not self.report.converged:
             raise ConvergenceError(f"there is no gradient: {self.report.message}")
-        touched = None if self.report._contact is None else RestingContact(body, self.report._contact)
+        touched = None if touching is None else RestingContact(body, touching)
         self._contact = touched if touched is not None and touched.pushes else None
         self._obstacle_count = len(checked_obstacles(obstacles))
         self.law, self._preconditioner, self._tolerance = law, preconditioner, adjoint_tolerance
@@ -151,6 +151,8 @@ def check_smooth(obstacles: Sequence[Shape], contact: Contact | None) -> None:
         InputError: There is friction, or the body touches itself.
     """
     contact = Contact() if contact is None else contact
+    if not isinstance(contact, Contact):
+        raise InputError(f"contact is {shown(contact)}; it must be a Contact")
     if contact.self_contact:
         raise InputError("the body may touch itself; gradients are of contact with obstacles only")
     for number, shape in enumerate(obstacles):

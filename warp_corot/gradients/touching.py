@@ -77,13 +77,16 @@ class RestingContact:
         from scipy.sparse import coo_array
 
         count, m = 3 * self._body.sizes.nodes, len(touches)
-        curvatures = self._curvatures(touches)
+        carriers = [self._carried(touch) for touch in touches]
+        each_world = self._body.sizes.nodes // self._body.worlds
+        curvatures = self._curvatures(touches, [int(nodes[0]) // each_world for nodes, _ in carriers])
+        x = self._contacts.surface.arrays.x.numpy().astype(float)
         entries, blocks, self._moved = [], [], []
         for i, (touch, normal, curvature) in enumerate(zip(touches, self.normals, curvatures, strict=True)):
-            nodes, carried = self._carried(touch)
+            nodes, carried = carriers[i]
             rows = (3 * nodes[:, None] + np.arange(3)).ravel()
             entries.append((rows, np.full(len(rows), i), (carried.T @ touch.shares)[:, None] * normal))
-            change = -float(touch.force @ normal) * self._hessian(touch, normal, curvature)
+            change = -float(touch.force @ normal) * self._hessian(touch, x[touch.places], normal, curvature)
             spread = np.kron(carried, np.eye(3))
             block = spread.T @ change @ spread
             blocks.append((np.repeat(rows, len(rows)), np.tile(rows, len(rows)), block))
@@ -104,14 +107,13 @@ class RestingContact:
             weights[row, np.searchsorted(nodes, those)] = shares
         return nodes + found[0][1] * count, weights
 
-    def _curvatures(self, touches: list[Touch]) -> Array:
+    def _curvatures(self, touches: list[Touch], worlds: list[int]) -> Array:
         """The second derivatives of obstacles' distances at contacts [1/m], [m, 3, 3], by central differences of
         normals."""
         contacts, device = self._contacts, self._contacts.device
         step = STEP * float(np.ptp(self._body.mesh.points, axis=0).max())
         steps = step * np.concatenate([np.eye(3), -np.eye(3)])
         points = np.array([touch.point for touch in touches])[:, None] + steps
-        worlds = [self._carried(touch)[0][0] // (self._body.sizes.nodes // self._body.worlds) for touch in touches]
         inputs = [
             contacts.obstacles.shapes,
             contacts.obstacles.motions,
@@ -125,16 +127,15 @@ class RestingContact:
         slopes = (found[:, :3] - found[:, 3:]) / (2.0 * step)
         return 0.5 * (slopes + np.swapaxes(slopes, 1, 2))
 
-    def _hessian(self, touch: Touch, normal: Array, curvature: Array) -> Array:
-        """The second derivative of the gap with respect to its places [1/m], [3 places, 3 places]."""
+    def _hessian(self, touch: Touch, x: Array, normal: Array, curvature: Array) -> Array:
+        """The second derivative of the gap with respect to its places x [1/m], [3 places, 3 places]."""
         count = len(touch.places)
         found = np.zeros((count, 3, count, 3))
         used = np.flatnonzero(touch.shares > LEAST_SHARE)
         shares = touch.shares[used]
         inner = np.einsum("a,b,ij->aibj", shares, shares, curvature)
         if len(used) > 1:
-            x = self._contacts.surface.arrays.x.numpy()[touch.places[used]].astype(float)
-            along = (x[1:] - x[0]).T
+            along = (x[used[1:]] - x[used[0]]).T
             slide = along.T @ curvature @ along
             values, vectors = np.linalg.eigh(slide)
             size = float(np.ptp(self._body.mesh.points, axis=0).max())

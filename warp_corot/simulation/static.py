@@ -66,8 +66,6 @@ class StaticReport:
     world_converged: npt.NDArray[np.bool_]
     displacements: npt.NDArray[np.float64] | None = None
     contacts: tuple[ContactPoint, ...] = field(default=(), repr=False)
-    #: What the contacts were read from, for gradients.
-    _contact: Contacts | None = field(default=None, repr=False)
 
 
 @in_turn
@@ -115,6 +113,35 @@ def solve_static(
         InputError: An argument has another type or is out of its range, the model does not support the mesh or the
             precision, the body is remeshed, or all its nodes are held.
     """
+    report, _ = static_answer(
+        body,
+        model=model,
+        gravity=gravity,
+        tolerance=tolerance,
+        iterations=iterations,
+        load_steps=load_steps,
+        preconditioner=preconditioner,
+        obstacles=obstacles,
+        contact=contact,
+        precision=precision,
+    )
+    return report
+
+
+def static_answer(
+    body: SoftBody,
+    *,
+    model: Model | None,
+    gravity: npt.ArrayLike | None,
+    tolerance: float = 1e-6,
+    iterations: int = 100,
+    load_steps: int = 1,
+    preconditioner: str | None = None,
+    obstacles: Shape | Sequence[Shape] = (),
+    contact: Contact | None = None,
+    precision: str = FLOAT32,
+) -> tuple[StaticReport, Contacts | None]:
+    """As ``solve_static``, with the contact of the answer if it touches anything, which the report does not keep."""
     refuse_tape()
     began = time.perf_counter()
     if not isinstance(body, SoftBody):
@@ -144,7 +171,7 @@ def solve_static(
         return _rest_on(answer, law, down, things, contact, tolerance, most, preconditioner, began)
     if answer.falls():
         message = "no node is held, and the loads do not balance: the body has no state of rest; fix some nodes"
-        return answer.report(began, message)
+        return answer.report(began, message), None
     solver = StaticSolver(
         body, forces, down, tolerance=tolerance, most=most, load_steps=steps, preconditioner=preconditioner
     )
@@ -152,8 +179,8 @@ def solve_static(
     answer.finish()
     converged = found.converged & (solver.share == 1.0)
     if precision == FLOAT64 and converged.all():
-        return _precise(answer, law, solver, began)
-    return answer.report(
+        return _precise(answer, law, solver, began), None
+    report = answer.report(
         began,
         "the body is at rest" if converged.all() else _what_stopped(body, solver, status_words(found)),
         iterations=solver.iterations,
@@ -163,6 +190,7 @@ def solve_static(
         load_share=solver.share,
         world_converged=converged,
     )
+    return report, None
 
 
 def _check_precision(precision: str, body: SoftBody, law: Model, *, touches: bool) -> None:
@@ -221,7 +249,7 @@ def _rest_on(
     most: int,
     preconditioner: str | None,
     began: float,
-) -> StaticReport:
+) -> tuple[StaticReport, Contacts | None]:
     """The answer in contact."""
     found = rest_on(
         answer.body,
@@ -248,7 +276,7 @@ def _rest_on(
         world_converged=found.converged,
     )
     points = () if found.contact is None else tuple(contact_points(found.contact))
-    return replace(report, contacts=points, _contact=found.contact)
+    return replace(report, contacts=points), found.contact
 
 
 class _Answer:
