@@ -43,9 +43,11 @@ def main() -> int:
     integrator = wc.SymplecticEuler(viscosity=VISCOSITY)
     sim = wc.Simulation(body, obstacles=[tool], gravity=(0, 0, 0), integrator=integrator)
     tell(f"{len(mesh.tets)} tetrahedra")
-    sim.advance(0.02)  # compiles and records
     hand = wc.haptics.ScriptedDevice(*stroke(options.seconds))
-    with wc.haptics.HapticLoop(sim, tool, hand, rate=options.rate, energy_bound=BOUND) as loop:
+    loop = wc.haptics.HapticLoop(sim, tool, hand, rate=options.rate, energy_bound=BOUND)
+    loop.connect()
+    sim.advance(0.02)  # compiles and records
+    with loop:
         share = loop.run(options.seconds)
     report = loop.report
     print(report)

@@ -10,6 +10,7 @@ import warp as wp
 
 from warp_corot.contact.obstacles import Obstacles
 from warp_corot.kernels.haptics import publish as kernels
+from warp_corot.kernels.stepping.work import separate_forces
 from warp_corot.solvers.guarding.mapped import Mapped
 from warp_corot.solvers.system import Constraint, System
 
@@ -60,7 +61,8 @@ class Exchange(Constraint):
     def __init__(self, system: System, obstacles: Obstacles, number: int):
         self._system, self._obstacles, self._number = system, obstacles, number
         device = system.device
-        wp.load_module(kernels.write_slot.module, device)  # the loop's clock does not wait for a compiler
+        for kernel in (kernels.write_slot, separate_forces):  # the loop's clock does not wait for a compiler
+            wp.load_module(kernel.module, device)
         self._shared = Mapped(1 + 2 * int(kernels.SLOT), device)
         self._stamp = Mapped(1, device)
         self._count = wp.zeros(1, dtype=wp.int64, device=device)
