@@ -222,3 +222,48 @@ def end_points(start: int, carriers: Carriers, d: wp.array[wp.vec4], touches: To
         total += touches.force[o, s]
     surface.d[s] = motion_at(s, surface, carriers, d)
     surface.f[s] = total
+
+
+@wp.kernel(enable_backward=False)
+def find_bearers(start: int, surface: Surface, bearers: Surface, nodes: wp.array[wp.vec4i], weights: wp.array[wp.vec4]):
+    """Find the nodes that bear each place of a body, and their weights; -1 where there is none."""
+    k = wp.tid()
+    s = start + k
+    found = wp.vec4i(-1, -1, -1, -1)
+    if surface.node[s] >= 0:
+        b = surface.bearing.bearers[s]
+        for m in range(4):
+            if surface.bearing.weights[s][m] != 0.0:
+                found[m] = bearers.node[b[m]]
+        weights[k] = surface.bearing.weights[s]
+    nodes[k] = found
+
+
+@wp.kernel(enable_backward=False)
+def gather_stiffness(
+    # In
+    start: int,
+    corner_starts: wp.array[wp.int32],
+    corners: wp.array[wp.int32],
+    touches: Touches,
+    spans: Spans,
+    have_triangles: int,
+    own_touches: Touches,
+    own_spans: Spans,
+    # Out
+    stiffness: wp.array[wp.mat33],
+):
+    """The stiffness of spans at a body's places: their own, and the shares of those at triangles."""
+    k = wp.tid()
+    s = start + k
+    total = wp.mat33()
+    for o in range(own_touches.force.shape[0]):
+        if own_touches.acts[o, s] != 0:
+            total += own_spans.derivative[o, s]
+    if have_triangles != 0:
+        for m in range(corner_starts[s], corner_starts[s + 1]):
+            t = corners[m] / 3
+            for o in range(touches.acts.shape[0]):
+                if touches.acts[o, t] != 0:
+                    total += touches.shares[o, t][corners[m] % 3] * spans.derivative[o, t]
+    stiffness[k] = total

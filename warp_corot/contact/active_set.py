@@ -116,6 +116,13 @@ class ActiveSet:
         """Number of surface places of one world."""
         return self._contacts.surface.parts[self._k].nodes
 
+    @property
+    def springs(self) -> None:
+        return None
+
+    def launch_springs(self) -> None:
+        """Do nothing."""
+
     def add_slopes(
         self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array, *, apart: bool = False
     ) -> None:

@@ -7,6 +7,7 @@ import warp as wp
 from warp_corot.kernels.contact import borne_meetings as meetings
 from warp_corot.kernels.contact import span_places as kernels
 from warp_corot.kernels.contact.law import Law
+from warp_corot.solvers.implicit.operator import Springs
 from warp_corot.solvers.system import System
 
 from .rigid_forces import RigidForces
@@ -43,6 +44,15 @@ class BorneSet:
     def count(self) -> int:
         """Number of surface places of one world."""
         return self._rigid.surface.parts[self._k].nodes
+
+    @property
+    def springs(self) -> Springs:
+        """All places, with the springs that push there."""
+        return self._spans.springs
+
+    def launch_springs(self) -> None:
+        """Launch the stiffness of ``springs``, from the last derivatives."""
+        self._spans.launch_springs()
 
     # --- launches ----------------------------------------------------------------------------------------------------
 

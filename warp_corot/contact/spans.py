@@ -12,6 +12,7 @@ from warp_corot.kernels.contact import spans as kernels
 from warp_corot.kernels.contact.law import Law
 from warp_corot.kernels.contact.touches import Touches
 from warp_corot.kernels.stepping.pace import Pace
+from warp_corot.solvers.implicit.operator import Springs
 
 from .carriers import PlaceCarriers
 from .rigid_forces import RigidForces
@@ -93,6 +94,7 @@ class Spans:
             used = np.where(surface.arrays.node.numpy() < 0, -1, np.arange(surface.count))
             corners = wp.array(np.repeat(used[:, None], 3, axis=1), dtype=wp.vec3i, device=device)
             self._items.append(Items(finding.locate_points, corners, part.start, count, touches, spans))
+        self.springs = self._made_springs()
 
     # --- launches ----------------------------------------------------------------------------------------------------
 
@@ -149,6 +151,16 @@ class Spans:
             inputs = [int(len(search) == 1), *self._places(each), each.touches, each.spans, d, change, search, slopes]
             self._launch(kernels.add_span_slopes, each, inputs)
 
+    def launch_springs(self) -> None:
+        """Launch the stiffness of ``springs``, from the derivatives of the last ``update``."""
+        surface = self._rigid.surface
+        part = surface.parts[self._k]
+        inputs = [part.start, surface.corner_starts, surface.corners, self._items[0].touches, self._items[0].spans]
+        last = self._items[-1]
+        inputs += [int(len(self._items) > 1), last.touches, last.spans]
+        count = surface.worlds * part.nodes
+        wp.launch(kernels.gather_stiffness, count, inputs, [self.springs.stiffness], device=self.device)
+
     def launch_end(self, d: wp.array) -> None:
         """Launch the motions of borne places and the forces on them, and the addition of forces on triangles."""
         surface, device = self._rigid.surface, self.device
@@ -171,6 +183,16 @@ class Spans:
         spans.count, spans.due = self._count, self._due
         spans.stiff = STIFF_OF_BORNE if self._is_borne else STIFF
         return spans
+
+    def _made_springs(self) -> Springs:
+        """The places of the body, with the nodes that bear them."""
+        surface, device = self._rigid.surface, self.device
+        part = surface.parts[self._k]
+        count = surface.worlds * part.nodes if self._is_borne else 0
+        nodes, weights = wp.zeros(count, dtype=wp.vec4i, device=device), wp.zeros(count, dtype=wp.vec4, device=device)
+        inputs = [part.start, surface.arrays, surface.bearers]
+        wp.launch(kernels.find_bearers, count, inputs, [nodes, weights], device=device)
+        return Springs(nodes, weights, wp.zeros(count, dtype=wp.mat33, device=device))
 
     def _touches_of_points(self) -> Touches:
         """Those of places, whose forces are those of obstacles on nodes in explicit steps."""

@@ -74,13 +74,19 @@ class JoinedPreconditioner:
         self, preconditioners: Sequence[Preconditioner], held: Sequence[Held | None], like: wp.array, parts: Parts
     ):
         self._parts = parts
-        self._each: list[Preconditioner] = [
+        self._each: list[Preconditioner | FreePreconditioner] = [
             preconditioner if own is None else FreePreconditioner(preconditioner, own, part)
             for preconditioner, own, part in zip(preconditioners, held, parts.of(like), strict=True)
         ]
 
     def update(self, operator: LinearOperator) -> None:
         """Do nothing: ``JoinedSolve`` keeps the bodies' preconditioners up to date."""
+
+    def take_springs(self) -> None:
+        """Launch the exchange of the springs of obstacles for the present ones."""
+        for preconditioner in self._each:
+            if isinstance(preconditioner, FreePreconditioner):
+                preconditioner.take_springs()
 
     def apply(self, r: wp.array, z: wp.array) -> None:
         for preconditioner, a, b in zip(self._each, self._parts.of(r), self._parts.of(z), strict=True):
@@ -188,6 +194,7 @@ class JoinedSolve:
         rows.add_forces(self._r)
         for (held, part), r in zip(self._each_held(d), self._held_parts(self._r), strict=True):
             held.launch_friction(part, r)
+        self._preconditioner.take_springs()
         self._solver.launch(self._preconditioner, self._r, self._change, like=self._b, share=SHARE)
         self._operator.apply_freely(self._change, self._q)
         rows.find_reached(d, self._change)

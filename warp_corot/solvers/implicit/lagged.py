@@ -9,7 +9,7 @@ import warp as wp
 from warp_corot.kernels.implicit import lagged as kernels
 from warp_corot.solvers.ranks import ALONE, Ranks
 
-from .operator import LinearOperator, Preconditioner
+from .operator import LinearOperator, Preconditioner, Springs
 
 
 class CostlySetUp(Preconditioner, Protocol):
@@ -87,6 +87,16 @@ class Lagged:
         )
         self._ranks.take_most(self._due)
         wp.capture_if(self._due, self._set_up)
+
+    def follow_springs(self, springs: Springs) -> None:
+        """Make room for springs; not while launches are recorded, and after ``prepare``."""
+        if hasattr(self.preconditioner, "follow_springs"):
+            self.preconditioner.follow_springs(springs)
+
+    def take_springs(self) -> None:
+        """Launch the exchange of the springs in the preconditioner for the present ones."""
+        if hasattr(self.preconditioner, "take_springs"):
+            self.preconditioner.take_springs()
 
     def apply(self, r: wp.array, z: wp.array) -> None:
         self.preconditioner.apply(r, z)

@@ -7,6 +7,7 @@ that take vectors launch kernels and do not wait for the device, so that a solve
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol
 
 import warp as wp
@@ -76,3 +77,18 @@ class Preconditioner(Protocol):
     def apply(self, r: wp.array, z: wp.array) -> None:
         """Launch z = B r; both vec4 [worlds * nodes], different arrays."""
         ...
+
+
+@dataclass(frozen=True, eq=False)
+class Springs:
+    """Places between nodes where springs may be, besides an operator.
+
+    Attributes:
+        nodes: The nodes that bear each place, numbered in all worlds, -1 for none, vec4i [S].
+        weights: Their shares, vec4 [S].
+        stiffness: Of the springs there now, zero where there is none, mat33 [S] [N/m].
+    """
+
+    nodes: wp.array
+    weights: wp.array
+    stiffness: wp.array

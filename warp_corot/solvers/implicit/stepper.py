@@ -278,6 +278,8 @@ class BodySteps:
             self._preconditioner.follow()
         if self.held is not None:
             self.held.prepare()
+            if self.held.springs is not None and hasattr(self._preconditioner, "follow_springs"):
+                self._preconditioner.follow_springs(self.held.springs)
         if self._version != self.body.version:
             if self._is_prepared:
                 self.before.fill_(np.nan)

@@ -11,7 +11,7 @@ from warp_corot.kernels.implicit.tangent import find_rest, judge_round
 
 from .line_search import LineSearch, SharedLineSearch
 from .newton import Newton
-from .operator import LinearOperator, Preconditioner
+from .operator import LinearOperator, Preconditioner, Springs
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
@@ -35,6 +35,13 @@ class Held(Protocol):
 
     @property
     def count(self) -> int: ...
+
+    @property
+    def springs(self) -> Springs | None:
+        """Springs that a preconditioner may take into account, if there are any."""
+        ...
+
+    def launch_springs(self) -> None: ...
 
     def prepare(self) -> None: ...
 
@@ -164,6 +171,12 @@ class FreePreconditioner:
     def update(self, operator: LinearOperator) -> None:
         self._preconditioner.update(operator)
 
+    def take_springs(self) -> None:
+        """Launch the exchange of the springs in B for the present ones."""
+        if self._held.springs is not None and hasattr(self._preconditioner, "take_springs"):
+            self._held.launch_springs()
+            self._preconditioner.take_springs()
+
     def apply(self, r: wp.array, z: wp.array) -> None:
         wp.copy(self._r, r)
         self._held.launch_yielding(self._r)
@@ -222,6 +235,7 @@ class TouchingSolve:
         wp.launch(find_rest, len(d), [b, self._q], [self._rest], device=self.device)
         wp.copy(self._r, self._rest)
         held.launch_friction(d, self._r)
+        self._preconditioner.take_springs()
         newton.solver.launch(self._preconditioner, self._r, self._change, like=b, share=SHARE)
         self._operator.apply(self._change, self._q)
         held.launch_free(self._q)

@@ -18,11 +18,12 @@ from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.implicit.multigrid import pattern, shared, values
 from warp_corot.kernels.implicit.multigrid.leaves_cpu import gather_leaves_on_cpu
 from warp_corot.kernels.tables.shapes import GRADIENT
-from warp_corot.solvers.implicit.operator import LinearOperator
+from warp_corot.solvers.implicit.operator import LinearOperator, Springs
 
 from .coarsest import DenseInverse
 from .level import Level, SmoothedLevel
 from .pattern import Midpoints, Pattern, PatternFinder
+from .springs import SpringsOnLevels
 from .subtrees import RootLevel, SubtreeLevel, suitable_batches
 from .swept import SweptLevel
 
@@ -103,6 +104,7 @@ class Multigrid:
         self._find_members = members
         self._is_half, self.sweeps, self._assembled = half, sweeps, assembled
         self.revision, self._version = -1, -1
+        self._springs: SpringsOnLevels | None = None
         self.follow()
 
     @property
@@ -141,6 +143,19 @@ class Multigrid:
                 level.pack()
         if self._coarsest is not None:
             self._coarsest.update()
+        if self._springs is not None:
+            self._springs.keep_plain()
+
+    def follow_springs(self, springs: Springs) -> None:
+        """Make room for springs on the present levels; not while launches are recorded. An ``update`` must follow."""
+        self._springs = SpringsOnLevels(self, springs, self._rank, self._ends)
+
+    def take_springs(self) -> None:
+        """Launch the exchange of the springs in all matrices for the present ones."""
+        assert self._springs is not None
+        self._springs.take()
+        if self._coarsest is not None:
+            self._coarsest.update()
 
     def apply(self, r: wp.array, z: wp.array) -> None:
         """Launch z = B r, one cycle from zero; both vec4 [worlds * nodes]."""
@@ -173,11 +188,12 @@ class Multigrid:
     def _build(self, levels: Levels) -> None:
         sizes, device = self.discretization.sizes, self.device
         self.count, self._mesh_nodes, self._nodes = levels.node_count, levels.mesh_nodes, levels.nodes
-        rank = wp.empty(self.count, dtype=wp.int32, device=device)
+        self._rank = rank = wp.empty(self.count, dtype=wp.int32, device=device)
         wp.launch(pattern.find_ranks, self.count, [levels.nodes], [rank], device=device)
         self._ends = wp.empty(self.count, dtype=wp.vec2i, device=device)
         wp.launch(pattern.rank_ends, self.count, [levels.ends, rank], [self._ends], device=device)
         self._free = wp.zeros(sizes.worlds * self.count, dtype=wp.uint8, device=device)
+        self._springs = None
         finder = PatternFinder(self._ends)
         members = self._members = self._find_members and self._find_members(sizes.world_elements)
         batches = self._subtrees(members)
