@@ -49,9 +49,9 @@ ISOTROPIC = "const auto& isotropic = material;\n"
 ISOTROPIC_PART = "const auto& isotropic = material.isotropic;\n"
 
 
-def on_cpu(*code: str) -> str:
-    """A native snippet on lanes; it is empty where Warp compiles it for a GPU."""
-    return f"#if !defined(__CUDA_ARCH__)\n{native('lanes')}{''.join(code)}#endif\n"
+def on_cpu(*code: str, otherwise: str = "") -> str:
+    """A native snippet on lanes; where Warp compiles it for a GPU, it is ``otherwise``."""
+    return f"#if !defined(__CUDA_ARCH__)\n{native('lanes')}{''.join(code)}#else\n{otherwise}#endif\n"
 
 
 @functools.cache

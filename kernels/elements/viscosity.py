@@ -8,6 +8,7 @@ power and has no torque.
 """
 
 import functools
+from typing import Any
 
 import warp as wp
 
@@ -38,9 +39,30 @@ def viscous_stress(u: wp.mat33, a: wp.mat33, mu: float, lam: float):
     return s + wp.skew(inverse * axial(u * s))
 
 
+@wp.func
+def add_viscous_forces(
+    elements: Any,
+    t: int,
+    eta: float,
+    material: IsotropicMaterial,
+    u: wp.array[wp.vec4],
+    v: wp.array[wp.vec4],
+    f: wp.array[wp.vec4],
+):
+    """Add the viscous nodal forces of element t to f: eta times the stiffness, for small motions."""
+    g = local_gradient(elements, t, u)
+    q = frame(elements, t)
+    r = byers_xu(q + g)
+    stretch = identity3() + corotated_strain(g, q, r)
+    rate = wp.transpose(r) * local_gradient(elements, t, v)
+    i = t * material.stride
+    p = r * viscous_stress(stretch, rate, eta * material.mu[i], eta * material.lam[i])
+    scatter_stress(elements, t, p, f)
+
+
 @functools.cache
 def scatter_viscous(Elements: type) -> wp.Kernel:
-    """Add viscous nodal forces to f: eta times the stiffness, for small motions."""
+    """Add viscous nodal forces to f; a thread is an element."""
 
     @unique_kernel()
     def scatter_viscous(
@@ -53,14 +75,6 @@ def scatter_viscous(Elements: type) -> wp.Kernel:
         # Out
         f: wp.array[wp.vec4],
     ):
-        t = wp.tid()
-        g = local_gradient(elements, t, u)
-        q = frame(elements, t)
-        r = byers_xu(q + g)
-        stretch = identity3() + corotated_strain(g, q, r)
-        rate = wp.transpose(r) * local_gradient(elements, t, v)
-        i = t * material.stride
-        p = r * viscous_stress(stretch, rate, eta * material.mu[i], eta * material.lam[i])
-        scatter_stress(elements, t, p, f)
+        add_viscous_forces(elements, wp.tid(), eta, material, u, v, f)
 
     return scatter_viscous

@@ -2,9 +2,12 @@
 
 import numpy as np
 import pytest
+import warp as wp
 
 import warp_corot as wc
 from warp_corot.elasticity.viscosity import Viscosity
+from warp_corot.kernels.elements.lanes import LANES
+from warp_corot.kernels.elements.viscosity import scatter_viscous
 
 BOX = wc.TetForest.box((1, 1, 2), 0.1, 3)
 GENERAL = wc.TetMesh(BOX.points, BOX.tets)
@@ -168,3 +171,25 @@ def test_the_first_mode_of_a_beam_decays_as_rayleigh_says(case, device):
 def test_viscosity_must_be_a_time(value):
     with pytest.raises(wc.InputError, match="viscosity is"):
         wc.SymplecticEuler(viscosity=value)
+
+
+MIXED = wc.TetForest.box((1, 1, 2), 0.1, 4).refine(np.arange(0, 100, 7))
+
+
+@pytest.mark.parametrize("mesh", [MIXED, wc.TetMesh(MIXED.points, MIXED.tets)], ids=["forest", "general"])
+@pytest.mark.parametrize("amount", [0.0, 0.05, 3.0])
+def test_elements_side_by_side_do_what_each_does_alone(mesh, amount, rng):
+    """Of all types, each with its own material, strained until some are turned inside out."""
+    count = len(mesh.tets)
+    assert count % LANES
+    body = wc.SoftBody(mesh, wc.Isotropic(rng.uniform(1e4, 1e5, count), 0.3, 1000.0), device="cpu")
+    body.displacements, body.velocities = strained(mesh, rng, amount), rng.normal(size=mesh.points.shape)
+    field = wc.Corotated().bind(body)
+    Viscosity(body, field, 0.1).add_forces()
+    expected, state = wp.zeros_like(body.state.forces), body.state
+    inputs = [field.elements, 0.1, field.isotropic, state.displacements, state.velocities]
+    wp.launch(scatter_viscous(body.discretization.element_kind), count, inputs, [expected], device="cpu")
+    atol = 2e-5 * np.abs(expected.numpy()).max()
+    np.testing.assert_allclose(state.forces.numpy(), expected.numpy(), rtol=0, atol=atol)
+    rest, now = (np.linalg.det(np.diff(x[mesh.tets], axis=1)) for x in (mesh.points, body.positions.numpy()))
+    assert (now / rest < 0.0).any() == (amount > 1.0)

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
+from warp_corot.kernels.elements.lanes import LANES
 from warp_corot.kernels.elements.viscosity import scatter_viscous
+from warp_corot.kernels.elements.viscosity_cpu import ViscousMaterial, scatter_viscous_eights
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
@@ -36,7 +38,8 @@ class Viscosity:
         complete: Callable[[wp.array], wp.array] | None = None,
     ):
         self.body, self.field, self.seconds, self._complete = body, field, seconds, complete
-        self._kernel = scatter_viscous(body.discretization.element_kind)
+        kind = body.discretization.element_kind
+        self._kernel = scatter_viscous_eights(kind) if body.device.is_cpu else scatter_viscous(kind)
         #: Separate places for each element's forces, if sums must be reproducible.
         self._slotted = body.discretization.plan(subtrees=False, deterministic=True) if field.deterministic else None
 
@@ -58,5 +61,11 @@ class Viscosity:
         slots.gather(f)
 
     def _launch(self, elements: object, u: wp.array, v: wp.array, f: wp.array) -> None:
-        inputs = [elements, self.seconds, self.field.isotropic, u, v]
-        wp.launch(self._kernel, self.field.element_count, inputs, [f], device=self.body.device)
+        field, device = self.field, self.body.device
+        if device.is_cuda:
+            inputs = [elements, self.seconds, field.isotropic, u, v]
+            wp.launch(self._kernel, field.element_count, inputs, [f], device=device)
+            return
+        material, count = ViscousMaterial(), field.element_count
+        material.isotropic, material.seconds, material.velocities = field.isotropic, self.seconds, v
+        wp.launch(self._kernel, -(-count // LANES), [elements, count, material, u], [f], device=device)
