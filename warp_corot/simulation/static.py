@@ -19,6 +19,7 @@ from warp_corot.elasticity import Corotated, ForceField, Model
 from warp_corot.errors import ConvergenceError, InputError
 from warp_corot.inputs.checks import checked_count, checked_number, refuse_tape, shown
 from warp_corot.inputs.turns import in_turn
+from warp_corot.solvers.implicit.nested import nested_start
 from warp_corot.solvers.implicit.preconditioners import check_preconditioner
 from warp_corot.solvers.implicit.static import StaticSolver, status_words
 
@@ -41,7 +42,7 @@ class StaticReport:
     Attributes:
         converged: Whether every world is at rest.
         message: What happened, in one line.
-        iterations: Newton's iterations.
+        iterations: Newton's iterations on the body's own mesh.
         linear_iterations: Iterations of conjugate gradients in all of Newton's iterations together.
         residual: The norm of the unbalanced forces over that of external and reaction forces, in the last iteration of
             the world where it is largest. Rounding of float32 leaves some 1e-5 on fine meshes.
@@ -175,7 +176,7 @@ def static_answer(
     solver = StaticSolver(
         body, forces, down, tolerance=tolerance, most=most, load_steps=steps, preconditioner=preconditioner
     )
-    found = solver.solve()
+    found = solver.solve(nested_start(body, law, forces, answer.loads) if steps == 1 else None)
     answer.finish()
     converged = found.converged & (solver.share == 1.0)
     if precision == FLOAT64 and converged.all():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -39,6 +40,7 @@ class StaticSolver:
         most: Maximum number of iterations of each load step.
         load_steps: Number of equal steps in which loads and gravity are added.
         preconditioner: The name of a preconditioner, or None.
+        least_share: The smallest fraction of the load that is added in one step.
 
     Attributes:
         iterations, linear_iterations: Sums over all load steps, of the world that needed most.
@@ -55,16 +57,21 @@ class StaticSolver:
         most: int,
         load_steps: int,
         preconditioner: str | None,
+        least_share: float = LEAST_SHARE,
     ):
-        self.body, self.field, self._load_steps = body, field, load_steps
+        self.body, self.field, self._load_steps, self._least_share = body, field, load_steps, least_share
         self.operator = TangentOperator(body, field, exact=True)
         chosen = preconditioner_of(preconditioner, self.operator, few_digits=True)
         self.newton = Newton(self.operator, chosen, gravity, tolerance=tolerance, most=most)
         self.iterations = self.linear_iterations = 0
         self.share = 0.0
 
-    def solve(self) -> NewtonReport:
+    def solve(self, near: npt.NDArray[np.float32] | None = None) -> NewtonReport:
         """Find the state of rest, or leave the body in the last good state on the way there. Waits for the device.
+
+        Args:
+            near: Displacements near the answer [m], [nodes, 4]. They are used if the body's free nodes are at rest,
+                their energy is less, and they turn no element over.
 
         If the search begins with elements turned over, their neighbours may hold such elements in place. Then another
         search begins with all free nodes at rest, and the state with less energy is used.
@@ -74,6 +81,10 @@ class StaticSolver:
         graph = self._record()
         self._limits = limits(self.field) if self._load_steps == 1 else []
         given, rest = wp.clone(state.displacements), self._free_nodes_at_rest()
+        if near is not None and np.array_equal(given.numpy(), rest) and self._is_better(near):
+            report = self._solve_from(given, graph, wp.array(near - rest, dtype=wp.vec4, device=self.body.device))
+            if report.converged.all():
+                return report
         report = self._solve_from(given, graph)
         if np.array_equal(given.numpy(), rest) or (report.converged.all() and not self._turned_over()):
             return report
@@ -85,12 +96,15 @@ class StaticSolver:
         wp.copy(state.displacements, first)
         return report
 
-    def _solve_from(self, start: wp.array, graph: wp.Graph) -> NewtonReport:
-        """Add the load at once, or in parts, smaller and smaller ones where Newton's method does not converge."""
+    def _solve_from(self, start: wp.array, graph: wp.Graph, first: wp.array | None = None) -> NewtonReport:
+        """Add the load at once, or in parts, smaller and smaller ones where Newton's method does not converge; the
+        first search begins at an increment, if there is one."""
         newton = self.newton
         wp.copy(newton.base, start)
         newton.increment.zero_()
         good = wp.clone(newton.increment)
+        if first is not None:
+            wp.copy(newton.increment, first)
         self.share, step = 0.0, 1.0 / self._load_steps
         if self._limits:
             report = self._solve_at_once(start, graph)
@@ -111,7 +125,7 @@ class StaticSolver:
                 continue
             wp.copy(newton.increment, good)
             step *= 0.5
-            if step < LEAST_SHARE:
+            if step < self._least_share:
                 self._put_back(good)
                 return report
 
@@ -155,23 +169,30 @@ class StaticSolver:
         u[self.body.conditions.inverse_mass.numpy() > 0.0] = 0.0
         return u
 
-    def _turned_over(self) -> bool:
-        """Whether an element is inside out."""
+    def _turned_over(self, displacements: npt.NDArray[np.float32] | None = None) -> bool:
+        """Whether an element is inside out, at the present displacements or at others."""
         mesh, body = self.body.mesh, self.body
-        u = body.state.displacements.numpy()[: body.sizes.nodes, :3].reshape(body.worlds, -1, 3)
-        rest = mesh.points[mesh.tets]
-        at_rest = np.linalg.det(rest[:, 1:] - rest[:, :1])
-        for world in u:
-            x = rest + world[mesh.tets]
-            if (np.linalg.det(x[:, 1:] - x[:, :1]) * at_rest <= 0.0).any():
+        u = body.state.displacements.numpy() if displacements is None else displacements
+        at_rest = _determinants(mesh.points, mesh.tets)
+        for world in u[: body.sizes.nodes, :3].reshape(body.worlds, -1, 3):
+            if (_determinants(mesh.points + world, mesh.tets) * at_rest <= 0.0).any():
                 return True
         return False
 
-    def _energy(self) -> float:
+    def _is_better(self, near: npt.NDArray[np.float32]) -> bool:
+        """Whether displacements turn no element over and have less energy than the present ones, with the smallest
+        lambda of the search."""
+        if self._turned_over(near):
+            return False
+        with limited(self.field, self._limits[0]) if self._limits else nullcontext():
+            return self._energy(wp.array(near, dtype=wp.vec4, device=self.body.device)) < self._energy()
+
+    def _energy(self, displacements: wp.array | None = None) -> float:
         """Strain energy minus the work of loads and gravity [J], of all worlds."""
-        state, count = self.body.state, self.body.sizes.nodes
-        u = state.displacements.numpy()[:count, :3].astype(np.float64)
-        return float(self.field.potentials(state.displacements).sum()) - float(np.sum(self._loads() * u))
+        count = self.body.sizes.nodes
+        where = self.body.state.displacements if displacements is None else displacements
+        u = where.numpy()[:count, :3].astype(np.float64)
+        return float(self.field.potentials(where).sum()) - float(np.sum(self._loads() * u))
 
     def _loads(self) -> npt.NDArray[np.float64]:
         """Loads and weight [N], [worlds * N, 3]."""
@@ -207,6 +228,13 @@ class StaticSolver:
         wp.copy(self.newton.increment, increment)
         self.newton.running.zero_()
         self.newton.launch_begin()
+
+
+def _determinants(points: npt.NDArray[np.float64], tets: npt.NDArray[np.int32]) -> npt.NDArray[np.float64]:
+    """Six times the volume of each tetrahedron, with its sign."""
+    x = np.ascontiguousarray(points.T)
+    a, b, c = ([row[tets[:, k]] - row[tets[:, 0]] for row in x] for k in (1, 2, 3))
+    return a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2]) + a[2] * (b[0] * c[1] - b[1] * c[0])
 
 
 def status_words(report: NewtonReport) -> str:

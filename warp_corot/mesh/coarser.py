@@ -1,0 +1,84 @@
+"""The mesh of a forest at a coarser level: all ancestors of that level, and all leaves above it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .bisection import corner_leaves
+from .numbering import renumbered, with_virtual
+from .tree import LIVE, VOID, Tree, UniformTree
+
+if TYPE_CHECKING:
+    from .forest import TetForest
+
+
+@dataclass(frozen=True, eq=False)
+class Coarser:
+    """A coarser mesh of a forest, without its filled shares, labels and surface.
+
+    Attributes:
+        forest: The coarser mesh.
+        nodes: The place of each of its nodes among the lattice points of the finer forest, [N].
+        leaves: For each leaf of the finer forest the leaf of the coarser one that it is or lies in, [T].
+    """
+
+    forest: TetForest
+    nodes: np.ndarray
+    leaves: np.ndarray
+
+
+def coarser(forest: TetForest, level: int) -> Coarser:
+    """The mesh of all ancestors of ``level`` and all leaves above it; the level of some leaf must be larger."""
+    tree = _uniform(forest.tree, level) if isinstance(forest.tree, UniformTree) else _cut(forest.tree, level)
+    above = forest.tree.ancestors(forest.tree.leaves, level)
+    starts_subtree = np.concatenate([[True], above[1:] != above[:-1]])
+    leaves = np.cumsum(starts_subtree) - 1
+    named = np.zeros(len(forest.lattice), bool)
+    named[tree.leaf_tets] = True
+    real = np.flatnonzero(named)
+    if isinstance(tree, UniformTree):
+        order, ends = real, forest.node_ends[real]
+        number = np.full(len(named), -1, np.int32)
+        number[order] = np.arange(len(order), dtype=np.int32)
+        # Numbers keep their order, so that the lower end stays the first.
+        ends = np.where(ends < 0, np.int32(-1), number[ends])
+        tree = UniformTree(number[tree.leaf_tets], level)
+    else:
+        order = with_virtual(real, tree, forest.lattice)
+        ends, tree = renumbered(order, forest.node_ends, tree)
+    made = replace(
+        forest,
+        lattice=forest.lattice[order],
+        node_ends=ends,
+        tree=tree,
+        phi=None,
+        fill=None,
+        labels=None,
+        node_labels=None,
+        label_names=(),
+        detail=None,
+        leaf_groups=None,
+    )
+    return Coarser(made, order[: len(real)], leaves)
+
+
+def _uniform(tree: UniformTree, level: int) -> UniformTree:
+    step = 2 ** (tree.depth - level)
+    corners = [tree.leaf_tets[leaf::step, place] for leaf, place in corner_leaves(level, tree.depth)]
+    return UniformTree(np.stack(corners, axis=1), level)
+
+
+def _cut(tree: Tree, level: int) -> Tree:
+    """The tree without the tetrahedra below a level."""
+    kept = tree.level <= level
+    number = np.cumsum(kept, dtype=np.int32) - 1
+    first_child = np.where(tree.first_child < 0, tree.first_child, number[tree.first_child])
+    lowest = (tree.level == level) & (tree.first_child >= 0)
+    live = np.zeros(len(kept), bool)
+    live[tree.ancestors(tree.leaves, level)] = True
+    first_child[lowest] = np.where(live[lowest], LIVE, VOID)
+    parent = np.where(tree.parent < 0, np.int32(-1), number[tree.parent])
+    return Tree(tree.tets[kept], tree.level[kept], parent[kept], first_child[kept].astype(np.int32))
