@@ -133,6 +133,7 @@ def take_span(
     spans.base[o, t] = base
     spans.target[o, t] = target
     spans.multiplier[o, t] = push * n + held_back(across(was, n), push, found.friction)
+    touches.force[o, t] = spans.multiplier[o, t]
     wp.atomic_add(spans.count, 0, 1)
     if push > 0.0 or is_passed:
         for k in range(3):
@@ -257,6 +258,9 @@ def locate_points(
             at = x + e
         found.moved = carried(now, later, x)
         far = 2.0 * way + wp.length(found.moved) + 2.0 * law.tolerance
+        if spans.stiffness[o, s] > 0.0:
+            # What a small gap has left of the last force still pushes.
+            far += wp.length(touches.force[o, s]) / spans.stiffness[o, s]
         gap, n = distance_to(shapes, o, pose, at, far)
         found.is_near = gap <= far
         found.shares = wp.vec3(1.0, 0.0, 0.0)

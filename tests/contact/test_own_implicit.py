@@ -103,6 +103,18 @@ def test_a_static_answer_is_where_steps_come_to_rest(ball, device):
     assert np.abs(a - b).max() < 0.02 * np.abs(b).max()
 
 
+def test_a_static_answer_with_many_places_takes_one_search(device):
+    """Forces go on from step to step: the 150 places below a brick come to rest with small gaps."""
+    lower, upper = (-0.013, -0.011, -0.007), (0.013, 0.011, 0.007)
+    body = wc.SoftBody(wc.TetForest.from_domain(wc.Domain.box(lower, upper), target_elements=3000), SOFT, device=device)
+    below = ground(lower[2])
+    report = wc.solve_static(body, obstacles=below, contact=wc.Contact(friction=0.5), gravity=DOWN)
+    assert report.converged
+    assert report.iterations < 30
+    assert len(report.contacts) > 100
+    assert force_on(below)[2] == pytest.approx(-weight(body), rel=1e-4)
+
+
 @pytest.mark.parametrize("steps", [6, pytest.param(40, marks=pytest.mark.slow)])
 def test_two_organs_and_the_ground(brick, device, steps):
     """One falls on the other by 0.2 mm, and comes to rest there."""
