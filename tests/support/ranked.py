@@ -15,6 +15,8 @@ import warp as wp
 wp.config.quiet = True
 wp.config.enable_backward = False
 
+import grown_parts  # noqa: E402
+
 import warp_corot as wc  # noqa: E402
 from warp_corot.distributed import front, mpi, simulation  # noqa: E402
 from warp_corot.distributed.patience import Patient, patience  # noqa: E402
@@ -397,6 +399,12 @@ def make_all(folder: Path, size: int, names: list[str]) -> None:
             found |= worlds_in_parts(folder / f"{size}.usda")
             for path in folder.glob("parts.?.npz"):
                 found |= resumed(path)
+        if "organ" in names:
+            grown_parts.assert_whole(grown_parts.blobs(), 0.33, max_level=6, sliver=0.3)
+            grown_parts.assert_refuses()
+        if "organs" in names:
+            grown_parts.assert_whole(wc.Domain.sphere(0.05, device="cpu"), 0.013, max_level=7, surface_error=1e-4)
+            grown_parts.assert_moves_as_whole(folder / f"grown.{size}.npz")
         if "touched" in names:
             found["parts.touched.x"] = touched_in_parts(folder / "touches.3.npz")
             found |= resumed(folder / "touches.3.npz")

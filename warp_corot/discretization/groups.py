@@ -60,6 +60,9 @@ class Groups:
         worlds: int,
     ) -> Groups:
         """The groups from the elements and their group numbers, both int [n], of a world with this many elements."""
+        # In the order of their first elements, so that a part has its groups in the order of the whole.
+        _, first, group = np.unique(group, return_index=True, return_inverse=True)
+        group = np.argsort(np.argsort(first))[group.ravel()]
         order = np.argsort(group, kind="stable")
         sizes = np.tile(np.bincount(group), worlds)
         members = elements[order] + in_world * np.arange(worlds)[:, None]

@@ -8,11 +8,12 @@ from . import mpi
 from .boxes import box
 from .dividing import divided
 from .gathering import gather
+from .grown import from_domain
 from .reading import load
 from .recording import record
 from .simulation import Simulation
 from .sweeping import sweep
 
-__all__ = ["Simulation", "box", "divided", "gather", "load", "record", "sweep"]
+__all__ = ["Simulation", "box", "divided", "from_domain", "gather", "load", "record", "sweep"]
 
 mpi.choose_device()

@@ -88,13 +88,13 @@ class Part(SoftBody):
 
 def numbered_part(mesh: Mesh, division: Partition, rank: int, *, prunes: bool = False) -> tuple[Mesh, Ints, Numbers]:
     """A rank's part of a mesh: the elements that it needs, in their order; their numbers, int32 [t]; and all numbers in
-    the whole mesh. The places are those in the part. ``prunes``: see ``_part_of_forest``."""
+    the whole mesh. The places are those in the part. ``prunes``: see ``part_of_forest``."""
     kept = division.needed(mesh, rank)
     elements = np.flatnonzero(kept).astype(np.int32)
     others: dict[str, Ints] = {}
     part: Mesh
     if isinstance(mesh, TetForest):
-        forest, order, stays = _part_of_forest(mesh, kept, division.sharing[kept], prunes)
+        forest, order, stays = part_of_forest(mesh, kept, division.sharing[kept], prunes)
         part, nodes, others = forest, order[: forest.node_count], {"tree": stays, "lattice": order}
     else:
         part, nodes = part_of_mesh(mesh, kept, division)
@@ -107,7 +107,7 @@ def numbered_part(mesh: Mesh, division: Partition, rank: int, *, prunes: bool = 
 def part_of_mesh(mesh: Mesh, kept: npt.NDArray[np.bool_], partition: Partition) -> tuple[Mesh, Ints]:
     """The mesh of some elements, bool [T], in their order; and its nodes' numbers in the whole mesh."""
     if isinstance(mesh, TetForest):
-        forest, order, _ = _part_of_forest(mesh, kept, partition.sharing[kept], False)
+        forest, order, _ = part_of_forest(mesh, kept, partition.sharing[kept], False)
         return forest, order[: forest.node_count]
     nodes = np.unique(mesh.tets[kept]).astype(np.int32)
     number = np.full(len(mesh.points), -1, np.int32)
@@ -117,7 +117,7 @@ def part_of_mesh(mesh: Mesh, kept: npt.NDArray[np.bool_], partition: Partition) 
     return part, nodes
 
 
-def _part_of_forest(
+def part_of_forest(
     forest: TetForest, kept: npt.NDArray[np.bool_], groups: Ints, prunes: bool
 ) -> tuple[TetForest, Ints, Ints]:
     """The forest of some leaves; and the numbers of its lattice points and of its tetrahedra of all levels in the whole

@@ -67,6 +67,20 @@ def pruned(tree: Tree, empty: np.ndarray) -> tuple[Tree, np.ndarray]:
     return Tree(tree.tets[stays], tree.level[stays], parent, child), stays
 
 
+def by_levels(tree: Tree) -> Tree:
+    """The tree with level after level, each in the order of the tree, whatever the order in which it was grown."""
+    rows = [np.flatnonzero(tree.parent < 0)]
+    while len(inner := rows[-1][tree.first_child[rows[-1]] >= 0]):
+        first = tree.first_child[inner]
+        rows.append(np.stack([first, first + 1], axis=1).ravel())
+    order = np.concatenate(rows)
+    place = np.empty(len(order), np.int32)
+    place[order] = np.arange(len(order), dtype=np.int32)
+    parent, child = tree.parent[order], tree.first_child[order]
+    parent, child = (np.where(each < 0, each, place[np.maximum(each, 0)]) for each in (parent, child))
+    return Tree(tree.tets[order], tree.level[order], parent, child)
+
+
 def live_or_void(tree: Tree, live: np.ndarray) -> Tree:
     """The tree in which the leaves in a mask bool [M] are live."""
     leaf = np.where(live, np.int32(LIVE), np.int32(VOID))

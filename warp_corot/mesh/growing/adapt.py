@@ -21,6 +21,8 @@ from .judging import Judge, Wishes
 if TYPE_CHECKING:
     from warp_corot.domain import Domain
 
+#: The tetrahedra of a root cube.
+TETS_OF_CUBE = 6
 #: Each time a surface error is lowered to at least ``STEEPEST`` and at most ``FLATTEST`` of itself.
 STEEPEST, FLATTEST = 0.2, 0.7
 #: This fraction of the elements may remain as conformity made them.
@@ -130,14 +132,25 @@ class Growing:
         cell_size: Edge of a root cube [m].
         wishes: The required fineness.
         device: The device of the computation.
+        cubes: The root cubes that are bisected, in the order of `path_tetrahedra`: the first one, and the one after the
+            last; None: all.
     """
 
-    def __init__(self, domain: Domain, cell_size: float, wishes: Wishes, device: wp.Device):
+    def __init__(
+        self,
+        domain: Domain,
+        cell_size: float,
+        wishes: Wishes,
+        device: wp.Device,
+        cubes: tuple[int, int] | None = None,
+    ):
         self.cells, self.origin = grid_around(domain.bounds, cell_size)
         a, b, c = self.cells
         points = (a + 1, b + 1, c + 1)
         lattice = np.indices(points, dtype=np.int32).reshape(3, -1).T << LATTICE_BITS
         tets = path_tetrahedra(self.cells, points)
+        if cubes is not None:
+            tets = tets[TETS_OF_CUBE * cubes[0] : TETS_OF_CUBE * cubes[1]]
         roots = len(tets)
         leaf = np.full(roots, LIVE, np.int32)
         tree = Tree(tets, np.zeros(roots, np.int32), np.full(roots, -1, np.int32), leaf)

@@ -13,17 +13,18 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_count, checked_number, shown
 from warp_corot.inputs.device import checked_device
 from warp_corot.mesh.forest import TetForest
-from warp_corot.mesh.lattice import MAX_LEVEL, check_levels, checked_cell_size, checked_level
+from warp_corot.mesh.lattice import check_levels, checked_cell_size, checked_level
 from warp_corot.mesh.numbering import in_order_of_leaves, live_or_void, pruned, renumbered, with_virtual
-from warp_corot.mesh.tree import LIVE
+from warp_corot.mesh.tree import LIVE, Tree
 
 from .adapt import Closer, grow
 from .budget import NEAR, NEAR_ENOUGH, Budget, chosen_meshes
-from .cut import label_shares, without_slivers
+from .cut import label_shares
 from .detail import Detail
 from .growth import lattice_spacing
 from .judging import Field, Wishes
 from .resolved import LEAST, MOST_POINTS, Resolved, points_within
+from .slivers import without_slivers
 from .strays import strays
 
 if TYPE_CHECKING:
@@ -60,22 +61,17 @@ def mesh_domain(
     device: str | wp.Device | None,
 ) -> TetForest:
     """See `TetForest.from_domain`."""
-    for name, function in (("refine_where", refine_where), ("field", field)):
-        if function is not None and not callable(function):
-            raise InputError(f"{name} is {shown(function)}; it must be a function of points [n, 3], or None")
     where = checked_device(domain.device if device is None else device)
-    checked_level(min_level, "min_level")
-    _check(cell_size, min_level, max_level, surface_error, field_tolerance, target_elements, min_layers, detail, sliver)
-    error = 0.0 if surface_error is None else float(surface_error)
-    wishes = Wishes(error, min_level, MAX_LEVEL, refine_where, field, float(field_tolerance))
+    _check(cell_size, target_elements, min_layers, detail, sliver)
+    wishes = checked_wishes(max_level, surface_error, min_level, refine_where, field, field_tolerance)
     if target_elements is not None:
         size = None if cell_size is None else float(cell_size)
         _check_cubes(domain, size, target_elements)
+        error = wishes.surface_error
         budget = Budget(target_elements, size, min_level, max_level, error, float(min_layers), wishes)
         return _of_size(domain, budget, sliver, where)
     if cell_size is None:
         raise InputError("cell_size is None; it must be a length in metres where target_elements is not given")
-    wishes = replace(wishes, max_level=MAX_LEVEL_BY_DEFAULT if max_level is None else max_level)
     closer = Closer(detail, CLOSER_ERROR, CLOSER_ELEMENTS) if detail else None
     grown = grow(domain, float(cell_size), wishes, where, closer)
     resolved = Resolved(grown, float(cell_size), domain if detail else None)
@@ -112,27 +108,45 @@ def _of_size(domain: Domain, budget: Budget, sliver: float, device: wp.Device) -
     return replace(best, detail=_detail(meshes.resolved, meshes.surface(threshold), domain))
 
 
-class _EmptyError(InputError):
-    """No element holds anything of the body."""
-
-
-def _check(cell_size, min_level, max_level, surface_error, field_tolerance, target, min_layers, detail, sliver) -> None:
+def _check(cell_size: Any, target: Any, min_layers: Any, detail: Any, sliver: Any) -> None:
     if cell_size is not None:
         checked_cell_size(cell_size)
-    check_levels(min_level, max_level)
     checked_level(detail, "detail")
     if not 0 <= checked_number(min_layers, "min_layers") < np.inf:
         raise InputError(f"min_layers is {min_layers}; it must be a number of elements, 0 for no care")
-    if surface_error is not None and not 0 < checked_number(surface_error, "surface_error", "m") < np.inf:
-        raise InputError(f"surface_error is {surface_error}; it must be a positive length in metres, or None")
-    if not checked_number(field_tolerance, "field_tolerance") >= 0:
-        raise InputError(f"field_tolerance is {field_tolerance}; it must not be negative")
     if target is not None:
         checked_count(target, "target_elements", 1)
         if target > MOST_ELEMENTS:
             raise InputError(f"target_elements is {target}; it must be at most {MOST_ELEMENTS}")
     if not 0 <= checked_number(sliver, "sliver") < 1:
         raise InputError(f"sliver is {sliver}; it must be a share of an element's volume, from 0 to below 1")
+
+
+def checked_wishes(
+    max_level: int | None,
+    surface_error: float | None,
+    min_level: int,
+    refine_where: Field | None,
+    field: Field | None,
+    field_tolerance: float,
+) -> Wishes:
+    """The required fineness, of arguments of `TetForest.from_domain`.
+
+    Raises:
+        InputError: One is out of its range.
+    """
+    for name, function in (("refine_where", refine_where), ("field", field)):
+        if function is not None and not callable(function):
+            raise InputError(f"{name} is {shown(function)}; it must be a function of points [n, 3], or None")
+    checked_level(min_level, "min_level")
+    check_levels(min_level, max_level)
+    if surface_error is not None and not 0 < checked_number(surface_error, "surface_error", "m") < np.inf:
+        raise InputError(f"surface_error is {surface_error}; it must be a positive length in metres, or None")
+    if not checked_number(field_tolerance, "field_tolerance") >= 0:
+        raise InputError(f"field_tolerance is {field_tolerance}; it must not be negative")
+    error = 0.0 if surface_error is None else float(surface_error)
+    deepest = MAX_LEVEL_BY_DEFAULT if max_level is None else max_level
+    return Wishes(error, min_level, deepest, refine_where, field, float(field_tolerance))
 
 
 def _check_cubes(domain: Domain, size: float | None, target: int) -> None:
@@ -154,17 +168,27 @@ def _say(left_out: str) -> None:
         warnings.warn(left_out, UserWarning, stacklevel=4)
 
 
+def filled_tree(resolved: Resolved, child: np.ndarray) -> tuple[Tree, np.ndarray]:
+    """The tree of a mesh in a grown forest without what holds nothing, and its tetrahedra's numbers in the forest."""
+    tree, stays = resolved.tree_of(child)
+    tree, kept = pruned(tree, (tree.first_child < 0) & (resolved.held[stays] <= 0.0))
+    return tree, stays[kept]
+
+
+def empty_error(domain: Domain, cell_size: float) -> InputError:
+    """The error of a mesh without elements."""
+    return InputError(
+        f"the body comes out empty: no tetrahedron of cells of {cell_size:g} m holds any of it, "
+        "with bounds " + " to ".join(str(np.round(b, 6).tolist()) for b in np.asarray(domain.bounds))
+    )
+
+
 def _finished(resolved: Resolved, child: np.ndarray, domain: Domain, sliver: float) -> tuple[TetForest, str]:
     """A separate mesh from a grown forest, without empty and nearly empty elements, and what else it leaves out."""
     grown, cell_size = resolved.grown, resolved.cell_size
-    tree, stays = resolved.tree_of(child)
-    tree, kept = pruned(tree, (tree.first_child < 0) & (resolved.held[stays] <= 0.0))
-    stays = stays[kept]
+    tree, stays = filled_tree(resolved, child)
     if not len(tree.leaves):
-        raise _EmptyError(
-            f"the body comes out empty: no tetrahedron of cells of {cell_size:g} m holds any of it, "
-            "with bounds " + " to ".join(str(np.round(b, 6).tolist()) for b in np.asarray(domain.bounds))
-        )
+        raise empty_error(domain, cell_size)
     leaves = tree.leaves
     held, given_up = without_slivers(
         tree.leaf_tets, resolved.held[stays[leaves]], resolved.volume[stays[leaves]], sliver

@@ -58,12 +58,25 @@ class Growth:
         if not len(elements):
             return
         slots = self.insert_edges(elements, of_refinement=True)
-        self.launch(kernels.activate, len(slots), [slots, self._values, self.ends], [self.active, self.touched])
+        self._activate(slots)
         base, count = self.element_count, self.element_count + 2 * len(elements)
         self._make_room(count, "tets", "level", "parent", "first_child", "wished", "bound")
         outputs = [self.tets, self.level, self.parent, self.first_child, self.bound]
         self.launch(kernels.bisect, len(elements), [elements, slots, self._values, base], outputs)
         self.element_count = count
+
+    def bisect_edges(self, pairs: np.ndarray) -> np.ndarray:
+        """Make the midpoints of edges active, as elements elsewhere do that are bisected there; returns the midpoints.
+
+        Args:
+            pairs: The nodes of each edge, int [n, 2].
+        """
+        if not len(pairs):
+            return np.zeros(0, np.int32)
+        slots = self.insert_pairs(self._on_device(pairs, wp.vec2i))
+        self._activate(slots)
+        middles: np.ndarray = self._values.numpy()[slots.numpy()]
+        return middles
 
     def insert_edges(self, elements: wp.array, *, of_refinement: bool) -> wp.array:
         """Ensure that the elements' refinement edges, or all their edges, have midpoints; return slots in the table [n]
@@ -77,6 +90,11 @@ class Growth:
             )
         else:
             self.launch(kernels.all_edges, len(elements), [elements, self.tets], [pairs])
+        return self.insert_pairs(pairs)
+
+    def insert_pairs(self, pairs: wp.array) -> wp.array:
+        """Ensure that edges between these nodes, vec2i [n], have midpoints; return slots in the table [n]."""
+        count = len(pairs)
         slots = wp.empty(count, dtype=wp.int32, device=self.device)
         # About five elements share an edge: a part at a time needs less room than the worst case of all together.
         part = max(self.node_count, 1 << 16)
@@ -84,7 +102,7 @@ class Growth:
             stop = min(start + part, count)
             moved = self._reserve_nodes(stop - start)
             if moved and start:
-                return self.insert_edges(elements, of_refinement=of_refinement)
+                return self.insert_pairs(pairs)
             table = [self.lattice, self.ends, self._keys, self._values, self._counts]
             self.launch(kernels.insert_midpoints, stop - start, [pairs[start:stop], *table], [slots[start:stop]])
             self._read_counts()
@@ -154,6 +172,9 @@ class Growth:
         wp.launch(kernel, dim=count, inputs=inputs, outputs=outputs, device=self.device)
 
     # --- room ------------------------------------------------------------------------------------------------------
+
+    def _activate(self, slots: wp.array) -> None:
+        self.launch(kernels.activate, len(slots), [slots, self._values, self.ends], [self.active, self.touched])
 
     def _reserve_nodes(self, more: int) -> bool:
         """Reserve room for more nodes; return whether the table's slots have changed."""

@@ -1,0 +1,90 @@
+"""Meshes that ranks grow in parts, compared with the whole."""
+
+from pathlib import Path
+
+import numpy as np
+
+import warp_corot as wc
+from warp_corot.distributed import mpi
+from warp_corot.mesh.surfaces.boundary import boundary_faces
+
+
+def blobs() -> wc.Domain:
+    """Balls of many sizes, some smaller than an element and some that overlap: elements are given up, connect what
+    would break apart, or hang from others by a node."""
+    rng = np.random.default_rng(7)
+    centres, radii = rng.uniform(-0.9, 0.9, (60, 3)) * [1.0, 0.6, 0.6], rng.uniform(0.01, 0.12, 60)
+
+    def phi(x: np.ndarray) -> np.ndarray:
+        found: np.ndarray = (np.linalg.norm(x[:, None] - centres, axis=2) - radii).min(axis=1)
+        return found
+
+    return wc.Domain.from_function(phi, [[-1.0, -0.6, -0.6], [1.0, 0.6, 0.6]], device="cpu")
+
+
+def assert_whole(domain: wc.Domain, cell_size: float, **options: float) -> None:
+    """All ranks have the parts of the mesh that one process makes: the same bits, all elements around the nodes that
+    they move, and the surface of the whole around these."""
+    import warp_corot.distributed as wd
+
+    part, whole = (make(domain, cell_size, **options) for make in (wd.from_domain, wc.TetForest.from_domain))
+    numbers, everybody = part.numbers, mpi.world()
+    assert (part.element_count, numbers.node_count) == (len(whole.tets), len(whole.points))
+    assert part.smallest_volume == whole.volumes.min()
+    np.testing.assert_array_equal(part.bounds, [whole.points.min(axis=0), whole.points.max(axis=0)])
+    np.testing.assert_array_equal(numbers.nodes[part.tets], whole.tets[numbers.elements])
+    np.testing.assert_array_equal(part.points, whole.points[numbers.nodes])
+    np.testing.assert_array_equal(part.fill, whole.fill[numbers.elements])
+    own = numbers.nodes[numbers.owner == everybody.rank]
+    for mine, count in ((own, numbers.node_count), (numbers.elements[numbers.counted], part.element_count)):
+        np.testing.assert_array_equal(np.sort(np.concatenate(everybody.allgather(mine))), np.arange(count))
+    assert np.isin(np.flatnonzero(np.isin(whole.tets, own).any(axis=1)), numbers.elements).all()
+    outer = np.sort(boundary_faces(whole.tets)[0], axis=1)
+    found = {tuple(each) for each in np.sort(numbers.nodes[part.outer], axis=1).tolist()}
+    assert found <= {tuple(each) for each in outer.tolist()}
+    assert {tuple(each) for each in outer[np.isin(outer, own).any(axis=1)].tolist()} <= found
+
+
+def assert_moves_as_whole(kept: Path) -> None:
+    """A ball grown in parts, whose elements share their dilatation, moves as the whole one on the same ranks, bit by
+    bit; from a checkpoint, too."""
+    import warp_corot.distributed as wd
+
+    ball, found = wc.Domain.sphere(0.05, device="cpu"), []
+    for make in (wd.from_domain, wc.TetForest.from_domain):
+        body = wc.SoftBody(make(ball, 0.03, max_level=5), wc.Isotropic(3e3, 0.49, 1000.0), device="cpu")
+        body.fix("z < zmin + 0.02")
+        sim = wd.Simulation(body, deterministic=True)
+        sim.advance(0.02)
+        if make is wd.from_domain:
+            sim.save(kept)
+        sim.advance(0.01)
+        found.append(wd.gather(body.positions))
+    resumed = wd.Simulation.load(kept)
+    resumed.advance(0.01)
+    found.append(wd.gather(resumed.bodies[0].positions))
+    if sim.rank == 0:
+        assert np.abs(found[1] - body.mesh.points).max() > 1e-3
+        np.testing.assert_array_equal(found[0], found[1])
+        np.testing.assert_array_equal(found[2], found[1])
+
+
+def assert_refuses() -> None:
+    """Every rank says what is wrong, in one line."""
+    import warp_corot.distributed as wd
+
+    labels = wc.Domain.from_labels(np.ones((4, 4, 4), np.int16), spacing=(0.01, 0.01, 0.01), labels={"one": 1})
+    ball = wc.Domain.sphere(0.05, device="cpu")
+    for domain, size, options, said in (
+        (labels, 0.01, {}, "has labels"),
+        (ball, 0.2, {"max_level": 3}, "take fewer ranks"),
+        (ball, 0.03, {"max_level": -1}, "max_level is -1"),
+        (ball, 0.003, {"max_level": 48}, "must be less in parts"),
+        ("ball", 0.03, {}, "must be a Domain"),
+    ):
+        found = ""
+        try:
+            wd.from_domain(domain, size, **options)
+        except wc.InputError as error:
+            found = str(error)
+        assert said in found, (said, found)

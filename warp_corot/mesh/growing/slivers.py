@@ -1,0 +1,262 @@
+"""Nearly empty elements at a body's surface: given up, where that breaks no piece of the mesh.
+
+Elements may stand for several: far from the nearly empty ones it does not matter which elements a part of the mesh has.
+So the choice can be made from few numbers, though ranks hold different parts of the mesh.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .cut import face_pairs, linked
+
+Array = np.ndarray
+
+#: A part that would come off is given up if it has at most this many elements and less than this fraction of its piece.
+FEW_ELEMENTS, LITTLE = 4, 1.0e-3
+
+
+class LumpedError(Exception):
+    """Elements that stand for several decide where a way is.
+
+    Attributes:
+        lumps: These elements.
+    """
+
+    def __init__(self, lumps: Array):
+        super().__init__(f"{len(lumps)} elements stand for several")
+        self.lumps = lumps
+
+
+@dataclass(frozen=True, eq=False)
+class Filling:
+    """The parts of a body in elements.
+
+    Attributes:
+        pairs: Pairs of elements that share a face [m, 2].
+        held: Volume of the body in each element [n].
+        least: Elements that hold less than this are small [n].
+        counts: The number of elements for which each stands [n]; small ones and their neighbours stand for themselves.
+        total: About the volume of all elements.
+        anchors: A function of a mask of elements, bool [n]: for each of these the last other element that shares a
+            node with it, -1 if there is none.
+    """
+
+    pairs: Array
+    held: Array
+    least: Array
+    counts: Array
+    total: float
+    anchors: Callable[[Array], Array]
+
+    @classmethod
+    def of(cls, tets: Array, held: Array, volume: Array, sliver: float) -> Filling:
+        """Of elements [n, 4] with these volumes [n], of which those filled by less than a fraction are small."""
+
+        def anchors(suspects: Array) -> Array:
+            last = np.full(int(tets.max()) + 1, -1)
+            rest = np.flatnonzero(~suspects)
+            last[tets[rest]] = rest[:, None]
+            found: Array = last[tets[suspects]].max(axis=1)
+            return found
+
+        ones = np.ones(len(tets), np.int64)
+        return cls(face_pairs(tets), held, sliver * volume, ones, float(volume.sum()), anchors)
+
+    def exact(self, volumes: Array) -> Array:
+        """Volumes as whole numbers, whose sums do not depend on the order [n]."""
+        return np.rint(np.ldexp(volumes, 50 - int(np.ceil(np.log2(self.total)))))
+
+    def without(self, left_out: Array, held: Array) -> Filling:
+        """The rest, in the same order, with other volumes."""
+        kept, number = np.flatnonzero(~left_out), np.cumsum(~left_out) - 1
+        pairs = number[self.pairs[~left_out[self.pairs].any(axis=1)]]
+        return replace(self, pairs=pairs, held=held[kept], least=self.least[kept], counts=self.counts[kept])
+
+
+def merged(pairs: Array, held: Array, small: Array) -> tuple[Array, Array]:
+    """Add the contents of small elements to the fullest neighbour across a face, and so on outwards.
+
+    Among small elements that have only small neighbours, the fullest one stays.
+
+    Args:
+        pairs: Pairs of elements that share a face [m, 2].
+        held: Volume of the body in each element [n].
+        small: Mask of the elements to be given up, bool [n].
+
+    Returns:
+        The new volumes, and the mask of elements that are given up.
+    """
+    held, small = held.copy(), small.copy()
+    pairs = np.concatenate([pairs[small[pairs[:, 0]]], pairs[small[pairs[:, 1]]][:, ::-1]])
+    goes_to = np.full(len(held), -1)
+    waiting = small.copy()
+    while waiting.any():
+        # From each waiting element to its settled neighbours; of several, to the fullest one.
+        usable = pairs[waiting[pairs[:, 0]] & ~waiting[pairs[:, 1]]]
+        if not len(usable):
+            waiting[_fullest_of_each_piece(pairs, waiting, held)] = False
+            continue
+        usable = usable[np.lexsort((usable[:, 1], held[usable[:, 1]]))]
+        goes_to[usable[:, 0]] = usable[:, 1]
+        waiting[usable[:, 0]] = False
+    given_up = goes_to >= 0
+    target = goes_to.copy()
+    while (on := given_up & given_up[np.maximum(target, 0)]).any():
+        target[on] = goes_to[target[on]]
+    np.add.at(held, target[given_up], held[given_up])
+    held[given_up] = 0.0
+    return held, given_up
+
+
+def without_slivers(tets: Array, held: Array, volume: Array, sliver: float) -> tuple[Array, Array]:
+    """Give up elements that contain too little of a body, but none that connects parts of a piece.
+
+    Pieces are connected through faces.
+
+    Args:
+        tets: int32 [n, 4].
+        held: Volume of the body in each element [n].
+        volume: Of each [n].
+        sliver: Elements filled by less than this fraction are small.
+
+    Returns:
+        The new volumes of the body in elements, and the mask of elements that are given up.
+    """
+    if (held >= sliver * volume).all():
+        return held, np.zeros(len(tets), bool)
+    return without_small(Filling.of(tets, held, volume, sliver))
+
+
+def without_small(filling: Filling) -> tuple[Array, Array]:
+    """`without_slivers` of elements that may stand for several.
+
+    Raises:
+        LumpedError: Some of these must stand for themselves.
+    """
+    held, small = filling.held, filling.held < filling.least
+    if not small.any():
+        return held, small
+    crumbs, held = _crumbs(filling, linked(filling.pairs, len(held)), small)
+    volumes, given_up = np.zeros(len(held)), crumbs.copy()
+    kept = np.flatnonzero(~crumbs)
+    try:
+        volumes[kept], given_up[kept] = _without(filling.without(crumbs, held) if crumbs.any() else filling)
+    except LumpedError as error:
+        raise LumpedError(kept[error.lumps]) from None
+    return volumes, given_up
+
+
+def _without(filling: Filling) -> tuple[Array, Array]:
+    """`without_small` of elements that are connected to others through faces, or not at all."""
+    pairs, held = filling.pairs, filling.held
+    small = held < filling.least
+    if not small.any():
+        return held, small
+    piece = linked(pairs, len(held))
+    volumes, given_up = merged(pairs, held, small)
+    broken, small_parts = _broken(filling, piece, ~given_up, volumes)
+    if broken.any() or small_parts.any():
+        small |= small_parts
+        small &= ~_ways(filling, piece, ~given_up & ~small_parts, broken)
+        volumes, given_up = merged(pairs, held, small)
+    return volumes, given_up
+
+
+def _broken(filling: Filling, piece: Array, kept: Array, volumes: Array) -> tuple[Array, Array]:
+    """The pieces that break without the elements that are not kept.
+
+    Returns:
+        The mask of elements of these pieces, bool [n], and the mask of elements of their negligible parts.
+    """
+    count, pairs, volumes = len(piece), filling.pairs, filling.exact(volumes)
+    part = linked(pairs[kept[pairs].all(axis=1)], count)
+    sizes, held = np.bincount(part, kept * filling.counts), np.bincount(part, volumes)
+    whole = np.bincount(piece, volumes)
+    of_part = np.zeros(len(sizes), np.int64)
+    of_part[part] = piece
+    minor = (sizes > 0) & (sizes <= FEW_ELEMENTS) & (held < LITTLE * whole[of_part])
+    parts = np.bincount(of_part, (sizes > 0) & ~minor, len(whole))
+    # If all parts are negligible, none is given up for this reason.
+    minor &= parts[of_part] > 0
+    return (parts > 1)[piece], minor[part] & kept
+
+
+def _ways(filling: Filling, piece: Array, kept: Array, broken: Array) -> Array:
+    """Elements through which the parts of broken pieces are connected by the shortest ways, bool [n].
+
+    Raises:
+        LumpedError: Elements outside the largest part of a broken piece stand for several.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import breadth_first_order
+
+    count, pairs = len(piece), filling.pairs
+    found = np.zeros(count, bool)
+    if not broken.any():
+        return found
+    part = linked(pairs[kept[pairs].all(axis=1)], count)
+    sizes = np.bincount(part, kept * filling.counts)
+    largest = np.zeros(int(piece.max()) + 1, np.int64)
+    by_size = np.argsort(sizes[part], kind="stable")
+    largest[piece[by_size]] = part[by_size]
+    apart = broken & (part != largest[piece])
+    if (lumps := np.flatnonzero(apart & (filling.counts > 1))).size:
+        raise LumpedError(lumps)
+    # An additional node, linked to the largest part of each piece, allows one search for all pieces. Of ways of one
+    # length it finds the one through the first elements.
+    pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
+    start = np.flatnonzero(kept & (part == largest[piece]))
+    rows, columns = np.append(pairs[:, 0], np.full(len(start), count)), np.append(pairs[:, 1], start)
+    links = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(count + 1, count + 1)).tocsr()
+    order, before = breadth_first_order(links, count, directed=False)
+    order = order[1:]
+    others = order[kept[order] & apart[order]]
+    _, first = np.unique(part[others], return_index=True)
+    at = others[first]
+    while len(at):
+        at = before[at]
+        at = np.unique(at[(at != count) & ~found[np.minimum(at, count - 1)]])
+        found[at] = True
+        at = at[part[at] != largest[piece[at]]]
+    return found
+
+
+def _crumbs(filling: Filling, piece: Array, small: Array) -> tuple[Array, Array]:
+    """Pieces of few or only small elements that are connected to others only through nodes, about which they would
+    rotate.
+
+    Returns:
+        The mask of their elements, bool [n], and the volumes after they are added to the connected elements.
+    """
+    held, exact = filling.held, filling.exact(filling.held)
+    sizes, volumes = np.bincount(piece, filling.counts), np.bincount(piece, exact)
+    little = volumes < LITTLE * volumes.sum()
+    tiny = (sizes <= FEW_ELEMENTS) & little | (np.bincount(piece, ~small) == 0)
+    suspects = tiny[piece]
+    if not suspects.any() or suspects.all():
+        return np.zeros(len(piece), bool), held
+    to = np.full(len(sizes), -1)
+    np.maximum.at(to, piece[suspects], filling.anchors(suspects))
+    crumbs = suspects & (to[piece] >= 0)
+    held = held.copy()
+    np.add.at(held, to[piece[crumbs]], held[crumbs])
+    held[crumbs] = 0.0
+    return crumbs, held
+
+
+def _fullest_of_each_piece(pairs: Array, waiting: Array, held: Array) -> Array:
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    linked = pairs[waiting[pairs].all(axis=1)]
+    n = len(waiting)
+    _, piece = connected_components(coo_array((np.ones(len(linked)), linked.T), shape=(n, n)), directed=False)
+    left = np.flatnonzero(waiting)
+    left = left[np.argsort(held[left], kind="stable")]
+    fullest = np.full(n, -1)
+    fullest[piece[left]] = left
+    return fullest[fullest >= 0]
