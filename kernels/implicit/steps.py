@@ -19,8 +19,8 @@ from .tangent import DAMPING, MASS, STIFFNESS
 wp.set_module_options({"enable_backward": False})
 
 #: Rows of a scheme: acceleration and velocity of the stage, velocity after the step, and the next h1 and h2. The last
-#: row has the fraction of the step at which the stage is, and the fraction of v dt with which the search for the
-#: increment begins.
+#: row has the fraction of the step at which the stage is, the fraction of v dt with which the search for the increment
+#: begins, and the increment over the unknown of linear solves.
 ACCELERATION, RATE, VELOCITY, FIRST, SECOND, STAGE = (wp.constant(k) for k in range(6))
 ROWS = 6
 #: Columns: d, v, h1 and h2.
@@ -64,15 +64,20 @@ def choose_scales(
     # Out
     scales: wp.array[wp.float32],
     inertia: wp.array[wp.float32],
+    share: wp.array[wp.float32],
 ):
-    """Choose the scales of the operator for this step, including damping proportional to mass."""
+    """Choose the scales of the operator for this step, including damping proportional to mass. ``share`` is the
+    increment over the operator's unknown.
+    """
     which = begins[0]
     a = table[which, ACCELERATION, 0]
     b = table[which, RATE, 0]
-    scales[MASS] = a + damping * b
-    scales[DAMPING] = b
-    scales[STIFFNESS] = 1.0
+    c = table[which, STAGE, 2]
+    scales[MASS] = c * (a + damping * b)
+    scales[DAMPING] = c * b
+    scales[STIFFNESS] = c
     inertia[0] = a + damping * b
+    share[0] = c
 
 
 @wp.kernel(enable_backward=False)
@@ -98,7 +103,7 @@ def begin_step(
 ):
     """Find the base of the increments, their first values, and the pull of inertia and damping.
 
-    ``guess`` is the increment beyond its first value if the velocity keeps changing as it has since the step before,
+    ``guess`` is the unknown beyond its first value if the velocity keeps changing as it has since the step before,
     ``before``; it is zero at held nodes. Held nodes keep their velocity. ``drift`` is the stage's velocity without the
     increment's part, or one entry if it is not needed; h1 and h2 have one entry in schemes without them.
     """
@@ -126,7 +131,7 @@ def begin_step(
         rest -= d
         store_node(pull, i, -(combined(table, ACCELERATION, which, velocity, first, second) + damping * rate))
     store_node(base, i, place)
-    store_node(guess, i, rest)
+    store_node(guess, i, rest / table[which, STAGE, 2])
     store_node(increment, i, d)
     store_node(u, i, place + d)
     if drift.shape[0] > 1:
@@ -144,7 +149,8 @@ def find_rates(
 ):
     """Find the stage's velocities from the present increments."""
     i = wp.tid()
-    store_node(rates, i, scales[DAMPING] * load_node(increment, i) + load_node(drift, i))
+    rate = scales[DAMPING] / scales[STIFFNESS]
+    store_node(rates, i, rate * load_node(increment, i) + load_node(drift, i))
 
 
 @wp.kernel(enable_backward=False)
@@ -213,7 +219,7 @@ def end_step(
             push = load_node(contact_forces, i)
             if wp.dot(push, push) > 0.0:
                 dt = float(pace.seconds[DT])
-                after = d / dt
+                after = d / (table[which, STAGE, 0] * dt)
                 store_node(h1, i, (after - velocity) / dt)
         velocity = after
     elif wp.dot(d, d) > 0.0:

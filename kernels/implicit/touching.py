@@ -14,13 +14,41 @@ COLUMNS = 2
 
 
 @wp.kernel(enable_backward=False)
-def take_free(inverse_mass: wp.array[wp.float32], increment: wp.array[wp.vec4], d: wp.array[wp.vec4]):
-    """d = the increment at free nodes, zero at the others."""
+def take_free(
+    inverse_mass: wp.array[wp.float32],
+    share: wp.array[wp.float32],
+    increment: wp.array[wp.vec4],
+    d: wp.array[wp.vec4],
+):
+    """d = the whole motion at free nodes, of which the increment is a share, and zero at the others."""
     i = wp.tid()
     free = wp.vec3()
     if inverse_mass[i] > 0.0:
-        free = load_node(increment, i)
+        free = load_node(increment, i) / share[0]
     store_node(d, i, free)
+
+
+@wp.kernel(enable_backward=False)
+def move_held(
+    # In
+    inverse_mass: wp.array[wp.float32],
+    base: wp.array[wp.vec4],
+    share: wp.array[wp.float32],
+    to_end: int,
+    # In and out
+    increment: wp.array[wp.vec4],
+    # Out
+    u: wp.array[wp.vec4],
+):
+    """Move held nodes from the stage to the end of the step, or back."""
+    i = wp.tid()
+    if inverse_mass[i] == 0.0:
+        factor = share[0]
+        if to_end != 0:
+            factor = 1.0 / share[0]
+        moved = factor * load_node(increment, i)
+        store_node(increment, i, moved)
+        store_node(u, i, load_node(base, i) + moved)
 
 
 @wp.kernel(enable_backward=False)
@@ -36,6 +64,7 @@ def take_increments(
     count: int,
     inverse_mass: wp.array[wp.float32],
     base: wp.array[wp.vec4],
+    share: wp.array[wp.float32],
     d: wp.array[wp.vec4],
     # In and out
     increment: wp.array[wp.vec4],
@@ -43,11 +72,11 @@ def take_increments(
     u: wp.array[wp.vec4],
     sizes: wp.array2d[wp.float32],
 ):
-    """Take d as the increment of free nodes, and find the largest change and displacement of each world."""
+    """Take a share of d as the increment of free nodes, and find the largest change and displacement of each world."""
     i = wp.tid()
     world = i / count
     if inverse_mass[i] > 0.0:
-        after = load_node(d, i)
+        after = share[0] * load_node(d, i)
         wp.atomic_max(sizes, world, CHANGE, wp.length(after - load_node(increment, i)))
         store_node(increment, i, after)
         place = load_node(base, i) + after

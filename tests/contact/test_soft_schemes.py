@@ -55,7 +55,8 @@ def test_blocks_are_pressed_together_as_in_explicit_steps(device):
 
     explicit = pressed(wc.SymplecticEuler(damping=120.0))
     assert explicit > 0.1
-    found = {name: pressed(scheme) for name, scheme in (SCHEMES | {"QuasiStatic": wc.QuasiStatic(dt=0.02)}).items()}
+    others = {"QuasiStatic": wc.QuasiStatic(dt=0.02), "GeneralizedAlpha": wc.GeneralizedAlpha(DT, spectral_radius=0.5)}
+    found = {name: pressed(scheme) for name, scheme in (SCHEMES | others).items()}
     assert found == {name: pytest.approx(explicit, rel=1e-3) for name in found}
 
 

@@ -18,7 +18,7 @@ from warp_corot.elasticity import Model
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, checked_things, shown
 from warp_corot.inputs.indices import checked_indices
-from warp_corot.solvers import GeneralizedAlpha, Integrator, QuasiStatic, Stepper
+from warp_corot.solvers import Integrator, QuasiStatic, Stepper
 from warp_corot.solvers.ranks import ALONE, Ranks
 from warp_corot.solvers.system import System
 
@@ -99,12 +99,12 @@ def checked_contact(
     return given, Contact() if contact is None else contact
 
 
-def check_implicit(integrator: Integrator, *, touches: bool, remeshes: bool, ordered: bool) -> None:
+def check_implicit(integrator: Integrator, *, remeshes: bool, ordered: bool) -> None:
     """Check that an implicit integrator supports what the simulation needs.
 
     Args:
         integrator: Any integrator.
-        touches, remeshes: Whether bodies touch something, or are remeshed.
+        remeshes: Whether bodies are remeshed.
         ordered: Whether sums must have a fixed order on CUDA, which products with the stiffness do not have.
 
     Raises:
@@ -113,11 +113,6 @@ def check_implicit(integrator: Integrator, *, touches: bool, remeshes: bool, ord
     if not integrator.is_implicit:
         return
     name = type(integrator).__name__
-    if touches and isinstance(integrator, GeneralizedAlpha) and integrator.spectral_radius > 0.0:
-        raise InputError(
-            f"{name} supports contact only with spectral_radius=0, where forces are those at the end of a step; it is "
-            f"{integrator.spectral_radius:g}"
-        )
     if remeshes and isinstance(integrator, QuasiStatic):
         raise InputError(f"{name} does not support remeshing; with remesh the integrator must be another one")
     if ordered:

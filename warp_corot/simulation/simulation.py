@@ -112,12 +112,7 @@ class Simulation(Clock, FormerNames):
             self.gravity = checked_gravity(gravity, self.bodies[0].mesh.up_axis)
             touching = checked_contact(obstacles, contact)
             ordered = self.deterministic and self.device.is_cuda
-            check_implicit(
-                self.integrator,
-                touches=touching is not None,
-                remeshes=remesh is not None,
-                ordered=ordered,
-            )
+            check_implicit(self.integrator, remeshes=remesh is not None, ordered=ordered)
 
             self.remeshing = Remeshing(self.bodies, self.models, remesh, deterministic=self.deterministic)
             bound = zip(self.models, self.bodies, strict=True)

@@ -155,6 +155,7 @@ class JoinedSolve:
         rows, blocks = self._rows, []
         for k, newton in enumerate(self._newtons):
             blocks.append(newton.operator.diagonal_blocks())
+            newton.move_held(to_end=True)
             rows.launch_begin(k, self._parts.starts[k], blocks[k], newton.increment, newton.step)
         rows.launch_search(offset)
         for newton, held, d, own in zip(self._newtons, self._held, self._parts.of(self._d), blocks, strict=True):
@@ -162,6 +163,8 @@ class JoinedSolve:
                 held.launch_begin(newton.body.state.displacements, d, own)
         rows.locates.fill_(1)
         rows.launch_located(self._d, is_first=True)
+        for newton in self._newtons:
+            newton.move_held(to_end=False)
 
     def launch_again(self) -> None:
         """Launch the beginning of another linearisation of the same step."""

@@ -54,7 +54,7 @@ class JoinedNewton:
             newton.launch_residual()
         self._joined.linearise()
         for newton, product in zip(self._newtons, self._products, strict=True):
-            inputs = [newton.body.conditions.inverse_mass, newton.increment]
+            inputs = [newton.body.conditions.inverse_mass, newton.share, newton.increment]
             wp.launch(kernels.take_free, len(product), inputs, [newton.step], device=self.device)
             newton.operator.apply(newton.step, product)
             wp.launch(kernels.add_product, len(product), [product], [newton.residual], device=self.device)
@@ -68,7 +68,8 @@ class JoinedNewton:
         self._sizes.zero_()
         for newton in self._newtons:
             state = newton.body.state
-            inputs = [newton.operator.node_count, newton.body.conditions.inverse_mass, newton.base, newton.step]
+            inputs = [newton.operator.node_count, newton.body.conditions.inverse_mass, newton.base]
+            inputs += [newton.share, newton.step]
             outputs = [newton.increment, state.displacements, self._sizes]
             wp.launch(kernels.take_increments, len(newton.step), inputs, outputs, device=self.device)
         self._going.zero_()

@@ -10,6 +10,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.kernels.implicit import newton as kernels
+from warp_corot.kernels.implicit import touching
 
 from .conjugate_gradients import ConjugateGradients
 from .operator import Preconditioner
@@ -69,6 +70,8 @@ class Newton:
         iterations, solved, status: Results of each world, as in ``NewtonReport``, int32 [worlds].
         base, increment: The two parts of displacements [m], vec4.
         inertia: The scale a of the inertia [1/s^2], float32 [1].
+        share: The increment over the unknown of the operator and of ``step``, for steps with contact, float32 [1].
+        is_at_stage: Whether the increment ends before the step does, so that the share is less than one.
         pull: a h, the acceleration in the inertia of a time step [m/s^2], vec4.
         external_share: The factor of loads and gravity, float32 [1].
         running: The number of worlds that are still iterated, int32 [1].
@@ -104,6 +107,7 @@ class Newton:
         self._energies = wp.zeros(self.field.energy_count, dtype=wp.float64, device=self.device)
         self._scalars = wp.zeros((self.worlds, kernels.SCALARS), dtype=wp.float64, device=self.device)
         self.inertia = wp.zeros(1, dtype=wp.float32, device=self.device)
+        self.share, self.is_at_stage = wp.ones(1, dtype=wp.float32, device=self.device), False
         self.external_share = wp.ones(1, dtype=wp.float32, device=self.device)
         self.iterations, self.solved, self.status, self._accepted = (
             wp.zeros(self.worlds, dtype=wp.int32, device=self.device) for _ in range(4)
@@ -181,6 +185,14 @@ class Newton:
         outputs = [self.increment, self.body.state.displacements]
         wp.launch(kernels.try_step, self.worlds * self._count, inputs, outputs, device=self.device)
         self.ranks.complete(self.operator.number, self.body.state.displacements)
+
+    def move_held(self, *, to_end: bool) -> None:
+        """Launch the motion of held nodes from the stage to the end of the step, or back, if these are not the same."""
+        if not self.is_at_stage:
+            return
+        inputs = [self.body.conditions.inverse_mass, self.base, self.share, int(to_end)]
+        outputs = [self.increment, self.body.state.displacements]
+        wp.launch(touching.move_held, len(self.step), inputs, outputs, device=self.device)
 
     # --- on the host -------------------------------------------------------------------------------------------------
 

@@ -71,8 +71,6 @@ class ImplicitIntegrator(Integrator):
     is_implicit: ClassVar[bool] = True
     #: The number of vectors that a step keeps for the next one.
     history: ClassVar[int] = 0
-    #: Whether nodes that are touched take velocities of backward Euler.
-    settles_contact: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if self.dt is None or not SHORTEST <= checked_number(self.dt, "dt", "s") < math.inf:
@@ -92,6 +90,16 @@ class ImplicitIntegrator(Integrator):
     def stable_step(self, frequency: float) -> float:
         """Infinite: any step is stable."""
         return math.inf
+
+    @property
+    def settles_contact(self) -> bool:
+        """Whether nodes that are touched take velocities of backward Euler."""
+        return False
+
+    @property
+    def is_at_stage(self) -> bool:
+        """Whether forces are balanced before the end of the step."""
+        return False
 
     @property
     def newton_with_contact(self) -> NewtonOptions:
@@ -161,6 +169,14 @@ class GeneralizedAlpha(ImplicitIntegrator):
         if not 0.0 <= checked_number(self.spectral_radius, "spectral_radius") <= 1.0:
             raise InputError(f"spectral_radius is {self.spectral_radius}; it must be between 0 and 1")
 
+    @property
+    def settles_contact(self) -> bool:
+        return self.is_at_stage
+
+    @property
+    def is_at_stage(self) -> bool:
+        return self.spectral_radius > 0.0
+
     def scheme(self, dt: float) -> Table:
         rho = self.spectral_radius
         mass_share, force_share = (2.0 * rho - 1.0) / (rho + 1.0), rho / (rho + 1.0)
@@ -185,7 +201,6 @@ class Newmark(ImplicitIntegrator):
     gamma: float = 0.5
 
     history: ClassVar[int] = 1
-    settles_contact: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -193,6 +208,10 @@ class Newmark(ImplicitIntegrator):
             raise InputError(f"gamma is {self.gamma}; it must be between 0.5 and 1")
         if not 0.5 * self.gamma <= checked_number(self.beta, "beta") <= 1.0:
             raise InputError(f"beta is {self.beta}; it must be between gamma / 2 and 1 for steps of any length")
+
+    @property
+    def settles_contact(self) -> bool:
+        return True
 
     def scheme(self, dt: float) -> Table:
         return generalized_alpha(dt, self.beta, self.gamma, 0.0, 0.0)

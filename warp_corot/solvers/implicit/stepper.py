@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from warp_corot.elasticity.viscosity import Viscosity
+from warp_corot.errors import InputError
 from warp_corot.kernels.elements.prony import set_elapsed
 from warp_corot.kernels.implicit import conjugate_gradients
 from warp_corot.kernels.implicit import newton as kernels_of_newton
@@ -247,6 +248,8 @@ class BodySteps:
         if touches:
             # The increments of a step with contact begin with zero.
             tables[:, int(kernels.STAGE), 1] = 0.0
+        # Contact is that of the end of the step, so whole motions are the unknowns there.
+        tables[:, int(kernels.STAGE), 2] = tables[:, int(kernels.STAGE), 0] if touches else 1.0
         self._table = wp.array(tables, dtype=wp.float32, device=self.device)
 
     def _make_solvers(self) -> None:
@@ -262,6 +265,7 @@ class BodySteps:
             most_linear=options.linear_iterations,
             others=self._add_others,
         )
+        self.newton.is_at_stage = options.is_at_stage
         self.touching: TouchingSolve | None = None
         self.touching_newton: TouchingNewton | None = None
         if self.held is not None and self.stepper.rows is None:
@@ -280,6 +284,8 @@ class BodySteps:
             self.held.prepare()
             if self.held.springs is not None and hasattr(self._preconditioner, "follow_springs"):
                 self._preconditioner.follow_springs(self.held.springs)
+        if self.stepper.holds and self.stepper.integrator.is_at_stage:
+            raise InputError("GeneralizedAlpha supports grasps only with spectral_radius=0")
         if self._version != self.body.version:
             if self._is_prepared:
                 self.before.fill_(np.nan)
@@ -398,7 +404,7 @@ class BodySteps:
             self.stepper.integrator,
         )
         inputs = [self._begins, self._table, options.damping]
-        outputs = [self.operator.scales, newton.inertia]
+        outputs = [self.operator.scales, newton.inertia, newton.share]
         wp.launch(kernels.choose_scales, 1, inputs, outputs, device=self.device)
         if self.field.elapsed is not None:
             inputs = [self._begins, self._table, int(kernels.STAGE), options.dt]

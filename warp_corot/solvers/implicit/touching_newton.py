@@ -12,8 +12,10 @@ from .touching import TouchingSolve
 class TouchingNewton:
     """Solves for the increments of ``touching.newton``, which begin with zero at free nodes.
 
-    The unknown of each linear problem is the whole increment d: A d = r(d0) + A d0 + contact, with the residual r and
-    its derivative -A at the increment d0 so far. So contact has the same unknowns in each of them.
+    The unknown of each linear problem is the whole motion d of the step: A d = r(d0) + A d0 + contact, with the
+    residual r and its derivative -A at the motion d0 so far. So contact has the same unknowns in each of them. Where a
+    scheme balances forces at a stage before the end of the step, increments are those of the stage, a share of d.
+    Contact is that of the end of the step, with its whole force in the balance.
 
     Args:
         touching: The solve of one linearisation.
@@ -44,7 +46,10 @@ class TouchingNewton:
         self.linear_iterations.zero_()
         newton.launch_residual()
         touching.linearise()
-        held.launch_begin(newton.body.state.displacements, newton.step, self._operator.diagonal_blocks())
+        blocks = self._operator.diagonal_blocks()
+        newton.move_held(to_end=True)
+        held.launch_begin(newton.body.state.displacements, newton.step, blocks)
+        newton.move_held(to_end=False)
         self._finish()
         wp.capture_while(self._going, self._go_on)
         held.launch_end(newton.step)
@@ -53,7 +58,7 @@ class TouchingNewton:
         newton, touching = self._newton, self._touching
         newton.launch_residual()
         touching.linearise()
-        inputs = [newton.body.conditions.inverse_mass, newton.increment]
+        inputs = [newton.body.conditions.inverse_mass, newton.share, newton.increment]
         self._launch(kernels.take_free, inputs, [newton.step])
         self._operator.apply(newton.step, self._product)
         self._launch(kernels.add_product, [self._product], [newton.residual])
@@ -67,7 +72,7 @@ class TouchingNewton:
         touching.iterations.zero_()
         touching.launch_rounds()
         self._sizes.zero_()
-        inputs = [self._count, body.conditions.inverse_mass, newton.base, newton.step]
+        inputs = [self._count, body.conditions.inverse_mass, newton.base, newton.share, newton.step]
         outputs = [newton.increment, body.state.displacements, self._sizes]
         self._launch(kernels.take_increments, inputs, outputs)
         newton.ranks.complete(newton.operator.number, body.state.displacements)
