@@ -104,6 +104,50 @@ def test_boundary_rest_and_worlds(device, rng):
     np.testing.assert_allclose(found.rest.sum(axis=0), moved, atol=1e-3 * np.abs(found.obstacles).max())
 
 
+def test_places_that_friction_holds_stay_where_they_are(device, rng):
+    """The same derivatives as with these nodes fixed, of other answers without contact."""
+    mesh, held, obstacle, gravity = on_floor(device)
+    weights = rng.normal(size=mesh.points.shape) / len(mesh.points)
+    names = ("young", "poisson", "gravity", "obstacles", "loads")
+    body = wc.SoftBody(mesh, wc.Isotropic(5e3, 0.4, 1000.0), device=device)
+    body.fix(held)
+    found = wc.static_gradient(
+        body,
+        lambda x: (float(np.sum(weights * x.numpy())), weights),
+        wrt=names,
+        gravity=gravity,
+        obstacles=obstacle(np.zeros(3)),
+        contact=wc.Contact(friction=2.0),
+    )
+    stuck = sorted({node for contact in found.report.contacts for node in contact.nodes})
+    assert max(np.linalg.norm(contact.friction_force) for contact in found.report.contacts) > 1e-3
+    rested = body.displacements.numpy().astype(float)
+    pushed = np.argmax(np.abs(found.loads).sum(axis=1))
+
+    def value(young=5e3, poisson=0.4, gravity=gravity, by=(0.0, 0.0, 0.0), load=(0.0, 0.0, 0.0)):
+        other = wc.SoftBody(mesh, wc.Isotropic(young, poisson, 1000.0), device=device)
+        u = rested.copy()
+        u[stuck] += by
+        other.displacements = u
+        other.fix(held)
+        other.fix(stuck)
+        other.load([pushed], load)
+        assert wc.solve_static(other, gravity=gravity).converged
+        return np.sum(weights * other.positions.numpy().astype(float))
+
+    size = np.abs(found.obstacles).max()
+    assert found.young == pytest.approx((value(young=5.1e3) - value(young=4.9e3)) / 200.0, rel=2e-3)
+    assert found.poisson == pytest.approx((value(poisson=0.402) - value(poisson=0.398)) / 0.004, rel=2e-3)
+    for axis in np.eye(3):
+        slope = (value(by=4e-4 * axis) - value(by=-4e-4 * axis)) / 8e-4
+        assert found.obstacles[0] @ axis == pytest.approx(slope, abs=2e-3 * size)
+        more = (value(gravity=gravity + 0.05 * axis) - value(gravity=gravity - 0.05 * axis)) / 0.1
+        assert found.gravity @ axis == pytest.approx(more, abs=2e-3 * np.abs(found.gravity).max())
+        loads = (value(load=1e-3 * axis) - value(load=-1e-3 * axis)) / 2e-3
+        assert found.loads[pushed] @ axis == pytest.approx(loads, abs=2e-3 * np.abs(found.loads[pushed]).max())
+    assert not found.loads[stuck].any()
+
+
 def test_what_has_no_gradient_is_refused(device):
     mesh, held, obstacle, gravity = on_floor(device)
     body = wc.SoftBody(mesh, wc.Isotropic(5e3, 0.4, 1000.0), device=device)
@@ -113,8 +157,8 @@ def test_what_has_no_gradient_is_refused(device):
     def objective(x):
         return 0.0, np.ones_like(x.numpy())
 
-    with pytest.raises(wc.InputError, match=r"obstacle 0 has friction 0\.3; gradients need contact without"):
-        wc.static_gradient(body, objective, **given)
+    with pytest.raises(wc.InputError, match=r"\d of \d contacts slip; gradients need friction that sticks"):
+        wc.static_gradient(body, objective, contact=wc.Contact(friction=0.01), **given)
     with pytest.raises(wc.InputError, match="it must be a Contact"):
         wc.static_gradient(body, objective, contact="none", **given)
     with pytest.raises(wc.InputError, match="contact with obstacles only"):

@@ -64,7 +64,7 @@ class RestState:
         if not isinstance(body, SoftBody):
             raise InputError(f"body is {shown(body)}; it must be a SoftBody")
         check_held(body)
-        check_smooth(checked_obstacles(obstacles), contact)
+        friction = friction_of(checked_obstacles(obstacles), contact)
         if not 0.0 < checked_number(adjoint_tolerance, "adjoint_tolerance") < 1.0:
             raise InputError(f"adjoint_tolerance is {adjoint_tolerance}; it must be between 0 and 1")
         (law,) = checked_models(Corotated() if model is None else model, 1)
@@ -76,7 +76,7 @@ class RestState:
         self.report, touching = static_answer(body, model=law, gravity=gravity, **options)
         if not self.report.converged:
             raise ConvergenceError(f"there is no gradient: {self.report.message}")
-        touched = None if touching is None else RestingContact(body, touching)
+        touched = None if touching is None else RestingContact(body, touching, friction)
         self._contact = touched if touched is not None and touched.pushes else None
         self._obstacle_count = len(checked_obstacles(obstacles))
         self.law, self._preconditioner, self._tolerance = law, preconditioner, adjoint_tolerance
@@ -144,23 +144,18 @@ def bound(body: SoftBody, law: Model, names: Sequence[str]) -> tuple[ForceField,
     return law.bind(body), parameters.needed(names)
 
 
-def check_smooth(obstacles: Sequence[Shape], contact: Contact | None) -> None:
-    """Check that contact has a gradient.
+def friction_of(obstacles: Sequence[Shape], contact: Contact | None) -> list[float]:
+    """The coefficient of friction of each obstacle.
 
     Raises:
-        InputError: There is friction, or the body touches itself.
+        InputError: The body touches itself.
     """
     contact = Contact() if contact is None else contact
     if not isinstance(contact, Contact):
         raise InputError(f"contact is {shown(contact)}; it must be a Contact")
     if contact.self_contact:
         raise InputError("the body may touch itself; gradients are of contact with obstacles only")
-    for number, shape in enumerate(obstacles):
-        friction = contact.friction if shape.friction is None else shape.friction
-        if friction > 0.0:
-            raise InputError(
-                f"obstacle {number} has friction {friction:g}; gradients need contact without: give friction=0.0"
-            )
+    return [contact.friction if shape.friction is None else shape.friction for shape in obstacles]
 
 
 def check_held(body: SoftBody) -> None:

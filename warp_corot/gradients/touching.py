@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,6 +29,8 @@ MOST_ROWS = 4000
 DEPENDENT = 1e-7
 #: The step of differences of obstacles' normals, over the size of the body.
 STEP = 1e-3
+#: The share of Coulomb's bound from which on a contact slips.
+SLIPS = 0.999
 #: Shares of corners below this are zero: the contact is on an edge or a corner.
 LEAST_SHARE = 1e-5
 #: Curvature times the size of the body, below which an obstacle is flat.
@@ -35,36 +38,41 @@ FLAT = 1e-2
 
 
 class RestingContact:
-    """The contacts of a body at rest, without friction.
+    """The contacts of a body at rest, without friction or with friction that holds them where they are.
 
     In an equilibrium, forces f(x) + sum_i l_i grad d_i = 0 and gaps d_i(x) = 0. With the stiffness K, the normals
     N = grad d, and the turning of the normals G = -sum_i l_i grad grad d_i, a change of forces by q moves the nodes by
     dx with (K + G) dx - N dl = q and N^T dx = 0. A contact on a triangle or an edge slides there to where the gap is
-    least, which is part of G.
+    least, which is part of G. A place that friction holds does not move: N has three columns for it, and G nothing.
 
     Args:
         body: The body.
         contacts: Its contact in the last step, which must be at rest.
+        friction: The coefficient of each obstacle.
 
     Attributes:
         pushes: Whether there are any contacts.
-        obstacle: The obstacle of each contact, int [m].
-        normals: The contacts' normals [m, 3].
+        obstacle: The obstacle of each column of N, int [m].
+        normals: The directions of these columns [m, 3].
 
     Raises:
-        InputError: There are more than ``MOST_ROWS`` contacts.
+        InputError: There are more than ``MOST_ROWS`` columns, or contacts that slip.
     """
 
-    def __init__(self, body: SoftBody, contacts: Contacts):
+    def __init__(self, body: SoftBody, contacts: Contacts, friction: Sequence[float]):
         self._body, self._contacts = body, contacts
-        touches = list(obstacle_touches(contacts))
+        found = list(obstacle_touches(contacts))
+        sticks = _sticking(found, friction)
+        touches = [touch for touch, stuck in zip(found, sticks, strict=True) for _ in range(3 if stuck else 1)]
         if len(touches) > MOST_ROWS:
-            raise InputError(f"there are {len(touches)} contacts; gradients take up to {MOST_ROWS}")
+            raise InputError(f"contact has {len(touches)} unknowns; gradients take up to {MOST_ROWS}")
         self.pushes = bool(touches)
         if not self.pushes:
             return
+        directions = [np.eye(3) if stuck else _unit(touch) for touch, stuck in zip(found, sticks, strict=True)]
+        self._yields = np.concatenate([np.full(len(each), len(each) == 1) for each in directions])
         self.obstacle = np.array([touch.obstacle for touch in touches])
-        self.normals = np.array([touch.normal / np.linalg.norm(touch.normal) for touch in touches])
+        self.normals = np.concatenate(directions)
         self._assemble(touches)
         free = np.repeat(~body.conditions.held_mask(), 3)
         self._free_normals = self._all_normals.multiply(free[:, None]).tocsc()
@@ -86,7 +94,8 @@ class RestingContact:
             nodes, carried = carriers[i]
             rows = (3 * nodes[:, None] + np.arange(3)).ravel()
             entries.append((rows, np.full(len(rows), i), (carried.T @ touch.shares)[:, None] * normal))
-            change = -float(touch.force @ normal) * self._hessian(touch, x[touch.places], normal, curvature)
+            push = float(touch.force @ normal) if self._yields[i] else 0.0
+            change = -push * self._hessian(touch, x[touch.places], normal, curvature)
             spread = np.kron(carried, np.eye(3))
             block = spread.T @ change @ spread
             blocks.append((np.repeat(rows, len(rows)), np.tile(rows, len(rows)), block))
@@ -248,6 +257,31 @@ class RestingPreconditioner:
     def apply(self, r: wp.array, z: wp.array) -> None:
         self._preconditioner.apply(r, z)
         self._contact.launch_free(z)
+
+
+def _unit(touch: Touch) -> Array:
+    """A contact's normal, [1, 3]."""
+    return (touch.normal / np.linalg.norm(touch.normal))[None]
+
+
+def _sticking(touches: list[Touch], friction: Sequence[float]) -> list[bool]:
+    """Whether friction holds each contact.
+
+    Raises:
+        InputError: It does not hold a contact that has friction.
+    """
+    sticks, slipping = [], 0
+    for touch in touches:
+        normal, bound = _unit(touch)[0], friction[touch.obstacle]
+        push = float(touch.force @ normal)
+        across = float(np.linalg.norm(touch.force - push * normal))
+        sticks.append(bound > 0.0)
+        slipping += bound > 0.0 and across > SLIPS * bound * push
+    if slipping:
+        raise InputError(
+            f"{slipping} of {len(touches)} contacts slip; gradients need friction that sticks, or friction=0.0"
+        )
+    return sticks
 
 
 def _inverse(matrix: Array) -> Array:
