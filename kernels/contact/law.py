@@ -14,6 +14,9 @@ wp.set_module_options({"enable_backward": False})
 
 #: Fraction of the remaining gap, or of the distance to an anchor, that closes in a step.
 SETTLING = wp.constant(0.1)
+#: Places and triangles of a mesh that has just changed may begin inside obstacles, because the mesh hung through
+#: between its former places. They may stay as deep, by an allowance of which this fraction is lost in each step.
+LOST = wp.constant(1.0 / 256.0)
 
 
 @wp.struct
@@ -31,6 +34,14 @@ def least_motion(gap: float, law: Law, dt: float):
     if gap > law.tolerance:
         return -(gap - (1.0 - law.settling) * law.tolerance)
     return wp.min(-law.settling * gap, law.recovery * dt)
+
+
+@wp.func
+def allowed(allowance: float, gap: float):
+    """How deep something may be [m]: as deep as it is if that is not known yet, which a negative number says."""
+    if allowance < 0.0:
+        return wp.max(-gap, 0.0)
+    return allowance
 
 
 @wp.func

@@ -3,7 +3,7 @@
 import warp as wp
 
 from .closest import deepest_on_triangle, on_triangle, point_of, segment_to_triangle
-from .law import Law, held_back
+from .law import LOST, Law, allowed, held_back
 from .motion import Motions, Surface
 from .near import Near
 from .shapes import CAPSULE, SPHERE, Shapes, carried, distance_to
@@ -38,6 +38,7 @@ class Touches:
     acts: wp.array2d[wp.int32]
     force: wp.array2d[wp.vec3]  # on the triangle [N]
     more: wp.array2d[wp.vec3]  # its change in this round
+    allowance: wp.array2d[wp.float32]  # how deep the triangle may be [m]; see ``law.allowed``
 
 
 @wp.func
@@ -103,6 +104,13 @@ def find_touch(
         gap = -2.0 * shapes.size[o][0] - gap
     if gap > far or wp.max(w) > CORNER:
         return
+    allowance = touches.allowance[o, t]
+    if allowance != 0.0:
+        allowance = allowed(allowance, gap)
+        touches.allowance[o, t] = (1.0 - LOST) * allowance
+        gap += allowance
+        if gap > far:
+            return
     friction = wp.where(gap < -SKEWERED * shapes.thickness[o], 0.0, shapes.friction[o])
     touches.shares[o, t] = w
     touches.normal[o, t] = n

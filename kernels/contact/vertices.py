@@ -3,7 +3,7 @@
 import warp as wp
 
 from .bearing import loose_share
-from .law import SETTLING, Law, held_back, least_motion, left_to_held
+from .law import LOST, SETTLING, Law, allowed, held_back, least_motion, left_to_held
 from .motion import Motions, Surface
 from .shapes import MESH, Shapes, carried, distance_to
 
@@ -20,6 +20,7 @@ class Beside:
     anchors: wp.array2d[wp.vec4]  # in the obstacle's frame; the fourth number is 1 if the place sticks
     away: wp.array2d[wp.vec4]  # the direction out of the obstacle, and the gap [m]
     moved: wp.array2d[wp.vec3]  # motion of the obstacle's point in this step [m]
+    allowance: wp.array2d[wp.float32]  # how deep the place may be [m]; see ``law.allowed``
 
 
 @wp.func
@@ -37,6 +38,11 @@ def find_beside(
     x = surface.x[s]
     moved = carried(now, motions.later[world, o], x)
     gap, n = distance_to(shapes, o, now, x, far + law.tolerance + wp.length(moved))
+    allowance = beside.allowance[o, s]
+    if allowance != 0.0:
+        allowance = allowed(allowance, gap)
+        beside.allowance[o, s] = allowance
+        gap += allowance
     beside.away[o, s] = wp.vec4(n[0], n[1], n[2], gap)
     beside.moved[o, s] = moved
 
@@ -194,13 +200,16 @@ def anchor(
     forces: wp.array2d[wp.vec3],
     beside: Beside,
 ):
-    """Set an anchor if the node begins to stick, drag it along with a slipping node, remove it without contact."""
+    """Set an anchor if the node begins to stick, drag it along with a slipping node, remove it without contact. At the
+    end of a step a part of the allowance is lost."""
     if surface.yielding[s] == 0.0:
         return
     world = surface.world[s]
     x = surface.x[s]
     end = x + surface.d[s]
     for o in range(forces.shape[0]):
+        if beside.allowance[o, s] > 0.0:
+            beside.allowance[o, s] = (1.0 - LOST) * beside.allowance[o, s]
         force = forces[o, s]
         if wp.dot(force, force) == 0.0:
             beside.anchors[o, s] = wp.vec4()

@@ -4,7 +4,7 @@ import warp as wp
 
 from warp_corot.kernels.meshing.bisection import refinement_end
 
-from .pools import Pools
+from .pools import LEAVES, Pools
 
 wp.set_module_options({"enable_backward": False})
 
@@ -54,3 +54,27 @@ def bind_points(
         w = in_child(w, k, second)
     nodes[i] = pools.tets[element]
     weights[i] = wp.vec4(float(w[0]), float(w[1]), float(w[2]), float(w[3]))
+
+
+@wp.kernel(enable_backward=False)
+def find_node_levels(pools: Pools, levels: wp.array[wp.int32]):
+    """The largest level of the leaves around each node; ``levels`` is zero before."""
+    i = wp.tid()
+    if i >= pools.counts[LEAVES]:
+        return
+    leaf = pools.leaves[i]
+    for k in range(4):
+        wp.atomic_max(levels, pools.tets[leaf][k], pools.level[leaf])
+
+
+@wp.kernel(enable_backward=False)
+def find_point_levels(
+    nodes: wp.array[wp.vec4i], weights: wp.array[wp.vec4], of_nodes: wp.array[wp.int32], levels: wp.array[wp.int32]
+):
+    """The level of the node with the largest weight at each point."""
+    i = wp.tid()
+    largest = int(0)
+    for k in range(4):
+        if weights[i][k] > weights[i][largest]:
+            largest = k
+    levels[i] = of_nodes[nodes[i][largest]]

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import warp as wp
 
 import warp_corot as wc
 
@@ -78,3 +79,42 @@ def test_runs_repeat(device):
         found.append((low.positions.numpy(), high.positions.numpy(), tool.wrench.numpy()))
     for first, second in zip(*found, strict=True):
         np.testing.assert_array_equal(first, second)
+
+
+@wp.func
+def closeness(element: wc.remesh.ElementState, parameters: wp.array[wp.float32]):
+    """How near an element is to a plane x = const, below a distance [m]."""
+    return parameters[0] - wp.abs(element.corner[0] - parameters[1])
+
+
+def force_on_places(sim):
+    return sim.contact.rigid.forces.numpy().astype(float).sum(axis=(0, 1))
+
+
+def test_contact_goes_on_through_passes(device):
+    """A brick on a slope, at 0.9 of the angle of friction; each pass refines one half of its bottom and simplifies the
+    other. Its surface between the former contact points hangs through below the slope, and is pushed out gently."""
+    mesh = wc.TetForest.from_domain(wc.Domain.box((-0.013, -0.011, -0.007), (0.013, 0.011, 0.007)), target_elements=400)
+    body, ground = wc.SoftBody(mesh, wc.Isotropic(2e4, 0.4, 1000.0), device=device), wc.Ground(offset=-0.007)
+    near, every = wp.array([0.006, -0.01], dtype=wp.float32, device=device), 500
+    options = {"max_level": int(mesh.levels.max()) + 1, "refine_above": 0.0, "simplify_below": -0.002}
+    remesh = wc.OnlineRemesh(capacity=2000, every=every, criterion=closeness, parameters=near, **options)
+    angle = 0.9 * np.arctan(0.5)
+    gravity = 9.81 * np.array([np.sin(angle), 0.0, -np.cos(angle)])
+    contact = wc.Contact(friction=0.5)
+    sim = wc.Simulation(body, obstacles=ground, contact=contact, gravity=gravity, integrator=CALM, remesh=remesh)
+    sim.advance_steps(2 * every - 1)
+    carried = []
+    for number in range(4):
+        near.assign(np.float32([0.006, 0.01 if number % 2 == 0 else -0.01]))
+        version = body.version
+        sim.advance_steps(1)
+        assert body.version > version
+        before = force_on_places(sim)
+        sim.contact.prepare()
+        np.testing.assert_allclose(force_on_places(sim), before, rtol=1e-5, atol=1e-5 * weight(body))
+        sim.advance_steps(1)
+        carried.append(-ground.wrench.numpy()[0, 2] / (weight(body) * np.cos(angle)))
+        sim.advance_steps(every - 2)
+    assert min(carried) > 0.2
+    assert max(carried) < 2.0

@@ -17,6 +17,7 @@ from warp_corot.solvers.system import System
 
 from .active_set import ActiveSet
 from .borne_set import BorneSet
+from .carried import CarriedForces
 from .joined_rows import JoinedRows
 from .obstacles import Obstacles
 from .options import SURFACE, Contact
@@ -117,9 +118,11 @@ class Contacts:
     def prepare(self) -> None:
         if self.is_full:
             self.grow()
-        before = self.surface.revision
-        if self.surface.follow():
+        if self.surface.is_outdated:
+            before, carried = self.surface.revision, CarriedForces(self.surface, self.rigid, self.pairs)
+            self.surface.follow()
             self._follow(before)
+            carried.give_back()
         if self.rigid is not None:
             self.rigid.prepare()
         if self.pairs is not None:

@@ -85,11 +85,12 @@ class RigidForces:
         self._beside = Beside()
         self._beside.anchors, self._beside.moved = self.anchors, wp.zeros_like(self.forces)
         self._beside.away = wp.zeros_like(self.anchors)
+        self.allowances = self._beside.allowance = wp.zeros((obstacles, count), dtype=wp.float32, device=device)
         self.touches = touches.Touches()
         shape = (obstacles, self.surface.triangle_count if self.have_edges else 0)
         for name in ("shares", "normal", "moved", "force", "more"):
             setattr(self.touches, name, wp.zeros(shape, dtype=wp.vec3, device=device))
-        for name in ("gap", "friction"):
+        for name in ("gap", "friction", "allowance"):
             setattr(self.touches, name, wp.zeros(shape, dtype=wp.float32, device=device))
         self.touches.acts = wp.zeros(shape, dtype=wp.int32, device=device)
         self._crowd = wp.zeros(count, dtype=wp.float32, device=device)
@@ -118,6 +119,8 @@ class RigidForces:
         self.anchors.zero_()
         self.kinds.zero_()
         self.touches.force.zero_()
+        for allowances in (self.allowances, self.touches.allowance):
+            allowances.zero_()
         if self.surface.is_borne:
             # Borne places begin with the forces of the last step.
             self.forces.zero_()
@@ -127,6 +130,7 @@ class RigidForces:
         """The arrays that it keeps from step to step."""
         touches = self.touches
         sides = {"touch_normals": touches.normal.flatten(), "touch_forces": touches.force.flatten()}
+        sides |= {"allowances": self.allowances.flatten(), "touch_allowances": touches.allowance.flatten()}
         borne = {"forces": self.forces.flatten()} if self.surface.is_borne else {}
         return {"anchors": self.anchors.flatten(), **sides, **borne}
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -50,8 +50,7 @@ class Skin:
         tetrahedra."""
         own = own_surface(body.mesh) if is_own else None
         if own is not None:
-            opposite = np.full(len(own.triangles), -1, np.int32)
-            return cls(own.nodes[:, 0], own, own.triangles, *_edges_of(own.triangles), opposite)
+            return cls.of_surface(own)
         tets = body.mesh.tets
         faces, parents = body.surface_faces
         nodes, places = np.unique(faces, return_inverse=True)
@@ -61,12 +60,28 @@ class Skin:
         opposite = np.where(nodes[found] == fourth, found, -1).astype(np.int32)
         return cls(nodes.astype(np.int32), None, triangles, *_edges_of(triangles), opposite)
 
+    @classmethod
+    def of_surface(cls, own: SurfaceMesh) -> Skin:
+        """A body's own surface."""
+        opposite = np.full(len(own.triangles), -1, np.int32)
+        return cls(own.nodes[:, 0], own, own.triangles, *_edges_of(own.triangles), opposite)
+
+    def on(self, own: SurfaceMesh) -> Skin:
+        """The same triangles and edges with other nodes around the points."""
+        return replace(self, nodes=own.nodes[:, 0], own=own)
+
+    def points(self, rest: npt.NDArray[np.float32]) -> npt.NDArray[np.floating]:
+        """Rest positions of the places [m], [n, 3], from those of the nodes, [N, 3] or more."""
+        return rest[self.nodes, :3] if self.own is None else self.own.points
+
     @property
     def bearers(self) -> Ints:
         """The nodes that bear places, int32 [b]."""
         if self.own is None:
             return np.zeros(0, np.int32)
-        return np.unique(self.own.nodes[self.own.weights != 0.0]).astype(np.int32)
+        bears = np.zeros(int(self.own.nodes.max(initial=-1)) + 1, bool)
+        bears[self.own.nodes[self.own.weights != 0.0]] = True
+        return np.flatnonzero(bears).astype(np.int32)
 
 
 def has_own_surface(mesh: TetForest | TetMesh) -> bool:
@@ -88,10 +103,11 @@ def own_surface(mesh: TetForest | TetMesh) -> SurfaceMesh | None:
 
 def _edges_of(triangles: Ints) -> tuple[Ints, Ints]:
     """The edges of a closed surface, and two triangles at each."""
-    ends = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    order = np.lexsort((ends[:, 1], ends[:, 0]))
-    edges, first = np.unique(ends[order], axis=0, return_index=True)
-    owners = order // 3
+    ends = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1).astype(np.int64)
+    keys = ends[:, 0] << 32 | ends[:, 1]
+    order = np.argsort(keys, kind="stable")
+    keys, owners = keys[order], order // 3
+    first = np.flatnonzero(np.append(True, keys[1:] != keys[:-1])[: len(keys)])
     # If more than two triangles meet in an edge, as where two bodies share one, the first two of them count.
     sides = np.column_stack([owners[first], owners[np.minimum(first + 1, len(owners) - 1)]])
-    return edges.astype(np.int32), sides.astype(np.int32)
+    return np.column_stack([keys[first] >> 32, keys[first] & 0xFFFFFFFF]).astype(np.int32), sides.astype(np.int32)

@@ -12,7 +12,8 @@ import warp as wp
 
 from warp_corot.kernels.contact.motion import Bearing, Surface
 
-from .skin import Skin
+from .followed import FollowedSurface
+from .skin import Skin, has_own_surface
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
@@ -81,7 +82,8 @@ class ContactSurface:
         self.are_own = are_own
         self.revision = 0
         self.parts: list[Part] = []
-        self._make_room([self._skin(body) for body in bodies])
+        self._followed: dict[int, FollowedSurface] = {}
+        self._make_room([self._skin(k) for k in range(len(bodies))])
 
     @property
     def own(self) -> Surface:
@@ -132,12 +134,15 @@ class ContactSurface:
         """The number of the body at each place for a node, int32 [S]."""
         return np.repeat(np.arange(len(self.parts)), [self.worlds * part.nodes for part in self.parts]).astype(np.int32)
 
-    def follow(self) -> bool:
-        """Update to the present meshes; returns whether any has changed."""
+    @property
+    def is_outdated(self) -> bool:
+        """Whether any mesh has changed."""
+        return any(body.version != part.version for body, part in zip(self.bodies, self.parts, strict=True))
+
+    def follow(self) -> None:
+        """Update to the present meshes."""
         changed = [k for k, body in enumerate(self.bodies) if body.version != self.parts[k].version]
-        if not changed:
-            return False
-        skins = [self._skin(body) if k in changed else self.parts[k].skin for k, body in enumerate(self.bodies)]
+        skins = [self._skin(k) if k in changed else self.parts[k].skin for k in range(len(self.bodies))]
         fits = all(len(body.state.rest) == len(own) for body, own in zip(self.bodies, self.places, strict=True))
         fits = fits and all(
             size <= room
@@ -146,11 +151,10 @@ class ContactSurface:
         )
         if not fits:
             self._make_room(skins)
-            return True
+            return
         for body, part, skin in zip(self.bodies, self.parts, skins, strict=True):
             part.skin, part.version = skin, body.version
         self._fill()
-        return True
 
     @property
     def rooms(self) -> list[list[int]]:
@@ -159,7 +163,7 @@ class ContactSurface:
 
     def make_room(self, rooms: Sequence[Sequence[int]]) -> None:
         """Update to the present meshes, with the room of a former ``rooms``."""
-        self._make_room([self._skin(body) for body in self.bodies], rooms)
+        self._make_room([self._skin(k) for k in range(len(self.bodies))], rooms)
 
     def places_of(self, k: int) -> slice:
         """The places of a body's nodes."""
@@ -217,8 +221,13 @@ class ContactSurface:
         self.revision += 1
         self._fill()
 
-    def _skin(self, body: SoftBody) -> Skin:
-        return Skin.of(body, is_own=self.are_own)
+    def _skin(self, k: int) -> Skin:
+        body = self.bodies[k]
+        if body.changing is None or not self.are_own or not has_own_surface(body.changing.forest.source):
+            return Skin.of(body, is_own=self.are_own)
+        if k not in self._followed:
+            self._followed[k] = FollowedSurface(body)
+        return self._followed[k].skin()
 
     def _room_for_bearing(self, count: int) -> Bearing:
         """Room for the bearing of a number of places: up to four nodes bear each."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from functools import partial
-from typing import Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +27,9 @@ from .plan import FlatLeaves, Plan
 from .planning.fixed import ForcePlan, pays_in_groups, units_of
 from .sizes import Sizes
 from .slots import Slots
+
+if TYPE_CHECKING:
+    from .changing.pools import DeviceForest
 
 #: Elements, and with them nodes, are numbered in 32 bits.
 MOST_ELEMENTS = 2**31 - 1
@@ -146,6 +149,10 @@ class Discretization(ABC):
 
 class MeshChanges(Protocol):
     """The owner of a changing mesh, for calls by the body; arrays have the present nodes."""
+
+    @property
+    def forest(self) -> DeviceForest:
+        """The mesh on the device."""
 
     def remember(self) -> None:
         """Save the present mesh and state for ``reset``."""

@@ -52,20 +52,84 @@ def clustered(surface: SurfaceMesh, sizes: Floats) -> SurfaceMesh:
 def _merged(points: Floats, triangles: Ints, sizes: Floats, shift: float) -> tuple[Ints, Ints]:
     """One pass with cubes that are shifted by a fraction of their size: the vertices that are left, and triangles of
     these."""
+    cluster, nearest = _clustered(points, _edges(triangles), sizes, shift)
+    used, corners = np.unique(_distinct(cluster[triangles]), return_inverse=True)
+    return nearest[used], corners.reshape(-1, 3)
+
+
+def _clustered(points: Floats, ends: Ints, sizes: Floats, shift: float) -> tuple[Ints, Ints]:
+    """The cluster of each vertex in one such pass, and the vertex that is nearest to the middle of each cluster."""
     cubes = np.column_stack([np.floor(points / sizes[:, None] + shift), sizes])
-    first, second = _edges(triangles).T
+    first, second = ends.T
     together = np.ones(len(first), bool)
     for numbers in cubes.T:
         together &= numbers[first] == numbers[second]
-    cluster = _connected(np.column_stack([first[together], second[together]]), len(points))
+    cluster = _connected(ends[together], len(points))
     count = int(cluster.max(initial=-1)) + 1
     members = np.bincount(cluster, minlength=count)
     middles = np.column_stack([np.bincount(cluster, points[:, axis], count) for axis in range(3)]) / members[:, None]
     far = np.linalg.norm(points - middles[cluster], axis=1)
     order = np.lexsort((far, cluster))
-    nearest = order[np.searchsorted(cluster[order], np.arange(count))]
-    used, corners = np.unique(_distinct(cluster[triangles]), return_inverse=True)
-    return nearest[used], corners.reshape(-1, 3)
+    return cluster, order[np.searchsorted(cluster[order], np.arange(count))]
+
+
+class Clusters:
+    """The clusterings of one surface for sizes that depend on a level, each found when it is first asked for.
+
+    Each vertex has a level of its own, which may change. What stands for a vertex depends on the levels of the vertices
+    in its cube only, so that the surface changes only where levels do.
+
+    Args:
+        points: The vertices of the surface [m], [V, 3].
+        triangles: [F, 3].
+        size: The size for level 0 [m]; each level divides it by the cube root of 2.
+    """
+
+    def __init__(self, points: Floats, triangles: Ints, size: float):
+        self._points, self._triangles, self._size = points, triangles, size
+        self._ends = _edges(triangles)
+        self._pieces = _connected(self._ends, len(points))
+        self._known: dict[int, tuple[Ints, Ints]] = {}
+
+    def thinned(self, levels: Ints) -> tuple[Ints, Ints]:
+        """The surface with vertices about a size apart.
+
+        Args:
+            levels: The level of each vertex, [V].
+
+        Returns:
+            The vertices that are left, ascending [n], and triangles of them [f, 3].
+        """
+        stands_for = np.arange(len(self._points))
+        for level in np.flatnonzero(np.bincount(levels)):
+            cluster, order = self._at(int(level))
+            members = order[levels[order] == level]
+            nearest = np.empty(len(self._points), np.int64)
+            # The last of those with the same number counts, which is the nearest.
+            nearest[cluster[members]] = members
+            stands_for[members] = nearest[cluster[members]]
+        found = _distinct(stands_for[self._triangles])
+        stays = np.zeros(len(self._points), bool)
+        stays[self._pieces[found[:, 0]]] = True
+        if not stays[self._pieces[self._triangles[:, 0]]].all():
+            whole = self._triangles[~stays[self._pieces[self._triangles[:, 0]]]]
+            found = np.concatenate([found, whole])
+        used = np.zeros(len(self._points), bool)
+        used[found] = True
+        places = np.cumsum(used) - 1
+        return np.flatnonzero(used), places[found].astype(np.int32)
+
+    def _at(self, level: int) -> tuple[Ints, Ints]:
+        """The cluster of each vertex, and all vertices, those farthest from the middles of their clusters first."""
+        if level not in self._known:
+            sizes = np.full(len(self._points), self._size * 2.0 ** (-level / 3.0))
+            first, near = _clustered(self._points, self._ends, sizes, 0.0)
+            ends = first[self._ends]
+            second, nearer = _clustered(self._points[near], ends[ends[:, 0] != ends[:, 1]], 0.5 * sizes[near], 0.5)
+            cluster = second[first]
+            far = np.linalg.norm(self._points - self._points[near[nearer]][cluster], axis=1)
+            self._known[level] = cluster, np.argsort(-far, kind="stable")
+        return self._known[level]
 
 
 def _edges(triangles: Ints) -> Ints:
