@@ -40,6 +40,28 @@ def test_two_ranks_make_a_box_in_parts(folder):
 
 
 @pytest.mark.slow
+def test_two_ranks_grow_a_surface_in_parts(folder):
+    """They have the mesh and the table of one process, and write two pieces of one stage."""
+    from pxr import Usd, UsdGeom
+
+    bunny = ("warp:bunny", "--level", "2", "--fix", "y < 0.06", "--young", "8kPa", "--dt", "0.4ms", "--duration", "0.1")
+    bunny += ("--probe", "y > 0.15", "--device", "cpu")
+    on_two = on_ranks(2, "-m", "warp_corot", "simulate", *bunny, "--csv", "two.csv", "-o", "two.usda")
+    assert on_two.returncode == 0, on_two.stderr
+    assert "bunny in parts" in on_two.stdout
+    assert simulate(*bunny, "--csv", "one.csv", "-o", "one.usda", "--draw-tets") == 0
+    one, two = (Usd.Stage.Open(name) for name in ("one.usda", "two.usda"))
+    counts = []
+    for stage in (one, two):
+        tets = [UsdGeom.TetMesh(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.TetMesh)]
+        counts.append([len(each.GetTetVertexIndicesAttr().Get()) for each in tets])
+    assert len(counts[1]) == 2
+    assert sum(counts[1]) == sum(counts[0])
+    # The bunny's ears sink by centimetres.
+    np.testing.assert_allclose(last_row("two.csv"), last_row("one.csv"), rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.slow
 def test_rank_0_hands_out_parts_of_other_bodies(folder):
     """The table is that of one process, whose pressure changes with time."""
     bear = (

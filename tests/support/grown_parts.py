@@ -73,10 +73,11 @@ def assert_refuses() -> None:
     """Every rank says what is wrong, in one line."""
     import warp_corot.distributed as wd
 
-    labels = wc.Domain.from_labels(np.ones((4, 4, 4), np.int16), spacing=(0.01, 0.01, 0.01), labels={"one": 1})
+    numbers = np.repeat(np.arange(1, 5), 16).reshape(4, 4, 4).astype(np.int16)
+    labels = wc.Domain.from_labels(numbers, spacing=(0.01, 0.01, 0.01))
     ball = wc.Domain.sphere(0.05, device="cpu")
     for domain, size, options, said in (
-        (labels, 0.01, {}, "has labels"),
+        (labels, 0.01, {}, "several labels"),
         (ball, 0.2, {"max_level": 3}, "take fewer ranks"),
         (ball, 0.03, {"max_level": -1}, "max_level is -1"),
         (ball, 0.003, {"max_level": 48}, "must be less in parts"),

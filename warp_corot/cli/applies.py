@@ -43,7 +43,7 @@ RULES = (
         lambda args, opened: opened.kind == "surface" or (opened.kind == "scan" and args.skin == "marched"),
         "surfaces",
     ),
-    Rule(("level",), lambda _, opened: opened.kind == "box", "the box"),
+    Rule(("level",), lambda _, opened: opened.kind != "tets", "the box, surfaces and scans"),
     Rule(("unit", "up"), _is_file, "files"),
     Rule(("rotation_level",), lambda _, opened: opened.kind != "tets", "box, surfaces and scans"),
     Rule(
@@ -92,6 +92,8 @@ def refuse_options(args: argparse.Namespace, opened: Opened) -> None:
             if given is not None and given is not False and not rule.applies(args, opened):
                 option = f"--{name.replace('_', '-')}"
                 raise InputError(f"{option} is for {rule.purpose}, and {args.input} is not one{_instead(name, args)}")
+    if opened.kind != "box" and args.level is not None and (args.tets is not None or args.max_level is not None):
+        raise InputError("--level is given, with which neither --tets nor --max-level has an effect")
     if args.labels is not None and args.young is not None:
         raise InputError("--young is given, but --labels gives each label its own")
     if args.draw_labels and args.labels is None and args.materials is None:

@@ -1,4 +1,4 @@
-"""``warp-corot simulate box`` on several ranks, of which none makes the whole mesh."""
+"""``warp-corot simulate`` on several ranks, of which none makes the whole mesh."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ import numpy as np
 
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.errors import InputError, UnstableError
-from warp_corot.experiments import paper
 from warp_corot.inputs.device import checked_device
 from warp_corot.materials.isotropic import Isotropic
 from warp_corot.simulation.parts import checked_gravity
@@ -22,10 +21,9 @@ from warp_corot.solvers import SymplecticEuler
 from .bodies import model_of
 from .compiling import compiling_said
 from .loading import Load, loads_of, ramp_of
-from .opened import offset_of
+from .meshes_in_parts import OF_ORGANS, box_in_parts, is_one_body, organ_in_parts
 from .ranks import are_several, hands_out
 from .say import complain, kept_so_far
-from .subject import BOX_LEVEL
 from .summary import aligned, length, milliseconds, pressure
 from .waiting import progress_bar
 
@@ -33,7 +31,9 @@ if TYPE_CHECKING:
     from warp_corot.distributed import Simulation
     from warp_corot.io.write.animate import Recording
 
-#: The options with which a box is made in parts; with others every rank makes the whole.
+    from .subject import Subject
+
+#: The options with which a mesh is made in parts; with others every rank makes the whole.
 OPTIONS = (
     {"command", "command_line", "input", "output", "device", "level", "scale", "offset"}
     | {"young", "poisson", "density", "model", "rotation_level", "dilatation"}
@@ -51,11 +51,15 @@ COLUMNS += [f"reaction {axis} [N]" for axis in "xyz"]
 def is_in_parts(options: Sequence[argparse.Namespace]) -> bool:
     """Whether ranks make a box in parts; rank 0 says why not if another option than these is given."""
     args = options[0]
-    if not are_several() or len(options) > 1 or args.input != "box":
+    is_box = args.input == "box"
+    if not are_several() or len(options) > 1 or not (is_box or args.level is not None):
         return False
-    others = sorted(name for name, value in vars(args).items() if name not in OPTIONS and value)
-    if args.level is not None and args.level < LEAST_LEVEL:
+    known = OPTIONS if is_box else OPTIONS | OF_ORGANS
+    others = sorted(name for name, value in vars(args).items() if name not in known and value)
+    if is_box and args.level is not None and args.level < LEAST_LEVEL:
         others.append("level")
+    if not is_box:
+        others += [f"{name} that is not given" for name in ("fix", "young") if getattr(args, name) is None]
     expressions = [*(args.fix or ()), *(each[0] for each in args.pull or ()), *(args.probe or ())]
     words = {word for text in expressions for word in re.findall(r"[A-Za-z_]\w*", text)}
     if any(not re.search("[A-Za-z_]", text) for text in args.probe or ()):
@@ -63,8 +67,8 @@ def is_in_parts(options: Sequence[argparse.Namespace]) -> bool:
     others += sorted(words & WHOLE)
     if others:
         who = "rank 0" if hands_out(options) else "every rank"
-        complain(f"{who} makes the whole box, because of {', '.join(others)}", kind="note")
-    return not others
+        complain(f"{who} makes the whole mesh, because of {', '.join(others)}", kind="note")
+    return not others and (is_box or is_one_body(args))
 
 
 def run_in_parts(args: argparse.Namespace) -> int:
@@ -76,10 +80,11 @@ def run_in_parts(args: argparse.Namespace) -> int:
     import warp_corot.distributed as wd
     from warp_corot.io.write.animate import Recording, frame_count
 
-    duration = paper.SHORT_DURATION if args.duration is None else args.duration
     done = Recording(args.output)
     with compiling_said(checked_device(args.device)):
-        sim, loads = _simulation(args, duration)
+        subject = box_in_parts(args) if args.input == "box" else organ_in_parts(args)
+        duration = subject.duration if args.duration is None else args.duration
+        sim, loads = _simulation(args, subject, duration)
         table = _Table(args, sim)
     try:
         with progress_bar(frame_count(duration, args.fps)) as progress, table.open() if args.csv else nullcontext():
@@ -95,24 +100,21 @@ def run_in_parts(args: argparse.Namespace) -> int:
     except OSError as error:
         complain(str(error))
         return 1
-    print(_summary(args, sim, loads, done))
+    print(_summary(args, sim, loads, subject, done))
     return 0
 
 
-def _simulation(args: argparse.Namespace, duration: float) -> tuple[Simulation, list[Load]]:
+def _simulation(args: argparse.Namespace, subject: Subject, duration: float) -> tuple[Simulation, list[Load]]:
     """The simulation of this rank's part, held and moved, and its loads."""
     import warp_corot.distributed as wd
     from warp_corot.distributed import mpi
     from warp_corot.io.write.animate import steps_per_frame
 
-    scale, (x, y, z) = 1.0 if args.scale is None else args.scale, offset_of(args).tolist()
-    level = BOX_LEVEL if args.level is None else args.level
-    loads = loads_of(args)
-    mesh = wd.box(paper.CELLS, paper.CELL_SIZE * scale, level, origin=(x, y, z))
+    loads, mesh = loads_of(args), subject.mesh
     given = {name: getattr(args, name) for name in ("young", "poisson", "density")}
-    material = Isotropic(**{name: paper.MATERIAL[name] if value is None else value for name, value in given.items()})
-    body = SoftBody(mesh, material, device=args.device)
-    for expression in ["z <= zmin"] if args.fix is None else args.fix:
+    given = {name: getattr(subject, name) if value is None else value for name, value in given.items()}
+    body = SoftBody(mesh, Isotropic(**given), device=args.device)
+    for expression in args.fix or [subject.fix]:
         body.fix(expression)
     comm = mpi.world()
     for load in loads:
@@ -122,7 +124,7 @@ def _simulation(args: argparse.Namespace, duration: float) -> tuple[Simulation, 
         body.prescribe(load.patch, times=times, displacements=shares[:, None] * load.values)
     if not any(comm.allgather(len(body.constrained) > np.count_nonzero(body.constrained))):
         raise InputError("options hold or move all nodes; at least one must be free to move")
-    damping = paper.Settings.damping if args.damping is None else args.damping
+    damping = subject.damping if args.damping is None else args.damping
     dt = args.dt
     SymplecticEuler(dt, damping, args.viscosity or 0.0)  # checks all values
     if dt is not None:
@@ -131,7 +133,7 @@ def _simulation(args: argparse.Namespace, duration: float) -> tuple[Simulation, 
         body,
         model=model_of(args.model, args.rotation_level, args.dilatation),
         integrator=SymplecticEuler(dt, damping, args.viscosity or 0.0),
-        gravity=checked_gravity(paper.GRAVITY if args.gravity is None else tuple(args.gravity), mesh.up_axis),
+        gravity=checked_gravity(subject.gravity if args.gravity is None else tuple(args.gravity), mesh.up_axis),
     )
     return sim, loads
 
@@ -189,13 +191,15 @@ class _Table:
             self._file.flush()
 
 
-def _summary(args: argparse.Namespace, sim: Simulation, loads: Sequence[Load], done: Recording) -> str:
+def _summary(
+    args: argparse.Namespace, sim: Simulation, loads: Sequence[Load], subject: Subject, done: Recording
+) -> str:
     from warp_corot.distributed.part_meshes import ForestPart
 
     body, mesh = sim.body, sim.body.mesh
     assert isinstance(mesh, ForestPart)
     nodes = sim.following[0].part.numbers.node_count
-    held = " or ".join(args.fix or ["z <= zmin"])
+    held = " or ".join(args.fix or [str(subject.fix)])
     stepping = max(done.stepping, 1e-9)
     material: Any = body.material
     shortest, longest = sim.dt_range
@@ -212,4 +216,6 @@ def _summary(args: argparse.Namespace, sim: Simulation, loads: Sequence[Load], d
         ("device", f"{sim.device} ({sim.device.name}), {sim.size} ranks"),
         ("written", f"{done.path} and a piece for each rank, {done.frames} frames, {done.simulated:.4g} s"),
     ]
-    return "\n".join(["box in parts", *aligned(rows), *([f"  {'table':<14}{args.csv}"] if args.csv else [])])
+    return "\n".join(
+        [f"{subject.name} in parts", *aligned(rows), *([f"  {'table':<14}{args.csv}"] if args.csv else [])]
+    )

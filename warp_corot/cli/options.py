@@ -12,7 +12,7 @@ from . import patches, run_file
 from .implicit import IMPLICIT_DT, STEPPING
 from .label_materials import FORM
 from .loading import add_load_options
-from .organs import MAX_LEVEL_FOR_ERROR
+from .organs import CUBES_OF_LEVEL, MAX_LEVEL_FOR_ERROR
 from .previews import add_preview_options
 from .quantities import (
     acceleration,
@@ -159,7 +159,9 @@ def add_scene_options(parser: argparse.ArgumentParser) -> None:
         "--level",
         type=whole_number,
         metavar="L",
-        help=f"number of bisections of the cubes of the box; three halve the edge (default: {BOX_LEVEL})",
+        help=f"number of bisections of the cubes of the box; three halve the edge (default: {BOX_LEVEL}). For surfaces "
+        f"and scans, in place of --tets: of the cubes at the surface, {CUBES_OF_LEVEL} along the longest side if "
+        "--cell-size is not given; several ranks then make the mesh in parts if --fix and --young are given",
     )
     body.add_argument("--scale", type=number, metavar="S", help="multiply the coordinates by this, after --unit")
     body.add_argument(

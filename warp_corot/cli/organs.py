@@ -15,6 +15,7 @@ import numpy as np
 
 from warp_corot.errors import InputError
 from warp_corot.mesh import TetForest
+from warp_corot.mesh.lattice import checked_level
 
 from .label_materials import LabelMaterial, numbers_by_name, parse_labels
 from .opened import Opened, offset_of, placed_surface, placed_volume
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 #: With a surface error or a level instead of a number of tetrahedra: the default number for each root cube in a cube of
 #: the body's length, which gives the size of root cubes.
 TETS_PER_CUBE = 30
+#: With a level: the number of root cubes along the body's longest side.
+CUBES_OF_LEVEL = 16
 #: Maximum number of bisections of cubes in this case, and of further levels for details between nodes.
 MAX_LEVEL_FOR_ERROR, DETAIL = 12, 6
 #: Root cubes extend beyond the body by this fraction of its length.
@@ -63,12 +66,12 @@ def find_organ(opened: Opened, args: argparse.Namespace) -> Subject:
     Raises:
         InputError: It encloses no body, or an option is out of its range.
     """
-    with _as_options():
+    with as_options():
         started = time.perf_counter()
         if args.scale is not None and not (np.isfinite(args.scale) and args.scale > 0):
             raise InputError(f"scale is {args.scale:g}; it must be a positive number")
         entries: list[LabelMaterial] = []
-        domain = _scan(opened, args, entries) if opened.kind == "scan" else _surface(opened, args)
+        domain = domain_of(opened, args, entries)
         meshing = time.perf_counter()
         mesh = _mesh(args, domain)
         surface = mesh.surface()
@@ -92,6 +95,20 @@ def find_organ(opened: Opened, args: argparse.Namespace) -> Subject:
     if asset:
         subject.take(asset, args)
     return subject
+
+
+def domain_of(opened: Opened, args: argparse.Namespace, entries: list[LabelMaterial]) -> Domain:
+    """The domain of a surface or a scan; ``entries`` are filled with the materials of its labels."""
+    return _scan(opened, args, entries) if opened.kind == "scan" else _surface(opened, args)
+
+
+def fineness_of(args: argparse.Namespace, domain: Domain) -> dict[str, Any]:
+    """The arguments of ``from_domain`` for a level."""
+    size = args.cell_size
+    if size is None:
+        size = float(np.ptp(domain.bounds, axis=0).max()) * (1.0 + MARGIN) / CUBES_OF_LEVEL
+    checked_level(args.level, "--level")
+    return {"cell_size": size, "max_level": args.level, "surface_error": args.surface_error, "device": args.device}
 
 
 def _surface(opened: Opened, args: argparse.Namespace) -> Domain:
@@ -158,6 +175,8 @@ def _see_labels(volume: LoadedVolume) -> None:
 
 
 def _mesh(args: argparse.Namespace, domain: Domain) -> TetForest:
+    if args.level is not None:
+        return TetForest.from_domain(domain, **fineness_of(args, domain))
     count = args.tets
     if count is None and args.max_level is None and args.surface_error is None:
         count = TETS
@@ -213,7 +232,11 @@ def _measured(args: argparse.Namespace, mesh: TetForest, domain: Domain, surface
         warnings.warn(doubt.replace("more tetrahedra", f"more tetrahedra (--tets {more}{through})"), stacklevel=2)
     off = max(found.distance_95)
     if args.surface_error is not None and off > args.surface_error:
-        helps = "a larger --tets" if args.tets is not None else f"--max-level {int(mesh.levels.max()) + 3}"
+        helps = (
+            "a larger --tets"
+            if args.tets is not None
+            else f"--{'max-' * (args.level is None)}level {int(mesh.levels.max()) + 3}"
+        )
         warnings.warn(
             f"--surface-error is {length(args.surface_error)}, and 95 % of the surface are within {length(off)}; "
             f"{helps} would bring it nearer",
@@ -223,7 +246,7 @@ def _measured(args: argparse.Namespace, mesh: TetForest, domain: Domain, surface
 
 
 @contextmanager
-def _as_options() -> Iterator[None]:
+def as_options() -> Iterator[None]:
     """Replace Python's argument names by options in error messages."""
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")

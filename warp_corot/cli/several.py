@@ -45,7 +45,8 @@ def bodies_in(opened: Opened, args: argparse.Namespace) -> list[tuple[Opened, ar
     found = []
     for place, (part, share) in enumerate(zip(parts, volumes / volumes.sum(), strict=True)):
         own = argparse.Namespace(**vars(args))
-        if args.tets is not None or (args.max_level is None and args.surface_error is None and args.cell_size is None):
+        fineness = (args.level, args.max_level, args.surface_error, args.cell_size)
+        if args.tets is not None or all(given is None for given in fineness):
             own.tets = max(FEWEST_TETS, int((args.tets or TETS) * share))
         found.append((replace(opened, surface=part, size=size, notes=opened.notes if place == 0 else []), own))
     return found

@@ -176,7 +176,11 @@ def _listed(names: Sequence[str]) -> str:
 
 def _box(scale: float, level: int, offset: np.ndarray) -> Subject:
     x, y, z = offset.tolist()
-    mesh = TetForest.box(paper.CELLS, paper.CELL_SIZE * scale, level, origin=(x, y, z))
+    return box_subject(TetForest.box(paper.CELLS, paper.CELL_SIZE * scale, level, origin=(x, y, z)))
+
+
+def box_subject(mesh: TetForest) -> Subject:
+    """A box with its defaults."""
     return Subject(
         mesh,
         "box",

@@ -73,7 +73,7 @@ def from_domain(
         device: The device that grows the mesh; None: the domain's.
 
     Raises:
-        InputError: On all ranks: MPI is not there, an argument is out of its range, the domain has labels, no
+        InputError: On all ranks: MPI is not there, an argument is out of its range, the domain has several labels, no
             tetrahedron holds any of the body, or fewer cubes than ranks hold any of it.
 
     Warns:
@@ -84,8 +84,8 @@ def from_domain(
     comm = mpi.world()
     if not isinstance(domain, Domain):
         raise InputError(f"domain is {shown(domain)}; it must be a Domain")
-    if domain.label_names:
-        raise InputError("the domain has labels, which meshes grown in parts do not have; use divided")
+    if len(domain.label_names) > 1:
+        raise InputError("the domain has several labels, which meshes grown in parts do not have; use divided")
     where = checked_device(domain.device if device is None else device)
     size = checked_cell_size(cell_size)
     wishes = checked_wishes(max_level, surface_error, min_level, refine_where, field, field_tolerance)
