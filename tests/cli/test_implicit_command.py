@@ -47,6 +47,42 @@ def test_static_follows_a_pull(tmp_path, capsys):
     assert ends[1] == pytest.approx(0.01, abs=1e-3)
 
 
+def test_static_stands_on_the_ground(tmp_path, capsys):
+    """The ground carries the weight in the first row and the last, and so do the nodes in the stage."""
+    path, table = tmp_path / "stands.usd", tmp_path / "stands.csv"
+    options = ["--young", "5kPa", "--poisson", "0.4", "--self-contact"]
+    assert simulate(*BOX, "--static", "--ground", *options, "--csv", table, "-o", path) == 0
+    assert "at rest in contact after" in capsys.readouterr().out
+    rows = np.genfromtxt(table, delimiter=",", skip_header=1)
+    weight = 9.8 * 10.0 * 0.064 * 0.064 * 0.192
+    np.testing.assert_allclose(rows[:, 2], -weight, rtol=1e-4)
+    assert len(rows) == 2
+    first, last = frames_of(path)
+    assert np.abs(last - first).max() < 1e-6
+    stage = Usd.Stage.Open(str(path))
+    drawn = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/SoftBody/tetrahedra"))
+    for time in (0, stage.GetEndTimeCode()):
+        felt = np.array(drawn.GetPrimvar("contactForce").Get(time), float).sum(axis=0)
+        assert felt[1] == pytest.approx(weight, rel=1e-4)
+
+
+def test_static_follows_a_tool(tmp_path, capsys):
+    """A ball sinks 3 mm into the side of a beam; without motion left, forces stay."""
+    path, table = tmp_path / "pressed.usd", tmp_path / "pressed.csv"
+    (tmp_path / "way.csv").write_text("0,0.032,0.0745,0.096\n0.1,0.032,0.0712,0.096\n")
+    tool = ["--tool", "sphere:r=1cm", "--tool-path", tmp_path / "way.csv", "--fix", "bottom", "--poisson", "0.4"]
+    options = [*tool, "--young", "5kPa", "--duration", "0.2", "--fps", "20", "--csv", table, "-o", path]
+    assert simulate(*BOX, "--static", *options) == 0
+    rows = np.genfromtxt(table, delimiter=",", names=True)
+    force = rows["tool_1_force_y_N"]
+    assert force[0] == 0.0
+    assert 0.0 < force[1] < force[2]
+    assert force[4] == pytest.approx(force[2], rel=1e-3)
+    capsys.readouterr()
+    free = [*tool[:4], "--fix", "none", "-o", tmp_path / "free.usd"]
+    assert_refused(tmp_path, capsys, "can only follow bodies that are held", *BOX, "--static", "--ground", *free)
+
+
 def test_an_implicit_run(tmp_path, capsys):
     """Steps of 16 ms are shortened until a whole number of them makes a frame; the run file repeats the run."""
     path, run = tmp_path / "swings.usd", tmp_path / "run.toml"
@@ -75,7 +111,7 @@ def test_a_body_falls_in_implicit_steps(tmp_path, capsys):
     [
         (["--static", "--dt", "1ms"], "--static has no steps in time; leave out --dt"),
         (["--static", "--integrator", "newmark"], "leave out --integrator"),
-        (["--static", "--drop", "1cm"], "--static does not support contact"),
+        (["--static", "--drop", "1cm"], "--static has no fall; leave out --drop"),
         (["--integrator", "generalized-alpha", "--drop", "1cm"], "contact only with spectral_radius=0"),
         (["--integrator", "generalized-alpha", "--dt", "-1ms"], "--dt is -0.001"),
         (["--integrator", "euler"], "argument --integrator: invalid choice: 'euler'"),

@@ -65,7 +65,7 @@ def prepared(options: Sequence[argparse.Namespace], others: Others | None = None
         for body in bodies:
             with waiting(f"meshing {body.args.input}"):
                 body.subject = find_body(body)
-        duration, count = _frames(shared, bodies)
+        duration, count = _frames(shared, bodies, touched)
         started = time.perf_counter()
         for found in inputs:
             find_patches(found)
@@ -87,14 +87,15 @@ def prepared(options: Sequence[argparse.Namespace], others: Others | None = None
     return Run(bodies, sim, probes, duration, count, touched)
 
 
-def _frames(args: argparse.Namespace, bodies: Sequence[Body]) -> tuple[float, int]:
+def _frames(args: argparse.Namespace, bodies: Sequence[Body], touched: Touched) -> tuple[float, int]:
     """The duration [s], and the number of frames after the first one."""
     from warp_corot.io.write.animate import frame_count, rounding
 
     duration = args.duration
     if duration is not None and (note := rounding(duration, args.fps)):
         bodies[0].subject.notes.append(note)
-    if duration is None and getattr(args, "static", False) and not any(body.loads for body in bodies):
+    moves = touched.moves or any(body.loads for body in bodies)
+    if duration is None and getattr(args, "static", False) and not moves:
         duration = 1.0 / args.fps
     if duration is None:
         duration = max(body.subject.duration for body in bodies)

@@ -12,7 +12,6 @@ from warp_corot.simulation.simulation import Simulation
 
 from .about import about
 from .bodies import Body
-from .implicit import rest
 from .in_parts import is_in_parts, run_in_parts
 from .options import add_parser
 from .prepared import Run, prepared
@@ -21,6 +20,7 @@ from .probing import Table, check_table_path
 from .ranks import Others, hands_out, leads, serve
 from .run_file import bodies_of, check_run_path, write_run
 from .say import complain, interrupt_status, kept_so_far
+from .static import rest
 from .summary import summary, title_of
 from .waiting import progress_bar
 

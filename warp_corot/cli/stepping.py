@@ -11,12 +11,13 @@ import numpy as np
 
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.simulation.simulation import Simulation
-from warp_corot.solvers import INTEGRATORS, Integrator, QuasiStatic, SymplecticEuler
+from warp_corot.solvers import INTEGRATORS, Integrator, SymplecticEuler
 
 from .bodies import Body, gravity_of
-from .implicit import IMPLICIT_DT, check_implicit, integrator_name, is_static
+from .implicit import IMPLICIT_DT, integrator_name, is_static
 from .ranks import Others, are_several, led_simulation, one_first
 from .remesh import as_remesh_options
+from .static import check_static, static_integrator
 from .touching import Touched
 
 
@@ -29,14 +30,14 @@ def make_simulation(
     """
     from warp_corot.io.write.animate import steps_per_frame
 
-    check_implicit(args, touches=touched.contact is not None, remeshes=any(body.remesh for body in bodies))
+    check_static(args, touches=touched.contact is not None, remeshes=any(body.remesh for body in bodies))
     first = bodies[0].subject
     damping = first.damping if args.damping is None else args.damping
     viscosity = args.viscosity or 0.0
     SymplecticEuler(args.dt, damping, viscosity)  # checks all values; the step is shortened later
     integrator: Integrator
     if is_static(args):
-        integrator = QuasiStatic(1.0 / args.fps)
+        integrator = static_integrator(args, bodies, touched)
     elif INTEGRATORS[integrator_name(args)].is_implicit:
         steps = steps_per_frame(args.fps, args.dt or IMPLICIT_DT)
         integrator = INTEGRATORS[integrator_name(args)](1.0 / (args.fps * steps), damping, viscosity)  # type: ignore[call-arg]

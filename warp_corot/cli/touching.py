@@ -106,6 +106,11 @@ class Touched:
     obstacles: dict[str, Obstacle] = field(default_factory=dict)
 
     @property
+    def moves(self) -> bool:
+        """Whether a tool moves."""
+        return any(isinstance(each, Tool) and each.keys is not None for each in self.obstacles.values())
+
+    @property
     def rows(self) -> list[tuple[str, str]]:
         """Lines of the summary."""
         if self.contact is None:

@@ -13,6 +13,8 @@ from .contacts import Contacts
 
 #: Arrays that follow from the shapes and the meshes.
 GIVEN = {"meeting", "shapes"}
+#: Arrays that each simulation has for itself: of motions, of its clock, and of when to search again.
+OWN = ("obstacles.", "search.", "rigid._pace.")
 
 
 def kept_arrays(contacts: Contacts) -> dict[str, wp.array]:
@@ -51,6 +53,26 @@ def keep_again(contacts: Contacts, rooms: list[list[int]], room: int, kept: dict
         if values.shape[: array.ndim] != array.shape:
             raise InputError(f"{name} has shape {list(values.shape)}; it must begin with {list(array.shape)}")
         array.assign(values)
+
+
+def take_state(contacts: Contacts, former: Contacts) -> None:
+    """Go on from the forces of another simulation of the same bodies and obstacles. Obstacles keep their motion.
+
+    Raises:
+        InputError: The bodies or obstacles are others.
+    """
+    bodies = contacts.system.bodies
+    felt = [wp.clone(body.state.contact_forces) for body in bodies]
+    contacts.take_rooms(former.surface.rooms, 0 if former.pairs is None else former.pairs.room)
+    for body, forces in zip(bodies, felt, strict=True):
+        wp.copy(body.state.contact_forces, forces)
+    arrays, others = kept_arrays(contacts), kept_arrays(former)
+    for name, array in arrays.items():
+        if name.startswith(OWN) and name != "obstacles.wrenches":
+            continue
+        if name not in others or others[name].shape != array.shape:
+            raise InputError("contact is that of other bodies or obstacles")
+        wp.copy(array, others[name])
 
 
 def _arrays_in(name: str, value: Any) -> Iterator[tuple[str, wp.array]]:

@@ -1,4 +1,4 @@
-"""The state of rest of a body on obstacles: steps so long that inertia hardly matters, each from rest."""
+"""The state of rest of bodies on obstacles: steps so long that inertia hardly matters, each from rest."""
 
 from __future__ import annotations
 
@@ -61,10 +61,10 @@ def checked_obstacles(given: Shape | Sequence[Shape]) -> tuple[Shape, ...]:
 
 
 def rest_on(
-    body: SoftBody,
-    law: Model,
-    field: ForceField,
-    loads: npt.NDArray[np.float64],
+    bodies: Sequence[SoftBody],
+    laws: Sequence[Model],
+    fields: Sequence[ForceField],
+    loads: Sequence[npt.NDArray[np.float64]],
     gravity: tuple[float, float, float],
     obstacles: Sequence[Shape],
     contact: Contact | None,
@@ -73,50 +73,52 @@ def rest_on(
     most: int,
     preconditioner: str | None,
 ) -> Rest:
-    """Move the body to where it rests on obstacles, from its present displacements.
+    """Move bodies to where they rest on obstacles and on one another, from their present displacements.
 
     If the steps do not come to rest, shorter ones are tried from the beginning, which search more carefully. If these
-    fail too, the body returns to its first state.
+    fail too, the bodies return to their first state.
 
     Args:
-        body: The body.
-        law, field: Its elasticity.
-        loads: Loads and weight [N], [worlds * N, 3].
+        bodies: The bodies.
+        laws, fields: Their elasticity.
+        loads: Loads and weight of each [N], [worlds * N, 3].
         gravity: [m/s^2].
-        obstacles: The obstacles on which it rests.
+        obstacles: The obstacles on which they rest.
         contact: The options of contact.
         tolerance: For the last step: the largest motion over the largest displacement.
         most: The maximum number of steps.
         preconditioner: The preconditioner of the linear solves.
     """
-    start = body.displacements.numpy().copy()
-    steps = linear = 0
-    correction, converged = np.full(body.worlds, np.inf), np.zeros(body.worlds, bool)
+    starts = [body.displacements.numpy().copy() for body in bodies]
+    steps, linear, worlds = 0, 0, bodies[0].worlds
+    correction, converged = np.full(worlds, np.inf), np.zeros(worlds, bool)
     for number, (length, settling) in enumerate(LENGTHS):
-        dt = length * _wave_time(body)
+        dt = length * max(_wave_time(body) for body in bodies)
         euler = BackwardEuler(dt=dt, linear_tolerance=LINEAR, preconditioner=preconditioner)
-        sim = Simulation(body, model=law, integrator=euler, gravity=gravity, obstacles=obstacles, contact=contact)
+        sim = Simulation(bodies, model=laws, integrator=euler, gravity=gravity, obstacles=obstacles, contact=contact)
         if sim.contact is not None:
             sim.contact.settle(settling, exactly=number == 0)
-        still = np.zeros_like(start)
         try:
             for _ in range(most):
-                body.state.set_velocities(still)
+                for body, start in zip(bodies, starts, strict=True):
+                    body.state.set_velocities(np.zeros_like(start))
                 sim.advance_steps(1)
-                correction, least = _correction(body, dt)
+                corrections = [_correction(body, dt) for body in bodies]
+                correction = np.max([each for each, _least in corrections], axis=0)
                 steps += 1
-                if (correction <= np.maximum(tolerance, least)).all():
-                    converged = _residuals(body, field, loads) <= BALANCED
+                if all((each <= np.maximum(tolerance, least)).all() for each, least in corrections):
+                    converged = _residuals(bodies, fields, loads) <= BALANCED
                     if converged.all():
                         break
         except UnstableError:
-            converged = np.zeros(body.worlds, bool)
+            converged = np.zeros(worlds, bool)
         linear += sim.solves.linear_iterations if sim.solves is not None else 0
         if converged.all():
             break
-        body.displacements = start
+        for body, start in zip(bodies, starts, strict=True):
+            body.displacements = start
     contact_then = sim.contact if converged.all() else None
-    residual = float(_residuals(body, field, loads).max())
+    residual = float(_residuals(bodies, fields, loads).max())
     return Rest(converged, steps, linear, float(correction.max()), residual, contact_then)
 
 
@@ -138,9 +140,15 @@ def _correction(body: SoftBody, dt: float) -> tuple[npt.NDArray[np.float64], npt
     return moved / reach, ROUNDING * float(np.abs(body.mesh.points).max()) / reach
 
 
-def _residuals(body: SoftBody, field: ForceField, loads: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def _residuals(
+    bodies: Sequence[SoftBody], fields: Sequence[ForceField], loads: Sequence[npt.NDArray[np.float64]]
+) -> npt.NDArray[np.float64]:
     """The norm of forces that are out of balance over that of the loads or of contact, whichever is larger, of each
-    world."""
+    world and the body where it is largest."""
+    return np.max([_residual(*each) for each in zip(bodies, fields, loads, strict=True)], axis=0)
+
+
+def _residual(body: SoftBody, field: ForceField, loads: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     state, count, worlds = body.state, body.sizes.nodes, body.worlds
     pushes = state.contact_forces.numpy()[:count, :3]
     forces = field.elastic_forces(state.displacements).numpy()[:count, :3] + loads + pushes

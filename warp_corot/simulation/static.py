@@ -15,7 +15,7 @@ from warp_corot.contact.contacts import Contacts
 from warp_corot.contact.options import Contact
 from warp_corot.contact.reading import ContactPoint, contact_points
 from warp_corot.contact.shapes import Shape
-from warp_corot.elasticity import Corotated, ForceField, Model
+from warp_corot.elasticity import Corotated, Model
 from warp_corot.errors import ConvergenceError, InputError
 from warp_corot.inputs.checks import checked_count, checked_number, refuse_tape, shown
 from warp_corot.inputs.turns import in_turn
@@ -23,11 +23,10 @@ from warp_corot.solvers.implicit.nested import nested_start
 from warp_corot.solvers.implicit.preconditioners import check_preconditioner
 from warp_corot.solvers.implicit.static import StaticSolver, status_words
 
+from .loaded import LoadedBody
 from .parts import check_whole, checked_gravity, checked_models
 from .resting import checked_obstacles, rest_on
 
-#: Loads on a free body balance if their sum is less than this share of the sum of their magnitudes.
-BALANCED = 1e-5
 #: Rounding of float32 displacements and forces hides what is smaller: Newton's method would stop without an answer.
 LEAST_TOLERANCE = 1e-6
 
@@ -253,10 +252,10 @@ def _rest_on(
 ) -> tuple[StaticReport, Contacts | None]:
     """The answer in contact."""
     found = rest_on(
-        answer.body,
-        law,
-        answer.field,
-        answer.loads,
+        [answer.body],
+        [law],
+        [answer.field],
+        [answer.loads],
         gravity,
         obstacles,
         contact,
@@ -280,34 +279,8 @@ def _rest_on(
     return replace(report, contacts=points), found.contact
 
 
-class _Answer:
-    """The loads of a body, and the state that a solve ends in."""
-
-    def __init__(self, body: SoftBody, field: ForceField, gravity: tuple[float, float, float]):
-        self.body, self.field = body, field
-        conditions, count = body.conditions, body.sizes.nodes
-        self.loads = body.masses[:, None] * np.array(gravity)
-        if conditions.has_loads:
-            self.loads = self.loads + conditions.loads.numpy()[:count, :3].astype(np.float64)
-
-    def falls(self) -> bool:
-        """Whether nothing holds the body, and its loads do not balance."""
-        worlds = self.body.worlds
-        held = self.body.conditions.held_mask().reshape(worlds, -1).any(axis=1)
-        of_worlds = self.loads.reshape(worlds, -1, 3)
-        sums = np.linalg.norm(of_worlds.sum(axis=1), axis=1)
-        return bool((~held & (sums > BALANCED * np.linalg.norm(of_worlds, axis=2).sum(axis=1))).any())
-
-    def finish(self) -> None:
-        """Let the body rest: no velocity, reactions at held nodes, positions published."""
-        body, state = self.body, self.body.state
-        state.velocities.zero_()
-        elastic = self.field.elastic_forces(state.displacements).numpy()[: body.sizes.nodes, :3]
-        held = body.conditions.held_mask()[:, None]
-        reactions = np.zeros((body.sizes.nodes, 4), np.float32)
-        reactions[:, :3] = np.where(held, -(elastic + self.loads), 0.0)
-        state.reactions[: body.sizes.nodes].assign(reactions)
-        state.publish_positions()
+class _Answer(LoadedBody):
+    """A body and the state that a solve ends in."""
 
     def report(
         self,
