@@ -5,7 +5,7 @@ import warp as wp
 from warp_corot.kernels.stepping.threads import least_of_lanes, same_in_lanes
 
 from .motion import Surface
-from .rows import BAND, Meeting
+from .rows import BAND, Meeting, triangle_normal
 from .watch import Watch
 
 wp.set_module_options({"enable_backward": False})
@@ -34,12 +34,14 @@ def edge_reach(meeting: Meeting, e: wp.vec2i):
 
 @wp.kernel(enable_backward=False)
 def box_triangles(surface: Surface, meeting: Meeting, lower: wp.array[wp.vec3], upper: wp.array[wp.vec3]):
+    """Find the boxes of triangles, and their normals."""
     t = wp.tid()
     c = meeting.triangles[t]
     if c[0] < 0:
         lower[t] = wp.vec3(NOWHERE, NOWHERE, NOWHERE)
         upper[t] = lower[t]
         return
+    meeting.normals[t] = triangle_normal(surface, c)
     a = surface.x[c[0]]
     b = surface.x[c[1]]
     e = surface.x[c[2]]
@@ -51,12 +53,15 @@ def box_triangles(surface: Surface, meeting: Meeting, lower: wp.array[wp.vec3], 
 
 @wp.kernel(enable_backward=False)
 def box_edges(surface: Surface, meeting: Meeting, lower: wp.array[wp.vec3], upper: wp.array[wp.vec3]):
+    """Find the boxes of edges, after those of triangles, and the sums of the normals at each."""
     k = wp.tid()
     e = meeting.edges[k]
     if e[0] < 0:
         lower[k] = wp.vec3(NOWHERE, NOWHERE, NOWHERE)
         upper[k] = lower[k]
         return
+    sides = meeting.sides[k]
+    meeting.outs[k] = meeting.normals[sides[0]] + meeting.normals[sides[1]]
     a = surface.x[e[0]]
     b = surface.x[e[1]]
     far = edge_reach(meeting, e) + BAND * wp.length(b - a)

@@ -27,6 +27,8 @@ class Meeting:
     sides: wp.array[wp.vec2i]  # [E] their two triangles
     corner_starts: wp.array[wp.int32]  # [S + 1] triangles around each node, see ``Skin``
     corners: wp.array[wp.int32]
+    normals: wp.array[wp.vec3]  # [T] at the last search
+    outs: wp.array[wp.vec3]  # [E] the sums of the two normals at each edge, at the last search
     reach: wp.array[wp.float32]  # [S] how far a node may move until the next search for pairs [m]
     lower: wp.array2d[wp.vec3]  # [worlds, bodies] bounds of the places that a body may reach [m]
     upper: wp.array2d[wp.vec3]

@@ -8,7 +8,7 @@ from .closest import on_segments, on_triangle, point_of
 from .locate import ENDS, edge_normal
 from .motion import Surface
 from .near import CRUSHED, PAIRED, Near, mark
-from .rows import BAND, Meeting, Rows, row_count, triangle_normal
+from .rows import BAND, Meeting, Rows, row_count
 from .watch import Watch
 
 wp.set_module_options({"enable_backward": False})
@@ -19,8 +19,11 @@ Kept = wp.types.vector(length=16, dtype=wp.int32)
 
 #: Edges with a larger sine of the bend are sharp.
 SHARP = wp.constant(0.15)
-#: The largest cosine between the normals of two surfaces that face each other.
-FACING = wp.constant(-0.5)
+#: The largest cosine between the normals of two surfaces that face each other, and between those of a node and a
+#: triangle of one body that may face each other before the next search.
+FACING, MAY_FACE = wp.constant(-0.5), wp.constant(0.5)
+#: Edges that bend by up to about 100 degrees, whose normals add up to at least this, touch only what they face.
+BLUNT = wp.constant(1.25)
 
 
 @wp.struct
@@ -37,8 +40,8 @@ class OldRows:
 def bend(surface: Surface, meeting: Meeting, k: int):
     """The sine of the angle by which the surface bends at an edge, positive if the edge is convex."""
     sides = meeting.sides[k]
-    first = triangle_normal(surface, meeting.triangles[sides[0]])
-    second = triangle_normal(surface, meeting.triangles[sides[1]])
+    first = meeting.normals[sides[0]]
+    second = meeting.normals[sides[1]]
     e = meeting.edges[k]
     c = meeting.triangles[sides[1]]
     middle = (surface.x[c[0]] + surface.x[c[1]] + surface.x[c[2]]) / 3.0
@@ -57,13 +60,17 @@ def may_meet(s: int, r: int, surface: Surface, meeting: Meeting):
 
 
 @wp.func
-def node_is_near(s: int, t: int, surface: Surface, meeting: Meeting, near: Near):
+def node_is_near(s: int, t: int, out: wp.vec3, surface: Surface, meeting: Meeting, near: Near):
+    """Whether a node and a triangle may touch before the next search; ``out`` is the normal at the node."""
     c = meeting.triangles[t]
     if c[0] < 0 or not may_meet(s, c[0], surface, meeting):
         return False
     if c[0] == s or c[1] == s or c[2] == s or meeting.opposite[t] == s:
         return False
+    normal = meeting.normals[t]
     if meeting.body[s] == meeting.body[c[0]]:
+        if wp.dot(out, normal) > MAY_FACE:
+            return False
         # Inverted elements have passed through their own body and have to get back.
         flags = near.flags[s] | near.flags[c[0]] | near.flags[c[1]] | near.flags[c[2]]
         if (flags & CRUSHED) != 0:
@@ -77,7 +84,7 @@ def node_is_near(s: int, t: int, surface: Surface, meeting: Meeting, near: Near)
     x = surface.x[s]
     way = x - point_of(on_triangle(x, a, b, e), a, b, e)
     far = meeting.reach[s] + triangle_reach(surface, meeting, c)
-    if wp.dot(way, wp.cross(b - a, e - a)) < 0.0:
+    if wp.dot(way, normal) < 0.0:
         far += BAND * triangle_size(surface, c)
     return wp.length(way) <= far
 
@@ -118,7 +125,17 @@ def flat_edges_cross(k: int, m: int, s: float, t: float, way: wp.vec3, surface: 
 
 
 @wp.func
-def edge_is_near(k: int, m: int, is_sharp: bool, surface: Surface, meeting: Meeting, near: Near):
+def face_away(first: wp.vec3, second: wp.vec3):
+    """Whether two blunt edges of a body face so much the same way that they cannot touch before the next search, from
+    the sums of their normals."""
+    if wp.min(wp.length(first), wp.length(second)) < BLUNT:
+        return False
+    return wp.dot(first, second) > MAY_FACE * wp.length(first) * wp.length(second)
+
+
+@wp.func
+def edge_is_near(k: int, m: int, is_sharp: bool, out: wp.vec3, surface: Surface, meeting: Meeting, near: Near):
+    """Whether two edges may cross before the next search; ``out`` is the sum of the normals at the first."""
     e = meeting.edges[k]
     f = meeting.edges[m]
     if f[0] < 0 or not may_meet(e[0], f[0], surface, meeting):
@@ -126,6 +143,8 @@ def edge_is_near(k: int, m: int, is_sharp: bool, surface: Surface, meeting: Meet
     if e[0] == f[0] or e[0] == f[1] or e[1] == f[0] or e[1] == f[1]:
         return False
     if meeting.body[e[0]] == meeting.body[f[0]]:
+        if face_away(out, meeting.outs[m]):
+            return False
         flags = near.flags[e[0]] | near.flags[e[1]] | near.flags[f[0]] | near.flags[f[1]]
         if (flags & CRUSHED) != 0:
             return False
@@ -172,13 +191,18 @@ def near_node(
     beyond = wp.vec3(reach, reach, reach)
     low = surface.x[i] - beyond
     high = surface.x[i] + beyond
+    out = wp.vec3()
+    if meeting.meets_itself != 0:
+        for k in range(meeting.corner_starts[i], meeting.corner_starts[i + 1]):
+            out += meeting.normals[meeting.corners[k] / 3]
+        out = wp.normalize(out)
     for g in range(meeting.groups):
         root = root_of(0, g, i, low, high, surface, meeting)
         if root >= 0:
             query = wp.bvh_query_aabb(of_triangles, low, high, root)
             t = int(0)
             while wp.bvh_query_next(query, t):
-                if node_is_near(i, t, surface, meeting, near):
+                if node_is_near(i, t, out, surface, meeting, near):
                     if start >= 0:
                         add_other(start, count, t, rows)
                     elif count < KEPT:
@@ -203,13 +227,14 @@ def near_edge(
         return 0, kept
     low = wp.min(a, b) - beyond
     high = wp.max(a, b) + beyond
+    out = meeting.outs[k]
     for g in range(meeting.groups):
         root = root_of(1, g, e[0], low, high, surface, meeting)
         if root >= 0:
             query = wp.bvh_query_aabb(of_edges, low, high, root)
             m = int(0)
             while wp.bvh_query_next(query, m):
-                if edge_is_near(k, m, own > SHARP, surface, meeting, near):
+                if edge_is_near(k, m, own > SHARP, out, surface, meeting, near):
                     if start >= 0:
                         add_other(start, count, m, rows)
                     elif count < KEPT:

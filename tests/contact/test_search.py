@@ -97,6 +97,17 @@ def test_the_search_finds_all_pairs_of_remeshed_bodies(device):
     assert len(low.mesh.tets) != before
 
 
+def test_neighbours_on_a_curved_surface_are_no_pairs(device, rng):
+    """They face the same way, so a ball has hardly any pairs with itself while it is shaken."""
+    mesh = wc.TetForest.from_domain(wc.Domain.sphere(0.05), target_elements=800)
+    ball = wc.SoftBody(mesh, SOFT, device=device)
+    sim = wc.Simulation(ball, contact=wc.Contact(self_contact=True), gravity=(0.0, 0.0, 0.0))
+    ball.velocities = rng.normal(scale=0.2, size=mesh.points.shape)
+    sim.advance_steps(20)
+    assert sim.contact.search.count > 2
+    assert len(candidates(sim.contact)) < 0.05 * sim.contact.surface.count
+
+
 def thrown(device, least, **sizes):
     """Final positions of two blocks that were thrown at one another, and the search for pairs."""
     low, high = block(device, 0.0), block(device, 0.0205, cells=(1, 1, 1), at=0.008)

@@ -68,6 +68,8 @@ class Pairs:
         meeting.triangles, meeting.edges, meeting.sides = surface.triangles, surface.edges, surface.sides
         meeting.opposite = surface.opposite
         meeting.corner_starts, meeting.corners = surface.corner_starts, surface.corners
+        meeting.normals = wp.zeros(surface.triangle_count, dtype=wp.vec3, device=device)
+        meeting.outs = wp.zeros(edges, dtype=wp.vec3, device=device)
         meeting.reach = self.search.watch.reach
         shape = (surface.worlds, len(surface.parts))
         meeting.lower, meeting.upper = (wp.zeros(shape, dtype=wp.vec3, device=device) for _ in range(2))
