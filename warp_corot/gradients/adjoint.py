@@ -40,7 +40,7 @@ class Adjoint:
     Attributes:
         iterations: Number of iterations of conjugate gradients in the world that needed most.
         residual: Norm of g - (K + s M) a over that of g, the largest of all worlds.
-        multipliers: With contact, the shares of the contacts' normals in g - K a, float64 [contacts].
+        multipliers: With contact, the shares of the contacts' normals in g - (K + s M) a, float64 [contacts].
     """
 
     def __init__(
@@ -52,18 +52,23 @@ class Adjoint:
         contact: RestingContact | None = None,
     ):
         self.body, self.operator, self._tolerance = body, TangentOperator(body, field, exact=True), tolerance
-        operator: LinearOperator = self.operator
-        self._preconditioner, self._contact = preconditioner_of(preconditioner, self.operator), contact
-        if contact is not None:
-            operator = RestingOperator(operator, contact)  # type: ignore[assignment]
-            self._preconditioner = RestingPreconditioner(self._preconditioner, contact)
-        u = body.state.displacements
-        self._solver = ConjugateGradients(operator, len(u), most=MOST)
+        self._free_preconditioner = preconditioner_of(preconditioner, self.operator)
+        self._solver = ConjugateGradients(self.operator, len(body.state.displacements), most=MOST)
+        self.keep_to(contact)
         self.multipliers = np.zeros(0)
         self._solver.tolerance.fill_(tolerance)
         self._held = body.conditions.held_mask()[:, None]
         self._masses, self._share = body.masses[:, None], 0.0
         self.iterations, self.residual = 0, 0.0
+
+    def keep_to(self, contact: RestingContact | None) -> None:
+        """Let the motion keep to other contacts, or to none."""
+        operator: LinearOperator = self.operator
+        self._contact, self._preconditioner = contact, self._free_preconditioner
+        if contact is not None:
+            operator = RestingOperator(operator, contact)  # type: ignore[assignment]
+            self._preconditioner = RestingPreconditioner(self._preconditioner, contact)
+        self._solver.operator = operator
 
     def take(self, u: wp.array, share: float = 0.0) -> None:
         """Set the stiffness to that at displacements u [m], vec4 [worlds * N], with the factor s of the mass
@@ -94,7 +99,8 @@ class Adjoint:
         motion = wp.array(padded(adjoint), dtype=wp.vec4, device=body.device)
         product = self._product(motion)
         if self._contact is not None:
-            self.multipliers = self._contact.multipliers(np.where(self._held, 0.0, right - product))
+            rest = right - product - self._share * self._masses * adjoint
+            self.multipliers = self._contact.multipliers(np.where(self._held, 0.0, rest))
             product = product + self._contact.reactions(self.multipliers)
         return motion, product
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,6 +15,7 @@ from warp_corot.solvers.implicit.schemes import ImplicitIntegrator
 
 from .adjoint import Adjoint
 from .sums import StepSums
+from .touching import RestingContact
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
@@ -34,8 +36,10 @@ class ImplicitRun:
         sums: The sums over steps.
         displacements: The displacements before the first step and after each step, vec4.
         tolerance: Tolerance of the adjoint solves.
+        contacts: What obstacles have pushed in each step, if there are any obstacles.
 
     Attributes:
+        of_obstacles: The derivative with respect to the places of the obstacles, or 0.
         of_displacements, of_velocities: The adjoint of the state that the run backwards has reached, float64
             [worlds * N, 3].
     """
@@ -48,7 +52,9 @@ class ImplicitRun:
         sums: StepSums,
         displacements: list[wp.array],
         tolerance: float,
+        contacts: Sequence[RestingContact] = (),
     ):
+        self._contacts, self.of_obstacles = contacts, np.zeros(1)
         self.body, self.sums, self.displacements = body, sums, displacements
         self._adjoint = Adjoint(body, field, integrator.preconditioner, tolerance)
         self._dt, self._damping = integrator.dt, integrator.damping
@@ -69,9 +75,13 @@ class ImplicitRun:
         made = [table[int(row)] for row in (rows.VELOCITY, rows.FIRST, rows.SECOND)]
         of_made = (self.of_velocities, self._of_first, self._of_second)
         right = self.of_displacements / stage_share + sum(row[0] * of for row, of in zip(made, of_made, strict=True))
+        contact = self._contacts[step] if self._contacts and self._contacts[step].pushes else None
+        self._adjoint.keep_to(contact)
         self._adjoint.take(stage, inertia[0])
         motion, product = self._adjoint.solve(np.where(self._held, 0.0, right))
         p = motion.numpy()[:, :3].astype(np.float64)
+        if contact is not None:
+            self.of_obstacles = self.of_obstacles + contact.of_obstacles(p, self._adjoint.multipliers)
         of_u = self.of_displacements - product
         # Held nodes keep their velocity and move with it; at the stage they have made the stage's fraction of that
         # motion.

@@ -11,6 +11,7 @@ import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.options import Contact
+from warp_corot.contact.reading import obstacle_touches
 from warp_corot.contact.shapes import Shape
 from warp_corot.elasticity import Corotated, ForceField, Model
 from warp_corot.errors import ConvergenceError, InputError
@@ -76,7 +77,9 @@ class RestState:
         self.report, touching = static_answer(body, model=law, gravity=gravity, **options)
         if not self.report.converged:
             raise ConvergenceError(f"there is no gradient: {self.report.message}")
-        touched = None if touching is None else RestingContact(body, touching, friction)
+        touched = (
+            None if touching is None else RestingContact(body, touching, list(obstacle_touches(touching)), friction)
+        )
         self._contact = touched if touched is not None and touched.pushes else None
         self._obstacle_count = len(checked_obstacles(obstacles))
         self.law, self._preconditioner, self._tolerance = law, preconditioner, adjoint_tolerance

@@ -12,14 +12,17 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
+from warp_corot.contact.options import Contact
+from warp_corot.contact.shapes import Shape
 from warp_corot.discretization.nodal import padded
 from warp_corot.elasticity import Corotated, ForceField, Model
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.checks import checked_count, refuse_tape, shown
 from warp_corot.inputs.turns import in_turn
 from warp_corot.simulation.parts import checked_gravity, checked_models
+from warp_corot.simulation.resting import checked_obstacles
 from warp_corot.simulation.simulation import Simulation
-from warp_corot.solvers import QuasiStatic, SymplecticEuler
+from warp_corot.solvers import BackwardEuler, QuasiStatic, SymplecticEuler
 from warp_corot.solvers.implicit.schemes import ImplicitIntegrator
 from warp_corot.solvers.integrator import Integrator
 
@@ -27,13 +30,18 @@ from . import parameters
 from .explicit import ExplicitRun
 from .implicit import ImplicitRun
 from .objective import Objective, value_and_derivative
-from .rest_state import bound
+from .rest_state import bound, friction_of
 from .sums import StepSums
+from .touches import touches_after
+from .touching import RestingContact
 
 Array = npt.NDArray[np.float64]
 
 #: Names of the derivatives of runs.
-NAMES = ("young", "poisson", "density", "loads", "gravity", "rest", "activation", "displacements", "velocities")
+NAMES = (
+    *("young", "poisson", "density", "loads", "gravity", "rest", "activation"),
+    *("displacements", "velocities", "obstacles"),
+)
 
 
 @dataclass(frozen=True)
@@ -50,6 +58,7 @@ class RunGradient:
         rest: dJ/dX of each node's rest position [1/m], [worlds * N, 3]. Displacements at the beginning, elements'
             materials and the directions of fibres stay as they are.
         displacements, velocities: dJ/du [1/m] and dJ/dv [s/m] of the state at the beginning, [worlds * N, 3].
+        obstacles: dJ/dp of each obstacle's place, the same in all steps [1/m], [obstacles, 3].
     """
 
     value: float
@@ -63,6 +72,7 @@ class RunGradient:
     activation: Array | None = None
     displacements: Array | None = None
     velocities: Array | None = None
+    obstacles: Array | None = None
 
     def __getitem__(self, name: str) -> Any:
         if name not in NAMES or getattr(self, name) is None:
@@ -82,6 +92,8 @@ def run_gradient(
     gravity: npt.ArrayLike | None = None,
     every: int | None = None,
     adjoint_tolerance: float = 1e-6,
+    obstacles: Shape | Sequence[Shape] = (),
+    contact: Contact | None = None,
 ) -> RunGradient:
     """The derivatives of an objective of a body's positions after time steps, by running the adjoint of the steps
     backwards.
@@ -99,15 +111,19 @@ def run_gradient(
         model, gravity: As for ``Simulation``.
         every: J is the sum of the objective's values after each of this number of steps; None: the value at the end.
         adjoint_tolerance: Tolerance of the linear solve of each implicit step backwards.
+        obstacles, contact: Shapes at rest that the body touches at its nodes without friction, in steps of
+            ``BackwardEuler``. The gradient is that of the nodes that are touched in each step: it jumps where one more
+            or less is.
 
     Raises:
-        InputError: As ``static_gradient``, or the integrator is not one of these, the body is remeshed, or nodes or
-            active stress follow keyframes.
+        InputError: As ``static_gradient``, or the integrator is not one of these, the body is remeshed, nodes or active
+            stress follow keyframes, or obstacles touch something else than nodes.
         UnstableError: The run does not stay finite.
         ConvergenceError: An adjoint solve does not converge.
     """
     refuse_tape()
     names = _checked(body, integrator, steps, wrt)
+    things = _checked_contact(integrator, obstacles, contact)
     (law,) = checked_models(Corotated() if model is None else model, 1)
     field, _needs = bound(body, law, [name for name in names if name in parameters.NEEDS])
     if field.elapsed is not None:
@@ -121,12 +137,17 @@ def run_gradient(
     if not marks:
         raise InputError(f"every is {every}; the run has {steps} steps")
     seen = _Values(body, objective)
+    of_obstacles = np.zeros((len(things), 3))
     if isinstance(integrator, SymplecticEuler):
         kept, of_u, of_v = _explicit(body, field, integrator, down, sums, steps, marks, seen)
     else:
         assert isinstance(integrator, ImplicitIntegrator)
-        kept, of_u, of_v = _implicit(body, field, integrator, law, down, sums, steps, marks, seen, adjoint_tolerance)
-    found = sums.derivatives() | {"displacements": of_u, "velocities": of_v}
+        run = _implicit(
+            body, field, integrator, law, down, sums, steps, marks, seen, adjoint_tolerance, things, contact
+        )
+        kept, of_u, of_v = steps + 1, run.of_displacements, run.of_velocities
+        of_obstacles = of_obstacles + run.of_obstacles
+    found = sums.derivatives() | {"displacements": of_u, "velocities": of_v, "obstacles": of_obstacles}
     if "rest" in names:
         found["rest"] = found["rest"] + of_u
     return RunGradient(seen.value, kept, **{name: found[name] for name in names})
@@ -170,20 +191,24 @@ def _implicit(
     marks: set[int],
     seen: _Values,
     tolerance: float,
-) -> tuple[int, Array, Array]:
-    """The same for implicit steps."""
-    sim = Simulation(body, model=law, integrator=integrator, gravity=gravity)
-    states = [wp.clone(body.state.displacements)]
+    obstacles: Sequence[Shape],
+    contact: Contact | None,
+) -> ImplicitRun:
+    """The run backwards of implicit steps, at the beginning."""
+    sim = Simulation(body, model=law, integrator=integrator, gravity=gravity, obstacles=obstacles, contact=contact)
+    states, contacts, friction = [wp.clone(body.state.displacements)], [], [0.0] * len(obstacles)
     for _ in range(steps):
         sim.step()
         states.append(wp.clone(body.state.displacements))
+        if sim.contact is not None:
+            contacts.append(RestingContact(body, sim.contact, touches_after(body, sim.contact), friction))
     check_finite(body)
-    run = ImplicitRun(body, field, integrator, sums, states, tolerance)
+    run = ImplicitRun(body, field, integrator, sums, states, tolerance, contacts)
     for step in reversed(range(steps)):
         if step + 1 in marks:
             run.of_displacements = run.of_displacements + seen.derivative(states[step + 1])
         run.backward(step)
-    return len(states), run.of_displacements, run.of_velocities
+    return run
 
 
 class _Values:
@@ -209,6 +234,23 @@ def check_finite(body: SoftBody) -> None:
     """
     if not np.isfinite(body.state.displacements.numpy()[: body.sizes.nodes]).all():
         raise UnstableError("the run does not stay finite; take shorter steps")
+
+
+def _checked_contact(
+    integrator: Integrator, obstacles: Shape | Sequence[Shape], contact: Contact | None
+) -> tuple[Shape, ...]:
+    """The obstacles of a run.
+
+    Raises:
+        InputError: Their contact has no gradient.
+    """
+    things = checked_obstacles(obstacles)
+    if contact is not None or things:
+        if not isinstance(integrator, BackwardEuler):
+            raise InputError(f"integrator is {shown(integrator)}; runs with contact need BackwardEuler for gradients")
+        if any(friction_of(things, contact)):
+            raise InputError("obstacles have friction; runs with gradients need contact without: give friction=0.0")
+    return things
 
 
 def _checked(body: SoftBody, integrator: Integrator, steps: int, wrt: str | Sequence[str]) -> tuple[str, ...]:

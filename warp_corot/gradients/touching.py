@@ -10,18 +10,17 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.contact.contacts import Contacts
-from warp_corot.contact.reading import Touch, obstacle_touches
+from warp_corot.contact.reading import Touch
 from warp_corot.errors import InputError
 from warp_corot.kernels.gradients import contact as kernels
 from warp_corot.solvers.implicit.operator import LinearOperator, Preconditioner
+
+from .touches import Array, Ints, sticking, unit_normal
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
     from warp_corot.body.soft_body import SoftBody
-
-Array = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 #: The largest number of contacts: the inverse of their matrix is dense.
 MOST_ROWS = 4000
@@ -29,8 +28,6 @@ MOST_ROWS = 4000
 DEPENDENT = 1e-7
 #: The step of differences of obstacles' normals, over the size of the body.
 STEP = 1e-3
-#: The share of Coulomb's bound from which on a contact slips.
-SLIPS = 0.999
 #: Shares of corners below this are zero: the contact is on an edge or a corner.
 LEAST_SHARE = 1e-5
 #: Curvature times the size of the body, below which an obstacle is flat.
@@ -47,7 +44,8 @@ class RestingContact:
 
     Args:
         body: The body.
-        contacts: Its contact in the last step, which must be at rest.
+        contacts: Its contact in the last step.
+        found: Where obstacles push it.
         friction: The coefficient of each obstacle.
 
     Attributes:
@@ -59,17 +57,18 @@ class RestingContact:
         InputError: There are more than ``MOST_ROWS`` columns, or contacts that slip.
     """
 
-    def __init__(self, body: SoftBody, contacts: Contacts, friction: Sequence[float]):
+    def __init__(self, body: SoftBody, contacts: Contacts, found: Sequence[Touch], friction: Sequence[float]):
         self._body, self._contacts = body, contacts
-        found = list(obstacle_touches(contacts))
-        sticks = _sticking(found, friction)
+        sticks = sticking(found, friction)
         touches = [touch for touch, stuck in zip(found, sticks, strict=True) for _ in range(3 if stuck else 1)]
         if len(touches) > MOST_ROWS:
             raise InputError(f"contact has {len(touches)} unknowns; gradients take up to {MOST_ROWS}")
         self.pushes = bool(touches)
         if not self.pushes:
             return
-        directions = [np.eye(3) if stuck else _unit(touch) for touch, stuck in zip(found, sticks, strict=True)]
+        directions = [
+            np.eye(3) if stuck else unit_normal(touch)[None] for touch, stuck in zip(found, sticks, strict=True)
+        ]
         self._yields = np.concatenate([np.full(len(each), len(each) == 1) for each in directions])
         self.obstacle = np.array([touch.obstacle for touch in touches])
         self.normals = np.concatenate(directions)
@@ -257,31 +256,6 @@ class RestingPreconditioner:
     def apply(self, r: wp.array, z: wp.array) -> None:
         self._preconditioner.apply(r, z)
         self._contact.launch_free(z)
-
-
-def _unit(touch: Touch) -> Array:
-    """A contact's normal, [1, 3]."""
-    return (touch.normal / np.linalg.norm(touch.normal))[None]
-
-
-def _sticking(touches: list[Touch], friction: Sequence[float]) -> list[bool]:
-    """Whether friction holds each contact.
-
-    Raises:
-        InputError: It does not hold a contact that has friction.
-    """
-    sticks, slipping = [], 0
-    for touch in touches:
-        normal, bound = _unit(touch)[0], friction[touch.obstacle]
-        push = float(touch.force @ normal)
-        across = float(np.linalg.norm(touch.force - push * normal))
-        sticks.append(bound > 0.0)
-        slipping += bound > 0.0 and across > SLIPS * bound * push
-    if slipping:
-        raise InputError(
-            f"{slipping} of {len(touches)} contacts slip; gradients need friction that sticks, or friction=0.0"
-        )
-    return sticks
 
 
 def _inverse(matrix: Array) -> Array:
