@@ -32,10 +32,12 @@ def mark(near: Near, s: int, flag: int):
 
 
 @wp.kernel(enable_backward=False)
-def find_common_motion(surface: Surface, near: Near, watch: Watch):
-    """Sum the motion of nodes that were near other surfaces."""
+def find_common_motion(everywhere: int, surface: Surface, near: Near, watch: Watch):
+    """Sum the motion of nodes that were near other surfaces; of all nodes if there were none, or ``everywhere``."""
     s = ASKED * wp.tid()
-    if watch.due[0] == 0 or surface.node[s] < 0 or (near.flags[s] & PAIRED) == 0:
+    if watch.due[0] == 0 or surface.node[s] < 0:
+        return
+    if everywhere == 0 and near.count[0] > 0 and (near.flags[s] & PAIRED) == 0:
         return
     world = surface.world[s]
     motion = surface.d[s] / watch.size

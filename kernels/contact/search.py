@@ -336,16 +336,18 @@ def find_pairs(
 
 @wp.kernel(enable_backward=False)
 def keep_rows(watch: Watch, rows: Rows, old: OldRows):
-    """Copy the present rows, because the search overwrites them."""
+    """Copy the present rows, because the search overwrites them; a thread for each node and edge."""
     i = wp.tid()
     if watch.due[0] == 0:
         return
-    if i < rows.starts.shape[0]:
-        old.starts[i] = rows.starts[i]
-        old.counts[i] = rows.counts[i]
-    if i < row_count(rows):
-        old.other[i] = rows.other[i]
-        old.force[i] = rows.force[i]
+    owners = rows.starts.shape[0]
+    old.starts[i] = rows.starts[i]
+    old.counts[i] = rows.counts[i]
+    row = int(i)
+    while row < row_count(rows):
+        old.other[row] = rows.other[row]
+        old.force[row] = rows.force[row]
+        row += owners
 
 
 @wp.kernel(enable_backward=False)

@@ -16,7 +16,8 @@ FAST = wp.constant(2.0)
 FARTHEST = wp.constant(64.0)
 #: An item that is hit moves as far as the item that hits it; this many times that motion is reserved.
 HIT = wp.constant(2.0)
-#: Nodes with nothing near may move this many times as far, and as many elements: few of them come near anything.
+#: Nodes with nothing near may move this many times as far, and as many elements: few of them come near anything. In
+#: self-contact they may not move more elements: so much of the body is that near.
 ALONE = wp.constant(4.0)
 #: Only one of so many nodes is asked for the common motion; that is summed in multiples of an element's size over this.
 ASKED, PARTS = wp.constant(16), wp.constant(1048576.0)
@@ -41,6 +42,8 @@ class Watch:
     common: wp.array[wp.vec3]
     asked: wp.array2d[wp.int64]  # [W, 4] sum of motions in the step of the search, and the number of nodes
     size: float  # size of the smallest element [m]
+    most_alone: float  # how many elements nodes with nothing near may move
+    is_implicit: int  # whether steps are so long that hardly any search lasts for two
     fastest: wp.array[wp.float32]  # [1] largest motion in the step of the search
     due: wp.array[wp.int32]  # [1] whether a search is due
     missed: wp.array[wp.int32]  # [1] how often an item moved too far
@@ -58,7 +61,10 @@ def stays(gone: float, next_step: float, reach: float):
 @wp.func
 def reserved(step: float, farther: float, watch: Watch):
     """How far an item may move, given its motion in the present step; ``farther``: so many times as far."""
-    ahead = wp.min(farther * AHEAD * step, wp.max(farther * watch.size, FAST * step)) + HIT * watch.fastest[0]
+    farthest = wp.max(wp.min(farther, watch.most_alone) * watch.size, FAST * step)
+    ahead = wp.min(farther * AHEAD * step, farthest)
+    hit = HIT * watch.fastest[0]
+    ahead = wp.where(watch.is_implicit != 0, wp.max(ahead, hit), ahead + hit)
     return watch.least[0] + wp.min(ahead, FARTHEST * watch.size)
 
 

@@ -88,7 +88,7 @@ class JoinedRows:
 
     def reserve(self, motion: float) -> None:
         """Search for pairs with a larger margin, if anything may begin to move so far in a step [m]."""
-        self._pairs.search.reserve(motion)
+        self._pairs.search.serve_implicit(motion)
 
     # --- launches ----------------------------------------------------------------------------------------------------
 

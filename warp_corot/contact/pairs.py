@@ -50,6 +50,8 @@ class Pairs:
         self.surface, self.search, self.device = surface, search, surface.device
         self.friction, self.meets_itself, self._flat_edges = options.friction, options.self_contact, options.flat_edges
         self.revision, self._room, self._taken, self._built = 0, 0, -1, 0
+        if self.meets_itself:
+            search.watch.most_alone = 1.0
         search.finders.append(self._find)
         self.follow()
 
@@ -205,7 +207,7 @@ class Pairs:
         for tree in self._trees:
             tree.refit()
         owners = len(rows.starts)
-        wp.launch(search_kernels.keep_rows, max(owners, self._room), [watch, rows, old], device=device)
+        wp.launch(search_kernels.keep_rows, owners, [watch, rows, old], device=device)
         wp.launch(search_kernels.begin_rows, 1, [watch, rows], device=device)
         inputs = [watch, *(tree.id for tree in self._trees), self.surface.arrays, self.meeting, old]
         wp.launch(search_kernels.find_pairs, owners, inputs, [rows, self.search.near], device=device)

@@ -57,7 +57,7 @@ class Search:
         watch, device = kernels.Watch(), self.device
         watch.least = wp.full(1, LEAST * size, dtype=wp.float32, device=device)
         watch.fastest = wp.zeros(1, dtype=wp.float32, device=device)
-        watch.size = size
+        watch.size, watch.most_alone = size, float(kernels.ALONE)
         watch.due, watch.missed, watch.searches = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(3))
         watch.drift, watch.common = (wp.zeros(surface.worlds, dtype=wp.vec3, device=device) for _ in range(2))
         watch.asked = wp.zeros((surface.worlds, 4), dtype=wp.int64, device=device)
@@ -140,8 +140,9 @@ class Search:
             raise UnstableError(f"surfaces that are hit go farther than {1e3 * self.farthest:.3g} mm in one step")
         self.watch.least.fill_(least)
 
-    def reserve(self, motion: float) -> None:
-        """Search with a larger margin from now on, if anything may go so far in a step [m]."""
+    def serve_implicit(self, motion: float) -> None:
+        """Serve implicit steps, in which anything may begin to move so far [m]."""
+        self.watch.is_implicit = 1
         motion = min(motion, self.farthest / WIDER)
         if motion > float(self.watch.least.numpy()[0]):
             self.watch.least.fill_(motion)
@@ -188,7 +189,8 @@ class Search:
         threads = 1 if self.device.is_cpu else min(dim, MEASURING_THREADS)
         if is_framed:
             few = -(-self.surface.count // kernels.ASKED)
-            wp.launch(near_kernels.find_common_motion, few, [arrays, self.near, self.watch], device=self.device)
+            asked = [int(len(self.surface.parts) == 1), arrays, self.near, self.watch]
+            wp.launch(near_kernels.find_common_motion, few, asked, device=self.device)
         wp.launch(kernels.find_fastest, threads, [threads, *inputs], device=self.device)
         wp.launch(near_kernels.reserve, dim, [*inputs, self.near], device=self.device)
         for find in self.finders:
