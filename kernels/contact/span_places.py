@@ -23,6 +23,8 @@ FIRST, AGAIN, MISSING = (wp.constant(k) for k in range(3))
 ALLOWED = wp.constant(0.2)
 #: An obstacle must be closer to a triangle than to its corners by this many times the size of rounding errors.
 CLOSER = wp.constant(4.0)
+#: The point of a triangle stays if another is closer by at most this many times the law's slack.
+STAYS = wp.constant(8.0)
 
 
 @wp.struct
@@ -50,10 +52,15 @@ def find_span(
     far: float,
     was: wp.vec3,
     side: wp.vec3,
+    before: wp.vec3,
     shapes: Shapes,
     law: Law,
 ):
-    """The point of a triangle that is closest to an obstacle, if that is within reach and closer than the corners."""
+    """The point of a triangle that is closest to an obstacle, if that is within reach and closer than the corners.
+
+    The point with the shares ``before`` stays if it is hardly less close: along an edge of an obstacle all points are
+    about as close, and forces that jump between them do not come to rest.
+    """
     found = Found()
     found.is_near = False
     middle = (a + b + c) / 3.0
@@ -69,13 +76,21 @@ def find_span(
         gap = -2.0 * shapes.size[o][0] - gap
     if gap > far or wp.max(w) > CORNER:
         return found
-    corners = wp.matrix_from_rows(a, b, c)
+    # The fourth is the former point.
+    points = wp.matrix_from_rows(a, b, c, before[0] * a + before[1] * b + before[2] * c)
+    tried = int(3)
+    if wp.dot(was, was) > 0.0 and wp.max(before) <= CORNER and shapes.kind[o] != CAPSULE:
+        tried = 4
     # This loop is not unrolled, so that there is one distance function to compile.
     k = int(0)
-    while k < 3:
-        there, _normal = distance_to(shapes, o, pose, corners[k], most)
-        if there <= gap + CLOSER * law.tolerance:
+    while k < tried:
+        there, away = distance_to(shapes, o, pose, points[k], most)
+        if k < 3 and there <= gap + CLOSER * law.tolerance:
             return found
+        if k == 3 and there <= gap + STAYS * law.slack:
+            w = before
+            gap = there
+            n = away
         k += 1
     found.is_near = True
     found.shares = w
@@ -191,7 +206,9 @@ def locate_spans(
             at = x + e
         middle = (x[0] + x[1] + x[2]) / 3.0
         far = 2.0 * way + wp.length(carried(now, later, middle)) + 2.0 * law.tolerance
-        found = find_span(o, pose, at[0], at[1], at[2], far, was, touches.normal[o, t], shapes, law)
+        found = find_span(
+            o, pose, at[0], at[1], at[2], far, was, touches.normal[o, t], touches.shares[o, t], shapes, law
+        )
         found.moved = carried(now, later, found.shares * x)
         found.opened = wp.dot(found.normal, found.shares * e - found.moved)
         found.is_at_end = is_at_end

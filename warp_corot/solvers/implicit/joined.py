@@ -16,7 +16,7 @@ from .operator import LinearOperator, Preconditioner
 from .touching import NEAR, SETTLED, SHARE, FreePreconditioner, Held, Rows
 
 #: Maximum number of linear solves in a step.
-ROUNDS = 40
+ROUNDS = 100
 
 
 class Parts:
