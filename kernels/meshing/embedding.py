@@ -129,3 +129,13 @@ def find_holders(
             best = least
             holder = candidate
     holders[i] = holder
+
+
+@wp.kernel(enable_backward=False)
+def find_distances(points: wp.array[wp.vec3], mesh: wp.uint64, far: float, distances: wp.array[wp.float32]):
+    """The distance of each point from a surface, at most ``far`` [m]."""
+    i = wp.tid()
+    distances[i] = far
+    found = wp.mesh_query_point_no_sign(mesh, points[i], far)
+    if found.result:
+        distances[i] = wp.length(points[i] - wp.mesh_eval_position(mesh, found.face, found.u, found.v))

@@ -11,10 +11,10 @@ import warp as wp
 from warp_corot.discretization.changing.following import FollowingBinding
 from warp_corot.kernels.remesh import follow as kernels
 from warp_corot.mesh.surfaces.bound import BoundPoints, SurfaceMesh
-from warp_corot.mesh.surfaces.clustering import Clusters
+from warp_corot.mesh.surfaces.clustering import Clusters, resolved
 from warp_corot.mesh.surfaces.splitting import longest_edge, split
 
-from .skin import APART, Skin
+from .skin import APART, Skin, apart, levels_at
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
@@ -53,6 +53,7 @@ class FollowedSurface:
         while self._is_coarse(levels):
             self._take(*split(self._points, self._triangles))
             levels = self._levels()
+        levels = np.maximum(levels, self._least)
         if self._known is None or not np.array_equal(levels, self._known_levels):
             kept, triangles = self._clusters.thinned(levels)
             self._known_levels, self._kept = levels, kept
@@ -70,6 +71,11 @@ class FollowedSurface:
         leaves, weights = source.embed(points)
         bound = BoundPoints(points, source.tets[leaves], weights)
         self._binding = FollowingBinding(bound, source, leaves, device)
+        levels = levels_at(source, bound)
+        sizes = apart(source, levels)
+        fewer = np.rint(3.0 * np.log2(sizes / resolved(SurfaceMesh(points, bound.nodes, weights, triangles), sizes)))
+        #: The level with which the surface keeps its shape, where that is not the level of the first mesh.
+        self._least = np.where(fewer > 0.0, levels + fewer.astype(np.int32), 0)
         self._clusters = Clusters(points, triangles, APART * source.cell_size)
         self._of_points = wp.zeros(len(points), dtype=wp.int32, device=device)
         self._known = None
@@ -88,8 +94,8 @@ class FollowedSurface:
     def _is_coarse(self, levels: Ints) -> bool:
         """Whether triangles are too large for the elements."""
         assert self._body.changing is not None
-        apart = APART * self._body.changing.forest.source.cell_size * 2.0 ** (-levels / 3.0)
-        return 4 * len(self._points) <= MOST_POINTS and longest_edge(self._points, self._triangles, apart) > LONGEST
+        sizes = apart(self._body.changing.forest.source, levels)
+        return 4 * len(self._points) <= MOST_POINTS and longest_edge(self._points, self._triangles, sizes) > LONGEST
 
     def _bound(self, kept: Ints, triangles: Ints) -> SurfaceMesh:
         nodes, weights = (array.numpy()[kept] for array in (self._binding.nodes, self._binding.weights))

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_corot.mesh.forest import TetForest
-from warp_corot.mesh.surfaces.bound import SurfaceMesh
-from warp_corot.mesh.surfaces.clustering import clustered
+from warp_corot.mesh.surfaces.bound import BoundPoints, SurfaceMesh
+from warp_corot.mesh.surfaces.clustering import clustered, resolved
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
@@ -94,11 +94,20 @@ def own_surface(mesh: TetForest | TetMesh) -> SurfaceMesh | None:
     if not isinstance(mesh, TetForest) or mesh.phi is None:
         return None
     whole = mesh.surface()
-    level = np.zeros(mesh.node_count)
+    return clustered(whole, resolved(whole, apart(mesh, levels_at(mesh, whole))))
+
+
+def levels_at(mesh: TetForest, points: BoundPoints) -> Ints:
+    """The finest level around the node with the largest weight at each point."""
+    level = np.zeros(mesh.node_count, np.int32)
     for each in np.unique(mesh.levels):
         level[mesh.tets[mesh.levels == each]] = each  # the finest comes last
-    nearest = np.take_along_axis(whole.nodes, np.argmax(whole.weights, axis=1)[:, None], axis=1)[:, 0]
-    return clustered(whole, APART * mesh.cell_size * 2.0 ** (-level[nearest] / 3.0))
+    return level[np.take_along_axis(points.nodes, np.argmax(points.weights, axis=1)[:, None], axis=1)[:, 0]]
+
+
+def apart(mesh: TetForest, levels: npt.NDArray[np.integer]) -> npt.NDArray[np.float64]:
+    """How far points should be from one another where elements have these levels [m]."""
+    return APART * mesh.cell_size * 2.0 ** (-levels / 3.0)
 
 
 def _edges_of(triangles: Ints) -> tuple[Ints, Ints]:

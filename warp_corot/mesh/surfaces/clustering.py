@@ -11,6 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from .bound import SurfaceMesh
+from .locating import distances_from
+
+#: Where vertices would be farther from the coarser surface than this many sizes, sizes are halved, this many times.
+LOST, HALVED = 0.15, 2
+#: The weight of the distance from the middle of a cluster, among squares of distances from planes.
+FLAT = 0.1
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.integer]
@@ -19,17 +25,19 @@ Ints = npt.NDArray[np.integer]
 def clustered(surface: SurfaceMesh, sizes: Floats) -> SurfaceMesh:
     """A surface with vertices about a size apart; each is a vertex of the given one.
 
-    Vertices become one if they are in the same cube of that size and a path of edges within it connects them, so that
-    the two sides of a sheet stay two. A closed surface stays closed. Parts smaller than a cube vanish, but a piece of
-    the surface that would vanish as a whole stays as it is.
+    Each stands for the vertices of its cluster: the one nearest to the planes of their triangles, so that edges and
+    corners stay. Vertices become one if they are in the same cube of that size and a path of edges within it connects
+    them, so that the two sides of a sheet stay two. A closed surface stays closed. Parts smaller than a cube vanish,
+    but a piece of the surface that would vanish as a whole stays as it is.
 
     Args:
         surface: The surface.
         sizes: The size at each of its vertices [m], [V]; vertices of different sizes stay apart.
     """
-    kept, triangles = _merged(surface.points, surface.triangles, sizes, 0.0)
+    quadrics = _quadrics(surface.points, surface.triangles)
+    kept, triangles, quadrics = _merged(surface.points, surface.triangles, quadrics, sizes, 0.0)
     # Vertices on both sides of a cube's wall may still be close together.
-    again, triangles = _merged(surface.points[kept], triangles, 0.5 * sizes[kept], 0.5)
+    again, triangles, _ = _merged(surface.points[kept], triangles, quadrics, 0.5 * sizes[kept], 0.5)
     kept = kept[again]
     pieces = _connected(_edges(surface.triangles), len(surface.points))
     lost = np.zeros(len(surface.points), bool)
@@ -49,16 +57,18 @@ def clustered(surface: SurfaceMesh, sizes: Floats) -> SurfaceMesh:
     )
 
 
-def _merged(points: Floats, triangles: Ints, sizes: Floats, shift: float) -> tuple[Ints, Ints]:
-    """One pass with cubes that are shifted by a fraction of their size: the vertices that are left, and triangles of
-    these."""
-    cluster, nearest = _clustered(points, _edges(triangles), sizes, shift)
+def _merged(
+    points: Floats, triangles: Ints, quadrics: Floats, sizes: Floats, shift: float
+) -> tuple[Ints, Ints, Floats]:
+    """One pass with cubes that are shifted by a fraction of their size: the vertices that are left, triangles of these,
+    and their quadrics."""
+    cluster, chosen, sums = _clustered(points, _edges(triangles), quadrics, sizes, shift)
     used, corners = np.unique(_distinct(cluster[triangles]), return_inverse=True)
-    return nearest[used], corners.reshape(-1, 3)
+    return chosen[used], corners.reshape(-1, 3), sums[used]
 
 
-def _clustered(points: Floats, ends: Ints, sizes: Floats, shift: float) -> tuple[Ints, Ints]:
-    """The cluster of each vertex in one such pass, and the vertex that is nearest to the middle of each cluster."""
+def _clustered(points: Floats, ends: Ints, quadrics: Floats, sizes: Floats, shift: float) -> tuple[Ints, Ints, Floats]:
+    """The cluster of each vertex in one such pass, the vertex that stands for each cluster, and sums of quadrics."""
     cubes = np.column_stack([np.floor(points / sizes[:, None] + shift), sizes])
     first, second = ends.T
     together = np.ones(len(first), bool)
@@ -66,11 +76,60 @@ def _clustered(points: Floats, ends: Ints, sizes: Floats, shift: float) -> tuple
         together &= numbers[first] == numbers[second]
     cluster = _connected(ends[together], len(points))
     count = int(cluster.max(initial=-1)) + 1
-    members = np.bincount(cluster, minlength=count)
-    middles = np.column_stack([np.bincount(cluster, points[:, axis], count) for axis in range(3)]) / members[:, None]
-    far = np.linalg.norm(points - middles[cluster], axis=1)
-    order = np.lexsort((far, cluster))
-    return cluster, order[np.searchsorted(cluster[order], np.arange(count))]
+    sums: Floats = np.column_stack([np.bincount(cluster, each, count) for each in quadrics.T])
+    error = _errors(points, cluster, sums)
+    order = np.lexsort((error, cluster))
+    return cluster, order[np.searchsorted(cluster[order], np.arange(count))], sums
+
+
+def _quadrics(points: Floats, triangles: Ints) -> Floats:
+    """For each vertex the sum, over its triangles, of the area times the products of the plane's four numbers [V, 10]
+    (Garland and Heckbert 1997)."""
+    a, b, c = np.moveaxis(points[triangles], 1, 0)
+    normal = np.cross(b - a, c - a)
+    area = np.linalg.norm(normal, axis=1)
+    normal /= np.maximum(area, 1e-300)[:, None]
+    plane = np.column_stack([normal, -np.einsum("fc,fc->f", normal, a)])
+    corners = triangles.ravel()
+    rows = [area * plane[:, i] * plane[:, j] for i in range(4) for j in range(i, 4)]
+    return np.column_stack([np.bincount(corners, np.repeat(each, 3), len(points)) for each in rows])
+
+
+def _errors(points: Floats, cluster: Ints, sums: Floats) -> Floats:
+    """How far each vertex is from the planes of its cluster's triangles, so that the one on an edge or in a corner
+    stands for them; in a plane, how far from the middle: squares times areas."""
+    members = np.bincount(cluster)
+    middles = np.column_stack([np.bincount(cluster, points[:, axis]) for axis in range(3)]) / members[:, None]
+    x = np.column_stack([points, np.ones(len(points))])
+    own, error, number = sums[cluster], np.zeros(len(points)), 0
+    for i in range(4):
+        for j in range(i, 4):
+            error += (1.0 if i == j else 2.0) * own[:, number] * x[:, i] * x[:, j]
+            number += 1
+    areas = own[:, [0, 4, 7]].sum(axis=1)
+    return error + FLAT * areas * ((points - middles[cluster]) ** 2).sum(axis=1)
+
+
+def resolved(surface: SurfaceMesh, sizes: Floats) -> Floats:
+    """Sizes for ``clustered`` that are halved, up to twice, where the surface would lose its shape: where a mesh is
+    coarse for its curvature or its thickness.
+
+    Args:
+        surface: The surface.
+        sizes: The size at each of its vertices [m], [V].
+    """
+    for _ in range(HALVED):
+        thin = clustered(surface, sizes)
+        far = distances_from(thin.points, thin.triangles, surface.points, float(sizes.max()))
+        lost = far > LOST * sizes
+        if not lost.any():
+            break
+        cubes = np.floor(surface.points / sizes[:, None]).astype(np.int64)
+        _, cube = np.unique(np.column_stack([cubes, sizes.view(np.int64)]), axis=0, return_inverse=True)
+        in_lost = np.zeros(len(sizes), bool)
+        in_lost[cube.ravel()[lost]] = True
+        sizes = np.where(in_lost[cube.ravel()], 0.5 * sizes, sizes)
+    return sizes
 
 
 class Clusters:
@@ -89,6 +148,7 @@ class Clusters:
         self._points, self._triangles, self._size = points, triangles, size
         self._ends = _edges(triangles)
         self._pieces = _connected(self._ends, len(points))
+        self._quadrics = _quadrics(points, triangles)
         self._known: dict[int, tuple[Ints, Ints]] = {}
 
     def thinned(self, levels: Ints) -> tuple[Ints, Ints]:
@@ -104,10 +164,10 @@ class Clusters:
         for level in np.flatnonzero(np.bincount(levels)):
             cluster, order = self._at(int(level))
             members = order[levels[order] == level]
-            nearest = np.empty(len(self._points), np.int64)
-            # The last of those with the same number counts, which is the nearest.
-            nearest[cluster[members]] = members
-            stands_for[members] = nearest[cluster[members]]
+            best = np.empty(len(self._points), np.int64)
+            # The last of those with the same number counts, which has the least error.
+            best[cluster[members]] = members
+            stands_for[members] = best[cluster[members]]
         found = _distinct(stands_for[self._triangles])
         stays = np.zeros(len(self._points), bool)
         stays[self._pieces[found[:, 0]]] = True
@@ -120,15 +180,16 @@ class Clusters:
         return np.flatnonzero(used), places[found].astype(np.int32)
 
     def _at(self, level: int) -> tuple[Ints, Ints]:
-        """The cluster of each vertex, and all vertices, those farthest from the middles of their clusters first."""
+        """The cluster of each vertex, and all vertices, those with the largest errors first."""
         if level not in self._known:
             sizes = np.full(len(self._points), self._size * 2.0 ** (-level / 3.0))
-            first, near = _clustered(self._points, self._ends, sizes, 0.0)
+            first, chosen, sums = _clustered(self._points, self._ends, self._quadrics, sizes, 0.0)
             ends = first[self._ends]
-            second, nearer = _clustered(self._points[near], ends[ends[:, 0] != ends[:, 1]], 0.5 * sizes[near], 0.5)
+            ends = ends[ends[:, 0] != ends[:, 1]]
+            second, _, _ = _clustered(self._points[chosen], ends, sums, 0.5 * sizes[chosen], 0.5)
             cluster = second[first]
-            far = np.linalg.norm(self._points - self._points[near[nearer]][cluster], axis=1)
-            self._known[level] = cluster, np.argsort(-far, kind="stable")
+            sums = np.column_stack([np.bincount(second, each) for each in sums.T])
+            self._known[level] = cluster, np.argsort(-_errors(self._points, cluster, sums), kind="stable")
         return self._known[level]
 
 

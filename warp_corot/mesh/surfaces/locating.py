@@ -86,3 +86,16 @@ def nearest_faces(nodes: np.ndarray, faces: np.ndarray, points: np.ndarray, far:
     closest = wp.empty(len(points), dtype=wp.int32, device=device)
     wp.launch(kernels.nearest_faces, len(points), [given, mesh.id, far], [closest], device=device)
     return closest.numpy()
+
+
+def distances_from(nodes: np.ndarray, faces: np.ndarray, points: np.ndarray, far: float) -> np.ndarray:
+    """The distance of each point from a surface, at most ``far`` [m], float32 [n]."""
+    device, middle = wp.get_device("cpu"), nodes.mean(axis=0)
+    mesh = wp.Mesh(
+        wp.array(nodes - middle, dtype=wp.vec3, device=device),
+        wp.array(np.ascontiguousarray(faces, dtype=np.int32).ravel(), dtype=wp.int32, device=device),
+    )
+    given = wp.array(points - middle, dtype=wp.vec3, device=device)
+    found = wp.empty(len(points), dtype=wp.float32, device=device)
+    wp.launch(kernels.find_distances, len(points), [given, mesh.id, far], [found], device=device)
+    return found.numpy()
