@@ -72,8 +72,7 @@ def _rest_in_contact(sim: Simulation) -> str:
     began = time.perf_counter()
     found = bring_to_rest(sim)
     if not found.converged.all():
-        why = "the steps were not enough; a body that may roll or slide needs --fix"
-        raise UnstableError(f"--static: not converged: {why}")
+        raise UnstableError(f"--static: {found.message}")
     return (
         f"at rest in contact after {found.iterations} long steps, {found.linear_iterations} linear iterations, "
         f"{time.perf_counter() - began:.2f} s"

@@ -39,6 +39,7 @@ class Rest(NamedTuple):
         residual: The norm of forces that are out of balance, contact included, over that of the loads or of
             contact, of the world where it is largest.
         contact: The contact of the last step; None if the search did not end.
+        rolls: Whether the last step was mostly a motion without deformation, of some body that nothing holds.
     """
 
     converged: npt.NDArray[np.bool_]
@@ -47,6 +48,16 @@ class Rest(NamedTuple):
     correction: float
     residual: float
     contact: Contacts | None
+    rolls: bool
+
+    @property
+    def message(self) -> str:
+        """What happened, in one line."""
+        if self.converged.all():
+            return "the body is at rest"
+        if self.rolls:
+            return "not converged: the body still rolls, slides or falls as a whole; fix some nodes, or add friction"
+        return "not converged: the steps were not enough"
 
 
 def checked_obstacles(given: Shape | Sequence[Shape]) -> tuple[Shape, ...]:
@@ -90,7 +101,7 @@ def rest_on(
         preconditioner: The preconditioner of the linear solves.
     """
     starts = [body.displacements.numpy().copy() for body in bodies]
-    steps, linear, worlds = 0, 0, bodies[0].worlds
+    steps, linear, worlds, rolls = 0, 0, bodies[0].worlds, False
     correction, converged = np.full(worlds, np.inf), np.zeros(worlds, bool)
     for number, (length, settling) in enumerate(LENGTHS):
         dt = length * max(_wave_time(body) for body in bodies)
@@ -115,11 +126,12 @@ def rest_on(
         linear += sim.solves.linear_iterations if sim.solves is not None else 0
         if converged.all():
             break
+        rolls = any(_rolls(body) for body in bodies)
         for body, start in zip(bodies, starts, strict=True):
             body.displacements = start
     contact_then = sim.contact if converged.all() else None
     residual = float(_residuals(bodies, fields, loads).max())
-    return Rest(converged, steps, linear, float(correction.max()), residual, contact_then)
+    return Rest(converged, steps, linear, float(correction.max()), residual, contact_then, rolls)
 
 
 def _wave_time(body: SoftBody) -> float:
@@ -156,3 +168,17 @@ def _residual(body: SoftBody, field: ForceField, loads: npt.NDArray[np.float64])
     rest, load, push = (np.linalg.norm(each.reshape(worlds, -1), axis=1) for each in (forces, loads, pushes))
     scale = np.maximum(load, push)
     return np.asarray(rest / np.where(scale > 0.0, scale, 1.0))
+
+
+def _rolls(body: SoftBody) -> bool:
+    """Whether nothing holds the body in a world, and its last motion there was mostly that of a rigid body."""
+    held = body.conditions.held_mask().reshape(body.worlds, -1).any(axis=1)
+    x, v = (array.numpy().reshape(body.worlds, -1, 3).astype(np.float64) for array in (body.positions, body.velocities))
+    for world in np.flatnonzero(~held):
+        turns = np.stack([np.cross(axis, x[world] - x[world].mean(axis=0)) for axis in np.eye(3)])
+        shifts = np.broadcast_to(np.eye(3)[:, None], turns.shape)
+        modes = np.concatenate([shifts, turns]).reshape(6, -1).T
+        rest = v[world].ravel() - modes @ np.linalg.lstsq(modes, v[world].ravel(), rcond=None)[0]
+        if np.linalg.norm(rest) < 0.5 * np.linalg.norm(v[world]):
+            return True
+    return False

@@ -264,10 +264,9 @@ def _rest_on(
         preconditioner=preconditioner,
     )
     answer.finish()
-    message = "the body is at rest" if found.converged.all() else "not converged: the steps were not enough"
     report = answer.report(
         began,
-        message,
+        found.message,
         iterations=found.iterations,
         linear_iterations=found.linear_iterations,
         residual=found.residual,
