@@ -161,8 +161,6 @@ def test_what_has_no_gradient_is_refused(device):
         wc.static_gradient(body, objective, contact=wc.Contact(friction=0.01), **given)
     with pytest.raises(wc.InputError, match="it must be a Contact"):
         wc.static_gradient(body, objective, contact="none", **given)
-    with pytest.raises(wc.InputError, match="contact with obstacles only"):
-        wc.static_gradient(body, objective, contact=wc.Contact(friction=0.0, self_contact=True), **given)
     far = wc.static_gradient(
         body,
         objective,

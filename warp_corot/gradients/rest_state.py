@@ -10,6 +10,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
+from warp_corot.contact.contacts import Contacts
 from warp_corot.contact.options import Contact
 from warp_corot.contact.reading import obstacle_touches
 from warp_corot.contact.shapes import Shape
@@ -24,6 +25,7 @@ from . import parameters
 from .adjoint import Adjoint
 from .element_work import ElementWork
 from .sums import derivatives
+from .touches import pairs_of
 from .touching import RestingContact
 
 Array = npt.NDArray[np.float64]
@@ -77,9 +79,7 @@ class RestState:
         self.report, touching = static_answer(body, model=law, gravity=gravity, **options)
         if not self.report.converged:
             raise ConvergenceError(f"there is no gradient: {self.report.message}")
-        touched = (
-            None if touching is None else RestingContact(body, touching, list(obstacle_touches(touching)), friction)
-        )
+        touched = None if touching is None else _resting(body, touching, friction)
         self._contact = touched if touched is not None and touched.pushes else None
         self._obstacle_count = len(checked_obstacles(obstacles))
         self.law, self._preconditioner, self._tolerance = law, preconditioner, adjoint_tolerance
@@ -147,17 +147,25 @@ def bound(body: SoftBody, law: Model, names: Sequence[str]) -> tuple[ForceField,
     return law.bind(body), parameters.needed(names)
 
 
+def _resting(body: SoftBody, contacts: Contacts, friction: Sequence[float]) -> RestingContact:
+    """The contacts of a body at rest."""
+    return RestingContact(body, contacts, [*obstacle_touches(contacts), *pairs_of(contacts)], friction)
+
+
 def friction_of(obstacles: Sequence[Shape], contact: Contact | None) -> list[float]:
     """The coefficient of friction of each obstacle.
 
     Raises:
-        InputError: The body touches itself.
+        InputError: The body touches itself with friction.
     """
     contact = Contact() if contact is None else contact
     if not isinstance(contact, Contact):
         raise InputError(f"contact is {shown(contact)}; it must be a Contact")
-    if contact.self_contact:
-        raise InputError("the body may touch itself; gradients are of contact with obstacles only")
+    if contact.self_contact and contact.friction > 0.0:
+        raise InputError(
+            f"the body touches itself with friction {contact.friction:g}; gradients need that contact without: give "
+            "friction=0.0"
+        )
     return [contact.friction if shape.friction is None else shape.friction for shape in obstacles]
 
 

@@ -248,6 +248,8 @@ def _checked_contact(
     if contact is not None or things:
         if not isinstance(integrator, BackwardEuler):
             raise InputError(f"integrator is {shown(integrator)}; runs with contact need BackwardEuler for gradients")
+        if contact is not None and contact.self_contact:
+            raise InputError("the body may touch itself; gradients of runs are of contact with obstacles only")
         if any(friction_of(things, contact)):
             raise InputError("obstacles have friction; runs with gradients need contact without: give friction=0.0")
     return things

@@ -101,9 +101,9 @@ def static_gradient(
             "activation", "gravity", "obstacles".
         model, gravity, tolerance, iterations, load_steps, preconditioner: As for ``solve_static``.
         adjoint_tolerance: Tolerance of the adjoint solve, its residual over the right side.
-        obstacles, contact: As for ``solve_static``, without self-contact. The gradient is that of the contacts at rest:
-            it jumps where a contact begins or ends. Friction must hold all places that have it; they count as held
-            where they are.
+        obstacles, contact: As for ``solve_static``. The gradient is that of the contacts at rest: it jumps where a
+            contact begins or ends. Friction of obstacles must hold all places that have it; they count as held where
+            they are. Self-contact must be without friction, and at places inside triangles and edges.
         precision: "float32": everything is computed on the body's device. "float64": the answer is refined on the host,
             by Newton's method with a sparse direct solver, and the adjoint is solved there; positions are vec3d. For
             the models ``Corotated``, ``Linear``, ``StVenantKirchhoff`` and ``NeoHookean`` with isotropic materials, and
@@ -111,7 +111,7 @@ def static_gradient(
 
     Raises:
         InputError: As ``solve_static``, a name is none of these, the model or the material has no such derivative, a
-            world has no held node, contacts slip, or the objective gives something else.
+            world has no held node, contacts slip or are where gradients jump, or the objective gives something else.
         ConvergenceError: The body does not come to rest, the state of rest is not stable, or the adjoint solve does not
             converge.
     """

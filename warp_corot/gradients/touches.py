@@ -1,9 +1,9 @@
-"""Where obstacles push a body, and whether friction holds it there."""
+"""Where obstacles and its own surface push a body, and whether friction holds it there."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -22,14 +22,86 @@ Ints = npt.NDArray[np.int64]
 
 #: The share of Coulomb's bound from which on a contact slips.
 SLIPS = 0.999
+#: Shares of corners below this are zero: the contact is on an edge or a corner.
+LEAST_SHARE = 1e-5
 
 
-def unit_normal(touch: Touch) -> Array:
+class Pair(NamedTuple):
+    """A node at a triangle of the same body, or an edge at another one, that pushed in the last step.
+
+    Attributes:
+        is_edge: Whether it is two edges, places 0, 1 and 2, 3; else a node and the corners of a triangle.
+        obstacle: -1.
+        places, normal, force: As of a ``Touch``; the normal and the force are those of the first side.
+        shares: The weights of places in the gap, negative on the other side.
+    """
+
+    is_edge: bool
+    obstacle: int
+    places: npt.NDArray[np.integer]
+    shares: Array
+    normal: Array
+    force: Array
+
+
+def pairs_of(contacts: Contacts) -> list[Pair]:
+    """The pairs of soft surfaces that pushed in the last step.
+
+    Raises:
+        InputError: Some push at the border of a triangle or at the end of an edge.
+    """
+    if contacts.pairs is None:
+        return []
+    rows = contacts.pairs.rows
+    count = min(int(rows.total.numpy()[0]), len(rows.owner))
+    acts, owner = rows.acts.numpy()[:count], rows.owner.numpy()[:count]
+    force, normal, shares = (each.numpy()[:count].astype(float) for each in (rows.force, rows.normal, rows.shares))
+    places, nodes = rows.places.numpy(), contacts.surface.count
+    acting = np.flatnonzero((acts != 0) & force.any(axis=1))
+    borders = int((np.abs(shares[acting]).min(axis=1, initial=1.0) < LEAST_SHARE).sum())
+    if borders:
+        raise InputError(
+            f"{borders} of {len(acting)} contacts of the body with itself are at borders of triangles, where gradients "
+            "jump"
+        )
+    return [Pair(bool(owner[k] >= nodes), -1, places[k], shares[k], normal[k], force[k]) for k in acting]
+
+
+def pair_hessian(pair: Pair, x: Array) -> Array:
+    """The second derivative of a pair's gap with respect to its four places x [1/m], [12, 12], by central differences
+    of the first."""
+    step = 1e-5 * float(np.abs(x - x[0]).max())
+    slopes = np.zeros((12, 12))
+    for k in range(12):
+        by = np.zeros(12)
+        by[k] = step
+        ahead, behind = (_pair_slope(pair, x + sign * by.reshape(4, 3)) for sign in (1.0, -1.0))
+        slopes[k] = (ahead - behind) / (2.0 * step)
+    return np.asarray(0.5 * (slopes + slopes.T))
+
+
+def _pair_slope(pair: Pair, x: Array) -> Array:
+    """The derivative of a pair's gap with respect to its four places, [12]."""
+    if pair.is_edge:
+        along, across = x[1] - x[0], x[3] - x[2]
+        normal = np.cross(along, across)
+        s, t, _ = np.linalg.solve(np.stack([along, -across, normal], axis=1), x[2] - x[0])
+        shares = np.array([1.0 - s, s, t - 1.0, -t])
+    else:
+        first, second = x[2] - x[1], x[3] - x[1]
+        normal = np.cross(first, second)
+        s, t, _ = np.linalg.solve(np.stack([first, second, normal], axis=1), x[0] - x[1])
+        shares = np.array([1.0, s + t - 1.0, -s, -t])
+    normal = normal * np.sign(normal @ pair.normal) / np.linalg.norm(normal)
+    return np.asarray((shares[:, None] * normal).ravel())
+
+
+def unit_normal(touch: Touch | Pair) -> Array:
     """A contact's normal, [3]."""
     return np.asarray(touch.normal / np.linalg.norm(touch.normal))
 
 
-def sticking(touches: Sequence[Touch], friction: Sequence[float]) -> list[bool]:
+def sticking(touches: Sequence[Touch | Pair], friction: Sequence[float]) -> list[bool]:
     """Whether friction holds each contact.
 
     Args:
@@ -41,7 +113,7 @@ def sticking(touches: Sequence[Touch], friction: Sequence[float]) -> list[bool]:
     """
     sticks, slipping = [], 0
     for touch in touches:
-        normal, bound = unit_normal(touch), friction[touch.obstacle]
+        normal, bound = unit_normal(touch), 0.0 if isinstance(touch, Pair) else friction[touch.obstacle]
         push = float(touch.force @ normal)
         across = float(np.linalg.norm(touch.force - push * normal))
         sticks.append(bound > 0.0)

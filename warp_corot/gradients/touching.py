@@ -15,7 +15,7 @@ from warp_corot.errors import InputError
 from warp_corot.kernels.gradients import contact as kernels
 from warp_corot.solvers.implicit.operator import LinearOperator, Preconditioner
 
-from .touches import Array, Ints, sticking, unit_normal
+from .touches import LEAST_SHARE, Array, Ints, Pair, pair_hessian, sticking, unit_normal
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -28,8 +28,6 @@ MOST_ROWS = 4000
 DEPENDENT = 1e-7
 #: The step of differences of obstacles' normals, over the size of the body.
 STEP = 1e-3
-#: Shares of corners below this are zero: the contact is on an edge or a corner.
-LEAST_SHARE = 1e-5
 #: Curvature times the size of the body, below which an obstacle is flat.
 FLAT = 1e-2
 
@@ -45,19 +43,19 @@ class RestingContact:
     Args:
         body: The body.
         contacts: Its contact in the last step.
-        found: Where obstacles push it.
+        found: Where obstacles push it, and pairs of its own surface that push each other.
         friction: The coefficient of each obstacle.
 
     Attributes:
         pushes: Whether there are any contacts.
-        obstacle: The obstacle of each column of N, int [m].
+        obstacle: The obstacle of each column of N, int [m]; -1 for pairs.
         normals: The directions of these columns [m, 3].
 
     Raises:
         InputError: There are more than ``MOST_ROWS`` columns, or contacts that slip.
     """
 
-    def __init__(self, body: SoftBody, contacts: Contacts, found: Sequence[Touch], friction: Sequence[float]):
+    def __init__(self, body: SoftBody, contacts: Contacts, found: Sequence[Touch | Pair], friction: Sequence[float]):
         self._body, self._contacts = body, contacts
         sticks = sticking(found, friction)
         touches = [touch for touch, stuck in zip(found, sticks, strict=True) for _ in range(3 if stuck else 1)]
@@ -78,7 +76,7 @@ class RestingContact:
         self._inverse = _inverse((self._free_normals.T @ self._free_normals).toarray())
         self._upload()
 
-    def _assemble(self, touches: list[Touch]) -> None:
+    def _assemble(self, touches: list[Touch | Pair]) -> None:
         """The sparse matrices: ``_all_normals`` N [3n, m], ``_turning`` G [3n, 3n], and the sums of G's columns over
         the nodes of each contact, ``_moved`` [m, 3n, 3] as a list."""
         from scipy.sparse import coo_array
@@ -86,7 +84,7 @@ class RestingContact:
         count, m = 3 * self._body.sizes.nodes, len(touches)
         carriers = [self._carried(touch) for touch in touches]
         each_world = self._body.sizes.nodes // self._body.worlds
-        curvatures = self._curvatures(touches, [int(nodes[0]) // each_world for nodes, _ in carriers])
+        curvatures = self._curvatures(touches, np.array([int(nodes[0]) // each_world for nodes, _ in carriers]))
         x = self._contacts.surface.arrays.x.numpy().astype(float)
         entries, blocks, self._moved = [], [], []
         for i, (touch, normal, curvature) in enumerate(zip(touches, self.normals, curvatures, strict=True)):
@@ -94,7 +92,9 @@ class RestingContact:
             rows = (3 * nodes[:, None] + np.arange(3)).ravel()
             entries.append((rows, np.full(len(rows), i), (carried.T @ touch.shares)[:, None] * normal))
             push = float(touch.force @ normal) if self._yields[i] else 0.0
-            change = -push * self._hessian(touch, x[touch.places], normal, curvature)
+            at = x[touch.places]
+            bends = pair_hessian(touch, at) if isinstance(touch, Pair) else self._hessian(touch, at, normal, curvature)
+            change = -push * bends
             spread = np.kron(carried, np.eye(3))
             block = spread.T @ change @ spread
             blocks.append((np.repeat(rows, len(rows)), np.tile(rows, len(rows)), block))
@@ -104,7 +104,7 @@ class RestingContact:
         first, second, values = (np.concatenate([np.ravel(b[k]) for b in blocks]) for k in range(3))
         self._turning: csr_array = coo_array((values, (first, second)), shape=(count, count)).tocsr()
 
-    def _carried(self, touch: Touch) -> tuple[Ints, Array]:
+    def _carried(self, touch: Touch | Pair) -> tuple[Ints, Array]:
         """The nodes, numbered over all worlds, that carry a contact's places, and the weight of each node [places,
         nodes]."""
         surface, count = self._contacts.surface, self._body.sizes.nodes // self._body.worlds
@@ -115,25 +115,31 @@ class RestingContact:
             weights[row, np.searchsorted(nodes, those)] = shares
         return nodes + found[0][1] * count, weights
 
-    def _curvatures(self, touches: list[Touch], worlds: list[int]) -> Array:
+    def _curvatures(self, all_touches: list[Touch | Pair], worlds: Ints) -> Array:
         """The second derivatives of obstacles' distances at contacts [1/m], [m, 3, 3], by central differences of
-        normals."""
+        normals; zero for pairs."""
         contacts, device = self._contacts, self._contacts.device
+        curvatures = np.zeros((len(all_touches), 3, 3))
+        touches = [touch for touch in all_touches if isinstance(touch, Touch)]
+        if not touches:
+            return curvatures
+        with_obstacles = self.obstacle >= 0
         step = STEP * float(np.ptp(self._body.mesh.points, axis=0).max())
         steps = step * np.concatenate([np.eye(3), -np.eye(3)])
         points = np.array([touch.point for touch in touches])[:, None] + steps
         inputs = [
             contacts.obstacles.shapes,
             contacts.obstacles.motions,
-            wp.array(self.obstacle, dtype=wp.int32, device=device),
-            wp.array(worlds, dtype=wp.int32, device=device),
+            _ints(self.obstacle[with_obstacles], device),
+            _ints(worlds[with_obstacles], device),
             wp.array(points, dtype=wp.vec3, device=device),
         ]
         normals = wp.zeros((len(touches), 6), dtype=wp.vec3, device=device)
         wp.launch(kernels.find_normals, normals.shape, inputs, [normals], device=device)
         found = normals.numpy().astype(float)
         slopes = (found[:, :3] - found[:, 3:]) / (2.0 * step)
-        return 0.5 * (slopes + np.swapaxes(slopes, 1, 2))
+        curvatures[with_obstacles] = 0.5 * (slopes + np.swapaxes(slopes, 1, 2))
+        return curvatures
 
     def _hessian(self, touch: Touch, x: Array, normal: Array, curvature: Array) -> Array:
         """The second derivative of the gap with respect to its places x [1/m], [3 places, 3 places]."""
@@ -225,6 +231,8 @@ class RestingContact:
         found = np.zeros((self._contacts.obstacles.count, 3))
         flat = motion.ravel()
         for i, (rows, moved) in enumerate(self._moved):
+            if self.obstacle[i] < 0:
+                continue
             found[self.obstacle[i]] += multipliers[i] * self.normals[i] + flat[rows] @ moved
         return found
 
@@ -249,12 +257,18 @@ class RestingPreconditioner:
 
     def __init__(self, preconditioner: Preconditioner, contact: RestingContact):
         self._preconditioner, self._contact = preconditioner, contact
+        self._r: wp.array | None = None
 
     def update(self, operator: LinearOperator) -> None:
         self._preconditioner.update(operator)
 
     def apply(self, r: wp.array, z: wp.array) -> None:
-        self._preconditioner.apply(r, z)
+        if self._r is None:
+            self._r = wp.zeros_like(r)
+        # Rounding moves residuals out of the range of S.
+        wp.copy(self._r, r)
+        self._contact.launch_free(self._r)
+        self._preconditioner.apply(self._r, z)
         self._contact.launch_free(z)
 
 
