@@ -4,28 +4,23 @@ import numpy as np
 import pytest
 import warp as wp
 from half_balls import CONTACT, DEPTH, FORCE, HALF, POISSON, RADIUS, YOUNG, boussinesq
-from soft_blocks import DOWN, SOFT, force_on, weight
+from organs import BALL, SOFT, ball_mesh, brick_mesh, fork_mesh, ground
+from soft_blocks import DOWN, force_on, weight
 
 import warp_corot as wc
 
-BALL, STEP = 0.02, 0.01
+STEP = 0.01
 EULER = wc.BackwardEuler(dt=STEP)
 
 
 @pytest.fixture(scope="module")
 def ball():
-    return wc.TetForest.from_domain(wc.Domain.sphere(BALL), target_elements=400)
+    return ball_mesh()
 
 
 @pytest.fixture(scope="module")
 def brick():
-    """A brick whose sides lie inside its tetrahedra."""
-    lower, upper = (-0.013, -0.011, -0.007), (0.013, 0.011, 0.007)
-    return wc.TetForest.from_domain(wc.Domain.box(lower, upper), target_elements=400)
-
-
-def ground(height=-BALL):
-    return wc.Ground(normal=(0, 0, 1), offset=height)
+    return brick_mesh()
 
 
 def lowest(body):
@@ -105,9 +100,7 @@ def test_a_static_answer_is_where_steps_come_to_rest(ball, device):
 
 def test_a_static_answer_with_many_places_takes_one_search(device):
     """Forces go on from step to step: the 150 places below a brick come to rest with small gaps."""
-    lower, upper = (-0.013, -0.011, -0.007), (0.013, 0.011, 0.007)
-    body = wc.SoftBody(wc.TetForest.from_domain(wc.Domain.box(lower, upper), target_elements=3000), SOFT, device=device)
-    below = ground(lower[2])
+    body, below = wc.SoftBody(brick_mesh(3000), SOFT, device=device), ground(-0.007)
     report = wc.solve_static(body, obstacles=below, contact=wc.Contact(friction=0.5), gravity=DOWN)
     assert report.converged
     assert report.iterations < 30
@@ -137,10 +130,7 @@ def test_two_organs_and_the_ground(brick, device, steps):
 @pytest.mark.slow
 def test_the_prongs_of_a_fork_touch_each_other(device):
     """As in explicit steps; plates of 12 mm may sink in between points by a fifth of half of that."""
-    base = wc.Domain.capsule((-0.012, 0, 0), (0.012, 0, 0), 0.006)
-    prongs = [wc.Domain.capsule((x, 0, 0), (x, 0, 0.05), 0.005) for x in (-0.012, 0.012)]
-    mesh = wc.TetForest.from_domain(base | prongs[0] | prongs[1], target_elements=500)
-    body = wc.SoftBody(mesh, SOFT, device=device)
+    body = wc.SoftBody(fork_mesh(), SOFT, device=device)
     body.fix("z < 0.002")
     plates = [wc.Tool(wc.Box((0.01, 0.04, 0.012), position=(x, 0.0, 0.042)), speed=0.2) for x in (-0.024, 0.024)]
     contact = wc.Contact(friction=0.3, self_contact=True)

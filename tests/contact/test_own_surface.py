@@ -4,27 +4,21 @@ import numpy as np
 import pytest
 import warp as wp
 from half_balls import CONTACT, DEPTH, FORCE, HALF, POISSON, RADIUS, YOUNG, boussinesq
+from organs import BALL, SOFT, ball_mesh, brick_mesh, fork_mesh, ground
 
 import warp_corot as wc
 
-SOFT = wc.Isotropic(young=2e4, poisson=0.4, density=1000.0)
-BALL, AXIS = 0.02, (0.5, 0.5, 0.5, 0.5)
+AXIS = (0.5, 0.5, 0.5, 0.5)
 
 
 @pytest.fixture(scope="module")
 def ball():
-    return wc.TetForest.from_domain(wc.Domain.sphere(BALL), target_elements=400)
+    return ball_mesh()
 
 
 @pytest.fixture(scope="module")
 def brick():
-    """A brick whose sides lie inside its tetrahedra."""
-    lower, upper = (-0.013, -0.011, -0.007), (0.013, 0.011, 0.007)
-    return wc.TetForest.from_domain(wc.Domain.box(lower, upper), target_elements=400)
-
-
-def ground(height=-BALL):
-    return wc.Ground(normal=(0, 0, 1), offset=height)
+    return brick_mesh()
 
 
 def momenta(body):
@@ -169,10 +163,7 @@ def test_two_organs_collide(ball, device):
 
 def test_the_prongs_of_a_fork_touch_each_other(device):
     """Two plates press them together. The tetrahedra around them would have crossed by 6 mm."""
-    base = wc.Domain.capsule((-0.012, 0, 0), (0.012, 0, 0), 0.006)
-    prongs = [wc.Domain.capsule((x, 0, 0), (x, 0, 0.05), 0.005) for x in (-0.012, 0.012)]
-    mesh = wc.TetForest.from_domain(base | prongs[0] | prongs[1], target_elements=500)
-    body = wc.SoftBody(mesh, SOFT, device=device)
+    body = wc.SoftBody(fork_mesh(), SOFT, device=device)
     body.fix("z < 0.002")
     plates = [wc.Tool(wc.Box((0.01, 0.04, 0.012), position=(x, 0.0, 0.042)), speed=0.2) for x in (-0.024, 0.024)]
     integrator = wc.SymplecticEuler(damping=20.0, viscosity=3e-3)

@@ -25,6 +25,8 @@ class ActiveSet:
     """
 
     rounds = 16
+    #: Springs are not in the preconditioner: most contact here holds nodes.
+    springs = None
 
     def __init__(self, contacts: Contacts, k: int):
         assert contacts.rigid is not None
@@ -78,6 +80,11 @@ class ActiveSet:
             self._spans.launch_begin(blocks, d)
             self._locate(spans.FIRST, d)
 
+    @property
+    def nodes(self) -> ActiveSet:
+        """Itself: it holds nodes."""
+        return self
+
     def launch_again(self) -> None:
         """Launch the beginning of another linearisation of the same step."""
         self._rounds.zero_()
@@ -115,13 +122,6 @@ class ActiveSet:
     def count(self) -> int:
         """Number of surface places of one world."""
         return self._contacts.surface.parts[self._k].nodes
-
-    @property
-    def springs(self) -> None:
-        return None
-
-    def launch_springs(self) -> None:
-        """Do nothing."""
 
     def add_slopes(
         self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array, *, apart: bool = False

@@ -17,7 +17,7 @@ from .spans import Spans
 class BorneSet:
     """Contact of a body with obstacles in implicit steps: all of it consists of springs with multipliers.
 
-    Members are those of ``ActiveSet``; no node is held.
+    Members are those of ``ActiveSet``.
 
     Args:
         system: The bodies.
@@ -27,6 +27,8 @@ class BorneSet:
     """
 
     rounds = 32
+    #: No node is held.
+    nodes = None
 
     def __init__(self, system: System, rigid: RigidForces, law: Law, k: int):
         self._system, self._rigid, self._law, self._k = system, rigid, law, k
@@ -50,24 +52,11 @@ class BorneSet:
         """All places, with the springs that push there."""
         return self._spans.springs
 
-    def launch_springs(self) -> None:
-        """Launch the stiffness of ``springs``, from the last derivatives."""
-        self._spans.launch_springs()
-
     # --- launches ----------------------------------------------------------------------------------------------------
 
     def launch_begin(self, u: wp.array, d: wp.array, blocks: wp.array) -> None:
         self._spans.launch_begin(blocks, d)
         self._spans.launch_located(kernels.FIRST, d, self.changed)
-
-    def launch_again(self) -> None:
-        """Do nothing: springs go on."""
-
-    def launch_free(self, v: wp.array) -> None:
-        """Do nothing: no direction is held."""
-
-    def launch_yielding(self, v: wp.array) -> None:
-        """Do nothing."""
 
     def launch_imposed(self, d: wp.array) -> None:
         self._spans.launch_located(kernels.AGAIN, d, self.changed)

@@ -151,7 +151,7 @@ class Spans:
             inputs = [int(len(search) == 1), *self._places(each), each.touches, each.spans, d, change, search, slopes]
             self._launch(kernels.add_span_slopes, each, inputs)
 
-    def launch_springs(self) -> None:
+    def _update_springs(self) -> None:
         """Launch the stiffness of ``springs``, from the derivatives of the last ``update``."""
         surface = self._rigid.surface
         part = surface.parts[self._k]
@@ -192,7 +192,8 @@ class Spans:
         nodes, weights = wp.zeros(count, dtype=wp.vec4i, device=device), wp.zeros(count, dtype=wp.vec4, device=device)
         inputs = [part.start, surface.arrays, surface.bearers]
         wp.launch(kernels.find_bearers, count, inputs, [nodes, weights], device=device)
-        return Springs(nodes, weights, wp.zeros(count, dtype=wp.mat33, device=device))
+        stiffness = wp.zeros(count, dtype=wp.mat33, device=device)
+        return Springs(nodes, weights, stiffness, self._update_springs)
 
     def _touches_of_points(self) -> Touches:
         """Those of places, whose forces are those of obstacles on nodes in explicit steps."""

@@ -169,7 +169,8 @@ class JoinedSolve:
     def launch_again(self) -> None:
         """Launch the beginning of another linearisation of the same step."""
         for held, _d in self._each_held(self._d):
-            held.launch_again()
+            if held.nodes is not None:
+                held.nodes.launch_again()
 
     def launch_rounds(self) -> None:
         """Launch the linear solves, until contact no longer changes."""

@@ -24,9 +24,19 @@ SETTLED = 10.0
 NEAR = 100.0
 
 
+class HeldNodes(Protocol):
+    """Nodes that are held along directions, by ``contact.active_set.ActiveSet``, which explains the members."""
+
+    def launch_again(self) -> None: ...
+
+    def launch_free(self, v: wp.array) -> None: ...
+
+    def launch_yielding(self, v: wp.array) -> None: ...
+
+
 class Held(Protocol):
-    """Something that holds nodes along directions, such as ``contact.active_set.ActiveSet``, which explains the
-    members.
+    """Contact with obstacles, which holds nodes (``contact.active_set.ActiveSet``, which explains the members), or only
+    consists of springs (``contact.borne_set.BorneSet``).
     """
 
     changed: wp.array
@@ -37,21 +47,18 @@ class Held(Protocol):
     def count(self) -> int: ...
 
     @property
+    def nodes(self) -> HeldNodes | None:
+        """The nodes that are held; None if none ever are."""
+        ...
+
+    @property
     def springs(self) -> Springs | None:
         """Springs that a preconditioner may take into account, if there are any."""
         ...
 
-    def launch_springs(self) -> None: ...
-
     def prepare(self) -> None: ...
 
     def launch_begin(self, u: wp.array, d: wp.array, blocks: wp.array) -> None: ...
-
-    def launch_again(self) -> None: ...
-
-    def launch_free(self, v: wp.array) -> None: ...
-
-    def launch_yielding(self, v: wp.array) -> None: ...
 
     def launch_imposed(self, d: wp.array) -> None: ...
 
@@ -173,15 +180,20 @@ class FreePreconditioner:
 
     def take_springs(self) -> None:
         """Launch the exchange of the springs in B for the present ones."""
-        if self._held.springs is not None and hasattr(self._preconditioner, "take_springs"):
-            self._held.launch_springs()
+        springs = self._held.springs
+        if springs is not None and hasattr(self._preconditioner, "take_springs"):
+            springs.update()
             self._preconditioner.take_springs()
 
     def apply(self, r: wp.array, z: wp.array) -> None:
+        nodes = self._held.nodes
+        if nodes is None:
+            self._preconditioner.apply(r, z)
+            return
         wp.copy(self._r, r)
-        self._held.launch_yielding(self._r)
+        nodes.launch_yielding(self._r)
         self._preconditioner.apply(self._r, z)
-        self._held.launch_yielding(z)
+        nodes.launch_yielding(z)
 
 
 class TouchingSolve:
@@ -238,7 +250,8 @@ class TouchingSolve:
         self._preconditioner.take_springs()
         newton.solver.launch(self._preconditioner, self._r, self._change, like=b, share=SHARE)
         self._operator.apply(self._change, self._q)
-        held.launch_free(self._q)
+        if held.nodes is not None:
+            held.nodes.launch_free(self._q)
         self._search.launch(self._rest, self._q, self._change, d)
         self._operator.apply(d, self._q)
         held.launch_judgement(b, self._q, d)

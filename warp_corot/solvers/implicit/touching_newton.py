@@ -62,7 +62,8 @@ class TouchingNewton:
         self._launch(kernels.take_free, inputs, [newton.step])
         self._operator.apply(newton.step, self._product)
         self._launch(kernels.add_product, [self._product], [newton.residual])
-        touching.held.launch_again()
+        if touching.held.nodes is not None:
+            touching.held.nodes.launch_again()
         self._finish()
 
     def _finish(self) -> None:
