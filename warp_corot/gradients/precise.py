@@ -11,6 +11,7 @@ import numpy.typing as npt
 from warp_corot.solvers.implicit.precise import PreciseRest
 from warp_corot.solvers.implicit.precise_elements import PreciseElements
 
+from .precise_contact import PreciseContact
 from .rest_state import RestState
 from .sums import derivatives
 
@@ -38,7 +39,12 @@ class PreciseState:
         loads = body.masses[:, None] * solved.gravity
         if body.conditions.has_loads:
             loads = loads + body.conditions.loads.numpy()[: body.sizes.nodes, :3]
-        self._rest = PreciseRest(body, solved.field, solved.law, loads)
+        self._contacts, shapes = [], solved.obstacles
+        if solved.contact is not None:
+            rest = body.mesh.points
+            self._contacts = [PreciseContact(solved.contact, shapes, rest, world) for world in range(body.worlds)]
+        self._obstacle_count = len(shapes)
+        self._rest = PreciseRest(body, solved.field, solved.law, loads, self._contacts)
         self.adjoint_iterations, self.adjoint_residual = 0, 0.0
 
     @property
@@ -50,12 +56,22 @@ class PreciseState:
         """As ``RestState.pull_back``."""
         given = np.asarray(derivative, np.float64).reshape(self._rest.u.shape)
         moved, boundary = np.zeros_like(self._rest.u), np.zeros_like(self._rest.u)
+        of_obstacles = np.zeros((self._obstacle_count, 3))
         for world, (stiffness, factors) in enumerate(self._rest.factors):
             free, held = self._rest.free[world], self._rest.held[world]
             motion = np.zeros(given[world].size)
-            motion[free] = factors.solve(given[world].ravel()[free])
+            contact = self._contacts[world] if self._contacts and self._contacts[world].count else None
+            right = given[world].ravel()[free]
+            solution = factors.solve(np.pad(right, (0, 0 if contact is None else contact.count)))
+            motion[free] = solution[: len(free)]
             moved[world] = motion.reshape(-1, 3)
-            boundary[world] = np.where(held[:, None], given[world] - (stiffness @ motion).reshape(-1, 3), 0.0)
+            product = stiffness @ motion
+            if contact is not None:
+                u, multipliers = self._rest.u[world], solution[len(free) :]
+                product = product + contact.normals(u) @ multipliers
+                pushes = self._rest.pushes[world]
+                of_obstacles += contact.of_obstacles(u, pushes, moved[world], multipliers)
+            boundary[world] = np.where(held[:, None], given[world] - product.reshape(-1, 3), 0.0)
         work = _Work(self._rest.elements, self._rest.u, moved)
         flat = moved.reshape(-1, 3)
         found = derivatives(self.body, work, names, flat, flat @ self._gravity)
@@ -63,6 +79,8 @@ class PreciseState:
             found["rest"] = found["rest"] + boundary.reshape(-1, 3)
         if "boundary" in names:
             found["boundary"] = boundary.reshape(-1, 3)
+        if "obstacles" in names:
+            found["obstacles"] = of_obstacles
         return found
 
 

@@ -45,6 +45,8 @@ class RestState:
         report: The report of the solve.
         law, field: The model, and its elastic forces.
         gravity: [m/s^2], float64 [3].
+        obstacles: The obstacles.
+        contact: What they push, or None.
         adjoint_iterations, adjoint_residual: Iterations and residual of the last adjoint solve.
 
     Raises:
@@ -80,8 +82,8 @@ class RestState:
         if not self.report.converged:
             raise ConvergenceError(f"there is no gradient: {self.report.message}")
         touched = None if touching is None else _resting(body, touching, friction)
-        self._contact = touched if touched is not None and touched.pushes else None
-        self._obstacle_count = len(checked_obstacles(obstacles))
+        self.contact = touched if touched is not None and touched.pushes else None
+        self.obstacles = checked_obstacles(obstacles)
         self.law, self._preconditioner, self._tolerance = law, preconditioner, adjoint_tolerance
         self._adjoint: Adjoint | None = None
         self.adjoint_iterations, self.adjoint_residual = 0, 0.0
@@ -99,7 +101,7 @@ class RestState:
             names: Some of the names that the state was made with.
         """
         if self._adjoint is None:
-            options = (self._preconditioner, self._tolerance, self._contact)
+            options = (self._preconditioner, self._tolerance, self.contact)
             self._adjoint = Adjoint(self.body, self.field, *options)
             self._adjoint.take(self.body.state.displacements)
         adjoint, count = self._adjoint, self.body.sizes.nodes
@@ -125,9 +127,9 @@ class RestState:
         if "boundary" in names:
             found["boundary"] = boundary
         if "obstacles" in names:
-            found["obstacles"] = np.zeros((self._obstacle_count, 3))
-            if self._contact is not None and self._adjoint is not None:
-                found["obstacles"] = self._contact.of_obstacles(moved, self._adjoint.multipliers)
+            found["obstacles"] = np.zeros((len(self.obstacles), 3))
+            if self.contact is not None and self._adjoint is not None:
+                found["obstacles"] = self.contact.of_obstacles(moved, self._adjoint.multipliers)
         return found
 
 

@@ -106,8 +106,8 @@ def static_gradient(
             they are. Self-contact must be without friction, and at places inside triangles and edges.
         precision: "float32": everything is computed on the body's device. "float64": the answer is refined on the host,
             by Newton's method with a sparse direct solver, and the adjoint is solved there; positions are vec3d. For
-            the models ``Corotated``, ``Linear``, ``StVenantKirchhoff`` and ``NeoHookean`` with isotropic materials, and
-            bodies of some 10,000 nodes.
+            the models ``Corotated``, ``Linear``, ``StVenantKirchhoff`` and ``NeoHookean`` with isotropic materials,
+            bodies of some 10,000 nodes, and contact of nodes with ``Ground`` and ``Sphere``.
 
     Raises:
         InputError: As ``solve_static``, a name is none of these, the model or the material has no such derivative, a

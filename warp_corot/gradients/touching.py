@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -70,6 +70,7 @@ class RestingContact:
         self._yields = np.concatenate([np.full(len(each), len(each) == 1) for each in directions])
         self.obstacle = np.array([touch.obstacle for touch in touches])
         self.normals = np.concatenate(directions)
+        self._touches = touches
         self._assemble(touches)
         free = np.repeat(~body.conditions.held_mask(), 3)
         self._free_normals = self._all_normals.multiply(free[:, None]).tocsc()
@@ -103,6 +104,11 @@ class RestingContact:
         self._all_normals = coo_array((values, (of_rows, of_touches)), shape=(count, m)).tocsc()
         first, second, values = (np.concatenate([np.ravel(b[k]) for b in blocks]) for k in range(3))
         self._turning: csr_array = coo_array((values, (first, second)), shape=(count, count)).tocsr()
+
+    def described(self) -> Iterator[tuple[Touch | Pair, Array, bool, tuple[Ints, Array]]]:
+        """For each column of N what touches, its direction, whether the place may slide, and what carries it."""
+        for i, touch in enumerate(self._touches):
+            yield touch, self.normals[i], bool(self._yields[i]), self._carried(touch)
 
     def _carried(self, touch: Touch | Pair) -> tuple[Ints, Array]:
         """The nodes, numbered over all worlds, that carry a contact's places, and the weight of each node [places,

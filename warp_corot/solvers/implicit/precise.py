@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import block_array
 from scipy.sparse.linalg import SuperLU, splu
 
 from warp_corot.elasticity import ForceField, Model
@@ -27,6 +29,20 @@ Array = npt.NDArray[np.float64]
 ITERATIONS, SMALL = 20, 1e-13
 
 
+class HostContact(Protocol):
+    """Contact of one world in float64, such as ``gradients.precise_contact.PreciseContact``, which explains the
+    members."""
+
+    count: int
+    pushes: Array
+
+    def gaps(self, u: Array) -> Array: ...
+
+    def normals(self, u: Array) -> Any: ...
+
+    def turning(self, u: Array, pushes: Array) -> Any: ...
+
+
 class PreciseRest:
     """Moves a body from a state of rest in float32 to the one in float64.
 
@@ -35,13 +51,16 @@ class PreciseRest:
         field: Its elastic forces.
         law: The model.
         loads: Loads and weight [N], float64 [worlds * N, 3].
+        contacts: The contact of each world, if there is any.
 
     Attributes:
         elements: The elements of each world.
         u: Displacements [m], float64 [worlds, N, 3].
         held: Whether nodes are held, bool [worlds, N].
         free: Free entries of each world's displacements, int64 each.
-        factors: The stiffness and its factors at free entries, of each world.
+        factors: The stiffness and its factors at free entries, of each world. With contact, unknowns are the free
+            entries and the opposites of forces of contact.
+        pushes: The forces of contact of each world [N].
         iterations: Newton's iterations of the world that needed most.
         correction: The largest displacement of the last iteration over the largest displacement.
         residual: The norm of the unbalanced forces over that of loads and reactions, of the world where it is largest.
@@ -51,7 +70,11 @@ class PreciseRest:
         ConvergenceError: Newton's method does not converge from the present state, or the stiffness is singular.
     """
 
-    def __init__(self, body: SoftBody, field: ForceField, law: Model, loads: Array):
+    def __init__(
+        self, body: SoftBody, field: ForceField, law: Model, loads: Array, contacts: Sequence[HostContact] = ()
+    ):
+        self._contacts = contacts
+        self.pushes = [each.pushes for each in contacts]
         of_host = checked_host_law(body, law)
         shared = HostDilatation(field) if isinstance(field, DilatationField) else None
         worlds, count = body.worlds, body.sizes.nodes
@@ -72,20 +95,37 @@ class PreciseRest:
         body.displacements = self.u.reshape(-1, 3)
 
     def _solved(self, world: int, u: Array) -> Array:
-        elements, free = self.elements[world], self.free[world]
+        free = self.free[world]
         for number in range(ITERATIONS):
             step = np.zeros(u.size)
-            step[free] = self._factored(world, u).solve(self._unbalanced(world, u).ravel()[free])
+            left = self._unbalanced(world, u).ravel()[free]
+            if self._touches(world):
+                left = np.concatenate([left, -self._contacts[world].gaps(u)])
+            found = self._factored(world, u).solve(left)
+            step[free] = found[: len(free)]
+            if self._touches(world):
+                self.pushes[world] = self.pushes[world] - found[len(free) :]
             u = u + step.reshape(u.shape)
             if not np.abs(step).max() > SMALL * np.abs(u).max():
-                self.factors.append((elements.stiffness(u), self._factored(world, u)))
+                self.factors.append((self._stiffness(world, u), self._factored(world, u)))
                 self._measure(world, u, number + 1, np.abs(step).max())
                 return u
         raise ConvergenceError("Newton's method in float64 does not converge from the answer of float32")
 
     def _unbalanced(self, world: int, u: Array) -> Array:
         """Elastic forces and loads [N], [N, 3]; reactions are their opposites."""
-        return self.elements[world].forces(u) + self._loads[world]
+        found = self.elements[world].forces(u) + self._loads[world]
+        if self._touches(world):
+            found = found + (self._contacts[world].normals(u) @ self.pushes[world]).reshape(-1, 3)
+        return found
+
+    def _touches(self, world: int) -> bool:
+        return bool(self._contacts) and self._contacts[world].count > 0
+
+    def _stiffness(self, world: int, u: Array) -> Any:
+        """K, and the turning of contacts' normals."""
+        found = self.elements[world].stiffness(u)
+        return found + self._contacts[world].turning(u, self.pushes[world]) if self._touches(world) else found
 
     def _measure(self, world: int, u: Array, iterations: int, step: float) -> None:
         left, size = self._unbalanced(world, u).ravel(), np.abs(u).max()
@@ -97,8 +137,12 @@ class PreciseRest:
 
     def _factored(self, world: int, u: Array) -> SuperLU:
         free = self.free[world]
+        matrix = self._stiffness(world, u)[free][:, free]
+        if self._touches(world):
+            normals = self._contacts[world].normals(u)[free]
+            matrix = block_array([[matrix, normals], [normals.T, None]])
         try:
-            return splu(self.elements[world].stiffness(u)[free][:, free].tocsc())
+            return splu(matrix.tocsc())
         except RuntimeError:
             raise ConvergenceError("the stiffness is singular: the state of rest has no gradient") from None
 
