@@ -20,10 +20,6 @@ BLUR = wp.constant(1.0e-3)
 #: half the thickness the way out points to the other side, and contacts that hold are far shallower. A fast stab stayed
 #: on the tool with friction at every depth, and tools that moved at random kept a body without friction at any.
 SKEWERED = wp.constant(0.25)
-#: Fraction of the last step's normal force with which the rounds begin: with more, triangles hold off the nodes around
-#: an obstacle, and bodies seem stiffer. Friction begins with all of it, because the slip that restores a part would
-#: accumulate.
-WARMTH = wp.constant(0.5)
 
 
 @wp.struct
@@ -38,6 +34,7 @@ class Touches:
     acts: wp.array2d[wp.int32]
     force: wp.array2d[wp.vec3]  # on the triangle [N]
     more: wp.array2d[wp.vec3]  # its change in this round
+    warmth: wp.array[wp.float32]  # [T] fraction of the last step's normal force with which the rounds begin
     allowance: wp.array2d[wp.float32]  # how deep the triangle may be [m]; see ``law.allowed``
 
 
@@ -118,7 +115,8 @@ def find_touch(
     touches.friction[o, t] = friction
     touches.moved[o, t] = carried(pose, later, point_of(w, a, b, c))
     was_push = wp.max(wp.dot(was, n), 0.0)
-    push = WARMTH * was_push
+    push = touches.warmth[t] * was_push
+    # Friction begins with all of it, because the slip that restores a part would accumulate.
     if push > 0.0:
         touches.acts[o, t] = 1
         force = push * n + held_back(across(was, n), was_push, friction)

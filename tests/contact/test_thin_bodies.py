@@ -46,8 +46,9 @@ def test_both_sides_of_a_plate_carry_the_same_force(plate, device):
     body, ground, ball = wc.SoftBody(plate, SOFT, device=device), wc.Ground(offset=-0.001), wc.Tool(wc.Sphere(0.005))
     ball.follow([0.0, 0.1], [(0.0, 0.0, 0.0062), (0.0, 0.0, 0.0057)])
     calm = wc.SymplecticEuler(viscosity=1e-3, damping=20.0)
-    sim = wc.Simulation(body, obstacles=[ground, ball], gravity=(0.0, 0.0, -9.81), integrator=calm)
-    sim.advance(0.5)
+    given = {"gravity": (0.0, 0.0, -9.81), "contact": wc.Contact(friction=0.0), "integrator": calm}
+    sim = wc.Simulation(body, obstacles=[ground, ball], **given)
+    sim.advance(0.3)
     found = []
     for _ in range(10):
         sim.advance(0.001)
@@ -55,8 +56,8 @@ def test_both_sides_of_a_plate_carry_the_same_force(plate, device):
     carried, pressed = np.mean(found, axis=0)
     assert pressed > 0.02
     assert -carried == pytest.approx(pressed + 9.81 * body.masses.sum(), rel=1e-3)
-    # Forces of single steps differ by some per cent: points of both sides move the same nodes.
-    assert np.std(found, axis=0).max() < 0.1 * pressed
+    assert np.ptp(found, axis=0).max() < 2e-3 * pressed
     skin = plate.surface().moved(body.displacements.numpy())
     assert np.linalg.norm(skin - [0.0, 0.0, 0.0057], axis=1).min() > 0.005 - 2e-4
-    assert np.linalg.norm(body.velocities.numpy()[:, :3], axis=1).max() < 5e-3
+    # Without friction it may glide.
+    assert np.abs(body.velocities.numpy()[:, 2]).max() < 1e-3

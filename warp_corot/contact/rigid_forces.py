@@ -92,6 +92,7 @@ class RigidForces:
             setattr(self.touches, name, wp.zeros(shape, dtype=wp.vec3, device=device))
         for name in ("gap", "friction", "allowance"):
             setattr(self.touches, name, wp.zeros(shape, dtype=wp.float32, device=device))
+        self.touches.warmth = self.surface.warmth
         self.touches.acts = wp.zeros(shape, dtype=wp.int32, device=device)
         self._crowd = wp.zeros(count, dtype=wp.float32, device=device)
         self._sums = Sums()

@@ -21,6 +21,10 @@ if TYPE_CHECKING:
 #: Room for a body whose mesh changes, over the size of its surface when the room is reserved.
 ROOM = 1.5
 NO_NODE = -1
+#: Steps begin with this fraction of the last step's forces of obstacles on triangles: with more, triangles hold off the
+#: nodes around an obstacle, and bodies seem stiffer. Where nodes bear both sides of a thin wall they begin with all:
+#: the rounds of a step do not make up for the rest there.
+WARMTH = 0.5
 
 Ints = npt.NDArray[np.int32]
 
@@ -66,6 +70,8 @@ class ContactSurface:
         bearers: The nodes that bear places between nodes, as such a struct.
         triangles: Places of their corners, vec3i [T]; -1 where there is none.
         opposite: For each triangle the fourth node of its tetrahedron, int32 [T]; -1 inside the body.
+        warmth: For each triangle the fraction of the last step's force of an obstacle with which a step begins, float32
+            [T].
         edges, sides: Places of the ends of edges, and the two triangles of each, vec2i [E]; -1 where there is none.
         corner_starts, corners: For each node, from one start to the next: three times a triangle and which corner.
         parts: The place of each body.
@@ -214,6 +220,7 @@ class ContactSurface:
         self.arrays.bearing = self._room_for_bearing(count)
         self.triangles = wp.empty(triangle_start, dtype=wp.vec3i, device=device)
         self.opposite = wp.empty(triangle_start, dtype=wp.int32, device=device)
+        self.warmth = wp.empty(triangle_start, dtype=wp.float32, device=device)
         self.edges, self.sides = (wp.empty(edge_start, dtype=wp.vec2i, device=device) for _ in range(2))
         self.corner_starts = wp.empty(count + 1, dtype=wp.int32, device=device)
         self.corners = wp.empty(3 * triangle_start, dtype=wp.int32, device=device)
@@ -281,6 +288,7 @@ class ContactSurface:
         self._fill_bearing()
         triangles = np.full((self.triangle_count, 3), -1, np.int32)
         opposite = np.full(self.triangle_count, -1, np.int32)
+        warmth = np.full(self.triangle_count, WARMTH, np.float32)
         edges, sides = (np.full((self.edge_count, 2), -1, np.int32) for _ in range(2))
         for body, part in zip(self.bodies, self.parts, strict=True):
             for w in range(self.worlds):
@@ -290,6 +298,7 @@ class ContactSurface:
                 world[first : first + part.nodes] = w
                 triangles[first_triangle : first_triangle + len(skin.triangles)] = skin.triangles + first
                 own = slice(first_triangle, first_triangle + len(skin.opposite))
+                warmth[own][skin.is_thin] = 1.0
                 opposite[own] = np.where(skin.opposite < 0, -1, skin.opposite + first)
                 own = slice(part.edge_start + w * part.edges, part.edge_start + w * part.edges + len(skin.edges))
                 edges[own], sides[own] = skin.edges + first, skin.sides + first_triangle
@@ -308,6 +317,7 @@ class ContactSurface:
         self.arrays.world.assign(world)
         self.triangles.assign(triangles)
         self.opposite.assign(opposite)
+        self.warmth.assign(warmth)
         self.edges.assign(edges)
         self.sides.assign(sides)
         ends = triangles.ravel()
