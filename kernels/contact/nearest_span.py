@@ -1,0 +1,86 @@
+"""The point of a triangle that is closest to an obstacle in an implicit step; see ``span_places``."""
+
+import warp as wp
+
+from .law import Law
+from .shapes import CAPSULE, Shapes, distance_to
+from .touches import CORNER, nearest
+
+wp.set_module_options({"enable_backward": False})
+
+#: An obstacle must be closer to a triangle than to its corners by this many times the size of rounding errors.
+CLOSER = wp.constant(4.0)
+#: The point of a triangle stays if another is closer by at most this many times the law's slack.
+STAYS = wp.constant(8.0)
+
+
+@wp.struct
+class Found:
+    """Where an obstacle is close to an item."""
+
+    is_near: wp.bool
+    shares: wp.vec3
+    gap: float
+    normal: wp.vec3
+    moved: wp.vec3  # how far the obstacle goes there in the step [m]
+    opened: float  # how far the gap opens in the step [m]
+    is_at_end: wp.bool  # whether the gap is that at the end of the step
+    allowed: float  # how far the obstacle may sink in [m]
+    friction: float
+
+
+@wp.func
+def find_span(
+    o: int,
+    pose: wp.transform,
+    a: wp.vec3,
+    b: wp.vec3,
+    c: wp.vec3,
+    far: float,
+    was: wp.vec3,
+    side: wp.vec3,
+    before: wp.vec3,
+    shapes: Shapes,
+    law: Law,
+):
+    """The point of a triangle that is closest to an obstacle, if that is within reach and closer than the corners.
+
+    The point with the shares ``before`` stays if it is hardly less close: along an edge of an obstacle all points are
+    about as close, and forces that jump between them do not come to rest.
+    """
+    found = Found()
+    found.is_near = False
+    middle = (a + b + c) / 3.0
+    size = wp.max(wp.length(a - middle), wp.max(wp.length(b - middle), wp.length(c - middle)))
+    most = size + far
+    distance, _away = distance_to(shapes, o, pose, middle, most)
+    if distance > most:
+        return found
+    w, gap, n = nearest(shapes, o, pose, most, a, b, c)
+    if wp.dot(was, was) > 0.0 and wp.dot(n, side) < 0.0 and shapes.kind[o] == CAPSULE:
+        # The axis has passed through since the last time.
+        n = -n
+        gap = -2.0 * shapes.size[o][0] - gap
+    if gap > far or wp.max(w) > CORNER:
+        return found
+    # The fourth is the former point.
+    points = wp.matrix_from_rows(a, b, c, before[0] * a + before[1] * b + before[2] * c)
+    tried = int(3)
+    if wp.dot(was, was) > 0.0 and wp.max(before) <= CORNER and shapes.kind[o] != CAPSULE:
+        tried = 4
+    # This loop is not unrolled, so that there is one distance function to compile.
+    k = int(0)
+    while k < tried:
+        there, away = distance_to(shapes, o, pose, points[k], most)
+        if k < 3 and there <= gap + CLOSER * law.tolerance:
+            return found
+        if k == 3 and there <= gap + STAYS * law.slack:
+            w = before
+            gap = there
+            n = away
+        k += 1
+    found.is_near = True
+    found.shares = w
+    found.gap = gap
+    found.normal = n
+    return found
