@@ -36,6 +36,11 @@ def move_values(sources: wp.array[wp.int32], targets: wp.array[wp.int32], source
     found[targets[i]] = source[sources[i]]
 
 
+# All types of values at once: each later one would compile this module again.
+for _kind in (wp.float32, wp.float64, wp.vec3, wp.vec4, wp.int32, wp.uint8):
+    wp.overload(move_values, [wp.array[wp.int32], wp.array[wp.int32], wp.array[_kind], wp.array[_kind]])
+
+
 @wp.kernel(enable_backward=False)
 def clear_energies(places: wp.array[wp.int32], energies: wp.array[wp.float64]):
     """Set energies at some places to zero."""

@@ -115,14 +115,18 @@ def newton_rotation(c0: wp.vec3, c1: wp.vec3, c2: wp.vec3, handedness: float):
     z2 = c2
     det = float(0.0)
     sound = bool(True)
+    # Not a static power of the iteration: Warp names a kernel with such a number differently before and after its code
+    # is generated, and would compile it twice.
+    factor = float(1.0)
     for iteration in range(wp.static(ITERATIONS)):
         a0 = wp.cross(z1, z2)
         a1 = wp.cross(z2, z0)
         a2 = wp.cross(z0, z1)
         det = wp.dot(z0, a0)
-        if wp.static(iteration == 0):
+        if iteration == 0:
             sound = handedness * det > FLAT
-        r = wp.static(4.0**iteration) * reciprocal(det)
+        r = factor * reciprocal(det)
+        factor = 4.0 * factor
         z0 = z0 + r * a0
         z1 = z1 + r * a1
         z2 = z2 + r * a2
