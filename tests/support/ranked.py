@@ -179,7 +179,13 @@ def options_of(case: str) -> dict[str, Any]:
     made: dict[str, Any] = {"model": MODELS.get(case), "integrator": integrator, **touching}
     if case in REMESHED:
         made["remesh"] = wc.OnlineRemesh(
-            refine_above=1.05, simplify_below=1.01, min_level=3, max_level=8, every=30, capacity=4000
+            refine_above=1.02 if case == "dented" else 1.05,
+            simplify_below=1.01,
+            # The surface of the ball is that of its elements, which would be too coarse for the tool.
+            min_level=6 if case == "dented" else 3,
+            max_level=8,
+            every=30,
+            capacity=4000,
         )
     return made
 
