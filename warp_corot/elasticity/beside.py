@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import warp as wp
 
 from warp_corot.discretization.discretization import Discretization
+from warp_corot.discretization.elements import Elements
 from warp_corot.discretization.members import Members
 from warp_corot.discretization.plan import Plan
 from warp_corot.kernels.elements.forces import add_energies, scatter_forces
+from warp_corot.kernels.elements.lanes import LANES
 
 from .model import ForceField, SmallForces
 from .stiffness import ElementMaterial, ElementStiffness
@@ -31,6 +33,8 @@ class BesideField(ForceField):
         Material: The struct that the other stress reads.
         stress, differential, density: The other stress, its differential, and its energy density, as
             ``kernels.elements.forces`` and ``kernels.elements.stiffness_products`` take them.
+        eights: A function that makes the kernel that adds the other forces on the CPU, of eight elements in a thread,
+            for a kind of elements; None: that of ``stress``.
 
     Attributes:
         law: The same.
@@ -46,11 +50,13 @@ class BesideField(ForceField):
         stress: wp.Function,
         differential: wp.Function,
         density: wp.Function,
+        eights: Callable[[type], wp.Kernel] | None = None,
     ):
         self.law = law
         super().__init__(discretization, law.deterministic)
         kind = discretization.element_kind
         self._forces, self._energies = scatter_forces(kind, Material, stress), add_energies(kind, Material, density)
+        self._eights = eights(kind) if eights is not None and self.device.is_cpu else None
         self._stiffness = ElementStiffness(discretization, differential, Material)
         #: Separate places for each element's forces, if sums must be reproducible.
         self._slotted = discretization.plan(subtrees=False, deterministic=True) if self.deterministic else None
@@ -72,13 +78,20 @@ class BesideField(ForceField):
     def add_own_forces(self, u: wp.array, f: wp.array) -> None:
         """Launch the kernel that adds only the forces of the additional stress."""
         if self._slotted is None:
-            self.launch(self._forces, self.element_count, [self.elements, self.material, u], [f])
+            self._scatter_own(self.elements, u, f)
             return
         slots = self._slotted.slots
         assert slots is not None
         slots.values.zero_()
-        self.launch(self._forces, self.element_count, [self._slotted.elements, self.material, u], [slots.values])
+        self._scatter_own(self._slotted.elements, u, slots.values)
         slots.gather(f)
+
+    def _scatter_own(self, elements: Elements, u: wp.array, f: wp.array) -> None:
+        count = self.element_count
+        if self._eights is None:
+            self.launch(self._forces, count, [elements, self.material, u], [f])
+        else:
+            self.launch(self._eights, -(-count // LANES), [elements, count, self.material, u], [f])
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         raise NotImplementedError("add_forces does all")

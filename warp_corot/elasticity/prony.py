@@ -15,6 +15,8 @@ from warp_corot.discretization.discretization import Discretization, discretizat
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, shown
 from warp_corot.kernels.elements import prony as kernels
+from warp_corot.kernels.elements.lanes import LANES
+from warp_corot.kernels.elements.prony_cpu import relax_eights, scatter_prony_eights
 
 from .beside import BesideField
 from .corotated.model import Corotated
@@ -100,7 +102,7 @@ class PronyField(BesideField):
 
     def __init__(self, discretization: Discretization, model: Prony, law: ForceField):
         functions = (kernels.prony_stress, kernels.prony_differential, kernels.prony_density)
-        super().__init__(discretization, law, kernels.PronyMaterial, *functions)
+        super().__init__(discretization, law, kernels.PronyMaterial, *functions, eights=scatter_prony_eights)
         g, tau = (np.array(values, np.float32) for values in model.terms)
         self._carried, counts = model.carried, self.plan.counts
         #: The number of elements may grow if the mesh changes.
@@ -108,7 +110,7 @@ class PronyField(BesideField):
         self._g, self._tau = (wp.array(v, dtype=wp.float32, device=self.device) for v in (g, tau))
         self._elapsed = wp.zeros(1, dtype=wp.float32, device=self.device)
         self._known = wp.zeros(len(self._carried) * self._count, dtype=wp.float32, device=self.device)
-        self._relax = kernels.relax(discretization.element_kind)
+        self._relax = (relax_eights if self.device.is_cpu else kernels.relax)(discretization.element_kind)
 
     @property
     def material(self) -> kernels.PronyMaterial:
@@ -123,7 +125,11 @@ class PronyField(BesideField):
 
     def complete_step(self, u: wp.array, pace: Pace) -> None:
         self.law.complete_step(u, pace)
-        self.launch(self._relax, self.element_count, [self.elements, u, pace, self.material], [])
+        count, inputs = self.element_count, [u, pace, self.material]
+        if self.device.is_cpu:
+            self.launch(self._relax, -(-count // LANES), [self.elements, count, *inputs], [])
+        else:
+            self.launch(self._relax, count, [self.elements, *inputs], [])
 
     def relax_fully(self) -> None:
         self._elapsed.fill_(math.inf)
