@@ -16,7 +16,7 @@ from .dilatation import FREE, MOST, RAMP, Dilatation
 from .elements import GeneralElements, frame, rest_volume
 from .general_cpu import rest_inverse_of
 from .lanes import COMPILER_FLAGS, ELEMENTS, ISOTROPIC, ISOTROPIC_PART, constants, native, on_cpu, scatter_lanes
-from .law_lanes import LAWS
+from .law_lanes import LawInLanes, code_of, has_log
 
 wp.set_module_options({"enable_backward": False})
 
@@ -116,13 +116,13 @@ class GroupedMaterial:
 
 
 @functools.cache
-def scatter_grouped_elements(law: str, of: Dilatation) -> wp.Kernel:
+def scatter_grouped_elements(law: LawInLanes, of: Dilatation) -> wp.Kernel:
     """Forces of a law of ``law_lanes`` with a shared dilatation; a thread is ``GROUPS`` groups.
 
     The corotated law lists what it leaves out.
     """
     leaves_out = ["left_out_elements"] if law == "corotated" else []
-    code = LAWS[law] + law_of(of, has_log=law == "neo-hookean") + ISOTROPIC_PART
+    code = code_of(law) + law_of(of, has_log=has_log(law)) + ISOTROPIC_PART
     code += constants(GROUPS=GROUPS, MOST=MOST) + native("group_dilatations", "rest_elements", "elements")
     code += native("group_pressures", "rest_elements", "grouped_elements", "element_forces", *leaves_out) + "}\n"
     return scatter_lanes(code, GeneralElements, GroupedMaterial, wp.int32)

@@ -14,17 +14,17 @@ import warp as wp
 from .constitutive import IsotropicMaterial
 from .elements import ForestElements, GeneralElements, frame, gradient_of, rest_volume
 from .lanes import ELEMENTS, ISOTROPIC, native, scatter_lanes
-from .law_lanes import LAWS
+from .law_lanes import LawInLanes, code_of
 
 wp.set_module_options({"enable_backward": False})
 
 
 @functools.cache
-def scatter_law_elements(law: str) -> wp.Kernel:
+def scatter_law_elements(law: LawInLanes) -> wp.Kernel:
     """Forces of a law of ``law_lanes``; a thread is eight elements. The corotated law lists what it leaves out."""
     leaves_out = ["left_out_elements"] if law == "corotated" else []
     forces = native(*ELEMENTS, "isotropic_elements", "element_forces", *leaves_out)
-    return scatter_lanes(LAWS[law] + ISOTROPIC + forces, GeneralElements, IsotropicMaterial, wp.int32)
+    return scatter_lanes(code_of(law) + ISOTROPIC + forces, GeneralElements, IsotropicMaterial, wp.int32)
 
 
 @wp.func

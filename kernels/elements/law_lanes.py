@@ -15,8 +15,13 @@ too; and where E is small, with its digits,
     n0 = t (18 + t (8 + t)) - a (10 + t) - 2j - y (1 + a),  and  P = F (2 mu (I - S^-1) + lambda t S^-1).
 """
 
+import functools
+
+from warp_corot.kernels.math.eigen import SWEEPS
+
 from .constitutive import CONTINUED_BELOW
 from .lanes import constants, native
+from .ogden import part_of_volume, stretch_limits
 
 #: q, 16 at rest, below which R is not trusted: the root has lost digits, or is about to meet another.
 INDEFINITE = 1.0
@@ -31,3 +36,35 @@ LAWS = {
     "stvk": native("strain", "stvk"),
     "neo-hookean": constants(CONTINUED_BELOW=CONTINUED_BELOW) + native("strain", "invariants", "log", "neo_hookean"),
 }
+
+#: A law in lanes: a name, or the terms (share, alpha) of Ogden's.
+LawInLanes = str | tuple[tuple[float, float], ...]
+
+
+def code_of(law: LawInLanes) -> str:
+    """Native code of a law: a key of ``LAWS``, or Ogden's with these terms."""
+    return LAWS[law] if isinstance(law, str) else _ogden(law)
+
+
+def has_log(law: LawInLanes) -> bool:
+    """Whether the code of a law has ``log_of``."""
+    return law == "neo-hookean" or not isinstance(law, str)
+
+
+@functools.cache
+def _ogden(terms: tuple[tuple[float, float], ...]) -> str:
+    slope = ""
+    for share, alpha in terms:
+        low, high = ((stretch**2 - 1.0) / 2.0 for stretch in stretch_limits(alpha))
+        m = 2.0 * share / alpha
+        rest = m - part_of_volume(share, alpha)
+        numbers = constants(M=m, REST=rest, POWER=0.5 * alpha - 1.0, LOW=low, HIGH=high)
+        slope += f"{{\n{numbers}{native('ogden_term')}}}\n"
+    return (
+        LAWS["neo-hookean"].replace("const auto stress", "const auto neo_hookean")
+        + constants(SWEEPS=int(SWEEPS), VOLUME_PART=sum(part_of_volume(*term) for term in terms))
+        + native("eigen")
+        + "const auto slope_of = [&](const lanes8& e) {\nlanes8 slope = spread(0.0f);\n"
+        + f"{slope}return slope;\n}};\n"
+        + native("ogden")
+    )

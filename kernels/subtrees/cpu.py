@@ -17,7 +17,7 @@ from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.kernels.elements.dilatation_lanes import law_of
 from warp_corot.kernels.elements.elements import Subtrees
 from warp_corot.kernels.elements.lanes import ISOTROPIC, ISOTROPIC_PART, native, scatter_lanes
-from warp_corot.kernels.elements.law_lanes import LAWS, ROTATION
+from warp_corot.kernels.elements.law_lanes import LAWS, ROTATION, LawInLanes, code_of, has_log
 
 from .lanes import begin, near_test, product
 
@@ -44,19 +44,15 @@ class DilatingMaterial:
     lam: wp.array[wp.float32]
 
 
-def joining(law: str, shared: Dilatation | None) -> str:
+def joining(law: LawInLanes, shared: Dilatation | None) -> str:
     """Native code that adds the shared dilatation to a law, or the law alone if there is none."""
     if shared is None:
         return native("own_leaves")
-    return (
-        law_of(shared, has_log=law == "neo-hookean")
-        + "const auto& dilating = material.lam;\n"
-        + native("shared_dilatation")
-    )
+    return law_of(shared, has_log=has_log(law)) + "const auto& dilating = material.lam;\n" + native("shared_dilatation")
 
 
 @functools.cache
-def scatter_law_subtrees(shape: int, law: str = "corotated", shared: Dilatation | None = None) -> wp.Kernel:
+def scatter_law_subtrees(shape: int, law: LawInLanes = "corotated", shared: Dilatation | None = None) -> wp.Kernel:
     """Forces of subtrees under a law of ``elements.law_lanes``, each leaf on its own; a thread is eight subtrees.
 
     With a shared dilatation the material is a ``DilatingMaterial``.
@@ -64,8 +60,8 @@ def scatter_law_subtrees(shape: int, law: str = "corotated", shared: Dilatation 
     flags = ["left_out_leaves"] if law == "corotated" else []
     leaves = joining(law, shared) + "const masks8 done = {};\n" + native("leaves", "subtree_forces", *flags)
     if shared is None:
-        return scatter_lanes(LAWS[law] + ISOTROPIC + begin(shape) + leaves, Subtrees, IsotropicMaterial, wp.uint8)
-    return scatter_lanes(LAWS[law] + ISOTROPIC_PART + begin(shape) + leaves, Subtrees, DilatingMaterial, wp.uint8)
+        return scatter_lanes(code_of(law) + ISOTROPIC + begin(shape) + leaves, Subtrees, IsotropicMaterial, wp.uint8)
+    return scatter_lanes(code_of(law) + ISOTROPIC_PART + begin(shape) + leaves, Subtrees, DilatingMaterial, wp.uint8)
 
 
 @functools.cache

@@ -16,6 +16,7 @@ from warp_corot.kernels.elements.dilatation import LOG_VOLUME
 
 from .dilatation import AUTO, bind_law, check_dilatation
 from .model import ForceField, Model
+from .paths.law_lanes import LawLanesField
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretized
@@ -35,8 +36,8 @@ class Ogden(Model):
 
     The law holds for J >= 0.5 and principal stretches within ``stretch_limits``, at which a term is a thousand times as
     stiff as at rest. Beyond, the energy continues as a parabola, in J as for ``NeoHookean`` and in squared stretches:
-    energy, force and stiffness are continuous and exist for every F, and inverted elements are pushed back. Elements
-    are computed one by one, which is slower than the subtrees and lanes of ``NeoHookean``.
+    energy, force and stiffness are continuous and exist for every F, and inverted elements are pushed back. On CUDA,
+    elements are computed one by one, which is slower than the subtrees of ``NeoHookean``.
 
     Attributes:
         mu: The shear moduli mu_p > 0 of the terms, in any unit; only their ratios count.
@@ -84,6 +85,8 @@ class Ogden(Model):
         functions = kernels.ogden(self.terms)
 
         def bind(discretization: Discretization, deterministic: bool) -> LawField:
+            if discretization.device.is_cpu:
+                return LawLanesField(discretization, law=self.terms, **functions, deterministic=deterministic)
             return LawField(discretization, **functions, deterministic=deterministic)
 
         return bind_law(bind, LOG_VOLUME, self.dilatation, body, deterministic)

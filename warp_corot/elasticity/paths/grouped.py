@@ -15,6 +15,7 @@ from warp_corot.kernels.elements.dilatation_lanes import (
     scatter_grouped_elements,
 )
 from warp_corot.kernels.elements.elements import GeneralElements
+from warp_corot.kernels.elements.law_lanes import LawInLanes
 
 
 class GroupedLanes:
@@ -62,15 +63,15 @@ class GroupedLanes:
         inputs = [self._plan.elements, material, lam, self._members, self._live]
         wp.launch(self._order, most, inputs, [self._general, grouped], device="cpu")
 
-    def kernel(self, law: str) -> wp.Kernel:
+    def kernel(self, law: LawInLanes) -> wp.Kernel:
         """The kernel that adds the forces of a law."""
         return scatter_grouped_elements(law, self._of)
 
-    def scatter_forces(self, law: str, u: wp.array, f: wp.array, repair: wp.Kernel | None = None) -> None:
+    def scatter_forces(self, law: LawInLanes, u: wp.array, f: wp.array, repair: wp.Kernel | None = None) -> None:
         """Add the forces of displacements u to f, both vec4 [N].
 
         Args:
-            law: A key of ``kernels.elements.law_lanes.LAWS``.
+            law: A law of ``kernels.elements.law_lanes``.
             repair: Computes the elements that the law leaves out, if any.
         """
         if not self.count:

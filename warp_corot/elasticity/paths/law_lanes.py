@@ -11,6 +11,7 @@ from warp_corot.discretization.plan import Plan
 from warp_corot.elasticity.model import LawField
 from warp_corot.kernels.elements.general_cpu import rest_matrices, scatter_law_elements
 from warp_corot.kernels.elements.lanes import LANES
+from warp_corot.kernels.elements.law_lanes import LawInLanes
 from warp_corot.kernels.subtrees.cpu import scatter_law_subtrees
 from warp_corot.mesh import TetForest
 
@@ -26,11 +27,11 @@ class LawLanesField(LawField):
 
     Args:
         discretization: On the CPU.
-        law: A key of ``kernels.elements.law_lanes.LAWS``.
+        law: A law of ``kernels.elements.law_lanes``.
         functions: As for ``LawField``.
     """
 
-    def __init__(self, discretization: Discretization, *, law: str, **functions: Any):
+    def __init__(self, discretization: Discretization, *, law: LawInLanes, **functions: Any):
         super().__init__(discretization, **functions)
         self._law = law
         self._lanes: Lanes | None = None
