@@ -8,6 +8,8 @@ from .rows import BAND, BAND_AT_REST, BAND_OF_NEIGHBOURS, Meeting, Rows, triangl
 
 wp.set_module_options({"enable_backward": False})
 
+#: The largest cosine between the normals of two surfaces that face each other.
+FACING = wp.constant(-0.5)
 #: A node this far outside a triangle's border, relative to the triangle's size, still counts as being at the triangle.
 BORDER = wp.constant(0.02)
 #: Fraction of an edge at each end that is left to its nodes; and the least sine of the angle between edges that are not
@@ -30,6 +32,38 @@ def deepest(size: float, is_self: bool, apart: wp.vec3):
     if is_self:
         band = wp.min(band, BAND_AT_REST * wp.length(apart))
     return -band
+
+
+@wp.func
+def rest_normal(surface: Surface, c: wp.vec3i):
+    a = surface.rest[c[0]]
+    return wp.normalize(wp.cross(surface.rest[c[1]] - a, surface.rest[c[2]] - a))
+
+
+@wp.func
+def face_at_rest(out: wp.vec3, n: wp.vec3, apart: wp.vec3):
+    """Whether two parts of a body face each other at rest, as those beside a slit do.
+
+    Args:
+        out, n: The normals at the first and at the second.
+        apart: The way from the second to the first [m].
+    """
+    return wp.dot(out, n) < FACING * wp.length(out) * wp.length(n) and wp.dot(apart, n) >= 0.0
+
+
+@wp.func
+def node_faces_at_rest(s: int, c: wp.vec3i, apart: wp.vec3, surface: Surface, meeting: Meeting):
+    out = wp.vec3()
+    for k in range(meeting.corner_starts[s], meeting.corner_starts[s + 1]):
+        out += rest_normal(surface, meeting.triangles[meeting.corners[k] / 3])
+    return face_at_rest(out, rest_normal(surface, c), apart)
+
+
+@wp.func
+def rest_edge_normal(e: int, surface: Surface, meeting: Meeting):
+    sides = meeting.sides[e]
+    first = rest_normal(surface, meeting.triangles[sides[0]])
+    return first + rest_normal(surface, meeting.triangles[sides[1]])
 
 
 @wp.func
@@ -71,7 +105,9 @@ def locate_node(row: int, s: int, t: int, surface: Surface, meeting: Meeting, ro
         apart = surface.rest[s] - point_of(w, surface.rest[c[0]], surface.rest[c[1]], surface.rest[c[2]])
     if is_self and gap < -BAND_OF_NEIGHBOURS * wp.length(apart) and are_neighbours(s, c, meeting):
         return False
-    return gap > deepest(size, is_self, apart)
+    if gap > deepest(size, is_self, apart):
+        return True
+    return gap > -BAND * size and node_faces_at_rest(s, c, apart, surface, meeting)
 
 
 @wp.func
@@ -109,4 +145,9 @@ def locate_edge(row: int, first: int, second: int, surface: Surface, meeting: Me
     rows.shares[row] = wp.vec4(1.0 - s, s, -(1.0 - t), -t)
     rows.normal[row] = n
     rows.gap[row] = gap
-    return gap > deepest(size, is_self, apart)
+    if gap > deepest(size, is_self, apart):
+        return True
+    if gap <= -BAND * size:
+        return False
+    out = rest_edge_normal(first, surface, meeting)
+    return face_at_rest(out, rest_edge_normal(second, surface, meeting), apart)

@@ -5,7 +5,7 @@ import warp as wp
 from .bearing import share_bearers
 from .boxes import edge_reach, root_of, triangle_reach, triangle_size
 from .closest import on_segments, on_triangle, point_of
-from .locate import ENDS, edge_normal
+from .locate import ENDS, FACING, edge_normal
 from .motion import Surface
 from .near import CRUSHED, PAIRED, Near, mark
 from .rows import BAND, Meeting, Rows, row_count
@@ -19,9 +19,9 @@ Kept = wp.types.vector(length=16, dtype=wp.int32)
 
 #: Edges with a larger sine of the bend are sharp.
 SHARP = wp.constant(0.15)
-#: The largest cosine between the normals of two surfaces that face each other, and between those of a node and a
-#: triangle of one body that may face each other before the next search.
-FACING, MAY_FACE = wp.constant(-0.5), wp.constant(0.5)
+#: The largest cosine between the normals of a node and a triangle of one body that may face each other before the next
+#: search.
+MAY_FACE = wp.constant(0.5)
 #: Edges that bend by up to about 100 degrees, whose normals add up to at least this, touch only what they face.
 BLUNT = wp.constant(1.25)
 
