@@ -76,3 +76,21 @@ def test_a_ball_that_begins_inside_is_met_where_it_is(device):
     np.testing.assert_allclose(pushed, -wrench, atol=1e-3 * wrench[2])
     for contact in report.contacts:
         assert abs(contact.gap) < 1e-6
+
+
+def test_a_corner_that_is_pressed_far_into_the_same_body_comes_to_rest(device):
+    """In the first step, it goes much farther than an element."""
+    from scipy.spatial.transform import Rotation
+
+    block, cube = wc.TetForest.box((1, 1, 1), 0.02, 4), wc.TetForest.box((1, 1, 1), 0.012, 3)
+    turned = Rotation.from_euler("yx", [33.0, 40.0], degrees=True).apply(cube.points)
+    turned += np.array([0.0118, 0.0087, 0.026]) - turned[np.argmin(turned[:, 2])]
+    points = np.concatenate([block.points, turned])
+    mesh = wc.TetMesh(points, np.concatenate([block.tets, cube.tets + len(block.points)]))
+    body = wc.SoftBody(mesh, wc.Isotropic(2e4, 0.4, 1000.0), device=device)
+    top = points[:, 2] > 0.036
+    body.displacements = np.where(top[:, None], [0.0, 0.0, -0.0072], 0.0)
+    body.fix(top | (points[:, 2] < 1e-9))
+    report = wc.solve_static(body, gravity=(0, 0, -10), contact=wc.Contact(friction=0.0, self_contact=True))
+    assert report.converged, report.message
+    assert len(report.contacts) == 1

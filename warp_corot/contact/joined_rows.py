@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import warp as wp
 
 from warp_corot.kernels.contact import joined as kernels
@@ -88,7 +89,8 @@ class JoinedRows:
 
     def reserve(self, motion: float) -> None:
         """Search for pairs with a larger margin, if anything may begin to move so far in a step [m]."""
-        self._pairs.search.serve_implicit(motion)
+        bounds = [self._system.ranks.bounds(body) for body in self._system.bodies]
+        self._pairs.search.serve_implicit(motion, max(float(np.linalg.norm(high - low)) for low, high in bounds))
 
     # --- launches ----------------------------------------------------------------------------------------------------
 

@@ -133,16 +133,17 @@ class Search:
         """
         if not self.has_missed:
             return
-        least = WIDER * float(self.watch.least.numpy()[0])
+        least = float(self.watch.least.numpy()[0])
         self.watch.missed.zero_()
         self._report.values[MISSED] = 0.0
-        if least > self.farthest:
+        if least >= self.farthest:
             raise UnstableError(f"surfaces that are hit go farther than {1e3 * self.farthest:.3g} mm in one step")
+        least = min(WIDER * least, self.farthest)
         self.watch.least.fill_(least)
 
-    def serve_implicit(self, motion: float) -> None:
-        """Serve implicit steps, in which anything may begin to move so far [m]."""
-        self.watch.is_implicit = 1
+    def serve_implicit(self, motion: float, extent: float) -> None:
+        """Serve implicit steps, in which anything may begin to move so far, and at most an extent [m]."""
+        self.watch.is_implicit, self.farthest = 1, max(self.farthest, extent)
         motion = min(motion, self.farthest / WIDER)
         if motion > float(self.watch.least.numpy()[0]):
             self.watch.least.fill_(motion)

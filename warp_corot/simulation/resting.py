@@ -40,6 +40,7 @@ class Rest(NamedTuple):
             contact, of the world where it is largest.
         contact: The contact of the last step; None if the search did not end.
         rolls: Whether the last step was mostly a motion without deformation, of some body that nothing holds.
+        fault: What ended the last search, in some words; empty: its steps.
     """
 
     converged: npt.NDArray[np.bool_]
@@ -49,6 +50,7 @@ class Rest(NamedTuple):
     residual: float
     contact: Contacts | None
     rolls: bool
+    fault: str = ""
 
     @property
     def message(self) -> str:
@@ -57,7 +59,7 @@ class Rest(NamedTuple):
             return "the body is at rest"
         if self.rolls:
             return "not converged: the body still rolls, slides or falls as a whole; fix some nodes, or add friction"
-        return "not converged: the steps were not enough"
+        return f"not converged: {self.fault or 'the steps were not enough'}"
 
 
 def checked_obstacles(given: Shape | Sequence[Shape]) -> tuple[Shape, ...]:
@@ -101,7 +103,7 @@ def rest_on(
         preconditioner: The preconditioner of the linear solves.
     """
     starts = [body.displacements.numpy().copy() for body in bodies]
-    steps, linear, worlds, rolls = 0, 0, bodies[0].worlds, False
+    steps, linear, worlds, rolls, fault = 0, 0, bodies[0].worlds, False, ""
     correction, converged = np.full(worlds, np.inf), np.zeros(worlds, bool)
     for number, (length, settling) in enumerate(LENGTHS):
         dt = length * max(_wave_time(body) for body in bodies)
@@ -121,8 +123,9 @@ def rest_on(
                     converged = _residuals(bodies, fields, loads) <= BALANCED
                     if converged.all():
                         break
-        except UnstableError:
-            converged = np.zeros(worlds, bool)
+            fault = ""
+        except UnstableError as error:
+            converged, fault = np.zeros(worlds, bool), str(error).split(" at step ")[0]
         linear += sim.solves.linear_iterations if sim.solves is not None else 0
         if converged.all():
             break
@@ -131,7 +134,7 @@ def rest_on(
             body.displacements = start
     contact_then = sim.contact if converged.all() else None
     residual = float(_residuals(bodies, fields, loads).max())
-    return Rest(converged, steps, linear, float(correction.max()), residual, contact_then, rolls)
+    return Rest(converged, steps, linear, float(correction.max()), residual, contact_then, rolls, fault)
 
 
 def _wave_time(body: SoftBody) -> float:
