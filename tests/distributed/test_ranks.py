@@ -60,6 +60,48 @@ def test_all_cases_are_the_same_on_seven_ranks(tmp_path):
     np.testing.assert_array_equal(found[7]["parts.x"], found[1]["worlds.True.x"])
 
 
+@pytest.mark.slow
+def test_ranks_keep_record_and_reset_bodies_that_are_remeshed(tmp_path):
+    found = made_on(3, tmp_path, ranked.REMESHED)
+    for case in ranked.REMESHED:
+        alone = {name: found[1][f"{case}.True.{name}"] for name in ("saved.x", "saved.numbers", "frames", "again.x")}
+        assert alone["frames"][0] == len(ranked.bodies_of(case)[0].mesh.tets)
+        assert len(set(alone["frames"])) > 1
+        for name, values in alone.items():
+            np.testing.assert_array_equal(found[3][f"{case}.True.{name}"], values)
+        for size in (1, 3):
+            for what in ("x", "numbers"):
+                np.testing.assert_array_equal(found[3][f"{case}.{size}.{what}"], alone[f"saved.{what}"])
+        assert_pieces_are_closed(tmp_path / f"{case}.3.usda", alone["frames"])
+        one = wc.Simulation.load(tmp_path / f"{case}.3.npz")
+        one.advance(0.01)
+        assert one.steps == alone["saved.numbers"][0]
+        assert one.body.positions.numpy().shape == alone["saved.x"].shape
+        if case == "stretched":
+            np.testing.assert_allclose(one.body.positions.numpy(), alone["saved.x"], atol=1e-6)
+
+
+def assert_pieces_are_closed(path, counts):
+    """The surfaces of all pieces together enclose their tetrahedra in every frame."""
+    from pxr import Usd, UsdGeom
+
+    stage = Usd.Stage.Open(str(path))
+    meshes = [UsdGeom.Mesh(prim) for prim in stage.Traverse() if prim.GetTypeName() == "Mesh"]
+    for frame, count in enumerate(counts):
+        elements, volume, enclosed = 0, 0.0, 0.0
+        for mesh in meshes:
+            solid = UsdGeom.TetMesh(stage.GetPrimAtPath(mesh.GetPath().GetParentPath().AppendChild("tetrahedra")))
+            x = np.array(solid.GetPointsAttr().Get(frame), np.float64)
+            a, b, c, d = np.moveaxis(x[np.array(solid.GetTetVertexIndicesAttr().Get(frame))], 1, 0)
+            elements += len(a)
+            volume += np.einsum("nk,nk->", np.cross(b - a, c - a), d - a) / 6.0
+            x = np.array(mesh.GetPointsAttr().Get(frame), np.float64)
+            a, b, c = np.moveaxis(x[np.array(mesh.GetFaceVertexIndicesAttr().Get(frame)).reshape(-1, 3)], 1, 0)
+            enclosed += np.einsum("nk,nk->", np.cross(a, b), c) / 6.0
+        assert elements == count
+        np.testing.assert_allclose(enclosed, volume, rtol=1e-5)
+
+
 def test_a_mesh_that_no_rank_holds_whole_gives_the_same_run(runs):
     np.testing.assert_array_equal(runs[3]["parts.x"], runs[1]["worlds.True.x"])
     np.testing.assert_array_equal(runs[3]["parts.touched.x"], runs[1]["touched.True.x"])

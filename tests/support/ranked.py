@@ -74,7 +74,7 @@ TOUCHING = ("touched", "organ", "meeting", "organs", "pressed", "bdf2", "dented"
 #: Cases whose meshes change.
 REMESHED = ("stretched", "dented")
 #: Cases whose checkpoints several ranks keep.
-KEPT = (*(case for case in TOUCHING if case not in REMESHED), "multigrid")
+KEPT = (*TOUCHING, "stretched", "multigrid")
 
 
 def obstacles_of(case: str) -> list[wc.Ground | wc.Tool]:
@@ -223,8 +223,24 @@ def made(case: str, deterministic: bool, kept: Path | None) -> dict[str, np.ndar
     if kept is not None:
         sim.save(kept)
         sim.advance(0.01)
+        # Positions of a body that is remeshed are in another array now.
+        positions = [body.positions for body in bodies]
         found |= {"saved.x": gathered(positions), "saved.numbers": np.array([sim.steps, sim.time])}
+        if case in REMESHED:
+            found |= recorded_and_reset(sim, kept.with_name(f"{case}.{sim.size}.usda"))
     return {f"{case}.{deterministic}.{key}": value for key, value in found.items()}
+
+
+def recorded_and_reset(sim: Any, stage: Path) -> dict[str, np.ndarray | None]:
+    """Reset a run whose meshes have changed, record it from then on, and give the numbers of elements in the frames,
+    and the positions."""
+    import warp_corot.distributed as wd
+
+    sim.reset()
+    at_rest = gathered([body.displacements for body in sim.bodies])
+    assert at_rest is None or not at_rest.any()
+    elements = wd.record(sim, stage, duration=0.04, fps=100).elements
+    return {"frames": np.array(elements), "again.x": gathered([body.positions for body in sim.bodies])}
 
 
 def resumed(path: Path) -> dict[str, np.ndarray | None]:
@@ -386,7 +402,7 @@ def make_all(folder: Path, size: int, names: list[str]) -> None:
     several ranks resume; these keep those of ``KEPT``."""
     found: dict[str, Any] = {}
     for name in names:
-        keeps = name not in REMESHED and (size == 1 or name in KEPT)
+        keeps = size == 1 or name in KEPT
         found |= made(name, True, folder / f"{name}.{size}.npz" if keeps else None)
     if size == 1 and "worlds" in names:
         kept_in_parts(folder / "parts.1.npz")
@@ -394,7 +410,8 @@ def make_all(folder: Path, size: int, names: list[str]) -> None:
         # This rank compiles the kernels that three ranks need.
         grown_parts.assert_whole(grown_parts.blobs(), 0.33, max_level=4)
     if size > 2:
-        for path in (folder / "forest.1.npz", *(folder / f"{name}.{size}.npz" for name in KEPT)):
+        alone = (folder / f"{name}.1.npz" for name in ("forest", *REMESHED))
+        for path in (*alone, *(folder / f"{name}.{size}.npz" for name in KEPT)):
             if path.stem.split(".")[0] in names and path.exists():
                 found |= resumed(path)
         if "forest" in names:

@@ -160,6 +160,9 @@ class MeshChanges(Protocol):
     def reset(self, chosen: wp.array, clock: Clock) -> None:
         """Return to the saved state, if the world is chosen, int32 [1]."""
 
+    def restore(self) -> None:
+        """Return to the saved state, but leave the time at which motions begin."""
+
 
 class Discretized(Protocol):
     """Something that has a discretization, as a body does."""

@@ -133,7 +133,11 @@ class Following:
 
     def take_initial(self) -> None:
         """Copy the state that a reset restores to the part."""
-        given = self.whole.state.initial
+        state = self.whole.state
+        given = state.initial
+        if self.whole.changing is not None:
+            # The whole body has that state already, on its initial mesh.
+            given = state.displacements, state.velocities
         if given is None:
             self.part.state.initial = None
             return
@@ -158,9 +162,9 @@ class Following:
 
     def whole_values(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Values of all nodes of the whole body on all ranks, from those of the parts' nodes, [n, …]; zero at nodes of
-        no element.
+        no element, and in the room for nodes of a body that is remeshed.
         """
-        found = np.zeros((self.whole.node_count, *values.shape[1:]), values.dtype)
+        found = np.zeros((len(self.whole.state.displacements), *values.shape[1:]), values.dtype)
         for nodes, own in self._comm.allgather((self.own_nodes, values[self._number[self.own_nodes]])):
             found[nodes] = own
         return found

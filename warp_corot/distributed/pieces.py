@@ -90,7 +90,13 @@ class Piece:
             everywhere = np.broadcast_to(getattr(body.material.isotropic, name), shape)
             values.append(everywhere[self._world, elements])
         joined = np.concatenate(values).astype(np.float64)
-        return float(joined[0]) if (joined == joined[0]).all() else joined
+        # A piece of a mesh that changes may get elements of other materials.
+        varies = any(np.ptp(getattr(e.whole.material.isotropic, name)) > 0 for e in self._following if _changes(e))
+        return float(joined[0]) if (joined == joined[0]).all() and not varies else joined
+
+
+def _changes(following: Following) -> bool:
+    return following.whole.changing is not None
 
 
 def _outer_faces(following: Following) -> Ints:
@@ -112,4 +118,5 @@ def _skin(points: npt.NDArray[np.float64], faces: Ints) -> Skin:
     used, triangles = np.unique(faces, return_inverse=True)
     weights = np.tile([1.0, 0.0, 0.0, 0.0], (len(used), 1))
     nodes = np.repeat(used[:, None], 4, axis=1).astype(np.int32)
-    return Skin("surface", SurfaceMesh(points[used], nodes, weights, triangles.reshape(-1, 3).astype(np.int32)))
+    surface = SurfaceMesh(points[used], nodes, weights, triangles.reshape(-1, 3).astype(np.int32))
+    return Skin("surface", surface, is_boundary=True)

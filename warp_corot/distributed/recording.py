@@ -33,7 +33,8 @@ def record(
 
     ``beam.usd`` becomes a small stage that refers to ``beam.ranks/rank-0000.usdc`` and so on: every rank writes the
     elements that it counts and their faces on the surface, and no rank gathers the whole body. All pieces have the same
-    range of colours. Bodies made from a domain are drawn by their tetrahedra. If the run is interrupted, all but the
+    range of colours. Bodies made from a domain are drawn by their tetrahedra. Of a body that is remeshed, each frame
+    shows the current mesh, and the pieces are those of its present division. If the run is interrupted, all but the
     last few seconds of frames are kept.
 
     Args:
@@ -57,7 +58,6 @@ def record(
     """
     if not isinstance(sim, Simulation):
         raise InputError("sim must be a Simulation of warp_corot.distributed; warp_corot.record takes others")
-    sim.check_not_remeshed("a recording")
     checked_path(path, "path")
     count = frame_count(duration, fps)
     if world is None and sim.worlds > 1:
@@ -78,7 +78,8 @@ class _Pieces:
         self._sim, self._path, self._fps = sim, path, fps
         self._folder = path.with_name(f"{path.stem}.ranks")
         self._comm = sim.comm
-        self._piece = Piece(sim.following, world)
+        self._world = world
+        self._make_piece()
         self.done = done
 
         def made() -> Any:
@@ -91,6 +92,7 @@ class _Pieces:
                 material=self._piece,
                 skins=[self._piece.skin],
                 tets=tets,
+                changing=sim.remeshing is not None,
                 gravity=sim.gravity if sim.rank == 0 else None,
             )
 
@@ -124,8 +126,16 @@ class _Pieces:
         self._together(lambda: self._join(done.frames))
         return done
 
+    def _make_piece(self) -> None:
+        self._following, self._piece = self._sim.following, Piece(self._sim.following, self._world)
+
     def _write_frame(self) -> None:
-        sim, piece, done = self._sim, self._piece, self.done
+        sim, done = self._sim, self.done
+        if sim.following is not self._following:
+            self._make_piece()
+            piece = self._piece
+            self._writer.change_mesh(piece, fixed=piece.fixed, material=piece, skins=[piece.skin])
+        piece = self._piece
         displacements, velocities = (piece.state(name, sim.completed) for name in ("displacements", "velocities"))
         positions = (piece.points + displacements).astype(np.float32)
         stress = piece.of_elements(sim.von_mises())

@@ -12,6 +12,7 @@ from warp_corot.errors import InputError
 from warp_corot.solvers import Integrator
 
 from .part_meshes import InParts
+from .passes import Passes
 
 #: Models whose forces need only the elements around a node.
 MODELS = (Corotated, Linear, NeoHookean, StVenantKirchhoff)
@@ -66,7 +67,7 @@ def check_supported(
         if getattr(model, "rotation", None) == "warm":
             raise InputError("rotation 'warm' does not work on several ranks yet; it must be 'byers-xu' or 'svd'")
     for body in bodies:
-        if body.changing is not None:
+        if body.changing is not None and not isinstance(others.get("remesh"), Passes):
             raise InputError("a body that is remeshed does not work on several ranks yet")
 
 

@@ -14,14 +14,20 @@ import warp as wp
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.contacts import Contacts
 from warp_corot.contact.tool import Obstacle
-from warp_corot.elasticity import Corotated, ForceField, Model
+from warp_corot.elasticity import Corotated, Model
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_count
 from warp_corot.inputs.device import checked_device
-from warp_corot.remesh.remeshing import Remeshing
+from warp_corot.remesh.online import OnlineRemesh
 from warp_corot.simulation import simulation as on_one
 from warp_corot.simulation.energy import Energy, WorldEnergies
-from warp_corot.simulation.parts import checked_bodies, checked_gravity, checked_integrator, checked_models
+from warp_corot.simulation.parts import (
+    checked_bodies,
+    checked_gravity,
+    checked_integrator,
+    checked_models,
+    chosen_worlds,
+)
 from warp_corot.simulation.solves import Solves
 from warp_corot.solvers import Integrator, SymplecticEuler
 
@@ -30,6 +36,7 @@ from .following import Following
 from .gathering import forget, register
 from .of_parts import SimulationOfParts, compile_once, of_their_own, part_of, settled_model
 from .parts import Part
+from .passes import Passes
 from .ranks import MpiRanks, Together
 from .refusals import check_supported
 
@@ -84,20 +91,16 @@ class Simulation:
         models = tuple(settled_model(m, body, comm) for m, body in zip(models, self.bodies, strict=True))
         self.gravity = checked_gravity(gravity, self.bodies[0].mesh.up_axis)
         self._division = costs, here
-        self._remeshing: Remeshing | None = None
-        self._fields: tuple[ForceField, ...] = ()
+        self._passes: Passes | None = None
         if (remesh := others.pop("remesh", None)) is not None:
-            self._remeshing = Remeshing(self.bodies, models, remesh, deterministic=deterministic)
-            bound = zip(models, self.bodies, strict=True)
-            self._fields = tuple(model.bind(body, deterministic=deterministic) for model, body in bound)
-            self._remeshing.serve(self._fields)
+            self._passes = Passes.of(self.bodies, models, remesh, deterministic=deterministic)
         self._options: dict[str, Any] = {"model": models, "integrator": integrator, "gravity": self.gravity} | others
         self._options["deterministic"] = deterministic
         parts = self._divided(models, deterministic)
         compile_once(comm, parts, **{name: value for name, value in self._options.items() if name != "deterministic"})
         self._parts = self._made(parts)
-        if self._remeshing is not None:
-            self._parts.take_remeshing(self._remeshing, self._remesh)
+        if self._passes is not None:
+            self._parts.take_remeshing(self._passes.remeshing, self._remesh)
         register(self._following)
 
     def _divided(self, models: Sequence[Model], deterministic: bool) -> list[Part]:
@@ -121,15 +124,18 @@ class Simulation:
 
     def _remesh(self) -> None:
         """Make the passes that are due over the whole bodies, on all ranks alike, and divide the new meshes."""
-        remeshing = self._remeshing
-        assert remeshing is not None
+        assert self._passes is not None
+        remeshing = self._passes.remeshing
         self._publish()
         self.collect()
         before = [body.version for body in self.bodies]
         remeshing.run(self._parts.steps)
         remeshing.step_may_change()
-        if before == [body.version for body in self.bodies]:
-            return
+        if before != [body.version for body in self.bodies]:
+            self._divide_anew()
+
+    def _divide_anew(self) -> None:
+        """Go on with parts of the present meshes; the whole bodies have the state of all nodes."""
         forget(self._following)
         for body in self.bodies:
             if body.state.is_touched:
@@ -189,13 +195,28 @@ class Simulation:
         self._parts.on_step(called, checked_count(every, "every", least=1))
 
     def reset(self, worlds: npt.ArrayLike | wp.array | None = None) -> None:
-        """Reset worlds to their initial state, like ``warp_corot.Simulation.reset``."""
-        self.check_not_remeshed("reset")
+        """Reset worlds to their initial state, like ``warp_corot.Simulation.reset``.
+
+        The meshes to which bodies return that are remeshed are divided anew.
+        """
         self._take_over()
+        if self._passes is not None:
+            self._restore_meshes(worlds)
         for each in self._following:
             each.take_initial()
         self._parts.reset(worlds)
         self._publish()
+
+    def _restore_meshes(self, worlds: npt.ArrayLike | wp.array | None) -> None:
+        """Put the meshes of bodies that are remeshed back to those of their initial states, and divide these."""
+        if not chosen_worlds(worlds, self.worlds, self.device).numpy()[0]:
+            return
+        self._publish()
+        self.collect()
+        for body in self.bodies:
+            if body.changing is not None:
+                body.changing.restore()
+        self._divide_anew()
 
     # --- looking ---------------------------------------------------------------------------------------------------
 
@@ -312,9 +333,9 @@ class Simulation:
         return self._following
 
     @property
-    def remeshing(self) -> tuple[Remeshing, tuple[ForceField, ...]] | None:
+    def remeshing(self) -> Passes | None:
         """The passes over the whole bodies, and the force fields of these; None without remeshing."""
-        return None if self._remeshing is None else (self._remeshing, self._fields)
+        return self._passes
 
     def von_mises(self) -> list[npt.NDArray[np.float32]]:
         """Von Mises stress of each element of this rank's part of each body [Pa], float32 [worlds * t]."""
@@ -349,7 +370,6 @@ class Simulation:
         Raises:
             InputError: On all ranks, if one cannot write to the folder.
         """
-        self.check_not_remeshed("save")
         self._take_over()
         if any(each.is_in_parts for each in self._following):
             in_pieces.save(path, self._parts, self._following, self._comm)
@@ -358,7 +378,13 @@ class Simulation:
         checkpoint.save(path, self.bodies, self._parts, self._following, self._comm)
 
     @classmethod
-    def load(cls, path: str | PathLike[str], *, device: str | wp.Device | None = None) -> Simulation:
+    def load(
+        cls,
+        path: str | PathLike[str],
+        *,
+        device: str | wp.Device | None = None,
+        remesh: OnlineRemesh | Sequence[OnlineRemesh | None] | None = None,
+    ) -> Simulation:
         """Resume from a checkpoint that ``save`` or one process wrote, on any number of ranks; all ranks must call
         this.
 
@@ -367,6 +393,7 @@ class Simulation:
         Args:
             path: The file, which every rank reads; of bodies in parts also the files beside it.
             device: The device; None: the one on which it was saved, or the rank's own card.
+            remesh: As for ``warp_corot.Simulation.load``.
 
         Raises:
             InputError: As for ``warp_corot.Simulation.load``, or a run that does not work on several ranks.
@@ -379,11 +406,13 @@ class Simulation:
             if in_parts.touching:
                 in_parts.resume_touch(made._parts, made._following[0])
             return made
-        loaded = on_one.Simulation.load(path, device=device)
+        loaded = on_one.Simulation.load(path, device=device, remesh=remesh)
         touching: dict[str, Any] = {}
         if loaded.contact is not None:
             touching = {"obstacles": of_their_own(loaded.contact.obstacles.given), "contact": loaded.contact.options}
-        check_supported(loaded.bodies, loaded.models, loaded.integrator, {"remesh": any(loaded.remesh), **touching})
+        if any(loaded.remesh):
+            touching["remesh"] = Passes(loaded.remeshing, loaded.fields)
+        check_supported(loaded.bodies, loaded.models, loaded.integrator, touching)
         made = cls(
             loaded.bodies,
             model=loaded.models,
@@ -396,15 +425,6 @@ class Simulation:
         return made
 
     # --- pieces ----------------------------------------------------------------------------------------------------
-
-    def check_not_remeshed(self, what: str) -> None:
-        """Check that no body is remeshed, for what does not work with those.
-
-        Raises:
-            InputError: One is.
-        """
-        if self._remeshing is not None:
-            raise InputError(f"{what} of bodies that are remeshed does not work on several ranks yet")
 
     def _take_over(self) -> None:
         for k, each in enumerate(self._following):

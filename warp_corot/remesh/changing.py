@@ -148,13 +148,16 @@ class Changing:
 
         Loads, held nodes and keyframes are the last ones given on that mesh.
         """
-        if not chosen.numpy()[0]:
-            return
+        if chosen.numpy()[0]:
+            starts = self.body.conditions.world_starts
+            wp.launch(set_start, dim=1, inputs=[clock.arrays], outputs=[starts], device=self.device)
+            self.restore()
+
+    def restore(self) -> None:
+        """Restore the initial mesh and state, as ``reset`` does, but leave the time at which motions begin."""
         self.conditions.note()
         self.forest.restart()
         self.conditions.put_back()
-        starts = self.body.conditions.world_starts
-        wp.launch(set_start, dim=1, inputs=[clock.arrays], outputs=[starts], device=self.device)
         self.renew()
         self.conditions.keep()
         self.body.conditions.find_inverse_masses()
