@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 
 import warp_corot as wc
+from warp_corot.mesh.surfaces.locating import distances_from
 
 SOFT = wc.Isotropic(young=5e3, poisson=0.4, density=1000.0)
 CALM = wc.SymplecticEuler(viscosity=1e-3)
@@ -118,3 +119,43 @@ def test_contact_goes_on_through_passes(device):
         sim.advance_steps(every - 2)
     assert min(carried) > 0.2
     assert max(carried) < 2.0
+
+
+@pytest.fixture
+def coarser(device):
+    """A ball of 20 mm, and a simulation in which each second step merges all its elements that may be merged."""
+    box = wc.TetForest.box((1, 1, 1), 0.045, level=6, origin=(-0.0225, -0.0225, -0.0225))
+    place = (box.cells, box.cell_size, box.origin, box.lattice, box.node_ends, box.tree, box.up_axis)
+    mesh = wc.TetForest(*place, phi=np.linalg.norm(box.points, axis=1) - 0.02)
+    body, low = wc.SoftBody(mesh, SOFT, device=device), wp.array([-1.0, 0.0], dtype=wp.float32, device=device)
+    given = {"min_level": 3, "refine_above": 1.0, "simplify_below": 0.5, "criterion": closeness, "parameters": low}
+    remesh = wc.OnlineRemesh(every=2, **given)
+    still = {"gravity": (0.0, 0.0, 0.0), "integrator": CALM}
+    return body, wc.Simulation(body, obstacles=wc.Ground(offset=-0.03), remesh=remesh, **still)
+
+
+def test_the_surface_of_a_mesh_that_coarsens_keeps_its_shape(coarser):
+    """Its points are about as near the drawn surface as those of the first mesh; without this they are 9 mm off."""
+    body, sim = coarser
+    drawn = body.mesh.surface()
+    sim.advance_steps(21)
+    assert body.element_count == 48
+    found = body.contact_surface
+    assert distances_from(found.points, found.triangles, drawn.points, 1.0).max() < 0.15 * 0.045 / 4.0
+    assert found.volume == pytest.approx(drawn.volume, rel=0.03)
+
+
+def test_the_contact_surface_can_be_read_after_a_pass(coarser):
+    """It has the points and triangles to which the pressures of the last step belong, on the nodes of the new mesh."""
+    body, sim = coarser
+    sim.advance_steps(1)
+    before, nodes = body.contact_surface, body.node_count
+    sim.advance_steps(1)
+    assert body.node_count < nodes
+    after = body.contact_surface
+    assert len(after.triangles) == len(body.contact_pressure)
+    np.testing.assert_array_equal(after.points, before.points)
+    np.testing.assert_array_equal(after.triangles, before.triangles)
+    displaced = body.positions.numpy() * [0.1, -0.2, 0.3] + [0.0, 0.0, 1e-3]
+    expected = after.points * [1.1, 0.8, 1.3] + [0.0, 0.0, 1e-3]
+    np.testing.assert_allclose(after.moved(displaced), expected, rtol=0.0, atol=1e-6)

@@ -6,6 +6,7 @@ import pytest
 import warp_corot as wc
 from warp_corot.mesh.surfaces.bound import SurfaceMesh
 from warp_corot.mesh.surfaces.clustering import Clusters
+from warp_corot.mesh.surfaces.locating import distances_from
 from warp_corot.mesh.surfaces.splitting import longest_edge, split
 
 BALL = 0.02
@@ -62,3 +63,17 @@ def test_split_triangles_have_the_same_shape(whole):
     sizes = np.ones(len(points))
     longest = longest_edge(whole.points, whole.triangles, sizes)
     assert longest_edge(points, triangles, sizes) == pytest.approx(0.5 * longest, rel=1e-12)
+
+
+def test_levels_are_lowered_only_where_the_surface_keeps_its_shape(whole):
+    """A ball of 20 mm: with points as far apart as that it would be more than 2 mm off."""
+    clusters, count = Clusters(whole.points, whole.triangles, 0.02), len(whole.points)
+    free = clusters.thinned(np.zeros(count, int))
+    assert distances_from(whole.points[free[0]], free[1], whole.points, 1.0).max() > 2e-3
+    levels, allowed = np.full(count, 9), np.full(count, 1e-3)
+    for level in range(8, -1, -1):
+        levels = clusters.lowered(levels, level, allowed)
+    kept, triangles = clusters.thinned(levels)
+    assert is_closed(triangles)
+    assert distances_from(whole.points[kept], triangles, whole.points, 1.0).max() <= 1e-3
+    assert len(kept) < 0.5 * len(clusters.thinned(np.full(count, 9))[0])

@@ -229,12 +229,15 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
         """The surface on which contact acts, bound to the nodes of a world.
 
         It is the body's own surface if its mesh was made from a domain, a little coarser than ``mesh.surface()``;
-        otherwise the boundary of the tetrahedra, ``surface_triangles``. See ``Contact(on=...)``.
+        otherwise the boundary of the tetrahedra, ``surface_triangles``. See ``Contact(on=...)``. After a pass of
+        remeshing, the body's own surface has the points and triangles of the last step until the next one.
 
         Raises:
             InputError: The body is in no simulation with contact.
         """
         self._check_touched()
+        if self.state.rebound_contact_surface is not None:
+            return self.state.rebound_contact_surface()
         return self.state.contact_surface or boundary_surface(self.mesh)
 
     @property

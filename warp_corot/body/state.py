@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -36,6 +37,7 @@ class State:
         contact_forces: Contact forces in the last step [N]; one entry until the body may have contact.
         contact_pressures: Contact pressures on the triangles of the surface [Pa], float32; empty until then.
         contact_surface: That surface; None: the boundary of the tetrahedra.
+        rebound_contact_surface: Binds it to the nodes of the present mesh; None: the mesh does not change.
         is_touched: Whether the body may have contact.
         initial: Displacements and velocities that a reset restores; None for rest.
         revision: Changes whenever ``positions`` becomes another array.
@@ -49,6 +51,7 @@ class State:
         self.contact_forces, self.is_touched = wp.zeros(1, dtype=wp.vec4, device=device), False
         self.contact_pressures = wp.zeros(0, dtype=wp.float32, device=device)
         self.contact_surface: SurfaceMesh | None = None
+        self.rebound_contact_surface: Callable[[], SurfaceMesh] | None = None
         self.initial: tuple[wp.array, wp.array] | None = None
         self.revision = 0
 

@@ -369,6 +369,7 @@ class Contacts:
             triangles = len(part.skin.triangles)
             body.state.contact_pressures = pressures if self.system.worlds > 1 else pressures[:triangles]
             body.state.contact_surface = part.skin.own
+            body.state.rebound_contact_surface = self.surface.rebound(body)
 
     def _nodes_of(self, part: Part) -> tuple[int, int, Surface]:
         """The nodes that carry a body's surface: the first one, how many there are, and their arrays."""

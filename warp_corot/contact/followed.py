@@ -11,7 +11,7 @@ import warp as wp
 from warp_corot.discretization.changing.following import FollowingBinding
 from warp_corot.kernels.remesh import follow as kernels
 from warp_corot.mesh.surfaces.bound import BoundPoints, SurfaceMesh
-from warp_corot.mesh.surfaces.clustering import Clusters, resolved
+from warp_corot.mesh.surfaces.clustering import LOST, Clusters, resolved
 from warp_corot.mesh.surfaces.splitting import longest_edge, split
 
 from .skin import APART, Skin, apart, levels_at
@@ -29,7 +29,8 @@ Ints = npt.NDArray[np.integer]
 
 
 class FollowedSurface:
-    """The surface of the first mesh, thinned where the present one is coarse.
+    """The surface of the first mesh, thinned where the present one is coarse, but nowhere so far that it leaves the
+    drawn one by more than a fraction of the distance that points of the first mesh have.
 
     It needs no copy of the present mesh on the host: the device finds the elements that hold the points.
 
@@ -43,7 +44,8 @@ class FollowedSurface:
         self._known: Skin | None = None
         self._known_levels: Ints = np.zeros(0, np.int32)
         self._kept: Ints = np.zeros(0, np.int64)
-        whole = body.changing.forest.source.surface()
+        self._last = whole = body.changing.forest.source.surface()
+        self._version = -1
         self._take(whole.points, whole.triangles)
 
     def skin(self) -> Skin:
@@ -53,14 +55,25 @@ class FollowedSurface:
         while self._is_coarse(levels):
             self._take(*split(self._points, self._triangles))
             levels = self._levels()
-        levels = np.maximum(levels, self._least)
+        levels = self._in_shape(levels)
         if self._known is None or not np.array_equal(levels, self._known_levels):
-            kept, triangles = self._clusters.thinned(levels)
-            self._known_levels, self._kept = levels, kept
-            self._known = Skin.of_surface(self._bound(kept, triangles))
-            return self._known
-        assert self._known.own is not None
-        return self._known.on(self._bound(self._kept, self._known.own.triangles))
+            self._known_levels = levels
+            self._kept, triangles = self._clusters.thinned(levels)
+            self._last = self._bound(triangles)
+            self._known = Skin.of_surface(self._last)
+        else:
+            self._last = self._bound(self._last.triangles)
+            self._known = self._known.on(self._last)
+        self._version = self._body.version
+        return self._known
+
+    def last(self) -> SurfaceMesh:
+        """The last ``skin``, bound to the nodes of the present mesh."""
+        if self._version != self._body.version:
+            assert self._body.changing is not None
+            self._binding.rebind(self._body.changing.forest.pools)
+            self._last, self._version = self._bound(self._last.triangles), self._body.version
+        return self._last
 
     # --- pieces ------------------------------------------------------------------------------------------------------
 
@@ -73,12 +86,23 @@ class FollowedSurface:
         self._binding = FollowingBinding(bound, source, leaves, device)
         levels = levels_at(source, bound)
         sizes = apart(source, levels)
-        fewer = np.rint(3.0 * np.log2(sizes / resolved(SurfaceMesh(points, bound.nodes, weights, triangles), sizes)))
-        #: The level with which the surface keeps its shape, where that is not the level of the first mesh.
-        self._least = np.where(fewer > 0.0, levels + fewer.astype(np.int32), 0)
+        resolved_sizes = resolved(SurfaceMesh(points, bound.nodes, weights, triangles), sizes)
+        fewer = np.rint(3.0 * np.log2(sizes / resolved_sizes))
+        self._far = LOST * resolved_sizes
+        #: The lowest level at each point with which the surface keeps its shape, of those down to ``_tried``.
+        self._least: Ints = levels + np.maximum(fewer, 0.0).astype(np.int32)
+        self._tried = int(self._least.max(initial=0))
         self._clusters = Clusters(points, triangles, APART * source.cell_size)
         self._of_points = wp.zeros(len(points), dtype=wp.int32, device=device)
         self._known = None
+
+    def _in_shape(self, levels: Ints) -> Ints:
+        """These levels, or higher ones where the surface would lose its shape."""
+        below = levels[levels < self._least]
+        while self._tried > below.min(initial=self._tried):
+            self._tried -= 1
+            self._least = self._clusters.lowered(self._least, self._tried, self._far)
+        return np.maximum(levels, self._least)
 
     def _levels(self) -> Ints:
         """Bind the points to the present elements, and return the level at each."""
@@ -97,8 +121,8 @@ class FollowedSurface:
         sizes = apart(self._body.changing.forest.source, levels)
         return 4 * len(self._points) <= MOST_POINTS and longest_edge(self._points, self._triangles, sizes) > LONGEST
 
-    def _bound(self, kept: Ints, triangles: Ints) -> SurfaceMesh:
-        nodes, weights = (array.numpy()[kept] for array in (self._binding.nodes, self._binding.weights))
+    def _bound(self, triangles: Ints) -> SurfaceMesh:
+        nodes, weights = (array.numpy()[self._kept] for array in (self._binding.nodes, self._binding.weights))
         weights = np.where(np.abs(weights) < LEAST_WEIGHT, 0.0, weights.astype(np.float64))
         weights /= weights.sum(axis=1, keepdims=True)
-        return SurfaceMesh(self._points[kept], nodes.astype(np.int32), weights, triangles)
+        return SurfaceMesh(self._points[self._kept], nodes.astype(np.int32), weights, triangles)

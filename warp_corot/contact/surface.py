@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -17,6 +17,7 @@ from .skin import Skin, has_own_surface
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
+    from warp_corot.mesh.surfaces.bound import SurfaceMesh
 
 #: Room for a body whose mesh changes, over the size of its surface when the room is reserved.
 ROOM = 1.5
@@ -170,6 +171,11 @@ class ContactSurface:
     def make_room(self, rooms: Sequence[Sequence[int]]) -> None:
         """Update to the present meshes, with the room of a former ``rooms``."""
         self._make_room([self._skin(k) for k in range(len(self.bodies))], rooms)
+
+    def rebound(self, body: SoftBody) -> Callable[[], SurfaceMesh] | None:
+        """What binds a body's own surface to the nodes of its present mesh; None if the mesh does not change."""
+        followed = self._followed.get(self.bodies.index(body)) if body in self.bodies else None
+        return None if followed is None else followed.last
 
     def places_of(self, k: int) -> slice:
         """The places of a body's nodes."""

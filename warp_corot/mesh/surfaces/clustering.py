@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .bound import SurfaceMesh
-from .locating import distances_from
+from .locating import distances_from, nearest_faces
 
 #: Where vertices would be farther from the coarser surface than this many sizes, sizes are halved, this many times.
 LOST, HALVED = 0.15, 2
@@ -178,6 +178,33 @@ class Clusters:
         used[found] = True
         places = np.cumsum(used) - 1
         return np.flatnonzero(used), places[found].astype(np.int32)
+
+    def lowered(self, levels: Ints, level: int, far: Floats) -> Ints:
+        """Levels that are this one where they were one above it, as far as the surface keeps its shape.
+
+        Args:
+            levels: The level of each vertex, [V].
+            level: The new level.
+            far: How far each vertex may be from the surface [m], [V].
+        """
+        lower, (cluster, _) = levels == level + 1, self._at(level)
+        first, second = cluster[self._ends].T
+        size = 2.0 * float(np.ptp(self._points, axis=0).max())
+        while lower.any():
+            kept, triangles = self.thinned(np.where(lower, level, levels))
+            lost = np.flatnonzero(distances_from(self._points[kept], triangles, self._points, size) > far)
+            nearest = nearest_faces(self._points[kept], triangles, self._points[lost], size)
+            is_lost = np.zeros(len(cluster), bool)
+            is_lost[cluster[lost]] = True
+            is_lost[cluster[kept[triangles[nearest]]]] = True
+            if not (is_lost[cluster] & lower).any():
+                # Clusters beside lower ones have lost the vertices that stood for them.
+                around = is_lost[first], is_lost[second]
+                is_lost[second[around[0]]] = is_lost[first[around[1]]] = True
+            if not (is_lost[cluster] & lower).any():
+                break
+            lower &= ~is_lost[cluster]
+        return np.where(lower, level, levels)
 
     def _at(self, level: int) -> tuple[Ints, Ints]:
         """The cluster of each vertex, and all vertices, those with the largest errors first."""
