@@ -22,6 +22,9 @@ FIRST, AGAIN, MISSING = (wp.constant(k) for k in range(3))
 #: An obstacle may sink into triangles by this fraction of half its thickness. Otherwise all triangles around a ball are
 #: tangent to it, hold off the nodes, and make bodies much too stiff. So nodes less than 1.26 radii apart need no spans.
 ALLOWED = wp.constant(0.2)
+#: Triangles with an edge longer than this, in halves of an obstacle's thickness, are wide: obstacles between their
+#: corners may sink in less.
+WIDE = wp.constant(0.8)
 
 
 @wp.func
@@ -138,8 +141,11 @@ def locate_spans(
         found.opened = wp.dot(found.normal, found.shares * e - found.moved)
         found.is_at_end = is_at_end
         found.allowed = ALLOWED * thickness[o]
+        longest = wp.max(wp.length(x[0] - x[1]), wp.max(wp.length(x[1] - x[2]), wp.length(x[2] - x[0])))
+        if longest > WIDE * thickness[o]:
+            found.allowed = wp.min(found.allowed, spans.deepest)
         found.friction = shapes.friction[o]
-        if found.gap < -(SKEWERED + ALLOWED) * thickness[o]:
+        if found.gap < -SKEWERED * thickness[o] - found.allowed:
             found.friction = 0.0
         take_span(
             o,
@@ -200,9 +206,9 @@ def locate_points(
             at = x + e
         found.moved = carried(now, later, x)
         far = 2.0 * way + wp.length(found.moved) + 2.0 * law.tolerance
-        if spans.stiffness[o, s] > 0.0:
+        if wp.length_sq(touches.force[o, s]) > 0.0:
             # What a small gap has left of the last force still pushes.
-            far += wp.length(touches.force[o, s]) / spans.stiffness[o, s]
+            far += 4.0 * law.slack
         gap, n = distance_to(shapes, o, pose, at, far)
         found.is_near = gap <= far
         found.shares = wp.vec3(1.0, 0.0, 0.0)

@@ -33,6 +33,7 @@ class Spans:
     count: wp.array[wp.int32]  # [1] how many are listed
     due: wp.array[wp.int32]  # [1] whether all are to be found again
     stiff: float  # the stiffness of a span over that of its point
+    deepest: float  # how far an obstacle may sink into wide triangles at most [m]
 
 
 @wp.func

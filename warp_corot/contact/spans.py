@@ -15,10 +15,13 @@ from warp_corot.kernels.stepping.pace import Pace
 from warp_corot.solvers.implicit.operator import Springs
 
 from .carriers import PlaceCarriers
+from .pairs import smallest_size
 from .rigid_forces import RigidForces
 
 #: The stiffness of a span over that of its point; places of an own surface are many, and share nodes.
 STIFF, STIFF_OF_BORNE = 32.0, 8.0
+#: Obstacles sink into wide triangles of own surfaces by no more than this fraction of the smallest element.
+DEEPEST = 0.01
 #: Types of the arrays of ``Spans``, and of those of ``Touches`` that points need.
 FIELDS = {
     "listed": wp.int32,
@@ -182,6 +185,8 @@ class Spans:
             setattr(spans, name, wp.zeros(touches.force.shape, dtype=dtype, device=self.device))
         spans.count, spans.due = self._count, self._due
         spans.stiff = STIFF_OF_BORNE if self._is_borne else STIFF
+        size = smallest_size([body.discretization.smallest_volume for body in self._rigid.surface.bodies])
+        spans.deepest = DEEPEST * size if self._is_borne else np.inf
         return spans
 
     def _made_springs(self) -> Springs:
