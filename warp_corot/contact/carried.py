@@ -85,6 +85,10 @@ class CarriedForces:
         if pairs is not None:
             self._take_rows(pairs)
 
+    def go_on_with(self, surface: ContactSurface, rigid: RigidForces | None, pairs: Pairs | None) -> None:
+        """Give back to other contact of the same bodies, which was made after their meshes had changed."""
+        self._surface, self._of_obstacles, self._pairs = surface, rigid, pairs
+
     def give_back(self) -> None:
         """Let contact on the present surfaces go on with it."""
         surface = self._surface

@@ -267,13 +267,20 @@ class Contacts:
             self.pairs.take_room(room)
 
     def continue_from(self, former: Contacts) -> None:
-        """Go on from the contact of the same bodies before their meshes changed. Forces are forgotten."""
+        """Go on from the contact of the same bodies before their meshes changed.
+
+        Forces are carried if every rank has the whole surfaces, and forgotten if each has only a part.
+        """
         for name in ("tolerance", "recovery", "grain"):
             setattr(self.law, name, getattr(former.law, name))
         self.obstacles.continue_from(former.obstacles)
         wp.copy(self.obstacles.wrenches, former.obstacles.wrenches)
         self.search.continue_from(former.search)
         self._is_looked_at, self._has_crushed = former._is_looked_at, former._has_crushed
+        if self.surface.is_whole:
+            carried = CarriedForces(former.surface, former.rigid, former.pairs)
+            carried.go_on_with(self.surface, self.rigid, self.pairs)
+            carried.give_back()
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
