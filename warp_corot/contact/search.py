@@ -136,10 +136,12 @@ class Search:
         least = float(self.watch.least.numpy()[0])
         self.watch.missed.zero_()
         self._report.values[MISSED] = 0.0
-        if least >= self.farthest:
+        wider = WIDER * least
+        if self.watch.is_implicit and least < self.farthest:
+            wider = min(wider, self.farthest)
+        if wider > self.farthest:
             raise UnstableError(f"surfaces that are hit go farther than {1e3 * self.farthest:.3g} mm in one step")
-        least = min(WIDER * least, self.farthest)
-        self.watch.least.fill_(least)
+        self.watch.least.fill_(wider)
 
     def serve_implicit(self, motion: float, extent: float) -> None:
         """Serve implicit steps, in which anything may begin to move so far, and at most an extent [m]."""
