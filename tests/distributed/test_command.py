@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import simulate
+from grown_parts import layers
 from mpirun import needs_mpi, on_ranks
 
 pytestmark = needs_mpi
@@ -59,6 +60,25 @@ def test_two_ranks_grow_a_surface_in_parts(folder):
     assert sum(counts[1]) == sum(counts[0])
     # The bunny's ears sink by centimetres.
     np.testing.assert_allclose(last_row("two.csv"), last_row("one.csv"), rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_two_ranks_grow_a_scan_of_several_materials_in_parts(folder):
+    """They have the table of one process; without a level, rank 0 makes the whole body."""
+    import nibabel
+
+    domain = layers()
+    nibabel.save(nibabel.Nifti1Image(domain.numbers, np.diag([10.0, 10.0, 10.0, 1.0])), "scan.nii.gz")
+    scan = ("scan.nii.gz", "--labels", "top@1=3kPa:0.45,bottom@2=8kPa,layer@3=10kPa:0.4,tip@4=1kPa", "--dt", "0.4ms")
+    scan += ("--fix", "x < 0.06", "--duration", "0.05", "--fps", "40", "--probe", "x > 0.2", "--device", "cpu")
+    for more, said in ((("--level", "2"), "scan in parts"), (("--tets", "2000"), "2 ranks")):
+        on_two = on_ranks(2, "-m", "warp_corot", "simulate", *scan, *more, "--csv", "two.csv", "-o", "two.usda")
+        assert on_two.returncode == 0, on_two.stderr
+        assert said in on_two.stdout
+        assert "bottom: E = 8 kPa, nu = 0.45" in on_two.stdout
+        assert simulate(*scan, *more, "--csv", "one.csv", "-o", "one.usda") == 0
+        # The end has sunk by millimetres.
+        np.testing.assert_allclose(last_row("two.csv"), last_row("one.csv"), rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.slow

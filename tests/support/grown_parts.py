@@ -22,6 +22,17 @@ def blobs() -> wc.Domain:
     return wc.Domain.from_function(phi, [[-1.0, -0.6, -0.6], [1.0, 0.6, 0.6]], device="cpu")
 
 
+def layers() -> wc.Domain:
+    """A ball of voxels in four labels: two halves, a thin layer between them, and a single voxel that is smaller than
+    an element."""
+    x, y, z = np.indices((24, 20, 20)) - np.array([11.5, 9.5, 9.5])[:, None, None, None]
+    numbers = np.where(z > 0.0, 1, 2).astype(np.int16)
+    numbers[np.abs(z + 0.3 * x) < 0.6] = 3
+    numbers[20, 10, 10] = 4
+    numbers[x**2 / 1.4 + y**2 + z**2 > 80.0] = 0
+    return wc.Domain.from_labels(numbers, spacing=(0.01, 0.01, 0.01), device="cpu")
+
+
 def assert_whole(domain: wc.Domain, cell_size: float, **options: float) -> None:
     """All ranks have the parts of the mesh that one process makes: the same bits, all elements around the nodes that
     they move, and the surface of the whole around these."""
@@ -35,6 +46,9 @@ def assert_whole(domain: wc.Domain, cell_size: float, **options: float) -> None:
     np.testing.assert_array_equal(numbers.nodes[part.tets], whole.tets[numbers.elements])
     np.testing.assert_array_equal(part.points, whole.points[numbers.nodes])
     np.testing.assert_array_equal(part.fill, whole.fill[numbers.elements])
+    assert part.label_names == whole.label_names
+    if whole.labels is not None:
+        np.testing.assert_array_equal(part.labels, whole.labels[numbers.elements])
     own = numbers.nodes[numbers.owner == everybody.rank]
     for mine, count in ((own, numbers.node_count), (numbers.elements[numbers.counted], part.element_count)):
         np.testing.assert_array_equal(np.sort(np.concatenate(everybody.allgather(mine))), np.arange(count))
@@ -46,13 +60,16 @@ def assert_whole(domain: wc.Domain, cell_size: float, **options: float) -> None:
 
 
 def assert_moves_as_whole(kept: Path) -> None:
-    """A ball grown in parts, whose elements share their dilatation, moves as the whole one on the same ranks, bit by
-    bit; from a checkpoint, too."""
+    """A body of several materials grown in parts, whose elements share their dilatation, moves as the whole one on the
+    same ranks, bit by bit; from a checkpoint, too."""
     import warp_corot.distributed as wd
 
-    ball, found = wc.Domain.sphere(0.05, device="cpu"), []
+    domain, found = layers(), []
+    young = np.array([0.0, 3e3, 5e3, 2e4, 1e3])
     for make in (wd.from_domain, wc.TetForest.from_domain):
-        body = wc.SoftBody(make(ball, 0.03, max_level=5), wc.Isotropic(3e3, 0.49, 1000.0), device="cpu")
+        mesh = make(domain, 0.06, max_level=4)
+        assert mesh.labels is not None
+        body = wc.SoftBody(mesh, wc.Isotropic(young[mesh.labels], 0.49, 1000.0), device="cpu")
         body.fix("z < zmin + 0.02")
         sim = wd.Simulation(body, deterministic=True)
         sim.advance(0.02)
@@ -73,11 +90,8 @@ def assert_refuses() -> None:
     """Every rank says what is wrong, in one line."""
     import warp_corot.distributed as wd
 
-    numbers = np.repeat(np.arange(1, 5), 16).reshape(4, 4, 4).astype(np.int16)
-    labels = wc.Domain.from_labels(numbers, spacing=(0.01, 0.01, 0.01))
     ball = wc.Domain.sphere(0.05, device="cpu")
     for domain, size, options, said in (
-        (labels, 0.01, {}, "several labels"),
         (ball, 0.2, {"max_level": 3}, "take fewer ranks"),
         (ball, 0.03, {"max_level": -1}, "max_level is -1"),
         (ball, 0.003, {"max_level": 48}, "must be less in parts"),

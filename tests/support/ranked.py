@@ -428,6 +428,7 @@ def make_all(folder: Path, size: int, names: list[str]) -> None:
                 found |= resumed(path)
         if "organ" in names:
             grown_parts.assert_whole(grown_parts.blobs(), 0.33, max_level=6, sliver=0.3)
+            grown_parts.assert_whole(grown_parts.layers(), 0.08, max_level=3)
         if "organs" in names:
             grown_parts.assert_refuses()
             grown_parts.assert_whole(wc.Domain.sphere(0.05, device="cpu"), 0.013, max_level=7, surface_error=1e-4)

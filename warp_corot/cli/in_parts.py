@@ -7,24 +7,31 @@ import csv
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.device import checked_device
-from warp_corot.materials.isotropic import Isotropic
 from warp_corot.simulation.parts import checked_gravity
 from warp_corot.solvers import SymplecticEuler
 
 from .bodies import model_of
 from .compiling import compiling_said
 from .loading import Load, loads_of, ramp_of
-from .meshes_in_parts import OF_ORGANS, box_in_parts, is_one_body, organ_in_parts
+from .meshes_in_parts import (
+    OF_ORGANS,
+    box_in_parts,
+    is_one_body,
+    material_in_parts,
+    material_lines,
+    needs_young,
+    organ_in_parts,
+)
 from .ranks import are_several, hands_out
 from .say import complain, kept_so_far
-from .summary import aligned, length, milliseconds, pressure
+from .summary import aligned, length, milliseconds
 from .waiting import progress_bar
 
 if TYPE_CHECKING:
@@ -59,7 +66,8 @@ def is_in_parts(options: Sequence[argparse.Namespace]) -> bool:
     if is_box and args.level is not None and args.level < LEAST_LEVEL:
         others.append("level")
     if not is_box:
-        others += [f"{name} that is not given" for name in ("fix", "young") if getattr(args, name) is None]
+        needed = ["fix", *(["young"] if needs_young(args) else [])]
+        others += [f"{name} that is not given" for name in needed if getattr(args, name) is None]
     expressions = [*(args.fix or ()), *(each[0] for each in args.pull or ()), *(args.probe or ())]
     words = {word for text in expressions for word in re.findall(r"[A-Za-z_]\w*", text)}
     if any(not re.search("[A-Za-z_]", text) for text in args.probe or ()):
@@ -78,12 +86,14 @@ def run_in_parts(args: argparse.Namespace) -> int:
         InputError: Bad options; nothing was simulated or written.
     """
     import warp_corot.distributed as wd
-    from warp_corot.io.write.animate import Recording, frame_count
+    from warp_corot.io.write.animate import Recording, frame_count, rounding
 
     done = Recording(args.output)
     with compiling_said(checked_device(args.device)):
         subject = box_in_parts(args) if args.input == "box" else organ_in_parts(args)
         duration = subject.duration if args.duration is None else args.duration
+        if note := rounding(duration, args.fps):
+            complain(note, kind="note")
         sim, loads = _simulation(args, subject, duration)
         table = _Table(args, sim)
     try:
@@ -111,12 +121,10 @@ def _simulation(args: argparse.Namespace, subject: Subject, duration: float) -> 
     from warp_corot.io.write.animate import steps_per_frame
 
     loads, mesh = loads_of(args), subject.mesh
-    given = {name: getattr(args, name) for name in ("young", "poisson", "density")}
-    given = {name: getattr(subject, name) if value is None else value for name, value in given.items()}
-    body = SoftBody(mesh, Isotropic(**given), device=args.device)
+    comm = mpi.world()
+    body = SoftBody(mesh, material_in_parts(args, subject, comm), device=args.device)
     for expression in args.fix or [subject.fix]:
         body.fix(expression)
-    comm = mpi.world()
     for load in loads:
         times, shares = load.curve(ramp_of(args, duration))
         if not any(comm.allgather(len(body.node_indices(load.patch)) > 0)):
@@ -196,16 +204,15 @@ def _summary(
 ) -> str:
     from warp_corot.distributed.part_meshes import ForestPart
 
-    body, mesh = sim.body, sim.body.mesh
+    mesh = sim.body.mesh
     assert isinstance(mesh, ForestPart)
     nodes = sim.following[0].part.numbers.node_count
     held = " or ".join(args.fix or [str(subject.fix)])
     stepping = max(done.stepping, 1e-9)
-    material: Any = body.material
     shortest, longest = sim.dt_range
     rows = [
         ("mesh", f"{nodes} nodes, {mesh.element_count} tetrahedra; {sim.elements_here[0]} on rank 0"),
-        ("material", f"E = {pressure(material.young)}, nu = {material.poisson:g}, rho = {material.density:g} kg/m^3"),
+        *material_lines(args, subject),
         ("fixed", f"where {held}"),
         *[("moved", str(load)) for load in loads],
         ("gravity", f"{' '.join(f'{g:g}' for g in sim.gravity)} m/s^2"),

@@ -3,29 +3,41 @@
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
 import numpy as np
 
 from warp_corot.errors import InputError
 from warp_corot.experiments import paper
+from warp_corot.materials.isotropic import Isotropic
 
 from .applies import refuse_options
+from .label_materials import LabelMaterial, covers_all, label_material, numbers_by_name, parse_labels
 from .opened import offset_of, open_input
 from .organs import as_options, domain_of, fineness_of
 from .say import complain
 from .several import bodies_in
 from .subject import BOX_LEVEL, Subject, box_subject
+from .summary import pressure
 
 #: The options of surfaces and scans beside those of boxes.
-OF_ORGANS = {"unit", "up", "cell_size", "surface_error", "threshold", "smoothing", "join"}
+OF_ORGANS = {"unit", "up", "cell_size", "surface_error", "threshold", "smoothing", "join", "labels", "materials"}
 
 
 def is_one_body(args: argparse.Namespace) -> bool:
-    """Whether an input is one surface or scan of one material, and not several bodies."""
+    """Whether an input is one surface or scan, and not several bodies."""
     opened = open_input(args.input)
-    if opened.volume is not None and args.threshold is None and len(np.setdiff1d(opened.volume.values, 0)) > 1:
-        return False
     return opened.kind in ("surface", "scan") and len(bodies_in(opened, args)) == 1
+
+
+def needs_young(args: argparse.Namespace) -> bool:
+    """Whether a part of the body has no stiffness if ``--young`` is not given."""
+    if args.labels is not None:
+        return False
+    if args.materials is None or (volume := open_input(args.input).volume) is None:
+        return True
+    named, _ = numbers_by_name(parse_labels(args.materials, "--materials"), volume)
+    return bool(len(np.setdiff1d(volume.values, [0, *(number for of_name in named.values() for number in of_name)])))
 
 
 def box_in_parts(args: argparse.Namespace) -> Subject:
@@ -49,14 +61,52 @@ def organ_in_parts(args: argparse.Namespace) -> Subject:
     refuse_options(args, opened)
     if args.scale is not None and not args.scale > 0.0:
         raise InputError(f"scale is {args.scale:g}; it must be a positive number")
+    entries: list[LabelMaterial] = []
     with as_options():
-        domain = domain_of(opened, args, [])
+        domain = domain_of(opened, args, entries)
         mesh = wd.from_domain(domain, **fineness_of(args, domain))
     for note in opened.notes:
         complain(note, kind="note")
     loaded = opened.volume or opened.surface
     assert loaded is not None
-    subject = Subject(mesh, loaded.name.encode(errors="replace").decode(), opened.source)
+    subject = Subject(mesh, loaded.name.encode(errors="replace").decode(), opened.source, labels=entries)
     if opened.asset:
         subject.take(opened.asset, args)
     return subject
+
+
+def material_in_parts(args: argparse.Namespace, subject: Subject, comm: Any) -> Isotropic:
+    """The material of this rank's part; all ranks must call this.
+
+    Raises:
+        InputError: A value is out of its range, or ``--young`` is given for labels that all have their own.
+    """
+    given = {name: getattr(args, name) for name in ("young", "poisson", "density")}
+    given = {name: getattr(subject, name) if value is None else value for name, value in given.items()}
+    if not subject.labels:
+        return Isotropic(**given)
+    if all(comm.allgather(covers_all(subject.mesh, subject.labels))):
+        if args.young is not None:
+            raise InputError("--young is given, but --materials gives each label its own")
+        given["young"] = subject.labels[0].young  # of no element
+    return label_material(subject.mesh, subject.labels, **given)
+
+
+def material_lines(args: argparse.Namespace, subject: Subject) -> list[tuple[str, str]]:
+    """The lines of the summary about the material."""
+    given = {name: getattr(args, name) for name in ("young", "poisson", "density")}
+    given = {name: getattr(subject, name) if value is None else value for name, value in given.items()}
+    if not subject.labels:
+        return [("material", _values(**given))]
+    lines = []
+    for entry in subject.labels:
+        own = {name: getattr(entry, name) for name in given}
+        own = {name: given[name] if value is None else value for name, value in own.items()}
+        lines.append(f"{entry.name}: {_values(**own)}")
+    if given["young"] is not None:
+        lines.append(f"all others: {_values(**given)}")
+    return [("" if number else "material", line) for number, line in enumerate(lines)]
+
+
+def _values(young: float, poisson: float, density: float) -> str:
+    return f"E = {pressure(young)}, nu = {poisson:g}, rho = {density:g} kg/m^3"

@@ -17,6 +17,7 @@ from warp_corot.mesh import TetForest
 from warp_corot.mesh.growing.adapt import TETS_OF_CUBE, Growing, grid_around
 from warp_corot.mesh.growing.from_domain import checked_wishes, empty_error, filled_tree
 from warp_corot.mesh.growing.judging import Field, Wishes
+from warp_corot.mesh.growing.labelling import Growers, labels_of
 from warp_corot.mesh.growing.resolved import Resolved
 from warp_corot.mesh.lattice import checked_cell_size
 from warp_corot.mesh.numbering import by_levels, in_order_of_leaves, live_or_void, pruned, renumbered, with_virtual
@@ -63,8 +64,8 @@ def from_domain(
     ranks, better tens for each. Ranks exchange what conformity needs on the faces between their cubes, which nearly
     empty elements they give up, and the elements around the nodes that they move. No rank ever holds the whole mesh.
     ``SoftBody`` and ``Simulation`` take the part like a whole mesh, as they take that of ``box``. For any number of
-    ranks the mesh is the same, bit by bit, and that of ``TetForest.from_domain`` with these arguments. It has no labels
-    and no surface of its own: contact acts on the boundary of its tetrahedra.
+    ranks the mesh is the same, bit by bit, and that of ``TetForest.from_domain`` with these arguments. It has
+    the labels of its elements, but no surface of its own: contact acts on the boundary of its tetrahedra.
 
     Args:
         domain, cell_size, max_level, surface_error, min_level, refine_where, field, field_tolerance, sliver: As for
@@ -73,8 +74,8 @@ def from_domain(
         device: The device that grows the mesh; None: the domain's.
 
     Raises:
-        InputError: On all ranks: MPI is not there, an argument is out of its range, the domain has several labels, no
-            tetrahedron holds any of the body, or fewer cubes than ranks hold any of it.
+        InputError: On all ranks: MPI is not there, an argument is out of its range, no tetrahedron holds any of the
+            body, or fewer cubes than ranks hold any of it.
 
     Warns:
         UserWarning: As ``TetForest.from_domain``, on rank 0.
@@ -84,8 +85,6 @@ def from_domain(
     comm = mpi.world()
     if not isinstance(domain, Domain):
         raise InputError(f"domain is {shown(domain)}; it must be a Domain")
-    if len(domain.label_names) > 1:
-        raise InputError("the domain has several labels, which meshes grown in parts do not have; use divided")
     where = checked_device(domain.device if device is None else device)
     size = checked_cell_size(cell_size)
     wishes = checked_wishes(max_level, surface_error, min_level, refine_where, field, field_tolerance)
@@ -144,7 +143,8 @@ def _finished(resolved: Resolved, domain: Domain, sliver: float, territory: Terr
         InputError: On all ranks, if there are none.
     """
     comm, grown, size = territory.comm, resolved.grown, resolved.cell_size
-    tree, stays = filled_tree(resolved, resolved.as_wished())
+    child = resolved.as_wished()
+    tree, stays = filled_tree(resolved, child)
     counts = comm.allgather(int((tree.first_child == LIVE).sum()))
     _check_all_have_some(counts, domain, size)
     leaves = tree.leaves
@@ -155,7 +155,8 @@ def _finished(resolved: Resolved, domain: Domain, sliver: float, territory: Terr
         tree.leaf_tets, territory.keys(grown.lattice), resolved.held[stays[leaves]], volume, faces, firsts
     )
     held, given_up, said = without_slivers(elements, sliver, domain, territory)
-    _check_all_have_some(comm.allgather(int((~given_up).sum())), domain, size)
+    counts = comm.allgather(int((~given_up).sum()))
+    _check_all_have_some(counts, domain, size)
     live = np.zeros(len(tree.level), bool)
     live[leaves[~given_up]] = True
     tree = live_or_void(tree, live)
@@ -165,7 +166,12 @@ def _finished(resolved: Resolved, domain: Domain, sliver: float, territory: Terr
     ends, tree = renumbered(order, grown.ends, tree)
     fill = (held / volume)[~given_up]
     lattice = grown.lattice[order]
-    return TetForest(grown.cells, size, grown.origin, lattice, ends, tree, domain.up_axis, fill=fill), said
+    forest = TetForest(grown.cells, size, grown.origin, lattice, ends, tree, domain.up_axis, fill=fill)
+    if domain.label_names:
+        growers = Growers(sum(counts[: comm.rank]), comm.allgather)
+        labels = labels_of(resolved, child, stays[leaves[~given_up]], forest, domain, growers)
+        forest = replace(forest, labels=labels, label_names=tuple(domain.label_names))
+    return forest, said
 
 
 def _check_all_have_some(counts: list[int], domain: Domain, cell_size: float) -> None:

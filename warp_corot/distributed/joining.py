@@ -185,11 +185,19 @@ def _together(branches: list[Branch], rank: int, *, node_count: int, **whole: An
         tree,
         one.up_axis,
         fill=np.concatenate([each.fill for each in forests]),
+        labels=_together_or_none([each.labels for each in forests]),
+        label_names=one.label_names,
         leaf_groups=np.concatenate(groups),
         numbers=of_whole,
         outer=place[outer],
         **whole,
     )
+
+
+def _together_or_none(values: list[Ints | None]) -> Ints | None:
+    """Arrays one after another; None if they are None."""
+    there = [each for each in values if each is not None]
+    return np.concatenate(there) if there else None
 
 
 def _one_tree(forests: list[TetForest], nodes: list[Ints]) -> tuple[Tree, npt.NDArray[np.intp]]:

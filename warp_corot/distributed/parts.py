@@ -137,9 +137,20 @@ def part_of_forest(
     real = in_order_of_leaves(tree)
     order = with_virtual(real, tree, forest.lattice)
     ends, tree = renumbered(order, forest.node_ends, tree)
-    fill = None if forest.fill is None else forest.fill[kept]
-    place = (forest.cells, forest.cell_size, forest.origin)
-    made = TetForest(*place, forest.lattice[order], ends, tree, forest.up_axis, fill=fill, leaf_groups=groups)
+    fill, labels = (None if each is None else each[kept] for each in (forest.fill, forest.labels))
+    made = TetForest(
+        forest.cells,
+        forest.cell_size,
+        forest.origin,
+        forest.lattice[order],
+        ends,
+        tree,
+        forest.up_axis,
+        fill=fill,
+        labels=labels,
+        label_names=forest.label_names,
+        leaf_groups=groups,
+    )
     return made, order.astype(np.int32), stays.astype(np.int32)
 
 

@@ -19,11 +19,10 @@ from warp_corot.mesh.tree import LIVE, Tree
 
 from .adapt import Closer, grow
 from .budget import NEAR, NEAR_ENOUGH, Budget, chosen_meshes
-from .cut import label_shares
 from .detail import Detail
-from .growth import lattice_spacing
 from .judging import Field, Wishes
-from .resolved import LEAST, MOST_POINTS, Resolved, points_within
+from .labelling import labels_of, labels_of_nodes
+from .resolved import Resolved
 from .slivers import without_slivers
 from .strays import strays
 
@@ -38,8 +37,6 @@ MOST_ELEMENTS = 100_000_000
 CUBES_PER_ELEMENT = 1000
 #: Number of meshes after which one with nearly the requested elements is good enough.
 MOST_MESHES = 4
-#: Number of points of an element at which labels are sampled, if few elements have several.
-MOST_POINTS_EACH = 64
 #: How finely a body is sampled below the mesh's levels: surface error over an element's edge, and tetrahedra of all
 #: levels.
 CLOSER_ERROR, CLOSER_ELEMENTS = 0.2, 4_000_000
@@ -214,122 +211,22 @@ def _finished(resolved: Resolved, child: np.ndarray, domain: Domain, sliver: flo
         fill=fill,
     )
     if domain.label_names:
-        labels = _labels(resolved, child, stays[leaves[~given_up]], domain)
         node_labels = np.asarray(domain.labels_at(forest.lattice_points, nearest=True), np.int32)
+        labels = labels_of(resolved, child, stays[leaves[~given_up]], forest, domain)
         forest = replace(forest, labels=labels, node_labels=node_labels, label_names=tuple(domain.label_names))
-        forest = replace(forest, labels=_with_lost(forest, domain))
     return forest, left_out
-
-
-def _with_lost(forest: TetForest, domain: Domain) -> np.ndarray:
-    """Labels of elements; a label that no element has, but of which a point is known, gets the element that contains
-    the point.
-    """
-    assert forest.labels is not None
-    labels = forest.labels.copy()
-    count = np.bincount(labels, minlength=len(domain.label_names) + 1)
-    for number, name in enumerate(domain.label_names, start=1):
-        point = None if count[number] else domain.point_in(name)
-        if point is not None:
-            (element,), _ = forest.embed(point[None])
-            if count[labels[element]] > 1:
-                count[labels[element]] -= 1
-                labels[element] = number
-    return labels
 
 
 def _detail(resolved: Resolved, child: np.ndarray, domain: Domain) -> Detail:
     """The leaves of a mesh in a grown forest that hold the surface, and borders of labels."""
-    grown = resolved.grown
+    grown, points = resolved.grown, resolved.points(slice(None))
     tets = grown.tree.tets[child == LIVE]
     wanted = (grown.phi[tets] < 0).any(axis=1)
     if not domain.label_names:
         tets = tets[wanted & (grown.phi[tets] >= 0).any(axis=1)]
-        return Detail.of(_points(resolved, slice(None)), tets, grown.phi, None).sharpened(domain)
+        return Detail.of(points, tets, grown.phi, None).sharpened(domain)
     tets = tets[wanted]
-    labels = _labels_of_nodes(resolved, tets, domain)
+    labels = labels_of_nodes(resolved, tets, domain)
     own = labels[tets]
     tets = tets[(grown.phi[tets] >= 0).any(axis=1) | (own != own[:, :1]).any(axis=1)]
-    return Detail.of(_points(resolved, slice(None)), tets, grown.phi, labels)
-
-
-def _points(resolved: Resolved, nodes: Any) -> np.ndarray:
-    return np.asarray(resolved.grown.origin) + resolved.grown.lattice[nodes] * lattice_spacing(resolved.cell_size)
-
-
-def _labels_of_nodes(resolved: Resolved, tets: np.ndarray, domain: Domain) -> np.ndarray:
-    """Labels of the nodes of tetrahedra, int32, as many as there are lattice points."""
-    found = np.zeros(len(resolved.grown.lattice), np.int32)
-    used = np.unique(tets)
-    found[used] = domain.labels_at(_points(resolved, used), nearest=True)
-    return found
-
-
-def _labels(resolved: Resolved, child: np.ndarray, elements: np.ndarray, domain: Domain) -> np.ndarray:
-    """Labels of elements of the mesh.
-
-    An element has the label that takes most of it. A label that would be in none has the element of which it takes
-    most, unless that is another's only one.
-    """
-    grown, count = resolved.grown, len(domain.label_names)
-    tets = grown.tree.tets[resolved.leaves]
-    at_nodes = _labels_of_nodes(resolved, tets, domain)
-    place = np.full(len(child), -1, np.int64)
-    place[elements] = np.arange(len(elements))
-    owner = place[resolved.owners(child)[resolved.leaves]]
-    size = resolved.volume[resolved.leaves]
-    values, own = grown.phi[tets], at_nodes[tets]
-    alike = (own == own[:, :1]).all(axis=1)
-    mixed = np.flatnonzero(~alike)
-    shares = label_shares(values[mixed], own[mixed])
-    row, label, share = _sampled_labels(resolved, resolved.leaves[mixed], own[mixed], shares, domain)
-    keys = np.concatenate([owner[alike] * (count + 1) + own[alike, 0], owner[mixed[row]] * (count + 1) + label])
-    weights = np.concatenate([(resolved.shares * size)[alike], share * size[mixed[row]]])
-    there = np.concatenate([owner[alike], owner[mixed[row]]]) >= 0
-    found, index = np.unique(keys[there], return_inverse=True)
-    total = np.bincount(index.ravel(), weights[there])
-    whose, label = found // (count + 1), found % (count + 1)
-    labels = np.zeros(len(elements), np.int32)
-    order = np.argsort(total, kind="stable")
-    labels[whose[order]] = label[order]
-    for lost in np.setdiff1d(label[label > 0], labels):
-        mine = order[label[order] == lost][::-1]
-        free = np.bincount(labels, minlength=count + 1)[labels[whose[mine]]] > 1
-        if free.any():
-            labels[whose[mine[np.argmax(free)]]] = lost
-    return labels
-
-
-def _sampled_labels(
-    resolved: Resolved, elements: np.ndarray, own: np.ndarray, shares: np.ndarray, domain: Domain
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The fraction of elements that each label fills, by random points; labels at corners get at least a small
-    fraction.
-
-    Args:
-        resolved: The forest.
-        elements: The elements in which labels vary [n].
-        own: Labels of their nodes [n, 4].
-        shares: The fractions if borders were halfway between nodes; see `label_shares` [n, 4].
-        domain: The body.
-
-    Returns:
-        Places in ``elements``, labels and fractions, [m] each, without zero fractions.
-    """
-    rng, stride = np.random.default_rng(0), len(domain.label_names) + 1
-    each = int(np.clip(MOST_POINTS // max(len(elements), 1), 1, MOST_POINTS_EACH))
-    seen = []
-    for part in np.array_split(np.arange(len(elements)), len(elements) * each // MOST_POINTS + 1):
-        points = points_within(resolved.grown, elements[part], resolved.cell_size, each, rng).reshape(-1, 3)
-        labels = domain.labels_at(points)
-        seen.append((np.repeat(part, each) * stride + labels)[labels > 0])
-    keys, counts = np.unique(np.concatenate(seen), return_counts=True)
-    total = np.bincount(keys // stride, counts, len(elements))
-    sampled = counts * (shares.sum(axis=1) / np.maximum(total, 1.0))[keys // stride]
-    at_nodes = np.where(total[:, None] > 0, LEAST * shares, shares)
-    row, node = np.nonzero(at_nodes)
-    keys, place = np.unique(np.concatenate([keys, row * stride + own[row, node]]), return_inverse=True)
-    found = np.zeros(len(keys))
-    np.maximum.at(found, place.ravel(), np.concatenate([sampled, at_nodes[row, node]]))
-    kept = found > 0.0
-    return keys[kept] // stride, keys[kept] % stride, found[kept]
+    return Detail.of(points, tets, grown.phi, labels)

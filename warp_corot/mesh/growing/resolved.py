@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from warp_corot.kernels.meshing import coarsening as kernels
 from warp_corot.mesh.lattice import volume_shares
+from warp_corot.mesh.scattered import spread_over_eighths
 from warp_corot.mesh.tree import LIVE, VOID, Tree
 
 from .cut import connected, inside_shares
@@ -80,6 +81,10 @@ class Resolved:
     def lengths(self) -> np.ndarray:
         """An edge length for each tetrahedron [m]: the cell size, halved every three levels."""
         return self.cell_size * 0.5 ** (self.grown.tree.level / 3.0)
+
+    def points(self, nodes: Any) -> np.ndarray:
+        """The places of lattice points [m], float64 [n, 3]."""
+        return np.asarray(self.grown.origin) + self.grown.lattice[nodes] * lattice_spacing(self.cell_size)
 
     def _rough(self, leaves: np.ndarray) -> np.ndarray:
         """Mask of leaves whose corners do not determine their contents, bool [n]. Leaves that were not evaluated,
@@ -248,27 +253,15 @@ def _near(points: np.ndarray, others: np.ndarray, reach: float) -> np.ndarray:
     return ((points >= others.min(axis=0) - reach) & (points <= others.max(axis=0) + reach)).all(axis=1)
 
 
-#: Corners of the eight tetrahedra of one size that a tetrahedron is made of, as barycentric coordinates [8, 4, 4].
-_ENDS = {n: np.eye(4)[n] for n in range(4)}
-_MIDDLES = {(i, j): 0.5 * (np.eye(4)[i] + np.eye(4)[j]) for i in range(4) for j in range(4) if i != j}
-_EIGHTHS = np.array(
-    [[_ENDS[n], *(_MIDDLES[n, m] for m in range(4) if m != n)] for n in range(4)]
-    + [
-        [_MIDDLES[0, 2], _MIDDLES[1, 3], _MIDDLES[a], _MIDDLES[b]]
-        for a, b in (((0, 1), (1, 2)), ((1, 2), (2, 3)), ((2, 3), (0, 3)), ((0, 3), (0, 1)))
-    ]
-)
-
-
 def points_within(
     grown: Grown, elements: np.ndarray, cell_size: float, each: int, rng: np.random.Generator
 ) -> np.ndarray:
     """Random points in tetrahedra, spread evenly over their eighths [n, each, 3] [m]."""
-    eighths = rng.integers(0, 8, len(elements))[:, None] + np.arange(each) * max(8 // each, 1)
+    first = rng.integers(0, 8, len(elements))
     weights = rng.standard_exponential((len(elements), each, 4), dtype=np.float32)
     weights /= weights.sum(axis=2, keepdims=True)
     corners = grown.lattice[grown.tree.tets[elements]] * lattice_spacing(cell_size)
-    return np.einsum("nek,nekc->nec", weights, _EIGHTHS[eighths % 8]) @ corners + np.asarray(grown.origin)
+    return spread_over_eighths(weights, first) @ corners + np.asarray(grown.origin)
 
 
 def _sampled_shares(

@@ -1,0 +1,208 @@
+"""Labels of a mesh's elements: each has the one that takes most of it, and none is lost.
+
+Processes that grow a mesh together find the labels of the whole one, each those of its own elements.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_corot.mesh.forest_arrays import ForestArrays
+from warp_corot.mesh.scattered import combined, weights_within
+
+from .cut import label_shares
+from .resolved import LEAST, MOST_POINTS, Resolved
+
+if TYPE_CHECKING:
+    from warp_corot.domain import Domain
+
+Ints = npt.NDArray[np.int32]
+Longs = npt.NDArray[np.int64]
+Floats = npt.NDArray[np.float64]
+
+#: Number of points of an element at which labels are sampled, if few elements have several.
+MOST_POINTS_EACH = 64
+
+
+@dataclass(frozen=True)
+class Growers:
+    """The processes that grow a mesh, of which this one has some of the elements.
+
+    Attributes:
+        first: The number of its first element in the whole mesh.
+        gathered: Gives the values of all processes, in their order; all must call it.
+    """
+
+    first: int
+    gathered: Callable[[Any], list[Any]]
+
+
+#: A process that has all elements.
+ALONE = Growers(0, lambda value: [value])
+
+
+def labels_of(
+    resolved: Resolved,
+    child: np.ndarray,
+    elements: np.ndarray,
+    forest: ForestArrays,
+    domain: Domain,
+    growers: Growers = ALONE,
+) -> Ints:
+    """Labels of elements of a mesh, int32 [T].
+
+    An element has the label that takes most of it. A label that would be in none has the element of which it takes
+    most, unless that is another's only one. A label that takes nothing of any element, but of which a point is known,
+    has the element at this point.
+
+    Args:
+        resolved: What the body has of a grown forest.
+        child: The mesh in the forest, as its first children.
+        elements: The mesh's elements, numbers of tetrahedra of the forest [T].
+        forest: The mesh.
+        domain: The body.
+        growers: The processes that grow the mesh; all must call this.
+    """
+    count = len(domain.label_names)
+    whose, label, total = _parts(resolved, child, elements, domain, growers)
+    labels = np.zeros(len(elements), np.int32)
+    order = np.argsort(total, kind="stable")
+    labels[whose[order]] = label[order]
+    there = np.sum(growers.gathered(np.bincount(labels, minlength=count + 1)), axis=0)
+    lost = np.flatnonzero((there[label] == 0) & (label > 0))
+    told = label[lost], growers.first + whose[lost], total[lost], labels[whose[lost]]
+    whose_lost = [np.concatenate(each) for each in zip(*growers.gathered(told), strict=True)]
+    for element, number in _given_to_lost(*whose_lost, there=there).items():
+        if 0 <= element - growers.first < len(labels):
+            labels[element - growers.first] = number
+    return _with_points(labels, forest, domain, growers)
+
+
+def labels_of_nodes(resolved: Resolved, tets: np.ndarray, domain: Domain) -> Ints:
+    """Labels of the nodes of tetrahedra, as many as there are lattice points."""
+    found = np.zeros(len(resolved.grown.lattice), np.int32)
+    used = np.unique(tets)
+    found[used] = domain.labels_at(resolved.points(used), nearest=True)
+    return found
+
+
+def _parts(
+    resolved: Resolved, child: np.ndarray, elements: np.ndarray, domain: Domain, growers: Growers
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The volumes that labels take of elements: places of these, labels and volumes [m], elements ascending."""
+    grown, count = resolved.grown, len(domain.label_names)
+    tets = grown.tree.tets[resolved.leaves]
+    at_nodes = labels_of_nodes(resolved, tets, domain)
+    place = np.full(len(child), -1, np.int64)
+    place[elements] = np.arange(len(elements))
+    owner = place[resolved.owners(child)[resolved.leaves]]
+    size = resolved.volume[resolved.leaves]
+    values, own = grown.phi[tets], at_nodes[tets]
+    alike = (own == own[:, :1]).all(axis=1)
+    mixed = np.flatnonzero(~alike)
+    shares = label_shares(values[mixed], own[mixed])
+    row, label, share = _sampled_labels(resolved, resolved.leaves[mixed], own[mixed], shares, domain, growers)
+    keys = np.concatenate([owner[alike] * (count + 1) + own[alike, 0], owner[mixed[row]] * (count + 1) + label])
+    weights = np.concatenate([(resolved.shares * size)[alike], share * size[mixed[row]]])
+    there = np.concatenate([owner[alike], owner[mixed[row]]]) >= 0
+    found, index = np.unique(keys[there], return_inverse=True)
+    return found // (count + 1), found % (count + 1), np.bincount(index.ravel(), weights[there], len(found))
+
+
+def _sampled_labels(
+    resolved: Resolved, elements: np.ndarray, own: np.ndarray, shares: np.ndarray, domain: Domain, growers: Growers
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The fraction of elements that each label fills, by random points; labels at corners get at least a small
+    fraction.
+
+    Args:
+        resolved: The forest.
+        elements: The elements in which labels vary [n].
+        own: Labels of their nodes [n, 4].
+        shares: The fractions if borders were halfway between nodes; see `label_shares` [n, 4].
+        domain: The body.
+        growers: The processes that grow the mesh.
+
+    Returns:
+        Places in ``elements``, labels and fractions, [m] each, without zero fractions.
+    """
+    grown, stride = resolved.grown, len(domain.label_names) + 1
+    each = int(np.clip(MOST_POINTS // max(sum(growers.gathered(len(elements))), 1), 1, MOST_POINTS_EACH))
+    seen = []
+    for part in np.array_split(np.arange(len(elements)), len(elements) * each // MOST_POINTS + 1):
+        tets = grown.tree.tets[elements[part]]
+        weights = weights_within(grown.lattice[tets].sum(axis=1, dtype=np.int64), each)
+        labels = domain.labels_at(combined(weights, resolved.points(tets)[:, None]).reshape(-1, 3))
+        seen.append((np.repeat(part, each) * stride + labels)[labels > 0])
+    keys, counts = np.unique(np.concatenate(seen), return_counts=True)
+    total = np.bincount(keys // stride, counts, len(elements))
+    sampled = counts * (shares.sum(axis=1) / np.maximum(total, 1.0))[keys // stride]
+    at_nodes = np.where(total[:, None] > 0, LEAST * shares, shares)
+    row, node = np.nonzero(at_nodes)
+    keys, place = np.unique(np.concatenate([keys, row * stride + own[row, node]]), return_inverse=True)
+    found = np.zeros(len(keys))
+    np.maximum.at(found, place.ravel(), np.concatenate([sampled, at_nodes[row, node]]))
+    kept = found > 0.0
+    return keys[kept] // stride, keys[kept] % stride, found[kept]
+
+
+def _given_to_lost(label: Longs, element: Longs, total: Floats, own: Ints, *, there: Longs) -> dict[int, int]:
+    """The elements that change to labels that no element has.
+
+    Args:
+        label, element, total: Such labels, elements of which they take some, and how much.
+        own: The labels that these elements have.
+        there: The number of elements of each label; it is changed, too.
+    """
+    now = dict(zip(element.tolist(), own.tolist(), strict=True))
+    given: dict[int, int] = {}
+    order = np.lexsort((element, total))[::-1]
+    for lost in np.unique(label).tolist():
+        for number in element[order[label[order] == lost]].tolist():
+            if there[now[number]] > 1:
+                there[now[number]] -= 1
+                there[lost] += 1
+                now[number] = given[number] = lost
+                break
+    return given
+
+
+def _with_points(labels: Ints, forest: ForestArrays, domain: Domain, growers: Growers) -> Ints:
+    """The labels, with those that no element has at an element each, if a point of them is known and the element is not
+    another label's only one."""
+    there = np.sum(growers.gathered(np.bincount(labels, minlength=len(domain.label_names) + 1)), axis=0)
+    for number, name in enumerate(domain.label_names, start=1):
+        point = None if there[number] else domain.point_in(name)
+        if point is None:
+            continue
+        depth, element = _at(forest, point, growers)
+        told = growers.gathered((depth, -growers.first - element, int(labels[element])))
+        own = max(told)
+        if there[own[2]] > 1:
+            there[own[2]] -= 1
+            there[number] += 1
+            if own[1] == -growers.first - element:
+                labels[element] = number
+    return labels
+
+
+def _at(forest: ForestArrays, point: np.ndarray, growers: Growers) -> tuple[float, int]:
+    """The element in which a point is deepest, or outside which it is least far, by its smallest barycentric
+    coordinate; and that coordinate."""
+    corners = forest.points[forest.tets]
+    near = ((corners.min(axis=1) <= point) & (point <= corners.max(axis=1))).all(axis=1)
+    if not any(growers.gathered(bool(near.any()))):
+        near[:] = True
+    elements = np.flatnonzero(near)
+    if not len(elements):
+        return -np.inf, 0
+    x = corners[elements]
+    later = np.linalg.solve(np.swapaxes(x[:, 1:] - x[:, :1], 1, 2), (point - x[:, 0])[..., None])[..., 0]
+    depth = np.minimum(later.min(axis=1), 1.0 - later.sum(axis=1))
+    best = int(np.argmax(depth))
+    return float(depth[best]), int(elements[best])
