@@ -2,38 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
-import numpy as np
 import warp as wp
 
-from warp_corot.elasticity.viscosity import Viscosity
-from warp_corot.errors import InputError
-from warp_corot.kernels.elements.prony import set_elapsed
-from warp_corot.kernels.implicit import conjugate_gradients
-from warp_corot.kernels.implicit import newton as kernels_of_newton
-from warp_corot.kernels.implicit import steps as kernels
-from warp_corot.kernels.stepping.integrate import follow_trajectory
 from warp_corot.solvers.integrator import Stepper
-from warp_corot.solvers.ranks import ALONE
 
+from .body_steps import BodySteps, SharedSteps
 from .joined import JoinedSolve
 from .joined_newton import JoinedNewton
-from .lagged import Lagged
-from .multigrid import Multigrid
-from .newton import Newton
-from .preconditioners import preconditioner_of
-from .tangent import TangentOperator
-from .touching import Held, Hold, Touching, TouchingSolve
-from .touching_newton import TouchingNewton
 
 if TYPE_CHECKING:
     from warp_corot.solvers.system import System
 
     from .schemes import ImplicitIntegrator
-
-#: The search for soft surfaces leaves room for motions of this many times what a body that is let go falls in a step.
-FALLS = 2.0
 
 
 class ImplicitStepper(Stepper):
@@ -46,28 +28,20 @@ class ImplicitStepper(Stepper):
     Attributes:
         totals: Steps, iterations of Newton's method and of linear solves, and steps that did not come within the
             tolerance, of all bodies, int64 [4].
-        touching: The constraints that implicit steps resolve.
-        rows: The contact of bodies with one another, or None.
+        shared: What the steps of all bodies share.
     """
 
     graph_steps = 8
     resolves_constraints = True
 
     def __init__(self, system: System, integrator: ImplicitIntegrator):
-        self.system, self.integrator = system, integrator
         system.lag, system.is_implicit = 0.0, True
-        self.totals = wp.zeros(4, dtype=wp.int64, device=system.device)
-        self.touching = cast("list[Touching]", [each for each in system.constraints if hasattr(each, "active_set")])
-        self.rows = next((rows for each in self.touching if (rows := each.joined_rows()) is not None), None)
-        if self.rows is not None:
-            self.rows.reserve(FALLS * float(np.linalg.norm(system.gravity)) * integrator.dt**2)
+        self.system, self.integrator, self.shared = system, integrator, SharedSteps(system, integrator)
+        self.totals = self.shared.totals
         self._joined: JoinedSolve | None = None
         self._joined_newton: JoinedNewton | None = None
-        #: Nonzero if all bodies that are solved for together begin again with a first step, int32 [1].
-        self.begins = wp.zeros(1, dtype=wp.int32, device=system.device)
-        #: Nonzero while each step is a first step, of backward Euler, int32 [1].
-        self.sturdy, self._is_sturdy = wp.zeros(1, dtype=wp.int32, device=system.device), False
-        self._bodies = [BodySteps(self, k) for k in range(len(system.bodies))]
+        self._is_sturdy = False
+        self._bodies = [BodySteps(self.shared, k) for k in range(len(system.bodies))]
 
     @property
     def kept(self) -> dict[str, wp.array]:
@@ -83,21 +57,21 @@ class ImplicitStepper(Stepper):
         before = [body.newton for body in self._bodies]
         for body in self._bodies:
             body.prepare()
-        if self.rows is not None:
-            self.rows.prepare()
+        if self.shared.rows is not None:
+            self.shared.rows.prepare()
             if self._joined is None or before != [body.newton for body in self._bodies]:
                 self._join()
 
     def fall_back(self) -> bool:
         falls = bool(self.integrator.history) and not self._is_sturdy
         if falls:
-            self.sturdy.fill_(1)
+            self.shared.sturdy.fill_(1)
             self._is_sturdy = True
         return falls
 
     def recover(self) -> None:
         if self._is_sturdy:
-            self.sturdy.zero_()
+            self.shared.sturdy.zero_()
             self._is_sturdy = False
 
     def forces(self, offset: int = 0) -> None:
@@ -108,10 +82,10 @@ class ImplicitStepper(Stepper):
         for offset in range(count):
             self.system.offset = offset
             if forces_known and offset == 0:
-                self.forget_forces()
-            for each in self.touching:
+                self.shared.forget_forces()
+            for each in self.shared.touching:
                 each.launch_motion(offset)
-            for hold in self.holds:
+            for hold in self.shared.holds:
                 hold.launch_begin()
             if self._joined is not None:
                 self._launch_joined(offset, self._joined)
@@ -125,13 +99,13 @@ class ImplicitStepper(Stepper):
 
     def _launch_joined(self, offset: int, joined: JoinedSolve) -> None:
         """Launch a step of all bodies together."""
-        assert self.rows is not None
-        wp.copy(self.begins, self.sturdy)
+        assert self.shared.rows is not None
+        wp.copy(self.shared.begins, self.shared.sturdy)
         for body in self._bodies:
             body.launch_changes(offset)
         touched = [body.touched for body in self._bodies]
         if self.integrator.history:
-            self.rows.launch_meetings(offset, touched, self.begins)
+            self.shared.rows.launch_meetings(offset, touched, self.shared.begins)
         for body in self._bodies:
             body.launch_begin()
         solve: JoinedSolve | JoinedNewton = joined
@@ -142,335 +116,21 @@ class ImplicitStepper(Stepper):
             solve = self._joined_newton
         solve.launch(offset)
         if self.integrator.history:
-            self.rows.launch_touched(touched)
+            self.shared.rows.launch_touched(touched)
         for body in self._bodies:
             body.take_solved(solve)
             body.launch_end(offset, is_last=True)
 
     def _join(self) -> None:
-        assert self.rows is not None
+        assert self.shared.rows is not None
         options, newtons = self.integrator, [body.newton for body in self._bodies]
         self._joined = JoinedSolve(
             newtons,
             [body.held for body in self._bodies],
-            self.rows,
+            self.shared.rows,
             worlds=self.system.bodies[0].worlds,
             tolerance=options.linear_tolerance,
             most=options.linear_iterations,
         )
-        if not self.in_one_solve:
+        if not self.shared.in_one_solve:
             self._joined_newton = JoinedNewton(self._joined, newtons, **options.newton_with_contact)
-
-    @property
-    def in_one_solve(self) -> bool:
-        """Whether a step with contact is one linearisation of backward Euler."""
-        return self.integrator.tolerance is None and self.integrator.history == 0
-
-    def add_other_forces(self) -> None:
-        """Launch all forces except elastic ones in the present state to ``state.forces`` of the bodies."""
-        self.forget_forces()
-        for forces in [*self.system.forces, *self.holds]:
-            forces.add_forces()
-
-    @property
-    def holds(self) -> list[Hold]:
-        """The constraints that are springs in implicit steps."""
-        return cast("list[Hold]", [each for each in self.system.constraints if hasattr(each, "add_stiffness")])
-
-    def add_counted_forces(self) -> None:
-        """The same for forces whose work is counted separately."""
-        self.forget_forces()
-        for forces in self.system.counted:
-            forces.add_forces()
-
-    def forget_forces(self) -> None:
-        """Launch the reset of all forces."""
-        for body in self.system.bodies:
-            body.state.forces.zero_()
-
-
-class BodySteps:
-    """Steps of one body.
-
-    Args:
-        stepper: The stepper of all bodies.
-        k: The number of the body in the system.
-
-    Attributes:
-        held: What holds nodes, or None.
-        history: The vectors that a step keeps for the next one, and the body's state after it, vec4 each.
-        before: Velocities before the last step, for the guess of the next one, vec4; NaN before the first.
-        met: A number for the obstacles that each node touched when the last step began, in schemes of second order,
-            else empty, int32.
-        touched: What each node has touched of soft surfaces, in schemes of second order, else empty, int32; see
-            ``kernels.contact.meetings``.
-        lagged: The preconditioner, if it is kept over many steps, else None.
-    """
-
-    def __init__(self, stepper: ImplicitStepper, k: int):
-        self.stepper, self.k = stepper, k
-        self._counts: list[wp.array] = []
-        self._good = 0
-        system, options = stepper.system, stepper.integrator
-        self.body, self.field, self.system = system.bodies[k], system.fields[k], system
-        self.device = self.body.device
-        self.viscosity = Viscosity(self.body, self.field, options.viscosity) if options.viscosity else None
-        sets = [each.active_set(k) for each in stepper.touching]
-        self.held: Held | None = next((each for each in sets if each is not None), None)
-        touches = self.held is not None or stepper.rows is not None
-        # Contact needs a matrix that is positive definite.
-        exact = options.tolerance is not None and not touches
-        self.operator = TangentOperator(
-            self.body, self.field, viscosity=self.viscosity, exact=exact, ranks=system.ranks, number=k
-        )
-        self._preconditioner = preconditioner_of(
-            options.preconditioner, self.operator, short_cycles=not exact, few_digits=True
-        )
-        self.lagged: Lagged | None = None
-        if not exact and isinstance(self._preconditioner, Multigrid):
-            self._preconditioner = self.lagged = Lagged(self._preconditioner, self.operator, system.ranks)
-        self._make_solvers()
-        like = self.body.state.displacements
-        self._none = wp.zeros(1, dtype=wp.vec4, device=self.device)
-        wanted = options.history
-        self._h = [wp.zeros_like(like) if number < wanted else self._none for number in range(2)]
-        self._left = [wp.full_like(like, np.nan) if wanted else self._none for _ in range(2)]
-        self.history = [*self._h[:wanted], *(self._left if wanted else [])]
-        self.before = wp.full_like(like, np.nan)
-        kept = [len(like) if wanted and each is not None else 0 for each in (self.held, stepper.rows)]
-        self.met, self.touched = (wp.zeros(length, dtype=wp.int32, device=self.device) for length in kept)
-        self._drift, self._rates = (self._none if self.viscosity is None else wp.zeros_like(like) for _ in range(2))
-        self._moves = wp.zeros(1, dtype=wp.int32, device=self.device)
-        self._begins = wp.zeros(1, dtype=wp.int32, device=self.device) if stepper.rows is None else stepper.begins
-        self._is_prepared = False
-        self._one = wp.ones(self.body.worlds, dtype=wp.int32, device=self.device)
-        tables = np.stack([options.scheme(options.dt), options.start(options.dt)])
-        if touches:
-            # The increments of a step with contact begin with zero.
-            tables[:, int(kernels.STAGE), 1] = 0.0
-        # Contact is that of the end of the step, so whole motions are the unknowns there.
-        tables[:, int(kernels.STAGE), 2] = tables[:, int(kernels.STAGE), 0] if touches else 1.0
-        self._table = wp.array(tables, dtype=wp.float32, device=self.device)
-
-    def _make_solvers(self) -> None:
-        """Make everything that depends on the mesh."""
-        options = self.stepper.integrator
-        self._version = self.body.version
-        self.newton = Newton(
-            self.operator,
-            self._preconditioner,
-            self.system.gravity,
-            tolerance=options.tolerance or options.linear_tolerance,
-            most=options.iterations,
-            most_linear=options.linear_iterations,
-            others=self._add_others,
-        )
-        self.newton.is_at_stage = options.is_at_stage
-        self.touching: TouchingSolve | None = None
-        self.touching_newton: TouchingNewton | None = None
-        if self.held is not None and self.stepper.rows is None:
-            self.touching = TouchingSolve(self.newton, self.held)
-            if not self.stepper.in_one_solve:
-                self.touching_newton = TouchingNewton(self.touching, **options.newton_with_contact)
-
-    def prepare(self) -> None:
-        """Make everything that launches use, so that they can be recorded."""
-        self.operator.prepare()
-        if self.lagged is not None:
-            self.lagged.prepare()
-        elif isinstance(self._preconditioner, Multigrid):
-            self._preconditioner.follow()
-        if self.held is not None:
-            self.held.prepare()
-            if self.held.springs is not None and hasattr(self._preconditioner, "follow_springs"):
-                self._preconditioner.follow_springs(self.held.springs)
-        if self.stepper.holds and self.stepper.integrator.is_at_stage:
-            raise InputError("GeneralizedAlpha supports grasps only with spectral_radius=0")
-        if self._version != self.body.version:
-            if self._is_prepared:
-                self.before.fill_(np.nan)
-            self._make_solvers()
-        self._is_prepared = True
-        self.operator.stiff_forces = (
-            *(each for each in self.system.forces if hasattr(each, "add_stiffness")),
-            *self.stepper.holds,
-        )
-        if self.stepper.integrator.tolerance is None or self.touching_newton is not None:
-            self.newton.solver.tolerance.fill_(self.stepper.integrator.linear_tolerance)
-        u = self.body.state.displacements
-        self.field.elastic_forces(u)
-        self.field.potentials(u)
-
-    def launch_changes(self, offset: int) -> None:
-        """Launch what is given for the ``offset``-th step since the clock was last advanced, and the test whether it is
-        a first step."""
-        self.body.conditions.follow_activations(self.system.pace, offset + 1)
-        self._follow_trajectories(offset)
-        if self.stepper.rows is None:
-            wp.copy(self._begins, self.stepper.sturdy)
-        if not self.history:
-            return
-        state = self.body.state
-        inputs = [self.body.conditions.inverse_mass, state.displacements, state.velocities, *self._left]
-        self._launch(kernels.find_changes, inputs, [self._begins])
-        if self.held is not None:
-            # Velocities jump when nodes meet obstacles, so schemes of second order begin again.
-            self.held.launch_meetings(self.met, self._begins)
-        self.system.ranks.take_most(self._begins)
-
-    def launch_residual(self) -> None:
-        """Launch the forces that are out of balance, if the step is solved for by itself."""
-        if self.stepper.integrator.tolerance is None and self.touching_newton is None:
-            self.newton.launch_residual()
-
-    def launch_solve(self) -> None:
-        """Launch the solve for the step."""
-        newton, solver = self.newton, self.newton.solver
-        if self.touching_newton is not None:
-            self._solve_touching(self.touching_newton)
-            return
-        if self.stepper.integrator.tolerance is not None:
-            newton.launch_begin()
-            wp.capture_while(newton.running, newton.launch_iteration)
-            self._counts = [newton.iterations, newton.solved, newton.status]
-            self._good = int(kernels_of_newton.CONVERGED)
-            return
-        iterations = solver.iterations
-        if self.touching is None:
-            newton.launch_solve(guessed=True)
-        else:
-            self.touching.launch()
-            iterations = self.touching.iterations
-        self._take(iterations, solver.status)
-
-    def _solve_touching(self, solve: TouchingNewton) -> None:
-        """Launch the solve for a step with contact by Newton's method."""
-        solve.launch()
-        self._take_counts(solve)
-
-    def _take_counts(self, solve: TouchingNewton | JoinedNewton) -> None:
-        if self.lagged is not None:
-            self.lagged.judge(solve.linear_iterations, solve.status)
-        self._counts = [solve.iterations, solve.linear_iterations, solve.status]
-        self._good = int(conjugate_gradients.CONVERGED)
-
-    def take_solved(self, solve: JoinedSolve | JoinedNewton) -> None:
-        """Launch the copy of this body's step from a solve for all bodies."""
-        if isinstance(solve, JoinedNewton):
-            self._take_counts(solve)
-        else:
-            self._take(solve.iterations, solve.status)
-
-    def _take(self, iterations: wp.array, status: wp.array) -> None:
-        newton = self.newton
-        if self.lagged is not None:
-            self.lagged.judge(iterations, status)
-        self._launch(kernels.take_step, [newton.step], [newton.increment, self.body.state.displacements])
-        self.system.ranks.complete(self.k, self.body.state.displacements)
-        self._counts, self._good = [self._one, iterations, status], int(conjugate_gradients.CONVERGED)
-
-    def launch_end(self, offset: int, *, is_last: bool) -> None:
-        """Launch the state after the step, and the count of its iterations.
-
-        Args:
-            offset: As for ``launch_changes``.
-            is_last: Whether this may be the last step of a run, whose reactions a user may read.
-        """
-        self._end(offset, self._counts[-1])
-        if is_last or not self._can_leave_out_reactions:
-            self._find_reactions()
-        else:
-            wp.capture_if(self._moves, self._find_reactions)
-        wp.launch(kernels.count_solves, 1, [*self._counts, self._good], [self.stepper.totals], device=self.device)
-
-    # --- pieces ------------------------------------------------------------------------------------------------------
-
-    def _follow_trajectories(self, offset: int) -> None:
-        """Launch the velocities that move nodes to their keyframes at the end of the step."""
-        body, system = self.body, self.system
-        for each in body.conditions.trajectories:
-            inputs = [each.nodes, each.times, each.displacements, system.pace.arrays, body.conditions.world_starts]
-            inputs += [body.world_node_count, offset, body.state.forces, body.state.displacements]
-            outputs = [body.state.velocities, system.support_work_of(body)]
-            wp.launch(follow_trajectory, len(each.nodes), inputs, outputs, device=self.device)
-
-    def launch_begin(self) -> None:
-        """Launch the input of the step's solve."""
-        system = self.system
-        state, conditions, newton, options = (
-            self.body.state,
-            self.body.conditions,
-            self.newton,
-            self.stepper.integrator,
-        )
-        inputs = [self._begins, self._table, options.damping]
-        outputs = [self.operator.scales, newton.inertia, newton.share]
-        wp.launch(kernels.choose_scales, 1, inputs, outputs, device=self.device)
-        if self.field.elapsed is not None:
-            inputs = [self._begins, self._table, int(kernels.STAGE), options.dt]
-            wp.launch(set_elapsed, 1, inputs, [self.field.elapsed], device=self.device)
-        inputs = [self._begins, self._table, options.dt, options.damping, conditions.inverse_mass]
-        inputs += [state.velocities, *self._h]
-        outputs = [state.displacements, self.before, newton.base, newton.increment, newton.pull]
-        outputs += [newton.step, self._drift]
-        self._launch(kernels.begin_step, inputs, outputs)
-        system.ranks.complete(self.k, state.displacements)
-
-    def _add_others(self) -> None:
-        """Launch forces other than elastic ones at the stage."""
-        self.stepper.add_other_forces()
-        if self.viscosity is not None:
-            inputs = [self.operator.scales, self.newton.increment, self._drift]
-            self._launch(kernels.find_rates, inputs, [self._rates])
-            self.system.ranks.complete(self.k, self._rates)
-            state = self.body.state
-            self.viscosity.scatter(state.displacements, self._rates, state.forces)
-
-    def _end(self, offset: int, status: wp.array) -> None:
-        """Launch the state after the step, and the work of forces."""
-        body, system, newton = self.body, self.system, self.newton
-        state, conditions = body.state, body.conditions
-        inputs = [self._begins, self._table, self.operator.node_count, status, conditions.inverse_mass]
-        rests = self.stepper.integrator.settles_contact and (self.held is not None or self.stepper.rows is not None)
-        inputs += [newton.base, newton.increment, state.contact_forces if rests else self._none]
-        inputs += [system.pace.arrays, offset]
-        outputs = [state.velocities, *self._h, state.displacements, *self._left, system.bad_step, self._moves]
-        self._moves.zero_()
-        self._launch(kernels.end_step, inputs, outputs)
-        system.ranks.complete(self.k, state.displacements)
-        self.field.complete_step(state.displacements, system.pace.arrays)
-        if system.counted:
-            self.stepper.add_counted_forces()
-            account = system.accounts[self.k]
-            self._launch(kernels.count_work, [conditions.inverse_mass, state.forces, newton.increment], [account])
-        if self.stepper.holds:
-            self.stepper.add_other_forces()
-            for hold in self.stepper.holds:
-                hold.launch_held(body)
-        for account in system.constraint_accounts(self.k):
-            inputs = [conditions.inverse_mass, state.contact_forces, newton.increment]
-            self._launch(kernels.count_work, inputs, [account])
-
-    @property
-    def _can_leave_out_reactions(self) -> bool:
-        """Whether reactions matter only at the end of a run, or if held nodes move: evaluating the forces changes
-        nothing else. On CUDA the condition costs more than the forces."""
-        system = self.system
-        others = system.forces or system.constraints or system.counted
-        return self.device.is_cpu and system.ranks is ALONE and not others and not self.field.state
-
-    def _find_reactions(self) -> None:
-        """Launch the reactions after the step, and the work of supports."""
-        body, system, newton = self.body, self.system, self.newton
-        state, conditions = body.state, body.conditions
-        self.field.add_forces(state.displacements, newton.forces)
-        self.stepper.add_other_forces()
-        inputs = [system.gravity, conditions.mass, conditions.inverse_mass, int(conditions.has_loads)]
-        inputs += [conditions.loads, newton.forces, state.forces, newton.increment]
-        kernel = kernels.COUNT_SUPPORTS[conditions.loads.dtype]
-        self._launch(kernel, inputs, [state.reactions, system.support_work_of(body)])
-        newton.forces.zero_()
-        self.stepper.forget_forces()
-
-    def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
-        wp.launch(kernel, self.body.sizes.launch_nodes, inputs, outputs, device=self.device)
