@@ -14,7 +14,7 @@ from warp_corot.kernels.implicit.line_search import TRIED
 from .carriers import Carriers, motion_at, push_at
 from .motion import Surface
 from .rows import Rows, row_count
-from .springs import spring_state
+from .springs import bound_of, spring_state
 
 wp.set_module_options({"enable_backward": False})
 
@@ -38,6 +38,7 @@ class Joined:
     force: wp.array[wp.vec3]  # [P] on the first [N]
     derivative: wp.array[wp.mat33]  # [P] [N/m]
     locates: wp.array[wp.int32]  # [1] whether pairs are to be located
+    solves: wp.array[wp.int32]  # [1] how many linear solves the step has had so far
     near: wp.array[wp.int32]  # [P] the pairs that may meet, as they were located
     pushing: wp.array[wp.int32]  # [P] those that push
     reached: wp.array[wp.int32]  # [P] those that push before or after a change of the motions
@@ -75,6 +76,7 @@ def empty_list(which: int, joined: Joined):
 @wp.kernel(enable_backward=False)
 def update_rows(
     threads: int,
+    is_solved: int,
     friction: float,
     d: wp.array[wp.vec4],
     surface: Surface,
@@ -82,16 +84,20 @@ def update_rows(
     rows: Rows,
     joined: Joined,
 ):
-    """Forces and derivatives after motions d, with the friction that the push there allows, and the pairs that push."""
+    """Forces and derivatives after motions d, with the friction that the push there allows, and the pairs that push.
+
+    ``is_solved`` says that a solve has ended with d, which is when bounds of friction change.
+    """
     k = wp.tid()
     while k < joined.counts[NEAR]:
         row = joined.near[k]
         e = opened_by(row, d, rows, surface, carriers)
         push = row_state(row, e, 0.0, rows, joined).push
-        joined.most[row] = friction * push
+        most = bound_of(joined.most[row], push, friction, is_solved != 0, joined.solves[0])
+        joined.most[row] = most
         joined.force[row] = wp.vec3()
         if push > 0.0:
-            made = row_state(row, e, friction * push, rows, joined)
+            made = row_state(row, e, most, rows, joined)
             joined.force[row] = made.force
             joined.derivative[row] = made.derivative
             joined.pushing[wp.atomic_add(joined.counts, PUSHING, 1)] = row
@@ -249,11 +255,13 @@ def judge_round(
     rounds: wp.array[wp.int32],
     linear: wp.array[wp.int32],
     # Out
+    solves: wp.array[wp.int32],
     going: wp.array[wp.int32],
 ):
     """Solve again until the last solve had next to nothing to do, just after pairs were located."""
     linear[0] = linear[0] + iterations[0]
     rounds[0] = rounds[0] + 1
+    solves[0] = rounds[0]
     was_located = locates[0] != 0 or total[0] == 0
     is_settled = changed[0] == 0 and not had_much_to_do(scalars, 0, settled)
     locates[0] = wp.where(changed[0] == 0 and not had_much_to_do(scalars, 0, near), 1, 0)

@@ -75,6 +75,7 @@ def locate(
     joined.force[row] = wp.vec3()
     joined.stiffness[row] = 0.0
     if not is_near:
+        joined.most[row] = 0.0
         return
     p = rows.places[row]
     w = rows.shares[row]
@@ -86,6 +87,7 @@ def locate(
         given += w[k] * gone_at(p[k], surface, carriers)
         k += 1
     if not is_free:
+        joined.most[row] = 0.0
         return
     joined.stiffness[row] = 1.0
     joined.given[row] = given

@@ -13,7 +13,7 @@ from warp_corot.kernels.implicit.line_search import TRIED
 
 from .carriers import Carriers, motion_at, push_at
 from .motion import Surface
-from .springs import spring_state
+from .springs import bound_of, spring_state
 from .touches import Touches
 
 wp.set_module_options({"enable_backward": False})
@@ -32,6 +32,7 @@ class Spans:
     derivative: wp.array2d[wp.mat33]  # [N/m]
     count: wp.array[wp.int32]  # [1] how many are listed
     due: wp.array[wp.int32]  # [1] whether all are to be found again
+    solves: wp.array[wp.int32]  # [1] how many linear solves the step has had so far
     stiff: float  # the stiffness of a span over that of its point
     deepest: float  # how far an obstacle may sink into wide triangles at most [m]
 
@@ -57,17 +58,21 @@ def judge_spans(
     most: int,
     # In and out
     due: wp.array[wp.int32],
+    solves: wp.array[wp.int32],
     going: wp.array[wp.int32],
 ):
     """Find all spans again before the next solve if the last one had little to do. The step is solved for only if spans
     had just been found again, or there are none.
     """
+    solves[0] = rounds[0]
     if going[0] == 0 and due[0] == 0 and count[0] > 0 and rounds[0] < most:
         going[0] = 1
     is_near = changed[0] == 0
     for world in range(scalars.shape[0]):
         is_near = is_near and not had_much_to_do(scalars, world, near)
     due[0] = wp.where(is_near, 1, 0)
+    if going[0] == 0:
+        solves[0] = 0
 
 
 @wp.func
@@ -83,6 +88,7 @@ def span_state(o: int, t: int, e: wp.vec3, most: float, touches: Touches, spans:
 def update_spans(
     # In
     start: int,
+    is_solved: int,
     surface: Surface,
     triangles: wp.array[wp.vec3i],
     carriers: Carriers,
@@ -91,16 +97,20 @@ def update_spans(
     touches: Touches,
     spans: Spans,
 ):
-    """Forces and derivatives after motions d, with the friction that the push there allows."""
+    """Forces and derivatives after motions d, with the friction that the push there allows.
+
+    ``is_solved`` says that a solve has ended with d, which is when bounds of friction change.
+    """
     t = start + wp.tid()
     for o in range(touches.force.shape[0]):
         touches.acts[o, t] = 0
         touches.force[o, t] = wp.vec3()
+        last = spans.most[o, t]
         spans.most[o, t] = 0.0
         if spans.listed[o, t] != 0:
             e = motion_of(touches.shares[o, t], triangles[t], surface, carriers, d) - touches.moved[o, t]
             push = span_state(o, t, e, 0.0, touches, spans).push
-            most = touches.friction[o, t] * push
+            most = bound_of(last, push, touches.friction[o, t], is_solved != 0, spans.solves[0])
             spans.most[o, t] = most
             if push > 0.0:
                 made = span_state(o, t, e, most, touches, spans)

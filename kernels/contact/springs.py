@@ -13,6 +13,10 @@ from .vertices import across
 
 wp.set_module_options({"enable_backward": False})
 
+#: Number of solves after which the bounds of friction follow the push only by half of the change in each solve, then by
+#: a quarter. Friction may pull a place off the obstacle; then it would have a push and no friction in turns.
+HALVED, QUARTERED = wp.constant(6), wp.constant(16)
+
 
 @wp.struct
 class SpringState:
@@ -42,6 +46,19 @@ def kept_gap(gap: float, pushed: bool, law: Law, dt: float):
         # What the slack lets pass in each step of a tool's way would add up.
         return gap + wp.min(-0.5 * gap, law.recovery * dt)
     return least_gap(gap, law, dt)
+
+
+@wp.func
+def bound_of(most: float, push: float, friction: float, is_solved: bool, solves: int):
+    """The bound of friction that belongs to a push, or the last one for the time of a solve, see ``HALVED`` [N]."""
+    if solves > 0 and not is_solved:
+        return most
+    share = float(1.0)
+    if solves >= QUARTERED:
+        share = 0.25
+    elif solves >= HALVED:
+        share = 0.5
+    return most + share * (friction * push - most)
 
 
 @wp.func

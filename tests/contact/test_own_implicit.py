@@ -46,8 +46,9 @@ def test_an_organ_rests_on_its_surface(brick, device, integrator):
     assert sim.solves.linear_iterations - before < 5 * 8
 
 
-@pytest.mark.parametrize("share", [0.99, 1.01])
+@pytest.mark.parametrize("share", [0.99, 1.01, 1.05])
 def test_an_organ_slips_at_the_angle_of_friction(brick, device, share):
+    """Friction pulls places at its edge off the slope; then they have no friction, and come back."""
     friction, body = 0.5, wc.SoftBody(brick, SOFT, device=device)
     angle = share * np.arctan(friction)
     gravity = 9.81 * np.array([np.sin(angle), 0.0, -np.cos(angle)])
@@ -55,7 +56,9 @@ def test_an_organ_slips_at_the_angle_of_friction(brick, device, share):
     sim = wc.Simulation(body, obstacles=ground(-0.007), integrator=EULER, contact=contact, gravity=gravity)
     sim.advance_steps(30)
     x, v = (array.numpy()[:, 0].astype(float).mean() for array in (body.positions, body.velocities))
+    before = sim.solves.linear_iterations
     sim.advance_steps(30)
+    assert sim.solves.linear_iterations - before < 30 * 10
     if share < 1.0:
         assert abs(body.positions.numpy()[:, 0].mean() - x) < 1e-6
     else:

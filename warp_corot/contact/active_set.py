@@ -147,7 +147,7 @@ class ActiveSet:
         self.changed.zero_()
         if self._spans is not None:
             wp.copy(self._forces, b)
-            self._spans.update(d)
+            self._spans.update(d, is_solved=True)
             self._spans.add_forces(self._forces)
             b = self._forces
         self._find_bounds(d, int(kernels.THOSE_APART), at_end=True)

@@ -76,7 +76,7 @@ class BorneSet:
 
     def launch_judgement(self, b: wp.array, q: wp.array, d: wp.array) -> None:
         self.changed.zero_()
-        self._spans.update(d)
+        self._spans.update(d, is_solved=True)
         self._spans.launch_located(kernels.MISSING, d, self.changed)
 
     def launch_going(

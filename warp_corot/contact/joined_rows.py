@@ -44,12 +44,13 @@ class JoinedRows:
 
     Attributes:
         locates: Whether pairs are located in the next round, int32 [1].
+        solves: Number of linear solves that the step has had so far, int32 [1].
         total: Number of pairs, int32 [1].
     """
 
     def __init__(self, system: System, pairs: Pairs, law: Law):
         self._system, self._pairs, self._law, self.device = system, pairs, law, system.device
-        self.locates = wp.zeros(1, dtype=wp.int32, device=self.device)
+        self.locates, self.solves = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(2))
         self._made = (-1, -1, -1)
         self._carriers = PlaceCarriers(pairs.surface, system.bodies)
         self._places: Surface | None = None
@@ -70,7 +71,7 @@ class JoinedRows:
         for fields, size in ((OF_PLACES, sizes[0]), (OF_PAIRS, sizes[1])):
             for name, dtype in fields.items():
                 setattr(joined, name, wp.zeros(size, dtype=dtype, device=self.device))
-        joined.locates = self.locates
+        joined.locates, joined.solves = self.locates, self.solves
         joined.counts = wp.zeros(3, dtype=wp.int32, device=self.device)
         self._joined = joined
         self._added = wp.zeros(sizes[0], dtype=wp.vec3, device=self.device)
@@ -152,10 +153,10 @@ class JoinedRows:
         self._on_rows(finding.locate_rows, [*inputs, carriers, self._pairs.rows, joined])
         self._on_rows(finding.stiffen_rows, self._springs)
 
-    def update(self, d: wp.array) -> None:
-        """Launch forces and their derivatives after motions d."""
+    def update(self, d: wp.array, *, is_solved: bool = False) -> None:
+        """Launch forces and their derivatives after motions d, which are those of a solve if ``is_solved``."""
         self._empty(kernels.PUSHING)
-        self._on_rows(kernels.update_rows, [self._pairs.friction, d, *self._springs])
+        self._on_rows(kernels.update_rows, [int(is_solved), self._pairs.friction, d, *self._springs])
 
     def find_reached(self, d: wp.array, change: wp.array) -> None:
         """Launch the list of pairs that may push along a change of the motions d; ``add_slopes`` visits only these."""

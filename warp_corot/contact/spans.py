@@ -85,7 +85,7 @@ class Spans:
         part, device = surface.parts[self._k], self.device
         self._is_borne = part.bearers > 0
         self._carriers.follow()
-        self._count, self._due = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
+        self._count, self._due, self._solves = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(3))
         self._items: list[Items] = []
         if rigid.have_edges:
             spans, count = self._made(rigid.touches), surface.worlds * part.triangles
@@ -131,12 +131,12 @@ class Spans:
     ) -> None:
         """Launch the decision whether they are found again; see ``kernels.judge_spans``."""
         inputs = [scalars, wp.float64(near), self._count, changed, rounds, most]
-        wp.launch(kernels.judge_spans, 1, [*inputs, self._due, going], device=self.device)
+        wp.launch(kernels.judge_spans, 1, [*inputs, self._due, self._solves, going], device=self.device)
 
-    def update(self, d: wp.array) -> None:
-        """Launch forces and their derivatives after motions d."""
+    def update(self, d: wp.array, *, is_solved: bool = False) -> None:
+        """Launch forces and their derivatives after motions d, which are those of a solve if ``is_solved``."""
         for each in self._items:
-            self._launch(kernels.update_spans, each, [*self._places(each), d, each.touches, each.spans])
+            self._launch(kernels.update_spans, each, [int(is_solved), *self._places(each), d, each.touches, each.spans])
 
     def add_forces(self, y: wp.array) -> None:
         """Launch the addition of their forces at free nodes [N]."""
@@ -183,7 +183,7 @@ class Spans:
         spans = kernels.Spans()
         for name, dtype in FIELDS.items():
             setattr(spans, name, wp.zeros(touches.force.shape, dtype=dtype, device=self.device))
-        spans.count, spans.due = self._count, self._due
+        spans.count, spans.due, spans.solves = self._count, self._due, self._solves
         spans.stiff = STIFF_OF_BORNE if self._is_borne else STIFF
         size = smallest_size([body.discretization.smallest_volume for body in self._rigid.surface.bodies])
         spans.deepest = DEEPEST * size if self._is_borne else np.inf

@@ -174,7 +174,7 @@ class JoinedSolve:
 
     def launch_rounds(self) -> None:
         """Launch the linear solves, until contact no longer changes."""
-        for count in (self._rounds, self._linear, self._changed, self._rows.locates):
+        for count in (self._rounds, self._linear, self._changed, self._rows.locates, self._rows.solves):
             count.zero_()
         self._going.fill_(1)
         wp.capture_while(self._going, self._round)
@@ -214,7 +214,7 @@ class JoinedSolve:
     def _judge(self) -> None:
         """Launch the choice of the nodes that obstacles hold from now on, and whether another round is needed."""
         rows, d = self._rows, self._d
-        rows.update(d)
+        rows.update(d, is_solved=True)
         self._operator.apply_freely(d, self._q)
         wp.copy(self._r, self._b)
         rows.add_forces(self._r)
@@ -223,7 +223,7 @@ class JoinedSolve:
             held.launch_judgement(b, q, part)
             wp.launch(kernels.gather_change, 1, [held.changed, self._changed], device=self.device)
         inputs = [self._solver.scalars, self._solver.iterations, self._changed, rows.total, ROUNDS, SETTLED, NEAR]
-        outputs = [rows.locates, self._rounds, self._linear, self._going]
+        outputs = [rows.locates, self._rounds, self._linear, rows.solves, self._going]
         wp.launch(kernels.judge_round, 1, inputs, outputs, device=self.device)
         for held, _d in self._each_held(d):
             held.launch_going(self._solver.scalars, NEAR, held.changed, self._rounds, ROUNDS, self._going)

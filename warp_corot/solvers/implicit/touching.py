@@ -85,6 +85,7 @@ class Rows(Protocol):
     """Forces between bodies, such as ``contact.joined_rows.JoinedRows``, which explains the members."""
 
     locates: wp.array
+    solves: wp.array
 
     @property
     def total(self) -> wp.array: ...
@@ -103,7 +104,7 @@ class Rows(Protocol):
 
     def launch_located(self, d: wp.array, *, is_first: bool) -> None: ...
 
-    def update(self, d: wp.array) -> None: ...
+    def update(self, d: wp.array, *, is_solved: bool = False) -> None: ...
 
     def find_reached(self, d: wp.array, change: wp.array) -> None: ...
 
