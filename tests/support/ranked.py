@@ -70,11 +70,11 @@ def dented() -> wc.SoftBody:
 
 
 #: Cases with contact.
-TOUCHING = ("touched", "organ", "meeting", "organs", "pressed", "bdf2", "dented")
+TOUCHING = ("touched", "organ", "meeting", "organs", "pressed", "bdf2", "dented", "squeezed")
 #: Cases whose meshes change.
-REMESHED = ("stretched", "dented")
+REMESHED = ("stretched", "dented", "drawn", "squeezed")
 #: Cases whose checkpoints several ranks keep.
-KEPT = (*TOUCHING, "stretched", "multigrid")
+KEPT = (*TOUCHING, "stretched", "drawn", "multigrid")
 
 
 def obstacles_of(case: str) -> list[wc.Ground | wc.Tool]:
@@ -129,6 +129,8 @@ INTEGRATORS = {
     "organ": lambda: wc.SymplecticEuler(dt=1e-3),
     "organs": lambda: wc.SymplecticEuler(dt=1e-3),
     "stretched": lambda: wc.SymplecticEuler(dt=3e-4),
+    "drawn": lambda: wc.BDF2(0.005),
+    "squeezed": lambda: wc.BackwardEuler(0.0033),
     "dented": lambda: wc.SymplecticEuler(dt=4e-4),
 }
 
@@ -145,6 +147,8 @@ CASES: dict[str, Callable[[], wc.SoftBody | list[wc.SoftBody]]] = {
     "organs": organs,
     "stretched": lambda: stretched(),
     "dented": dented,
+    "drawn": lambda: drawn(),
+    "squeezed": lambda: touched(wc.TetForest.box((1, 1, 3), 0.05, level=4)),
     "pressed": lambda: touched(wc.TetForest.box((1, 1, 3), 0.05, level=4)),
     "bdf2": touched,
     "shared": lambda: body_of(graded(), 0.3),
@@ -171,6 +175,18 @@ def stretched() -> wc.SoftBody:
     return body
 
 
+def drawn() -> wc.SoftBody:
+    """A bar whose muscle shortens it, while its end is drawn away and aside."""
+    mesh = wc.TetForest.box((4, 1, 1), 0.05, level=5)
+    muscle = wc.TransverselyIsotropic(8e3, 5e3, 0.3, 0.3, 2e3, (1.0, 0.0, 0.0), 1000.0)
+    body = wc.SoftBody(mesh, muscle, device="cpu")
+    body.fix("x < 1e-9")
+    places = [[0.0, 0.0, 0.0], [0.02, 0.0, 0.0], [0.02, 0.02, 0.0], [0.0, 0.02, 0.0]]
+    body.prescribe("x > xmax - 1e-9", times=[0.0, 0.03, 0.06, 0.1], displacements=places)
+    body.activate(500.0)
+    return body
+
+
 def options_of(case: str) -> dict[str, Any]:
     """The options with which a case is stepped."""
     integrator = INTEGRATORS.get(case, wc.SymplecticEuler)()
@@ -184,7 +200,7 @@ def options_of(case: str) -> dict[str, Any]:
             # The surface of the ball is that of its elements, which would be too coarse for the tool.
             min_level=6 if case == "dented" else 3,
             max_level=8,
-            every=30,
+            every=30 if isinstance(integrator, wc.SymplecticEuler) else 2,
             capacity=4000,
         )
     return made

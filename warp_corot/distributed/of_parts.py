@@ -75,6 +75,7 @@ class SimulationOfParts(on_one.Simulation):
         if self.contact is not None:
             assert other.contact is not None
             other.contact.continue_from(self.contact)
+        other.stepper.continue_from(self.stepper)
         known, guard = self.pace.known, self.guard.state
         guard["counted"] = np.full_like(guard["counted"], np.nan)
         for name in CHANGED:

@@ -35,8 +35,11 @@ def check_supported(
         InputError: It cannot.
     """
     in_parts = any(isinstance(body.mesh, InParts) for body in bodies)
-    if others.get("remesh"):
-        _check_remeshed(bodies, integrator, in_parts=in_parts)
+    if others.get("remesh") and in_parts:
+        raise InputError(
+            "remeshing of meshes that no rank holds whole does not work yet; leave remesh out, let every rank make the "
+            "whole mesh, or run on one process"
+        )
     contact = others.get("contact")
     meets = getattr(contact, "self_contact", False) or (len(bodies) > 1 and (contact or others.get("obstacles")))
     if meets and (in_parts or integrator.is_implicit):
@@ -69,22 +72,3 @@ def check_supported(
     for body in bodies:
         if body.changing is not None and not isinstance(others.get("remesh"), Passes):
             raise InputError("a body that is remeshed does not work on several ranks yet")
-
-
-def _check_remeshed(bodies: Sequence[SoftBody], integrator: Integrator, *, in_parts: bool) -> None:
-    """Check that bodies can be remeshed on several ranks.
-
-    Raises:
-        InputError: They cannot.
-    """
-    refused = {
-        "in implicit steps": integrator.is_implicit,
-        "of meshes that no rank holds whole": in_parts,
-        "of bodies that follow keyframes": any(body.conditions.trajectories for body in bodies),
-        "of bodies with active stress": any(body.discretization.has_activation for body in bodies),
-    }
-    for what, is_so in refused.items():
-        if is_so:
-            raise InputError(
-                f"remeshing {what} does not work on several ranks yet; leave remesh out, or run on one process"
-            )

@@ -36,6 +36,9 @@ class Stepper(ABC):
     def prepare(self) -> None:  # noqa: B027 (most need nothing)
         """Copy what launches read of the bodies' conditions to the device; called before steps are recorded."""
 
+    def continue_from(self, other: Stepper) -> None:  # noqa: B027 (most need nothing)
+        """Take over what another stepper of the same integrator has counted, in whose place this one is."""
+
     def fall_back(self) -> bool:
         """Make steps sturdier until ``recover`` is called; whether they can be."""
         return False

@@ -62,6 +62,10 @@ class ImplicitStepper(Stepper):
             if self._joined is None or before != [body.newton for body in self._bodies]:
                 self._join()
 
+    def continue_from(self, other: Stepper) -> None:
+        assert isinstance(other, ImplicitStepper)
+        wp.copy(self.totals, other.totals)
+
     def fall_back(self) -> bool:
         falls = bool(self.integrator.history) and not self._is_sturdy
         if falls:
