@@ -4,12 +4,18 @@ import warp as wp
 
 from .law import Law
 from .motion import Motions, Surface
-from .near import AROUND, BESIDE, Near, mark
-from .shapes import GROUND, Shapes, distance_to
+from .near import AROUND, BESIDE, Near, leave_room, mark
+from .shapes import GROUND, Shapes, distance_to, sure_distance
 from .touches import Touches
-from .watch import Watch
+from .watch import FARTHEST, Watch
 
 wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def horizon(watch: Watch):
+    """How far beyond what is reserved a search looks for obstacles [m]: not where others are nearer already."""
+    return wp.min(watch.room[0], FARTHEST * watch.size)
 
 
 @wp.kernel(enable_backward=False)
@@ -35,10 +41,11 @@ def find_nodes_beside(
         world = surface.world[s]
         for o in range(forces.shape[0]):
             far = watch.reach[s] + watch.reach_of[world, o] + law.tolerance
-            gap, _normal = distance_to(shapes, o, motions.now[world, o], surface.x[s], far)
+            gap, _normal = distance_to(shapes, o, motions.now[world, o], surface.x[s], far + horizon(watch))
             if gap <= far:
                 mark(near, s, BESIDE)
                 return
+            leave_room(sure_distance(shapes, o, gap) - far, watch)
     for o in range(forces.shape[0]):
         forces[o, s] = wp.vec3()
         anchors[o, s] = wp.vec4()
@@ -74,8 +81,10 @@ def find_triangles_beside(
         reach = wp.max(watch.reach[corners[0]], wp.max(watch.reach[corners[1]], watch.reach[corners[2]]))
         # The centre moves, and the corners move relative to it.
         far = size + 3.0 * reach + watch.reach_of[world, o] + law.tolerance
-        gap, _normal = distance_to(shapes, o, motions.now[world, o], middle, far)
-        if gap <= far:
+        gap, _normal = distance_to(shapes, o, motions.now[world, o], middle, far + horizon(watch))
+        if gap > far:
+            leave_room(sure_distance(shapes, o, gap) - far, watch)
+        else:
             near.touches[wp.atomic_add(near.touch_count, 0, 1)] = o * triangles.shape[0] + t
             for k in range(3):
                 mark(near, corners[k], AROUND)

@@ -12,6 +12,8 @@ wp.set_module_options({"enable_backward": False})
 PAIRED, BESIDE, AROUND = wp.constant(1), wp.constant(2), wp.constant(4)
 #: Any of these flags; and a flag for nodes of inverted elements.
 SOMETHING, CRUSHED = wp.constant(7), wp.constant(8)
+#: More room than there is [m].
+FAR = wp.constant(1.0e6)
 
 
 @wp.struct
@@ -29,6 +31,13 @@ class Near:
 def mark(near: Near, s: int, flag: int):
     if (wp.atomic_or(near.flags, s, flag) & SOMETHING) == 0:
         near.nodes[wp.atomic_add(near.count, 0, 1)] = s
+
+
+@wp.func
+def leave_room(room: float, watch: Watch):
+    """Note the distance between a node or triangle and an obstacle beyond what is reserved [m]."""
+    if room < watch.room[0]:
+        wp.atomic_min(watch.room, 0, room)
 
 
 @wp.kernel(enable_backward=False)
@@ -68,8 +77,12 @@ def reserve(surface: Surface, motions: Motions, obstacles: int, watch: Watch, ne
         forget_forces(s, surface)
         near.flags[s] = 0
     if s == 0:
+        # Where something was near at the last search, no room is looked for.
+        watch.room[0] = wp.where(near.count[0] > 0, 0.0, FAR)
         near.count[0] = 0
         near.touch_count[0] = 0
+        watch.free[0] = 0.0
+        watch.free[1] = 0.0
 
 
 @wp.kernel(enable_backward=False)

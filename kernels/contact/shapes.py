@@ -183,6 +183,13 @@ def distance_to(shapes: Shapes, o: int, pose: wp.transform, x: wp.vec3, most: fl
 
 
 @wp.func
+def sure_distance(shapes: Shapes, o: int, distance: float):
+    """The least that a positive distance may be in truth: outside a grid, ``grid_distance`` adds up two sides of a
+    triangle whose angle is at least a right one."""
+    return wp.where(shapes.kind[o] == GRID, 0.5 * distance, distance)
+
+
+@wp.func
 def carried(now: wp.transform, later: wp.transform, x: wp.vec3):
     """The motion of a point that is carried along by a change of pose; exactly zero if the pose stays the same."""
     arm = x - wp.transform_get_translation(now)

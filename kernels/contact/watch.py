@@ -46,6 +46,15 @@ class Watch:
     is_implicit: int  # whether steps are so long that hardly any search lasts for two
     fastest: wp.array[wp.float32]  # [1] largest motion in the step of the search
     due: wp.array[wp.int32]  # [1] whether a search is due
+    awake: wp.array[wp.int32]  # [1] whether steps look for forces; otherwise nothing is near (see ``sleep``)
+    room: wp.array[wp.float32]  # [1] least distance between nodes and obstacles beyond what is reserved [m]
+    free: wp.array[wp.float32]  # [2] how far nodes may move while contact sleeps, and obstacles beyond their reach [m]
+    # [2] how much is reserved for all nodes at least, to sleep where soft surfaces are nearest [m]; and the number of
+    # searches until more is tried again
+    calm: wp.array[wp.float32]
+    most_calm: float  # how many elements that is at most; zero if soft surfaces cannot meet
+    spread: float  # largest sum of the absolute weights with which nodes bear a place
+    published: wp.array[wp.int64]  # [1] number of steps done when the last run ended
     missed: wp.array[wp.int32]  # [1] how often an item moved too far
     searches: wp.array[wp.int32]  # [1]
 
@@ -56,6 +65,13 @@ def stays(gone: float, next_step: float, reach: float):
     not finite.
     """
     return gone + next_step <= SKIN * reach
+
+
+@wp.func
+def wake(watch: Watch):
+    """Ask for a search."""
+    watch.due[0] = 1
+    watch.awake[0] = 1
 
 
 @wp.func
@@ -88,7 +104,7 @@ def watch_nodes(surface: Surface, watch: Watch):
     common = watch.common[world]
     gone = surface.x[s] - watch.places[s] - (watch.drift[world] - common)
     if not stays(wp.length(gone), wp.length(surface.d[s] - common), watch.reach[s]):
-        watch.due[0] = 1
+        wake(watch)
 
 
 @wp.func
@@ -98,7 +114,7 @@ def follow_node(s: int, surface: Surface, watch: Watch):
     step = surface.d[s]
     gone = wp.length(surface.x[s] + step - watch.places[s] - watch.drift[world])
     if not stays(gone, wp.length(step - watch.common[world]), watch.reach[s]):
-        watch.due[0] = 1
+        wake(watch)
         if gone > watch.reach[s]:
             wp.atomic_add(watch.missed, 0, 1)
 
@@ -134,8 +150,9 @@ def begin_obstacle(
         reach = motions.reach[o]
         later = motions.later[world, o]
         step = distance_between(motions.now[world, o], later, reach)
-        if not stays(distance_between(watch.poses[world, o], later, reach), step, watch.reach_of[world, o]):
-            watch.due[0] = 1
+        gone = distance_between(watch.poses[world, o], later, reach)
+        if not stays(gone, step, watch.reach_of[world, o] + watch.free[1]):
+            wake(watch)
 
 
 @wp.kernel(enable_backward=False)
@@ -181,16 +198,4 @@ def reserve_node(s: int, farther: float, surface: Surface, watch: Watch):
     """Record the place of a node and how far it may move from there."""
     watch.places[s] = surface.x[s]
     step = wp.length(surface.d[s] - common_motion(surface.world[s], watch))
-    watch.reach[s] = reserved(step, farther, watch)
-
-
-@wp.kernel(enable_backward=False)
-def end_search(watch: Watch):
-    """End a search."""
-    if watch.due[0] != 0:
-        watch.due[0] = 0
-        watch.fastest[0] = 0.0
-        watch.searches[0] = watch.searches[0] + 1
-        for world in range(watch.asked.shape[0]):
-            for k in range(4):
-                watch.asked[world, k] = wp.int64(0)
+    watch.reach[s] = wp.max(reserved(step, farther, watch), watch.calm[0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 import warp as wp
@@ -25,7 +26,8 @@ from .pairs import Pairs, smallest_size
 from .rigid_forces import RigidForces
 from .search import Search
 from .skin import has_own_surface
-from .surface import ContactSurface, Part
+from .sleep import Sleep
+from .surface import ContactSurface
 from .tool import Obstacle
 from .warned import OVERLAP, warn_of_crushed, warn_of_overlaps
 from .whole_surface import WholeSurface
@@ -98,6 +100,8 @@ class Contacts:
         if self.obstacles.count:
             given = (self.surface, self.obstacles, self.search, self.law, system.pace.arrays, self._ranks, self.pairs)
             self.rigid = RigidForces(*given)
+        #: Steps while nothing is near; None where the device cannot leave anything out.
+        self.sleep = Sleep(self) if self.search.can_sleep else None
         self._revision = 0
         self._is_looked_at = self._has_crushed = False
         self._make_arrays()
@@ -172,9 +176,17 @@ class Contacts:
         self._has_crushed = self._has_crushed or warn_of_crushed(self)
 
     def launch(self, offset: int, damping: float) -> None:
+        if self.sleep is not None:
+            self.sleep.launch(offset, partial(self._act, offset, damping))
+        else:
+            self.obstacles.launch_targets()
+            self._act(offset, damping, moves=True)
+
+    def _act(self, offset: int, damping: float, *, moves: bool = False) -> None:
+        """Launch the forces of a step; ``moves``: and the motion of obstacles."""
         system, surface = self.system, self.surface
-        self._predict(offset, damping, moves=True)
-        self.search.launch(offset, follows=True)
+        self._predict(offset, damping, begins=True, moves=moves)
+        self.search.launch(offset, follows=True, sleeps=self.sleep is not None)
         self._solve()
         self._ranks.clear_surface(surface.arrays.f)
         follows = bool(self.search.finders) and not surface.is_whole
@@ -184,7 +196,7 @@ class Contacts:
             if part.bearers and len(system.constraints) > 1:
                 # Grasps add to the forces of nodes that bear nothing, too.
                 state.contact_forces.zero_()
-            start, count, arrays = self._nodes_of(part)
+            start, count, arrays = self.nodes_of(k)
             places = self._count(k) if follows else 0
             inputs = [start, count, part.start, places, int(part.bearers > 0), arrays, surface.arrays]
             inputs += [int(counts), damping, system.gravity, conditions.inverse_mass, int(conditions.has_loads)]
@@ -221,13 +233,15 @@ class Contacts:
             thinnest = min(thinnest, 0.5 * self.smallest)
         if not np.isfinite(thinnest):
             return
-        for body, part in zip(self.system.bodies, self.surface.parts, strict=True):
-            start, count, arrays = self._nodes_of(part)
+        for k, body in enumerate(self.system.bodies):
+            start, count, arrays = self.nodes_of(k)
             inputs = [start, arrays.node, body.state.velocities, thinnest]
             self._launch(motion.measure_rates, count, inputs, [self.system.motion_rates])
 
     def publish(self) -> None:
         surface, obstacles = self.surface, self.obstacles
+        if self.sleep is not None:
+            self.sleep.launch_check()
         if self.rigid is not None:
             forces = self.rigid.launch_totals()
             for number in range(obstacles.count if self.rigid.have_edges else 0):
@@ -312,23 +326,27 @@ class Contacts:
         law.grain = heaviest * self.smallest / step**2 / GRAINS
         return law
 
-    def _predict(self, offset: int, damping: float, *, moves: bool = False) -> None:
-        """Launch the motion of the surfaces without contact; ``moves``: and that of obstacles."""
+    def _predict(self, offset: int, damping: float, *, begins: bool = False, moves: bool = False) -> None:
+        """Launch the motion of the surfaces without contact.
+
+        Args:
+            offset, damping: As for ``launch``.
+            begins: Whether a step begins.
+            moves: Whether obstacles move.
+        """
         system, surface, obstacles = self.system, self.surface, self.obstacles
-        if moves:
-            obstacles.launch_targets()
         world_starts = system.bodies[0].conditions.world_starts
         # On CUDA a launch takes longer than the work: places find the nodes that bear them by themselves.
         finds_borne = self.device.is_cuda and not surface.is_whole
         for k, body in enumerate(system.bodies):
             state, conditions, part = body.state, body.conditions, surface.parts[k]
-            start, count, arrays = self._nodes_of(part)
+            start, count, arrays = self.nodes_of(k)
             borne = self._count(k) if part.bearers and finds_borne else 0
             moved = system.worlds * obstacles.count if moves and k == 0 else 0
             inputs = [start, count, part.start, borne, damping, system.gravity, conditions.inverse_mass]
             inputs += [int(conditions.has_loads), conditions.loads, system.pace.arrays, offset]
             inputs += [state.rest, state.forces, state.displacements, state.velocities, surface.bearers]
-            frames = system.worlds if moves and k == 0 else 0
+            frames = system.worlds if begins and k == 0 else 0
             inputs += [frames, moved, obstacles.motions, world_starts, int(moves)]
             outputs = [self.search.watch, arrays, surface.arrays]
             self._launch(BEGIN_STEP[conditions.loads.dtype], max(count, borne, moved, frames), inputs, outputs)
@@ -378,8 +396,9 @@ class Contacts:
             body.state.contact_surface = part.skin.own
             body.state.rebound_contact_surface = self.surface.rebound(body)
 
-    def _nodes_of(self, part: Part) -> tuple[int, int, Surface]:
+    def nodes_of(self, k: int) -> tuple[int, int, Surface]:
         """The nodes that carry a body's surface: the first one, how many there are, and their arrays."""
+        part = self.surface.parts[k]
         if part.bearers:
             return part.bearer_start, self.system.worlds * part.bearers, self.surface.own_bearers
         return part.start, self.system.worlds * part.nodes, self.surface.own

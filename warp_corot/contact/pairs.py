@@ -26,6 +26,9 @@ GROWTH = 2.0
 REBUILT = 100
 #: Up to this many bodies have trees of boxes of their own.
 OWN_TREES = 16
+#: For so many elements at most motion is reserved while nothing is near, if bodies do not touch themselves, and if they
+#: do: then so much of the same body is that near that searches take longer.
+CALM, CALM_ITSELF = 8.0, 1.0
 #: Threads that find the bounds of bodies on CUDA, at most: each warp ends with atomic minima.
 BOUNDING_THREADS = 1 << 15
 
@@ -50,6 +53,7 @@ class Pairs:
         self.surface, self.search, self.device = surface, search, surface.device
         self.friction, self.meets_itself, self._flat_edges = options.friction, options.self_contact, options.flat_edges
         self.revision, self._room, self._taken, self._built = 0, 0, -1, 0
+        search.watch.most_calm = CALM_ITSELF if self.meets_itself else CALM
         if self.meets_itself:
             search.watch.most_alone = 1.0
         search.finders.append(self._find)

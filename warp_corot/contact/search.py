@@ -9,6 +9,7 @@ import warp as wp
 
 from warp_corot.errors import UnstableError
 from warp_corot.kernels.contact import near as near_kernels
+from warp_corot.kernels.contact import sleep
 from warp_corot.kernels.contact import watch as kernels
 from warp_corot.solvers.guarding.mapped import Mapped
 
@@ -59,6 +60,10 @@ class Search:
         watch.fastest = wp.zeros(1, dtype=wp.float32, device=device)
         watch.size, watch.most_alone = size, float(kernels.ALONE)
         watch.due, watch.missed, watch.searches = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(3))
+        watch.awake = wp.ones(1, dtype=wp.int32, device=device)
+        watch.room, watch.free = (wp.zeros(n, dtype=wp.float32, device=device) for n in (1, 2))
+        watch.calm = wp.zeros(2, dtype=wp.float32, device=device)
+        watch.published = wp.full(1, -1, dtype=wp.int64, device=device)
         watch.drift, watch.common = (wp.zeros(surface.worlds, dtype=wp.vec3, device=device) for _ in range(2))
         watch.asked = wp.zeros((surface.worlds, 4), dtype=wp.int64, device=device)
         shape = (surface.worlds, obstacles.count)
@@ -88,6 +93,7 @@ class Search:
 
     def follow(self) -> None:
         """Update to the present surfaces."""
+        self.watch.spread = self.surface.spread
         if self.surface.revision != self._taken:
             count, device = self.surface.count, self.device
             self.watch.places = wp.zeros(count, dtype=wp.vec3, device=device)
@@ -103,6 +109,8 @@ class Search:
     def forget(self) -> None:
         """Search again before the next step."""
         self.watch.due.fill_(1)
+        self.watch.awake.fill_(1)
+        self.watch.calm.zero_()
 
     @property
     def pairs(self) -> int:
@@ -157,19 +165,27 @@ class Search:
 
     # --- launches --------------------------------------------------------------------------------------------------
 
-    def launch(self, offset: int, *, follows: bool = False) -> None:
+    @property
+    def can_sleep(self) -> bool:
+        """Whether the device can leave out contact while nothing is near."""
+        return self._branches and bool(self.finders)
+
+    def launch(self, offset: int, *, follows: bool = False, sleeps: bool = False) -> None:
         """Launch a search, if it is due in this step.
 
         Args:
             offset: The number of steps since the clock was last advanced.
             follows: Whether margins count motion relative to a frame, which the steps move; not with obstacles.
+            sleeps: Whether contact may sleep after the search.
         """
         if not self.finders:
             return
         if offset == 0:
             self._on_nodes(kernels.watch_nodes, [self.surface.arrays, self.watch])
-        search = partial(self._search, follows and not self.obstacles.count)
-        if self._branches:
+        search = partial(self._search, follows and not self.obstacles.count, sleeps)
+        if self._branches and sleeps:
+            wp.capture_while(self.watch.due, search)
+        elif self._branches:
             wp.capture_if(self.watch.due, search)
         else:
             search()
@@ -185,7 +201,7 @@ class Search:
             near_kernels.report_search, 1, [self.watch, self.near, self.most, self._report.array], device=self.device
         )
 
-    def _search(self, is_framed: bool) -> None:
+    def _search(self, is_framed: bool, sleeps: bool) -> None:
         arrays, obstacles = self.surface.arrays, self.watch.poses.size
         inputs = [arrays, self.obstacles.motions, obstacles, self.watch]
         dim = max(self.surface.count, obstacles, self.surface.worlds)
@@ -198,7 +214,7 @@ class Search:
         wp.launch(near_kernels.reserve, dim, [*inputs, self.near], device=self.device)
         for find in self.finders:
             find()
-        wp.launch(kernels.end_search, 1, [self.watch], device=self.device)
+        wp.launch(sleep.end_search, 1, [int(sleeps), self.near, self.watch], device=self.device)
 
     def _on_nodes(self, kernel: wp.Kernel, inputs: list) -> None:
         wp.launch(kernel, self.surface.count, inputs, device=self.device)

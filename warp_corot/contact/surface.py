@@ -137,6 +137,13 @@ class ContactSurface:
         """Whether any places lie between nodes."""
         return self.bearer_count > 0
 
+    @property
+    def spread(self) -> float:
+        """The largest sum of the absolute weights with which nodes bear a place: how many times as far as the nodes it
+        may move."""
+        borne = [np.abs(part.skin.own.weights).sum(axis=1).max() for part in self.parts if part.skin.own is not None]
+        return float(max(borne, default=1.0))
+
     def body_of_places(self) -> Ints:
         """The number of the body at each place for a node, int32 [S]."""
         return np.repeat(np.arange(len(self.parts)), [self.worlds * part.nodes for part in self.parts]).astype(np.int32)

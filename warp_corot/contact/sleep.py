@@ -1,0 +1,79 @@
+"""Steps in which contact sleeps, because nothing is near; see ``kernels.contact.sleep``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import warp as wp
+
+from warp_corot.kernels.contact import sleep as kernels
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from .contacts import Contacts
+
+
+class Sleep:
+    """What steps of awake and of sleeping contact launch.
+
+    Args:
+        contacts: The contact of the system.
+    """
+
+    def __init__(self, contacts: Contacts):
+        self._contacts, self._system, self._watch = contacts, contacts.system, contacts.search.watch
+        self._device = contacts.device
+
+    @property
+    def is_framed(self) -> bool:
+        """Whether margins count motion relative to frames; see ``Search.launch``."""
+        return not self._contacts.obstacles.count
+
+    def launch(self, offset: int, act: Callable[[], None]) -> None:
+        """Launch the motion of obstacles, and what contact does in a step while it is awake.
+
+        Args:
+            offset: The number of steps since the clock was last advanced.
+            act: Launches that.
+        """
+        obstacles = self._contacts.obstacles
+        obstacles.launch_targets()
+        for k, body in enumerate(self._system.bodies):
+            start, count, nodes = self._contacts.nodes_of(k)
+            moved = self._system.worlds * obstacles.count if k == 0 else 0
+            threads = 1 if self._device.is_cpu else max(count, moved)
+            inputs = [
+                threads,
+                start,
+                count,
+                nodes,
+                int(self.is_framed),
+                moved,
+                obstacles.motions,
+                body.conditions.world_starts,
+            ]
+            inputs += [self._system.pace.arrays, offset, *self._places(k), body.state.velocities]
+            wp.launch(kernels.rouse, threads, inputs, [self._watch], device=self._device)
+        wp.capture_if(self._watch.awake, act, self._sleep)
+
+    def launch_check(self) -> None:
+        """Launch the test after a run whether anything moved too far in its last step."""
+        for k in range(len(self._system.bodies)):
+            start, count, nodes = self._contacts.nodes_of(k)
+            inputs = [start, nodes, int(self.is_framed), self._system.pace.arrays, *self._places(k)]
+            wp.launch(kernels.check_sleep, count, inputs, [self._watch], device=self._device)
+
+    def _sleep(self) -> None:
+        """Launch a step in which nothing is near."""
+        if self.is_framed:
+            wp.launch(kernels.move_frames, self._system.worlds, [self._watch], device=self._device)
+        if len(self._system.constraints) > 1:
+            # Other constraints add to these.
+            for body in self._system.bodies:
+                body.state.contact_forces.zero_()
+
+    def _places(self, k: int) -> list[wp.array]:
+        """Rest positions and displacements of a body."""
+        state = self._system.bodies[k].state
+        return [state.rest, state.displacements]
