@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.elasticity import ForceField
 
 #: Loads on a free body balance if their sum is less than this share of the sum of their magnitudes.
 BALANCED = 1e-5
+#: Held nodes are on one line if they are within this share of their distances.
+ON_A_LINE = 1e-6
 
 
 class LoadedBody:
@@ -38,6 +41,28 @@ class LoadedBody:
         sums = np.linalg.norm(of_worlds.sum(axis=1), axis=1)
         return bool((~held & (sums > BALANCED * np.linalg.norm(of_worlds, axis=2).sum(axis=1))).any())
 
+    def turns(self) -> bool:
+        """Whether loads at the rest shape do work in a rigid motion of a whole part of the mesh that leaves all held
+        nodes where they are, because in some world they are on one line; parts that share no node move separately.
+        """
+        body = self.body
+        part, points = _parts(body.mesh.tets, body.node_count // body.worlds), body.mesh.points
+        held = body.conditions.held_mask().reshape(body.worlds, -1)
+        loads = self.loads.reshape(body.worlds, -1, 3)
+        for number in range(int(part.max()) + 1):
+            nodes = np.flatnonzero(part == number)
+            x = points[nodes] - points[nodes].mean(axis=0)
+            motions = _rigid_motions(x / max(float(np.abs(x).max()), 1e-30))
+            for world in range(body.worlds):
+                kept = motions[held[world, nodes]].reshape(-1, 6)
+                sizes, axes = np.linalg.eigh(kept.T @ kept)
+                left = axes[:, sizes <= ON_A_LINE**2 * max(float(sizes[-1]), 1e-30)]
+                forces = loads[world, nodes]
+                work = np.linalg.norm(np.einsum("nci,nc->i", motions, forces) @ left)
+                if work > BALANCED * np.linalg.norm(forces, axis=1).sum():
+                    return True
+        return False
+
     def finish(self) -> None:
         """Let the body rest: no velocity, reactions at held nodes, positions published."""
         body, state = self.body, self.body.state
@@ -48,3 +73,27 @@ class LoadedBody:
         reactions[:, :3] = np.where(held, -(elastic + self.loads), 0.0)
         state.reactions[: body.sizes.nodes].assign(reactions)
         state.publish_positions()
+
+
+def _rigid_motions(x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Three translations and three turns about the axes at points [n, 3], [n, 3, 6]."""
+    found = np.zeros((len(x), 3, 6))
+    for axis in range(3):
+        found[:, axis, axis] = 1.0
+        found[:, :, 3 + axis] = np.cross(np.eye(3)[axis], x)
+    return found
+
+
+def _parts(tets: npt.NDArray[np.integer], count: int) -> npt.NDArray[np.int32]:
+    """The part of each node, -1 if it is in no element: elements that share a node belong to one part."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    rows, columns = np.repeat(tets[:, 0], 3), tets[:, 1:].ravel()
+    links = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(count, count))
+    _, label = connected_components(links, directed=False)
+    used = np.zeros(count, bool)
+    used[tets.ravel()] = True
+    part = np.full(count, -1, np.int32)
+    part[used] = np.unique(label[used], return_inverse=True)[1]
+    return part

@@ -30,6 +30,10 @@ from .resting import checked_obstacles, rest_on
 #: Rounding of float32 displacements and forces hides what is smaller: Newton's method would stop without an answer.
 LEAST_TOLERANCE = 1e-6
 
+#: Parts of messages on bodies that are held nowhere, at a point or on a line.
+LOADS_TURN = "the body is free to turn as a whole, and its loads turn it"
+FIX_MORE = "fix nodes that are not on one line"
+
 #: Precisions of answers.
 FLOAT32, FLOAT64 = "float32", "float64"
 
@@ -172,6 +176,9 @@ def static_answer(
     if answer.falls():
         message = "no node is held, and the loads do not balance: the body has no state of rest; fix some nodes"
         return answer.report(began, message), None
+    if forces.is_linear and answer.turns():
+        message = f"{LOADS_TURN}: under a linear law it has no state of rest; {FIX_MORE}"
+        return answer.report(began, message), None
     solver = StaticSolver(
         body, forces, down, tolerance=tolerance, most=most, load_steps=steps, preconditioner=preconditioner
     )
@@ -182,7 +189,7 @@ def static_answer(
         return _precise(answer, law, solver, began), None
     report = answer.report(
         began,
-        "the body is at rest" if converged.all() else _what_stopped(body, solver, status_words(found)),
+        "the body is at rest" if converged.all() else _what_stopped(answer, solver, status_words(found)),
         iterations=solver.iterations,
         linear_iterations=solver.linear_iterations,
         residual=float(found.residual.max()),
@@ -311,14 +318,17 @@ class _Answer(LoadedBody):
         )
 
 
-def _what_stopped(body: SoftBody, solver: StaticSolver, why: str) -> str:
+def _what_stopped(answer: _Answer, solver: StaticSolver, why: str) -> str:
     """The message of a solve that did not converge."""
     from warp_corot.mesh.pieces import pieces_of
 
+    body = answer.body
     piece = pieces_of(body.mesh.tets)
     held = np.asarray(body.conditions.held_mask().reshape(body.worlds, -1).any(axis=0))
     pieces = np.unique(piece[held[body.mesh.tets].any(axis=1)])
     loose = int(piece.max()) + 1 - len(pieces)
     if loose and len(pieces):
         why = f"nothing holds {loose} of the {int(piece.max()) + 1} pieces of the mesh"
+    elif answer.turns():
+        why = f"{LOADS_TURN}; {FIX_MORE}"
     return f"not converged: {why}; the body is left at rest under {solver.share:.3g} of its load"

@@ -4,6 +4,7 @@ import numpy as np
 import oracle
 import pytest
 from cases import CUBE, MATERIAL, MODELS, jittered, oracle_mesh
+from scipy.sparse.linalg import spsolve
 
 import warp_corot as wc
 
@@ -193,6 +194,30 @@ def test_a_body_that_nothing_holds(device):
     assert longer > 0.0
 
 
+@pytest.mark.parametrize(
+    ("model", "held"), [("linear", "nothing"), ("linear", "a node"), ("linear", "an edge"), ("corotated", "an edge")]
+)
+def test_a_body_that_is_free_to_turn(model, held, device):
+    """Loads with a moment about what holds it turn it, and the report says so; other loads do not, but the search for
+    a body on one node may fail."""
+    mesh = wc.TetForest.box((1, 1, 1), CUBE, 3)
+    x = mesh.points - 0.5 * CUBE
+    body = wc.SoftBody(mesh, wc.Isotropic(500.0, 0.3, 10.0), device=device)
+    edge = (mesh.points[:, 0] < 1e-9) & (mesh.points[:, 2] < 1e-9)
+    body.fix({"nothing": np.zeros(len(x), bool), "a node": np.arange(len(x)) == 0, "an edge": edge}[held])
+    nodes = np.arange(body.node_count)
+    body.load(nodes, np.cross([0.0, 1.0, 0.0], x))
+    report = wc.solve_static(body, model=MODELS[model](), gravity=(0.0, 0.0, 0.0), iterations=20)
+    assert not report.converged
+    assert "free to turn as a whole, and its loads turn it" in report.message
+    assert not displaced(body).any()
+    if held == "a node":
+        return
+    body.load(nodes, [0.0, 1e-3, 0.0] * np.sign(x))
+    report = wc.solve_static(body, model=MODELS[model](), gravity=(0.0, 0.0, 0.0))
+    assert report.converged, report.message
+
+
 @pytest.mark.parametrize("model", [wc.Linear(), wc.Corotated()], ids=lambda model: type(model).__name__)
 def test_a_free_bar_under_even_tension(model, device):
     """It lengthens by the stress over E and narrows by nu times that, also if more digits are requested than float32
@@ -273,6 +298,28 @@ def test_answers_in_float64_balance_to_its_rounding(poisson, device):
     assert report.displacements.dtype == np.float64
     np.testing.assert_allclose(ends["float64"], report.displacements, atol=1e-7 * np.abs(report.displacements).max())
     np.testing.assert_allclose(ends["float32"], ends["float64"], atol=1e-5 * np.abs(report.displacements).max())
+
+
+@pytest.mark.parametrize("model", ["linear", "corotated", "neo_hookean"])
+def test_answers_in_float64_where_stiffness_jumps_by_a_million(model, device):
+    """Rounding of the stiff elements leaves more than elsewhere. With linear elasticity the oracle's matrix has the
+    same answer, to the rounding that its condition, some 1e9, allows."""
+    mesh = wc.TetForest.box((1, 1, 2), 0.064, 3)
+    young = np.where(np.random.default_rng(1).random(len(mesh.tets)) < 0.5, 1e3, 1e9)
+    body = wc.SoftBody(mesh, wc.Isotropic(young, 0.4, MATERIAL["density"]), device=device)
+    fixed = mesh.points[:, 2] < 1e-9
+    body.fix(fixed)
+    report = wc.solve_static(body, model=MODELS[model](), gravity=GRAVITY, precision="float64")
+    assert report.converged, report.message
+    assert report.correction < 1e-8
+    if model == "linear":
+        reference = oracle_mesh(mesh)
+        matrix = oracle.tangent_matrix("linear", reference, mesh.points, *oracle.lame(young, 0.4))
+        free = np.repeat(~fixed, 3)
+        right = np.zeros(mesh.points.size)
+        right[free] = spsolve(matrix[free][:, free].tocsc(), weight(body).ravel()[free])
+        right = right.reshape(-1, 3)
+        np.testing.assert_allclose(report.displacements, right, rtol=0.0, atol=1e-6 * np.abs(right).max())
 
 
 def test_cases_without_a_float64_answer_are_refused():

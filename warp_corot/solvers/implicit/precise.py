@@ -27,6 +27,9 @@ Array = npt.NDArray[np.float64]
 #: Maximum number of Newton's iterations, and the tolerance of the last one: its largest displacement over the largest
 #: displacement.
 ITERATIONS, SMALL = 20, 1e-13
+#: Newton's method squares the error, so after a step below this only rounding is left: of bodies whose stiffness jumps
+#: by factors of a million, more than ``SMALL``. Then the method ends once a step is more than half of the one before.
+ROUNDED = 1e-8
 
 
 class HostContact(Protocol):
@@ -95,7 +98,7 @@ class PreciseRest:
         body.displacements = self.u.reshape(-1, 3)
 
     def _solved(self, world: int, u: Array) -> Array:
-        free = self.free[world]
+        free, before = self.free[world], np.inf
         for number in range(ITERATIONS):
             step = np.zeros(u.size)
             left = self._unbalanced(world, u).ravel()[free]
@@ -106,10 +109,12 @@ class PreciseRest:
             if self._touches(world):
                 self.pushes[world] = self.pushes[world] - found[len(free) :]
             u = u + step.reshape(u.shape)
-            if not np.abs(step).max() > SMALL * np.abs(u).max():
+            longest, most = np.abs(step).max(), np.abs(u).max()
+            if not longest > SMALL * most or ROUNDED * most > before < 2.0 * longest:
                 self.factors.append((self._stiffness(world, u), self._factored(world, u)))
-                self._measure(world, u, number + 1, np.abs(step).max())
+                self._measure(world, u, number + 1, longest)
                 return u
+            before = longest
         raise ConvergenceError("Newton's method in float64 does not converge from the answer of float32")
 
     def _unbalanced(self, world: int, u: Array) -> Array:
