@@ -16,8 +16,9 @@ from .watch import SKIN, Watch, begin_obstacle, pair_of, reserved, stays, wake
 
 wp.set_module_options({"enable_backward": False})
 
-#: After more than a search could reserve was tried, this many searches pass before it is tried again.
-PATIENCE = wp.constant(8.0)
+#: After more than a search could reserve was tried, this many searches pass before it is tried again: twice as many
+#: each time, up to the second number.
+PATIENCE, MOST_PATIENCE = wp.constant(8.0), wp.constant(256.0)
 #: For so many elements motion is reserved first to sleep beside soft surfaces.
 LEAST_CALM = wp.constant(0.5)
 
@@ -126,8 +127,10 @@ def choose_calm(is_clear: bool, needed: float, watch: Watch):
     wait = watch.calm[1]
     if not is_clear:
         if calm > 0.0:
-            watch.calm[0] = wp.where(calm > LEAST_CALM * watch.size, 0.5 * calm, 0.0)
-            watch.calm[1] = PATIENCE
+            watch.calm[0] = wp.where(0.5 * calm >= needed, 0.5 * calm, 0.0)
+            patience = wp.max(watch.calm[2], PATIENCE)
+            watch.calm[1] = patience
+            watch.calm[2] = wp.min(2.0 * patience, MOST_PATIENCE)
         return calm > 0.0
     if wait > 0.0:
         watch.calm[1] = wait - 1.0
@@ -135,6 +138,7 @@ def choose_calm(is_clear: bool, needed: float, watch: Watch):
     most = watch.most_calm * watch.size
     if calm >= needed:
         watch.calm[0] = wp.max(calm, wp.min(2.0 * calm, most))
+        watch.calm[2] = 0.0
         return False
     enough = wp.max(needed, LEAST_CALM * watch.size)
     if enough > most:

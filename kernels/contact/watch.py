@@ -49,8 +49,8 @@ class Watch:
     awake: wp.array[wp.int32]  # [1] whether steps look for forces; otherwise nothing is near (see ``sleep``)
     room: wp.array[wp.float32]  # [1] least distance between nodes and obstacles beyond what is reserved [m]
     free: wp.array[wp.float32]  # [2] how far nodes may move while contact sleeps, and obstacles beyond their reach [m]
-    # [2] how much is reserved for all nodes at least, to sleep where soft surfaces are nearest [m]; and the number of
-    # searches until more is tried again
+    # [3] how much is reserved for all nodes at least, to sleep where soft surfaces are nearest [m]; the number of
+    # searches until more is tried again, and the number after the next time that it was too much
     calm: wp.array[wp.float32]
     most_calm: float  # how many elements that is at most; zero if soft surfaces cannot meet
     spread: float  # largest sum of the absolute weights with which nodes bear a place

@@ -69,5 +69,5 @@ def keep_elements(rotation: wp.Function) -> wp.Kernel:
 def add_exact_product() -> wp.Kernel:
     """y += K p; a thread is eight elements."""
     code = constants(PLACES=PLACES) + ISOTROPIC_PART
-    code += native("eights", "kept_elements", "elements", "exact_elements", "element_forces")
+    code += native("eights", "side_by_side", "kept_elements", "elements", "exact_elements", "element_forces")
     return scatter_lanes(code, GeneralElements, KeptGradients, wp.int32)

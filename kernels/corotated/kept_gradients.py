@@ -41,7 +41,7 @@ def turn_gradients() -> wp.Kernel:
 def add_kept_product() -> wp.Kernel:
     """y += K p; a thread is eight elements."""
     code = constants(PLACES=PLACES) + LAWS["linear"] + ISOTROPIC_PART
-    code += native("eights", "kept_elements", "elements", "isotropic_elements", "element_forces")
+    code += native("eights", "side_by_side", "kept_elements", "elements", "isotropic_elements", "element_forces")
     return scatter_lanes(code, GeneralElements, KeptGradients, wp.int32)
 
 

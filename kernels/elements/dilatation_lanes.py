@@ -123,8 +123,9 @@ def scatter_grouped_elements(law: LawInLanes, of: Dilatation) -> wp.Kernel:
     """
     leaves_out = ["left_out_elements"] if law == "corotated" else []
     code = code_of(law) + law_of(of, has_log=has_log(law)) + ISOTROPIC_PART
-    code += constants(GROUPS=GROUPS, MOST=MOST) + native("group_dilatations", "rest_elements", "elements")
-    code += native("group_pressures", "rest_elements", "grouped_elements", "element_forces", *leaves_out) + "}\n"
+    rest = native("side_by_side", "rest_elements")
+    code += constants(GROUPS=GROUPS, MOST=MOST) + native("group_dilatations") + rest + native("elements")
+    code += native("group_pressures") + rest + native("grouped_elements", "element_forces", *leaves_out) + "}\n"
     return scatter_lanes(code, GeneralElements, GroupedMaterial, wp.int32)
 
 

@@ -21,14 +21,14 @@ def gathering(Elements: type) -> str:
     defines.
     """
     if Elements is not ForestElements:
-        return native("strain", "eights", "rest_elements", "general_eights", "gather_eights")
+        return native("strain", "eights", "side_by_side", "rest_elements", "general_eights", "gather_eights")
     names = {"FRAME_SHIFT": FRAME_SHIFT, "MIRROR_BIT": MIRROR_BIT, "LEVEL_MASK": LEVEL_MASK}
     columns = [f"    a[{c}] = ({_by_type(column_sums, c)}) * inverse_h;\n" for c in range(3)]
     forces = [f"    force[{n}] = {_by_type(force_sums, n)};\n" for n in range(4)]
     volume = "is_type2 ? spread({2!r}f) : is_type1 ? spread({1!r}f) : spread({0!r}f)".format(*VOLUME)
     return (
         constants(**{name: int(value) for name, value in names.items()})
-        + native("strain", "eights", "forest_eights")
+        + native("strain", "eights", "side_by_side", "forest_eights")
         + f"const lanes8 inverse_h = 1.0f / h, weight = h * h * ({volume});\n"
         + "const auto columns = [&](const triple* x, triple* a) {\n"
         + "    const triple &x0 = x[0], &x1 = x[1], &x2 = x[2], &x3 = x[3];\n"

@@ -29,7 +29,7 @@ NATIVE = Path(__file__).parents[1] / "native"
 
 
 #: Native code that gathers eight elements.
-ELEMENTS = ("eights", "rest_elements", "elements")
+ELEMENTS = ("eights", "side_by_side", "rest_elements", "elements")
 
 
 @functools.cache

@@ -29,12 +29,15 @@ INDEFINITE = 1.0
 #: E, polynomials of S, and the rotation of F.
 ROTATION = constants(INDEFINITE=INDEFINITE) + native("strain", "invariants", "stretch", "rotation")
 
+#: The neo-Hookean law behind code that finds E.
+NEO_HOOKEAN = constants(CONTINUED_BELOW=CONTINUED_BELOW) + native("invariants", "log", "neo_hookean")
+
 #: Native code of the laws by their names.
 LAWS = {
     "corotated": constants(INDEFINITE=INDEFINITE) + native("strain", "invariants", "stretch", "corotated"),
     "linear": native("small_strain", "linear"),
     "stvk": native("strain", "stvk"),
-    "neo-hookean": constants(CONTINUED_BELOW=CONTINUED_BELOW) + native("strain", "invariants", "log", "neo_hookean"),
+    "neo-hookean": native("strain") + NEO_HOOKEAN,
 }
 
 #: A law in lanes: a name, or the terms (share, alpha) of Ogden's.
@@ -63,7 +66,7 @@ def _ogden(terms: tuple[tuple[float, float], ...]) -> str:
     return (
         LAWS["neo-hookean"].replace("const auto stress", "const auto neo_hookean")
         + constants(SWEEPS=int(SWEEPS), VOLUME_PART=sum(part_of_volume(*term) for term in terms))
-        + native("eigen")
+        + native("eigen", "exp")
         + "const auto slope_of = [&](const lanes8& e) {\nlanes8 slope = spread(0.0f);\n"
         + f"{slope}return slope;\n}};\n"
         + native("ogden")

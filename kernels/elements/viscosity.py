@@ -27,6 +27,15 @@ wp.set_module_options({"enable_backward": False})
 LEAST = wp.constant(0.05)
 
 
+@wp.struct
+class ViscousMaterial:
+    """Lamé's parameters [Pa], viscosities over these [s], and the velocities of nodes [m/s]."""
+
+    isotropic: IsotropicMaterial
+    seconds: float
+    velocities: wp.array[wp.vec4]
+
+
 @wp.func
 def viscous_stress(u: wp.mat33, a: wp.mat33, mu: float, lam: float):
     """R^T P of a stretch U, a rate A and viscosities [Pa s]."""
@@ -43,20 +52,19 @@ def viscous_stress(u: wp.mat33, a: wp.mat33, mu: float, lam: float):
 def add_viscous_forces(
     elements: Any,
     t: int,
-    eta: float,
-    material: IsotropicMaterial,
+    material: ViscousMaterial,
     u: wp.array[wp.vec4],
-    v: wp.array[wp.vec4],
     f: wp.array[wp.vec4],
 ):
-    """Add the viscous nodal forces of element t to f: eta times the stiffness, for small motions."""
+    """Add the viscous nodal forces of element t to f: the stiffness times seconds, for small motions."""
     g = local_gradient(elements, t, u)
     q = frame(elements, t)
     r = byers_xu(q + g)
     stretch = identity3() + corotated_strain(g, q, r)
-    rate = wp.transpose(r) * local_gradient(elements, t, v)
-    i = t * material.stride
-    p = r * viscous_stress(stretch, rate, eta * material.mu[i], eta * material.lam[i])
+    rate = wp.transpose(r) * local_gradient(elements, t, material.velocities)
+    eta = material.seconds
+    i = t * material.isotropic.stride
+    p = r * viscous_stress(stretch, rate, eta * material.isotropic.mu[i], eta * material.isotropic.lam[i])
     scatter_stress(elements, t, p, f)
 
 
@@ -68,13 +76,11 @@ def scatter_viscous(Elements: type) -> wp.Kernel:
     def scatter_viscous(
         # In
         elements: Elements,
-        eta: float,
-        material: IsotropicMaterial,
+        material: ViscousMaterial,
         u: wp.array[wp.vec4],
-        v: wp.array[wp.vec4],
         # Out
         f: wp.array[wp.vec4],
     ):
-        add_viscous_forces(elements, wp.tid(), eta, material, u, v, f)
+        add_viscous_forces(elements, wp.tid(), material, u, f)
 
     return scatter_viscous

@@ -6,22 +6,12 @@ import warp as wp
 
 from warp_corot.kernels.modules import unique_kernel
 
-from .constitutive import IsotropicMaterial
 from .eights import gathering
 from .lanes import COMPILER_FLAGS, LANES, constants, native, on_cpu
 from .law_lanes import INDEFINITE
-from .viscosity import LEAST, add_viscous_forces
+from .viscosity import LEAST, ViscousMaterial, add_viscous_forces
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.struct
-class ViscousMaterial:
-    """Lamé's parameters [Pa], viscosities over these [s], and the velocities of nodes [m/s]."""
-
-    isotropic: IsotropicMaterial
-    seconds: float
-    velocities: wp.array[wp.vec4]
 
 
 @functools.cache
@@ -51,7 +41,7 @@ def scatter_viscous_eights(Elements: type) -> wp.Kernel:
         while left_out != 0:
             if (left_out & 1) != 0:
                 t = LANES * block + lane
-                add_viscous_forces(elements, t, material.seconds, material.isotropic, u, material.velocities, f)
+                add_viscous_forces(elements, t, material, u, f)
             left_out >>= 1
             lane += 1
 

@@ -1,9 +1,6 @@
-// Eight elements of a forest. In: units (``ForestElements``), first_element, count; FRAME_SHIFT, MIRROR_BIT, LEVEL_MASK.
-// Out: their number ``end``; ``element`` of a lane, the last one again where there are no more; where they are of type 1
-// and 2; edge lengths h; the ``frame``, whose last column has the sign of its ``handedness``; ``values_of`` elements, side
-// by side; ``strain_of``.
-const int end = wp::min(8, count - first_element);
-const auto element = [&](int lane) { return wp::min(first_element + lane, count - 1); };
+// Eight elements of a forest. In: side_by_side.h; units (``ForestElements``); FRAME_SHIFT, MIRROR_BIT, LEVEL_MASK. Out: where
+// they are of type 1 and 2; edge lengths h; the ``frame``, whose last column has the sign of its ``handedness``;
+// ``strain_of``.
 const auto code = [&](int lane) { return units.code.data[element(lane)]; };
 lanes8 axes[9];
 gather_matrix([&](int lane) { return units.frames.data[code(lane) >> FRAME_SHIFT].data[0]; }, axes);
@@ -16,8 +13,4 @@ const masks8 is_type1 = type == 1, is_type2 = type == 2;
 triple frame[3];
 for (int j = 0; j < 3; ++j) frame[j] = triple{axes[j], axes[3 + j], axes[6 + j]};
 frame[2] = frame[2] * handedness;
-const auto values_of = [&](const float* values) {
-    return end == 8 ? *reinterpret_cast<const lanes8*>(values + first_element)
-        : gather_one([&](int lane) { return values + element(lane); });
-};
 const auto strain_of = [&](const triple* a, lanes8* e, triple* f_) { find_strain(a, frame, e, f_); };

@@ -1,5 +1,5 @@
 // Symmetric tensors (00, 11, 22, 01, 02, 12) of eight elements, from their frames to the axes of rest space and back.
-// In: frame, whose columns are orthonormal.
+// In: frame, whose columns are orthonormal. And vectors from the axes of rest space ``to_frame``.
 const auto out_of_frame = [&](const lanes8* s, lanes8* to) {
     triple v[3];
     times(frame, s, v);
@@ -20,3 +20,4 @@ const auto into_frame = [&](const lanes8* s, lanes8* to) {
     to[4] = dot(frame[0], v[2]);
     to[5] = dot(frame[1], v[2]);
 };
+const auto to_frame = [&](const triple& a) { return triple{dot(frame[0], a), dot(frame[1], a), dot(frame[2], a)}; };

@@ -3,6 +3,9 @@
 typedef float lanes8 __attribute__((vector_size(32), aligned(4)));
 typedef int masks8 __attribute__((vector_size(32)));
 typedef float four __attribute__((vector_size(16), aligned(4)));
+// For functions that are called more than once: if they are not inlined, Clang takes vectors that are passed by reference
+// for aligned ones, which they are not on the stack.
+#define INLINED __attribute__((always_inline))
 struct triple {
     lanes8 x, y, z;
     triple operator+(const triple& b) const { return {x + b.x, y + b.y, z + b.z}; }

@@ -7,7 +7,7 @@ import warp as wp
 import warp_corot as wc
 from warp_corot.elasticity.viscosity import Viscosity
 from warp_corot.kernels.elements.lanes import LANES
-from warp_corot.kernels.elements.viscosity import scatter_viscous
+from warp_corot.kernels.elements.viscosity import ViscousMaterial, scatter_viscous
 
 BOX = wc.TetForest.box((1, 1, 2), 0.1, 3)
 GENERAL = wc.TetMesh(BOX.points, BOX.tets)
@@ -187,7 +187,9 @@ def test_elements_side_by_side_do_what_each_does_alone(mesh, amount, rng):
     field = wc.Corotated().bind(body)
     Viscosity(body, field, 0.1).add_forces()
     expected, state = wp.zeros_like(body.state.forces), body.state
-    inputs = [field.elements, 0.1, field.isotropic, state.displacements, state.velocities]
+    material = ViscousMaterial()
+    material.isotropic, material.seconds, material.velocities = field.isotropic, 0.1, state.velocities
+    inputs = [field.elements, material, state.displacements]
     wp.launch(scatter_viscous(body.discretization.element_kind), count, inputs, [expected], device="cpu")
     atol = 2e-5 * np.abs(expected.numpy()).max()
     np.testing.assert_allclose(state.forces.numpy(), expected.numpy(), rtol=0, atol=atol)

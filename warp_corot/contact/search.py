@@ -62,7 +62,7 @@ class Search:
         watch.due, watch.missed, watch.searches = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(3))
         watch.awake = wp.ones(1, dtype=wp.int32, device=device)
         watch.room, watch.free = (wp.zeros(n, dtype=wp.float32, device=device) for n in (1, 2))
-        watch.calm = wp.zeros(2, dtype=wp.float32, device=device)
+        watch.calm = wp.zeros(3, dtype=wp.float32, device=device)
         watch.published = wp.full(1, -1, dtype=wp.int64, device=device)
         watch.drift, watch.common = (wp.zeros(surface.worlds, dtype=wp.vec3, device=device) for _ in range(2))
         watch.asked = wp.zeros((surface.worlds, 4), dtype=wp.int64, device=device)

@@ -14,9 +14,9 @@ from warp_corot.discretization.elements import Elements
 from warp_corot.discretization.members import Members
 from warp_corot.discretization.plan import Plan
 from warp_corot.kernels.elements.forces import add_energies, scatter_forces
-from warp_corot.kernels.elements.lanes import LANES
 
 from .model import ForceField, SmallForces
+from .paths.elements import ByElements, Factory
 from .stiffness import ElementMaterial, ElementStiffness
 from .tangent import Tangent
 
@@ -50,13 +50,13 @@ class BesideField(ForceField):
         stress: wp.Function,
         differential: wp.Function,
         density: wp.Function,
-        eights: Callable[[type], wp.Kernel] | None = None,
+        eights: Factory | None = None,
     ):
         self.law = law
         super().__init__(discretization, law.deterministic)
         kind = discretization.element_kind
-        self._forces, self._energies = scatter_forces(kind, Material, stress), add_energies(kind, Material, density)
-        self._eights = eights(kind) if eights is not None and self.device.is_cpu else None
+        self._forces = ByElements(discretization, lambda kind: scatter_forces(kind, Material, stress), eights)
+        self._energies = add_energies(kind, Material, density)
         self._stiffness = ElementStiffness(discretization, differential, Material)
         #: Separate places for each element's forces, if sums must be reproducible.
         self._slotted = discretization.plan(subtrees=False, deterministic=True) if self.deterministic else None
@@ -87,11 +87,7 @@ class BesideField(ForceField):
         slots.gather(f)
 
     def _scatter_own(self, elements: Elements, u: wp.array, f: wp.array) -> None:
-        count = self.element_count
-        if self._eights is None:
-            self.launch(self._forces, count, [elements, self.material, u], [f])
-        else:
-            self.launch(self._eights, -(-count // LANES), [elements, count, self.material, u], [f])
+        self._forces(elements, self.element_count, [self.material, u], [f])
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         raise NotImplementedError("add_forces does all")

@@ -21,12 +21,14 @@ from warp_corot.kernels.elements.fibres import (
     reinforced_differential,
     reinforced_stress,
 )
+from warp_corot.kernels.elements.fibres_cpu import scatter_reinforced_eights
 from warp_corot.kernels.elements.forces import element_energies, element_von_mises, scatter_forces
 from warp_corot.materials.reinforced import FibreReinforced
 
 from .corotated.anisotropic import fibre_material
 from .dilatation import AUTO, bind_law, check_dilatation
 from .model import ForceField, Model
+from .paths.elements import ByElements
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretized
@@ -61,14 +63,18 @@ class HolzapfelGasserOgden(Model):
 
 
 class ReinforcedField(ForceField):
-    """The forces of ``HolzapfelGasserOgden``, element by element."""
+    """The forces of ``HolzapfelGasserOgden``, element by element, or eight side by side on the CPU."""
 
     takes_anisotropic: ClassVar[bool] = True
 
     def __init__(self, discretization: Discretization, deterministic: bool):
         super().__init__(discretization, deterministic)
         kind = discretization.element_kind
-        self._forces = scatter_forces(kind, ReinforcedMaterial, reinforced_stress)
+        self._forces = ByElements(
+            discretization,
+            lambda kind: scatter_forces(kind, ReinforcedMaterial, reinforced_stress),
+            scatter_reinforced_eights,
+        )
         self._energies = element_energies(kind, ReinforcedMaterial, reinforced_density)
         self._von_mises = element_von_mises(kind, ReinforcedMaterial, reinforced_cauchy)
         self._stiffness = ElementStiffness(discretization, reinforced_differential, ReinforcedMaterial)
@@ -76,7 +82,7 @@ class ReinforcedField(ForceField):
         self._made, self._active = Kept(_material), Kept(fibre_material)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        self.launch(self._forces, self.element_count, [self.elements, self.material, u], [f])
+        self._forces(self.elements, self.element_count, [self.material, u], [f])
 
     def add_stiffness(self, u: wp.array, p: wp.array, y: wp.array) -> None:
         self._stiffness.add_product(self.elements, self.material, u, p, y)

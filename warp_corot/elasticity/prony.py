@@ -15,12 +15,12 @@ from warp_corot.discretization.discretization import Discretization, discretizat
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, shown
 from warp_corot.kernels.elements import prony as kernels
-from warp_corot.kernels.elements.lanes import LANES
 from warp_corot.kernels.elements.prony_cpu import relax_eights, scatter_prony_eights
 
 from .beside import BesideField
 from .corotated.model import Corotated
 from .model import ForceField, Model
+from .paths.elements import ByElements
 
 if TYPE_CHECKING:
     from warp_corot.discretization.changing.plan import DevicePlan
@@ -110,7 +110,7 @@ class PronyField(BesideField):
         self._g, self._tau = (wp.array(v, dtype=wp.float32, device=self.device) for v in (g, tau))
         self._elapsed = wp.zeros(1, dtype=wp.float32, device=self.device)
         self._known = wp.zeros(len(self._carried) * self._count, dtype=wp.float32, device=self.device)
-        self._relax = (relax_eights if self.device.is_cpu else kernels.relax)(discretization.element_kind)
+        self._relax = ByElements(discretization, kernels.relax, relax_eights)
 
     @property
     def material(self) -> kernels.PronyMaterial:
@@ -125,11 +125,7 @@ class PronyField(BesideField):
 
     def complete_step(self, u: wp.array, pace: Pace) -> None:
         self.law.complete_step(u, pace)
-        count, inputs = self.element_count, [u, pace, self.material]
-        if self.device.is_cpu:
-            self.launch(self._relax, -(-count // LANES), [self.elements, count, *inputs], [])
-        else:
-            self.launch(self._relax, count, [self.elements, *inputs], [])
+        self._relax(self.elements, self.element_count, [u, pace, self.material], [])
 
     def relax_fully(self) -> None:
         self._elapsed.fill_(math.inf)

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from warp_corot.kernels.elements.lanes import LANES
-from warp_corot.kernels.elements.viscosity import scatter_viscous
-from warp_corot.kernels.elements.viscosity_cpu import ViscousMaterial, scatter_viscous_eights
+from warp_corot.kernels.elements.viscosity import ViscousMaterial, scatter_viscous
+from warp_corot.kernels.elements.viscosity_cpu import scatter_viscous_eights
+
+from .paths.elements import ByElements
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
@@ -38,8 +39,7 @@ class Viscosity:
         complete: Callable[[wp.array], wp.array] | None = None,
     ):
         self.body, self.field, self.seconds, self._complete = body, field, seconds, complete
-        kind = body.discretization.element_kind
-        self._kernel = scatter_viscous_eights(kind) if body.device.is_cpu else scatter_viscous(kind)
+        self._scatter = ByElements(body.discretization, scatter_viscous, scatter_viscous_eights)
         #: Separate places for each element's forces, if sums must be reproducible.
         self._slotted = body.discretization.plan(subtrees=False, deterministic=True) if field.deterministic else None
 
@@ -61,11 +61,6 @@ class Viscosity:
         slots.gather(f)
 
     def _launch(self, elements: object, u: wp.array, v: wp.array, f: wp.array) -> None:
-        field, device = self.field, self.body.device
-        if device.is_cuda:
-            inputs = [elements, self.seconds, field.isotropic, u, v]
-            wp.launch(self._kernel, field.element_count, inputs, [f], device=device)
-            return
-        material, count = ViscousMaterial(), field.element_count
-        material.isotropic, material.seconds, material.velocities = field.isotropic, self.seconds, v
-        wp.launch(self._kernel, -(-count // LANES), [elements, count, material, u], [f], device=device)
+        material = ViscousMaterial()
+        material.isotropic, material.seconds, material.velocities = self.field.isotropic, self.seconds, v
+        self._scatter(elements, self.field.element_count, [material, u], [f])
