@@ -90,12 +90,12 @@ def test_help(args, capsys):
             assert f"--{name} " in said
 
 
-@pytest.mark.parametrize("stage", ["commands", "_start_warp"])
+@pytest.mark.parametrize("stage", ["cli.commands", "inputs.starting.start_warp"])
 def test_interrupted_before_anything_runs(stage, capsys, monkeypatch):
     def interrupt():
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(f"warp_corot.cli.{stage}", interrupt)
+    monkeypatch.setattr(f"warp_corot.{stage}", interrupt)
     assert simulate("box", "-o", "a.usd") == 130
     assert capsys.readouterr() == ("", "warp-corot: interrupted\n")
 

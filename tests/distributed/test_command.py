@@ -148,6 +148,17 @@ def test_what_does_not_work_is_refused_in_one_line(folder):
     assert "does not work on several ranks yet" in said[0]
 
 
+@pytest.mark.slow
+def test_help_and_errors_wait_for_no_rank(folder):
+    """Rank 0 ends all as soon as it has reported, and no rank waits after the help."""
+    for words, status, said in ((("--version",), 0, ""), (("simulate", "no.stl", "-o", "a.usd"), 2, "no such file")):
+        done = on_ranks(2, "-m", "warp_corot", *words, timeout=60.0)
+        assert done.returncode == status
+        assert said in done.stderr
+        # MPI's own end waits for ranks, which then disagree.
+        assert "PMIX ERROR" not in done.stderr
+
+
 @pytest.mark.parametrize("how", ["failed", *(pytest.param(how, marks=pytest.mark.slow) for how in ("killed", "hung"))])
 def test_a_rank_that_ends_takes_the_others_along(how, monkeypatch):
     if how == "hung":

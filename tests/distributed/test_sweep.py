@@ -132,3 +132,7 @@ def test_the_command_sweeps(folder, capsys):
     # Other options would give other results.
     assert run(*words, "--duration", "0.2", "-o", "results") == 2
     assert "another folder" in capsys.readouterr().err
+    # What no run can read is said before the first one.
+    assert run("sweep", "no.stl", "--vary", "young=500,1kPa", "-o", "others") == 2
+    assert "no.stl: no such file" in capsys.readouterr().err
+    assert not (folder / "others").exists()

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import argparse
 import logging
-import os
 import re
 import shlex
 import sys
-import tempfile
 import warnings
 from collections.abc import Sequence
 from types import ModuleType
@@ -19,9 +17,12 @@ from warp_corot.inputs.importing import uncollected
 from warp_corot.inputs.likely import meant
 
 from .parsing import StrictParser
-from .ranks import fall_silent, let_others_speak, speaks
+from .ranks import end_others, fall_silent, let_others_speak, speaks
 from .say import EXIT_CODES, as_option, complain, interrupt_status, open_streams, silence
 from .signals import leaving_at_once, terminable
+
+#: Exit statuses of runs that failed, and not by a signal.
+FAILED = (1, 2, 3)
 
 
 def commands() -> dict[str, ModuleType]:
@@ -78,16 +79,21 @@ def make_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     open_streams()
-    if speaks():
-        return _main(argv)
-    fall_silent()
-    status = 2  # unknown options end the parser
+    is_silent = not speaks()
+    if is_silent:
+        fall_silent()
+    status: object = None
     try:
-        status = _main(argv)
-        return status
+        status = found = _main(argv)
+    except SystemExit as end:  # of the parser
+        status = end.code
+        raise
     finally:
-        if status in (1, 2, 3):
+        if is_silent and status in FAILED:
             let_others_speak()
+    if found in FAILED and not is_silent:
+        end_others(found)
+    return found
 
 
 def _main(argv: Sequence[str] | None) -> int:
@@ -130,6 +136,8 @@ def _run(argv: Sequence[str] | None) -> int:
     with leaving_at_once(), uncollected():
         import warp as wp
 
+        from warp_corot.inputs.starting import start_warp
+
         wp.config.log_level = wp.LOG_ERROR  # before Warp starts, so that it prints no banner
         # The command differentiates nothing, and Newton's kernels compile in a third of the time without adjoints.
         wp.config.enable_backward = False
@@ -138,7 +146,7 @@ def _run(argv: Sequence[str] | None) -> int:
     args = parser.parse_args(argv)
     args.command_line = shlex.join(["warp-corot", *(sys.argv[1:] if argv is None else argv)])
     try:
-        _start_warp()
+        start_warp()
     except OSError as error:
         complain(
             f"Warp's kernel cache {error.filename or ''}: {error.strerror or error}; name a folder that can be written "
@@ -146,22 +154,3 @@ def _run(argv: Sequence[str] | None) -> int:
         )
         return 1
     return commands()[args.command].run(args)
-
-
-def _start_warp() -> None:
-    """Start Warp, which writes straight to the terminal; hide its message that there is no NVIDIA driver."""
-    import warp as wp
-
-    sys.stderr.flush()
-    with tempfile.TemporaryFile() as said:
-        kept = os.dup(2)
-        os.dup2(said.fileno(), 2)
-        try:
-            wp.init()
-        finally:
-            os.dup2(kept, 2)
-            os.close(kept)
-        said.seek(0)
-        for line in said.read().decode(errors="replace").splitlines():
-            if "Could not find or load the NVIDIA CUDA driver" not in line:
-                print(line, file=sys.stderr)

@@ -123,8 +123,11 @@ def _simulation(args: argparse.Namespace, subject: Subject, duration: float) -> 
     loads, mesh = loads_of(args), subject.mesh
     comm = mpi.world()
     body = SoftBody(mesh, material_in_parts(args, subject, comm), device=args.device)
-    for expression in args.fix or [subject.fix]:
+    held = args.fix or [str(subject.fix)]
+    for expression in held:
         body.fix(expression)
+    if not (loads or any(comm.allgather(bool(body.constrained.any())))):
+        complain(f"no node is held ({' or '.join(held)!r}): the body falls freely", kind="note")
     for load in loads:
         times, shares = load.curve(ramp_of(args, duration))
         if not any(comm.allgather(len(body.node_indices(load.patch)) > 0)):

@@ -7,7 +7,7 @@ import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from warp_corot.errors import InputError
@@ -44,6 +44,16 @@ def fall_silent() -> None:
     """Print nothing from here on: rank 0 prints for all ranks."""
     null = open(os.devnull, "w")  # noqa: SIM115 (open as long as the process lives)
     sys.stdout = sys.stderr = null
+
+
+def end_others(status: int) -> None:
+    """On rank 0 of several, after a report: end this process with a status at once, and so all others. MPI's own end
+    would wait for them, and they wait for this report."""
+    if are_several():
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(OSError, ValueError):
+                stream.flush()
+        os._exit(status)
 
 
 def let_others_speak() -> None:

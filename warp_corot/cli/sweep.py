@@ -69,6 +69,9 @@ def run(args: argparse.Namespace) -> int:
     """
     from warp_corot.distributed.sweeping import combinations, sweep
 
+    from .opened import open_input
+    from .run_file import bodies_of
+
     if args.output is None:
         raise InputError("-o is missing; it must name the folder of the results, for example -o results")
     varied = dict(values_of(text) for text in args.vary)
@@ -78,8 +81,11 @@ def run(args: argparse.Namespace) -> int:
     names = [f"--{name}" for name in ("duration", "device") if getattr(args, name)]
     others = [word for pair in zip(names, given, strict=True) for word in pair]
     others += [word for probe in args.probe or () for word in ("--probe", probe)]
+    inputs: set[str] = set()
     for each in combinations(varied):
-        options_of(args.input, others, each, args.output)
+        inputs |= {body.input for body in bodies_of(options_of(args.input, others, each, args.output))}
+    for name in sorted(inputs):
+        open_input(name)  # rather than in each run
     try:
         (args.output / RUNS).mkdir(parents=True, exist_ok=True)
         _check_same(args.output, args.input, others)
@@ -154,7 +160,6 @@ def options_of(source: str, others: list[str], values: dict[str, Any], folder: P
         InputError: A value is out of its range, or the input's run file is wrong.
     """
     from . import Parser, simulate
-    from .run_file import bodies_of
 
     name = folder / RUNS / name_of(values)
     words = ["simulate", source, *others, "-o", f"{name}.usd", "--csv", f"{name}.csv"]
@@ -164,7 +169,6 @@ def options_of(source: str, others: list[str], values: dict[str, Any], folder: P
     simulate.add_parser(parser.add_subparsers(dest="command", parser_class=Parser))
     args = parser.parse_args(words)
     args.command_line = "warp-corot " + " ".join(words)
-    bodies_of(args)
     return args
 
 

@@ -14,6 +14,7 @@ from warp_corot.contact.contacts import Contacts
 from warp_corot.contact.reading import ContactPoint
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.simulation.simulation import Simulation as OnOne
+from warp_corot.simulation.solves import Solves
 
 from . import mpi
 from .following import STATE
@@ -213,6 +214,10 @@ class LedSimulation(OnOne):
     @property
     def dt_range(self) -> tuple[float, float]:
         return self._crew.on_all.dt_range
+
+    @property
+    def solves(self) -> Solves | None:
+        return self._crew.on_all.solves
 
     @property
     def steps(self) -> int:

@@ -14,6 +14,7 @@ import warp as wp
 
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_count
+from warp_corot.inputs.starting import start_warp
 
 #: Number of runs given at a time to a user's engine, whose size is not known.
 HANDED_OVER = 256
@@ -83,7 +84,8 @@ def _begin(turn: Any) -> None:
     """Choose a card for this process, if there are cards."""
     with turn.get_lock():
         number, turn.value = turn.value, turn.value + 1
-    wp.config.quiet = True
+    wp.config.log_level = wp.LOG_ERROR
+    start_warp()
     count = wp.get_cuda_device_count()
     if count:
         wp.set_device(f"cuda:{number % count}")
