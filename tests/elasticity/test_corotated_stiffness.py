@@ -6,6 +6,7 @@ The exact K, with the derivative of the rotations, is in ``test_stiffness_produc
 import numpy as np
 import oracle
 import pytest
+import warp as wp
 from cases import CUBE, MATERIAL, MESHES, edge_scale, jittered, mixed_forest, oracle_mesh, random_displacement
 from shortened import crossed
 from tangents import (
@@ -22,6 +23,8 @@ from tangents import (
 )
 
 import warp_corot as wc
+from warp_corot.elasticity.corotated.subtree_tangent import SubtreeTangent, subtrees_of
+from warp_corot.elasticity.corotated.tangents import RotatedTangent
 
 MU, LAM = oracle.lame(MATERIAL["young"], MATERIAL["poisson"])
 CASES = ("level 3", "level 4", "level 5", "mixed levels", "general")
@@ -211,3 +214,34 @@ def test_warm_rotations_are_left_as_they_are(device, rng):
     for name, array in field.state.items():
         assert np.array_equal(array.numpy(), before[name])
     assert_equal(product(field, u, p, exact=True), product(bound(mesh, device), u, p, exact=True))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("level", [3, 4, 5])
+def test_products_over_subtrees_are_the_same(level, device, rng):
+    """As large bodies on CUDA have them: subtrees of each type in two worlds, with a modulus for each element."""
+    mesh = wc.TetForest.box((1, 1, 1), CUBE, level)
+    young = MATERIAL["young"] * rng.uniform(0.5, 2.0, len(mesh.tets))
+    body = wc.SoftBody(mesh, wc.Isotropic(young, 0.3, MATERIAL["density"]), worlds=2, device=device)
+    field = wc.Corotated(dilatation="element").bind(body)
+    batches = subtrees_of(field.plan)
+    assert batches
+    u, p = (np.concatenate([turned(mesh, rng, 0.2) for _ in range(2)]) for _ in range(2))
+    found = []
+    for tangent in (RotatedTangent(field), SubtreeTangent(field, batches)):
+        tangent.prepare(on_device(u, field))
+        tangent.take(on_device(u, field))
+        y, blocks = on_device(np.zeros_like(p), field), wp.zeros(len(u), dtype=wp.mat33, device=device)
+        tangent.add_product(on_device(p, field), y)
+        tangent.add_diagonal(blocks)
+        found.append((y.numpy()[:, :3], blocks.numpy()))
+    assert_equal(found[1][0], found[0][0])
+    np.testing.assert_array_equal(found[1][1], found[0][1])
+
+
+def test_large_bodies_on_cuda_have_products_over_subtrees(device, monkeypatch):
+    monkeypatch.setattr("warp_corot.elasticity.corotated.subtrees.FEWEST", 1)
+    field = bound(wc.TetForest.box((1, 1, 1), CUBE, 6), device)
+    assert isinstance(field.tangent(), SubtreeTangent) == field.device.is_cuda
+    assert not isinstance(field.tangent(exact=True), SubtreeTangent)
+    assert subtrees_of(bound(mixed_forest(), device).plan) is None

@@ -4,6 +4,7 @@ import functools
 
 import warp as wp
 
+from warp_corot.kernels.corotated.turned_subtrees import LeafMaterial, leaf_axes
 from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.kernels.elements.elements import ForestElements, Subtrees, nodal_forces, rest_volume, root_of
 from warp_corot.kernels.elements.forces import in_local_frame, own_gradient
@@ -15,7 +16,7 @@ from warp_corot.kernels.tables.shapes import VOLUME, fingerprint
 from warp_corot.kernels.tables.subtree import HANDEDNESS, LEAVES
 
 from .shared import kept_share
-from .subtrees import LeafMaterial, OwnBlocks, leaf_axes, own_block
+from .subtrees import OwnBlocks, own_block
 from .values import inverse_block
 
 wp.set_module_options({"enable_backward": False})

@@ -8,6 +8,7 @@ import functools
 
 import warp as wp
 
+from warp_corot.kernels.corotated.turned_subtrees import LeafMaterial, leaf_axes
 from warp_corot.kernels.elements.elements import Subtrees, load_node, root_of
 from warp_corot.kernels.elements.shapes import leaf_forces_of
 from warp_corot.kernels.modules import unique_kernel
@@ -16,7 +17,7 @@ from warp_corot.kernels.tables.shapes import VOLUME, fingerprint
 from warp_corot.kernels.tables.subtree import HANDEDNESS, LEAVES, POSITIONS
 
 from .pattern import key_of
-from .subtrees import LeafMaterial, OwnBlocks, leaf_axes, own_block
+from .subtrees import OwnBlocks, own_block
 from .values import inverse_block
 
 wp.set_module_options({"enable_backward": False})

@@ -18,6 +18,7 @@ from warp_corot.elasticity.paths.dilating import Dilating
 from warp_corot.elasticity.paths.grouped import GroupedLanes
 from warp_corot.elasticity.paths.lanes import Lanes, as_general
 from warp_corot.elasticity.structs import Kept
+from warp_corot.elasticity.tangent import Tangent
 from warp_corot.kernels.clusters.laws import isotropic_law
 from warp_corot.kernels.corotated.algebraic import corotated_stress
 from warp_corot.kernels.corotated.near_rotations import share_near_rotations
@@ -39,6 +40,7 @@ from .elements import (
 )
 from .left_out import LeftOutLeaves
 from .own_launches import OwnLaunches, does_in_blocks
+from .subtree_tangent import FEWEST, SubtreeTangent, subtrees_of
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
@@ -95,6 +97,14 @@ class SubtreeField(CorotatedField):
         self.derive()
         self.follow()
         return True
+
+    def tangent(self, *, exact: bool = False) -> Tangent:
+        own = self.model.level is None and self.model.tolerance is None and self.model.rotation != "warm"
+        if not exact and own and self._listed and self.element_count >= FEWEST:
+            batches = subtrees_of(self.plan)
+            if batches is not None:
+                return SubtreeTangent(self, batches)
+        return super().tangent(exact=exact)
 
     @property
     def in_clusters(self) -> tuple[ClusterScatter, Sequence[Batch]] | None:

@@ -15,8 +15,10 @@ import warp as wp
 from warp_corot.discretization.discretization import Discretization, FixedMesh
 from warp_corot.discretization.members import Members
 from warp_corot.discretization.subtrees import Batch
+from warp_corot.kernels.corotated import turned_subtrees
 from warp_corot.kernels.elements.elements import ForestElements, Subtrees
 from warp_corot.kernels.implicit.multigrid import diagonals, roots, subtrees
+from warp_corot.kernels.implicit.multigrid.values import rest_frame, turned_frame
 from warp_corot.kernels.subtrees.memory import BLOCK
 from warp_corot.mesh import TetForest
 from warp_corot.solvers.implicit.operator import LinearOperator
@@ -74,8 +76,9 @@ class SubtreeLevel(SmoothedLevel):
         super().__init__(len(rank), worlds, len(rank), free, degree)
         self.stiffening, self._discretization, self._batches = stiffening, discretization, tuple(batches)
         self._most_shared = min(most_shared, 1e30)
-        self._keep_turns, self._law = subtrees.keep_turns(is_turned), None if members is None else members.law
-        self._material = subtrees.LeafMaterial()
+        self._keep_turns = turned_subtrees.keep_turns(turned_frame if is_turned else rest_frame)
+        self._law = None if members is None else members.law
+        self._material = turned_subtrees.LeafMaterial()
         self._material.mu, self._material.lam = discretization.mu, discretization.lam
         # Where leaves share their dilatation, rows have all of it.
         self._material.most_lambda = min(most_lambda, 1e30) if members is None else 0.0
@@ -155,7 +158,7 @@ class SubtreeLevel(SmoothedLevel):
     def _load_kernels(self, shares: bool) -> None:
         uniform = self._discretization.material_stride == 0
         kinds = [(batch.shape, batch.grouped, uniform, shares) for batch in self._batches]
-        self._product = [subtrees.add_subtree_products(*kind) for kind in kinds]
+        self._product = [turned_subtrees.add_subtree_products(*kind) for kind in kinds]
         self._diagonal = [diagonals.add_diagonals(*kind) for kind in kinds]
         self._roots = [roots.write_roots(*kind) for kind in kinds]
         for kernel in self._product + self._diagonal + self._roots:
