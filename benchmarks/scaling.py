@@ -3,7 +3,8 @@
 
     python benchmarks/scaling.py [--device cuda] [--ranks 1,2] [--weak 18,21] [--strong 21] [--json FILE]
 
-The script starts ``mpirun`` for each number of ranks. It needs this package, mpi4py and MPI, and nccl4py for cards.
+Without options it measures 1, 2, 4, ... ranks, up to all cards, or up to all cores if there are none. The script starts
+``mpirun`` for each number of ranks. It needs this package, mpi4py and MPI, and nccl4py for cards.
 Weak scaling has one root cube of the given level on each rank. Strong scaling divides as many cubes as the largest
 number of ranks among all ranks. Levels are those of ``TetForest.box``: a cube has 1.6 million tetrahedra at level 18,
 12.6 million at 21, 100 million at 24.
@@ -32,6 +33,8 @@ STEPS, CPU_STEPS, ROUNDS, EXCHANGES = 512, 32, 7, 50
 AGREEMENT, MOST_CALLS = 0.03, 12
 #: Assumptions about a network between machines: the time of an exchange without data [us], and bytes per microsecond.
 NETWORK_LATENCY, NETWORK_RATE = 15.0, 40e3
+#: Levels of the cubes of weak and strong scaling that are measured by default, on a card and on a CPU.
+LEVELS, CPU_LEVELS = ("18,21", "21"), ("12", "12")
 #: A step far below every stable one [s]; its cost does not depend on its length.
 SHORT_STEP = 1e-7
 
@@ -99,7 +102,8 @@ def on_ranks(ranks: int, cubes: int, level: int, device: str) -> dict[str, Any]:
     done = subprocess.run([*start, __file__, *asked], capture_output=True, text=True, check=False)
     rows = [json.loads(line[4:]) for line in done.stdout.splitlines() if line.startswith("ROW ")]
     if done.returncode or len(rows) != ranks:
-        raise RuntimeError(f"{ranks} ranks, level {level}: {done.stderr.strip()[-2000:]}")
+        said = [line for line in done.stderr.splitlines() if line.startswith(("warp-corot:", "Error", "warp_corot."))]
+        raise RuntimeError(f"{ranks} ranks, level {level}: {said[0] if said else done.stderr.strip()[-2000:]}")
     slowest = max(rows, key=lambda row: row["step_us"])
     return slowest | {"level": level, **{name: max(row[name] for row in rows) for name in ("computed", "memory_mb")}}
 
@@ -156,12 +160,39 @@ def predicted(model: dict[str, float], ranks: int, level: int, *, machines: int 
     return {"ranks": ranks, "machines": machines, "level": level, "step_us": step, "efficiency": alone / step}
 
 
+def chosen(options: argparse.Namespace) -> tuple[str, list[int]]:
+    """The device, and the numbers of ranks, ascending from one.
+
+    Raises:
+        ValueError: A number of ranks is not positive, or there are fewer cards.
+    """
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_ERROR
+    cards = wp.get_cuda_device_count()
+    device = options.device or ("cuda" if cards else "cpu")
+    most = cards if device == "cuda" else len(os.sched_getaffinity(0))
+    if device == "cuda" and not cards:
+        raise ValueError("there is no card; --device must be cpu")
+    if options.ranks is None:
+        return device, sorted({*(2**k for k in range(most.bit_length())), most})
+    counts = sorted({1, *(int(n) for n in options.ranks.split(","))})
+    if counts[0] < 1 or (device == "cuda" and counts[-1] > cards):
+        raise ValueError(f"--ranks is {options.ranks}; they must be at least 1, and on cards at most {cards}")
+    return device, counts
+
+
 def main() -> int:
     of = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    of.add_argument("--device", default="cpu", help="cpu or cuda: on cuda each rank takes a card of its own")
-    of.add_argument("--ranks", default="1,2", help="numbers of ranks, ascending, with 1")
-    of.add_argument("--weak", default="12", help="levels of the cubes of weak scaling")
-    of.add_argument("--strong", default="12", help="levels of the cubes of strong scaling, as many as the most ranks")
+    of.add_argument("--device", choices=("cpu", "cuda"), help="cuda: each rank takes a card (default if there are any)")
+    of.add_argument("--ranks", help="numbers of ranks; 1 is always among them (default: 1, 2, 4, ... and all)")
+    of.add_argument(
+        "--weak", help=f"levels of the cubes of weak scaling ({LEVELS[0]} on cards, {CPU_LEVELS[0]} on a CPU)"
+    )
+    of.add_argument(
+        "--strong",
+        help=f"levels of cubes in strong scaling, as many as the most ranks ({LEVELS[1]}, {CPU_LEVELS[1]})",
+    )
     of.add_argument("--json", type=Path, help="write all numbers to this file, too")
     of.add_argument("--worker", type=int, help=argparse.SUPPRESS)
     of.add_argument("--level", type=int, help=argparse.SUPPRESS)
@@ -171,7 +202,23 @@ def main() -> int:
         # Each line is one write, so that the lines of ranks do not mix.
         os.write(1, f"ROW {json.dumps(row)}\n".encode())
         return 0
-    counts = [int(n) for n in options.ranks.split(",")]
+    try:
+        options.device, counts = chosen(options)
+        return measure(options, counts)
+    except (RuntimeError, ValueError) as error:
+        print(f"scaling.py: {error}", file=sys.stderr)
+        return 1
+
+
+def measure(options: argparse.Namespace, counts: list[int]) -> int:
+    """Measure, fit and predict, and print it all.
+
+    Raises:
+        RuntimeError: A run failed.
+    """
+    usual = LEVELS if options.device == "cuda" else CPU_LEVELS
+    options.weak = usual[0] if options.weak is None else options.weak
+    options.strong = usual[1] if options.strong is None else options.strong
     rows: list[dict[str, Any]] = []
     print(
         "scaling  level  ranks    elements    computed  copied      step     spread  exchange  efficiency    memory",
