@@ -229,7 +229,7 @@ def test_refusals(device):
     for options, message in (
         ({"wrt": "colour"}, "wrt has 'colour'; it must be one or several of 'young'"),
         ({"wrt": ()}, "wrt is empty"),
-        ({"wrt": "activation"}, "the material has no fibres"),
+        ({"wrt": "activation"}, "wrt has 'activation', but only anisotropic materials"),
         ({"model": wc.Corotated(rotation_level=0)}, "the model shares rotations"),
         ({"model": wc.Prony(model=wc.Corotated(rotation_level=0)), "wrt": "loads"}, "the model shares rotations"),
         ({"model": wc.EdgeStVK(springs="quadratic")}, "have no derivative with respect to moduli"),

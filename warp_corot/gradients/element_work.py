@@ -38,11 +38,12 @@ class ElementWork:
         self._shared = field if isinstance(field, DilatationField) else None
         law = (self._shared.shear if self._shared else field).stress_law
         if names and law is None:
-            raise InputError(f"forces of {type(field).__name__} have no derivative with respect to {_listed(names)}")
+            missing = _listed(names)
+            raise InputError(f"the model's forces have no derivative with respect to {missing}; leave it out of wrt")
         if "lame" in names and law is not None and law.Material is not IsotropicMaterial:
             raise InputError("the material is anisotropic; derivatives with respect to its moduli do not exist yet")
         if "activation" in names and law is not None and law.Material is not FibreMaterial:
-            raise InputError("the material has no fibres; only anisotropic ones have active stress")
+            raise InputError("wrt has 'activation', but only anisotropic materials have active stress")
         count, nodes = field.element_count, field.discretization.sizes.launch_nodes
         self._of_mu, self._of_lam, self._of_activation = (
             wp.zeros(count if name in names else 0, dtype=wp.float64, device=self.device)
