@@ -25,6 +25,9 @@ class Law:
     recovery: float  # speed at which overlapping surfaces are pushed apart [m/s]
     settling: float  # share of an overlap by which they are pushed apart in a step at most
     slack: float  # gaps at own surfaces of up to this size may stay as they are in implicit steps [m]
+    closing: (
+        float  # gaps at own surfaces of more than this, besides their own motion, do not close in an explicit step [m]
+    )
     grain: float  # forces on nodes are summed in multiples of this, so that the order does not matter [N]
 
 

@@ -20,6 +20,8 @@ wp.set_module_options({"enable_backward": False})
 
 #: Weights are summed in multiples of one over this.
 SHARES = wp.constant(1048576.0)
+#: Gaps of more than so many times the motion of their places, besides ``Law.closing``, do not close in a step.
+FORESEEN = wp.constant(4.0)
 #: Number of threads of a warp.
 LANES = wp.constant(32)
 
@@ -35,6 +37,7 @@ def opened(row: int, surface: Surface, rows: Rows):
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
+    if (!__any_sync(0xffffffffu, place >= 0)) return;
     const int lane = threadIdx.x & 31, axis = lane & 3;
     for (int k = 0; k < 4; ++k) {
         const int from = (lane & ~3) | k;
@@ -55,6 +58,24 @@ def add_by_warp(added: wp.array[wp.vec3l], place: int, grains: wp.vec3l):
     """Add grains at a place, or none if it is negative. All threads of a warp must call it: they add the components of
     one place side by side, which the memory does at once.
     """
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const unsigned those = __ballot_sync(0xffffffffu, is_live != 0);
+    if (those == 0) return;
+    const int lane = threadIdx.x & 31, first = __ffs(those) - 1;
+    int start = 0;
+    if (lane == first) start = atomicAdd(&wp::index(count, 0), __popc(those));
+    start = __shfl_sync(0xffffffffu, start, first);
+    if (is_live != 0) wp::index(live, start + __popc(those & ((1u << lane) - 1u))) = row;
+#else
+    if (is_live != 0) wp::index(live, wp::index(count, 0)++) = row;
+#endif
+""")
+def list_by_warp(live: wp.array[wp.int32], count: wp.array[wp.int32], row: int, is_live: int):
+    """Add a row to a list, or not. All threads of a warp must call it: they ask for their places together."""
     ...
 
 
@@ -110,6 +131,25 @@ def missing(row: int, law: Law, dt: float, surface: Surface, rows: Rows):
 
 
 @wp.func
+def may_push(row: int, law: Law, surface: Surface, rows: Rows):
+    """Whether a pair that has just been located may push in this step, whatever pushes its places."""
+    w = rows.shares[row]
+    if w[0] <= 0.0:
+        return 0
+    force = rows.force[row]
+    if wp.dot(force, force) > 0.0:
+        return 1
+    gap = rows.gap[row]
+    if gap <= law.closing:
+        return 1
+    p = rows.places[row]
+    most = float(0.0)
+    for k in range(4):
+        most += wp.abs(w[k]) * wp.length(surface.d[p[k]])
+    return wp.where(gap <= FORESEEN * most + law.closing, 1, 0)
+
+
+@wp.func
 def judge_row(row: int, law: Law, dt: float, surface: Surface, rows: Rows):
     """Find whether a pair acts in this round."""
     acts = int(0)
@@ -161,31 +201,35 @@ def solve_row(
 
 @wp.kernel(enable_backward=False)
 def locate_rows(threads: int, law: Law, surface: Surface, meeting: Meeting, rows: Rows, added: wp.array[wp.vec3l]):
-    """Where each pair is closest, and the force with which it begins: that of the last step."""
+    """Where each pair is closest, and the force with which it begins: that of the last step. Lists those that may push,
+    which are fewer than half."""
     row = wp.tid()
     # Warps stay together.
     beyond = row_count(rows) + row % wp.min(threads, LANES)
     while row < beyond:
         force = wp.vec3()
+        is_live = int(0)
         if row < row_count(rows):
             force = locate_row(row, surface, meeting, rows)
+            is_live = may_push(row, law, surface, rows)
         push_by_warp(row, force, law, rows, added)
+        list_by_warp(rows.live, rows.live_count, row, is_live)
         row += threads
 
 
 @wp.kernel(enable_backward=False)
 def judge_rows(threads: int, law: Law, pace: Pace, surface: Surface, rows: Rows, crowd: wp.array[wp.int32]):
     """Which pairs act, and the sum of their shares at each node."""
-    row = wp.tid()
-    count = row_count(rows)
+    k = wp.tid()
     dt = float(pace.seconds[DT])
-    while row < count:
+    while k < rows.live_count[0]:
+        row = rows.live[k]
+        k += threads
         if judge_row(row, law, dt, surface, rows) != 0:
             p = rows.places[row]
             w = rows.shares[row]
-            for k in range(4):
-                wp.atomic_add(crowd, p[k], int(SHARES * wp.abs(w[k])))
-        row += threads
+            for m in range(4):
+                wp.atomic_add(crowd, p[m], int(SHARES * wp.abs(w[m])))
 
 
 @wp.kernel(enable_backward=False)
@@ -203,19 +247,23 @@ def solve_rows(
     added: wp.array[wp.vec3l],
 ):
     """Correct the force of each pair that acts."""
-    row = wp.tid()
+    k = wp.tid()
     dt = float(pace.seconds[DT])
-    beyond = row_count(rows) + row % wp.min(threads, LANES)
-    while row < beyond:
+    count = rows.live_count[0]
+    beyond = count + k % wp.min(threads, LANES)
+    while k < beyond:
         more = wp.vec3()
-        if row < row_count(rows) and rows.acts[wp.min(row, rows.acts.shape[0] - 1)] != 0:
-            p = rows.places[row]
-            eases = wp.vec4()
-            for k in range(4):
-                eases[k] = ease(p[k], crowd, surface.yielding, surface) / SHARES
-            more = solve_row(row, law, dt, surface, friction, eases, rows)
+        row = int(0)
+        if k < count:
+            row = rows.live[k]
+            if rows.acts[row] != 0:
+                p = rows.places[row]
+                eases = wp.vec4()
+                for m in range(4):
+                    eases[m] = ease(p[m], crowd, surface.yielding, surface) / SHARES
+                more = solve_row(row, law, dt, surface, friction, eases, rows)
         push_by_warp(row, more, law, rows, added)
-        row += threads
+        k += threads
 
 
 @wp.func

@@ -55,6 +55,8 @@ class Rows:
     acts: wp.array[wp.int32]
     force: wp.array[wp.vec3]  # on the first [N]
     more: wp.array[wp.vec3]
+    live: wp.array[wp.int32]  # those that may push in this step
+    live_count: wp.array[wp.int32]  # [1]
 
 
 @wp.func

@@ -207,3 +207,27 @@ def test_more_contacts_than_memory_end_the_run_at_the_last_good_state(device, mo
     np.testing.assert_array_equal(high.positions.numpy(), before)
     monkeypatch.undo()
     sim.advance(0.01)
+
+
+@pytest.mark.parametrize("speed", [0.2, 4.0])
+def test_pairs_left_out_of_a_step_would_not_have_pushed(device, speed):
+    """A block hits another one: they move as with all pairs in every round."""
+    moved, live = [], []
+    for closing in (None, 1e6):
+        low, high = block(device, 0.0), block(device, 0.0204, at=0.003)
+        velocities = high.velocities.numpy()
+        velocities[:, 2] = -speed
+        high.velocities.assign(velocities)
+        integrator = wc.SymplecticEuler(dt=1e-4, viscosity=5e-4)
+        sim = wc.Simulation([low, high], gravity=(0, 0, 0), contact=wc.Contact(), integrator=integrator)
+        if closing is not None:
+            sim.contact.law.closing = closing
+        counts = []
+        for _ in range(10):
+            sim.advance_steps(10)
+            counts.append(int(sim.contact.pairs.rows.live_count.numpy()[0]))
+        moved.append(np.concatenate([each.displacements.numpy() for each in sim.bodies]))
+        live.append(max(counts))
+    assert sim.bodies[0].velocities.numpy()[:, 2].mean() < -0.01 * speed
+    assert 0 < live[0] < live[1]
+    np.testing.assert_allclose(*moved, rtol=0.0, atol=1e-5 * np.abs(moved[1]).max())

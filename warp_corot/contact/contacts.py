@@ -39,6 +39,9 @@ RECOVERY = 0.05
 #: Gaps at bodies' own surfaces of up to this fraction of the smallest element may stay as they are in implicit steps:
 #: places share nodes, so that forces that close all gaps exactly take many solves. In static answers times ``FINE``.
 SLACK, FINE = 0.002, 0.05
+#: Gaps of more than this fraction of the smallest element besides their own motion do not close in an explicit step:
+#: nothing moves by more than a tenth of it.
+CLOSING = 0.25
 #: Number of rounds for obstacles between the nodes, and with places that nodes bear.
 ROUNDS, ROUNDS_OF_BORNE = 3, 4
 #: Number of grains in the force that moves the heaviest node across the smallest element in a step; the maximum is
@@ -285,7 +288,7 @@ class Contacts:
 
         Forces are carried if every rank has the whole surfaces, and forgotten if each has only a part.
         """
-        for name in ("tolerance", "recovery", "grain"):
+        for name in ("tolerance", "recovery", "closing", "grain"):
             setattr(self.law, name, getattr(former.law, name))
         self.obstacles.continue_from(former.obstacles)
         wp.copy(self.obstacles.wrenches, former.obstacles.wrenches)
@@ -323,6 +326,7 @@ class Contacts:
         heaviest = self.system.ranks.most(max(float(body.masses.max()) for body in self.system.bodies))
         step = stable_dt if np.isfinite(stable_dt) else 1.0
         law.slack = SLACK * self.smallest if self.surface.is_borne else 0.0
+        law.closing = CLOSING * self.smallest
         law.grain = heaviest * self.smallest / step**2 / GRAINS
         return law
 

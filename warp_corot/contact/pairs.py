@@ -114,12 +114,12 @@ class Pairs:
     def _rows_for(self, room: int) -> tuple[Rows, search_kernels.OldRows]:
         device, owners = self.device, self.surface.count + self.surface.edge_count
         rows, old = Rows(), search_kernels.OldRows()
-        rows.total = wp.zeros(1, dtype=wp.int32, device=device)
+        rows.total, rows.live_count = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
         for kept in (rows, old):
             kept.starts, kept.counts = (wp.zeros(owners, dtype=wp.int32, device=device) for _ in range(2))
             kept.other = wp.zeros(room, dtype=wp.int32, device=device)
             kept.force = wp.zeros(room, dtype=wp.vec3, device=device)
-        rows.owner, rows.acts = (wp.zeros(room, dtype=wp.int32, device=device) for _ in range(2))
+        rows.owner, rows.acts, rows.live = (wp.zeros(room, dtype=wp.int32, device=device) for _ in range(3))
         rows.normal = wp.zeros(room, dtype=wp.vec3, device=device)
         rows.places = wp.zeros(room, dtype=wp.vec4i, device=device)
         rows.shares = wp.zeros(room, dtype=wp.vec4, device=device)
@@ -184,6 +184,7 @@ class Pairs:
 
     def launch_begin(self, law: Law) -> None:
         """Launch the places of all pairs."""
+        self.rows.live_count.zero_()
         self._on_rows(kernels.locate_rows, [law, self.surface.arrays, self.meeting, self.rows, self._added])
         self._apply(law)
 
