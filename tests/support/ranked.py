@@ -327,6 +327,7 @@ def general_loaded(file: Path) -> np.ndarray | None:
     import warp_corot.distributed as wd
 
     everybody, mesh = mpi.world(), jittered()
+    tissue, tip = 2 + 3 * (mesh.points[mesh.tets].mean(axis=1)[:, 2] // 0.07).astype(int), mesh.points[:, 2] > 0.18
     if everybody.rank == 0:
         counts = {"Points": len(mesh.points), "Cells": len(mesh.tets), "ConnectivityIds": mesh.tets.size}
         with h5py.File(file, "w") as opened:
@@ -335,9 +336,14 @@ def general_loaded(file: Path) -> np.ndarray | None:
                 grid[f"NumberOf{name}"] = [count]
             grid["Points"], grid["Connectivity"] = mesh.points, mesh.tets.ravel().astype(np.int64)
             grid["Types"] = np.full(len(mesh.tets), 10, np.uint8)
+            grid["CellData/tissue"], grid["CellData/quality"] = tissue, np.linspace(0.0, 1.0, len(mesh.tets))
+            grid["PointData/tip"] = tip.astype(np.uint8)
     everybody.Barrier()
     part = wd.load(file, up_axis="Y")
     np.testing.assert_array_equal(mesh.points[part.numbers.nodes], part.points)
+    assert part.label_names == ("2", "5", "8")
+    np.testing.assert_array_equal(part.labels, 1 + (tissue[part.numbers.elements] - 2) // 3)
+    np.testing.assert_array_equal(part.node_sets["tip"], tip[part.numbers.nodes])
     outer = sum(everybody.allgather(len(part.outer)))
     assert outer == len(boundary_faces(mesh.tets)[0])
     body = body_of(part, 0.3)

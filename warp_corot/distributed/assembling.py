@@ -5,6 +5,7 @@ Every node has a home, the rank that keeps what is known of it. Nodes are divide
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -40,9 +41,7 @@ class Homes:
 
     def coordinates(self, nodes: Longs) -> npt.NDArray[np.float64]:
         """The coordinates of ascending nodes [m], float64 [n, 3]; all ranks must call this."""
-        first = self.ends[self._comm.rank]
-        asked = self._comm.alltoall(self._by_home(nodes))
-        return np.concatenate(self._comm.alltoall([self._points[each - first] for each in asked]))
+        return fetched(self._points, self.ends, nodes, self._comm)
 
     def owners(self, nodes: Longs, others: Longs) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
         """The ranks that move nodes, the lowest of all that have elements around each; all ranks must call this.
@@ -63,6 +62,19 @@ class Homes:
 
     def _by_home(self, nodes: Longs) -> list[Longs]:
         return np.split(nodes, np.searchsorted(nodes, self.ends[1:-1]))
+
+
+def fetched(values: npt.NDArray[Any], ends: Longs, wanted: Longs, comm: Any) -> npt.NDArray[Any]:
+    """Values by number, each from the rank that keeps it; all ranks must call this.
+
+    Args:
+        values: Those of this rank, of the numbers ``ends[rank]`` to ``ends[rank + 1]``.
+        ends: The first number of each rank, and the number of all, int64 [ranks + 1].
+        wanted: The numbers, ascending.
+        comm: The ranks.
+    """
+    asked = comm.alltoall(np.split(wanted, np.searchsorted(wanted, ends[1:-1])))
+    return np.concatenate(comm.alltoall([values[each - ends[comm.rank]] for each in asked]))
 
 
 def moved_along_curve(tets: Longs, elements: Longs, homes: Homes, comm: Any) -> tuple[Longs, Longs]:
@@ -96,7 +108,15 @@ def moved_along_curve(tets: Longs, elements: Longs, homes: Homes, comm: Any) -> 
     return tets[ascending], elements[ascending]
 
 
-def assembled(tets: Longs, elements: Longs, node_count: int, homes: Homes, comm: Any, **options: Any) -> MeshPart:
+def assembled(
+    tets: Longs,
+    elements: Longs,
+    node_count: int,
+    homes: Homes,
+    comm: Any,
+    described: Callable[[Longs, Longs], dict[str, Any]],
+    **options: Any,
+) -> MeshPart:
     """This rank's part of a mesh, from the elements that it counts; all ranks must call this.
 
     Args:
@@ -105,7 +125,9 @@ def assembled(tets: Longs, elements: Longs, node_count: int, homes: Homes, comm:
         node_count: Number of nodes of the whole mesh.
         homes: The homes of the nodes.
         comm: The ranks.
-        options: Further options of ``TetMesh``.
+        described: Gives options of ``TetMesh`` for the part's nodes and elements, by their ascending numbers in the
+            whole mesh; all ranks call it.
+        options: Further options.
     """
     none = np.zeros(0, np.int64)
     owner, _ = homes.owners(np.unique(tets), none)
@@ -141,6 +163,7 @@ def assembled(tets: Longs, elements: Longs, node_count: int, homes: Homes, comm:
         bounds=np.array([np.min(low, axis=0), np.max(high, axis=0)]),
         smallest_volume=min(smallest),
         outer=_outer(tets, here, homes, comm),
+        **described(here, all_elements[order]),
         **options,
     )
 

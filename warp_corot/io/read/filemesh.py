@@ -17,6 +17,11 @@ FACES = {"triangle": 3, "quad": 4}
 CORNERS = {**SOLIDS, **FACES}
 #: Arrays with more distinct numbers than this do not define node sets.
 MOST_SETS = 32
+#: Arrays of VTK that number neither regions nor sets of nodes.
+INTERNAL = (
+    *("vtkGhostType", "vtkOriginalCellIds", "vtkOriginalPointIds"),
+    *("GlobalCellIds", "GlobalElementId", "GlobalPointIds", "GlobalNodeId"),
+)
 
 
 class Unreadable(Exception):
@@ -114,13 +119,20 @@ class FileMesh:
         return cls(arrays["points"], blocks, names, described["ignored"], described["notes"], sets)
 
 
-def sets_of_numbers(name: str, values: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
+def sets_of_numbers(
+    name: str, values: NDArray[np.int64], there: NDArray[np.int64] | None = None
+) -> dict[str, NDArray[np.int64]]:
     """The node sets that an array of whole numbers, one a node, defines.
 
     An array of zeros and ones is one set with the array's name. An array with a few distinct numbers is one set for
     each number but zero, ``NAME_NUMBER``. An array of many numbers, for instance one that counts nodes, defines no set.
+
+    Args:
+        name: The array's name.
+        values: Its numbers, or those of some of the nodes.
+        there: The distinct numbers of all nodes; None: those in ``values``.
     """
-    numbers = np.unique(values)
+    numbers = np.unique(values) if there is None else there
     numbers = numbers[numbers != 0]
     if len(numbers) > MOST_SETS:
         return {}

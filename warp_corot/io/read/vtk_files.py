@@ -20,7 +20,17 @@ from vtkmodules.vtkCommonDataModel import (
 )
 from vtkmodules.vtkFiltersCore import vtkAppendFilter, vtkTriangleFilter
 
-from .filemesh import CORNERS, Block, FileMesh, Unreadable, as_bytes, corners_note, sets_of_numbers, whole_numbers
+from .filemesh import (
+    CORNERS,
+    INTERNAL,
+    Block,
+    FileMesh,
+    Unreadable,
+    as_bytes,
+    corners_note,
+    sets_of_numbers,
+    whole_numbers,
+)
 from .split import fan, split_polyhedron
 
 #: VTK's cell types by the kind that their corners make; corners come first in cells of any order.
@@ -40,11 +50,6 @@ MANY_FACED = {
     HEXAPRISM: ("hexagonal prism", "hexagonal prisms"),
     POLYHEDRON: ("polyhedron", "polyhedra"),
 }
-#: Arrays that do not number regions.
-INTERNAL = (
-    *("vtkGhostType", "vtkOriginalCellIds", "vtkOriginalPointIds"),
-    *("GlobalCellIds", "GlobalElementId", "GlobalPointIds", "GlobalNodeId"),
-)
 
 
 def read(path: Path) -> FileMesh | dict[str, NDArray[Any]]:
