@@ -52,7 +52,7 @@ class StaticReport:
         correction: The largest displacement of the last iteration over the largest displacement.
         energy: Elastic energy minus the work of loads and gravity from the rest shape, of all worlds [J].
         time: Wall time [s].
-        load_share: Share of loads and gravity that the state carries; less than 1 if the solve did not converge.
+        load_share: Share of loads and gravity that the state carries in worlds that did not converge; else 1.
         world_converged: Whether each world is at rest, bool [worlds].
         displacements: With ``precision="float64"`` those of the answer [m], float64 [worlds * N, 3]; else None.
         contacts: The places where obstacles or the body itself push it.
@@ -184,12 +184,12 @@ def static_answer(
     )
     found = solver.solve(nested_start(body, law, forces, answer.loads) if steps == 1 else None)
     answer.finish()
-    converged = found.converged & (solver.share == 1.0)
+    converged = found.converged
     if precision == FLOAT64 and converged.all():
         return _precise(answer, law, solver, began), None
     report = answer.report(
         began,
-        "the body is at rest" if converged.all() else _what_stopped(answer, solver, status_words(found)),
+        "the body is at rest" if converged.all() else _what_stopped(answer, solver, status_words(found), converged),
         iterations=solver.iterations,
         linear_iterations=solver.linear_iterations,
         residual=float(found.residual.max()),
@@ -318,8 +318,8 @@ class _Answer(LoadedBody):
         )
 
 
-def _what_stopped(answer: _Answer, solver: StaticSolver, why: str) -> str:
-    """The message of a solve that did not converge."""
+def _what_stopped(answer: _Answer, solver: StaticSolver, why: str, converged: npt.NDArray[np.bool_]) -> str:
+    """The message of a solve that did not converge in all worlds."""
     from warp_corot.mesh.pieces import pieces_of
 
     body = answer.body
@@ -331,4 +331,8 @@ def _what_stopped(answer: _Answer, solver: StaticSolver, why: str) -> str:
         why = f"nothing holds {loose} of the {int(piece.max()) + 1} pieces of the mesh"
     elif answer.turns():
         why = f"{LOADS_TURN}; {FIX_MORE}"
-    return f"not converged: {why}; the body is left at rest under {solver.share:.3g} of its load"
+    where, kept = "", "the body is left at rest under {:.3g} of its load"
+    if converged.any():
+        where = f" in {int((~converged).sum())} of {body.worlds} worlds"
+        kept = "these are left at rest under {:.3g} of their load"
+    return f"not converged{where}: {why}; {kept.format(solver.share)}"

@@ -258,6 +258,20 @@ def test_a_load_without_an_answer_keeps_the_last_state_at_rest(device):
     assert np.array_equal(displaced(body), before)
 
 
+def test_a_world_without_an_answer_leaves_others_theirs(device):
+    body, alone = beam(3, device=device, worlds=3), beam(3, device=device)
+    tip = body.mesh.points[:, 2] > 3 * CUBE - 1e-9
+    body.load(np.flatnonzero(tip), [0.0, 1e30, 0.0], worlds=[1])
+    found, expected = (wc.solve_static(each, gravity=GRAVITY, iterations=30) for each in (body, alone))
+    assert expected.converged
+    assert found.world_converged.tolist() == [True, False, True]
+    assert not found.converged
+    assert "not converged in 1 of 3 worlds" in found.message
+    moved = displaced(body).reshape(3, -1, 3)
+    for world in (0, 2):
+        np.testing.assert_allclose(moved[world], displaced(alone), rtol=0.0, atol=1e-5 * np.abs(moved[world]).max())
+
+
 @pytest.mark.parametrize(
     ("options", "says"),
     [

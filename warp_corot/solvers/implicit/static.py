@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -44,7 +45,7 @@ class StaticSolver:
 
     Attributes:
         iterations, linear_iterations: Sums over all load steps, of the world that needed most.
-        share: The fraction of the load in the last good state.
+        share: The fraction of the load in the last good state, of worlds that are not at rest under all of it.
     """
 
     def __init__(
@@ -67,7 +68,8 @@ class StaticSolver:
         self.share = 0.0
 
     def solve(self, near: npt.NDArray[np.float32] | None = None) -> NewtonReport:
-        """Find the state of rest, or leave the body in the last good state on the way there. Waits for the device.
+        """Find the state of rest, or leave worlds that have none in the last good state on the way there. Waits for the
+        device. Worlds are at rest under the whole load where the report says that they converged.
 
         Args:
             near: Displacements near the answer [m], [nodes, 4]. They are used if the body's free nodes are at rest,
@@ -106,11 +108,13 @@ class StaticSolver:
         if first is not None:
             wp.copy(newton.increment, first)
         self.share, step = 0.0, 1.0 / self._load_steps
+        answers = _Answers(newton)
         if self._limits:
             report = self._solve_at_once(start, graph)
             if report.converged.all():
                 self.share = 1.0
                 return report
+            answers.take(report, 1.0)
             wp.copy(newton.increment, good)
             step = 0.5
         while True:
@@ -123,11 +127,14 @@ class StaticSolver:
                     return report
                 wp.copy(good, newton.increment)
                 continue
+            answers.take(report, share)
             wp.copy(newton.increment, good)
             step *= 0.5
-            if step < self._least_share:
+            if step < self._least_share or answers.found.all():
+                self.share = 1.0 if answers.found.all() else self.share
+                answers.put_into(good)
                 self._put_back(good)
-                return report
+                return answers.reported(report)
 
     def _solve_at_once(self, start: wp.array, graph: wp.Graph) -> NewtonReport:
         """Add the whole load to a body that hardly changes its volume: from a state that is not at rest directly, which
@@ -228,6 +235,43 @@ class StaticSolver:
         wp.copy(self.newton.increment, increment)
         self.newton.running.zero_()
         self.newton.launch_begin()
+
+
+class _Answers:
+    """The worlds that came to rest under the whole load while others did not, and where they did.
+
+    Attributes:
+        found: Whether each world has, bool [worlds].
+    """
+
+    def __init__(self, newton: Newton):
+        self._newton, worlds = newton, newton.worlds
+        self.found = np.zeros(worlds, bool)
+        self._status = np.full(worlds, int(kernels.STUCK), np.int32)
+        self._kept = np.zeros((worlds, newton.operator.node_count, 4), np.float32)
+
+    def take(self, report: NewtonReport, share: float) -> None:
+        """Keep the worlds that are at rest under the whole load for the first time, and why others failed. Waits for
+        the device."""
+        self._status = np.where(report.converged, self._status, report.status)
+        new = report.converged & ~self.found & (share == 1.0)
+        if new.any():
+            self._kept[new] = self._by_world(self._newton.increment.numpy())[new]
+            self.found |= new
+
+    def put_into(self, increment: wp.array) -> None:
+        """Put the worlds that were kept into an increment."""
+        values = increment.numpy().copy()
+        self._by_world(values)[self.found] = self._kept[self.found]
+        increment.assign(values)
+
+    def reported(self, report: NewtonReport) -> NewtonReport:
+        """The report with the status of each world under the whole load."""
+        return replace(report, status=np.where(self.found, int(kernels.CONVERGED), self._status))
+
+    def _by_world(self, values: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        worlds, count = len(self.found), self._newton.operator.node_count
+        return values[: worlds * count].reshape(worlds, count, 4)
 
 
 def _determinants(points: npt.NDArray[np.float64], tets: npt.NDArray[np.int32]) -> npt.NDArray[np.float64]:
