@@ -5,10 +5,10 @@ import warp as wp
 from .bearing import share_bearers
 from .boxes import edge_reach, root_of, triangle_reach, triangle_size
 from .closest import on_segments, on_triangle, point_of
-from .locate import ENDS, FACING, edge_normal
+from .locate import ENDS, FACING, edge_normal, node_faces_at_rest
 from .motion import Surface
 from .near import CRUSHED, PAIRED, Near, mark
-from .rows import BAND, Meeting, Rows, row_count
+from .rows import BAND, BAND_AT_REST, Meeting, Rows, row_count
 from .watch import Watch
 
 wp.set_module_options({"enable_backward": False})
@@ -83,10 +83,21 @@ def node_is_near(s: int, t: int, out: wp.vec3, surface: Surface, meeting: Meetin
     e = surface.x[c[2]]
     x = surface.x[s]
     way = x - point_of(on_triangle(x, a, b, e), a, b, e)
+    distance = wp.length(way)
     far = meeting.reach[s] + triangle_reach(surface, meeting, c)
-    if wp.dot(way, normal) < 0.0:
-        far += BAND * triangle_size(surface, c)
-    return wp.length(way) <= far
+    if wp.dot(way, normal) >= 0.0:
+        return distance <= far
+    band = BAND * triangle_size(surface, c)
+    if not (distance <= far + band):
+        return False
+    if meeting.body[s] == meeting.body[c[0]]:
+        # Deeper nodes of the same body do not count as touching; see ``locate.deepest``.
+        apart = surface.rest[s] - surface.rest[c[0]]
+        most = wp.max(wp.length(apart), wp.length(surface.rest[s] - surface.rest[c[1]]))
+        most = wp.max(most, wp.length(surface.rest[s] - surface.rest[c[2]]))
+        if distance > far + BAND_AT_REST * most:
+            return node_faces_at_rest(s, c, apart, surface, meeting)
+    return True
 
 
 @wp.func

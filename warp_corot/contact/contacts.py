@@ -12,7 +12,6 @@ from warp_corot.kernels.contact import bearing, motion, sums
 from warp_corot.kernels.contact.begin import BEGIN_STEP
 from warp_corot.kernels.contact.end import END_CONTACT
 from warp_corot.kernels.contact.law import SETTLING, Law
-from warp_corot.kernels.contact.motion import Surface
 from warp_corot.solvers.ranks import ALONE, Ranks
 from warp_corot.solvers.system import System
 
@@ -104,7 +103,7 @@ class Contacts:
             given = (self.surface, self.obstacles, self.search, self.law, system.pace.arrays, self._ranks, self.pairs)
             self.rigid = RigidForces(*given)
         #: Steps while nothing is near; None where the device cannot leave anything out.
-        self.sleep = Sleep(self) if self.search.can_sleep else None
+        self.sleep = Sleep(system, made, self.obstacles, self.search) if self.search.can_sleep else None
         self._revision = 0
         self._is_looked_at = self._has_crushed = False
         self._make_arrays()
@@ -199,7 +198,7 @@ class Contacts:
             if part.bearers and len(system.constraints) > 1:
                 # Grasps add to the forces of nodes that bear nothing, too.
                 state.contact_forces.zero_()
-            start, count, arrays = self.nodes_of(k)
+            start, count, arrays = self.surface.nodes_of(k)
             places = self._count(k) if follows else 0
             inputs = [start, count, part.start, places, int(part.bearers > 0), arrays, surface.arrays]
             inputs += [int(counts), damping, system.gravity, conditions.inverse_mass, int(conditions.has_loads)]
@@ -237,7 +236,7 @@ class Contacts:
         if not np.isfinite(thinnest):
             return
         for k, body in enumerate(self.system.bodies):
-            start, count, arrays = self.nodes_of(k)
+            start, count, arrays = self.surface.nodes_of(k)
             inputs = [start, arrays.node, body.state.velocities, thinnest]
             self._launch(motion.measure_rates, count, inputs, [self.system.motion_rates])
 
@@ -344,7 +343,7 @@ class Contacts:
         finds_borne = self.device.is_cuda and not surface.is_whole
         for k, body in enumerate(system.bodies):
             state, conditions, part = body.state, body.conditions, surface.parts[k]
-            start, count, arrays = self.nodes_of(k)
+            start, count, arrays = self.surface.nodes_of(k)
             borne = self._count(k) if part.bearers and finds_borne else 0
             moved = system.worlds * obstacles.count if moves and k == 0 else 0
             inputs = [start, count, part.start, borne, damping, system.gravity, conditions.inverse_mass]
@@ -399,13 +398,6 @@ class Contacts:
             body.state.contact_pressures = pressures if self.system.worlds > 1 else pressures[:triangles]
             body.state.contact_surface = part.skin.own
             body.state.rebound_contact_surface = self.surface.rebound(body)
-
-    def nodes_of(self, k: int) -> tuple[int, int, Surface]:
-        """The nodes that carry a body's surface: the first one, how many there are, and their arrays."""
-        part = self.surface.parts[k]
-        if part.bearers:
-            return part.bearer_start, self.system.worlds * part.bearers, self.surface.own_bearers
-        return part.start, self.system.worlds * part.nodes, self.surface.own
 
     def _count(self, k: int) -> int:
         """Number of places of a body in all worlds."""

@@ -11,24 +11,31 @@ from warp_corot.kernels.contact import sleep as kernels
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from .contacts import Contacts
+    from warp_corot.solvers.system import System
+
+    from .obstacles import Obstacles
+    from .search import Search
+    from .surface import ContactSurface
 
 
 class Sleep:
     """What steps of awake and of sleeping contact launch.
 
     Args:
-        contacts: The contact of the system.
+        system: The bodies.
+        surface: Their surfaces.
+        obstacles: The obstacles.
+        search: The search for nearby surfaces.
     """
 
-    def __init__(self, contacts: Contacts):
-        self._contacts, self._system, self._watch = contacts, contacts.system, contacts.search.watch
-        self._device = contacts.device
+    def __init__(self, system: System, surface: ContactSurface, obstacles: Obstacles, search: Search):
+        self._system, self._surface, self._obstacles = system, surface, obstacles
+        self._watch, self._device = search.watch, search.device
 
     @property
     def is_framed(self) -> bool:
         """Whether margins count motion relative to frames; see ``Search.launch``."""
-        return not self._contacts.obstacles.count
+        return not self._obstacles.count
 
     def launch(self, offset: int, act: Callable[[], None]) -> None:
         """Launch the motion of obstacles, and what contact does in a step while it is awake.
@@ -37,10 +44,10 @@ class Sleep:
             offset: The number of steps since the clock was last advanced.
             act: Launches that.
         """
-        obstacles = self._contacts.obstacles
+        obstacles = self._obstacles
         obstacles.launch_targets()
         for k, body in enumerate(self._system.bodies):
-            start, count, nodes = self._contacts.nodes_of(k)
+            start, count, nodes = self._surface.nodes_of(k)
             moved = self._system.worlds * obstacles.count if k == 0 else 0
             threads = 1 if self._device.is_cpu else max(count, moved)
             inputs = [
@@ -60,7 +67,7 @@ class Sleep:
     def launch_check(self) -> None:
         """Launch the test after a run whether anything moved too far in its last step."""
         for k in range(len(self._system.bodies)):
-            start, count, nodes = self._contacts.nodes_of(k)
+            start, count, nodes = self._surface.nodes_of(k)
             inputs = [start, nodes, int(self.is_framed), self._system.pace.arrays, *self._places(k)]
             wp.launch(kernels.check_sleep, count, inputs, [self._watch], device=self._device)
 

@@ -184,6 +184,13 @@ class ContactSurface:
         followed = self._followed.get(self.bodies.index(body)) if body in self.bodies else None
         return None if followed is None else followed.last
 
+    def nodes_of(self, k: int) -> tuple[int, int, Surface]:
+        """The nodes that carry a body's surface: the first one, how many there are, and their arrays."""
+        part = self.parts[k]
+        if part.bearers:
+            return part.bearer_start, self.worlds * part.bearers, self.own_bearers
+        return part.start, self.worlds * part.nodes, self.own
+
     def places_of(self, k: int) -> slice:
         """The places of a body's nodes."""
         part = self.parts[k]
