@@ -77,6 +77,20 @@ def are_neighbours(s: int, c: wp.vec3i, meeting: Meeting):
 
 
 @wp.func
+def faces(s: int, n: wp.vec3, surface: Surface, meeting: Meeting):
+    """Whether a surface with the normal n is one that a node may touch: one of the faces around the node, or all
+    together, must face it.
+    """
+    out = wp.vec3()
+    for k in range(meeting.corner_starts[s], meeting.corner_starts[s + 1]):
+        each = triangle_normal(surface, meeting.triangles[meeting.corners[k] / 3])
+        if wp.dot(each, n) < FACING:
+            return True
+        out += each
+    return wp.dot(out, n) < FACING * wp.length(out)
+
+
+@wp.func
 def locate_node(row: int, s: int, t: int, surface: Surface, meeting: Meeting, rows: Rows):
     """A node at a triangle."""
     c = meeting.triangles[t]
@@ -95,6 +109,8 @@ def locate_node(row: int, s: int, t: int, surface: Surface, meeting: Meeting, ro
             return False
         n = way / length
         gap = length
+        if not faces(s, n, surface, meeting):
+            return False
     rows.places[row] = wp.vec4i(s, c[0], c[1], c[2])
     rows.shares[row] = wp.vec4(1.0, -w[0], -w[1], -w[2])
     rows.normal[row] = n

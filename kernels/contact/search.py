@@ -22,6 +22,8 @@ SHARP = wp.constant(0.15)
 #: The largest cosine between the normals of a node and a triangle of one body that may face each other before the next
 #: search.
 MAY_FACE = wp.constant(0.5)
+#: The largest cosine between the normals of a node and a triangle of two bodies that may touch before the next search.
+MAY_TOUCH = wp.constant(-0.3)
 #: Edges that bend by up to about 100 degrees, whose normals add up to at least this, touch only what they face.
 BLUNT = wp.constant(1.25)
 
@@ -60,6 +62,21 @@ def may_meet(s: int, r: int, surface: Surface, meeting: Meeting):
 
 
 @wp.func
+def faces(s: int, n: wp.vec3, surface: Surface, meeting: Meeting):
+    """Whether a node may touch a triangle with the normal n before the next search: one of the faces around the node,
+    or all together, must face it. A node in a plane face that lies on another body's rim does not touch the faces
+    beyond that rim, which would hold it back.
+    """
+    out = wp.vec3()
+    for k in range(meeting.corner_starts[s], meeting.corner_starts[s + 1]):
+        each = meeting.normals[meeting.corners[k] / 3]
+        if wp.dot(each, n) < MAY_TOUCH:
+            return True
+        out += each
+    return wp.dot(out, n) < MAY_TOUCH * wp.length(out)
+
+
+@wp.func
 def node_is_near(s: int, t: int, out: wp.vec3, surface: Surface, meeting: Meeting, near: Near):
     """Whether a node and a triangle may touch before the next search; ``out`` is the normal at the node."""
     c = meeting.triangles[t]
@@ -85,19 +102,17 @@ def node_is_near(s: int, t: int, out: wp.vec3, surface: Surface, meeting: Meetin
     way = x - point_of(on_triangle(x, a, b, e), a, b, e)
     distance = wp.length(way)
     far = meeting.reach[s] + triangle_reach(surface, meeting, c)
-    if wp.dot(way, normal) >= 0.0:
-        return distance <= far
-    band = BAND * triangle_size(surface, c)
-    if not (distance <= far + band):
-        return False
-    if meeting.body[s] == meeting.body[c[0]]:
-        # Deeper nodes of the same body do not count as touching; see ``locate.deepest``.
-        apart = surface.rest[s] - surface.rest[c[0]]
-        most = wp.max(wp.length(apart), wp.length(surface.rest[s] - surface.rest[c[1]]))
-        most = wp.max(most, wp.length(surface.rest[s] - surface.rest[c[2]]))
-        if distance > far + BAND_AT_REST * most:
-            return node_faces_at_rest(s, c, apart, surface, meeting)
-    return True
+    if distance > far:
+        if wp.dot(way, normal) >= 0.0 or not (distance <= far + BAND * triangle_size(surface, c)):
+            return False
+        if meeting.body[s] == meeting.body[c[0]]:
+            # Deeper nodes of the same body do not count as touching; see ``locate.deepest``.
+            apart = surface.rest[s] - surface.rest[c[0]]
+            most = wp.max(wp.length(apart), wp.length(surface.rest[s] - surface.rest[c[1]]))
+            most = wp.max(most, wp.length(surface.rest[s] - surface.rest[c[2]]))
+            if distance > far + BAND_AT_REST * most:
+                return node_faces_at_rest(s, c, apart, surface, meeting)
+    return meeting.body[s] == meeting.body[c[0]] or faces(s, normal, surface, meeting)
 
 
 @wp.func

@@ -29,6 +29,22 @@ def closest(p, a, b, c):
     return np.where(inside, np.abs(height), least)
 
 
+def face_each_other(s, t, x, corners, body):
+    """Whether a node of one body and a triangle of another face each other: one of the faces around the node faces the
+    triangle within 60 degrees, or all of them together do."""
+    a, b, c = (x[corners[:, k]] for k in range(3))
+    normals = np.cross(b - a, c - a)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    out, least = np.zeros_like(x), np.ones(len(s))
+    for face in np.flatnonzero(corners[:, 0] >= 0):
+        for corner in corners[face]:
+            out[corner] += normals[face]
+            at = s == corner
+            least[at] = np.minimum(least[at], normals[t[at]] @ normals[face])
+    together = (out[s] * normals[t]).sum(axis=1) / np.maximum(np.linalg.norm(out[s], axis=1), 1e-30)
+    return (body[s] == body[corners[t, 0]]) | (np.minimum(least, together) < -0.5)
+
+
 def within_reach(contacts, itself):
     """All nodes and triangles that could meet in the last step, tested one by one: [n, 2]."""
     surface = contacts.surface
@@ -44,7 +60,8 @@ def within_reach(contacts, itself):
     s, t, c = s[may], t[may], c[may]
     far = closest(x[s], x[c[:, 0]], x[c[:, 1]], x[c[:, 2]])
     near = far <= step[s] + step[c].max(axis=1)
-    return np.column_stack([s, t])[near]
+    s, t = s[near], t[near]
+    return np.column_stack([s, t])[face_each_other(s, t, x, corners, body)]
 
 
 def candidates(contacts):

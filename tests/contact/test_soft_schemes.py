@@ -26,17 +26,21 @@ def test_a_block_that_falls_on_a_block_comes_to_rest(device, scheme):
     ground = wc.Ground()
     sim = wc.Simulation([low, high], obstacles=ground, gravity=DOWN, integrator=scheme)
     felt, mass, shares = np.zeros(3), high.masses.sum(), high.masses / high.masses.sum()
+    # It falls by 10 mm; docs/implicit.md says how fast blocks rebound.
+    fastest = np.sqrt(2.0 * 9.81 * 0.01) / 6.0
     for _ in range(24):
         sim.advance_steps(1)
         felt += DT * force_on(high)
         on_ground = ground.wrench.numpy()[0].astype(float)[:3]
         np.testing.assert_allclose(force_on(low) + force_on(high) + on_ground, 0.0, atol=1e-4 * np.abs(on_ground).max())
         speed = shares @ high.velocities.numpy().astype(float)
-        assert speed[2] < 0.05
+        assert speed[2] < fastest
         assert high.positions.numpy()[:, 2].min() > 0.019
     assert force_on(high)[2] == pytest.approx(weight(high), rel=1e-3)
     assert on_ground[2] == pytest.approx(-weight(low) - weight(high), rel=1e-3)
-    assert felt[2] == pytest.approx(24 * DT * weight(high) + mass * speed[2], rel=0.02)
+    # Schemes of second order have an impact's impulse wrong by up to a quarter (docs/implicit.md).
+    impulse = 24 * DT * weight(high) + mass * speed[2]
+    assert felt[2] == pytest.approx(impulse, rel=0.02 if isinstance(scheme, wc.BackwardEuler) else 0.25)
     assert sim.solves.unfinished == 0
 
 
