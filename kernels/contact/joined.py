@@ -247,7 +247,6 @@ def judge_round(
     iterations: wp.array[wp.int32],
     changed: wp.array[wp.int32],
     total: wp.array[wp.int32],
-    most: int,
     settled: wp.float64,
     near: wp.float64,
     # In and out
@@ -266,7 +265,7 @@ def judge_round(
     is_settled = changed[0] == 0 and not had_much_to_do(scalars, 0, settled)
     locates[0] = wp.where(changed[0] == 0 and not had_much_to_do(scalars, 0, near), 1, 0)
     changed[0] = 0
-    going[0] = wp.where((is_settled and was_located) or rounds[0] >= most, 0, 1)
+    going[0] = wp.where(is_settled and was_located, 0, 1)
 
 
 @wp.kernel(enable_backward=False)

@@ -3,15 +3,17 @@
 import warp as wp
 
 from .law import Law
-from .shapes import CAPSULE, Shapes, distance_to
+from .rolling import Rolling, rolling_of
+from .shapes import CAPSULE, SPHERE, Shapes, distance_to
 from .touches import CORNER, nearest
 
 wp.set_module_options({"enable_backward": False})
 
 #: An obstacle must be closer to a triangle than to its corners by this many times the size of rounding errors.
 CLOSER = wp.constant(4.0)
-#: The point of a triangle stays if another is closer by at most this many times the law's slack.
-STAYS = wp.constant(8.0)
+#: The point of a triangle stays if another is closer by at most this many times the law's slack, and goes no farther
+#: than to where it would stay.
+STAYS = wp.constant(1.0)
 
 
 @wp.struct
@@ -27,6 +29,8 @@ class Found:
     is_at_end: wp.bool  # whether the gap is that at the end of the step
     allowed: float  # how far the obstacle may sink in [m]
     friction: float
+    rolling: Rolling
+    tilt: wp.vec3  # its tilt there
 
 
 @wp.func
@@ -46,7 +50,7 @@ def find_span(
     """The point of a triangle that is closest to an obstacle, if that is within reach and closer than the corners.
 
     The point with the shares ``before`` stays if it is hardly less close: along an edge of an obstacle all points are
-    about as close, and forces that jump between them do not come to rest.
+    about as close, and forces that jump between them do not come to rest. On round obstacles it rolls instead.
     """
     found = Found()
     found.is_near = False
@@ -63,23 +67,35 @@ def find_span(
         gap = -2.0 * shapes.size[o][0] - gap
     if gap > far or wp.max(w) > CORNER:
         return found
-    # The fourth is the former point.
     points = wp.matrix_from_rows(a, b, c, before[0] * a + before[1] * b + before[2] * c)
+    is_round = shapes.kind[o] == SPHERE or shapes.kind[o] == CAPSULE
     tried = int(3)
-    if wp.dot(was, was) > 0.0 and wp.max(before) <= CORNER and shapes.kind[o] != CAPSULE:
+    if wp.dot(was, was) > 0.0 and wp.max(before) <= CORNER and not is_round:
         tried = 4
-    # This loop is not unrolled, so that there is one distance function to compile.
+    # The corners, the former point, and the one where it goes. This loop is not unrolled, so that there is one distance
+    # function to compile.
     k = int(0)
+    point = points[0]
     while k < tried:
-        there, away = distance_to(shapes, o, pose, points[k], most)
+        if k < 4:
+            point = points[k]
+        there, away = distance_to(shapes, o, pose, point, most)
         if k < 3 and there <= gap + CLOSER * law.tolerance:
             return found
-        if k == 3 and there <= gap + STAYS * law.slack:
-            w = before
+        if k == 3:
+            beyond = there - gap
+            if beyond > STAYS * law.slack:
+                w = before + (1.0 - wp.sqrt(STAYS * law.slack / beyond)) * (w - before)
+                point = w[0] * a + w[1] * b + w[2] * c
+                tried = 5
+            else:
+                w = before
+        if k >= 3:
             gap = there
             n = away
         k += 1
     found.is_near = True
+    found.rolling = rolling_of(o, pose, w, gap, n, a, b, c, shapes)
     found.shares = w
     found.gap = gap
     found.normal = n

@@ -9,6 +9,7 @@ from .carriers import Carriers, crowd_at, ease_at, is_held_at, motion_at
 from .law import Law, held_back
 from .motion import Motions, Surface
 from .nearest_span import Found, find_span
+from .rolling import tilted
 from .shapes import GROUND, Shapes, carried, distance_to
 from .spans import Spans
 from .springs import kept_gap
@@ -19,12 +20,13 @@ wp.set_module_options({"enable_backward": False})
 
 #: Which spans are found: all at the beginning of the step, all again if that is due, or those that are missing.
 FIRST, AGAIN, MISSING = (wp.constant(k) for k in range(3))
-#: An obstacle may sink into triangles by this fraction of half its thickness. Otherwise all triangles around a ball are
-#: tangent to it, hold off the nodes, and make bodies much too stiff. So nodes less than 1.26 radii apart need no spans.
+#: An obstacle may sink into triangles by this fraction of half its thickness, but not into wide triangles of own
+#: surfaces. Otherwise all triangles around a ball are tangent to it, hold off the nodes, and make bodies much too
+#: stiff. So nodes less than 1.26 radii apart need no spans.
 ALLOWED = wp.constant(0.2)
-#: Triangles with an edge longer than this, in halves of an obstacle's thickness, are wide: obstacles between their
-#: corners may sink in less.
-WIDE = wp.constant(0.8)
+#: Triangles with an edge longer than this, in halves of an obstacle's thickness, are wide: between corners that are
+#: nearer each other a round obstacle sinks in by less than 0.5 % of its radius.
+WIDE = wp.constant(0.2)
 
 
 @wp.func
@@ -75,6 +77,10 @@ def take_span(
     spans.listed[o, t] = 1
     spans.base[o, t] = base
     spans.target[o, t] = target
+    spans.rolling[o, t] = found.rolling
+    spans.tilt[o, t] = found.tilt
+    spans.moment[o, t] = wp.vec3()
+    spans.bend[o, t] = push * found.rolling.distance
     spans.multiplier[o, t] = push * n + held_back(across(was, n), push, found.friction)
     touches.force[o, t] = spans.multiplier[o, t]
     wp.atomic_add(spans.count, 0, 1)
@@ -140,10 +146,14 @@ def locate_spans(
         found.moved = carried(now, later, found.shares * x)
         found.opened = wp.dot(found.normal, found.shares * e - found.moved)
         found.is_at_end = is_at_end
+        if not is_at_end:
+            found.rolling.distance = 0.0
+        if found.is_near and found.rolling.distance > 0.0:
+            found.tilt = tilted(found.rolling, found.shares, found.normal, e)
         found.allowed = ALLOWED * thickness[o]
         longest = wp.max(wp.length(x[0] - x[1]), wp.max(wp.length(x[1] - x[2]), wp.length(x[2] - x[0])))
-        if longest > WIDE * thickness[o]:
-            found.allowed = wp.min(found.allowed, spans.deepest)
+        if spans.are_borne != 0 and longest > WIDE * thickness[o]:
+            found.allowed = 0.0
         found.friction = shapes.friction[o]
         if found.gap < -SKEWERED * thickness[o] - found.allowed:
             found.friction = 0.0

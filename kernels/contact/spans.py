@@ -13,6 +13,7 @@ from warp_corot.kernels.implicit.line_search import TRIED
 
 from .carriers import Carriers, motion_at, push_at
 from .motion import Surface
+from .rolling import Rolling, share_of_moment, tilted
 from .springs import bound_of, spring_state
 from .touches import Touches
 
@@ -30,11 +31,15 @@ class Spans:
     multiplier: wp.array2d[wp.vec3]  # [N]
     most: wp.array2d[wp.float32]  # most of friction [N]
     derivative: wp.array2d[wp.mat33]  # [N/m]
+    rolling: wp.array2d[Rolling]  # how the closest point moves
+    bend: wp.array2d[wp.float32]  # stiffness against tilts [N m]
+    tilt: wp.array2d[wp.vec3]  # where it is found
+    moment: wp.array2d[wp.vec3]  # against tilting [N m]
     count: wp.array[wp.int32]  # [1] how many are listed
     due: wp.array[wp.int32]  # [1] whether all are to be found again
     solves: wp.array[wp.int32]  # [1] how many linear solves the step has had so far
     stiff: float  # the stiffness of a span over that of its point
-    deepest: float  # how far an obstacle may sink into wide triangles at most [m]
+    are_borne: int  # whether nodes bear the corners
 
 
 @wp.func
@@ -45,6 +50,42 @@ def motion_of(w: wp.vec3, corners: wp.vec3i, surface: Surface, carriers: Carrier
         if w[k] != 0.0:
             e += w[k] * motion_at(corners[k], surface, carriers, d)
     return e
+
+
+@wp.func
+def tilt_of(
+    o: int,
+    t: int,
+    corners: wp.vec3i,
+    surface: Surface,
+    carriers: Carriers,
+    d: wp.array[wp.vec4],
+    touches: Touches,
+    spans: Spans,
+):
+    """The tilt of a triangle after motions d."""
+    e = wp.mat33()
+    for k in range(3):
+        e[k] = motion_at(corners[k], surface, carriers, d)
+    return tilted(spans.rolling[o, t], touches.shares[o, t], touches.normal[o, t], e)
+
+
+@wp.func
+def push_corners(
+    o: int,
+    t: int,
+    m: wp.vec3,
+    corners: wp.vec3i,
+    surface: Surface,
+    carriers: Carriers,
+    touches: Touches,
+    spans: Spans,
+    y: wp.array[wp.vec4],
+):
+    """Add the forces of a moment against tilting."""
+    for k in range(3):
+        force = share_of_moment(k, m, spans.rolling[o, t], touches.shares[o, t], touches.normal[o, t])
+        push_at(corners[k], force, surface, carriers, y)
 
 
 @wp.kernel(enable_backward=False)
@@ -65,13 +106,13 @@ def judge_spans(
     had just been found again, or there are none.
     """
     solves[0] = rounds[0]
-    if going[0] == 0 and due[0] == 0 and count[0] > 0 and rounds[0] < most:
+    if going[0] == 0 and due[0] == 0 and count[0] > 0:
         going[0] = 1
     is_near = changed[0] == 0
     for world in range(scalars.shape[0]):
         is_near = is_near and not had_much_to_do(scalars, world, near)
     due[0] = wp.where(is_near, 1, 0)
-    if going[0] == 0:
+    if going[0] == 0 or rounds[0] >= most:
         solves[0] = 0
 
 
@@ -108,6 +149,9 @@ def update_spans(
         last = spans.most[o, t]
         spans.most[o, t] = 0.0
         if spans.listed[o, t] != 0:
+            if spans.bend[o, t] > 0.0:
+                tilt = tilt_of(o, t, triangles[t], surface, carriers, d, touches, spans)
+                spans.moment[o, t] = spans.bend[o, t] * (spans.tilt[o, t] - tilt)
             e = motion_of(touches.shares[o, t], triangles[t], surface, carriers, d) - touches.moved[o, t]
             push = span_state(o, t, e, 0.0, touches, spans).push
             most = bound_of(last, push, touches.friction[o, t], is_solved != 0, spans.solves[0])
@@ -135,11 +179,14 @@ def add_span_forces(
     triangles: wp.array[wp.vec3i],
     carriers: Carriers,
     touches: Touches,
+    spans: Spans,
     y: wp.array[wp.vec4],
 ):
     """Add the forces of spans on nodes that are free [N]."""
     t = start + wp.tid()
     for o in range(touches.acts.shape[0]):
+        if spans.listed[o, t] != 0 and spans.bend[o, t] > 0.0:
+            push_corners(o, t, spans.moment[o, t], triangles[t], surface, carriers, touches, spans, y)
         if touches.acts[o, t] != 0:
             add_to_corners(touches.shares[o, t], touches.force[o, t], triangles[t], surface, carriers, y)
 
@@ -160,6 +207,9 @@ def add_span_products(
     """Add the derivative times x."""
     t = start + wp.tid()
     for o in range(touches.acts.shape[0]):
+        if spans.listed[o, t] != 0 and spans.bend[o, t] > 0.0:
+            m = spans.bend[o, t] * tilt_of(o, t, triangles[t], surface, carriers, x, touches, spans)
+            push_corners(o, t, m, triangles[t], surface, carriers, touches, spans, y)
         if touches.acts[o, t] != 0:
             w = touches.shares[o, t]
             product = spans.derivative[o, t] * motion_of(w, triangles[t], surface, carriers, x)
@@ -195,6 +245,11 @@ def add_span_slopes(
             e = motion_of(w, corners, surface, carriers, d) + float(search[world, TRIED]) * along - touches.moved[o, t]
             made = span_state(o, t, e, spans.most[o, t], touches, spans)
             power = wp.dot(wp.vec3d(made.force), wp.vec3d(along))
+            if spans.bend[o, t] > 0.0:
+                tilts = tilt_of(o, t, corners, surface, carriers, change, touches, spans)
+                tilt = tilt_of(o, t, corners, surface, carriers, d, touches, spans)
+                tilt += float(search[world, TRIED]) * tilts - spans.tilt[o, t]
+                power -= wp.float64(spans.bend[o, t]) * wp.dot(wp.vec3d(tilt), wp.vec3d(tilts))
             if power != wp.float64(0.0):
                 wp.atomic_add(slopes, world, power)
 
@@ -277,4 +332,8 @@ def gather_stiffness(
             for o in range(touches.acts.shape[0]):
                 if touches.acts[o, t] != 0:
                     total += touches.shares[o, t][corners[m] % 3] * spans.derivative[o, t]
+                    n = touches.normal[o, t]
+                    if spans.bend[o, t] > 0.0:
+                        slope = spans.rolling[o, t].slopes[corners[m] % 3]
+                        total += (spans.bend[o, t] * wp.length_sq(slope)) * wp.outer(n, n)
     stiffness[k] = total

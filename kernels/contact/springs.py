@@ -16,6 +16,9 @@ wp.set_module_options({"enable_backward": False})
 #: Number of solves after which the bounds of friction follow the push only by half of the change in each solve, then by
 #: a quarter. Friction may pull a place off the obstacle; then it would have a push and no friction in turns.
 HALVED, QUARTERED = wp.constant(6), wp.constant(16)
+#: What slides has no stiffness in the direction in which it slides. The matrix has only this share of the change: with
+#: all of it, places that start to slide in turns let a line search take only small parts of solves.
+LOOSE = wp.constant(0.9)
 
 
 @wp.struct
@@ -85,9 +88,8 @@ def spring_state(short: float, slip: wp.vec3, k: float, multiplier: wp.vec3, n: 
         plane = wp.identity(3, dtype=wp.float32) - whole
         share = float(1.0)
         if size > most:
-            # What slides has no stiffness in the direction in which it slides.
             share = most / size
-            plane -= wp.outer(sideways, sideways) / (size * size)
+            plane -= (LOOSE / (size * size)) * wp.outer(sideways, sideways)
         made.force += share * sideways
         made.derivative += (k * share) * plane
     return made

@@ -4,7 +4,7 @@ import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
 
-from .conjugate_gradients import had_much_to_do
+from .conjugate_gradients import BROKEN, LIMIT, had_much_to_do
 
 wp.set_module_options({"enable_backward": False})
 
@@ -109,7 +109,6 @@ def judge_round(
     iterations: wp.array[wp.int32],
     changed: wp.array[wp.int32],
     settled: wp.float64,
-    most: int,
     # In and out
     rounds: wp.array[wp.int32],
     total: wp.array[wp.int32],
@@ -123,4 +122,22 @@ def judge_round(
         if had_much_to_do(scalars, world, settled):
             again = 1
     rounds[0] = rounds[0] + 1
-    going[0] = wp.where(again != 0 and rounds[0] < most, 1, 0)
+    going[0] = again
+
+
+@wp.kernel(enable_backward=False)
+def end_rounds(
+    # In
+    rounds: wp.array[wp.int32],
+    most: int,
+    # In and out
+    going: wp.array[wp.int32],
+    # Out
+    status: wp.array[wp.int32],
+):
+    """End the solves of a step after ``most`` of them; the step is unfinished if another one should follow."""
+    if going[0] != 0 and rounds[0] >= most:
+        going[0] = 0
+        for world in range(status.shape[0]):
+            if status[world] != BROKEN:
+                status[world] = LIMIT

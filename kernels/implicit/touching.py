@@ -106,7 +106,9 @@ def judge_increments(
     status[world] = CONVERGED
     if solved[world] == BROKEN:
         status[world] = BROKEN
-    elif sizes[world, CHANGE] > tolerance * sizes[world, REACH]:
+    elif solved[world] == LIMIT:
+        status[world] = LIMIT
+    if status[world] != BROKEN and sizes[world, CHANGE] > tolerance * sizes[world, REACH]:
         status[world] = LIMIT
         if iterations[world] < most:
             going[0] = 1

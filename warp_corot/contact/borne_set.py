@@ -26,7 +26,7 @@ class BorneSet:
         k: The number of the body.
     """
 
-    rounds = 32
+    rounds = 100
     #: No node is held.
     nodes = None
 

@@ -37,7 +37,7 @@ ROUNDINGS = 16.0
 RECOVERY = 0.05
 #: Gaps at bodies' own surfaces of up to this fraction of the smallest element may stay as they are in implicit steps:
 #: places share nodes, so that forces that close all gaps exactly take many solves. In static answers times ``FINE``.
-SLACK, FINE = 0.002, 0.05
+SLACK, FINE = 0.0005, 0.2
 #: Gaps of more than this fraction of the smallest element besides their own motion do not close in an explicit step:
 #: nothing moves by more than a tenth of it.
 CLOSING = 0.25

@@ -10,18 +10,16 @@ import warp as wp
 from warp_corot.kernels.contact import span_places as finding
 from warp_corot.kernels.contact import spans as kernels
 from warp_corot.kernels.contact.law import Law
+from warp_corot.kernels.contact.rolling import Rolling
 from warp_corot.kernels.contact.touches import Touches
 from warp_corot.kernels.stepping.pace import Pace
 from warp_corot.solvers.implicit.operator import Springs
 
 from .carriers import PlaceCarriers
-from .pairs import smallest_size
 from .rigid_forces import RigidForces
 
-#: The stiffness of a span over that of its point; places of an own surface are many, and share nodes.
-STIFF, STIFF_OF_BORNE = 32.0, 8.0
-#: Obstacles sink into wide triangles of own surfaces by no more than this fraction of the smallest element.
-DEEPEST = 0.01
+#: The stiffness of a span over that of its point.
+STIFF = 32.0
 #: Types of the arrays of ``Spans``, and of those of ``Touches`` that points need.
 FIELDS = {
     "listed": wp.int32,
@@ -31,6 +29,10 @@ FIELDS = {
     "multiplier": wp.vec3,
     "most": wp.float32,
     "derivative": wp.mat33,
+    "rolling": Rolling,
+    "bend": wp.float32,
+    "tilt": wp.vec3,
+    "moment": wp.vec3,
 }
 OF_POINTS = {
     "shares": wp.vec3,
@@ -141,7 +143,7 @@ class Spans:
     def add_forces(self, y: wp.array) -> None:
         """Launch the addition of their forces at free nodes [N]."""
         for each in self._items:
-            self._launch(kernels.add_span_forces, each, [*self._places(each), each.touches, y])
+            self._launch(kernels.add_span_forces, each, [*self._places(each), each.touches, each.spans, y])
 
     def add_products(self, x: wp.array, y: wp.array) -> None:
         """Launch the addition of their derivative times x."""
@@ -184,9 +186,8 @@ class Spans:
         for name, dtype in FIELDS.items():
             setattr(spans, name, wp.zeros(touches.force.shape, dtype=dtype, device=self.device))
         spans.count, spans.due, spans.solves = self._count, self._due, self._solves
-        spans.stiff = STIFF_OF_BORNE if self._is_borne else STIFF
-        size = smallest_size([body.discretization.smallest_volume for body in self._rigid.surface.bodies])
-        spans.deepest = DEEPEST * size if self._is_borne else np.inf
+        spans.stiff = STIFF
+        spans.are_borne = int(self._is_borne)
         return spans
 
     def _made_springs(self) -> Springs:

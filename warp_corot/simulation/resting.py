@@ -26,6 +26,8 @@ LENGTHS = ((1e3, 0.5), (1e1, 0.5), (1.0, 0.1))
 ROUNDING = 8.0 * 2.0**-24
 #: Residual of each linear solve, and of forces that are in balance.
 LINEAR, BALANCED = 1e-5, 1e-3
+#: What ends a search whose last step did not find out what touches.
+UNFINISHED = "what touches kept changing in the linear solves of the last step"
 
 
 class Rest(NamedTuple):
@@ -113,17 +115,19 @@ def rest_on(
             sim.contact.settle(settling, exactly=number == 0)
         try:
             for _ in range(most):
+                unfinished = _unfinished(sim)
                 for body, start in zip(bodies, starts, strict=True):
                     body.state.set_velocities(np.zeros_like(start))
                 sim.advance_steps(1)
                 corrections = [_correction(body, dt) for body in bodies]
                 correction = np.max([each for each, _least in corrections], axis=0)
                 steps += 1
-                if all((each <= np.maximum(tolerance, least)).all() for each, least in corrections):
+                at_rest = all((each <= np.maximum(tolerance, least)).all() for each, least in corrections)
+                if at_rest and _unfinished(sim) == unfinished:
                     converged = _residuals(bodies, fields, loads) <= BALANCED
                     if converged.all():
                         break
-            fault = ""
+            fault = UNFINISHED if _unfinished(sim) > unfinished else ""
         except UnstableError as error:
             converged, fault = np.zeros(worlds, bool), str(error).split(" at step ")[0]
         linear += sim.solves.linear_iterations if sim.solves is not None else 0
@@ -135,6 +139,11 @@ def rest_on(
     contact_then = sim.contact if converged.all() else None
     residual = float(_residuals(bodies, fields, loads).max())
     return Rest(converged, steps, linear, float(correction.max()), residual, contact_then, rolls, fault)
+
+
+def _unfinished(sim: Simulation) -> int:
+    """The number of steps whose solves of contact ran out."""
+    return 0 if sim.solves is None else sim.solves.unfinished
 
 
 def _wave_time(body: SoftBody) -> float:

@@ -12,7 +12,7 @@ class Solves(NamedTuple):
         steps: Steps, once for each body.
         iterations: Iterations of Newton's method.
         linear_iterations: Iterations of conjugate gradients.
-        unfinished: Steps that did not reach the tolerance.
+        unfinished: Steps that did not reach the tolerance, or whose linear solves ran out while contact still changed.
     """
 
     steps: int

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import warp as wp
 
 from warp_corot.kernels.contact import joined as kernels
-from warp_corot.kernels.implicit.tangent import find_rest
+from warp_corot.kernels.implicit.tangent import end_rounds, find_rest
 
 from .conjugate_gradients import ConjugateGradients
 from .line_search import LineSearch
@@ -222,11 +222,13 @@ class JoinedSolve:
         for (held, part), b, q in each:
             held.launch_judgement(b, q, part)
             wp.launch(kernels.gather_change, 1, [held.changed, self._changed], device=self.device)
-        inputs = [self._solver.scalars, self._solver.iterations, self._changed, rows.total, ROUNDS, SETTLED, NEAR]
+        inputs = [self._solver.scalars, self._solver.iterations, self._changed, rows.total, SETTLED, NEAR]
         outputs = [rows.locates, self._rounds, self._linear, rows.solves, self._going]
         wp.launch(kernels.judge_round, 1, inputs, outputs, device=self.device)
         for held, _d in self._each_held(d):
             held.launch_going(self._solver.scalars, NEAR, held.changed, self._rounds, ROUNDS, self._going)
+        outputs = [self._going, self._solver.status]
+        wp.launch(end_rounds, 1, [self._rounds, ROUNDS], outputs, device=self.device)
 
     def _each_held(self, vector: wp.array) -> list[tuple[Held, wp.array]]:
         """The contacts of bodies with obstacles, and these bodies' parts of a vector."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import warp as wp
 
-from warp_corot.kernels.implicit.tangent import find_rest, judge_round
+from warp_corot.kernels.implicit.tangent import end_rounds, find_rest, judge_round
 
 from .line_search import LineSearch, SharedLineSearch
 from .newton import Newton
@@ -200,6 +200,8 @@ class FreePreconditioner:
 class TouchingSolve:
     """Solves for the step of ``newton`` with one linearisation, or with several; see ``TouchingNewton``.
 
+    If the number of linear solves is not enough, the status of the linear solver in ``newton`` says so.
+
     Args:
         newton: Newton's method with the operator, residual, preconditioner and linear solver.
         held: The contact of its body.
@@ -257,6 +259,8 @@ class TouchingSolve:
         self._operator.apply(d, self._q)
         held.launch_judgement(b, self._q, d)
         self._ranks.take_most(held.changed)
-        inputs = [newton.solver.scalars, newton.solver.iterations, held.changed, SETTLED, held.rounds]
+        inputs = [newton.solver.scalars, newton.solver.iterations, held.changed, SETTLED]
         wp.launch(judge_round, 1, inputs, [self._rounds, self.iterations, self._going], device=self.device)
         held.launch_going(newton.solver.scalars, NEAR, held.changed, self._rounds, held.rounds, self._going)
+        outputs = [self._going, newton.solver.status]
+        wp.launch(end_rounds, 1, [self._rounds, held.rounds], outputs, device=self.device)
