@@ -43,11 +43,12 @@ def test_edges_and_corners_of_a_brick_stay():
 
 
 def test_both_sides_of_a_plate_carry_the_same_force(plate, device):
-    """A small ball presses a plate on the ground; the same nodes bear the points of both sides."""
+    """A small ball presses a plate on the ground; the same nodes bear the points of both sides. Friction keeps it there:
+    without, it glides."""
     body, ground, ball = wc.SoftBody(plate, SOFT, device=device), wc.Ground(offset=-0.001), wc.Tool(wc.Sphere(0.005))
     ball.follow([0.0, 0.1], [(0.0, 0.0, 0.0062), (0.0, 0.0, 0.0057)])
     calm = wc.SymplecticEuler(viscosity=1e-3, damping=20.0)
-    given = {"gravity": DOWN, "contact": wc.Contact(friction=0.0), "integrator": calm}
+    given = {"gravity": DOWN, "contact": wc.Contact(friction=0.3), "integrator": calm}
     sim = wc.Simulation(body, obstacles=[ground, ball], **given)
     sim.advance(0.3)
     found = []
@@ -57,11 +58,10 @@ def test_both_sides_of_a_plate_carry_the_same_force(plate, device):
     carried, pressed = np.mean(found, axis=0)
     assert pressed > 0.02
     assert -carried == pytest.approx(pressed + 9.81 * body.masses.sum(), rel=1e-3)
-    assert np.ptp(found, axis=0).max() < 2e-3 * pressed
+    assert np.ptp(found, axis=0).max() < 1e-4 * pressed
     skin = plate.surface().moved(body.displacements.numpy())
     assert np.linalg.norm(skin - [0.0, 0.0, 0.0057], axis=1).min() > 0.005 - 2e-4
-    # Without friction it may glide.
-    assert np.abs(body.velocities.numpy()[:, 2]).max() < 1e-3
+    assert np.abs(body.velocities.numpy()).max() < 1e-3
 
 
 def pressed_by_a_ball(mesh, device, integrator, *, half, press, friction):
@@ -98,10 +98,10 @@ SLOW = pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "friction", "steps"),
     [
-        ("plate", 0.0, [0.005]),
+        ("plate", 0.3, [0.005]),
         ("plate of 1 mm", 0.3, [0.01]),
-        pytest.param("plate", 0.0, [0.0025, 0.01], marks=SLOW),
-        pytest.param("plate", 0.3, [0.0025, 0.005, 0.01], marks=SLOW),
+        pytest.param("plate", 0.0, [0.0025, 0.005, 0.01], marks=SLOW),
+        pytest.param("plate", 0.3, [0.0025, 0.01], marks=SLOW),
         pytest.param("plate of 1 mm", 0.0, [0.0025, 0.005, 0.01], marks=SLOW),
         pytest.param("plate of 1 mm", 0.3, [0.0025, 0.005], marks=SLOW),
         pytest.param("vessel", 0.0, [0.0025, 0.005, 0.01], marks=SLOW),
@@ -111,7 +111,8 @@ SLOW = pytest.mark.slow
 def test_implicit_steps_press_thin_bodies_as_explicit_ones_do(device, name, friction, steps):
     """The force of a ball is that of explicit steps to a tenth, and steady to a twentieth, for steps of any length.
 
-    Without friction the ball on the vessel is about to glide off: damping keeps it there.
+    Without friction plate and vessel are about to glide from under the ball: damping keeps them there on the CPU, and
+    elsewhere rounding may decide.
     """
     domain, elements, case = THIN[name]
     mesh = wc.TetForest.from_domain(domain, target_elements=elements)
