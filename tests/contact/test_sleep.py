@@ -39,7 +39,8 @@ def moved(sim):
 
 
 def test_far_obstacles_change_nothing(device):
-    """Not a single digit; nor do they cost searches. On CUDA one block makes steps without contact, in another order."""
+    """Not a single digit; nor do they cost searches. On CUDA one block makes the steps without contact, in another
+    order."""
     swinging = []
     for obstacles in ([], [wc.Ground(offset=-0.3), wc.Sphere(0.05, position=(0.5, 0.0, 0.0))]):
         body = cube(device)

@@ -43,8 +43,9 @@ def test_edges_and_corners_of_a_brick_stay():
 
 
 def test_both_sides_of_a_plate_carry_the_same_force(plate, device):
-    """A small ball presses a plate on the ground; the same nodes bear the points of both sides. Friction keeps it there:
-    without, it glides."""
+    """A small ball presses a plate on the ground; the same nodes bear the points of both sides. Friction keeps it
+    there, or it would glide away.
+    """
     body, ground, ball = wc.SoftBody(plate, SOFT, device=device), wc.Ground(offset=-0.001), wc.Tool(wc.Sphere(0.005))
     ball.follow([0.0, 0.1], [(0.0, 0.0, 0.0062), (0.0, 0.0, 0.0057)])
     calm = wc.SymplecticEuler(viscosity=1e-3, damping=20.0)
