@@ -62,7 +62,7 @@ def may_meet(s: int, r: int, surface: Surface, meeting: Meeting):
 
 
 @wp.func
-def faces(s: int, n: wp.vec3, surface: Surface, meeting: Meeting):
+def may_face(s: int, n: wp.vec3, surface: Surface, meeting: Meeting):
     """Whether a node may touch a triangle with the normal n before the next search: one of the faces around the node,
     or all together, must face it. A node in a plane face that lies on another body's rim does not touch the faces
     beyond that rim, which would hold it back.
@@ -112,7 +112,7 @@ def node_is_near(s: int, t: int, out: wp.vec3, surface: Surface, meeting: Meetin
             most = wp.max(most, wp.length(surface.rest[s] - surface.rest[c[2]]))
             if distance > far + BAND_AT_REST * most:
                 return node_faces_at_rest(s, c, apart, surface, meeting)
-    return meeting.body[s] == meeting.body[c[0]] or faces(s, normal, surface, meeting)
+    return meeting.body[s] == meeting.body[c[0]] or may_face(s, normal, surface, meeting)
 
 
 @wp.func
