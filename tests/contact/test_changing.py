@@ -134,6 +134,26 @@ def coarser(device):
     return body, wc.Simulation(body, obstacles=wc.Ground(offset=-0.03), remesh=remesh, **still)
 
 
+def test_contacts_are_listed_after_a_mesh_has_coarsened(device):
+    """Without a surface of its own, the places of a body are its nodes, whose number falls."""
+    mesh = wc.TetForest.box((2, 2, 1), 0.02, level=6, origin=(0.0, 0.0, 0.0))
+    body, far = wc.SoftBody(mesh, SOFT, device=device), wp.array([-1.0, 0.0], dtype=wp.float32, device=device)
+    given = {"min_level": 3, "refine_above": 1.0, "simplify_below": 0.5, "criterion": closeness, "parameters": far}
+    ground = wc.Ground()
+    remesh = wc.OnlineRemesh(every=5, **given)
+    sim = wc.Simulation(body, obstacles=ground, gravity=DOWN, integrator=wc.BackwardEuler(dt=0.01), remesh=remesh)
+    sim.advance_steps(4)
+    assert len(sim.contacts()) > 30
+    sim.advance_steps(20)
+    assert body.node_count < mesh.node_count // 3
+    found = sim.contacts()
+    forces = body.contact_forces.numpy().astype(float).sum(axis=0)
+    assert {each.body for each in found} == {body}
+    assert max(max(each.nodes) for each in found) < body.node_count
+    assert sum(each.normal_force for each in found) == pytest.approx(forces[2], rel=1e-5)
+    np.testing.assert_allclose(ground.wrench.numpy()[0, :3], -forces, rtol=1e-5, atol=1e-6)
+
+
 def test_the_surface_of_a_mesh_that_coarsens_keeps_its_shape(coarser):
     """Its points are about as near the drawn surface as those of the first mesh; without this they are 9 mm off."""
     body, sim = coarser

@@ -151,9 +151,8 @@ class CarriedForces:
         )
         anchors[:, found.places[same]] = self._rigid["anchors"][:, same]
         rigid.anchors.assign(anchors)
-        if self._surface.is_borne:
-            _add(forces, found.places, self._rigid["forces"])
-            rigid.forces.assign(forces)
+        _add(forces, found.places, self._rigid["forces"])
+        rigid.forces.assign(forces)
         allowances = np.full(rigid.allowances.shape, UNKNOWN, np.float32)
         allowances[:, found.places[stays]] = self._rigid["allowances"][:, stays]
         rigid.allowances.assign(allowances)
