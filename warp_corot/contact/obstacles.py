@@ -97,9 +97,10 @@ class Obstacles:
         rates = [tool.fastest() / tool.shape.thickness for tool in self.tools]
         if self._dt is not None and max(rates, default=0.0) * self._dt > LARGEST_SHARE:
             fastest = self.tools[int(np.argmax(rates))]
+            longest = 0.995 * LARGEST_SHARE / max(rates)  # still short enough once it is rounded to three digits
             raise InputError(
                 f"a {fastest!r} goes {1e3 * fastest.fastest() * self._dt:.3g} mm in a step, and bodies may pass "
-                f"through it; dt must be at most {LARGEST_SHARE / max(rates):.2g} s, or None"
+                f"through it; make it slower, or take a dt of at most {longest:.3g} s"
             )
         mode, first, keys, speed = [], [], [], []
         times, poses = [np.zeros(1)], [np.zeros((1, 7))]
