@@ -300,14 +300,19 @@ def test_an_overlap_at_the_start_warns_and_is_undone_slowly(device):
     assert motion(body)[0][2] < 0.003  # not thrown up
 
 
-def test_a_tool_that_is_too_fast_for_the_given_step_is_refused(device):
-    tool = wc.Tool(wc.Capsule(0.0005, 0.05, position=(0.0, 0.0, 0.1)))
-    options = {"obstacles": [tool], "integrator": wc.SymplecticEuler(dt=1e-4)}
-    wc.Simulation(block(device), **options)
-    with pytest.raises(wc.InputError, match=r"5 mm in a step.* dt must be at most 5e-06 s"):
-        tool.follow([0.0, 1.0], [(0.0, 0.0, 0.1), (0.0, 0.0, 50.1)])
+@pytest.mark.parametrize("z", [50.1, 33.4, 29.6])
+def test_a_tool_that_is_too_fast_for_the_given_step_is_refused(device, z):
+    """The message names a step with which it is not."""
+    tool, fast = wc.Tool(wc.Capsule(0.0005, 0.05, position=(0.0, 0.0, 0.1))), [(0.0, 0.0, 0.1), (0.0, 0.0, z)]
+    wc.Simulation(block(device), obstacles=[tool], integrator=wc.SymplecticEuler(dt=1e-4))
+    with pytest.raises(wc.InputError, match=r"[345](\.\d+)? mm in a step.* a dt of at most \S+ s$") as refused:
+        tool.follow([0.0, 1.0], fast)
     assert tool.keys is None
     tool.follow([0.0, 1.0], [(0.0, 0.0, 0.1), (0.0, 0.0, 0.2)])
+    named, tool = float(str(refused.value).split()[-2]), wc.Tool(wc.Capsule(0.0005, 0.05, position=(0.0, 0.0, 0.1)))
+    wc.Simulation(block(device), obstacles=[tool], integrator=wc.SymplecticEuler(dt=named))
+    tool.follow([0.0, 1.0], fast)
+    assert named > 0.98 * 1e-4 / (z - 0.1)
 
 
 # --- input ---------------------------------------------------------------------------------------------------------
