@@ -24,6 +24,7 @@ from warp_corot.kernels.elements.elements import (
 from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.kernels.modules import unique_kernel
 
+from .cycle import sum_over_lanes
 from .shared import row_at
 
 wp.set_module_options({"enable_backward": False})
@@ -227,9 +228,18 @@ def finish_leaves(
     inverses[world * ranks + i] = inverse
 
 
+@wp.func
+def matrix_over_lanes(part: wp.mat33, lanes: int):
+    """The sum of the parts of neighbouring threads."""
+    return wp.matrix_from_rows(
+        sum_over_lanes(part[0], lanes), sum_over_lanes(part[1], lanes), sum_over_lanes(part[2], lanes)
+    )
+
+
 @wp.kernel(enable_backward=False)
 def gather_products(
     # In
+    lanes: int,
     ranks: int,
     level_nodes: int,
     entries: int,
@@ -244,16 +254,24 @@ def gather_products(
     blocks: wp.array[wp.mat33],
     inverses: wp.array[wp.mat33],
 ):
-    """Find P^T A P of a coarser level and the inverses of its diagonal blocks."""
-    world, u = wp.tid()
+    """Find P^T A P of a coarser level and the inverses of its diagonal blocks.
+
+    Args:
+        lanes: The number of threads that share the sum of an entry.
+    """
+    world, thread = wp.tid()
+    u, lane = thread // lanes, thread % lanes
     i = upper[u][0]
     j = upper[u][1]
     total = wp.mat33()
     if free[world * ranks + i] != wp.uint8(0) and free[world * ranks + j] != wp.uint8(0):
         weights = wp.vec3(1.0, 0.5, 0.25)
-        for at in range(starts[u], starts[u + 1]):
+        for at in range(starts[u] + lane, starts[u + 1], lanes):
             code = codes[at]
             total += weights[code & 3] * fine_blocks[world * fine_entries + (code >> 2)]
+    total = matrix_over_lanes(total, lanes)
+    if lane > 0:
+        return
     where = places[u]
     first = world * entries
     if i == j:

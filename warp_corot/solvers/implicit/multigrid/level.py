@@ -15,6 +15,8 @@ LARGEST_EIGENVALUE = 4.0
 #: Lanes that share a row of a matrix on CUDA: of levels with more rows than this, and of others. Many rows keep the
 #: card busy; a small level takes no longer than its longest sum.
 LANES, MOST_LANES = ((100_000, 4), (5_000, 8)), 32
+#: Number of threads that share the sum of an entry of a coarser level's matrix on CUDA.
+GATHERING_LANES = 8
 
 
 def smoothing_factors(degree: int) -> list[tuple[float, float]]:
@@ -179,15 +181,16 @@ class Level(SmoothedLevel):
         """Compute the matrix P^T A P from the finer level's matrix A."""
         assert isinstance(fine, Level)
         pattern = self.pattern
-        inputs = [self.ranks, self.count, pattern.entries, fine.pattern.entries, self.free, pattern.upper]
+        lanes = 1 if self.device.is_cpu else GATHERING_LANES
+        inputs = [lanes, self.ranks, self.count, pattern.entries, fine.pattern.entries, self.free, pattern.upper]
         inputs += [pattern.sum_starts, pattern.codes, pattern.places, fine.blocks]
-        self.gather(values.gather_products, inputs)
+        self.gather(values.gather_products, inputs, lanes)
 
-    def gather(self, kernel: wp.Kernel, inputs: list[Any]) -> None:
-        """Launch a kernel that computes blocks and inverses, a thread for each entry of the upper triangle."""
+    def gather(self, kernel: wp.Kernel, inputs: list[Any], lanes: int = 1) -> None:
+        """Launch a kernel that computes blocks and inverses, with some threads for each entry of the upper triangle."""
         pattern = self.pattern
         inverses = self.inverses if self._unbounded is None else self._unbounded
-        self.launch(kernel, len(pattern.upper), inputs, [self.blocks, inverses])
+        self.launch(kernel, lanes * len(pattern.upper), inputs, [self.blocks, inverses])
         if self._unbounded is not None:
             inputs = [self.count, pattern.entries, pattern.starts, pattern.columns, self.blocks, inverses]
             self.launch(shared.bound_diagonal, self.count, inputs, [self.inverses])
