@@ -4,6 +4,7 @@ import warp as wp
 
 from warp_corot.kernels.stepping.threads import least_of_lanes, same_in_lanes
 
+from .extremes import extend_down, extend_up
 from .motion import Surface
 from .rows import BAND, Meeting, triangle_normal
 from .watch import Watch
@@ -83,13 +84,9 @@ def clear_bounds(watch: Watch, lower: wp.array2d[wp.vec3], upper: wp.array2d[wp.
 def extend_bounds(
     world: int, body: int, low: wp.vec3, high: wp.vec3, lower: wp.array2d[wp.vec3], upper: wp.array2d[wp.vec3]
 ):
-    """Extend a body's bounds; threads whose boxes are inside already do not wait for the others."""
-    a = lower[world, body]
-    b = upper[world, body]
-    if low[0] < a[0] or low[1] < a[1] or low[2] < a[2]:
-        wp.atomic_min(lower, world, body, low)
-    if high[0] > b[0] or high[1] > b[1] or high[2] > b[2]:
-        wp.atomic_max(upper, world, body, high)
+    """Extend a body's bounds."""
+    extend_down(lower, world, body, low)
+    extend_up(upper, world, body, high)
 
 
 @wp.func

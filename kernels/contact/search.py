@@ -7,15 +7,15 @@ from .boxes import edge_reach, root_of, triangle_reach, triangle_size
 from .closest import on_segments, on_triangle, point_of
 from .locate import ENDS, FACING, edge_normal, node_faces_at_rest
 from .motion import Surface
-from .near import CRUSHED, PAIRED, Near, mark
+from .near import CRUSHED, LINKED, PAIRED, Near, mark
 from .rows import BAND, BAND_AT_REST, Meeting, Rows, row_count
 from .watch import Watch
 
 wp.set_module_options({"enable_backward": False})
 
 #: Number of neighbours that a thread keeps; with more, it finds them a second time.
-KEPT = wp.constant(16)
-Kept = wp.types.vector(length=16, dtype=wp.int32)
+KEPT = wp.constant(32)
+Kept = wp.types.vector(length=32, dtype=wp.int32)
 
 #: Edges with a larger sine of the bend are sharp.
 SHARP = wp.constant(0.15)
@@ -62,18 +62,27 @@ def may_meet(s: int, r: int, surface: Surface, meeting: Meeting):
 
 
 @wp.func
-def may_face(s: int, n: wp.vec3, surface: Surface, meeting: Meeting):
-    """Whether a node may touch a triangle with the normal n before the next search: one of the faces around the node,
-    or all together, must face it. A node in a plane face that lies on another body's rim does not touch the faces
-    beyond that rim, which would hold it back.
-    """
+def node_normal(s: int, meeting: Meeting):
+    """The direction of the sum of the normals around a node."""
     out = wp.vec3()
     for k in range(meeting.corner_starts[s], meeting.corner_starts[s + 1]):
-        each = meeting.normals[meeting.corners[k] / 3]
-        if wp.dot(each, n) < MAY_TOUCH:
+        out += meeting.normals[meeting.corners[k] / 3]
+    return wp.normalize(out)
+
+
+@wp.func
+def may_face(s: int, out: wp.vec3, n: wp.vec3, meeting: Meeting):
+    """Whether a node with the normal ``out`` may touch a triangle with the normal n before the next search: one of the
+    faces around the node, or all together, must face it. A node in a plane face that lies on another body's rim does
+    not touch the faces beyond that rim, which would hold it back.
+    """
+    # Nearly all that are near face the triangle together.
+    if wp.dot(out, n) < MAY_TOUCH:
+        return True
+    for k in range(meeting.corner_starts[s], meeting.corner_starts[s + 1]):
+        if wp.dot(meeting.normals[meeting.corners[k] / 3], n) < MAY_TOUCH:
             return True
-        out += each
-    return wp.dot(out, n) < MAY_TOUCH * wp.length(out)
+    return False
 
 
 @wp.func
@@ -112,7 +121,7 @@ def node_is_near(s: int, t: int, out: wp.vec3, surface: Surface, meeting: Meetin
             most = wp.max(most, wp.length(surface.rest[s] - surface.rest[c[2]]))
             if distance > far + BAND_AT_REST * most:
                 return node_faces_at_rest(s, c, apart, surface, meeting)
-    return meeting.body[s] == meeting.body[c[0]] or may_face(s, normal, surface, meeting)
+    return meeting.body[s] == meeting.body[c[0]] or may_face(s, out, normal, meeting)
 
 
 @wp.func
@@ -208,6 +217,19 @@ def add_other(start: int, count: int, other: int, rows: Rows):
 
 
 @wp.func
+def in_order(kept: Kept, count: int):
+    """The first ones that are kept, in order."""
+    for k in range(1, count):
+        other = kept[k]
+        m = int(k)
+        while m > 0 and kept[m - 1] > other:
+            kept[m] = kept[m - 1]
+            m -= 1
+        kept[m] = other
+    return kept
+
+
+@wp.func
 def near_node(
     i: int, start: int, of_triangles: wp.uint64, surface: Surface, meeting: Meeting, near: Near, rows: Rows, kept: Kept
 ):
@@ -218,13 +240,13 @@ def near_node(
     low = surface.x[i] - beyond
     high = surface.x[i] + beyond
     out = wp.vec3()
-    if meeting.meets_itself != 0:
-        for k in range(meeting.corner_starts[i], meeting.corner_starts[i + 1]):
-            out += meeting.normals[meeting.corners[k] / 3]
-        out = wp.normalize(out)
+    knows = bool(False)
     for g in range(meeting.groups):
         root = root_of(0, g, i, low, high, surface, meeting)
         if root >= 0:
+            if not knows:
+                out = node_normal(i, meeting)
+                knows = True
             query = wp.bvh_query_aabb(of_triangles, low, high, root)
             t = int(0)
             while wp.bvh_query_next(query, t):
@@ -309,6 +331,16 @@ def mark_row(owner: int, other: int, meeting: Meeting, near: Near):
             mark(near, f[k], PAIRED)
 
 
+@wp.func
+def link_around(s: int, meeting: Meeting, near: Near):
+    """Mark the corners of the triangles around a node, whose motion turns their normals."""
+    for k in range(meeting.corner_starts[s], meeting.corner_starts[s + 1]):
+        c = meeting.triangles[meeting.corners[k] / 3]
+        for m in range(3):
+            if (near.flags[c[m]] & LINKED) == 0:
+                wp.atomic_or(near.flags, c[m], LINKED)
+
+
 @wp.kernel(enable_backward=False)
 def find_pairs(
     # In
@@ -341,11 +373,14 @@ def find_pairs(
     if count == 0:
         return
     if count <= KEPT:
+        kept = in_order(kept, count)
         for k in range(count):
-            add_other(start, k, kept[k], rows)
+            rows.other[start + k] = kept[k]
     else:
         near_owner(i, start, of_triangles, of_edges, surface, meeting, near, rows, kept)
     rows.counts[i] = count
+    if rows.sleeps != 0 and i < meeting.body.shape[0]:
+        link_around(i, meeting, near)
     before = old.starts[i]
     last = before + old.counts[i]
     for row in range(start, start + count):
@@ -357,6 +392,8 @@ def find_pairs(
             force = old.force[before]
         rows.owner[row] = i
         rows.force[row] = force
+        if rows.sleeps != 0:
+            rows.asleep[row] = 0.0
         mark_row(i, other, meeting, near)
 
 
@@ -378,9 +415,11 @@ def keep_rows(watch: Watch, rows: Rows, old: OldRows):
 
 @wp.kernel(enable_backward=False)
 def begin_rows(watch: Watch, rows: Rows):
-    """There are none."""
+    """There are none, and nothing has moved."""
     if watch.due[0] != 0:
         rows.total[0] = 0
+        rows.path[0] = 0.0
+        rows.moved[0] = 0.0
 
 
 @wp.kernel(enable_backward=False)

@@ -4,6 +4,7 @@ import warp as wp
 
 from warp_corot.kernels.stepping.pace import Pace
 
+from .extremes import raise_by_warp
 from .motion import Motions, Surface, distance_between, move_obstacle
 
 wp.set_module_options({"enable_backward": False})
@@ -179,8 +180,7 @@ def find_fastest(threads: int, surface: Surface, motions: Motions, obstacles: in
         world, o = pair_of(k, watch)
         fastest = wp.max(fastest, distance_between(motions.now[world, o], motions.later[world, o], motions.reach[o]))
         k += threads
-    if fastest > watch.fastest[0]:
-        wp.atomic_max(watch.fastest, 0, fastest)
+    raise_by_warp(watch.fastest, fastest)
 
 
 @wp.func

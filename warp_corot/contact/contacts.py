@@ -227,7 +227,10 @@ class Contacts:
 
     def joined_rows(self) -> JoinedRows | None:
         """The contact of soft surfaces in implicit steps, if they may touch."""
-        return None if self.pairs is None else JoinedRows(self.system, self.pairs, self.law)
+        if self.pairs is None:
+            return None
+        self.pairs.stay_awake()
+        return JoinedRows(self.system, self.pairs, self.law)
 
     def measure(self) -> None:
         thinnest = self.obstacles.thinnest
@@ -350,8 +353,9 @@ class Contacts:
             inputs += [int(conditions.has_loads), conditions.loads, system.pace.arrays, offset]
             inputs += [state.rest, state.forces, state.displacements, state.velocities, surface.bearers]
             frames = system.worlds if begins and k == 0 else 0
-            inputs += [frames, moved, obstacles.motions, world_starts, int(moves)]
-            outputs = [self.search.watch, arrays, surface.arrays]
+            links = int(self.pairs is not None and self.pairs.sleeps)
+            inputs += [links, self.search.near, frames, moved, obstacles.motions, world_starts, int(moves)]
+            outputs = [self.search.watch, None if self.pairs is None else self.pairs.moved, arrays, surface.arrays]
             self._launch(BEGIN_STEP[conditions.loads.dtype], max(count, borne, moved, frames), inputs, outputs)
         if isinstance(surface, WholeSurface):
             surface.complete()
@@ -370,9 +374,7 @@ class Contacts:
         if rigid is not None:
             rigid.launch(rounds)
         elif pairs is not None:
-            pairs.launch_begin(self.law)
-            for _ in range(rounds):
-                pairs.launch_round(self.law, self.system.pace.arrays)
+            pairs.launch_rounds(self.law, self.system.pace.arrays, rounds)
 
     def _make_arrays(self) -> None:
         surface, device = self.surface, self.device
