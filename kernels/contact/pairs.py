@@ -1,11 +1,12 @@
 """Contact between soft surfaces: nodes with triangles, and edges with edges.
 
-Rows are solved as in ``triangles``. Their contributions to nodes are summed as integers, so the order of threads does
-not matter.
+Rows are solved as in ``triangles``. If results must be reproducible, their contributions to nodes are summed as integers,
+so that the order of threads does not matter; otherwise as floats, of which a card adds a vector at once.
 """
 
 import warp as wp
 
+from warp_corot.kernels.elements.elements import add_force, load_node
 from warp_corot.kernels.stepping.pace import DT, Pace
 
 from .bearing import ease, forget_forces, give_way, is_borne, loose_share
@@ -126,6 +127,11 @@ def grains_of(force: wp.vec3, grain: float):
 @wp.func
 def push_by_warp(row: int, force: wp.vec3, law: Law, rows: Rows, added: wp.array[wp.vec3l]):
     """Add a pair's force to its places, by all threads of a warp, some of which may have none."""
+    if rows.exact == 0:
+        if wp.dot(force, force) > 0.0:
+            for k in range(4):
+                add_force(rows.summed, rows.places[row][k], rows.shares[row][k] * force)
+        return
     p = wp.vec4i(-1, -1, -1, -1)
     w = wp.vec4()
     if wp.dot(force, force) > 0.0:
@@ -332,23 +338,41 @@ def solve_rows(
 
 
 @wp.func
-def apply(s: int, law: Law, surface: Surface, added: wp.array[wp.vec3l], crowd: wp.array[wp.int32]):
-    crowd[s] = 0
+def take_sum(s: int, law: Law, rows: Rows, added: wp.array[wp.vec3l]):
+    """The force that was added at a place, which begins at zero again."""
+    if rows.exact == 0:
+        force = load_node(rows.summed, s)
+        if wp.dot(force, force) > 0.0:
+            rows.summed[s] = wp.vec4()
+        return force
     grains = added[s]
-    forget_forces(s, surface)
     if grains[0] != wp.int64(0) or grains[1] != wp.int64(0) or grains[2] != wp.int64(0):
-        force = law.grain * wp.vec3(float(grains[0]), float(grains[1]), float(grains[2]))
+        added[s] = wp.vec3l()
+    return law.grain * wp.vec3(float(grains[0]), float(grains[1]), float(grains[2]))
+
+
+@wp.func
+def apply(s: int, law: Law, surface: Surface, rows: Rows, added: wp.array[wp.vec3l], crowd: wp.array[wp.int32]):
+    crowd[s] = 0
+    force = take_sum(s, law, rows, added)
+    forget_forces(s, surface)
+    if wp.dot(force, force) > 0.0:
         surface.f[s] = surface.f[s] + force
         if is_borne(s, surface):
             surface.bearing.gathered[s] = force
         else:
             surface.d[s] = surface.d[s] + surface.yielding[s] * force
-        added[s] = wp.vec3l()
 
 
 @wp.kernel(enable_backward=False)
 def apply_added(
-    threads: int, near: Near, law: Law, surface: Surface, added: wp.array[wp.vec3l], crowd: wp.array[wp.int32]
+    threads: int,
+    near: Near,
+    law: Law,
+    surface: Surface,
+    rows: Rows,
+    added: wp.array[wp.vec3l],
+    crowd: wp.array[wp.int32],
 ):
     """Give nodes what was added to their forces."""
     k = wp.tid()
@@ -357,7 +381,7 @@ def apply_added(
         s = near.nodes[k]
         k += threads
         if (near.flags[s] & PAIRED) != 0:
-            apply(s, law, surface, added, crowd)
+            apply(s, law, surface, rows, added, crowd)
         else:
             forget_forces(s, surface)
 

@@ -1,7 +1,7 @@
 """The rounds of forces between soft surfaces in one launch: blocks wait for one another between the parts of a round.
 
 A part takes no longer than two launches need to follow one another. All blocks must run at once, so there are no more
-of them than the device has multiprocessors. The forces are those of the launches in ``pairs``, to the last bit.
+of them than the device has multiprocessors. The forces are those of the launches in ``pairs``, to the last bit if results must be reproducible.
 """
 
 import warp as wp
@@ -75,6 +75,7 @@ def apply_all(
     near: Near,
     law: Law,
     surface: Surface,
+    rows: Rows,
     added: wp.array[wp.vec3l],
     crowd: wp.array[wp.int32],
 ):
@@ -84,7 +85,7 @@ def apply_all(
         s = near.nodes[k]
         k += threads
         if (near.flags[s] & PAIRED) != 0:
-            apply(s, law, surface, added, crowd)
+            apply(s, law, surface, rows, added, crowd)
 
 
 @wp.kernel(enable_backward=False, grid_stride=False, launch_bounds=BLOCK)
@@ -114,7 +115,7 @@ def make_rounds(
     dt = float(pace.seconds[DT])
     if thread == 0:
         end_path(rows)
-    apply_all(thread, threads, near, law, surface, added, crowd)
+    apply_all(thread, threads, near, law, surface, rows, added, crowd)
     number = int(0)
     while number < rounds:
         synchronize_blocks(blocks, arrived)
@@ -122,5 +123,5 @@ def make_rounds(
         synchronize_blocks(blocks, arrived)
         solve(thread, threads, law, dt, surface, friction, crowd, rows, added)
         synchronize_blocks(blocks, arrived)
-        apply_all(thread, threads, near, law, surface, added, crowd)
+        apply_all(thread, threads, near, law, surface, rows, added, crowd)
         number += 1

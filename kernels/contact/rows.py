@@ -57,6 +57,8 @@ class Rows:
     more: wp.array[wp.vec3]
     live: wp.array[wp.int32]  # those that may push in this step
     live_count: wp.array[wp.int32]  # [1]
+    exact: int  # whether forces on places are summed as integers, so that the order of threads does not matter
+    summed: wp.array[wp.vec4]  # [S] these sums, if not
     sleeps: int  # whether pairs that are beside one another sleep until their places have moved far enough
     path: wp.array[wp.float32]  # [1] how far places near others have moved at most since the search [m]
     moved: wp.array[wp.float32]  # [1] how far in this step

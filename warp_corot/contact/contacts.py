@@ -97,7 +97,8 @@ class Contacts:
         self.law = self._law(stable_dt)
         self.search = Search(self.surface, self.obstacles, self.smallest, branches=system.ranks.is_alone)
         #: Contact between soft surfaces; None if they cannot touch one another.
-        self.pairs = Pairs(self.surface, self.search, options, system.ranks) if meets else None
+        exact = self.device.is_cpu or not system.ranks.is_alone or any(field.deterministic for field in system.fields)
+        self.pairs = Pairs(self.surface, self.search, options, system.ranks, exact=exact) if meets else None
         self.rigid: RigidForces | None = None
         if self.obstacles.count:
             given = (self.surface, self.obstacles, self.search, self.law, system.pace.arrays, self._ranks, self.pairs)

@@ -44,6 +44,7 @@ class Pairs:
         search: The search for nearby surfaces.
         options: The options of contact.
         ranks: The processes that compute other elements.
+        exact: Whether sums of forces do not depend on the order of threads.
 
     Attributes:
         rows: The pairs, as a struct for kernels.
@@ -55,7 +56,15 @@ class Pairs:
         revision: Changes whenever launches do.
     """
 
-    def __init__(self, surface: ContactSurface, search: Search, options: Contact, ranks: Ranks = ALONE):
+    def __init__(
+        self,
+        surface: ContactSurface,
+        search: Search,
+        options: Contact,
+        ranks: Ranks = ALONE,
+        *,
+        exact: bool = True,
+    ):
         self._ranks = ranks
         self.surface, self.search, self.device = surface, search, surface.device
         self.friction, self.meets_itself, self._flat_edges = options.friction, options.self_contact, options.flat_edges
@@ -63,6 +72,7 @@ class Pairs:
         self._path, self.moved = (wp.zeros(1, dtype=wp.float32, device=self.device) for _ in range(2))
         self._arrived = wp.zeros(1, dtype=wp.uint64, device=self.device)
         self.together = self.device.is_cpu
+        self.exact = exact
         self.sleeps = ranks.is_alone and not surface.is_borne
         search.watch.most_calm = CALM_ITSELF if self.meets_itself else CALM
         if self.meets_itself:
@@ -98,6 +108,7 @@ class Pairs:
         self.meeting = meeting
         self._crowd = wp.zeros(count, dtype=wp.int32, device=device)
         self._added = wp.zeros(count, dtype=wp.vec3l, device=device)
+        self._summed = wp.zeros(1 if self.exact else count, dtype=wp.vec4, device=device)
         self._boxes = [
             tuple(wp.zeros(max(number, 1), dtype=wp.vec3, device=device) for _ in range(2))
             for number in (surface.triangle_count, edges)
@@ -136,7 +147,8 @@ class Pairs:
         rows.shares = wp.zeros(room, dtype=wp.vec4, device=device)
         rows.gap, rows.asleep = (wp.zeros(room, dtype=wp.float32, device=device) for _ in range(2))
         rows.path, rows.moved = self._path, self.moved
-        rows.sleeps = int(self.sleeps)
+        rows.sleeps, rows.exact = int(self.sleeps), int(self.exact)
+        rows.summed = self._summed
         return rows, old
 
     @property
@@ -297,7 +309,7 @@ class Pairs:
     def _apply(self, law: Law) -> None:
         """Launch the addition of these forces to the nodes."""
         among = self.search.at_nodes
-        inputs = [*among, law, self.surface.arrays, self._added, self._crowd]
+        inputs = [*among, law, self.surface.arrays, self.rows, self._added, self._crowd]
         wp.launch(kernels.apply_added, among[0], inputs, device=self.device)
         if self.surface.is_borne:
             wp.launch(kernels.settle_pairs, among[0], [*among, self.surface.arrays], device=self.device)
