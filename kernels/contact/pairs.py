@@ -1,7 +1,7 @@
 """Contact between soft surfaces: nodes with triangles, and edges with edges.
 
-Rows are solved as in ``triangles``. If results must be reproducible, their contributions to nodes are summed as integers,
-so that the order of threads does not matter; otherwise as floats, of which a card adds a vector at once.
+Rows are solved as in ``triangles``. If results must be reproducible, their contributions to nodes are summed as
+integers, so that the order of threads does not matter; otherwise as floats, of which a card adds a vector at once.
 """
 
 import warp as wp

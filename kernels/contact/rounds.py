@@ -1,7 +1,8 @@
 """The rounds of forces between soft surfaces in one launch: blocks wait for one another between the parts of a round.
 
 A part takes no longer than two launches need to follow one another. All blocks must run at once, so there are no more
-of them than the device has multiprocessors. The forces are those of the launches in ``pairs``, to the last bit if results must be reproducible.
+of them than the device has multiprocessors. The forces are those of the launches in ``pairs``, to the last bit if
+results must be reproducible.
 """
 
 import warp as wp
