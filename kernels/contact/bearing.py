@@ -99,6 +99,8 @@ def place_among(place: Foreseen, weight: float, own: Foreseen):
     place.yielding += weight * weight * own.yielding
     if own.yielding > 0.0:
         place.loose += weight
+    else:
+        place.held += weight * (own.x - own.rest)
     return place
 
 
@@ -126,6 +128,7 @@ def place_borne(start: int, bearers: Surface, surface: Surface):
     surface.d[s] = place.d
     surface.yielding[s] = place.yielding
     surface.bearing.loose[s] = wp.clamp(place.loose, 0.0, 1.0)
+    surface.bearing.held[s] = place.held
 
 
 @wp.func

@@ -134,6 +134,7 @@ def begin_step(
             surface.d[s] = place.d
             surface.yielding[s] = place.yielding
             surface.bearing.loose[s] = wp.clamp(place.loose, 0.0, 1.0)
+            surface.bearing.held[s] = place.held
     if links != 0:
         raise_by_warp(moved, way)
 

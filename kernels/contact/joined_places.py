@@ -11,6 +11,7 @@ from .law import Law, held_back
 from .motion import Surface
 from .rows import Meeting, Rows, row_count
 from .springs import kept_gap
+from .supports import left_at_pair, loose_at_pair, loose_part
 from .vertices import across
 
 wp.set_module_options({"enable_backward": False})
@@ -94,7 +95,8 @@ def locate(
     joined.base[row] = wp.vec3()
     opened = opened_by(row, d, rows, surface, carriers)
     if is_first != 0:
-        joined.target[row] = kept_gap(rows.gap[row], pushed, law, dt)
+        allowed = left_at_pair(p, w, rows.gap[row], rows.normal[row], surface)
+        joined.target[row] = kept_gap(rows.gap[row] + allowed, pushed, law, dt) - allowed
     else:
         joined.base[row] = opened
     n = rows.normal[row]
@@ -152,6 +154,7 @@ def stiffen_rows(threads: int, surface: Surface, carriers: Carriers, rows: Rows,
             while k < 4:
                 yielding += ease_at(p[k], w[k], surface, carriers)
                 k += 1
-            joined.stiffness[row] = STIFF / wp.max(yielding, 1.0e-30)
+            part = loose_part(loose_at_pair(p, w, surface))
+            joined.stiffness[row] = part * STIFF / wp.max(yielding, 1.0e-30)
             joined.near[wp.atomic_add(joined.counts, NEAR, 1)] = row
         row += threads

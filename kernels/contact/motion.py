@@ -18,6 +18,7 @@ class Bearing:
     bearers: wp.array[wp.vec4i]  # [S] places among the bearers; -1: the place is a node itself
     weights: wp.array[wp.vec4]  # [S] their weights
     loose: wp.array[wp.float32]  # [S] the share of the weights that free nodes have
+    held: wp.array[wp.vec3]  # [S] the part of the displacement that comes from held nodes [m]
     gathered: wp.array[wp.vec3]  # [S] forces that have not moved the places yet [N]
     yielding: wp.array[wp.float32]  # [B] additional motion per force [m/N]
     crowd: wp.array[wp.int32]  # [B] the sum of the weights of contacts that push, in multiples; see ``together``
@@ -66,6 +67,7 @@ class Foreseen:
     d: wp.vec3
     yielding: float
     loose: float  # share of the weights that free nodes have
+    held: wp.vec3  # part of the displacement that comes from held nodes [m]
 
 
 @wp.func

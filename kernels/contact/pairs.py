@@ -15,6 +15,7 @@ from .locate import locate_edge, locate_node
 from .motion import Surface
 from .near import PAIRED, Near
 from .rows import Meeting, Rows, end_path, path_to_now, row_count
+from .supports import left_at_pair
 from .vertices import across
 
 wp.set_module_options({"enable_backward": False})
@@ -173,7 +174,9 @@ def locate_row(row: int, surface: Surface, meeting: Meeting, rows: Rows):
 @wp.func
 def missing(row: int, law: Law, dt: float, surface: Surface, rows: Rows):
     """How much more the pair must open [m]."""
-    return least_motion(rows.gap[row], law, dt) - wp.dot(opened(row, surface, rows), rows.normal[row])
+    gap = rows.gap[row]
+    gap += left_at_pair(rows.places[row], rows.shares[row], gap, rows.normal[row], surface)
+    return least_motion(gap, law, dt) - wp.dot(opened(row, surface, rows), rows.normal[row])
 
 
 @wp.func

@@ -13,6 +13,7 @@ from .rolling import tilted
 from .shapes import GROUND, Shapes, carried, distance_to
 from .spans import Spans
 from .springs import kept_gap
+from .supports import left_at_triangle, loose_at_triangle, loose_part
 from .touches import SKEWERED, Touches
 from .vertices import across
 
@@ -60,9 +61,14 @@ def take_span(
         if wp.abs(short) <= law.slack:
             was = spans.multiplier[o, t]
     base = wp.where(found.is_at_end, found.opened, 0.0)
-    target = wp.where(was_listed, spans.target[o, t], -found.allowed)
-    if which == FIRST:
-        target = kept_gap(found.gap + found.allowed, pushed, law, float(pace.seconds[DT])) - found.allowed
+    target = spans.target[o, t]
+    if not was_listed:
+        # Where held nodes bear most of the point, it may stay as deep as the obstacle's motion leads.
+        there = found.gap - base - wp.dot(n, found.moved)
+        allowed = found.allowed + left_at_triangle(found.shares, corners, there, n, surface)
+        target = -allowed
+        if which == FIRST:
+            target = kept_gap(found.gap + allowed, pushed, law, float(pace.seconds[DT])) - allowed
     is_passed = found.gap + found.opened - base < target - law.tolerance
     if which == MISSING:
         if not is_passed:
@@ -252,7 +258,10 @@ def stiffen_spans(
     # In and out
     spans: Spans,
 ):
-    """Stiffness of spans: those that share nodes share it. A span whose corners are all held does nothing."""
+    """Stiffness of spans: those that share nodes share it. A span whose corners are all held does nothing.
+
+    Where most of them are, it is no stiffer than where half are: it would amplify rounding.
+    """
     t = start + wp.tid()
     for o in range(touches.force.shape[0]):
         if spans.listed[o, t] != 0:
@@ -263,4 +272,5 @@ def stiffen_spans(
                     yielding += ease_at(triangles[t][k], w[k], surface, carriers)
             spans.stiffness[o, t] = 0.0
             if yielding > 0.0:
-                spans.stiffness[o, t] = spans.stiff / yielding
+                loose = loose_at_triangle(w, triangles[t], surface)
+                spans.stiffness[o, t] = loose_part(loose) * spans.stiff / yielding

@@ -14,6 +14,7 @@ from .law import Law, held_back, least_motion, left_to_held
 from .motion import Motions, Surface
 from .near import AROUND, BESIDE, Near
 from .shapes import Shapes
+from .supports import left_at_triangle
 from .touches import Touches
 from .vertices import Beside, across, anchor, begin_borne, push_borne, touch
 
@@ -47,7 +48,9 @@ def judge_touch(o: int, t: int, law: Law, dt: float, surface: Surface, corners: 
     acts = int(0)
     if w[0] + w[1] + w[2] > 0.0:
         n = touches.normal[o, t]
-        wanted = least_motion(touches.gap[o, t], law, dt) - wp.dot(approach(touches, o, t, surface, corners), n)
+        gap = touches.gap[o, t]
+        gap += left_at_triangle(w, corners, gap, n, surface)
+        wanted = least_motion(gap, law, dt) - wp.dot(approach(touches, o, t, surface, corners), n)
         if wanted > 0.0 or wp.dot(touches.force[o, t], n) > 0.0:
             acts = 1
     touches.acts[o, t] = acts
@@ -146,7 +149,9 @@ def solve_touch(
         return
     n = touches.normal[o, t]
     d = approach(touches, o, t, surface, corners)
-    wanted = least_motion(touches.gap[o, t], law, dt) - wp.dot(d, n)
+    gap = touches.gap[o, t]
+    gap += left_at_triangle(w, corners, gap, n, surface)
+    wanted = least_motion(gap, law, dt) - wp.dot(d, n)
     wanted -= left_to_held(wanted + wp.dot(free, n), share)
     normal_force = wp.max(wp.dot(before, n) + wanted / yielding, 0.0)
     sideways = held_back(across(before, n) - across(d, n) / yielding, normal_force, touches.friction[o, t])

@@ -6,6 +6,7 @@ from .bearing import loose_share
 from .law import LOST, SETTLING, Law, allowed, held_back, least_motion, left_to_held
 from .motion import Motions, Surface
 from .shapes import MESH, Shapes, carried, distance_to
+from .supports import left_at_place
 
 wp.set_module_options({"enable_backward": False})
 
@@ -173,7 +174,7 @@ def push_borne(
         before = forces[o, s]
         if gap <= far or wp.dot(before, before) > 0.0:
             relative = d - moved
-            wanted = least_motion(gap, law, dt) - wp.dot(relative, n)
+            wanted = least_motion(gap + left_at_place(s, gap, n, surface), law, dt) - wp.dot(relative, n)
             wanted -= left_to_held(wanted + wp.dot(d, n), loose_share(s, surface))
             if wanted > 0.0 or wp.dot(before, n) > 0.0:
                 count += 1.0

@@ -262,6 +262,7 @@ class ContactSurface:
         borne = count if bearers else 0
         bearing.bearers = wp.empty(borne, dtype=wp.vec4i, device=device)
         bearing.loose = wp.zeros(borne, dtype=wp.float32, device=device)
+        bearing.held = wp.zeros(borne, dtype=wp.vec3, device=device)
         bearing.gathered = wp.zeros(borne, dtype=wp.vec3, device=device)
         bearing.yielding = self.bearers.yielding
         bearing.crowd = wp.zeros(bearers, dtype=wp.int32, device=device)
