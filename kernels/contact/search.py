@@ -270,15 +270,20 @@ def near_edge(
     b = surface.x[e[1]]
     reach = edge_reach(meeting, e)
     beyond = wp.vec3(reach, reach, reach)
-    own = bend(surface, meeting, k)
-    if own <= SHARP and (own < -SHARP or meeting.flat_edges == 0):
-        return 0, kept
     low = wp.min(a, b) - beyond
     high = wp.max(a, b) + beyond
-    out = meeting.outs[k]
+    own = float(0.0)
+    out = wp.vec3()
+    knows = bool(False)
     for g in range(meeting.groups):
         root = root_of(1, g, e[0], low, high, surface, meeting)
         if root >= 0:
+            if not knows:
+                own = bend(surface, meeting, k)
+                out = meeting.outs[k]
+                knows = True
+            if own <= SHARP and (own < -SHARP or meeting.flat_edges == 0):
+                return 0, kept
             query = wp.bvh_query_aabb(of_edges, low, high, root)
             m = int(0)
             while wp.bvh_query_next(query, m):
