@@ -13,9 +13,9 @@ def thrown(device, itself, *, sleeps, together):
     rng = np.random.default_rng(3)
     low = wc.SoftBody(wc.TetForest.box((2, 2, 1), 0.02, 3), SOFT, device=device)
     low.fix("z < 1e-9")
-    high = wc.SoftBody(wc.TetForest.box((1, 1, 1), 0.02, 3, origin=(0.013, 0.009, 0.02005)), SOFT, device=device)
+    high = wc.SoftBody(wc.TetForest.box((1, 1, 1), 0.02, 3, origin=(0.013, 0.009, 0.0202)), SOFT, device=device)
     x = high.positions.numpy()
-    high.velocities = np.cross(rng.uniform(-20.0, 20.0, 3), x - x.mean(axis=0)) + np.array([0.4, 0.1, -0.8])
+    high.velocities = np.cross(rng.uniform(-20.0, 20.0, 3), x - x.mean(axis=0)) + (0.4, 0.1, -0.5)
     sim = wc.Simulation(
         [low, high],
         contact=wc.Contact(self_contact=itself),
@@ -38,9 +38,9 @@ def test_results_do_not_depend_on_sleep_and_launches(device, itself):
         for sleeps, together in ((False, False), (True, False), (True, True))
     ]
     asleep = touching = 0
-    for run in range(6):
+    for run in range(12):
         for sim in sims:
-            if run == 3:
+            if run == 6:
                 high = sim.bodies[1]
                 high.positions = high.positions.numpy() + np.array([1e-3, -5e-4, 0.0], np.float32)
             sim.advance_steps(20)
@@ -52,5 +52,4 @@ def test_results_do_not_depend_on_sleep_and_launches(device, itself):
         count = int(rows.total.numpy()[0])
         asleep += int(np.sum(rows.asleep.numpy()[:count] > rows.path.numpy()[0]))
         touching += len(first.contacts())
-    assert asleep > 40
-    assert touching > 20
+    assert asleep > 100 and touching > 20

@@ -5,9 +5,7 @@ import pytest
 import warp as wp
 
 import warp_corot as wc
-from warp_corot.elasticity.corotated.subtree_tangent import subtrees_of
 from warp_corot.elasticity.viscosity import Viscosity
-from warp_corot.elasticity.viscous_subtrees import ViscousSubtrees
 from warp_corot.kernels.elements.lanes import LANES
 from warp_corot.kernels.elements.viscosity import ViscousMaterial, scatter_viscous
 
@@ -197,24 +195,3 @@ def test_elements_side_by_side_do_what_each_does_alone(mesh, amount, rng):
     np.testing.assert_allclose(state.forces.numpy(), expected.numpy(), rtol=0, atol=atol)
     rest, now = (np.linalg.det(np.diff(x[mesh.tets], axis=1)) for x in (mesh.points, body.positions.numpy()))
     assert (now / rest < 0.0).any() == (amount > 1.0)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("level", [3, 4, 5])
-def test_forces_over_subtrees_are_the_same(level, device, rng):
-    """As large bodies on CUDA have them: subtrees of each type in two worlds, with a modulus for each element."""
-    mesh = wc.TetForest.box((1, 1, 1), 0.1, level)
-    young = 1e5 * rng.uniform(0.5, 2.0, len(mesh.tets))
-    body = wc.SoftBody(mesh, wc.Isotropic(young, 0.3, 1000.0), worlds=2, device=device)
-    field = wc.Corotated().bind(body)
-    batches = subtrees_of(field.plan)
-    assert batches
-    body.displacements = np.stack([strained(mesh, rng) for _ in range(2)])
-    body.velocities = rng.normal(size=(2, *mesh.points.shape))
-    Viscosity(body, field, 0.1).add_forces()
-    expected = body.state.forces.numpy()
-    found = wp.zeros_like(body.state.forces)
-    material = ViscousMaterial()
-    material.isotropic, material.seconds, material.velocities = field.isotropic, 0.1, body.state.velocities
-    ViscousSubtrees(field, batches).launch(material, body.state.displacements, found)
-    np.testing.assert_allclose(found.numpy(), expected, rtol=0, atol=5e-6 * np.abs(expected).max())

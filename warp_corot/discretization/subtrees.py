@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-import numpy as np
 import warp as wp
 
 from warp_corot.kernels.elements.elements import ForestElements, Subtrees
@@ -57,17 +56,6 @@ class Batch:
     def flags_by_eights(self) -> wp.array:
         """``flagged`` as uint64, eight subtrees each."""
         return wp.array(ptr=self.flagged.ptr, dtype=wp.uint64, shape=len(self.flagged) // 8, device=self.flagged.device)
-
-    def with_own_targets(self, device: wp.Device) -> Subtrees:
-        """The subtrees with their nodes as targets, for kernels with one thread a subtree."""
-        given, found = self.subtrees, Subtrees()
-        found.code, found.first, found.frames, found.size = given.code, given.first, given.frames, given.size
-        found.nodes = given.nodes
-        if device.is_cpu:
-            places = np.ascontiguousarray(given.nodes.numpy()[: self.count].T)
-            found.nodes = wp.array(places, dtype=wp.int32, device=device)
-        found.targets = found.nodes
-        return found
 
 
 def chosen(values: wp.array, places: wp.array) -> wp.array:

@@ -10,10 +10,7 @@ import warp as wp
 from warp_corot.kernels.elements.viscosity import ViscousMaterial, scatter_viscous
 from warp_corot.kernels.elements.viscosity_cpu import scatter_viscous_eights
 
-from .corotated.elements import CorotatedField
-from .corotated.subtree_tangent import FEWEST, subtrees_of
 from .paths.elements import ByElements
-from .viscous_subtrees import ViscousSubtrees
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
@@ -44,7 +41,6 @@ class Viscosity:
         self.body, self.field, self.seconds, self._complete = body, field, seconds, complete
         self._scatter = ByElements(body.discretization, scatter_viscous, scatter_viscous_eights)
         #: Separate places for each element's forces, if sums must be reproducible.
-        self._subtrees: tuple[object, ViscousSubtrees | None] = (None, None)
         self._slotted = body.discretization.plan(subtrees=False, deterministic=True) if field.deterministic else None
 
     def add_forces(self) -> None:
@@ -56,11 +52,7 @@ class Viscosity:
     def scatter(self, u: wp.array, v: wp.array, f: wp.array) -> None:
         """Launch the kernel that adds the forces of displacements u and velocities v, linear in v, to f [N]."""
         if self._slotted is None:
-            over = self._over_subtrees
-            if over is None:
-                self._launch(self.field.elements, u, v, f)
-            else:
-                over.launch(self._material(v), u, f)
+            self._launch(self.field.elements, u, v, f)
             return
         slots = self._slotted.slots
         assert slots is not None
@@ -69,20 +61,6 @@ class Viscosity:
         slots.gather(f)
 
     def _launch(self, elements: object, u: wp.array, v: wp.array, f: wp.array) -> None:
-        self._scatter(elements, self.field.element_count, [self._material(v), u], [f])
-
-    def _material(self, v: wp.array) -> ViscousMaterial:
         material = ViscousMaterial()
         material.isotropic, material.seconds, material.velocities = self.field.isotropic, self.seconds, v
-        return material
-
-    @property
-    def _over_subtrees(self) -> ViscousSubtrees | None:
-        """The launches over subtrees, on CUDA for large bodies all of whose elements are in subtrees."""
-        field = self.field
-        if field.device.is_cpu or not isinstance(field, CorotatedField) or field.element_count < FEWEST:
-            return None
-        if self._subtrees[0] is not field.plan:
-            batches = subtrees_of(field.plan)
-            self._subtrees = (field.plan, None if batches is None else ViscousSubtrees(field, batches))
-        return self._subtrees[1]
+        self._scatter(elements, self.field.element_count, [material, u], [f])
