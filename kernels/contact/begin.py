@@ -9,9 +9,7 @@ from warp_corot.kernels.stepping.integrate import by_vectors, symplectic_euler_v
 from warp_corot.kernels.stepping.pace import DT, Pace, length_before
 
 from .bearing import place_among
-from .extremes import raise_by_warp
 from .motion import Foreseen, Motions, Surface
-from .near import LINKED, PAIRED, Near
 from .watch import Watch, begin_obstacle, pair_of
 
 wp.set_module_options({"enable_backward": False})
@@ -72,8 +70,6 @@ def begin_step(
     u: wp.array[wp.vec4],
     v: wp.array[wp.vec4],
     bearers: Surface,
-    links: int,
-    near: Near,
     frames: int,
     obstacles: int,
     motions: Motions,
@@ -81,7 +77,6 @@ def begin_step(
     watches: int,
     # In and out
     watch: Watch,
-    moved: wp.array[wp.float32],
     # Out
     nodes: Surface,
     surface: Surface,
@@ -91,13 +86,11 @@ def begin_step(
     Args:
         start, count: The first of the ``nodes``, which are places or bear them, and how many there are.
         borne_start, borne: The first place that nodes bear, and how many of them to find here.
-        links: Whether to find in ``moved`` how far nodes near other surfaces, and those beside them, have moved.
         frames: Number of worlds in which the frame of the watch moves.
         obstacles: Number of obstacles of all worlds to move.
         watches: Whether a search becomes due if they move too far.
     """
     k = wp.tid()
-    way = float(0.0)
     if k < frames:
         watch.drift[k] = watch.drift[k] + watch.common[k]
     if k < obstacles:
@@ -110,8 +103,6 @@ def begin_step(
         nodes.yielding[s] = 0.0
         if i >= 0:
             own = foreseen(i, damping, gravity, inverse_mass, has_load, load, pace, offset, rest, f, u, v)
-            if links != 0 and (near.flags[s] & (PAIRED | LINKED)) != 0:
-                way = wp.length(own.x - nodes.x[s] - watch.common[nodes.world[s]])
             nodes.rest[s] = own.rest
             nodes.x[s] = own.x
             nodes.d[s] = own.d
@@ -135,8 +126,6 @@ def begin_step(
             surface.yielding[s] = place.yielding
             surface.bearing.loose[s] = wp.clamp(place.loose, 0.0, 1.0)
             surface.bearing.held[s] = place.held
-    if links != 0:
-        raise_by_warp(moved, way)
 
 
 BEGIN_STEP = by_vectors(begin_step, "load")

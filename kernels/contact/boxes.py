@@ -84,9 +84,13 @@ def clear_bounds(watch: Watch, lower: wp.array2d[wp.vec3], upper: wp.array2d[wp.
 def extend_bounds(
     world: int, body: int, low: wp.vec3, high: wp.vec3, lower: wp.array2d[wp.vec3], upper: wp.array2d[wp.vec3]
 ):
-    """Extend a body's bounds."""
-    extend_down(lower, world, body, low)
-    extend_up(upper, world, body, high)
+    """Extend a body's bounds; most threads see that their boxes are inside already."""
+    a = lower[world, body]
+    b = upper[world, body]
+    if low[0] < a[0] or low[1] < a[1] or low[2] < a[2]:
+        extend_down(lower, world, body, low)
+    if high[0] > b[0] or high[1] > b[1] or high[2] > b[2]:
+        extend_up(upper, world, body, high)
 
 
 @wp.func
@@ -105,18 +109,22 @@ def bound_bodies(
     lower: wp.array2d[wp.vec3],
     upper: wp.array2d[wp.vec3],
 ):
-    """Extend the bounds of each body to the boxes of its triangles and of their edges."""
-    t = wp.tid()
+    """Extend the bounds of each body to the boxes of its triangles and of their edges. A warp takes triangles that
+    follow one another, nearly always of one body."""
+    lanes = wp.min(threads, LANES)
+    warps = threads / lanes
+    each = (meeting.triangles.shape[0] + warps - 1) / warps
+    t = wp.tid() / lanes * each + wp.tid() % lanes
+    end = wp.min((wp.tid() / lanes + 1) * each, meeting.triangles.shape[0])
     if watch.due[0] == 0:
         return
     low = wp.vec3(NOWHERE, NOWHERE, NOWHERE)
     high = -low
     world = int(-1)
     body = int(-1)
-    while t < meeting.triangles.shape[0]:
+    while t < end:
         c = meeting.triangles[t]
         if c[0] >= 0:
-            # Places are sorted by body, so a thread rarely moves on to another body.
             if meeting.body[c[0]] != body or surface.world[c[0]] != world:
                 if body >= 0:
                     extend_bounds(world, body, low, high, lower, upper)
@@ -132,8 +140,8 @@ def bound_bodies(
             beyond = wp.vec3(far, far, far)
             low = wp.min(low, wp.min(a, wp.min(b, e)) - beyond)
             high = wp.max(high, wp.max(a, wp.max(b, e)) + beyond)
-        t += threads
-    # Nearly all warps have one body only, and one of their threads is enough.
+        t += lanes
+    # One thread of a warp with one body is enough.
     first = wp.tid() % LANES == 0
     if same_in_lanes(world * lower.shape[1] + body):
         low = least_of_lanes(low)

@@ -4,7 +4,7 @@ import warp as wp
 
 from .closest import on_segments, on_triangle, point_of
 from .motion import Surface
-from .rows import BAND, BAND_AT_REST, BAND_OF_NEIGHBOURS, Meeting, Rows, path_to_now, triangle_normal
+from .rows import BAND, BAND_AT_REST, BAND_OF_NEIGHBOURS, Meeting, Rows, triangle_normal
 
 wp.set_module_options({"enable_backward": False})
 
@@ -16,9 +16,6 @@ BORDER = wp.constant(0.02)
 #: parallel.
 ENDS = wp.constant(1.0e-3)
 PARALLEL = wp.constant(0.05)
-#: If all places move by at most m, distances change by 2 m, and directions over a length l by 2 m / l; so much is
-#: reserved for either. Motions are at most a fraction of all lengths.
-CHANGE, SMALL = wp.constant(2.5), wp.constant(0.25)
 
 
 @wp.func
@@ -94,69 +91,6 @@ def faces(s: int, n: wp.vec3, surface: Surface, meeting: Meeting):
 
 
 @wp.func
-def height_of(a: wp.vec3, b: wp.vec3, c: wp.vec3):
-    """The least height of a triangle [m]."""
-    longest = wp.max(wp.length_sq(b - a), wp.max(wp.length_sq(c - b), wp.length_sq(a - c)))
-    return wp.length(wp.cross(b - a, c - a)) / wp.sqrt(longest)
-
-
-@wp.func
-def motion_until_facing(s: int, n: wp.vec3, length: float, height: float, surface: Surface, meeting: Meeting):
-    """How far all places may move until the node may face a surface with the normal n [m]; see ``faces``.
-
-    Args:
-        length: The distance of the node from there, in the direction n [m].
-        height: The least height of the triangle there [m].
-    """
-    out = wp.vec3()
-    least = float(1.0)
-    count = float(0.0)
-    for k in range(meeting.corner_starts[s], meeting.corner_starts[s + 1]):
-        c = meeting.triangles[meeting.corners[k] / 3]
-        a = surface.x[c[0]]
-        b = surface.x[c[1]]
-        e = surface.x[c[2]]
-        each = wp.normalize(wp.cross(b - a, e - a))
-        height = wp.min(height, height_of(a, b, e))
-        least = wp.min(least, wp.dot(each, n))
-        out += each
-        count += 1.0
-    whole = wp.length(out)
-    turn = CHANGE / length + CHANGE / height
-    alone = (least - FACING) / (turn + CHANGE / height)
-    together = (wp.dot(out, n) - FACING * whole) / (whole * turn + CHANGE * count / height)
-    return wp.min(wp.min(alone, together), SMALL * height)
-
-
-@wp.func
-def motion_until_at(
-    s: int,
-    a: wp.vec3,
-    b: wp.vec3,
-    e: wp.vec3,
-    way: wp.vec3,
-    gap: float,
-    size: float,
-    surface: Surface,
-    meeting: Meeting,
-):
-    """How far all places may move until a node beside a triangle may come above or below it, or face its border [m].
-
-    Args:
-        a, b, e: The triangle's corners.
-        way: From the closest point of the triangle to the node.
-        gap: Its part along the normal.
-        size: The triangle's size.
-    """
-    length = wp.length(way)
-    height = height_of(a, b, e)
-    beside = wp.sqrt(wp.max(length * length - gap * gap, 0.0))
-    above = beside / (CHANGE * (1.0 + 2.0 * wp.abs(gap) / height))
-    border = wp.min((length - BORDER * size) / (1.1 * CHANGE), SMALL * length)
-    return wp.min(wp.min(above, border), motion_until_facing(s, way / length, length, height, surface, meeting))
-
-
-@wp.func
 def locate_node(row: int, s: int, t: int, surface: Surface, meeting: Meeting, rows: Rows):
     """A node at a triangle."""
     c = meeting.triangles[t]
@@ -171,13 +105,11 @@ def locate_node(row: int, s: int, t: int, surface: Surface, meeting: Meeting, ro
     length = wp.length(way)
     gap = wp.dot(way, n)
     if wp.min(w) <= 0.0 and length > BORDER * size:
-        height = gap
+        if gap < 0.0:
+            return False
         n = way / length
         gap = length
-        if height < 0.0 or not faces(s, n, surface, meeting):
-            if rows.sleeps != 0:
-                free = motion_until_at(s, a, b, e, way, height, size, surface, meeting)
-                rows.asleep[row] = path_to_now(rows) + free
+        if not faces(s, n, surface, meeting):
             return False
     rows.places[row] = wp.vec4i(s, c[0], c[1], c[2])
     rows.shares[row] = wp.vec4(1.0, -w[0], -w[1], -w[2])

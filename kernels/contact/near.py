@@ -10,9 +10,8 @@ wp.set_module_options({"enable_backward": False})
 
 #: Flags for what is near a node: another soft surface, an obstacle, or an obstacle at an adjacent triangle.
 PAIRED, BESIDE, AROUND = wp.constant(1), wp.constant(2), wp.constant(4)
-#: Any of these flags; and flags for nodes of inverted elements, and for those of triangles around a node that is near
-#: another surface.
-SOMETHING, CRUSHED, LINKED = wp.constant(7), wp.constant(8), wp.constant(16)
+#: Any of these flags; and a flag for nodes of inverted elements.
+SOMETHING, CRUSHED = wp.constant(7), wp.constant(8)
 #: More room than there is [m].
 FAR = wp.constant(1.0e6)
 

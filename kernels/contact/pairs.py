@@ -14,7 +14,7 @@ from .law import Law, held_back, least_motion, left_to_held
 from .locate import locate_edge, locate_node
 from .motion import Surface
 from .near import PAIRED, Near
-from .rows import Meeting, Rows, end_path, path_to_now, row_count
+from .rows import Meeting, Rows, row_count
 from .supports import left_at_pair
 from .vertices import across
 
@@ -26,10 +26,6 @@ SHARES = wp.constant(1048576.0)
 FORESEEN = wp.constant(4.0)
 #: Number of threads of a warp.
 LANES = wp.constant(32)
-#: On CUDA a block of so many threads takes so many pairs at a time, and locates those that are awake.
-WIDTH, TILE = 256, 1024
-#: The actions of ``awake_rows``.
-COLLECT, AT = wp.constant(0), wp.constant(1)
 
 
 @wp.func
@@ -85,40 +81,6 @@ def list_by_warp(live: wp.array[wp.int32], count: wp.array[wp.int32], row: int, 
     ...
 
 
-@wp.func_native(f"""
-#if defined(__CUDA_ARCH__)
-    __shared__ int found[{TILE}], count;
-    if (what == 1) return found[k];
-    __syncthreads();
-    if (threadIdx.x == 0) count = 0;
-    __syncthreads();
-    const int lane = threadIdx.x & 31;
-    for (int row = first + threadIdx.x; row - lane < k; row += blockDim.x) {{
-        const bool is_awake = row < k && !(now < wp::index(asleep, row));
-        const unsigned those = __ballot_sync(0xffffffffu, is_awake);
-        int start = 0;
-        if (lane == 0 && those != 0) start = atomicAdd(&count, __popc(those));
-        start = __shfl_sync(0xffffffffu, start, 0);
-        if (is_awake) found[start + __popc(those & ((1u << lane) - 1u))] = row;
-    }}
-    __syncthreads();
-    return count;
-#else
-    if (what == 1) return first;
-    return now < wp::index(asleep, first) ? 0 : 1;
-#endif
-""")
-def awake_rows(what: int, first: int, k: int, now: float, asleep: wp.array[wp.float32]) -> int:
-    """A block's list of rows that are awake, as one function; on the CPU of one row.
-
-    Args:
-        what: The action: ``COLLECT`` them between ``first`` and ``k``, and return how many there are, which all threads
-            of the block must call; or return the one ``AT`` k.
-        now: How far places have moved.
-    """
-    ...
-
-
 @wp.func
 def grains_of(force: wp.vec3, grain: float):
     g = force / grain
@@ -145,8 +107,6 @@ def push_by_warp(row: int, force: wp.vec3, law: Law, rows: Rows, added: wp.array
 @wp.func
 def locate_row(row: int, surface: Surface, meeting: Meeting, rows: Rows):
     """Where a pair is closest, and the force with which it begins."""
-    if rows.sleeps != 0 and path_to_now(rows) < rows.asleep[row]:
-        return wp.vec3()
     nodes = meeting.body.shape[0]
     owner = rows.owner[row]
     is_near = bool(False)
@@ -248,53 +208,28 @@ def solve_row(
 # --- all of them, however many threads there are --------------------------------------------------------------------
 
 
-@wp.kernel(enable_backward=False, grid_stride=False, launch_bounds=WIDTH)
-def locate_rows(
-    # In
-    threads: int,
-    width: int,
-    tile: int,
-    law: Law,
-    surface: Surface,
-    meeting: Meeting,
-    # In and out
-    rows: Rows,
-    # Out
-    added: wp.array[wp.vec3l],
-):
+@wp.kernel(enable_backward=False)
+def locate_rows(threads: int, law: Law, surface: Surface, meeting: Meeting, rows: Rows, added: wp.array[wp.vec3l]):
     """Where each pair is closest, and the force with which it begins: that of the last step. Lists those that may push,
-    which are fewer than half.
-
-    Args:
-        width: The number of threads of a block, of which each warp stays together.
-        tile: The number of pairs of which a block lists those that are awake.
-    """
-    thread = wp.tid()
-    first = (thread / width) * tile
-    while first < row_count(rows):
-        count = awake_rows(COLLECT, first, wp.min(first + tile, row_count(rows)), path_to_now(rows), rows.asleep)
-        k = thread % width
-        beyond = count + k % wp.min(width, LANES)
-        while k < beyond:
-            row = int(0)
-            force = wp.vec3()
-            is_live = int(0)
-            if k < count:
-                row = awake_rows(AT, first, k, 0.0, rows.asleep)
-                force = locate_row(row, surface, meeting, rows)
-                is_live = may_push(row, law, surface, rows)
-            push_by_warp(row, force, law, rows, added)
-            list_by_warp(rows.live, rows.live_count, row, is_live)
-            k += width
-        first += (threads / width) * tile
+    which are fewer than half."""
+    row = wp.tid()
+    # Warps stay together.
+    beyond = row_count(rows) + row % wp.min(threads, LANES)
+    while row < beyond:
+        force = wp.vec3()
+        is_live = int(0)
+        if row < row_count(rows):
+            force = locate_row(row, surface, meeting, rows)
+            is_live = may_push(row, law, surface, rows)
+        push_by_warp(row, force, law, rows, added)
+        list_by_warp(rows.live, rows.live_count, row, is_live)
+        row += threads
 
 
 @wp.kernel(enable_backward=False)
 def judge_rows(threads: int, law: Law, pace: Pace, surface: Surface, rows: Rows, crowd: wp.array[wp.int32]):
     """Which pairs act, and the sum of their shares at each node."""
     k = wp.tid()
-    if k == 0:
-        end_path(rows)
     dt = float(pace.seconds[DT])
     while k < rows.live_count[0]:
         row = rows.live[k]

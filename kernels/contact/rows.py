@@ -59,10 +59,6 @@ class Rows:
     live_count: wp.array[wp.int32]  # [1]
     exact: int  # whether forces on places are summed as integers, so that the order of threads does not matter
     summed: wp.array[wp.vec4]  # [S] these sums, if not
-    sleeps: int  # whether pairs that are beside one another sleep until their places have moved far enough
-    path: wp.array[wp.float32]  # [1] how far places near others have moved at most since the search [m]
-    moved: wp.array[wp.float32]  # [1] how far in this step
-    asleep: wp.array[wp.float32]  # how far they must have moved before the pair has to be located again
 
 
 @wp.func
@@ -70,19 +66,6 @@ def row_count(rows: Rows):
     if rows.owner.shape[0] == 0:
         return 0
     return wp.min(rows.total[0], rows.owner.shape[0])
-
-
-@wp.func
-def path_to_now(rows: Rows):
-    """How far any place near others may have moved since the search [m]."""
-    return rows.path[0] + rows.moved[0]
-
-
-@wp.func
-def end_path(rows: Rows):
-    """Add the motion in this step, after pairs were located."""
-    rows.path[0] = path_to_now(rows)
-    rows.moved[0] = 0.0
 
 
 @wp.func

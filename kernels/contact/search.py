@@ -7,7 +7,7 @@ from .boxes import edge_reach, root_of, triangle_reach, triangle_size
 from .closest import on_segments, on_triangle, point_of
 from .locate import ENDS, FACING, edge_normal, node_faces_at_rest
 from .motion import Surface
-from .near import CRUSHED, LINKED, PAIRED, Near, mark
+from .near import CRUSHED, PAIRED, Near, mark
 from .rows import BAND, BAND_AT_REST, Meeting, Rows, row_count
 from .watch import Watch
 
@@ -336,16 +336,6 @@ def mark_row(owner: int, other: int, meeting: Meeting, near: Near):
             mark(near, f[k], PAIRED)
 
 
-@wp.func
-def link_around(s: int, meeting: Meeting, near: Near):
-    """Mark the corners of the triangles around a node, whose motion turns their normals."""
-    for k in range(meeting.corner_starts[s], meeting.corner_starts[s + 1]):
-        c = meeting.triangles[meeting.corners[k] / 3]
-        for m in range(3):
-            if (near.flags[c[m]] & LINKED) == 0:
-                wp.atomic_or(near.flags, c[m], LINKED)
-
-
 @wp.kernel(enable_backward=False)
 def find_pairs(
     # In
@@ -384,8 +374,6 @@ def find_pairs(
     else:
         near_owner(i, start, of_triangles, of_edges, surface, meeting, near, rows, kept)
     rows.counts[i] = count
-    if rows.sleeps != 0 and i < meeting.body.shape[0]:
-        link_around(i, meeting, near)
     before = old.starts[i]
     last = before + old.counts[i]
     for row in range(start, start + count):
@@ -397,8 +385,6 @@ def find_pairs(
             force = old.force[before]
         rows.owner[row] = i
         rows.force[row] = force
-        if rows.sleeps != 0:
-            rows.asleep[row] = 0.0
         mark_row(i, other, meeting, near)
 
 
@@ -420,11 +406,9 @@ def keep_rows(watch: Watch, rows: Rows, old: OldRows):
 
 @wp.kernel(enable_backward=False)
 def begin_rows(watch: Watch, rows: Rows):
-    """There are none, and nothing has moved."""
+    """There are none."""
     if watch.due[0] != 0:
         rows.total[0] = 0
-        rows.path[0] = 0.0
-        rows.moved[0] = 0.0
 
 
 @wp.kernel(enable_backward=False)

@@ -15,7 +15,7 @@ from .bearing import is_borne
 from .law import Law
 from .motion import Motions, Surface
 from .near import BESIDE, Near
-from .rows import Meeting, Rows, end_path, row_count
+from .rows import Meeting, Rows, row_count
 from .shapes import Shapes
 from .together_items import (
     Sums,
@@ -193,8 +193,6 @@ def push_together(
         number += 1
         if not have_rows and number % 2 == 1:
             number += 1
-    if have_rows and thread == 0:
-        end_path(rows)
     # The last pass has left what moved the places.
     k = int(thread)
     while are_borne != 0 and k < near.count[0]:

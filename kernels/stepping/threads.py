@@ -23,29 +23,6 @@ def synchronize_any(flag: int) -> int:
     ...
 
 
-@wp.func_native("""
-#if defined(__CUDA_ARCH__)
-    __syncthreads();
-    if (threadIdx.x == 0) {
-        unsigned long long* count = reinterpret_cast<unsigned long long*>(&wp::index(arrived, 0));
-        __threadfence();
-        const unsigned long long before = atomicAdd(count, 1ull);
-        const unsigned long long all = (before / blocks + 1) * blocks;
-        while (*reinterpret_cast<volatile unsigned long long*>(count) < all) {}
-        __threadfence();
-    }
-    __syncthreads();
-#endif
-""")
-def synchronize_blocks(blocks: int, arrived: wp.array[wp.uint64]):
-    """Wait for all blocks of a launch, which must all run at once, and see what they have written.
-
-    Args:
-        arrived: How often blocks have waited so far; for launches with the same number of blocks [1].
-    """
-    ...
-
-
 @wp.func
 def number_in(word: wp.uint64, k: int):
     """The k-th of the four 16-bit numbers in a word."""

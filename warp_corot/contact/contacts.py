@@ -228,10 +228,7 @@ class Contacts:
 
     def joined_rows(self) -> JoinedRows | None:
         """The contact of soft surfaces in implicit steps, if they may touch."""
-        if self.pairs is None:
-            return None
-        self.pairs.stay_awake()
-        return JoinedRows(self.system, self.pairs, self.law)
+        return None if self.pairs is None else JoinedRows(self.system, self.pairs, self.law)
 
     def measure(self) -> None:
         thinnest = self.obstacles.thinnest
@@ -354,9 +351,8 @@ class Contacts:
             inputs += [int(conditions.has_loads), conditions.loads, system.pace.arrays, offset]
             inputs += [state.rest, state.forces, state.displacements, state.velocities, surface.bearers]
             frames = system.worlds if begins and k == 0 else 0
-            links = int(self.pairs is not None and self.pairs.sleeps)
-            inputs += [links, self.search.near, frames, moved, obstacles.motions, world_starts, int(moves)]
-            outputs = [self.search.watch, None if self.pairs is None else self.pairs.moved, arrays, surface.arrays]
+            inputs += [frames, moved, obstacles.motions, world_starts, int(moves)]
+            outputs = [self.search.watch, arrays, surface.arrays]
             self._launch(BEGIN_STEP[conditions.loads.dtype], max(count, borne, moved, frames), inputs, outputs)
         if isinstance(surface, WholeSurface):
             surface.complete()
@@ -375,7 +371,9 @@ class Contacts:
         if rigid is not None:
             rigid.launch(rounds)
         elif pairs is not None:
-            pairs.launch_rounds(self.law, self.system.pace.arrays, rounds)
+            pairs.launch_begin(self.law)
+            for _ in range(rounds):
+                pairs.launch_round(self.law, self.system.pace.arrays)
 
     def _make_arrays(self) -> None:
         surface, device = self.surface, self.device

@@ -11,7 +11,6 @@ from warp_corot.kernels.contact import pairs as kernels
 from warp_corot.kernels.contact import search as search_kernels
 from warp_corot.kernels.contact.crushed import mark_crushed
 from warp_corot.kernels.contact.law import Law
-from warp_corot.kernels.contact.rounds import BLOCK, make_rounds
 from warp_corot.kernels.contact.rows import Meeting, Rows
 from warp_corot.kernels.stepping.pace import Pace
 from warp_corot.solvers.ranks import ALONE, Ranks
@@ -30,8 +29,6 @@ OWN_TREES = 16
 #: For so many elements at most motion is reserved while nothing is near, if bodies do not touch themselves, and if they
 #: do: then so much of the same body is that near that searches take longer.
 CALM, CALM_ITSELF = 8.0, 1.0
-#: Blocks of threads that locate pairs on CUDA, at most.
-MOST_BLOCKS = 1 << 12
 #: Threads that find the bounds of bodies on CUDA, at most: each warp ends with atomic minima.
 BOUNDING_THREADS = 1 << 15
 
@@ -49,10 +46,6 @@ class Pairs:
     Attributes:
         rows: The pairs, as a struct for kernels.
         meeting: The things that may meet, as a struct for kernels.
-        sleeps: Whether pairs whose places are beside one another are not located in each step; places between nodes and
-            those that other ranks move are not watched.
-        together: Whether one launch makes all rounds, if there are no obstacles.
-        moved: How far places near other surfaces have moved in the step [m], float32 [1].
         revision: Changes whenever launches do.
     """
 
@@ -69,11 +62,7 @@ class Pairs:
         self.surface, self.search, self.device = surface, search, surface.device
         self.friction, self.meets_itself, self._flat_edges = options.friction, options.self_contact, options.flat_edges
         self.revision, self._room, self._taken, self._built = 0, 0, -1, 0
-        self._path, self.moved = (wp.zeros(1, dtype=wp.float32, device=self.device) for _ in range(2))
-        self._arrived = wp.zeros(1, dtype=wp.uint64, device=self.device)
-        self.together = self.device.is_cpu
         self.exact = exact
-        self.sleeps = ranks.is_alone and not surface.is_borne
         search.watch.most_calm = CALM_ITSELF if self.meets_itself else CALM
         if self.meets_itself:
             search.watch.most_alone = 1.0
@@ -145,9 +134,8 @@ class Pairs:
         rows.normal = wp.zeros(room, dtype=wp.vec3, device=device)
         rows.places = wp.zeros(room, dtype=wp.vec4i, device=device)
         rows.shares = wp.zeros(room, dtype=wp.vec4, device=device)
-        rows.gap, rows.asleep = (wp.zeros(room, dtype=wp.float32, device=device) for _ in range(2))
-        rows.path, rows.moved = self._path, self.moved
-        rows.sleeps, rows.exact = int(self.sleeps), int(self.exact)
+        rows.gap = wp.zeros(room, dtype=wp.float32, device=device)
+        rows.exact = int(self.exact)
         rows.summed = self._summed
         return rows, old
 
@@ -201,12 +189,6 @@ class Pairs:
         for number, tree in enumerate(self._trees):
             wp.launch(boxes.find_roots, roots.shape[1], [tree.id], [roots[number]], device=self.device)
 
-    def stay_awake(self) -> None:
-        """Locate all pairs in each step."""
-        self.sleeps, self.rows.sleeps = False, 0
-        self.rows.asleep.zero_()
-        self.revision += 1
-
     def forget(self) -> None:
         """Forget the forces of the last step."""
         self.rows.force.zero_()
@@ -215,28 +197,9 @@ class Pairs:
 
     def launch_begin(self, law: Law) -> None:
         """Launch the places of all pairs."""
-        self._locate(law)
-        self._apply(law)
-
-    def _locate(self, law: Law) -> None:
         self.rows.live_count.zero_()
-        width, tile = (1, 1) if self.device.is_cpu else (kernels.WIDTH, kernels.TILE)
-        threads = width * min(-(-self._room // tile), MOST_BLOCKS) if tile > 1 else 1
-        inputs = [threads, width, tile, law, self.surface.arrays, self.meeting, self.rows]
-        wp.launch(kernels.locate_rows, threads, inputs, [self._added], device=self.device, block_dim=width)
-
-    def launch_rounds(self, law: Law, pace: Pace, rounds: int) -> None:
-        """Launch the places of all pairs, and all rounds of their forces."""
-        if not self.together or self.surface.is_borne:
-            self.launch_begin(law)
-            for _ in range(rounds):
-                self.launch_round(law, pace)
-            return
-        self._locate(law)
-        width, blocks = (1, 1) if self.device.is_cpu else (BLOCK, self.device.sm_count)
-        inputs = [width * blocks, blocks, rounds, self.search.near, law, pace, self.friction]
-        outputs = [self.surface.arrays, self.rows, self._crowd, self._added, self._arrived]
-        wp.launch(make_rounds, width * blocks, inputs, outputs, device=self.device, block_dim=width)
+        self._on_rows(kernels.locate_rows, [law, self.surface.arrays, self.meeting, self.rows, self._added])
+        self._apply(law)
 
     def launch_round(self, law: Law, pace: Pace) -> None:
         """Launch one round of the forces between pairs."""
