@@ -5,7 +5,7 @@ import warp as wp
 from .bearing import share_bearers
 from .boxes import edge_reach, root_of, triangle_reach, triangle_size
 from .closest import on_segments, on_triangle, point_of
-from .locate import ENDS, FACING, edge_normal, node_faces_at_rest
+from .locate import BORDER, ENDS, FACING, edge_normal, node_faces_at_rest
 from .motion import Surface
 from .near import CRUSHED, PAIRED, Near, mark
 from .rows import BAND, BAND_AT_REST, Meeting, Rows, row_count
@@ -86,6 +86,22 @@ def may_face(s: int, out: wp.vec3, n: wp.vec3, meeting: Meeting):
 
 
 @wp.func
+def is_beside(way: wp.vec3, normal: wp.vec3, far: float, size: float, longest: float):
+    """Whether a node behind the plane of a triangle is so far beside the triangle that it cannot come below it before
+    the next search.
+
+    Args:
+        way: From the closest point of the triangle to the node.
+        far: How far the two may move relative to each other [m].
+        size, longest: The triangle's size, and its longest side [m].
+    """
+    depth = -wp.dot(way, normal)
+    # The triangle may tilt by twice its corners' motion over its least height, and counts a little beyond its border.
+    aside = far * (1.0 + 2.0 * depth * longest / (size * size)) + BORDER * size
+    return wp.length(way + depth * normal) > aside
+
+
+@wp.func
 def node_is_near(s: int, t: int, out: wp.vec3, surface: Surface, meeting: Meeting, near: Near):
     """Whether a node and a triangle may touch before the next search; ``out`` is the normal at the node."""
     c = meeting.triangles[t]
@@ -112,7 +128,10 @@ def node_is_near(s: int, t: int, out: wp.vec3, surface: Surface, meeting: Meetin
     distance = wp.length(way)
     far = meeting.reach[s] + triangle_reach(surface, meeting, c)
     if distance > far:
-        if wp.dot(way, normal) >= 0.0 or not (distance <= far + BAND * triangle_size(surface, c)):
+        size = triangle_size(surface, c)
+        if wp.dot(way, normal) >= 0.0 or not (distance <= far + BAND * size):
+            return False
+        if is_beside(way, normal, far, size, wp.max(wp.length(b - a), wp.max(wp.length(e - b), wp.length(a - e)))):
             return False
         if meeting.body[s] == meeting.body[c[0]]:
             # Deeper nodes of the same body do not count as touching; see ``locate.deepest``.
