@@ -65,7 +65,7 @@ def take_span(
     if not was_listed:
         # Where held nodes bear most of the point, it may stay as deep as the obstacle's motion leads.
         there = found.gap - base - wp.dot(n, found.moved)
-        allowed = found.allowed + left_at_triangle(found.shares, corners, there, n, surface)
+        allowed = found.allowed + left_at_triangle(found.shares, corners, there, n, surface.yielding, surface)
         target = -allowed
         if which == FIRST:
             target = kept_gap(found.gap + allowed, pushed, law, float(pace.seconds[DT])) - allowed
@@ -272,5 +272,5 @@ def stiffen_spans(
                     yielding += ease_at(triangles[t][k], w[k], surface, carriers)
             spans.stiffness[o, t] = 0.0
             if yielding > 0.0:
-                loose = loose_at_triangle(w, triangles[t], surface)
+                loose = loose_at_triangle(w, triangles[t], surface.yielding, surface)
                 spans.stiffness[o, t] = loose_part(loose) * spans.stiff / yielding

@@ -28,12 +28,20 @@ class Support:
 
 
 @wp.func
-def add_support(support: Support, s: int, weight: float, surface: Surface):
-    """Add a place with a positive weight."""
+def add_support(support: Support, s: int, weight: float, yielding: wp.array[wp.float32], surface: Surface):
+    """Add a place with a positive weight.
+
+    Args:
+        support: The sums so far.
+        s: The place.
+        weight: Its weight.
+        yielding: As in ``Surface``, also for nodes that another process moves.
+        surface: The surface.
+    """
     out = weight * (surface.x[s] - surface.rest[s])
     support.total += weight
     support.out += out
-    if surface.yielding[s] > 0.0:
+    if yielding[s] > 0.0:
         support.loose += weight * loose_share(s, surface)
         if is_borne(s, surface):
             support.held += weight * surface.bearing.held[s]
@@ -78,15 +86,15 @@ def left_at_place(s: int, gap: float, n: wp.vec3, surface: Surface):
     loose = loose_share(s, surface)
     if loose >= MOSTLY:
         return 0.0
-    return left_overlap(gap, loose, wp.dot(n, strayed(add_support(Support(), s, 1.0, surface))))
+    return left_overlap(gap, loose, wp.dot(n, strayed(add_support(Support(), s, 1.0, surface.yielding, surface))))
 
 
 @wp.func
-def loose_at_triangle(w: wp.vec3, corners: wp.vec3i, surface: Surface):
-    """The share of free nodes at a triangle's point."""
+def loose_at_triangle(w: wp.vec3, corners: wp.vec3i, yielding: wp.array[wp.float32], surface: Surface):
+    """The share of free nodes at a triangle's point. ``yielding``: see ``add_support``."""
     loose = float(0.0)
     for k in range(3):
-        if surface.yielding[corners[k]] > 0.0:
+        if yielding[corners[k]] > 0.0:
             loose += w[k] * loose_share(corners[k], surface)
     return loose
 
@@ -102,14 +110,18 @@ def loose_at_pair(p: wp.vec4i, w: wp.vec4, surface: Surface):
 
 
 @wp.func
-def left_at_triangle(w: wp.vec3, corners: wp.vec3i, gap: float, n: wp.vec3, surface: Surface):
-    """How deep a triangle's point with the shares w may stay in an obstacle with the normal n [m]."""
-    loose = loose_at_triangle(w, corners, surface)
+def left_at_triangle(
+    w: wp.vec3, corners: wp.vec3i, gap: float, n: wp.vec3, yielding: wp.array[wp.float32], surface: Surface
+):
+    """How deep a triangle's point with the shares w may stay in an obstacle with the normal n [m]. ``yielding``: see
+    ``add_support``.
+    """
+    loose = loose_at_triangle(w, corners, yielding, surface)
     if loose >= MOSTLY:
         return 0.0
     support = Support()
     for k in range(3):
-        support = add_support(support, corners[k], w[k], surface)
+        support = add_support(support, corners[k], w[k], yielding, surface)
     return left_overlap(gap, loose, wp.dot(n, strayed(support)))
 
 
@@ -123,7 +135,7 @@ def left_at_pair(p: wp.vec4i, w: wp.vec4, gap: float, n: wp.vec3, surface: Surfa
     second = Support()
     for k in range(4):
         if w[k] > 0.0:
-            first = add_support(first, p[k], w[k], surface)
+            first = add_support(first, p[k], w[k], surface.yielding, surface)
         elif w[k] < 0.0:
-            second = add_support(second, p[k], -w[k], surface)
+            second = add_support(second, p[k], -w[k], surface.yielding, surface)
     return left_overlap(gap, loose, wp.dot(n, strayed(first) - strayed(second)))

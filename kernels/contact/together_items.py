@@ -107,7 +107,7 @@ def begin_touch(
 
 @wp.func
 def weigh_touch(o: int, t: int, law: Law, dt: float, surface: Surface, corners: wp.vec3i, touches: Touches, sums: Sums):
-    if judge_touch(o, t, law, dt, surface, corners, touches) != 0:
+    if judge_touch(o, t, law, dt, surface, corners, surface.yielding, touches) != 0:
         w = touches.shares[o, t]
         for k in range(3):
             add_crowd(corners[k], w[k], surface, sums)

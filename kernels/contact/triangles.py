@@ -42,14 +42,23 @@ def approach(touches: Touches, o: int, t: int, surface: Surface, corners: wp.vec
 
 
 @wp.func
-def judge_touch(o: int, t: int, law: Law, dt: float, surface: Surface, corners: wp.vec3i, touches: Touches):
+def judge_touch(
+    o: int,
+    t: int,
+    law: Law,
+    dt: float,
+    surface: Surface,
+    corners: wp.vec3i,
+    corner_yielding: wp.array[wp.float32],
+    touches: Touches,
+):
     """Find whether the contact of an obstacle and a triangle acts in this round."""
     w = touches.shares[o, t]
     acts = int(0)
     if w[0] + w[1] + w[2] > 0.0:
         n = touches.normal[o, t]
         gap = touches.gap[o, t]
-        gap += left_at_triangle(w, corners, gap, n, surface)
+        gap += left_at_triangle(w, corners, gap, n, corner_yielding, surface)
         wanted = least_motion(gap, law, dt) - wp.dot(approach(touches, o, t, surface, corners), n)
         if wanted > 0.0 or wp.dot(touches.force[o, t], n) > 0.0:
             acts = 1
@@ -58,12 +67,20 @@ def judge_touch(o: int, t: int, law: Law, dt: float, surface: Surface, corners: 
 
 
 @wp.func
-def crowd_at(s: int, law: Law, dt: float, surface: Surface, skin: Skin, touches: Touches):
+def crowd_at(
+    s: int,
+    law: Law,
+    dt: float,
+    surface: Surface,
+    skin: Skin,
+    corner_yielding: wp.array[wp.float32],
+    touches: Touches,
+):
     total = float(0.0)
     for k in range(skin.corner_starts[s], skin.corner_starts[s + 1]):
         t = skin.corners[k] / 3
         for o in range(touches.acts.shape[0]):
-            if judge_touch(o, t, law, dt, surface, skin.triangles[t], touches) != 0:
+            if judge_touch(o, t, law, dt, surface, skin.triangles[t], corner_yielding, touches) != 0:
                 total += touches.shares[o, t][skin.corners[k] % 3]
     return total
 
@@ -79,6 +96,7 @@ def crowd_among(
     dt: float,
     surface: Surface,
     skin: Skin,
+    corner_yielding: wp.array[wp.float32],
     touches: Touches,
     forces: wp.array2d[wp.vec3],
     beside: Beside,
@@ -91,7 +109,7 @@ def crowd_among(
         k += threads
         total = float(0.0)
         if (near.flags[s] & AROUND) != 0:
-            total = crowd_at(s, law, dt, surface, skin, touches)
+            total = crowd_at(s, law, dt, surface, skin, corner_yielding, touches)
         if (near.flags[s] & BESIDE) != 0 and is_borne(s, surface):
             _more, pushing = push_borne(s, 0.0, shapes, motions, law, dt, beside, surface, forces)
             total += pushing
@@ -111,14 +129,34 @@ def crowd_nodes(
     skin: Skin,
     forces: wp.array2d[wp.vec3],
     beside: Beside,
+    corner_yielding: wp.array[wp.float32],
     # In and out
     touches: Touches,
     # Out
     crowd: wp.array[wp.float32],
 ):
-    """Find the contacts that act, and sum their weights at each place. All corners of a triangle find the same."""
+    """Find the contacts that act, and sum their weights at each place. All corners of a triangle find the same.
+
+    Args:
+        corner_yielding: ``yielding`` of the surface, also for nodes that another process moves.
+    """
     dt = float(pace.seconds[DT])
-    crowd_among(wp.tid(), threads, near, shapes, motions, law, dt, surface, skin, touches, forces, beside, crowd)
+    crowd_among(
+        wp.tid(),
+        threads,
+        near,
+        shapes,
+        motions,
+        law,
+        dt,
+        surface,
+        skin,
+        corner_yielding,
+        touches,
+        forces,
+        beside,
+        crowd,
+    )
 
 
 @wp.func
@@ -150,7 +188,7 @@ def solve_touch(
     n = touches.normal[o, t]
     d = approach(touches, o, t, surface, corners)
     gap = touches.gap[o, t]
-    gap += left_at_triangle(w, corners, gap, n, surface)
+    gap += left_at_triangle(w, corners, gap, n, corner_yielding, surface)
     wanted = least_motion(gap, law, dt) - wp.dot(d, n)
     wanted -= left_to_held(wanted + wp.dot(free, n), share)
     normal_force = wp.max(wp.dot(before, n) + wanted / yielding, 0.0)

@@ -189,7 +189,7 @@ class RigidForces:
             return
         step, rigid = [self._law, self._pace, self.surface.arrays], [self.obstacles.shapes, self.obstacles.motions]
         self._ranks.complete_surface(self.surface.arrays.d)
-        inputs = [*rigid, *step, self._skin, self.forces, self._beside, self.touches, self._crowd]
+        inputs = [*rigid, *step, self._skin, self.forces, self._beside, self._yielding, self.touches, self._crowd]
         self._on_nodes(triangles.crowd_nodes, inputs)
         self._ranks.complete_surface(self._crowd)
         if self.have_edges:
