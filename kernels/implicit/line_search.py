@@ -14,11 +14,14 @@ from .sums import add_up
 wp.set_module_options({"enable_backward": False})
 
 #: Columns of a world's search: the current fraction, the ends of the bracket, and the power at these; the power at zero
-#: without contacts, and its decrease with the fraction.
-TRIED, LOW, HIGH, AT_LOW, AT_HIGH, POWER, LOSS = (wp.constant(k) for k in range(7))
-COLUMNS = 7
+#: without contacts, and its decrease with the fraction; the power at zero with contacts, and the
+#: bracket's width one trial before.
+TRIED, LOW, HIGH, AT_LOW, AT_HIGH, POWER, LOSS, FIRST, WIDTH = (wp.constant(k) for k in range(9))
+COLUMNS = 9
 #: The whole change is taken if the power at its end, over that at its beginning, is at most this in magnitude.
 ENOUGH = wp.constant(wp.float64(0.2))
+#: The search ends where the power, over that at the beginning, is at most this in magnitude.
+FOUND = wp.constant(wp.float64(0.01))
 
 
 @wp.kernel(enable_backward=False)
@@ -46,11 +49,17 @@ def begin_search(
 def take_trial(
     # In
     number: int,
+    is_last: int,
     # In and out
     search: wp.array2d[wp.float64],
     slopes: wp.array[wp.float64],
 ):
-    """Read the power at the current fraction, first 0 and then 1, and choose the next fraction."""
+    """Read the power at the current fraction, first 0 and then 1, and choose the next fraction.
+
+    It is interpolated, or in the middle of a bracket that has not become half as wide: contacts that begin in the
+    middle of the change are so stiff that interpolation alone would hardly leave the bracket's lower end. The last
+    fraction is the upper end, where such contacts act, so that the next solve knows of them.
+    """
     world = wp.tid()
     s = search[world, TRIED]
     g = search[world, POWER] - s * search[world, LOSS] + slopes[world]
@@ -61,12 +70,17 @@ def take_trial(
         search[world, HIGH] = wp.float64(1.0)
         search[world, AT_HIGH] = wp.float64(0.0)
         search[world, TRIED] = wp.float64(1.0)
+        search[world, FIRST] = g
+        search[world, WIDTH] = wp.float64(2.0)
         return
     if number == 1:
         if g >= -ENOUGH * search[world, AT_LOW]:
             search[world, LOW] = s
             search[world, AT_LOW] = wp.float64(0.0)
         search[world, AT_HIGH] = g
+    elif wp.abs(g) <= FOUND * search[world, FIRST]:
+        search[world, LOW] = s
+        search[world, HIGH] = s
     elif g >= wp.float64(0.0):
         # Halve the power at the end that stays, so that both ends of the bracket move (Illinois rule).
         search[world, LOW] = s
@@ -79,8 +93,14 @@ def take_trial(
     low = search[world, LOW]
     high = search[world, HIGH]
     fall = search[world, AT_LOW] - search[world, AT_HIGH]
+    is_slow = high - low > wp.float64(0.5) * search[world, WIDTH]
+    search[world, WIDTH] = high - low
     share = high
-    if fall > wp.float64(0.0) and high > low:
+    if is_last != 0:
+        share = high
+    elif is_slow:
+        share = wp.float64(0.5) * (low + high)
+    elif fall > wp.float64(0.0) and high > low:
         share = low + (high - low) * search[world, AT_LOW] / fall
     search[world, TRIED] = share
 

@@ -186,6 +186,27 @@ def test_worlds_resumed_and_remeshed_runs(ball, device, tmp_path):
     assert min(point.gap for point in points) > -1.5e-3
 
 
+@pytest.mark.parametrize("step", [0.016, STEP])
+def test_a_small_stiff_rod_comes_to_rest_and_gains_no_energy(device, step):
+    """It falls by less than it goes in a step, so that a solve may end anywhere between flight and rest."""
+    length, drop = 0.019, 0.006
+    ends = (-0.5 * length, 0.0, 0.0), (0.5 * length, 0.0, 0.0)
+    mesh = wc.TetForest.from_domain(wc.Domain.capsule(*ends, 0.07 * length), target_elements=700)
+    body, below = (
+        wc.SoftBody(mesh, wc.Isotropic(3e4, 0.04, 1300.0), device=device),
+        ground(mesh.points[:, 2].min() - drop),
+    )
+    contact = wc.Contact(friction=1.0)
+    sim = wc.Simulation(body, obstacles=below, contact=contact, integrator=wc.BackwardEuler(dt=step), gravity=DOWN)
+    least = np.inf
+    while sim.time < 0.3:
+        sim.step()
+        total = sim.energy().total
+        assert total < least + 0.01 * weight(body) * drop
+        least = min(least, total)
+    assert force_on(below)[2] == pytest.approx(-weight(body), rel=1e-3)
+
+
 @pytest.mark.parametrize(("finest", "error"), [(12, 0.025), pytest.param(15, 0.035, marks=pytest.mark.slow)])
 def test_a_ball_sinks_into_an_embedded_half_space_as_hertz_says(device, finest, error):
     """As in explicit steps, with 2 and 4 elements over the radius of contact."""

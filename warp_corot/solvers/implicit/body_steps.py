@@ -25,6 +25,7 @@ from .preconditioners import preconditioner_of
 from .tangent import TangentOperator
 from .touching import Held, Hold, Touching, TouchingSolve
 from .touching_newton import TouchingNewton
+from .turning import TurnedState
 
 if TYPE_CHECKING:
     from warp_corot.solvers.system import System
@@ -64,6 +65,11 @@ class SharedSteps:
     def in_one_solve(self) -> bool:
         """Whether a step with contact is one linearisation of backward Euler."""
         return self.integrator.tolerance is None and self.integrator.history == 0
+
+    @property
+    def turns(self) -> bool:
+        """Whether steps are linearised where bodies will be turned."""
+        return self.integrator.tolerance is None and self.integrator.turns
 
     def add_other_forces(self) -> None:
         """Launch all forces except elastic ones in the present state to ``state.forces`` of the bodies."""
@@ -165,6 +171,8 @@ class BodySteps:
             others=self._add_others,
         )
         self.newton.is_at_stage = options.is_at_stage
+        if self.shared.turns:
+            self.newton.turned = TurnedState(self.operator, options.dt)
         self.touching: TouchingSolve | None = None
         self.touching_newton: TouchingNewton | None = None
         if self.held is not None and self.shared.rows is None:

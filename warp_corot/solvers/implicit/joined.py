@@ -145,10 +145,9 @@ class JoinedSolve:
         self.launch_end()
 
     def linearise(self) -> None:
-        """Launch the linearisation at the present displacements."""
+        """Launch the linearisation of all bodies."""
         for newton in self._newtons:
-            newton.operator.take(newton.body.state.displacements)
-            newton.preconditioner.update(newton.operator)
+            newton.linearise()
 
     def launch_begin(self, offset: int) -> None:
         """Launch the beginning of a step; increments must be zero at free nodes."""

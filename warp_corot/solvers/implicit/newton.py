@@ -16,6 +16,7 @@ from .conjugate_gradients import ConjugateGradients
 from .operator import Preconditioner
 from .sums import WorldSums
 from .tangent import TangentOperator
+from .turning import TurnedState
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -75,6 +76,7 @@ class Newton:
         pull: a h, the acceleration in the inertia of a time step [m/s^2], vec4.
         external_share: The factor of loads and gravity, float32 [1].
         running: The number of worlds that are still iterated, int32 [1].
+        turned: The state at which the only iteration is linearised, if that is another one than the present.
     """
 
     def __init__(
@@ -108,6 +110,7 @@ class Newton:
         self._scalars = wp.zeros((self.worlds, kernels.SCALARS), dtype=wp.float64, device=self.device)
         self.inertia = wp.zeros(1, dtype=wp.float32, device=self.device)
         self.share, self.is_at_stage = wp.ones(1, dtype=wp.float32, device=self.device), False
+        self.turned: TurnedState | None = None
         self.external_share = wp.ones(1, dtype=wp.float32, device=self.device)
         self.iterations, self.solved, self.status, self._accepted = (
             wp.zeros(self.worlds, dtype=wp.int32, device=self.device) for _ in range(4)
@@ -148,7 +151,10 @@ class Newton:
     def launch_residual(self) -> None:
         """Launch the unbalanced forces in the present state."""
         body, sums, conditions = self.body, self._sums, self.body.conditions
-        self.field.add_forces(body.state.displacements, self.forces)
+        if self.turned is None:
+            self.field.add_forces(body.state.displacements, self.forces)
+        else:
+            self.turned.launch_forces(self.forces)
         self.ranks.clear_ghosts(self.operator.number, self.forces)
         if self._others is not None:
             self._others()
@@ -161,9 +167,14 @@ class Newton:
 
     def launch_solve(self, *, guessed: bool = False) -> None:
         """Launch the linearisation and its step, from a guess of it in ``step`` if there is one."""
-        self.operator.take(self.body.state.displacements)
-        self.preconditioner.update(self.operator)
+        self.linearise()
         self.solver.launch(self.preconditioner, self.residual, self.step, guessed=guessed)
+
+    def linearise(self) -> None:
+        """Launch the linearisation at the present displacements, or at ``turned``; the residual must be known."""
+        if self.turned is None:
+            self.operator.take(self.body.state.displacements)
+        self.preconditioner.update(self.operator)
 
     def _launch_trial(self) -> None:
         self._try_step(commits=False)

@@ -71,6 +71,8 @@ class ImplicitIntegrator(Integrator):
     is_implicit: ClassVar[bool] = True
     #: The number of vectors that a step keeps for the next one.
     history: ClassVar[int] = 0
+    #: Whether steps of one iteration are linearised in the state to which the whole body will turn.
+    turns: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if self.dt is None or not SHORTEST <= checked_number(self.dt, "dt", "s") < math.inf:
@@ -146,6 +148,8 @@ def backward_euler(
 @dataclass(frozen=True)
 class BackwardEuler(ImplicitIntegrator):
     """v_after = v + dt a(u_after), u_after = u + dt v_after: first order; damps motion that it does not resolve."""
+
+    turns: ClassVar[bool] = True
 
     def scheme(self, dt: float) -> Table:
         return backward_euler(dt)

@@ -225,16 +225,11 @@ class TouchingSolve:
 
     def launch(self) -> None:
         """Launch the solve for ``newton.step``, from a guess; the residual must be known."""
-        self.linearise()
+        self.newton.linearise()
         self.iterations.zero_()
         self.held.launch_begin(self.newton.body.state.displacements, self.newton.step, self._operator.diagonal_blocks())
         self.launch_rounds()
         self.held.launch_end(self.newton.step)
-
-    def linearise(self) -> None:
-        """Launch the linearisation at the present displacements."""
-        self._operator.take(self.newton.body.state.displacements)
-        self._preconditioner.update(self._operator)
 
     def launch_rounds(self) -> None:
         """Launch the linear solves, until contact no longer changes."""

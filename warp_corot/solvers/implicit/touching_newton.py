@@ -41,11 +41,11 @@ class TouchingNewton:
 
     def launch(self) -> None:
         """Launch the increments and displacements of the step, from a guess of the increments in ``newton.step``."""
-        held, newton, touching = self._touching.held, self._newton, self._touching
+        held, newton = self._touching.held, self._newton
         self.iterations.zero_()
         self.linear_iterations.zero_()
         newton.launch_residual()
-        touching.linearise()
+        newton.linearise()
         blocks = self._operator.diagonal_blocks()
         newton.move_held(to_end=True)
         held.launch_begin(newton.body.state.displacements, newton.step, blocks)
@@ -57,7 +57,7 @@ class TouchingNewton:
     def _go_on(self) -> None:
         newton, touching = self._newton, self._touching
         newton.launch_residual()
-        touching.linearise()
+        newton.linearise()
         inputs = [newton.body.conditions.inverse_mass, newton.share, newton.increment]
         self._launch(kernels.take_free, inputs, [newton.step])
         self._operator.apply(newton.step, self._product)
