@@ -184,3 +184,11 @@ def test_a_broken_wall_says_how_many_elements_it_takes():
     assert elements_through(domain.kind, sample(box), 0.1) == pytest.approx(7.0 * 12.0 / 0.002**2, rel=0.03)
     solid = trimesh.creation.box((1.0, 1.0, 1.0))
     assert elements_through(wc.Domain.from_surface((solid.vertices, solid.faces)).kind, sample(solid), 0.1) == 0
+
+
+def test_a_part_with_a_hundredth_of_the_surface_counts_for_nothing():
+    cube, plate = trimesh.creation.box((1.0, 1.0, 1.0)), trimesh.creation.box((0.1, 0.1, 0.002))
+    plate.apply_translation((0.0, 0.0, 1.0))
+    both = trimesh.util.concatenate([cube, plate])
+    points = np.concatenate([sample(cube), sample(plate)[:20]])
+    assert elements_through(wc.Domain.from_surface((both.vertices, both.faces)).kind, points, 0.1) == 0

@@ -46,6 +46,6 @@ def elements_through(domain: SignedFunction, points: np.ndarray, length: float) 
         thickness[left] = np.where(found < 0.99 * reach * length, found, np.inf)
     if np.isinf(thickness).all():
         return 0
-    thickness = np.maximum(thickness, np.quantile(thickness, TIPS))
+    thickness = np.maximum(thickness, np.quantile(thickness, TIPS, method="lower"))
     area = extent_of(domain)[1] / len(points)
     return int(float((OF_SQUARE * area / thickness**2).sum()))
