@@ -154,6 +154,19 @@ def find_rates(
 
 
 @wp.kernel(enable_backward=False)
+def find_middle(
+    # In
+    a: wp.array[wp.vec4],
+    b: wp.array[wp.vec4],
+    # Out
+    middle: wp.array[wp.vec4],
+):
+    """Find the mean of two states."""
+    i = wp.tid()
+    store_node(middle, i, 0.5 * (load_node(a, i) + load_node(b, i)))
+
+
+@wp.kernel(enable_backward=False)
 def take_step(
     # In
     step: wp.array[wp.vec4],

@@ -13,14 +13,16 @@ SCENES = {
 }
 
 
-def spinning(device, model, scene, worlds=1):
+def spinning(device, model, scene, worlds=1, **options):
     """A stiff block that spins freely about an axis that is none of its own."""
     mesh = wc.TetForest.box((2, 1, 1), 0.02, level=4)
     body = wc.SoftBody(mesh, wc.Isotropic(1e6, 0.4, 1000.0), worlds=worlds, device=device)
     axis = np.array([0.6, 0.0, 0.8])
     arms = mesh.points - mesh.points.mean(axis=0)
     body.velocities = np.tile(np.cross(TURN / STEP * axis, arms), (worlds, 1)).astype(np.float32)
-    sim = wc.Simulation(body, model=model, integrator=wc.BackwardEuler(dt=STEP), gravity=(0.0, 0.0, 0.0), **scene)
+    sim = wc.Simulation(
+        body, model=model, integrator=wc.BackwardEuler(dt=STEP, **options), gravity=(0.0, 0.0, 0.0), **scene
+    )
     return body, sim
 
 
@@ -38,6 +40,16 @@ def test_a_stiff_body_that_spins_gains_no_energy_and_keeps_its_size(device, mode
     ends = [np.flatnonzero(np.all(body.mesh.points == (x, 0.0, 0.0), axis=1))[0] for x in (0.0, longest)]
     x = body.positions.numpy()
     assert np.linalg.norm(x[ends[1]] - x[ends[0]]) == pytest.approx(longest, rel=1e-3)
+
+
+@pytest.mark.parametrize("tolerance", [None, 1e-4])
+def test_a_turn_has_no_viscosity(device, tolerance):
+    _body, sim = spinning(device, None, {}, viscosity=1e-2, tolerance=tolerance)
+    totals = [sim.energy().total]
+    for _ in range(10):
+        sim.step()
+        totals.append(sim.energy().total)
+    assert np.all(np.diff(totals) < 1e-3 * totals[0])
 
 
 def test_worlds_with_held_nodes_are_not_turned(device):

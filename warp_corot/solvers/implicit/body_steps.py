@@ -145,6 +145,9 @@ class BodySteps:
         kept = [len(like) if wanted and each is not None else 0 for each in (self.held, shared.rows)]
         self.met, self.touched = (wp.zeros(length, dtype=wp.int32, device=self.device) for length in kept)
         self._drift, self._rates = (self._none if self.viscosity is None else wp.zeros_like(like) for _ in range(2))
+        if self.viscosity is not None and options.turns:
+            # Halfway through a turn, where the motion of the step has no strain.
+            self.operator.frame = wp.zeros_like(like)
         self._moves = wp.zeros(1, dtype=wp.int32, device=self.device)
         self._begins = wp.zeros(1, dtype=wp.int32, device=self.device) if shared.rows is None else shared.begins
         self._is_prepared = False
@@ -330,8 +333,11 @@ class BodySteps:
             inputs = [self.operator.scales, self.newton.increment, self._drift]
             self._launch(kernels.find_rates, inputs, [self._rates])
             self.system.ranks.complete(self.k, self._rates)
-            state = self.body.state
-            self.viscosity.scatter(state.displacements, self._rates, state.forces)
+            state, turned, frame = self.body.state, self.newton.turned, self.operator.frame
+            there = state.displacements if turned is None else turned.displacements
+            if frame is not None:
+                self._launch(kernels.find_middle, [self.newton.base, there], [frame])
+            self.viscosity.scatter(there if frame is None else frame, self._rates, state.forces)
 
     def _end(self, offset: int, status: wp.array) -> None:
         """Launch the state after the step, and the work of forces."""

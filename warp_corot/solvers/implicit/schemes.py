@@ -71,7 +71,8 @@ class ImplicitIntegrator(Integrator):
     is_implicit: ClassVar[bool] = True
     #: The number of vectors that a step keeps for the next one.
     history: ClassVar[int] = 0
-    #: Whether steps of one iteration are linearised in the state to which the whole body will turn.
+    #: Whether velocities are the motion of the step over dt, so that steps of one iteration are linearised in the state
+    #: to which the whole body will turn, and viscous forces turn as in the middle of the step.
     turns: ClassVar[bool] = False
 
     def __post_init__(self) -> None:

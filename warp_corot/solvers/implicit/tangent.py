@@ -31,6 +31,7 @@ class TangentOperator:
 
     Attributes:
         tangent: The elastic K.
+        frame: Displacements whose rotations turn viscous forces [m], vec4; None: those of the linearisation.
     """
 
     def __init__(
@@ -49,6 +50,7 @@ class TangentOperator:
         self.stiff_forces = tuple(stiff_forces)
         self.device, self.worlds = body.device, body.worlds
         self.tangent = field.tangent(exact=exact)
+        self.frame: wp.array | None = None
         self.scales = wp.array([0.0, 0.0, 1.0], dtype=wp.float32, device=self.device)
         self._none = wp.zeros(1, dtype=wp.vec4, device=self.device)
         self._no_blocks = wp.zeros(1, dtype=wp.mat33, device=self.device)
@@ -95,7 +97,8 @@ class TangentOperator:
             forces.add_stiffness(self.body, x, y)
         if self.viscosity is not None:
             self._damped.zero_()
-            self.viscosity.scatter(self.displacements, everywhere, self._damped)
+            frame = self.displacements if self.frame is None else self.frame
+            self.viscosity.scatter(frame, everywhere, self._damped)
         conditions = self.body.conditions
         inputs = [self.scales, conditions.mass, conditions.inverse_mass, x, self._damped]
         self._launch(finish_rows, inputs, [y])
