@@ -14,14 +14,16 @@ from .sums import add_up
 wp.set_module_options({"enable_backward": False})
 
 #: Columns of a world's search: the current fraction, the ends of the bracket, and the power at these; the power at zero
-#: without contacts, and its decrease with the fraction; the power at zero with contacts, and the
-#: bracket's width one trial before.
-TRIED, LOW, HIGH, AT_LOW, AT_HIGH, POWER, LOSS, FIRST, WIDTH = (wp.constant(k) for k in range(9))
-COLUMNS = 9
+#: without contacts, and its decrease with the fraction; the power at zero with contacts; and the upper end before, with
+#: the power there.
+TRIED, LOW, HIGH, AT_LOW, AT_HIGH, POWER, LOSS, FIRST, BEFORE, AT_BEFORE = (wp.constant(k) for k in range(10))
+COLUMNS = 10
 #: The whole change is taken if the power at its end, over that at its beginning, is at most this in magnitude.
 ENOUGH = wp.constant(wp.float64(0.2))
-#: The search ends where the power, over that at the beginning, is at most this in magnitude.
-FOUND = wp.constant(wp.float64(0.01))
+#: A fraction between is taken if the power there is negative, and over that at the beginning at most this in magnitude.
+CLOSE = wp.constant(wp.float64(0.05))
+#: The power bends in the bracket if it is so many times as far below zero at the upper end as above at the lower one.
+BENT = wp.constant(wp.float64(4.0))
 
 
 @wp.kernel(enable_backward=False)
@@ -49,59 +51,53 @@ def begin_search(
 def take_trial(
     # In
     number: int,
-    is_last: int,
     # In and out
     search: wp.array2d[wp.float64],
     slopes: wp.array[wp.float64],
 ):
     """Read the power at the current fraction, first 0 and then 1, and choose the next fraction.
 
-    It is interpolated, or in the middle of a bracket that has not become half as wide: contacts that begin in the
-    middle of the change are so stiff that interpolation alone would hardly leave the bracket's lower end. The last
-    fraction is the upper end, where such contacts act, so that the next solve knows of them.
+    Stiff contacts that close on the way bend the power: it falls slowly up to them, and steeply beyond. A secant
+    through both ends of the bracket stays near its beginning then, and the middle of the bracket is tried instead.
+    Every other fraction, and the last one, comes from a line through the last two upper ends, which meets zero beyond
+    the bend.
     """
     world = wp.tid()
     s = search[world, TRIED]
     g = search[world, POWER] - s * search[world, LOSS] + slopes[world]
     slopes[world] = wp.float64(0.0)
     if number == 0:
-        search[world, LOW] = s
-        search[world, AT_LOW] = g
-        search[world, HIGH] = wp.float64(1.0)
-        search[world, AT_HIGH] = wp.float64(0.0)
-        search[world, TRIED] = wp.float64(1.0)
         search[world, FIRST] = g
-        search[world, WIDTH] = wp.float64(2.0)
-        return
-    if number == 1:
-        if g >= -ENOUGH * search[world, AT_LOW]:
-            search[world, LOW] = s
-            search[world, AT_LOW] = wp.float64(0.0)
-        search[world, AT_HIGH] = g
-    elif wp.abs(g) <= FOUND * search[world, FIRST]:
-        search[world, LOW] = s
-        search[world, HIGH] = s
-    elif g >= wp.float64(0.0):
-        # Halve the power at the end that stays, so that both ends of the bracket move (Illinois rule).
         search[world, LOW] = s
         search[world, AT_LOW] = g
-        search[world, AT_HIGH] = wp.float64(0.5) * search[world, AT_HIGH]
-    else:
+        search[world, HIGH] = wp.where(g > wp.float64(0.0), wp.float64(1.0), s)
+        search[world, AT_HIGH] = wp.float64(0.0)
+        search[world, BEFORE] = wp.float64(-1.0)
+        search[world, TRIED] = search[world, HIGH]
+        return
+    enough = wp.where(number == 1, ENOUGH, CLOSE) * search[world, FIRST]
+    if g >= wp.float64(0.0) or g >= -enough:
+        search[world, LOW] = s
+        search[world, AT_LOW] = wp.max(g, wp.float64(0.0))
+    if g < wp.float64(0.0):
+        if number > 1:
+            search[world, BEFORE] = search[world, HIGH]
+            search[world, AT_BEFORE] = search[world, AT_HIGH]
         search[world, HIGH] = s
         search[world, AT_HIGH] = g
-        search[world, AT_LOW] = wp.float64(0.5) * search[world, AT_LOW]
     low = search[world, LOW]
     high = search[world, HIGH]
     fall = search[world, AT_LOW] - search[world, AT_HIGH]
-    is_slow = high - low > wp.float64(0.5) * search[world, WIDTH]
-    search[world, WIDTH] = high - low
     share = high
-    if is_last != 0:
-        share = high
-    elif is_slow:
+    if fall > wp.float64(0.0) and high > low:
         share = wp.float64(0.5) * (low + high)
-    elif fall > wp.float64(0.0) and high > low:
-        share = low + (high - low) * search[world, AT_LOW] / fall
+        if -search[world, AT_HIGH] <= BENT * search[world, AT_LOW]:
+            share = low + (high - low) * search[world, AT_LOW] / fall
+        steep = search[world, AT_HIGH] - search[world, AT_BEFORE]
+        if number % 2 == 0 and search[world, BEFORE] > high and steep > wp.float64(0.0):
+            beyond = high + (search[world, BEFORE] - high) * search[world, AT_HIGH] / steep
+            if beyond > low:
+                share = beyond
     search[world, TRIED] = share
 
 

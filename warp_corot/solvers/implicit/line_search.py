@@ -12,7 +12,7 @@ from warp_corot.solvers.ranks import ALONE, Ranks
 from .sums import WorldSums
 
 #: Number of shares that are tried, with 0 and 1.
-TRIALS = 10
+TRIALS = 13
 
 
 class Contacts(Protocol):
@@ -76,9 +76,7 @@ class LineSearch:
         wp.launch(kernels.begin_search, (self._worlds, lanes), inputs, [self._search, self._slopes], device=self.device)
         for number in range(TRIALS):
             self._add_slopes(d, change)
-            self._launch(
-                kernels.take_trial, self._worlds, [number, int(number == TRIALS - 1), self._search, self._slopes]
-            )
+            self._launch(kernels.take_trial, self._worlds, [number, self._search, self._slopes])
         self._launch(kernels.add_share, self._worlds * self._count, [self._search, self._count, change, d])
 
     def _launch(self, kernel: wp.Kernel, dim: int, inputs: list) -> None:
