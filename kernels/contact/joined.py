@@ -20,6 +20,8 @@ wp.set_module_options({"enable_backward": False})
 
 #: The stiffness of a pair over that of its nodes.
 STIFF = wp.constant(4.0)
+#: A pair that has begun to push so often in a step is no longer located again.
+OFTEN = wp.constant(3)
 #: Lists of pairs.
 NEAR, PUSHING, REACHED = (wp.constant(k) for k in range(3))
 
@@ -39,6 +41,8 @@ class Joined:
     derivative: wp.array[wp.mat33]  # [P] [N/m]
     locates: wp.array[wp.int32]  # [1] whether pairs are to be located
     solves: wp.array[wp.int32]  # [1] how many linear solves the step has had so far
+    pushed: wp.array[wp.int32]  # [P] whether it pushed when it was last located
+    begun: wp.array[wp.int32]  # [P] how often it has begun to push in this step
     near: wp.array[wp.int32]  # [P] the pairs that may meet, as they were located
     pushing: wp.array[wp.int32]  # [P] those that push
     reached: wp.array[wp.int32]  # [P] those that push before or after a change of the motions

@@ -6,7 +6,7 @@ from warp_corot.kernels.stepping.pace import DT, Pace
 
 from .carriers import Carriers, crowd_at, ease_at, gone_at, is_held_at, motion_at
 from .facing import locate_facing
-from .joined import NEAR, STIFF, Joined, opened_by
+from .joined import NEAR, OFTEN, STIFF, Joined, opened_by
 from .law import Law, held_back
 from .motion import Surface
 from .rows import Meeting, Rows, row_count
@@ -71,7 +71,16 @@ def locate(
         e = opened_by(row, d, rows, surface, carriers) - joined.base[row]
         if wp.abs(rows.gap[row] + wp.dot(rows.normal[row], e) - joined.target[row]) <= law.slack:
             was = joined.multiplier[row]
-    is_near = locate_facing(row, surface, meeting, rows)
+    stays = bool(False)
+    if is_first != 0:
+        joined.pushed[row] = 0
+        joined.begun[row] = 0
+    else:
+        if pushed and joined.pushed[row] == 0:
+            joined.begun[row] = joined.begun[row] + 1
+        joined.pushed[row] = int(pushed)
+        stays = joined.begun[row] >= OFTEN
+    is_near = stays or locate_facing(row, surface, meeting, rows)
     joined.multiplier[row] = wp.vec3()
     joined.force[row] = wp.vec3()
     joined.stiffness[row] = 0.0
@@ -92,12 +101,12 @@ def locate(
         return
     joined.stiffness[row] = 1.0
     joined.given[row] = given
-    joined.base[row] = wp.vec3()
     opened = opened_by(row, d, rows, surface, carriers)
     if is_first != 0:
+        joined.base[row] = wp.vec3()
         allowed = left_at_pair(p, w, rows.gap[row], rows.normal[row], surface)
         joined.target[row] = kept_gap(rows.gap[row] + allowed, pushed, law, dt) - allowed
-    else:
+    elif not stays:
         joined.base[row] = opened
     n = rows.normal[row]
     push = wp.max(wp.dot(was, n), 0.0)

@@ -184,3 +184,20 @@ def test_the_sides_of_a_slit_meet_as_two_bodies_do(device):
         found.append(np.concatenate([body.positions.numpy() for body in bodies]))
     assert found[1][split[0] :, 2].min() < 0.0199
     np.testing.assert_allclose(found[0], found[1], rtol=0, atol=2e-5)
+
+
+def test_coarse_bodies_that_fall_on_one_another_are_solved_for():
+    """Their contacts lie at edges of coarse, round surfaces. Found again after each solve, they changed for ever."""
+    size = 0.317
+    shape = wc.Domain.sphere(size / 3.0) | wc.Domain.sphere(size / 5.0, (0.0, 0.0, 0.45 * size))
+    mesh = wc.TetForest.from_domain(shape, target_elements=270)
+    low, high = (wc.SoftBody(mesh, wc.Isotropic(young=2.57e5, poisson=0.17, density=376.0)) for _ in range(2))
+    height = float(np.ptp(mesh.points[:, 2]))
+    for k, body in enumerate((low, high)):
+        way = [0.05 * size * k, 0.03 * size * k, 1.02 * height * k - mesh.points[:, 2].min()]
+        body.displacements = np.tile(way, (len(mesh.points), 1)).astype(np.float32)
+    contact = wc.Contact(friction=0.2, on="tetrahedra")
+    sim = wc.Simulation([low, high], obstacles=wc.Ground(), contact=contact, gravity=DOWN, integrator=EULER)
+    sim.advance_steps(8)
+    assert force_on(high)[2] > 0.1 * weight(high)
+    assert sim.solves.unfinished == 0

@@ -28,6 +28,8 @@ OF_PAIRS = {
     "most": wp.float32,
     "force": wp.vec3,
     "derivative": wp.mat33,
+    "pushed": wp.int32,
+    "begun": wp.int32,
     "near": wp.int32,
     "pushing": wp.int32,
     "reached": wp.int32,
