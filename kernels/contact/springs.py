@@ -56,12 +56,10 @@ def bound_of(most: float, push: float, friction: float, is_solved: bool, solves:
     """The bound of friction that belongs to a push, or the last one for the time of a solve, see ``HALVED`` [N]."""
     if solves > 0 and not is_solved:
         return most
-    share = float(1.0)
-    if solves >= QUARTERED:
-        share = 0.25
-    elif solves >= HALVED:
-        share = 0.5
-    return most + share * (friction * push - most)
+    if solves < HALVED:
+        # Exactly, so that a resumed run, which does not know the last bound, is the same.
+        return friction * push
+    return most + wp.where(solves < QUARTERED, 0.5, 0.25) * (friction * push - most)
 
 
 @wp.func
