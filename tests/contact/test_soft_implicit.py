@@ -201,3 +201,28 @@ def test_coarse_bodies_that_fall_on_one_another_are_solved_for():
     sim.advance_steps(8)
     assert force_on(high)[2] > 0.1 * weight(high)
     assert sim.solves.unfinished == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("speed", [0.3, 1.0])
+def test_an_organ_that_slides_fast_loses_the_speed_that_friction_takes(device, speed):
+    """It goes by one to three elements in each step of 10 ms."""
+    lower = wc.TetForest.from_domain(
+        wc.Domain.box((-0.03, -0.024, -0.0071), (0.2, 0.023, 0.0069)), target_elements=2500
+    )
+    upper = wc.TetForest.from_domain(
+        wc.Domain.box((-0.011, -0.014, 0.0071), (0.015, 0.008, 0.0181)), target_elements=900
+    )
+    low, high = (wc.SoftBody(mesh, wc.Isotropic(1e5, 0.45, 1000.0), device=device) for mesh in (lower, upper))
+    low.fix(lower.points[:, 2] < -0.0065)
+    friction, gravity, step = 0.3, 9.81, 0.01
+    contact, integrator = wc.Contact(friction=friction), wc.BackwardEuler(dt=step)
+    sim = wc.Simulation([low, high], contact=contact, gravity=(0.0, 0.0, -gravity), integrator=integrator)
+    sim.advance_steps(5)
+    begin = high.velocities.numpy()
+    begin[:, 0] += speed
+    high.velocities = begin
+    steps = 5 if speed < 0.5 else 12
+    sim.advance_steps(steps)
+    lost = speed - float(high.velocities.numpy()[:, 0].astype(float) @ high.masses / high.masses.sum())
+    assert lost == pytest.approx(friction * gravity * steps * step, rel=0.05)
