@@ -1,5 +1,9 @@
 """A session with rigid tools, and of several worlds: hands on tools, switches, and the world that is shown."""
 
+import asyncio
+from types import SimpleNamespace
+from unittest.mock import MagicMock
+
 import numpy as np
 import pytest
 from hands import TOP, block
@@ -205,3 +209,22 @@ def test_tools_that_a_visitor_cannot_move_are_named():
     page.ask(lambda: page.press_tool(1, 0))
     page.take_commands()
     assert "no tissue is within" in page.note
+
+
+def test_a_dragged_tool_goes_as_far_as_the_mouse():
+    """The browser tells where the place that was pressed is now: it moves with the tool."""
+    pytest.importorskip("viser")
+    from warp_corot.viewing.scene import EXTENT, Scene
+
+    page, tool = with_tool()
+    server = MagicMock()
+    Scene(server, page)
+    dragged = server.scene.add_mesh_simple.return_value.on_drag.call_args_list[-1].args[0]
+    scale, way = EXTENT / page.size, np.zeros(3)
+    for phase, share in (("start", 0.0), ("update", 0.3), ("update", 0.7), ("update", 1.0)):
+        start = scale * np.array([0.0, 0.0, 0.01])
+        event = {"client_id": 1, "phase": phase, "start_position": start + scale * way}
+        asyncio.run(dragged(SimpleNamespace(**event, end_position=start + scale * share * UP)))
+        still(page, 0.1)
+        way = share * UP
+        np.testing.assert_allclose(tool.present_pose[0, :3], [0.05, 0.05, 0.2202] + way, atol=1e-6)

@@ -179,13 +179,19 @@ class Scene:
             press: Called with the visitor and the place that was pressed [m].
         """
 
+        # An event's own start moves with the tool that is dragged.
+        starts: dict[Any, npt.NDArray[np.float64]] = {}
+
         async def dragged(event: Any) -> None:
             session, owner = self._session, event.client_id
-            start, end = (np.asarray(p, dtype=np.float64) for p in (event.start_position, event.end_position))
+            begun, end = (np.asarray(p, dtype=np.float64) for p in (event.start_position, event.end_position))
             if event.phase == "start":
-                position = start / self._scale + self._middle
+                starts[owner] = begun
+                position = begun / self._scale + self._middle
                 session.ask(lambda: press(owner, position))
+            start = starts.get(owner, begun)
             if event.phase == "end":
+                starts.pop(owner, None)
                 session.ask(lambda: session.let_go(owner))
             else:
                 session.ask(lambda: session.move(owner, (end - start) / self._scale))
