@@ -227,4 +227,4 @@ def test_a_dragged_tool_goes_as_far_as_the_mouse():
         asyncio.run(dragged(SimpleNamespace(**event, end_position=start + scale * share * UP)))
         still(page, 0.1)
         way = share * UP
-        np.testing.assert_allclose(tool.present_pose[0, :3], [0.05, 0.05, 0.2202] + way, atol=1e-6)
+        np.testing.assert_allclose(tool.present_pose[0, :3] - way, [0.05, 0.05, 0.2202], atol=1e-6)
