@@ -76,4 +76,7 @@ def locate_facing(row: int, surface: Surface, meeting: Meeting, rows: Rows) -> b
         return False
     if not is_faced(row, owner, surface, meeting, rows):
         return False
+    # Within a body, such pairs hold back parts of it that close on one another at rims.
+    if meeting.body[owner] == meeting.body[meeting.triangles[rows.other[row]][0]]:
+        return True
     return not leans_over(row, surface, meeting, rows)
