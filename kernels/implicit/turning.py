@@ -21,6 +21,24 @@ Sums = wp.types.vector(length=COLUMNS, dtype=wp.float64)
 LEAST = wp.constant(wp.float64(1.0e-3))
 
 
+@wp.func
+def motion_of(m: wp.float64, is_held: bool, x: wp.vec3d, v: wp.vec3d):
+    """A node's share of the sums."""
+    one = Sums()
+    spin = wp.cross(x, v)
+    one[MASS] = m
+    if is_held:
+        one[HELD] = wp.float64(1.0)
+    for axis in range(3):
+        after = (axis + 1) % 3
+        one[FIRST + axis] = m * x[axis]
+        one[MOMENTUM + axis] = m * v[axis]
+        one[SPIN + axis] = m * spin[axis]
+        one[SQUARES + axis] = m * x[axis] * x[axis]
+        one[SQUARES + 3 + axis] = m * x[axis] * x[after]
+    return one
+
+
 @wp.kernel(enable_backward=False)
 def sum_motion(
     # In
@@ -42,20 +60,8 @@ def sum_motion(
     while k < count:
         i = world * count + k
         if mass[i] > 0.0:
-            m = wp.float64(mass[i])
             x = wp.vec3d(load_node(rest, i)) + wp.vec3d(load_node(u, i))
-            rate = wp.vec3d(load_node(v, i))
-            spin = wp.cross(x, rate)
-            total[MASS] += m
-            if inverse_mass[i] == 0.0:
-                total[HELD] += wp.float64(1.0)
-            for axis in range(3):
-                after = (axis + 1) % 3
-                total[FIRST + axis] += m * x[axis]
-                total[MOMENTUM + axis] += m * rate[axis]
-                total[SPIN + axis] += m * spin[axis]
-                total[SQUARES + axis] += m * x[axis] * x[axis]
-                total[SQUARES + 3 + axis] += m * x[axis] * x[after]
+            total += motion_of(wp.float64(mass[i]), inverse_mass[i] == 0.0, x, wp.vec3d(load_node(v, i)))
         k += threads
     for column in range(COLUMNS):
         part = sum_of_lanes(total[column])

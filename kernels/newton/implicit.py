@@ -1,13 +1,15 @@
 """Implicit steps of a Newton model: the motions d of particles, and of the bodies that these touch, within a step.
 
-With v the velocities, f the forces at the beginning and those of links at the end, backward Euler with one
+With v the velocities, f the forces on particles, and those of links at the end, backward Euler with one
 linearisation of the elastic forces is
 
     (M (1/dt^2 + damping/dt) + K + D/dt) d = M v/dt + f + links(d),      v_after = d/dt.
 
-K is R K R^T with each element's rotation at the beginning, D its viscosity there. A vector has an entry for each
-particle, and two for each body, of its translation and its rotation. Entries of what is held, or moves as prescribed,
-are not free.
+K is R K R^T with each element's rotation where free pieces are turned as they will turn in the step (``turning``). The
+forces f are those there plus K times the way to there. D is the viscosity midway, where a turn has none.
+
+A vector has an entry for each particle, and two for each body, of its translation and its rotation. Entries of what is
+held, or moves as prescribed, are not free.
 """
 
 import warp as wp
@@ -25,7 +27,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Linearised:
-    """Elements at the beginning of a step; stiffness and viscosity times rest volumes."""
+    """Elements where a step is linearised; stiffness and viscosity times rest volumes."""
 
     nodes: wp.array[wp.vec4i]  # [T] entries
     rest_inverse: wp.array[wp.mat33]  # [T] [1/m]
@@ -45,16 +47,18 @@ def linearise(
     k_damp: wp.array[wp.float32],
     dt: float,
     q: wp.array[wp.vec3],
+    turned: wp.array[wp.vec3],
     # Out
     made: Linearised,
 ):
     t = wp.tid()
-    f = difference_gradient(elements, t, q)
+    f = difference_gradient(elements, t, turned)
     volume = elements.volume[t]
     made.rotation[t] = byers_xu(f)
     made.mu[t] = volume * mu[t]
     made.lam[t] = volume * lam[t]
     if made.gradient.shape[0] == made.rotation.shape[0]:
+        f = 0.5 * (f + difference_gradient(elements, t, q))
         made.gradient[t] = f
         made.viscosity[t] = 3.0 * volume * k_damp[t] / (dt * wp.max(wp.ddot(f, f), 1.0e-12))
 

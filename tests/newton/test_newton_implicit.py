@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import warp as wp
 from newton_scenes import builder, newton, wc, wn
+from scipy.spatial.transform import Rotation
 
 DT = 1 / 60
 TISSUE = wc.Isotropic(young=1e5, poisson=0.35, density=1000.0)
@@ -65,6 +66,49 @@ def test_steps_agree_with_short_explicit_ones(device):
         _, state, _ = stepped(model, 6, substeps=count)
         ends.append(np.abs(state.particle_q.numpy() - wanted.particle_q.numpy()).max())
     assert ends[0] > 1.7 * ends[1] > 1.7**2 * ends[2] > 0.0
+
+
+@pytest.mark.parametrize("kind", ["mesh", "forest"])
+def test_bodies_that_turn_far_in_a_step_keep_their_size(device, kind):
+    """Two cubes in one world that turn by 0.2 and -0.1 rad in a step, and one that is held."""
+    forest = wc.TetForest.box((1, 1, 1), 0.02, level=3, up_axis="Z")
+    mesh = forest if kind == "forest" else wc.TetMesh(forest.points, forest.tets, up_axis="Z")
+    made = builder(gravity=(0.0, 0.0, 0.0))
+    held = [False, False, forest.points[:, 0] == 0]
+    tissue = wc.Isotropic(young=1e6, poisson=0.4, density=1000.0)
+    blocks = [
+        (wn.add_forest if kind == "forest" else wn.add_mesh)(
+            made, mesh, tissue, pos=(0, 0.1 * i, 0), k_damp=100.0, **({} if i < 2 else {"fixed": held[i]})
+        ).particles
+        for i in range(3)
+    ]
+    model = made.finalize(device=device)
+    state = model.state()
+    q = state.particle_q.numpy()
+    arms = [q[block] - q[block].mean(axis=0) for block in blocks]
+    # They spin about the axis of their largest moment of inertia.
+    weighted = model.particle_mass.numpy()[blocks[0], None] * arms[0]
+    axis = np.linalg.eigh(weighted.T @ arms[0])[1][:, 0]
+    v = np.zeros_like(q)
+    for turn, block, arm in zip((0.2, -0.1), blocks, arms, strict=False):
+        v[block] = np.cross(turn / 0.01 * axis, arm)
+    state.particle_qd.assign(v)
+    solver, state, _ = stepped(model, 10, dt=0.01, state=state)
+    assert solver.solves.unfinished == 0
+    after = state.particle_q.numpy()
+    for turn, block, arm in zip((0.2, -0.1, 0.0), blocks, arms, strict=True):
+        now = after[block] - after[block].mean(axis=0)
+        # Centrifugal forces stretch them by some 1e-5.
+        np.testing.assert_allclose(np.linalg.norm(now, axis=1), np.linalg.norm(arm, axis=1), atol=2e-4 * 0.02)
+        if turn == 0.0:
+            continue
+        # Backward Euler of a rigid body: x1 x (x1 - 2 x0 + x-1) = 0 about its centre.
+        angles = [np.arctan(turn)]
+        for _ in range(9):
+            angles.append(np.arctan(np.sin(angles[-1]) / (2.0 - np.cos(angles[-1]))))
+        angle = np.sum(angles)
+        wanted = Rotation.from_rotvec(angle * axis).apply(arm)
+        np.testing.assert_allclose(now, wanted, atol=2e-3 * 0.02)
 
 
 @pytest.mark.parametrize(("young", "poisson", "dt"), [(1e9, 0.49999, DT), (1.0, 0.3, DT), (3e4, 0.4, 1e3)])

@@ -24,6 +24,7 @@ from .state import NAMESPACE
 from .step_operator import StepOperator
 from .steps import RUNAWAY, Steps
 from .tetrahedra import Tetrahedra
+from .turning import TurnedPieces
 from .unknowns import Unknowns
 
 #: Residual of the linear solve over its right side.
@@ -60,6 +61,7 @@ class ImplicitSteps(Steps):
             )
         self._unknowns = Unknowns(model)
         self._links = LinkForces(model, contacts, self._unknowns)
+        self._turned = TurnedPieces(model, tetrahedra, self._unknowns)
         self._operator = StepOperator(model, tetrahedra, self._unknowns, self._links)
         count = len(self._unknowns)
         self._b, self._d, self._r, self._rest, self._product, self._change = (
@@ -78,8 +80,9 @@ class ImplicitSteps(Steps):
         if control is not None and control.tet_activations is not None:
             activation = control.tet_activations
         now: Any = substep.state_in
+        self._turned.launch(now, substep.dt)
         # Viscous forces are those of the velocities after the step, which the solve finds.
-        at_rest: Any = SimpleNamespace(particle_q=now.particle_q, particle_qd=self._still)
+        at_rest: Any = SimpleNamespace(particle_q=self._turned.positions, particle_qd=self._still)
         setattr(at_rest, NAMESPACE, getattr(now, NAMESPACE, None))
         self.tetrahedra.add_forces(at_rest, activation, self._f)
         of_bodies = self._bodies_after(done, substep, given)
@@ -105,7 +108,8 @@ class ImplicitSteps(Steps):
             inputs += [model.body_inv_inertia, model.body_inertia, of_bodies.body_q, of_bodies.body_qd, given.body_f]
             inputs += [int(self.others.has_bodies), self.report.trouble, self._unknowns.body]
             self._launch(kernels.begin_bodies, model.body_count, inputs, outputs)
-        operator.take(now.particle_q, dt)
+        operator.take(now.particle_q, self._turned.positions, dt)
+        operator.add_product(self._turned.way, self._b)
 
     def _solve(self) -> None:
         """Launch linear solves until contacts no longer change."""

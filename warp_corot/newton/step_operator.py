@@ -46,12 +46,12 @@ class StepOperator:
         made.mu, made.lam = (wp.zeros(self._elements, dtype=wp.float32, device=self.device) for _ in range(2))
         self._make_room_for_viscosity(0)
 
-    def take(self, q: wp.array, dt: float) -> None:
-        """Launch the linearisation at positions q, after ``inertia`` and ``free``."""
+    def take(self, q: wp.array, turned: wp.array, dt: float) -> None:
+        """Launch the linearisation where positions q are turned, after ``inertia`` and ``free``."""
         tets = self._tetrahedra
         if tets.damped and not len(self._made.viscosity):
             self._make_room_for_viscosity(self._elements)
-        inputs = [tets.elements, tets.mu, tets.lam, tets.k_damp, dt, q]
+        inputs = [tets.elements, tets.mu, tets.lam, tets.k_damp, dt, q, turned]
         self._launch(kernels.linearise, self._elements, inputs, [self._made])
         self._of_elements.zero_()
         self._launch(kernels.add_element_blocks, self._elements, [self._made], [self._of_elements])
@@ -66,10 +66,14 @@ class StepOperator:
     def apply(self, x: wp.array, y: wp.array, *, linked: bool = True) -> None:
         """Launch y = A x, with or without the links."""
         y.zero_()
-        self._launch(kernels.add_element_products, self._elements, [self._made, x], [y])
+        self.add_product(x, y)
         if linked:
             self._links.add_products(x, y)
         self._launch(kernels.finish_rows, self._count, [self.free, self.inertia, x], [y])
+
+    def add_product(self, x: wp.array, y: wp.array) -> None:
+        """Launch y += (K + D/dt) x."""
+        self._launch(kernels.add_element_products, self._elements, [self._made, x], [y])
 
     @property
     def preconditioner(self) -> BlockInverses:
