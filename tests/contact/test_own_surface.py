@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 from half_balls import CONTACT, DEPTH, FORCE, HALF, POISSON, RADIUS, YOUNG, boussinesq
-from organs import BALL, SOFT, ball_mesh, brick_mesh, fork_mesh, ground
+from organs import BALL, SOFT, ball_mesh, brick_mesh, crossing, fork_mesh, ground
 
 import warp_corot as wc
 
@@ -175,10 +175,7 @@ def test_the_prongs_of_a_fork_touch_each_other(device):
     own = [point for point in sim.contacts() if point.other is body]
     assert own
     assert min(point.gap for point in own) > -1e-4
-    rest, now = body.contact_surface.points, body.contact_surface.moved(body.displacements.numpy())
-    tips = rest[:, 2] > 0.03
-    left, right = (now[tips & (sign * rest[:, 0] > 0.0), 0] for sign in (-1, 1))
-    assert left.max() - right.min() < 1e-3
+    assert crossing(body) < 4e-4
     assert -plates[0].wrench.numpy()[0][0] == pytest.approx(plates[1].wrench.numpy()[0][0], rel=0.2)
 
 
@@ -196,7 +193,7 @@ def test_a_needle_does_not_pass_between_the_points(ball, device):
     points = body.contact_surface.moved(body.displacements.numpy())
     above = points[points[:, 2] > tip[2] + 1e-3]
     assert np.linalg.norm(above[:, :2] - tip[:2], axis=1).min() > 0.9e-3
-    sim.advance(0.2)
+    sim.advance(0.5)
     assert np.abs(body.displacements.numpy()).max() < 1e-3
 
 

@@ -105,15 +105,15 @@ SLOW = pytest.mark.slow
         pytest.param("plate", 0.3, [0.0025, 0.01], marks=SLOW),
         pytest.param("plate of 1 mm", 0.0, [0.0025, 0.005, 0.01], marks=SLOW),
         pytest.param("plate of 1 mm", 0.3, [0.0025, 0.005], marks=SLOW),
-        pytest.param("vessel", 0.0, [0.0025, 0.005, 0.01], marks=SLOW),
+        pytest.param("vessel", 0.05, [0.0025, 0.005, 0.01], marks=SLOW),
         pytest.param("vessel", 0.3, [0.0025, 0.005, 0.01], marks=SLOW),
     ],
 )
 def test_implicit_steps_press_thin_bodies_as_explicit_ones_do(device, name, friction, steps):
     """The force of a ball is that of explicit steps to a tenth, and steady to a twentieth, for steps of any length.
 
-    Without friction plate and vessel are about to glide from under the ball: damping keeps them there on the CPU, and
-    elsewhere rounding may decide.
+    Without friction plates are about to glide from under the ball: damping keeps them there on the CPU, and elsewhere
+    rounding may decide. A vessel does glide away.
     """
     domain, elements, case = THIN[name]
     mesh = wc.TetForest.from_domain(domain, target_elements=elements)

@@ -11,7 +11,7 @@ import warp as wp
 from warp_corot.discretization.changing.following import FollowingBinding
 from warp_corot.kernels.remesh import follow as kernels
 from warp_corot.mesh.surfaces.bound import BoundPoints, SurfaceMesh
-from warp_corot.mesh.surfaces.clustering import LOST, Clusters, resolved
+from warp_corot.mesh.surfaces.clustering import Clusters, departures, resolved
 from warp_corot.mesh.surfaces.splitting import longest_edge, split
 
 from .skin import APART, Skin, apart, levels_at
@@ -86,9 +86,10 @@ class FollowedSurface:
         self._binding = FollowingBinding(bound, source, leaves, device)
         levels = levels_at(source, bound)
         sizes = apart(source, levels)
-        resolved_sizes = resolved(SurfaceMesh(points, bound.nodes, weights, triangles), sizes)
+        surface = SurfaceMesh(points, bound.nodes, weights, triangles)
+        resolved_sizes = resolved(surface, sizes)
         fewer = np.rint(3.0 * np.log2(sizes / resolved_sizes))
-        self._far = LOST * resolved_sizes
+        self._far = departures(surface, resolved_sizes)
         #: The lowest level at each point with which the surface keeps its shape, of those down to ``_tried``.
         self._least: Ints = levels + np.maximum(fewer, 0.0).astype(np.int32)
         self._tried = int(self._least.max(initial=0))

@@ -19,9 +19,6 @@ if TYPE_CHECKING:
 #: The distance between points of a body's own surface, over the edge of a cube of six of the elements there: with
 #: fewer points surfaces lose their shape, with more they touch in more places than the nodes can follow.
 APART = 1.0
-#: The length of the mean of the normals at the points that a node bears, below which they lie on opposite sides; at a
-#: corner of a cube it is 0.58.
-SIDED = 0.4
 
 Ints = npt.NDArray[np.int32]
 
@@ -82,11 +79,7 @@ class Skin:
         """Whether nodes around a triangle bear points of opposite sides of the body, too, bool [t]."""
         if self.own is None:
             return np.zeros(len(self.triangles), bool)
-        nodes, weights = self.own.nodes.ravel(), np.abs(self.own.weights).ravel()
-        ways = np.repeat(self.own.normals, 4, axis=0) * weights[:, None]
-        sums = np.column_stack([np.bincount(nodes, each) for each in ways.T])
-        one_sided = np.linalg.norm(sums, axis=1) >= SIDED * np.bincount(nodes, weights)
-        return ~(one_sided[self.own.nodes] | (self.own.weights == 0.0)).all(axis=1)[self.triangles].all(axis=1)
+        return self.own.is_thin[self.triangles].all(axis=1)
 
     @property
     def bearers(self) -> Ints:

@@ -17,6 +17,10 @@ from warp_corot.kernels.meshing import embedding as kernels
 
 from .locating import checked_points
 
+#: The length of the mean of the normals at the points that a node bears, below which they lie on opposite sides; at a
+#: corner of a cube it is 0.58.
+SIDED = 0.4
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class BoundPoints:
@@ -73,6 +77,15 @@ class SurfaceMesh(BoundPoints):
     def normals(self) -> np.ndarray:
         """Outward unit normals of the points at rest, weighted by the triangles' areas, float64 [V, 3]."""
         return vertex_normals(self.points, self.triangles)
+
+    @cached_property
+    def is_thin(self) -> np.ndarray:
+        """Whether a node of each point bears points of opposite sides of the body, too, bool [V]."""
+        nodes, weights = self.nodes.ravel(), np.abs(self.weights).ravel()
+        ways = np.repeat(self.normals, self.nodes.shape[1], axis=0) * weights[:, None]
+        sums = np.column_stack([np.bincount(nodes, each) for each in ways.T])
+        one_sided = np.linalg.norm(sums, axis=1) >= SIDED * np.bincount(nodes, weights)
+        return ~(one_sided[self.nodes] | (self.weights == 0.0)).all(axis=1)
 
     @property
     def area(self) -> float:

@@ -13,8 +13,9 @@ import numpy.typing as npt
 from .bound import SurfaceMesh
 from .locating import distances_from, nearest_faces
 
-#: Where vertices would be farther from the coarser surface than this many sizes, sizes are halved, this many times.
-LOST, HALVED = 0.15, 2
+#: Where vertices would be farther from the coarser surface than this many sizes, or, where the body is not thin, than
+#: this fraction of the largest extent of the surface, sizes are halved, this many times.
+LOST, HANGING, HALVED = 0.15, 0.005, 2
 #: The weight of the distance from the middle of a cluster, among squares of distances from planes.
 FLAT = 0.1
 
@@ -121,7 +122,7 @@ def resolved(surface: SurfaceMesh, sizes: Floats) -> Floats:
     for _ in range(HALVED):
         thin = clustered(surface, sizes)
         far = distances_from(thin.points, thin.triangles, surface.points, float(sizes.max()))
-        lost = far > LOST * sizes
+        lost = far > departures(surface, sizes)
         if not lost.any():
             break
         cubes = np.floor(surface.points / sizes[:, None]).astype(np.int64)
@@ -130,6 +131,19 @@ def resolved(surface: SurfaceMesh, sizes: Floats) -> Floats:
         in_lost[cube.ravel()[lost]] = True
         sizes = np.where(in_lost[cube.ravel()], 0.5 * sizes, sizes)
     return sizes
+
+
+def departures(surface: SurfaceMesh, sizes: Floats) -> Floats:
+    """How far each vertex may be from a coarser surface with vertices a size apart [m], [V].
+
+    In thin parts more points would only load the same few nodes from both sides, so there only the sizes count.
+
+    Args:
+        surface: The surface.
+        sizes: The size at each of its vertices [m], [V].
+    """
+    extent = np.ptp(surface.points, axis=0).max(initial=0.0)
+    return LOST * sizes if not extent else np.minimum(LOST * sizes, np.where(surface.is_thin, np.inf, HANGING * extent))
 
 
 class Clusters:
