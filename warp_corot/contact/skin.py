@@ -79,7 +79,7 @@ class Skin:
         """Whether nodes around a triangle bear points of opposite sides of the body, too, bool [t]."""
         if self.own is None:
             return np.zeros(len(self.triangles), bool)
-        return self.own.is_thin[self.triangles].all(axis=1)
+        return np.asarray(self.own.is_thin[self.triangles].all(axis=1))
 
     @property
     def bearers(self) -> Ints:

@@ -79,7 +79,7 @@ class SurfaceMesh(BoundPoints):
         return vertex_normals(self.points, self.triangles)
 
     @cached_property
-    def is_thin(self) -> np.ndarray:
+    def is_thin(self) -> npt.NDArray[np.bool_]:
         """Whether a node of each point bears points of opposite sides of the body, too, bool [V]."""
         nodes, weights = self.nodes.ravel(), np.abs(self.weights).ravel()
         ways = np.repeat(self.normals, self.nodes.shape[1], axis=0) * weights[:, None]
