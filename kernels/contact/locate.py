@@ -2,6 +2,7 @@
 
 import warp as wp
 
+from .bearing import is_borne
 from .closest import on_segments, on_triangle, point_of
 from .motion import Surface
 from .rows import BAND, BAND_AT_REST, BAND_OF_NEIGHBOURS, Meeting, Rows, triangle_normal
@@ -91,6 +92,40 @@ def faces(s: int, n: wp.vec3, surface: Surface, meeting: Meeting):
 
 
 @wp.func
+def is_nearer_to_a_side(
+    s: int, t: int, w: wp.vec3, n: wp.vec3, depth: float, size: float, surface: Surface, meeting: Meeting
+):
+    """Whether a node that is behind a triangle has a shorter way out over a sharp side of it, where another triangle
+    takes it: one that the node faces and is behind. So a bar on the rim of a block is not pushed off its side.
+
+    Args:
+        w: Barycentric coordinates of the closest point.
+        n: The triangle's normal.
+        depth: How far behind it the node is [m].
+        size: Root of twice its area [m].
+    """
+    c = meeting.triangles[t]
+    for k in range(3):
+        i = c[(k + 1) % 3]
+        j = c[(k + 2) % 3]
+        side = wp.length(surface.x[j] - surface.x[i])
+        if depth * side > w[k] * size * size:
+            for m in range(meeting.corner_starts[i], meeting.corner_starts[i + 1]):
+                other = meeting.corners[m] / 3
+                d = meeting.triangles[other]
+                if other != t and (d[0] == j or d[1] == j or d[2] == j):
+                    beside = triangle_normal(surface, d)
+                    middle = (surface.x[d[0]] + surface.x[d[1]] + surface.x[d[2]]) / 3.0
+                    is_sharp = wp.dot(beside, n) < -FACING and wp.dot(middle - surface.x[i], n) < 0.0
+                    below = -wp.dot(surface.x[s] - surface.x[i], beside)
+                    if is_sharp and below > 0.0 and below < depth and faces(s, beside, surface, meeting):
+                        v = on_triangle(surface.x[s], surface.x[d[0]], surface.x[d[1]], surface.x[d[2]])
+                        if wp.min(v) > 0.0:
+                            return True
+    return False
+
+
+@wp.func
 def locate_node(row: int, s: int, t: int, surface: Surface, meeting: Meeting, rows: Rows):
     """A node at a triangle."""
     c = meeting.triangles[t]
@@ -111,6 +146,9 @@ def locate_node(row: int, s: int, t: int, surface: Surface, meeting: Meeting, ro
         gap = length
         if not faces(s, n, surface, meeting):
             return False
+    # Points of own surfaces may not be at the other triangle, because several share the nodes that bear them.
+    if gap < 0.0 and not is_borne(s, surface) and is_nearer_to_a_side(s, t, w, n, -gap, size, surface, meeting):
+        return False
     rows.places[row] = wp.vec4i(s, c[0], c[1], c[2])
     rows.shares[row] = wp.vec4(1.0, -w[0], -w[1], -w[2])
     rows.normal[row] = n
@@ -152,6 +190,10 @@ def locate_edge(row: int, first: int, second: int, surface: Surface, meeting: Me
     if wp.dot(n, out_of_second) < 0.1 or wp.dot(n, out_of_first) > -0.1:
         return False
     gap = wp.dot(n, p + s * (q - p) - a - t * (b - a))
+    # The shorter way out is over an end, where its node touches a triangle.
+    to_ends = wp.min(wp.min(s, 1.0 - s) * wp.length(q - p), wp.min(t, 1.0 - t) * wp.length(b - a))
+    if gap < -to_ends:
+        return False
     is_self = meeting.body[f[0]] == meeting.body[g[0]]
     apart = wp.vec3()
     if is_self:

@@ -261,3 +261,21 @@ def test_pairs_left_out_of_a_step_would_not_have_pushed(device, speed):
     # A slow block meets all pairs that were found for it.
     assert 0 < live[0] < live[1] + (speed < 1.0)
     np.testing.assert_allclose(*moved, rtol=0.0, atol=1e-5 * np.abs(moved[1]).max())
+
+
+@pytest.mark.parametrize("integrator", [None, wc.BackwardEuler(dt=0.002)], ids=["explicit", "implicit"])
+def test_a_bar_at_the_rim_of_a_block_is_not_pushed_aside(device, integrator):
+    """It overlaps the top of the block by 0.5 mm. Its far side is 18 mm behind the block's side, but on top of it."""
+    mesh = wc.TetForest.box((1, 1, 1), 0.1, level=0, up_axis="Z")
+    bar = wc.TetMesh(mesh.points * [1.0, 0.15, 0.15] + [0.05, 0.003, 0.0995], mesh.tets, up_axis="Z")
+    tissue = wc.Isotropic(young=1e5, poisson=0.3, density=1000.0)
+    low, high = wc.SoftBody(mesh, tissue, device=device), wc.SoftBody(bar, tissue, device=device)
+    low.fix("z < 0.001")
+    sim = wc.Simulation([low, high], gravity=(0.0, 0.0, -9.81), contact=wc.Contact(friction=0.0), integrator=integrator)
+    for _ in range(10):
+        sim.advance_steps(1)
+        pushed = high.contact_forces.numpy().sum(axis=0)
+        assert np.abs(pushed[:2]).max() < 2e-3
+    sim.advance(0.05)
+    assert abs(high.masses @ high.velocities.numpy()[:, 1]) < 0.005 * high.masses.sum()
+    assert high.positions.numpy()[:, 2].min() > 0.09
