@@ -90,9 +90,9 @@ def test_help(args, capsys):
             assert f"--{name} " in said
 
 
-@pytest.mark.parametrize("stage", ["cli.commands", "inputs.starting.start_warp"])
+@pytest.mark.parametrize("stage", ["cli.subcommand", "inputs.starting.start_warp"])
 def test_interrupted_before_anything_runs(stage, capsys, monkeypatch):
-    def interrupt():
+    def interrupt(*_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(f"warp_corot.{stage}", interrupt)

@@ -171,11 +171,19 @@ def test_compiling_is_announced_only_if_kernels_are_compiled(tmp_path):
     assert "kernels" not in first
 
 
-def test_module_and_version(tmp_path):
+@pytest.mark.parametrize(
+    ("words", "said", "without"),
+    [
+        (["--version"], f"warp-corot {wc.__version__} (warp {wp.__version__})\n", "warp|numpy|scipy|pxr"),
+        (["--help"], "usage: warp-corot [-h] [--version] COMMAND", "warp|numpy|scipy|pxr"),
+        (["simulate", "--help"], "usage: warp-corot simulate", "scipy|pxr|newton|meshio|vtk|viser|matplotlib"),
+    ],
+)
+def test_imports_of_a_start(words, said, without, tmp_path):
     """Large libraries are imported when they are needed, so that the command starts quickly."""
-    process = started(tmp_path, "--version", env=os.environ | {"PYTHONPROFILEIMPORTTIME": "1"})
+    process = started(tmp_path, *words, env=os.environ | {"PYTHONPROFILEIMPORTTIME": "1"})
     out, imported = process.communicate(timeout=60)
     assert process.returncode == 0
-    assert out.startswith(f"warp-corot {wc.__version__}")
-    assert "warp_corot.cli.simulate" in imported
-    assert not re.search(r"\| +(scipy|pxr|newton|meshio|vtk|viser|matplotlib)\n", imported)
+    assert out.startswith(said)
+    assert re.search(r"\| +warp_corot.cli\n", imported)
+    assert not re.search(rf"\| +({without})\n", imported)

@@ -8,7 +8,9 @@ import re
 import shlex
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from importlib import import_module
+from importlib.metadata import version
 from types import ModuleType
 from typing import NoReturn
 
@@ -16,7 +18,7 @@ from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.importing import uncollected
 from warp_corot.inputs.likely import meant
 
-from .parsing import StrictParser
+from .parsing import COMMANDS, StrictParser
 from .ranks import end_others, fall_silent, let_others_speak, speaks
 from .say import EXIT_CODES, as_option, complain, interrupt_status, open_streams, silence
 from .signals import leaving_at_once, terminable
@@ -25,11 +27,9 @@ from .signals import leaving_at_once, terminable
 FAILED = (1, 2, 3)
 
 
-def commands() -> dict[str, ModuleType]:
-    """The subcommands by name; they import the whole package, which takes a while."""
-    from . import paper, scene, simulate, sweep, view
-
-    return {"simulate": simulate, "sweep": sweep, "view": view, "scene": scene, "paper": paper}
+def subcommand(name: str) -> ModuleType:
+    """The module of a subcommand; it imports the whole package, which takes a while."""
+    return import_module(f".{name}", __name__)
 
 
 class Parser(StrictParser):
@@ -59,9 +59,12 @@ class Parser(StrictParser):
         return found, unknown
 
 
-def make_parser() -> argparse.ArgumentParser:
-    import warp as wp
+def make_parser(needed: Collection[str] = COMMANDS) -> argparse.ArgumentParser:
+    """The parser of the command line.
 
+    Args:
+        needed: The subcommands whose options it knows. Of the others it has the names, and nothing is imported.
+    """
     from warp_corot import __version__
 
     parser = Parser(
@@ -69,10 +72,15 @@ def make_parser() -> argparse.ArgumentParser:
         description="Corotational finite elements for soft tissue, on CPU and CUDA.",
         epilog="Example: warp-corot simulate warp:bear -o bear.usd\n\n" + EXIT_CODES,
     )
-    parser.add_argument("--version", action="version", version=f"warp-corot {__version__} (warp {wp.__version__})")
+    parser.add_argument(
+        "--version", action="version", version=f"warp-corot {__version__} (warp {version('warp-lang')})"
+    )
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=Parser)
-    for command in commands().values():
-        command.add_parser(subparsers)
+    for name, line in COMMANDS.items():
+        if name in needed:
+            subcommand(name).add_parser(subparsers)
+        else:
+            subparsers.add_parser(name, help=line)
     return parser
 
 
@@ -133,6 +141,10 @@ def _warn(message: str, said: set[str]) -> None:
 
 
 def _run(argv: Sequence[str] | None) -> int:
+    words = sys.argv[1:] if argv is None else list(argv)
+    named = [word for word in words if not word.startswith("-")][:1]
+    if not COMMANDS.keys() & named:
+        make_parser(()).parse_args(words)  # prints help, the version or an error, and ends
     with leaving_at_once(), uncollected():
         import warp as wp
 
@@ -142,9 +154,9 @@ def _run(argv: Sequence[str] | None) -> int:
         # The command differentiates nothing, and Newton's kernels compile in a third of the time without adjoints.
         wp.config.enable_backward = False
         logging.basicConfig(format="warp-corot: warning: %(message)s", level=logging.WARNING)
-        parser = make_parser()
-    args = parser.parse_args(argv)
-    args.command_line = shlex.join(["warp-corot", *(sys.argv[1:] if argv is None else argv)])
+        parser = make_parser(tuple(named))
+    args = parser.parse_args(words)
+    args.command_line = shlex.join(["warp-corot", *words])
     try:
         start_warp()
     except OSError as error:
@@ -153,4 +165,4 @@ def _run(argv: Sequence[str] | None) -> int:
             "to in the environment variable WARP_CACHE_PATH"
         )
         return 1
-    return commands()[args.command].run(args)
+    return subcommand(args.command).run(args)

@@ -13,6 +13,7 @@ from .implicit import IMPLICIT_DT, STEPPING
 from .label_materials import FORM
 from .loading import add_load_options
 from .organs import CUBES_OF_LEVEL, MAX_LEVEL_FOR_ERROR
+from .parsing import COMMANDS
 from .previews import add_preview_options
 from .quantities import (
     acceleration,
@@ -43,7 +44,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParse
     """Add the command to ``warp-corot``."""
     parser = subparsers.add_parser(
         "simulate",
-        help="simulate a soft body and write its motion as a USD animation",
+        help=COMMANDS["simulate"],
         description="Lets a soft body sag and sway under gravity and writes a USD animation, coloured by stress.",
         epilog=f"""examples:
   warp-corot simulate warp:bunny -o bunny.usd --preview bunny.gif

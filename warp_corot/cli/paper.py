@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from warp_corot.errors import InputError
 
+from .parsing import COMMANDS
 from .say import complain, interrupt_status
 
 if TYPE_CHECKING:
@@ -24,7 +25,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParse
 
     parser = subparsers.add_parser(
         "paper",
-        help="run the paper's experiment: a table, results.json and figures 5 to 8",
+        help=COMMANDS["paper"],
         description="""\
 Simulates the beam of Tagawa, Yamada and Tanaka (IEEE EMBC 2013) under its own
 weight with linear, corotated (rotations at every level of the tree),

@@ -5,6 +5,15 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+#: The subcommands of ``warp-corot``, each a module of this package, and their lines in its help.
+COMMANDS = {
+    "simulate": "simulate a soft body and write its motion as a USD animation",
+    "sweep": "repeat a run with many combinations of parameters, and write a table of the results",
+    "view": "take hold of a soft body in a browser",
+    "scene": "step a USD stage: soft bodies, rigid bodies, ground",
+    "paper": "run the paper's experiment: a table, results.json and figures 5 to 8",
+}
+
 
 class StrictParser(argparse.ArgumentParser):
     """Accepts neither abbreviations nor ``--`` as a value, which argparse turns into an empty list."""

@@ -15,6 +15,7 @@ from warp_corot.inputs.device import checked_device
 
 from . import quantities
 from .compiling import compiling_said
+from .parsing import COMMANDS
 from .say import EXIT_CODES, complain, interrupt_status, kept_so_far
 from .summary import length, milliseconds, pressure
 from .waiting import progress_bar
@@ -33,7 +34,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParse
     """Add the command to ``warp-corot``."""
     parser = subparsers.add_parser(
         "scene",
-        help="step a USD stage: soft bodies, rigid bodies, ground",
+        help=COMMANDS["scene"],
         description="Steps the scene of a USD stage and writes a stage over it in which its bodies move, with the "
         'stress of every tetrahedron. Needs Newton: pip install "warp-corot[newton]" newton-usd-schemas.',
         epilog=f"""examples:

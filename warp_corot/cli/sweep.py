@@ -15,6 +15,7 @@ import numpy as np
 from warp_corot.errors import InputError
 from warp_corot.io.files.whole import written_whole
 
+from .parsing import COMMANDS
 from .say import complain, interrupt_status
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParse
     """Add the command to ``warp-corot``."""
     parser = subparsers.add_parser(
         "sweep",
-        help="repeat a run with many combinations of parameters, and write a table of the results",
+        help=COMMANDS["sweep"],
         description="Runs INPUT with every combination of the values of --vary, in several processes. The same command "
         "continues an interrupted sweep.",
         epilog="""examples:

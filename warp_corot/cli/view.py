@@ -20,6 +20,7 @@ from warp_corot.materials.isotropic import Isotropic
 
 from . import options
 from .loading import ramp_of
+from .parsing import COMMANDS
 from .prepared import Run, prepared
 from .pressing import press_patches
 from .quantities import whole_number
@@ -37,7 +38,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParse
     """Add the command to ``warp-corot``."""
     parser = subparsers.add_parser(
         "view",
-        help="take hold of a soft body in a browser",
+        help=COMMANDS["view"],
         description="Opens a page in which a soft body moves and can be dragged, pressed, held and cut with the mouse. "
         'Needs viser: pip install "warp-corot[view]".',
         epilog="""examples:
