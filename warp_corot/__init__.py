@@ -18,16 +18,19 @@ if TYPE_CHECKING:
 else:  # hidden from type checkers, which would accept any name
 
     def __getattr__(name: str) -> Any:
-        """Import everything when the first name is used, so that the command line can handle Ctrl-C before that."""
+        """Import a name when it is first used: all of the package takes twice as long as a body."""
         if name.startswith("__") and name != "__all__":
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         from importlib import import_module
 
-        from .inputs.importing import uncollected
+        from .inputs.importing import modules_of_names, public_name, uncollected
 
         with uncollected():
-            api = import_module(".api", __name__)
-        globals().update({"__all__": api.__all__} | {each: getattr(api, each) for each in api.__all__})
+            if name in modules_of_names():
+                globals()[name] = public_name(name)
+            else:  # __all__, or a folder of the package
+                api = import_module(".api", __name__)
+                globals().update({"__all__": api.__all__} | {each: getattr(api, each) for each in api.__all__})
         if name not in globals():
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         return globals()[name]

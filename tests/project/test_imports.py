@@ -1,10 +1,14 @@
 """Rules for imports."""
 
 import ast
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 from imports import Import, against_the_floors, circles, floor_of, imports, modules
+
+from warp_corot.inputs.importing import modules_of_names, public_name
 
 #: Kernels of passes over a mesh that changes.
 REMESHING = ("kernels.remesh",)
@@ -94,3 +98,25 @@ def test_modules_of_kernels_have_no_adjoint():
         if path.name != "modules.py":
             assert 'module="unique"' not in code, path
             assert "@wp.kernel" not in code or 'wp.set_module_options({"enable_backward": False' in code, path
+
+
+def test_a_body_imports_no_solvers():
+    """The names of the public interface are imported one by one, so that a program starts with what it uses."""
+    code = (
+        "import sys, warp_corot as wc; wc.SoftBody\n"
+        "mine = sorted(each for each in sys.modules if each.startswith('warp_corot.'))\n"
+        "print(len(mine), *{each.split('.')[1] for each in mine})"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    count, *rooms = said.splitlines()[-1].split()
+    assert not {"solvers", "contact", "simulation", "viewing", "newton", "gradients", "cli"} & set(rooms), rooms
+    assert int(count) < 150  # 130 of 497
+
+
+def test_public_names_are_those_of_the_interface():
+    import warp_corot as wc
+    from warp_corot import api
+
+    assert set(modules_of_names()) >= set(api.__all__)
+    for name in api.__all__:
+        assert public_name(name) is getattr(api, name) is getattr(wc, name), name
