@@ -21,7 +21,7 @@ BOX = ["simulate", "box", "-o", "a.usd", "--duration", "0.05", "--fps", "40", "-
 
 
 def started(folder: Path, *args: str, **options) -> subprocess.Popen:
-    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "encoding": "utf-8"}
     return subprocess.Popen([*COMMAND, *args], cwd=folder, **(streams | options))
 
 
