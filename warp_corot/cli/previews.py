@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import sys
 import tempfile
+import time
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
@@ -90,6 +91,9 @@ class Previews:
         args: The command's arguments.
         count: Number of frames after the first one.
 
+    Attributes:
+        seconds: Wall time of storing and drawing frames [s].
+
     Raises:
         InputError: Invalid frames or views, or a package is missing.
     """
@@ -99,6 +103,7 @@ class Previews:
     frames: list[int] = field(init=False)
     views: list[tuple[float, float]] = field(init=False)
     fps: float = field(init=False)
+    seconds: float = 0.0
     _file: Any = None
     _places: list[int] = field(default_factory=list)
 
@@ -117,10 +122,12 @@ class Previews:
         """Store the current state if its frame is drawn."""
         if frame not in self.frames:
             return
+        started = time.perf_counter()
         if self._file is None:
             self._file = tempfile.TemporaryFile()  # noqa: SIM115 (closed in draw)
         self._places.append(self._file.tell())
         shown_now(bodies, sim).write(self._file)
+        self.seconds += time.perf_counter() - started
 
     def draw(self, bodies: Sequence[Body], name: str) -> None:
         """Draw the stored frames.
@@ -136,6 +143,7 @@ class Previews:
             return
         from tqdm import tqdm
 
+        started = time.perf_counter()
         up_axis = bodies[0].soft.mesh.up_axis
         look = self._look(up_axis)
         with tqdm(
@@ -152,6 +160,7 @@ class Previews:
                     write_film(self.args.preview, drawing, self.fps)
             else:
                 self._draw_picture(name, up_axis, look, bar)
+        self.seconds += time.perf_counter() - started
 
     def _look(self, up_axis: str) -> Look:
         """The common view of all frames."""
@@ -196,7 +205,7 @@ class Previews:
         size = (1200, 900) if len(panels) == 1 else None
         several = len(self.views) > 1 and len(self.frames) > 1
         columns = len(self.views) if several else min(len(panels), MOST_COLUMNS)
-        words = name if len(self.frames) > 1 else f"{name}; {shown.time:.3g} s"
+        words = name if len(self.frames) > 1 or self.args.static else f"{name}; {shown.time:.3g} s"
         drawn = draw_strip(
             panels, cameras, value_range=look.limits, title=words, size=size, columns=columns, ground=look.ground
         )
@@ -204,21 +213,24 @@ class Previews:
 
     def _images(self, name: str, look: Look, bar: Any) -> Generator[Image, None, None]:
         """The frames of a film."""
-        from warp_corot.io.pictures.preview import draw_strip
+        from warp_corot.io.pictures.preview import Strip
 
         width, height = FILM_SIZE
+        strip = None
         for shown in self._kept():
             views = self._pictures(shown, "")
-            yield draw_strip(
-                views,
-                look.cameras,
-                value_range=look.limits,
-                title=f"{name}; {shown.time:.2f} s",
-                size=(width * len(views), height),
-                window=look.window,
-                ground=look.ground,
-                fineness=1,
-            )
+            if strip is None:
+                strip = Strip(
+                    views,
+                    look.cameras,
+                    titled=True,
+                    value_range=look.limits,
+                    size=(width * len(views), height),
+                    window=look.window,
+                    ground=look.ground,
+                    fineness=1,
+                )
+            yield strip.draw(views, f"{name}; {shown.time:.2f} s")
             bar.update()
 
     def _kept(self) -> Iterator[Shown]:

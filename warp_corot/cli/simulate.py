@@ -70,7 +70,8 @@ def run(args: argparse.Namespace) -> int:
         return 1
     finally:
         end()
-    print(summary(ready.bodies, ready.sim, done, ready.touched.rows, rested))
+    drawing = previews.seconds if previews is not None else 0.0
+    print(summary(ready.bodies, ready.sim, done, ready.touched.rows, rested, drawing))
     return 0
 
 

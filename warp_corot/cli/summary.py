@@ -39,6 +39,7 @@ def summary(
     done: Recording,
     touched: Sequence[tuple[str, str]] = (),
     rested: Sequence[str] = (),
+    drawing: float = 0.0,
 ) -> str:
     """The run in a dozen lines.
 
@@ -48,6 +49,7 @@ def summary(
         done: The recording.
         touched: Lines on what the bodies touch.
         rested: Lines on the static answers of the bodies.
+        drawing: Wall time of drawing [s].
     """
     shared = bodies[0].args
     integrator = asdict(sim.integrator)  # type: ignore[call-overload]
@@ -58,6 +60,7 @@ def summary(
     height = max(body.subject.height for body in bodies)
     at_end = f"{length(done.final_displacement)} at the end ({done.final_displacement / height:.1%} of the height)"
     at_last = " (at the end)" if sim.remeshing.every else ""
+    drawn = f", {drawing:.2f} s drawing" if drawing else ""
     lines, ranks = [], process_count()
     for body in bodies:
         lines += [f"{body.subject.name}, {body.held.words}", *aligned(_of_body(body))]
@@ -68,7 +71,7 @@ def summary(
         *[("static", line) for line in rested],
         *_time_step(sim, at_last),
         ("speed", f"{done.steps / stepping:.0f} steps/s, {done.simulated / stepping:.3g} times real time"),
-        ("wall time", f"{done.stepping:.2f} s stepping, {done.writing:.2f} s writing"),
+        ("wall time", f"{done.stepping:.2f} s stepping, {done.writing:.2f} s writing{drawn}"),
         ("displacement", f"{length(done.largest_displacement)} largest, {at_end}"),
         ("device", f"{sim.device} ({sim.device.name})" + (f", {ranks} ranks" if ranks > 1 else "")),
         ("written", f"{done.path}, {done.frames} frames, {done.simulated:.4g} s"),

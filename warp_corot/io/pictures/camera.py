@@ -47,7 +47,7 @@ class Camera:
 
     def project(self, points: Array) -> tuple[Array, Array]:
         """Picture coordinates [..., 2] and depth [...] (larger is nearer) of points [..., 3]."""
-        seen = (points - self.center) @ self.axes.T
+        seen = ((points - self.center).reshape(-1, 3) @ self.axes.T).reshape(points.shape)
         depth = seen[..., 2]
         return seen[..., :2] * (self.distance / (self.distance - depth))[..., None], depth
 
@@ -56,11 +56,11 @@ class Camera:
         towards = self.center + self.distance * self.axes[2] - points
         return towards / np.linalg.norm(towards, axis=-1, keepdims=True)
 
-    def sees_outside(self, triangles: Array) -> NDArray[np.bool_]:
-        """Which triangles [n, 3, 3] show their outer side."""
-        flat, _ = self.project(triangles)
-        (ax_, ay), (bx, by) = (flat[:, 1] - flat[:, 0]).T, (flat[:, 2] - flat[:, 0]).T
-        return ax_ * by - ay * bx > 0.0
+    def sees_outside(self, points: Array, faces: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which triangles [n, 3] of points [N, 3] show their outer side."""
+        u, v = self.project(points)[0].T
+        a, b, c = faces.T
+        return (u[b] - u[a]) * (v[c] - v[a]) > (v[b] - v[a]) * (u[c] - u[a])
 
 
 def _world_axes(up_axis: str) -> tuple[Array, Array, Array]:

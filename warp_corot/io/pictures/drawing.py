@@ -1,7 +1,7 @@
 """Shaded surfaces drawn into Matplotlib axes.
 
-A surface is drawn as many small polygons, back to front (painter's algorithm): faces that face away are left out, the
-others are cut into pieces small enough for smooth shading, and each piece is filled with one colour.
+A surface is drawn as triangles, back to front (painter's algorithm): faces that face away are left out, the others are
+cut into pieces small enough for smooth shading, whose corners are shaded and colours between them interpolated.
 """
 
 import math
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 INK = "#3b3640"
-_PIECES = 60_000  # approximate number of polygons of a body
+_PIECES = 30_000  # approximate number of triangles of a body
 _CREASE = math.cos(math.radians(40.0))  # edges sharper than this stay sharp
 _DOTS_ACROSS = 160  # dots are at least the distance to the viewer over this apart
 _BEFORE = 5e-3  # fraction of the body's size: a surface that much nearer than a dot hides it
@@ -43,7 +43,6 @@ def draw_body(
     square: ArrayLike | None = None,
     held: ArrayLike | None = None,
     pieces: int = _PIECES,
-    seams: float = 0.2,
 ) -> Camera:
     """Draw a shaded surface into Matplotlib axes.
 
@@ -61,8 +60,7 @@ def draw_body(
         ground: Height [m] of a ground that shows the shadow; True: below the lowest node; False: none.
         square: Corners of a ground that is outlined [4, 3] [m].
         held: Nodes marked with dots, mask [N].
-        pieces: Approximate number of polygons of the surface.
-        seams: Width of the polygons' edges [pt]; edges thinner than a pixel leave visible seams between polygons.
+        pieces: Approximate number of triangles into which the surface is cut.
 
     Returns:
         The camera used, for the next body.
@@ -70,13 +68,16 @@ def draw_body(
     Raises:
         InputError: Arrays that do not fit each other, or positions that are not finite.
     """
+    from .artists import Triangles
+
     x, tri = checked_surface(positions, faces, "positions")
     x_rest = None if rest is None else checked_surface(rest, faces, "rest")[0]
-    seen = [x[tri].reshape(-1, 3)] + ([x_rest[tri].reshape(-1, 3)] if x_rest is not None else [])
+    used = np.unique(tri)
+    seen = np.concatenate([each[used] for each in (x, x_rest) if each is not None])
     if camera is None:
-        camera = Camera.fit(np.concatenate(seen), up_axis)
+        camera = Camera.fit(seen, up_axis)
     if ground is not False:
-        height = min(float((s @ camera.world_up).min()) for s in seen) if ground is True else float(ground)
+        height = float((seen @ camera.world_up).min()) if ground is True else float(ground)
         shadow = draw_shadow(ax, x[tri], camera, height)
         ax.update_datalim(shadow)
     if square is not None:
@@ -84,30 +85,32 @@ def draw_body(
         _fill(ax, outline[None], "none", _GHOST_LINE, width=1.0, order=1)
         ax.update_datalim(outline)
     if x_rest is not None:
-        _draw_silhouette(ax, x_rest, tri, camera)
+        draw_silhouette(ax, x_rest, tri, camera)
 
-    cut, normals, values = _cut(x, tri, _values(scalars, len(x), tri), pieces)
-    _draw_outline(ax, x, tri, INK, camera, width=1.6, order=3)
-    front = camera.sees_outside(cut)
-    cut, normals = cut[front], normals[front]
+    values = _values(scalars, len(x), tri)
+    front = camera.sees_outside(x, tri)
+    faces_seen = tri[front]
+    normals = _corner_normals(x, tri, front)
+    lowest, highest = value_range or value_limits(scalars)
+    cut, normals, values = _cut(x[faces_seen], normals, None if values is None else values[front], pieces)
+    _draw_outline(ax, x, faces_seen, INK, camera, width=1.6, order=3)
     flat, depth = camera.project(cut)
-    order = np.argsort(depth.mean(axis=1))
+    order = np.argsort(depth.sum(axis=1))
     if values is None:
-        base = np.broadcast_to(srgb_to_linear(color), (len(cut), 3))
+        base = np.broadcast_to(srgb_to_linear(color), normals.shape)
     else:
-        lowest, highest = value_range or value_limits(scalars)
-        base = srgb_to_linear(stress_colors())[color_index(values[front], lowest, highest)]
-        base = np.where(np.isnan(values[front])[:, None], srgb_to_linear(STEEL), base)
-    shaded = _shade(base, normals, camera.rays(cut.mean(axis=1)), camera)[order]
-    # Each polygon's edge, in its own colour, closes the seams that antialiasing leaves between neighbours.
-    _fill(ax, flat[order], shaded, shaded, width=seams, order=4)
+        base = srgb_to_linear(stress_colors())[color_index(values, lowest, highest)]
+        base = np.where(np.isnan(values)[..., None], srgb_to_linear(STEEL), base)
+    shaded = _shade(base, normals, camera.rays(cut), camera)
+    ax.add_artist(Triangles(flat[order], shaded[order], order=4))
     if edges:
-        _draw_edges(ax, x[tri], camera)
+        drawn = camera.project(x)[0][faces_seen]
+        _fill(ax, drawn, "none", (0.23, 0.21, 0.25, 0.25), width=0.4, order=5)
     if held is not None and np.any(held):
-        _draw_dots(ax, x, tri, np.asarray(held, dtype=bool), camera)
+        _draw_dots(ax, x, faces_seen, np.asarray(held, dtype=bool), camera)
     ax.set_aspect("equal")
     ax.set_axis_off()
-    ax.update_datalim(np.concatenate([camera.project(s)[0] for s in seen]))
+    ax.update_datalim(camera.project(seen)[0])
     ax.margins(0.06)
     ax.autoscale_view()
     return camera
@@ -151,28 +154,30 @@ def _values(scalars: ArrayLike | None, nodes: int, tri: NDArray[np.int64]) -> Ar
     raise InputError(f"scalars has shape {list(values.shape)}; it must be [{nodes}] (nodes) or [{len(tri)}] (faces)")
 
 
-def _corner_normals(x: Array, tri: NDArray[np.int64]) -> Array:
-    """Unit normals at the corners of faces [F, 3, 3]: averages over the node's faces within the crease angle."""
+def _corner_normals(x: Array, tri: NDArray[np.int64], chosen: NDArray[np.bool_]) -> Array:
+    """Unit normals at the corners of chosen faces [n, 3, 3]: averages over the node's faces within the crease angle."""
     corners = x[tri]
     area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     unit = area / np.maximum(np.linalg.norm(area, axis=1, keepdims=True), 1e-300)
     order = np.argsort(tri.ravel(), kind="stable")
-    nodes, first, count = np.unique(tri.ravel()[order], return_index=True, return_counts=True)
-    place = np.searchsorted(nodes, tri.ravel())
-    total = np.zeros((tri.size, 3))
-    own = np.repeat(unit, 3, axis=0)
-    for corner in range(int(count.max())):
-        there = corner < count[place]
-        neighbour = order[np.where(there, first[place] + corner, 0)] // 3
-        near = there & (np.einsum("ij,ij->i", unit[neighbour], own) > _CREASE)
-        total += np.where(near[:, None], area[neighbour], 0.0)
-    total += 1e-12 * own * np.abs(area).max()
+    count = np.bincount(tri.ravel(), minlength=len(x))
+    first = np.cumsum(count) - count
+    nodes = tri[chosen].ravel()
+    own = np.repeat(unit[chosen], 3, axis=0)
+    total = 1e-12 * own * np.abs(area).max()
+    for neighbour in range(int(count.max())):
+        there = np.flatnonzero(neighbour < count[nodes])
+        face = order[first[nodes[there]] + neighbour] // 3
+        near = np.einsum("ij,ij->i", unit[face], own[there]) > _CREASE
+        total[there[near]] += area[face[near]]
     return (total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)).reshape(-1, 3, 3)
 
 
-def _cut(x: Array, tri: NDArray[np.int64], values: Array | None, count: int) -> tuple[Array, Array, Array | None]:
-    """Cut each face into n² triangles: their corners [m, 3, 3], and normals [m, 3] and values [m] at their centres."""
-    n = int(np.clip(math.sqrt(count / len(tri)), 1, 24))
+def _cut(x: Array, normals: Array, values: Array | None, count: int) -> tuple[Array, Array, Array | None]:
+    """Cut triangles [F, 3, 3] into n² each: corners and their normals [m, 3, 3], and their values [m, 3]."""
+    n = int(np.clip(math.sqrt(count / max(len(x), 1)), 1, 24))
+    if n == 1:
+        return x, normals, values
     weights = []
     for i in range(n):
         for j in range(n - i):
@@ -182,11 +187,9 @@ def _cut(x: Array, tri: NDArray[np.int64], values: Array | None, count: int) -> 
                 weights.append((b, (i + 1, j + 1), c))
     uv = np.array(weights, dtype=np.float64) / n
     bary = np.stack([1.0 - uv.sum(axis=2), uv[..., 0], uv[..., 1]], axis=2)  # [n², corner, 3]
-    pieces = np.einsum("scb,fbx->fscx", bary, x[tri]).reshape(-1, 3, 3)
-    centers = bary.mean(axis=1)
-    normals = np.einsum("sb,fbx->fsx", centers, _corner_normals(x, tri)).reshape(-1, 3)
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-    return pieces, normals, None if values is None else np.einsum("sb,fb->fs", centers, values).ravel()
+    pieces, turned = (np.einsum("scb,fbx->fscx", bary, each).reshape(-1, 3, 3) for each in (x, normals))
+    turned /= np.maximum(np.linalg.norm(turned, axis=2, keepdims=True), 1e-300)
+    return pieces, turned, None if values is None else np.einsum("scb,fb->fsc", bary, values).reshape(-1, 3)
 
 
 def _shade(base: Array, normals: Array, rays: Array, camera: Camera) -> Array:
@@ -197,22 +200,23 @@ def _shade(base: Array, normals: Array, rays: Array, camera: Camera) -> Array:
     lambert = np.clip((normals @ key + 0.2) / 1.2, 0.0, None)
     sky = 0.5 + 0.5 * normals @ camera.world_up
     # Ambient light is slightly rose: grey light would turn the colour map's yellows olive.
-    ambient = (0.13 + 0.24 * sky + 0.30 * np.clip(normals @ fill, 0.0, None))[:, None] * np.array([1.06, 0.96, 1.0])
-    light = ambient + 0.74 * lambert[:, None]
+    ambient = (0.13 + 0.24 * sky + 0.30 * np.clip(normals @ fill, 0.0, None))[..., None] * np.array([1.06, 0.96, 1.0])
+    light = ambient + 0.74 * lambert[..., None]
     halfway = key + rays
-    halfway /= np.linalg.norm(halfway, axis=1, keepdims=True)
-    gloss = 0.06 * np.clip(np.einsum("ij,ij->i", normals, halfway), 0.0, None) ** 24
-    linear = np.clip(base * light + gloss[:, None], 0.0, 1.0)
+    halfway /= np.linalg.norm(halfway, axis=-1, keepdims=True)
+    gloss = 0.06 * np.clip((normals * halfway).sum(axis=-1), 0.0, None) ** 24
+    linear = np.clip(base * light + gloss[..., None], 0.0, 1.0)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
-def _draw_silhouette(ax: "Axes", x: Array, tri: NDArray[np.int64], camera: Camera) -> None:
+def draw_silhouette(ax: "Axes", x: Array, tri: NDArray[np.int64], camera: Camera) -> None:
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path
 
-    _draw_outline(ax, x, tri, _GHOST_LINE, camera, width=2.2, order=1)
+    front = tri[camera.sees_outside(x, tri)]
+    _draw_outline(ax, x, front, _GHOST_LINE, camera, width=2.2, order=1)
     # One path of triangles that turn the same way is filled as a whole, without seams.
-    flat, _ = camera.project(x[tri][camera.sees_outside(x[tri])])
+    flat, _ = camera.project(x[front])
     closed = np.concatenate([flat, flat[:, :1]], axis=1)
     codes = np.tile([Path.MOVETO, Path.LINETO, Path.LINETO, Path.CLOSEPOLY], len(flat)).astype(Path.code_type)
     filled = Path(closed.reshape(-1, 2), codes)
@@ -220,23 +224,17 @@ def _draw_silhouette(ax: "Axes", x: Array, tri: NDArray[np.int64], camera: Camer
 
 
 def _draw_outline(
-    ax: "Axes", x: Array, tri: NDArray[np.int64], color: Any, camera: Camera, *, width: float, order: int
+    ax: "Axes", x: Array, front: NDArray[np.int64], color: Any, camera: Camera, *, width: float, order: int
 ) -> None:
-    """Draw lines along edges that belong to only one of the faces that face the viewer; inner ones are drawn over."""
+    """Draw lines along edges of only one of the faces that face the viewer [n, 3]; inner ones are drawn over."""
     from matplotlib.collections import LineCollection
 
-    front = tri[camera.sees_outside(x[tri])]
     ends = np.sort(front[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     keys, count = np.unique(ends[:, 0] * len(x) + ends[:, 1], return_counts=True)
     alone = keys[count == 1]
     lines, _ = camera.project(x[np.stack([alone // len(x), alone % len(x)], axis=1)])
     drawn = LineCollection(cast(Any, lines), colors=color, linewidth=width, capstyle="round", zorder=order)
     ax.add_collection(drawn, autolim=False)
-
-
-def _draw_edges(ax: "Axes", triangles: Array, camera: Camera) -> None:
-    flat, _ = camera.project(triangles[camera.sees_outside(triangles)])
-    _fill(ax, flat, "none", (0.23, 0.21, 0.25, 0.25), width=0.4, order=5)
 
 
 def _fill(ax: "Axes", polygons: Array, face: Any, edge: Any, *, width: float, order: int) -> None:
@@ -248,9 +246,8 @@ def _fill(ax: "Axes", polygons: Array, face: Any, edge: Any, *, width: float, or
     ax.add_collection(collection, autolim=False)
 
 
-def _draw_dots(ax: "Axes", x: Array, tri: NDArray[np.int64], held: NDArray[np.bool_], camera: Camera) -> None:
-    """Draw dots on visible held nodes, far enough apart to stay separate."""
-    faces = tri[camera.sees_outside(x[tri])]
+def _draw_dots(ax: "Axes", x: Array, faces: NDArray[np.int64], held: NDArray[np.bool_], camera: Camera) -> None:
+    """Draw dots on held nodes of the faces that face the viewer, where nothing hides them, and far enough apart."""
     marked = np.unique(faces[held[faces]])
     if not len(marked):
         return
@@ -258,19 +255,23 @@ def _draw_dots(ax: "Axes", x: Array, tri: NDArray[np.int64], held: NDArray[np.bo
     # Cells of the picture, not of the body, so that the dots of a film do not change with the motion.
     cells = np.floor(flat / (camera.distance / _DOTS_ACROSS)).astype(int)
     _, first = np.unique(cells, axis=0, return_index=True)
-    seen = first[_visible(x[marked[first]], x[faces], camera)]
+    seen = first[_visible(x[marked[first]], x, faces, camera)]
     ax.plot(*flat[seen].T, ".", color=INK, markersize=4.5, markeredgewidth=0.0, zorder=6)
 
 
-def _visible(points: Array, triangles: Array, camera: Camera) -> NDArray[np.bool_]:
-    """Which points [n, 3] are not hidden by any of the triangles [F, 3, 3]."""
+def _visible(points: Array, x: Array, faces: NDArray[np.int64], camera: Camera) -> NDArray[np.bool_]:
+    """Which points [n, 3] are not hidden by any of the faces [F, 3] of nodes ``x``."""
     flat, depth = camera.project(points)
-    corners, corner_depth = camera.project(triangles)
-    low, high = corners.min(axis=1), corners.max(axis=1)
-    size = float(np.linalg.norm(np.ptp(triangles.reshape(-1, 3), axis=0)))
+    node_flat, node_depth = camera.project(x)
+    corners, corner_depth = node_flat[faces], node_depth[faces]
+    (low_x, low_y), (high_x, high_y) = (
+        end(end(corners[:, 0], corners[:, 1]), corners[:, 2]).T.copy() for end in (np.minimum, np.maximum)
+    )
+    size = float(np.linalg.norm(np.ptp(x[np.unique(faces)], axis=0)))
     found = np.ones(len(points), bool)
     for index, (place, own) in enumerate(zip(flat, depth, strict=True)):
-        near = np.flatnonzero(((low <= place) & (place <= high)).all(axis=1))
+        u, v = place
+        near = np.flatnonzero((low_x <= u) & (u <= high_x) & (low_y <= v) & (v <= high_y))
         ends = corners[near] - place
         weights = np.stack([_cross(ends[:, (k + 1) % 3], ends[:, (k + 2) % 3]) for k in range(3)], axis=1)
         inside = (weights >= 0.0).all(axis=1) & (weights.sum(axis=1) > 0.0)

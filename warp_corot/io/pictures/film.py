@@ -64,7 +64,7 @@ def _write_gif(path: Path, images: Iterator[Image], fps: float) -> None:
 
     # One palette for all, to avoid flicker; from pictures of the whole film, since their colours differ.
     frames = list(images)
-    some = frames[:: -(-len(frames) // PALETTE_FRAMES)]
+    some = [frame.reduce(2) for frame in frames[:: -(-len(frames) // PALETTE_FRAMES)]]
     together = Image.new("RGB", (some[0].width, some[0].height * len(some)))
     for number, frame in enumerate(some):
         together.paste(frame, (0, number * frame.height))

@@ -15,6 +15,7 @@ BAR = 16
 
 
 def draw_color_bar(figure: "Figure", limits: tuple[float, float], label: str) -> "Axes":
+    label, limits = _readable(label, limits)
     ax = figure.add_axes((0.0, 0.2, BAR / (figure.get_figwidth() * 150.0), 0.55))
     ax.imshow(stress_colors()[:, None, :], aspect="auto", origin="lower", extent=(0.0, 1.0, *limits))
     ax.set_xticks([])
@@ -26,6 +27,15 @@ def draw_color_bar(figure: "Figure", limits: tuple[float, float], label: str) ->
     for spine in ax.spines.values():
         spine.set_visible(False)
     return ax
+
+
+def _readable(label: str, limits: tuple[float, float]) -> tuple[str, tuple[float, float]]:
+    """A label and limits in kPa, MPa or GPa in place of so many Pa."""
+    largest = max(map(abs, limits))
+    for unit, size in (("GPa", 1e9), ("MPa", 1e6), ("kPa", 1e3)):
+        if label.endswith("[Pa]") and largest >= size:
+            return f"{label[:-4]}[{unit}]", (limits[0] / size, limits[1] / size)
+    return label, limits
 
 
 def needed_width(legend: "Axes", width: int) -> float:

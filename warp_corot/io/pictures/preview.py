@@ -13,7 +13,7 @@ from warp_corot.errors import InputError
 from warp_corot.io.files.whole import written_whole
 
 from .camera import Array, Camera
-from .drawing import INK, checked_surface, draw_body, value_limits
+from .drawing import INK, checked_surface, draw_body, draw_silhouette, value_limits
 from .lettering import BAR, draw_color_bar, fit_line, needed_width
 from .shadow import dropped_shadow
 
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Camera", "Picture", "check_picture_path", "draw_body", "render_preview", "render_strip", "value_limits"]
 
-#: Width of polygons' edges [pt] if each pixel is drawn once, about a pixel; and the margin of a film's window.
-SEAMS, ROOM = 0.4, 0.06
+#: Pixels an inch, on which sizes of type depend; and the margin of a film's window.
+DPI, ROOM = 150.0, 0.06
 
 
 @dataclass
@@ -149,97 +149,161 @@ def bounds_of(pictures: Sequence[Picture]) -> Array:
 
 
 def draw_strip(
-    pictures: Sequence[Picture],
-    cameras: Sequence[Camera],
-    *,
-    scalar_label: str = "von Mises stress [Pa]",
-    value_range: tuple[float, float] | None = None,
-    title: str | None = None,
-    size: tuple[int, int] | None = None,
-    window: tuple[Array, Array] | None = None,
-    ground: float | None = None,
-    fineness: int = 2,
-    columns: int | None = None,
+    pictures: Sequence[Picture], cameras: Sequence[Camera], *, title: str | None = None, **options: Any
 ) -> "Image":
-    """Draw pictures side by side, with one colour bar; see `render_strip`.
+    """Draw pictures side by side once; the options are those of `Strip`."""
+    return Strip(pictures, cameras, titled=title is not None, **options).draw(pictures, title)
+
+
+class Strip:
+    """Pictures side by side with one colour bar, drawn again for each frame of a film; see `render_strip`.
 
     Args:
-        pictures: From left to right, and row after row.
+        pictures: Those of the first frame, from left to right, and row after row.
         cameras: One for each picture.
-        scalar_label, value_range, title, size: As in `render_strip`.
+        titled: Whether frames have a title.
+        scalar_label, value_range, size: As in `render_strip`.
         window: Lowest and highest picture coordinates of the panels, see `window_of`; None: those of the pictures.
         ground: Height of the ground; None: below the lowest node.
         fineness: Factor on the pixels drawn along each side, which are then averaged.
         columns: Pictures in a row; None: all.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise InputError('pictures need Matplotlib: pip install "warp-corot[plot]"') from None
-    from PIL import Image
 
-    corners = [
-        checked_surface(x, p.faces, "positions") for p in pictures for x in (p.positions, p.rest) if x is not None
-    ]
-    if ground is None:
-        ground = min(float((x[tri].reshape(-1, 3) @ cameras[0].world_up).min()) for x, tri in corners)
-    with_scalars = [p.scalars for p in pictures if p.scalars is not None]
-    if with_scalars and value_range is None:
-        value_range = (0.0, max(value_limits(scalars)[1] for scalars in with_scalars))
+    def __init__(
+        self,
+        pictures: Sequence[Picture],
+        cameras: Sequence[Camera],
+        *,
+        titled: bool = False,
+        scalar_label: str = "von Mises stress [Pa]",
+        value_range: tuple[float, float] | None = None,
+        size: tuple[int, int] | None = None,
+        window: tuple[Array, Array] | None = None,
+        ground: float | None = None,
+        fineness: int = 2,
+        columns: int | None = None,
+    ):
+        try:
+            from matplotlib.backends.backend_agg import FigureCanvasAgg
+            from matplotlib.figure import Figure
+        except ImportError:
+            raise InputError('pictures need Matplotlib: pip install "warp-corot[plot]"') from None
+        if ground is None:
+            given = [(x, p.faces) for p in pictures for x in (p.positions, p.rest) if x is not None]
+            surfaces = [checked_surface(x, faces, "positions") for x, faces in given]
+            ground = min(float((x[tri].reshape(-1, 3) @ cameras[0].world_up).min()) for x, tri in surfaces)
+        with_scalars = [p.scalars for p in pictures if p.scalars is not None]
+        if with_scalars and value_range is None:
+            value_range = (0.0, max(value_limits(scalars)[1] for scalars in with_scalars))
+        self._cameras, self._limits, self._ground, self._fineness = cameras, value_range, ground, fineness
+        self._window, self._fixed_size = window, size is not None
+        self._columns = columns or len(pictures)
+        self._rows = -(-len(pictures) // self._columns)
+        self._head, self._own_head = 56 * titled, 40 * any(p.title for p in pictures)
+        self._width, self._height = size or (600 * self._columns, 600 * self._rows)
+        self._figure = Figure((self._width / DPI, self._height / DPI), dpi=DPI, facecolor="white")
+        self._canvas = FigureCanvasAgg(self._figure)
+        self._legend, self._bar = None, 0.0
+        if with_scalars and value_range is not None:
+            self._legend = draw_color_bar(self._figure, value_range, scalar_label)
+            self._bar = needed_width(self._legend, self._width)
+        self._step = (self._width - self._bar) / self._columns
+        self._panels = [self._figure.add_axes((0.0, 0.0, 1.0, 1.0), label=f"panel {k}") for k in range(len(pictures))]
+        self._title = self._figure.text(0.5, 1.0, "", ha="center", va="top", color=INK)
+        self._is_laid_out = False
+        self._rest: list[ArrayLike] = []
+        self._rest_pixels: Any = None
 
-    # Pixels: the panels side by side below their titles, the colour bar at the right.
-    columns = columns or len(pictures)
-    rows = -(-len(pictures) // columns)
-    width, height = size or (600 * columns, 600 * rows)
-    figure = Figure(dpi=150, facecolor="white")
-    canvas = FigureCanvasAgg(figure)
-    figure.set_size_inches(width / 150.0, height / 150.0)
-    legend = bar = None
-    if with_scalars and value_range is not None:
-        legend = draw_color_bar(figure, value_range, scalar_label)
-        bar = needed_width(legend, width)
-    step = (width - (bar or 0)) / columns
-    head, own_head = 56 * (title is not None), 40 * any(p.title for p in pictures)
-    all_axes = []
-    for picture, camera in zip(pictures, cameras, strict=True):
-        ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-        options = {"ground": ground, "seams": SEAMS / fineness, **picture.options}
-        draw_body(
-            ax,
-            picture.positions,
-            picture.faces,
-            scalars=picture.scalars,
-            value_range=value_range,
-            rest=picture.rest,
-            camera=camera,
-            **options,
-        )
-        if picture.title:
-            fit_line(ax.set_title(picture.title, fontsize=11, color=INK, pad=4), step - 16)
-        all_axes.append(ax)
-    limits = np.array([[ax.get_xlim(), ax.get_ylim()] for ax in all_axes], dtype=np.float64)
-    low, high = limits[..., 0].min(axis=0), limits[..., 1].max(axis=0)
-    if window is not None:
-        low, high = window
-    if size is None:
-        height = rows * (int(step * np.clip((high[1] - low[1]) / (high[0] - low[0]), 0.3, 1.6)) + own_head) + head
-        figure.set_size_inches(width / 150.0, height / 150.0)
-    row_height = (height - head) / rows
-    _same_window(all_axes, low, high, step / (row_height - own_head))
-    for index, ax in enumerate(all_axes):
-        row, column = divmod(index, columns)
-        place = (column * step / width, (rows - 1 - row) * row_height / height)
-        ax.set_position((*place, step / width, (row_height - own_head) / height))
-    if legend is not None and bar is not None:
-        legend.set_position(((width - bar + 10) / width, 0.2, BAR / width, 0.55))
-    if title:
-        x_middle = (width - (bar or 0)) / (2.0 * width)
-        text = figure.text(x_middle, 1.0 - 14 / height, title, ha="center", va="top", fontsize=13, color=INK)
-        fit_line(text, width - (bar or 0) - 16)
-    figure.set_dpi(fineness * figure.dpi)
-    canvas.draw()
-    return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]).reduce(fineness)
+    def draw(self, pictures: Sequence[Picture], title: str | None = None) -> "Image":
+        """Draw a frame: as many pictures as the first one has, and its title."""
+        from PIL import Image
+
+        from .artists import Pixels
+
+        self._figure.set_dpi(DPI)
+        if self._window is not None:
+            self._lay_out(*self._window)
+            self._draw_rest(pictures)
+        self._clear()
+        for ax, picture, camera in zip(self._panels, pictures, self._cameras, strict=True):
+            if self._rest_pixels is not None:
+                ax.add_artist(Pixels(self._rest_pixels, order=2))
+            draw_body(
+                ax,
+                picture.positions,
+                picture.faces,
+                scalars=picture.scalars,
+                value_range=self._limits,
+                rest=picture.rest if self._window is None else None,
+                camera=camera,
+                **{"ground": self._ground, **picture.options},
+            )
+            if picture.title:
+                fit_line(ax.set_title(picture.title, fontsize=11, color=INK, pad=4), self._step - 16)
+        if self._window is None:
+            limits = np.array([[ax.get_xlim(), ax.get_ylim()] for ax in self._panels], dtype=np.float64)
+            self._lay_out(limits[..., 0].min(axis=0), limits[..., 1].max(axis=0))
+        if title:
+            self._title.set(text=title, fontsize=13)
+            fit_line(self._title, self._width - self._bar - 16)
+        self._figure.set_dpi(self._fineness * DPI)
+        self._canvas.draw()
+        return Image.fromarray(np.asarray(self._canvas.buffer_rgba())[..., :3]).reduce(self._fineness)
+
+    def _clear(self) -> None:
+        for ax in self._panels:
+            for artist in [*ax.collections, *ax.lines, *ax.patches, *ax.artists]:
+                artist.remove()
+
+    def _draw_rest(self, pictures: Sequence[Picture]) -> None:
+        """Draw the rest shapes and the colour bar to pixels, which frames show until the shapes change."""
+        shapes = [each for p in pictures if p.rest is not None for each in (p.rest, p.faces)]
+        if len(shapes) == len(self._rest) and all(map(np.array_equal, shapes, self._rest)):
+            return
+        from .artists import Pixels
+
+        self._rest = shapes
+        self._clear()
+        for ax, picture, camera in zip(self._panels, pictures, self._cameras, strict=True):
+            ax.set_axis_off()
+            if picture.rest is not None:
+                draw_silhouette(ax, *checked_surface(picture.rest, picture.faces, "rest"), camera)
+        for each in (self._figure.patch, self._title):
+            each.set_visible(False)
+        for former in self._figure.artists:
+            former.remove()
+        if self._legend is not None:
+            self._legend.set_visible(True)
+        self._figure.set_dpi(self._fineness * DPI)
+        self._canvas.draw()
+        self._rest_pixels = np.array(self._canvas.buffer_rgba())
+        self._figure.set_dpi(DPI)
+        for each in (self._figure.patch, self._title):
+            each.set_visible(True)
+        self._figure.add_artist(Pixels(self._rest_pixels, order=0))
+        if self._legend is not None:
+            self._legend.set_visible(False)
+
+    def _lay_out(self, low: Array, high: Array) -> None:
+        """Place the panels side by side below their titles, and the colour bar at the right, in pixels; once."""
+        if self._is_laid_out:
+            return
+        self._is_laid_out = True
+        width, step, rows = self._width, self._step, self._rows
+        if not self._fixed_size:
+            picture_height = int(step * np.clip((high[1] - low[1]) / (high[0] - low[0]), 0.3, 1.6))
+            self._height = rows * (picture_height + self._own_head) + self._head
+            self._figure.set_size_inches(width / DPI, self._height / DPI)
+        height = self._height
+        row_height = (height - self._head) / rows
+        _same_window(self._panels, low, high, step / (row_height - self._own_head))
+        for index, ax in enumerate(self._panels):
+            row, column = divmod(index, self._columns)
+            place = (column * step / width, (rows - 1 - row) * row_height / height)
+            ax.set_position((*place, step / width, (row_height - self._own_head) / height))
+        if self._legend is not None:
+            self._legend.set_position(((width - self._bar + 10) / width, 0.2, BAR / width, 0.55))
+        self._title.set_position(((width - self._bar) / (2.0 * width), 1.0 - 14 / height))
 
 
 def check_picture_path(path: str | Path, suffixes: Sequence[str] = (".png",)) -> Path:
