@@ -18,7 +18,7 @@ import numpy as np
 from warp_corot.errors import InputError
 from warp_corot.io.pictures.film import FILMS, check_film, frames_shown, write_film
 
-from .shown import Shown, shown_now
+from .shown import DrawnBody, Shown, shown_now
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -106,6 +106,7 @@ class Previews:
     seconds: float = 0.0
     _file: Any = None
     _places: list[int] = field(default_factory=list)
+    _bodies: list[DrawnBody] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         path = self.args.preview
@@ -125,8 +126,9 @@ class Previews:
         started = time.perf_counter()
         if self._file is None:
             self._file = tempfile.TemporaryFile()  # noqa: SIM115 (closed in draw)
+            self._bodies = [DrawnBody(body) for body in bodies]
         self._places.append(self._file.tell())
-        shown_now(bodies, sim).write(self._file)
+        shown_now(self._bodies, sim).write(self._file)
         self.seconds += time.perf_counter() - started
 
     def draw(self, bodies: Sequence[Body], name: str) -> None:

@@ -11,6 +11,8 @@ import numpy as np
 from warp_corot.contact.shapes import Ground
 
 if TYPE_CHECKING:
+    from warp_corot.discretization.elements import Mesh
+    from warp_corot.io.write.skins import Skin
     from warp_corot.simulation.simulation import Simulation
 
     from .bodies import Body
@@ -40,21 +42,40 @@ class Shown:
         return cls(x, faces, values, rest, held, ground, float(time))
 
 
-def shown_now(bodies: Sequence[Body], sim: Simulation) -> Shown:
-    """The current state of all bodies for drawing."""
-    from warp_corot.io.pictures.colors import VertexAverage
-    from warp_corot.io.write.skins import BoundSkins
-    from warp_corot.mesh.surfaces.boundary import signed_volumes
+class DrawnBody:
+    """What is drawn of a body: its skins and its stresses, bound again when its mesh has changed."""
 
+    def __init__(self, body: Body):
+        from warp_corot.io.write.skins import BoundSkins
+
+        self.soft = body.soft
+        self._mesh: Mesh | None = None
+        subject, mesh = body.subject, body.soft.mesh
+        self._skins = BoundSkins([mesh], subject.skin or subject.surface, changing=[mesh is not subject.mesh])
+
+    def skins(self) -> list[Skin]:
+        return self._skins.on([self.soft.mesh])
+
+    def stress(self, sim: Simulation) -> np.ndarray:
+        """Von Mises stress at the nodes [Pa], [N]."""
+        from warp_corot.io.pictures.colors import VertexAverage
+        from warp_corot.mesh.surfaces.boundary import signed_volumes
+
+        mesh = self.soft.mesh
+        if mesh is not self._mesh:
+            volumes = np.abs(signed_volumes(mesh.points, mesh.tets))
+            self._mesh, self._average = mesh, VertexAverage(mesh.tets, volumes, len(mesh.points))
+        return self._average(sim.von_mises(self.soft))
+
+
+def shown_now(bodies: Sequence[DrawnBody], sim: Simulation) -> Shown:
+    """The current state of all bodies for drawing."""
     moved: list[np.ndarray] = []
     rest: list[np.ndarray] = []
     triangles, values, held = [], [], []
     for body in bodies:
-        subject, mesh = body.subject, body.soft.mesh
-        drawn = subject.skin or subject.surface
-        average = VertexAverage(mesh.tets, np.abs(signed_volumes(mesh.points, mesh.tets)), len(mesh.points))
-        stress = average(sim.von_mises(body.soft))
-        for skin in BoundSkins([mesh], drawn, changing=[mesh is not subject.mesh]).on([mesh]):
+        stress = body.stress(sim)
+        for skin in body.skins():
             triangles.append(skin.surface.triangles + sum(len(points) for points in rest))
             moved.append(skin.surface.moved(body.soft.displacements.numpy()))
             rest.append(skin.surface.points)
