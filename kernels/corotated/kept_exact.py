@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_corot.kernels.elements.constitutive import corotated_strain
 from warp_corot.kernels.elements.elements import GeneralElements, local_gradient
-from warp_corot.kernels.elements.lanes import COMPILER_FLAGS, ISOTROPIC_PART, constants, native, scatter_lanes
+from warp_corot.kernels.elements.lanes import ISOTROPIC_PART, constants, native, scatter_lanes
 from warp_corot.kernels.math.matrices import identity3
 from warp_corot.kernels.modules import unique_kernel
 
@@ -44,7 +44,7 @@ def keep_numbers(first: int, gradients: wp.mat33, strain: wp.mat33, turning: wp.
 def keep_elements(rotation: wp.Function) -> wp.Kernel:
     """Write what products need, eight elements side by side."""
 
-    @unique_kernel(COMPILER_FLAGS)
+    @unique_kernel()
     def keep_elements(
         # In
         elements: GeneralElements,

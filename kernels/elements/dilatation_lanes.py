@@ -15,7 +15,7 @@ from .constitutive import CONTINUED_BELOW, IsotropicMaterial
 from .dilatation import FREE, MOST, RAMP, Dilatation
 from .elements import GeneralElements, frame, rest_volume
 from .general_cpu import rest_inverse_of
-from .lanes import COMPILER_FLAGS, ELEMENTS, ISOTROPIC, ISOTROPIC_PART, constants, native, on_cpu, scatter_lanes
+from .lanes import ELEMENTS, ISOTROPIC, ISOTROPIC_PART, constants, native, on_cpu, scatter_lanes
 from .law_lanes import LawInLanes, code_of, has_log
 
 wp.set_module_options({"enable_backward": False})
@@ -47,7 +47,7 @@ def measure_in_lanes(of: Dilatation) -> wp.Kernel:
         shared: wp.array[wp.vec4],
     ): ...
 
-    @unique_kernel(COMPILER_FLAGS)
+    @unique_kernel()
     def measure_in_lanes(
         # In
         units: GeneralElements,
@@ -81,7 +81,7 @@ def scatter_in_lanes(of: Dilatation) -> wp.Kernel:
         f: wp.array[wp.vec4],
     ): ...
 
-    @unique_kernel(COMPILER_FLAGS)
+    @unique_kernel()
     def scatter_in_lanes(
         # In
         units: GeneralElements,

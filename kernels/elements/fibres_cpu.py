@@ -8,7 +8,7 @@ from warp_corot.kernels.modules import unique_kernel
 
 from .eights import frames, gathering
 from .fibres import LEAST, MOST, ReinforcedMaterial
-from .lanes import COMPILER_FLAGS, constants, native, on_cpu
+from .lanes import constants, native, on_cpu
 from .law_lanes import NEO_HOOKEAN
 
 wp.set_module_options({"enable_backward": False})
@@ -30,7 +30,7 @@ def scatter_reinforced_eights(Elements: type) -> wp.Kernel:
         f: wp.array[wp.vec4],
     ): ...
 
-    @unique_kernel(COMPILER_FLAGS)
+    @unique_kernel()
     def scatter_reinforced_eights(
         # In
         elements: Elements,

@@ -51,7 +51,8 @@ ISOTROPIC_PART = "const auto& isotropic = material.isotropic;\n"
 
 def on_cpu(*code: str, otherwise: str = "") -> str:
     """A native snippet on lanes; where Warp compiles it for a GPU, it is ``otherwise``."""
-    return f"#if !defined(__CUDA_ARCH__)\n{native('lanes')}{''.join(code)}#else\n{otherwise}#endif\n"
+    on_lanes = f"#pragma clang fp contract(fast)\n{native('lanes')}{''.join(code)}"
+    return f"#if !defined(__CUDA_ARCH__)\n{on_lanes}#else\n{otherwise}#endif\n"
 
 
 @functools.cache
@@ -76,7 +77,7 @@ def scatter_lanes(code: str, Units: type, Material: type, missed_type: type) -> 
         missed: wp.array[missed_type],
     ): ...
 
-    @unique_kernel(COMPILER_FLAGS)
+    @unique_kernel()
     def scatter_lanes(
         # In
         units: Units,

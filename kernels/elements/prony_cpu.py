@@ -8,7 +8,7 @@ from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.stepping.pace import DT, Pace
 
 from .eights import frames, gathering
-from .lanes import COMPILER_FLAGS, native, on_cpu
+from .lanes import native, on_cpu
 from .prony import PronyMaterial
 
 wp.set_module_options({"enable_backward": False})
@@ -25,7 +25,7 @@ def scatter_prony_eights(Elements: type) -> wp.Kernel:
         units: Elements, block: int, count: int, material: PronyMaterial, u: wp.array[wp.vec4], f: wp.array[wp.vec4]
     ): ...
 
-    @unique_kernel(COMPILER_FLAGS)
+    @unique_kernel()
     def scatter_prony_eights(
         # In
         elements: Elements,
@@ -50,7 +50,7 @@ def relax_eights(Elements: type) -> wp.Kernel:
         units: Elements, block: int, count: int, u: wp.array[wp.vec4], time: float, material: PronyMaterial
     ): ...
 
-    @unique_kernel(COMPILER_FLAGS)
+    @unique_kernel()
     def relax_eights(
         # In
         elements: Elements,

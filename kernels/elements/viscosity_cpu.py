@@ -7,7 +7,7 @@ import warp as wp
 from warp_corot.kernels.modules import unique_kernel
 
 from .eights import gathering
-from .lanes import COMPILER_FLAGS, LANES, constants, native, on_cpu
+from .lanes import LANES, constants, native, on_cpu
 from .law_lanes import INDEFINITE
 from .viscosity import LEAST, ViscousMaterial, add_viscous_forces
 
@@ -25,7 +25,7 @@ def scatter_viscous_eights(Elements: type) -> wp.Kernel:
         units: Elements, block: int, count: int, material: ViscousMaterial, u: wp.array[wp.vec4], f: wp.array[wp.vec4]
     ) -> int: ...
 
-    @unique_kernel(COMPILER_FLAGS)
+    @unique_kernel()
     def scatter_viscous_eights(
         # In
         elements: Elements,

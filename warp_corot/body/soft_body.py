@@ -16,6 +16,7 @@ from warp_corot.discretization.nodal import vec3_view
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_count, checked_numbers, shown
 from warp_corot.inputs.device import checked_device
+from warp_corot.inputs.loading import BODY, load
 from warp_corot.inputs.turns import TURN, in_turn
 from warp_corot.kernels.stepping.integrate import RESET_NODES
 from warp_corot.materials.isotropic import Material
@@ -75,6 +76,7 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
             _check_made_of(mesh, material)
             self.worlds = checked_count(worlds, "worlds", least=1)
             self.device = checked_device(device)
+            load(BODY, self.device)
             self.discretization: Discretization = self._discretized(mesh, material)
             self.sizes = self.discretization.sizes
             #: The remeshing that changes the mesh, or None.

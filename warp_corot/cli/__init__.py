@@ -97,6 +97,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         status = end.code
         raise
     finally:
+        if "warp" in sys.modules:
+            from warp_corot.inputs.loading import give_up
+
+            give_up()
         if is_silent and status in FAILED:
             let_others_speak()
     if found in FAILED and not is_silent:
@@ -140,19 +144,24 @@ def _warn(message: str, said: set[str]) -> None:
         complain(message, kind="warning")
 
 
+def configure_warp() -> None:
+    """Set Warp's options, before it starts."""
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_ERROR  # so that it prints no banner
+    # The command differentiates nothing, and Newton's kernels compile in a third of the time without adjoints.
+    wp.config.enable_backward = False
+
+
 def _run(argv: Sequence[str] | None) -> int:
     words = sys.argv[1:] if argv is None else list(argv)
     named = [word for word in words if not word.startswith("-")][:1]
     if not COMMANDS.keys() & named:
         make_parser(()).parse_args(words)  # prints help, the version or an error, and ends
     with leaving_at_once(), uncollected():
-        import warp as wp
-
+        configure_warp()
         from warp_corot.inputs.starting import start_warp
 
-        wp.config.log_level = wp.LOG_ERROR  # before Warp starts, so that it prints no banner
-        # The command differentiates nothing, and Newton's kernels compile in a third of the time without adjoints.
-        wp.config.enable_backward = False
         logging.basicConfig(format="warp-corot: warning: %(message)s", level=logging.WARNING)
         parser = make_parser(tuple(named))
     args = parser.parse_args(words)

@@ -7,11 +7,16 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import warp as wp
+
 from warp_corot.inputs.device import checked_device
+from warp_corot.inputs.loading import BODY, CONTACT, MESHING, STEPS, STEPS_ON_CPU, SURFACES, begin_loading
 from warp_corot.simulation.simulation import Simulation
+from warp_corot.solvers import INTEGRATORS
 
 from .bodies import Body, asked_bodies, find_body, find_patches, gravity_of, make_body
 from .compiling import compiling_said
+from .implicit import integrator_name
 from .loading import ramp_of
 from .pressing import press_patches
 from .probing import Probe
@@ -62,6 +67,7 @@ def prepared(options: Sequence[argparse.Namespace], others: Others | None = None
             inputs.append(asked_bodies(each))
     bodies = [body for found in inputs for body in found]
     with compiling_said(device):
+        begin_loading(_modules(bodies, touched, device), device)
         for body in bodies:
             with waiting(f"meshing {body.args.input}"):
                 body.subject = find_body(body)
@@ -85,6 +91,16 @@ def prepared(options: Sequence[argparse.Namespace], others: Others | None = None
         bodies[0].subject.notes.append(f"{steps:.2g} steps of {sim.dt:.2g} s make a frame: this will take long")
     _say_notes(bodies)
     return Run(bodies, sim, probes, duration, count, touched)
+
+
+def _modules(bodies: Sequence[Body], touched: Touched, device: wp.Device) -> list[str]:
+    """Modules of kernels that the run is known to launch, in the order in which it needs them."""
+    meshed = any(body.opened.kind in ("surface", "scan") for body in bodies)
+    names = [*SURFACES, *MESHING] if meshed else []
+    if device.is_cuda:
+        return [*names, *BODY, *STEPS]
+    explicit = not INTEGRATORS[integrator_name(bodies[0].args)].is_implicit
+    return [*names, *(CONTACT if touched.contact is not None and explicit else ()), *BODY, *STEPS_ON_CPU]
 
 
 def _frames(args: argparse.Namespace, bodies: Sequence[Body], touched: Touched) -> tuple[float, int]:

@@ -13,6 +13,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import InputError
+from warp_corot.inputs.loading import SURFACES, load
 from warp_corot.io.read.surfaces import UP_AXES, LoadedSurface, load_surface
 from warp_corot.kernels.meshing import domain as kernels
 from warp_corot.kernels.meshing import windings
@@ -57,6 +58,7 @@ class SurfaceDomain(SignedFunction):
         rounding = 2.0**-23 * np.abs(used).max()
         bounds = np.stack([used.min(axis=0) - rounding, used.max(axis=0) + rounding])
         super().__init__(bounds, 1.0, **options)
+        load(SURFACES, self.device)
         self.closed = closed
         self.notes = list(notes)
         self._on: dict[str, wp.Mesh] = {}

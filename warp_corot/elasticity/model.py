@@ -142,6 +142,11 @@ class ForceField(ABC):
         """The plan of the field; by default the elements one by one."""
         return discretization.plan(subtrees=False, deterministic=self.deterministic)
 
+    @property
+    def kernels(self) -> list[wp.Kernel]:
+        """Kernels of factories that steps on the CPU launch; each that is named is loaded beside others."""
+        return []
+
     def load_kernels(self) -> None:  # noqa: B027 (most have none)
         """Load every kernel that a later plan may need, so that none is compiled during steps.
 
@@ -375,6 +380,14 @@ class ElementField(ForceField):
         self._energies = energies
         self._von_mises = von_mises
         self._stress_function = stress
+
+    @property
+    def kernels(self) -> list[wp.Kernel]:
+        return [*self._force_kernels, self._energies, self._von_mises]
+
+    @property
+    def _force_kernels(self) -> list[wp.Kernel]:
+        return [self._forces]
 
     @property
     def stress_law(self) -> StressLaw | None:

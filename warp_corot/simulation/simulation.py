@@ -22,7 +22,9 @@ from warp_corot.discretization.nodal import vec3_view
 from warp_corot.elasticity import Corotated, Model
 from warp_corot.errors import InputError, StabilityWarning, depth_of_user
 from warp_corot.inputs.checks import checked_count, checked_flag, checked_number, refuse_tape
+from warp_corot.inputs.loading import CONTACT, STEPS, STEPS_ON_CPU, load
 from warp_corot.inputs.turns import TURN, in_turn
+from warp_corot.kernels.stepping.gauge import find_strains
 from warp_corot.remesh.online import OnlineRemesh
 from warp_corot.remesh.remeshing import Remeshing
 from warp_corot.solvers import Integrator, SymplecticEuler, largest_frequency
@@ -123,6 +125,7 @@ class Simulation(Clock, FormerNames):
             given = self.integrator.dt
             self.pace = Pace(ANY_STEP if given is None else float(given), self.device)
             self.system = System(self.bodies, self.fields, self.pace, self.gravity, self.ranks)
+            self._load_kernels(touches=touching is not None)
             stable = self._find_stable_steps()
             #: Keeps bodies out of obstacles and out of one another; None without contact.
             self.contact: Contacts | None = None
@@ -138,6 +141,16 @@ class Simulation(Clock, FormerNames):
             self.recorded = RecordedSteps(self.system, self.stepper, self.guard, self.safe_step)
             #: Makes the steps.
             self.running = Running(self)
+
+    def _load_kernels(self, touches: bool) -> None:
+        """Load the kernels that steps are known to launch, several modules at a time."""
+        if self.device.is_cuda:
+            load(STEPS, self.device)
+            return
+        explicit = not self.integrator.is_implicit
+        kernels = [find_strains(body.discretization.element_kind) for body in self.bodies if self.integrator.dt is None]
+        kernels += [kernel for field in self.fields for kernel in field.kernels]
+        load((*(CONTACT if touches and explicit else ()), *STEPS_ON_CPU), self.device, kernels)
 
     # --- stepping --------------------------------------------------------------------------------------------------
 

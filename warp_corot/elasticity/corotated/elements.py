@@ -124,6 +124,14 @@ class CorotatedField(ForceField):
         self._von_mises = element_von_mises(kind, RotatedMaterial, given_cauchy)
 
     @property
+    def kernels(self) -> list[wp.Kernel]:
+        return [*self._force_kernels, self._extract, self._von_mises, self._own_energies or self._energies]
+
+    @property
+    def _force_kernels(self) -> list[wp.Kernel]:
+        return [self._own if self._fused else self._forces]
+
+    @property
     def state(self) -> dict[str, wp.array]:
         return self._state
 
@@ -292,6 +300,12 @@ class LanesField(CorotatedField):
     def __init__(self, discretization: Discretization, model: CorotatedOptions, deterministic: bool):
         super().__init__(discretization, model, deterministic)
         self._lanes = general_lanes(self.elements)
+
+    @property
+    def _force_kernels(self) -> list[wp.Kernel]:
+        groups = None if self._dilating is None else self._dilating.groups
+        forces = scatter_law_elements("corotated") if groups is None else groups.kernel("corotated")
+        return [forces, repair_elements()]
 
     def share_dilatation(self, dilating: Dilating) -> bool:
         self._dilating = dilating

@@ -73,6 +73,15 @@ class SubtreeField(CorotatedField):
         if self._clusters is not None:
             self._clusters.derive()
 
+    @property
+    def _force_kernels(self) -> list[wp.Kernel]:
+        of_subtrees = [self._kernel(*kind) for kind in self.plan.kinds]
+        if self._groups is not None:
+            return [*of_subtrees, self._groups.kernel("corotated"), repair_elements()]
+        if self._flat_lanes is not None:
+            return [*of_subtrees, scatter_law_elements("corotated"), repair_elements()]
+        return of_subtrees
+
     def load_kernels(self) -> None:
         one_launch = self._listed and self.rotation_level is None
         for shape, grouped, sharing in () if one_launch else self.plan.kinds:

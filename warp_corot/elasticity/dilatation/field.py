@@ -108,6 +108,13 @@ class DilatationField(ForceField):
             return ()
         return self.plan.batches if self._clustered is None else self._kept
 
+    @property
+    def kernels(self) -> list[wp.Kernel]:
+        own = [kernels.measure_elements(self.kind, self.of), kernels.scatter_pressures(self.kind, self.of)]
+        own += [kernels.unshare(self.kind, self.of), kernels.add_energies(self.kind, self.of)]
+        own.append(kernels.share_in_groups(self.kind, kernels.law_at(self.of)))
+        return [*self.shear.kernels, *own]
+
     def load_kernels(self) -> None:
         self.shear.load_kernels()
         for shape, grouped, _sharing in [] if self._joined else self.plan.kinds:

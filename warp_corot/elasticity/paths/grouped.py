@@ -6,6 +6,7 @@ import warp as wp
 
 from warp_corot.discretization.plan import Plan
 from warp_corot.elasticity.structs import isotropic_material
+from warp_corot.inputs.loading import load
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.kernels.elements.dilatation_lanes import (
@@ -34,6 +35,7 @@ class GroupedLanes:
     def __init__(self, plan: Plan, kind: type, of: Dilatation, starts: wp.array, members: wp.array, live: wp.array):
         self.count = 0
         self._plan, self._of, self._order = plan, of, order_elements(kind)
+        load(["elements.general_cpu"], wp.get_device("cpu"), [self._order])
         self._members, self._live, most = members, live, len(members)
         general = self._general = GeneralElements()
         general.nodes = general.targets = wp.zeros(most, dtype=wp.vec4i, device="cpu")

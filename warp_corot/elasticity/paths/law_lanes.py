@@ -41,12 +41,16 @@ class LawLanesField(LawField):
     def plan_of(self, discretization: Discretization) -> Plan:
         return discretization.plan()
 
-    def load_kernels(self) -> None:
+    @property
+    def _force_kernels(self) -> list[wp.Kernel]:
         kernels = [self._kernel(shape) for shape, _grouped, _sharing in self.plan.kinds]
         dilating, of_leaves = self._dilating, scatter_law_elements(self._law)
         if dilating is not None and dilating.groups is not None:
             of_leaves = dilating.groups.kernel(self._law)
-        for kernel in (*kernels, of_leaves):
+        return [*kernels, of_leaves]
+
+    def load_kernels(self) -> None:
+        for kernel in self._force_kernels:
             wp.load_module(kernel.module, self.device, block_dim=256)
 
     def _kernel(self, shape: int) -> wp.Kernel:

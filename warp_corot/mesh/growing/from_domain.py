@@ -12,6 +12,7 @@ import warp as wp
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_count, checked_number, shown
 from warp_corot.inputs.device import checked_device
+from warp_corot.inputs.loading import MESHING, load
 from warp_corot.mesh.forest import TetForest
 from warp_corot.mesh.lattice import check_levels, checked_cell_size, checked_level
 from warp_corot.mesh.numbering import in_order_of_leaves, live_or_void, pruned, renumbered, with_virtual
@@ -59,6 +60,7 @@ def mesh_domain(
 ) -> TetForest:
     """See `TetForest.from_domain`."""
     where = checked_device(domain.device if device is None else device)
+    load(MESHING, where)
     _check(cell_size, target_elements, min_layers, detail, sliver)
     wishes = checked_wishes(max_level, surface_error, min_level, refine_where, field, field_tolerance)
     if target_elements is not None:

@@ -1,0 +1,31 @@
+"""Kernels are loaded before the first step, several modules at a time."""
+
+import subprocess
+import sys
+
+STEPS = """
+import warp_corot as wc
+forest = wc.TetForest.box((1, 1, 2), 0.1, 4).refine([0, 1])
+tets = wc.TetMesh(forest.points, forest.tets)
+for mesh, model, poisson in (
+    (forest, wc.Corotated(), 0.49), (tets, wc.Corotated(), 0.49), (forest, wc.NeoHookean(), 0.3), (tets, wc.Corotated(), 0.3)
+):
+    body = wc.SoftBody(mesh, wc.Isotropic(1e4, poisson, 1e3), device="cpu")
+    body.fix("z == zmin")
+    sim = wc.Simulation(body, model=model)
+    print("steps", flush=True)
+    sim.advance(0.01)
+    sim.von_mises(), sim.energy()
+    print("end", flush=True)
+"""
+
+
+def test_steps_load_no_kernels():
+    """Warp says which modules it loads, and when."""
+    ran = subprocess.run([sys.executable, "-c", STEPS], capture_output=True, text=True, check=True)
+    found = [line.split()[:2] for line in ran.stdout.splitlines() if line.startswith(("steps", "end", "Module"))]
+    assert found.count(["steps"]) == found.count(["end"]) == 4
+    assert any(words[0] == "Module" for words in found)
+    for number, words in enumerate(found):
+        if words == ["steps"]:
+            assert found[number + 1] == ["end"], found[number + 1]

@@ -1,0 +1,68 @@
+"""Kernels compiled and loaded several modules at a time, before their first launches.
+
+Warp compiles a module when one of its kernels is first launched: one after another, on one core. The modules named here
+are those that every run of a kind launches; fields name the kernels that factories made for them.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import cache
+from importlib import import_module
+
+import warp as wp
+
+#: Modules of ``warp_corot.kernels`` for closed surfaces and for meshes of domains, the slowest to compile first.
+SURFACES = ("meshing.domain", "meshing.measuring", "meshing.windings")
+MESHING = (
+    *("meshing.domain", "meshing.elements", "meshing.embedding", "meshing.growth"),
+    *("meshing.coarsening", "meshing.surface_points", "meshing.leaves"),
+)
+#: Modules for bodies, and for their explicit steps.
+BODY = ("plan.lists", "plan.batches", "stepping.conditions")
+STEPS = ("stepping.integrate", "stepping.balance", "stepping.lanczos", "stepping.gauge", "stepping.pace")
+STEPS_ON_CPU = ("subtrees.repair", *STEPS, "stepping.subnormals")
+#: Modules for explicit contact with obstacles on the CPU.
+CONTACT = (
+    *("contact.together", "contact.begin", "contact.sums", "contact.beside", "contact.sleep", "contact.overlaps"),
+    *("contact.watch", "contact.near", "contact.end", "contact.bearing"),
+)
+
+#: What was begun: modules by device.
+_begun: dict[tuple[wp.Module, str], Future] = {}
+
+
+def begin_loading(names: Iterable[str], device: wp.Device, kernels: Iterable[wp.Kernel] = ()) -> list[Future]:
+    """Begin to load modules of ``warp_corot.kernels``, and those of kernels, in other threads and in this order."""
+    modules = [wp.get_module(import_module(f"warp_corot.kernels.{name}").__name__) for name in names]
+    found = []
+    for module in (*modules, *(kernel.module for kernel in kernels)):
+        key = (module, str(device))
+        if key not in _begun:
+            _begun[key] = _threads().submit(wp.load_module, module, device)
+        found.append(_begun[key])
+    return found
+
+
+def load(names: Iterable[str], device: wp.Device, kernels: Iterable[wp.Kernel] = ()) -> None:
+    """Load modules as `begin_loading` does, and wait for them."""
+    try:
+        for module in begin_loading(names, device, kernels):
+            module.result()
+    except BaseException:
+        give_up()
+        raise
+
+
+def give_up() -> None:
+    """Load none of the modules that wait for a thread; otherwise Python would load them before it ends."""
+    for key in [key for key, module in _begun.items() if module.cancel()]:
+        del _begun[key]
+
+
+@cache
+def _threads() -> ThreadPoolExecutor:
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return ThreadPoolExecutor(min(cores, 8), thread_name_prefix="compiling")
