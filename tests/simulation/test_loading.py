@@ -7,8 +7,9 @@ STEPS = """
 import warp_corot as wc
 forest = wc.TetForest.box((1, 1, 2), 0.1, 4).refine([0, 1])
 tets = wc.TetMesh(forest.points, forest.tets)
+corotated, neo_hookean = wc.Corotated(), wc.NeoHookean()
 for mesh, model, poisson in (
-    (forest, wc.Corotated(), 0.49), (tets, wc.Corotated(), 0.49), (forest, wc.NeoHookean(), 0.3), (tets, wc.Corotated(), 0.3)
+    (forest, corotated, 0.49), (tets, corotated, 0.49), (forest, neo_hookean, 0.3), (tets, corotated, 0.3)
 ):
     body = wc.SoftBody(mesh, wc.Isotropic(1e4, poisson, 1e3), device="cpu")
     body.fix("z == zmin")
