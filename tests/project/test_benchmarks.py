@@ -304,6 +304,21 @@ def test_the_haptic_loop_is_timed(run, tmp_path):
     assert all(word in done.stdout for word in ("median", "99 %", "longest", "delay"))
 
 
+@pytest.mark.parametrize("scenes", ["standing,dropped,worlds", "pressed,lifted,refined", "squeezed"])
+def test_standing_scenes_run_through(scenes, run, tmp_path):
+    """All steps are solved, and positions stay finite."""
+    path = tmp_path / "rows.json"
+    small = ["--elements", "600", "--young", "5e3", "--poisson", "0.49", "--duration", "0.1", "--device", "cpu"]
+    done = run("scenes.py", "--scenes", scenes, *small, "--json", path)
+    assert done.returncode == 0, done.stderr
+    rows = json.loads(path.read_text(encoding="utf-8"))["rows"]
+    assert [row["scene"] for row in rows] == [name for name in scenes.split(",") for _ in range(2)]
+    for row in rows:
+        assert row["factor"] > 0.0
+        assert "failure" not in row, row
+        assert not row.get("unfinished"), row
+
+
 def test_implicit_steps_are_timed(run, tmp_path):
     path = tmp_path / "steps.json"
     options = ["--levels", 3, "--tolerances", "1e-2", "--repeats", 1, "--json", path]
