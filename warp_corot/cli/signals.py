@@ -13,7 +13,7 @@ from typing import NoReturn
 
 from .say import Terminated, complain
 
-#: Delay before a signal that came during an import is checked again [s].
+#: Delay before a signal that could not end the run is checked again [s].
 WAIT = 0.02
 
 #: Whether the process may end during an import.
@@ -22,10 +22,10 @@ _may_leave = False
 
 @contextmanager
 def terminable() -> Iterator[None]:
-    """Let SIGINT and SIGTERM end the block by an exception, after the current import, if any.
+    """Let SIGINT and SIGTERM end the block by an exception, after the current import or destructor, if any.
 
     During an import, USD's modules swallow the exception, and the run would continue; NumPy's turn it into
-    another one.
+    another one. Python itself ignores exceptions of destructors.
     """
 
     def interrupt() -> NoReturn:
@@ -34,7 +34,7 @@ def terminable() -> Iterator[None]:
     def terminate() -> NoReturn:
         raise Terminated
 
-    with _handled(_after_imports(interrupt), signal.SIGINT), _handled(_after_imports(terminate), signal.SIGTERM):
+    with _handled(_when_heard(interrupt), signal.SIGINT), _handled(_when_heard(terminate), signal.SIGTERM):
         yield
 
 
@@ -49,9 +49,9 @@ def leaving_at_once() -> Iterator[None]:
         _may_leave = before
 
 
-def _after_imports(end: Callable[[], NoReturn]) -> Callable[[int, FrameType | None], None]:
+def _when_heard(end: Callable[[], NoReturn]) -> Callable[[int, FrameType | None], None]:
     def handle(number: int, frame: FrameType | None) -> None:
-        if not _is_importing(frame):
+        if _is_heard(frame):
             end()
         if _may_leave:
             complain("interrupted", kind="")
@@ -63,13 +63,13 @@ def _after_imports(end: Callable[[], NoReturn]) -> Callable[[int, FrameType | No
     return handle
 
 
-def _is_importing(frame: FrameType | None) -> bool:
-    """Whether a module is being imported by code called from ``main``."""
+def _is_heard(frame: FrameType | None) -> bool:
+    """Whether an exception ends the run: neither an import nor a destructor called from ``main`` is under way."""
     while frame is not None and not (frame.f_code.co_name == "main" and frame.f_globals.get("__name__") == __package__):
-        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
-            return True
+        if frame.f_code.co_filename == "<frozen importlib._bootstrap>" or frame.f_code.co_name == "__del__":
+            return False
         frame = frame.f_back
-    return False
+    return True
 
 
 @contextmanager
