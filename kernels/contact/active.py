@@ -13,6 +13,7 @@ the obstacle whatever k is.
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
+from warp_corot.kernels.implicit.assembled import Couplings
 from warp_corot.kernels.implicit.line_search import TRIED
 from warp_corot.kernels.stepping.pace import DT, Pace
 
@@ -308,6 +309,17 @@ def add_drag(start: int, surface: Surface, holding: Holding, x: wp.array[wp.vec4
     if holding.touched[s] != 0:
         i = surface.node[s]
         store_node(y, i, holding.projectors[s] * (load_node(y, i) + holding.drag[s] * load_node(x, i)))
+
+
+@wp.kernel(enable_backward=False)
+def couple_places(start: int, surface: Surface, holding: Holding, couplings: Couplings):
+    """Write S and D for an assembled matrix."""
+    s = start + wp.tid()
+    if holding.touched[s] != 0:
+        i = surface.node[s]
+        couplings.projected[i] = 1
+        couplings.projectors[i] = holding.projectors[s]
+        couplings.drag[i] = holding.drag[s]
 
 
 @wp.func

@@ -11,7 +11,7 @@ from .motion import Motions, Surface
 from .nearest_span import Found, find_span
 from .rolling import tilted
 from .shapes import GROUND, Shapes, carried, distance_to
-from .spans import Spans
+from .spans import Spans, list_span, span_at
 from .springs import kept_gap
 from .supports import left_at_triangle, loose_at_triangle, loose_part
 from .touches import SKEWERED, Touches
@@ -89,7 +89,7 @@ def take_span(
     spans.bend[o, t] = push * found.rolling.distance
     spans.multiplier[o, t] = push * n + held_back(across(was, n), push, found.friction)
     touches.force[o, t] = spans.multiplier[o, t]
-    wp.atomic_add(spans.count, 0, 1)
+    list_span(o, t, spans)
     if push > 0.0 or is_passed:
         for k in range(3):
             if found.shares[k] != 0.0:
@@ -237,20 +237,22 @@ def locate_points(
 
 
 @wp.kernel(enable_backward=False)
-def empty_spans(start: int, which: int, carriers: Carriers, spans: Spans):
-    """Begin to find spans of a body whose carriers begin at ``start``."""
+def empty_spans(start: int, which: int, carriers: Carriers, spans: Spans, own: Spans):
+    """Begin to find spans of a body whose carriers begin at ``start``, of its first and its last items."""
     c = wp.tid()
     if which == FIRST or spans.due[0] != 0:
         carriers.crowd[start + c] = 0.0
         if c == 0:
             spans.count[0] = 0
+            spans.length[0] = 0
+            own.length[0] = 0
             spans.due[0] = 1
 
 
 @wp.kernel(enable_backward=False)
 def stiffen_spans(
     # In
-    start: int,
+    threads: int,
     surface: Surface,
     triangles: wp.array[wp.vec3i],
     carriers: Carriers,
@@ -262,15 +264,16 @@ def stiffen_spans(
 
     Where most of them are, it is no stiffer than where half are: it would amplify rounding.
     """
-    t = start + wp.tid()
-    for o in range(touches.force.shape[0]):
-        if spans.listed[o, t] != 0:
-            w = touches.shares[o, t]
-            yielding = float(0.0)
-            for k in range(3):
-                if w[k] != 0.0:
-                    yielding += ease_at(triangles[t][k], w[k], surface, carriers)
-            spans.stiffness[o, t] = 0.0
-            if yielding > 0.0:
-                loose = loose_at_triangle(w, triangles[t], surface.yielding, surface)
-                spans.stiffness[o, t] = loose_part(loose) * spans.stiff / yielding
+    k = wp.tid()
+    while k < spans.length[0]:
+        o, t = span_at(k, spans)
+        w = touches.shares[o, t]
+        yielding = float(0.0)
+        for corner in range(3):
+            if w[corner] != 0.0:
+                yielding += ease_at(triangles[t][corner], w[corner], surface, carriers)
+        spans.stiffness[o, t] = 0.0
+        if yielding > 0.0:
+            loose = loose_at_triangle(w, triangles[t], surface.yielding, surface)
+            spans.stiffness[o, t] = loose_part(loose) * spans.stiff / yielding
+        k += threads

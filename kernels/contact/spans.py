@@ -8,9 +8,11 @@ multipliers; in between, spans that are missing are added.
 
 import warp as wp
 
+from warp_corot.kernels.implicit.assembled import Couplings, begin_coupling, couple, end_coupling, root_columns
 from warp_corot.kernels.implicit.conjugate_gradients import had_much_to_do
 from warp_corot.kernels.implicit.line_search import TRIED
 
+from .bearing import is_borne
 from .carriers import Carriers, motion_at, push_at
 from .motion import Surface
 from .rolling import Rolling, share_of_moment, tilted
@@ -35,11 +37,26 @@ class Spans:
     bend: wp.array2d[wp.float32]  # stiffness against tilts [N m]
     tilt: wp.array2d[wp.vec3]  # where it is found
     moment: wp.array2d[wp.vec3]  # against tilting [N m]
-    count: wp.array[wp.int32]  # [1] how many are listed
+    count: wp.array[wp.int32]  # [1] how many are listed, of all items
+    list: wp.array[wp.int32]  # [O * T] those of these items, as o * T + t
+    length: wp.array[wp.int32]  # [1] how many
     due: wp.array[wp.int32]  # [1] whether all are to be found again
     solves: wp.array[wp.int32]  # [1] how many linear solves the step has had so far
     stiff: float  # the stiffness of a span over that of its point
     are_borne: int  # whether nodes bear the corners
+
+
+@wp.func
+def list_span(o: int, t: int, spans: Spans):
+    spans.list[wp.atomic_add(spans.length, 0, 1)] = o * spans.listed.shape[1] + t
+    wp.atomic_add(spans.count, 0, 1)
+
+
+@wp.func
+def span_at(k: int, spans: Spans):
+    """The k-th listed span: its obstacle and its item."""
+    items = spans.listed.shape[1]
+    return spans.list[k] / items, spans.list[k] % items
 
 
 @wp.func
@@ -128,7 +145,7 @@ def span_state(o: int, t: int, e: wp.vec3, most: float, touches: Touches, spans:
 @wp.kernel(enable_backward=False)
 def update_spans(
     # In
-    start: int,
+    threads: int,
     is_solved: int,
     surface: Surface,
     triangles: wp.array[wp.vec3i],
@@ -142,25 +159,24 @@ def update_spans(
 
     ``is_solved`` says that a solve has ended with d, which is when bounds of friction change.
     """
-    t = start + wp.tid()
-    for o in range(touches.force.shape[0]):
+    k = wp.tid()
+    while k < spans.length[0]:
+        o, t = span_at(k, spans)
         touches.acts[o, t] = 0
         touches.force[o, t] = wp.vec3()
-        last = spans.most[o, t]
-        spans.most[o, t] = 0.0
-        if spans.listed[o, t] != 0:
-            if spans.bend[o, t] > 0.0:
-                tilt = tilt_of(o, t, triangles[t], surface, carriers, d, touches, spans)
-                spans.moment[o, t] = spans.bend[o, t] * (spans.tilt[o, t] - tilt)
-            e = motion_of(touches.shares[o, t], triangles[t], surface, carriers, d) - touches.moved[o, t]
-            push = span_state(o, t, e, 0.0, touches, spans).push
-            most = bound_of(last, push, touches.friction[o, t], is_solved != 0, spans.solves[0])
-            spans.most[o, t] = most
-            if push > 0.0:
-                made = span_state(o, t, e, most, touches, spans)
-                touches.acts[o, t] = 1
-                touches.force[o, t] = made.force
-                spans.derivative[o, t] = made.derivative
+        if spans.bend[o, t] > 0.0:
+            tilt = tilt_of(o, t, triangles[t], surface, carriers, d, touches, spans)
+            spans.moment[o, t] = spans.bend[o, t] * (spans.tilt[o, t] - tilt)
+        e = motion_of(touches.shares[o, t], triangles[t], surface, carriers, d) - touches.moved[o, t]
+        push = span_state(o, t, e, 0.0, touches, spans).push
+        most = bound_of(spans.most[o, t], push, touches.friction[o, t], is_solved != 0, spans.solves[0])
+        spans.most[o, t] = most
+        if push > 0.0:
+            made = span_state(o, t, e, most, touches, spans)
+            touches.acts[o, t] = 1
+            touches.force[o, t] = made.force
+            spans.derivative[o, t] = made.derivative
+        k += threads
 
 
 @wp.func
@@ -174,7 +190,7 @@ def add_to_corners(
 
 @wp.kernel(enable_backward=False)
 def add_span_forces(
-    start: int,
+    threads: int,
     surface: Surface,
     triangles: wp.array[wp.vec3i],
     carriers: Carriers,
@@ -183,18 +199,20 @@ def add_span_forces(
     y: wp.array[wp.vec4],
 ):
     """Add the forces of spans on nodes that are free [N]."""
-    t = start + wp.tid()
-    for o in range(touches.acts.shape[0]):
-        if spans.listed[o, t] != 0 and spans.bend[o, t] > 0.0:
+    k = wp.tid()
+    while k < spans.length[0]:
+        o, t = span_at(k, spans)
+        if spans.bend[o, t] > 0.0:
             push_corners(o, t, spans.moment[o, t], triangles[t], surface, carriers, touches, spans, y)
         if touches.acts[o, t] != 0:
             add_to_corners(touches.shares[o, t], touches.force[o, t], triangles[t], surface, carriers, y)
+        k += threads
 
 
 @wp.kernel(enable_backward=False)
 def add_span_products(
     # In
-    start: int,
+    threads: int,
     surface: Surface,
     triangles: wp.array[wp.vec3i],
     carriers: Carriers,
@@ -205,21 +223,85 @@ def add_span_products(
     y: wp.array[wp.vec4],
 ):
     """Add the derivative times x."""
-    t = start + wp.tid()
-    for o in range(touches.acts.shape[0]):
-        if spans.listed[o, t] != 0 and spans.bend[o, t] > 0.0:
+    k = wp.tid()
+    while k < spans.length[0]:
+        o, t = span_at(k, spans)
+        if spans.bend[o, t] > 0.0:
             m = spans.bend[o, t] * tilt_of(o, t, triangles[t], surface, carriers, x, touches, spans)
             push_corners(o, t, m, triangles[t], surface, carriers, touches, spans, y)
         if touches.acts[o, t] != 0:
             w = touches.shares[o, t]
             product = spans.derivative[o, t] * motion_of(w, triangles[t], surface, carriers, x)
             add_to_corners(w, product, triangles[t], surface, carriers, y)
+        k += threads
+
+
+@wp.func
+def couple_corners(parts: wp.mat33, corners: wp.vec3i, surface: Surface, carriers: Carriers, couplings: Couplings):
+    """Add c c^T to a matrix, with the rows of ``parts`` as c at an item's corners."""
+    c = begin_coupling(couplings)
+    if c < 0:
+        return
+    places = int(0)
+    for k in range(3):
+        s = corners[k]
+        if wp.length_sq(parts[k]) == 0.0:
+            continue
+        if is_borne(s, surface):
+            first = surface.node.shape[0]
+            b = surface.bearing.bearers[s]
+            w = surface.bearing.weights[s]
+            for m in range(4):
+                if w[m] != 0.0 and carriers.compliance[first + b[m]] > 0.0:
+                    places = couple(c, places, carriers.entry[first + b[m]], w[m] * parts[k], couplings)
+        elif carriers.compliance[s] > 0.0:
+            places = couple(c, places, carriers.entry[s], parts[k], couplings)
+    end_coupling(c, places, couplings)
+
+
+@wp.kernel(enable_backward=False)
+def couple_spans(
+    # In
+    threads: int,
+    surface: Surface,
+    triangles: wp.array[wp.vec3i],
+    carriers: Carriers,
+    touches: Touches,
+    spans: Spans,
+    # In and out
+    couplings: Couplings,
+):
+    """Add the derivative to an assembled matrix."""
+    i = wp.tid()
+    while i < spans.length[0]:
+        o, t = span_at(i, spans)
+        w = touches.shares[o, t]
+        if spans.bend[o, t] > 0.0:
+            root = wp.sqrt(spans.bend[o, t])
+            rolling = spans.rolling[o, t]
+            is_along = wp.length_sq(rolling.along) > 0.0
+            for axis in range(wp.where(is_along, 1, 3)):
+                m = wp.vec3()
+                m[axis] = root
+                if is_along:
+                    m = root * rolling.along
+                parts = wp.mat33()
+                for k in range(3):
+                    parts[k] = share_of_moment(k, m, rolling, w, touches.normal[o, t])
+                couple_corners(parts, triangles[t], surface, carriers, couplings)
+        if touches.acts[o, t] != 0:
+            roots = root_columns(spans.derivative[o, t])
+            for axis in range(3):
+                g = wp.vec3(roots[0, axis], roots[1, axis], roots[2, axis])
+                if wp.length_sq(g) > 0.0:
+                    couple_corners(wp.outer(w, g), triangles[t], surface, carriers, couplings)
+        i += threads
 
 
 @wp.kernel(enable_backward=False)
 def add_span_slopes(
     # In
-    start: int,
+    threads: int,
     only_world: int,
     surface: Surface,
     triangles: wp.array[wp.vec3i],
@@ -233,25 +315,24 @@ def add_span_slopes(
     slopes: wp.array[wp.float64],
 ):
     """Add the power of spans along a change of motions, at the share that is tried."""
-    t = start + wp.tid()
-    corners = triangles[t]
-    if corners[0] < 0:
-        return
-    world = wp.where(only_world != 0, 0, surface.world[corners[0]])
-    for o in range(touches.acts.shape[0]):
-        if spans.listed[o, t] != 0:
-            w = touches.shares[o, t]
-            along = motion_of(w, corners, surface, carriers, change)
-            e = motion_of(w, corners, surface, carriers, d) + float(search[world, TRIED]) * along - touches.moved[o, t]
-            made = span_state(o, t, e, spans.most[o, t], touches, spans)
-            power = wp.dot(wp.vec3d(made.force), wp.vec3d(along))
-            if spans.bend[o, t] > 0.0:
-                tilts = tilt_of(o, t, corners, surface, carriers, change, touches, spans)
-                tilt = tilt_of(o, t, corners, surface, carriers, d, touches, spans)
-                tilt += float(search[world, TRIED]) * tilts - spans.tilt[o, t]
-                power -= wp.float64(spans.bend[o, t]) * wp.dot(wp.vec3d(tilt), wp.vec3d(tilts))
-            if power != wp.float64(0.0):
-                wp.atomic_add(slopes, world, power)
+    k = wp.tid()
+    while k < spans.length[0]:
+        o, t = span_at(k, spans)
+        corners = triangles[t]
+        world = wp.where(only_world != 0, 0, surface.world[corners[0]])
+        w = touches.shares[o, t]
+        along = motion_of(w, corners, surface, carriers, change)
+        e = motion_of(w, corners, surface, carriers, d) + float(search[world, TRIED]) * along - touches.moved[o, t]
+        made = span_state(o, t, e, spans.most[o, t], touches, spans)
+        power = wp.dot(wp.vec3d(made.force), wp.vec3d(along))
+        if spans.bend[o, t] > 0.0:
+            tilts = tilt_of(o, t, corners, surface, carriers, change, touches, spans)
+            tilt = tilt_of(o, t, corners, surface, carriers, d, touches, spans)
+            tilt += float(search[world, TRIED]) * tilts - spans.tilt[o, t]
+            power -= wp.float64(spans.bend[o, t]) * wp.dot(wp.vec3d(tilt), wp.vec3d(tilts))
+        if power != wp.float64(0.0):
+            wp.atomic_add(slopes, world, power)
+        k += threads
 
 
 @wp.kernel(enable_backward=False)

@@ -14,10 +14,12 @@ from .sums import add_up
 wp.set_module_options({"enable_backward": False})
 
 #: Columns of a world's search: the current fraction, the ends of the bracket, and the power at these; the power at zero
-#: without contacts, and its decrease with the fraction; the power at zero with contacts; and the upper end before, with
-#: the power there.
-TRIED, LOW, HIGH, AT_LOW, AT_HIGH, POWER, LOSS, FIRST, BEFORE, AT_BEFORE = (wp.constant(k) for k in range(10))
-COLUMNS = 10
+#: without contacts, and its decrease with the fraction; the power at zero with contacts; the upper end before, with
+#: the power there; and the number of fractions that were tried.
+TRIED, LOW, HIGH, AT_LOW, AT_HIGH, POWER, LOSS, FIRST, BEFORE, AT_BEFORE, NUMBER = (wp.constant(k) for k in range(11))
+COLUMNS = 11
+#: Maximum number of fractions that are tried, with 0 and 1.
+TRIALS = wp.constant(13)
 #: The whole change is taken if the power at its end, over that at its beginning, is at most this in magnitude.
 ENOUGH = wp.constant(wp.float64(0.2))
 #: A fraction between is taken if the power there is negative, and over that at the beginning at most this in magnitude.
@@ -35,8 +37,9 @@ def begin_search(
     # Out
     search: wp.array2d[wp.float64],
     slopes: wp.array[wp.float64],
+    searching: wp.array[wp.int32],
 ):
-    """Begin with a fraction of zero."""
+    """Begin with a fraction of zero; ``searching`` counts the worlds that search."""
     world, lane = wp.tid()
     first = add_up(power, world, lane, lanes, 0)
     second = add_up(loss, world, lane, lanes, 0)
@@ -44,18 +47,27 @@ def begin_search(
         search[world, POWER] = first
         search[world, LOSS] = second
         search[world, TRIED] = wp.float64(0.0)
+        search[world, NUMBER] = wp.float64(0.0)
         slopes[world] = wp.float64(0.0)
+        if world == 0:
+            searching[0] = power.shape[0]
+
+
+@wp.func
+def end_search(world: int, search: wp.array2d[wp.float64], searching: wp.array[wp.int32]):
+    search[world, NUMBER] = wp.float64(TRIALS)
+    wp.atomic_sub(searching, 0, 1)
 
 
 @wp.kernel(enable_backward=False)
 def take_trial(
-    # In
-    number: int,
     # In and out
     search: wp.array2d[wp.float64],
     slopes: wp.array[wp.float64],
+    searching: wp.array[wp.int32],
 ):
-    """Read the power at the current fraction, first 0 and then 1, and choose the next fraction.
+    """Read the power at the current fraction, first 0 and then 1, and choose the next fraction. A world whose bracket
+    is empty keeps its fraction.
 
     Stiff contacts that close on the way bend the power: it falls slowly up to them, and steeply beyond. A secant
     through both ends of the bracket stays near its beginning then, and the middle of the bracket is tried instead.
@@ -63,6 +75,11 @@ def take_trial(
     the bend.
     """
     world = wp.tid()
+    number = int(search[world, NUMBER])
+    if number >= TRIALS:
+        slopes[world] = wp.float64(0.0)
+        return
+    search[world, NUMBER] = wp.float64(number + 1)
     s = search[world, TRIED]
     g = search[world, POWER] - s * search[world, LOSS] + slopes[world]
     slopes[world] = wp.float64(0.0)
@@ -74,6 +91,8 @@ def take_trial(
         search[world, AT_HIGH] = wp.float64(0.0)
         search[world, BEFORE] = wp.float64(-1.0)
         search[world, TRIED] = search[world, HIGH]
+        if search[world, HIGH] == s:
+            end_search(world, search, searching)
         return
     enough = wp.where(number == 1, ENOUGH, CLOSE) * search[world, FIRST]
     if g >= wp.float64(0.0) or g >= -enough:
@@ -99,6 +118,8 @@ def take_trial(
             if beyond > low:
                 share = beyond
     search[world, TRIED] = share
+    if high <= low or number + 1 == TRIALS:
+        end_search(world, search, searching)
 
 
 @wp.kernel(enable_backward=False)

@@ -9,6 +9,7 @@ import warp as wp
 from warp_corot.kernels.contact import active as kernels
 from warp_corot.kernels.contact import span_places as spans
 from warp_corot.kernels.contact.meetings import find_meetings
+from warp_corot.kernels.implicit.assembled import Couplings
 
 from .spans import Spans
 
@@ -117,6 +118,12 @@ class ActiveSet:
             self._spans.add_forces(r)
         motions = self._contacts.obstacles.motions
         self._launch(kernels.add_friction, [motions, self._surface, self._holding, d, r])
+
+    def launch_couplings(self, couplings: Couplings) -> None:
+        """Launch the addition of S, D and obstacles between nodes to an assembled matrix."""
+        if self._spans is not None:
+            self._spans.add_couplings(couplings)
+        self._launch(kernels.couple_places, [self._surface, self._holding, couplings])
 
     @property
     def count(self) -> int:

@@ -7,6 +7,7 @@ import warp as wp
 from warp_corot.kernels.contact import borne_meetings as meetings
 from warp_corot.kernels.contact import span_places as kernels
 from warp_corot.kernels.contact.law import Law
+from warp_corot.kernels.implicit.assembled import Couplings
 from warp_corot.solvers.implicit.operator import Springs
 from warp_corot.solvers.system import System
 
@@ -67,6 +68,9 @@ class BorneSet:
     def launch_friction(self, d: wp.array, r: wp.array) -> None:
         self._spans.update(d)
         self._spans.add_forces(r)
+
+    def launch_couplings(self, couplings: Couplings) -> None:
+        self._spans.add_couplings(couplings)
 
     def add_slopes(
         self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array, *, apart: bool = False

@@ -39,6 +39,9 @@ class Grasp:
             is remeshed in several worlds, or the stiffness is not positive.
     """
 
+    #: Whether its stiffness couples no two nodes.
+    is_diagonal = True
+
     def __init__(self, body: SoftBody, patch: Nodes, *, tool: Tool, stiffness: float | None = None):
         if not isinstance(body, SoftBody):
             raise InputError(f"body is {shown(body)}; it must be a SoftBody")

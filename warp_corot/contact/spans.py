@@ -12,6 +12,7 @@ from warp_corot.kernels.contact import spans as kernels
 from warp_corot.kernels.contact.law import Law
 from warp_corot.kernels.contact.rolling import Rolling
 from warp_corot.kernels.contact.touches import Touches
+from warp_corot.kernels.implicit.assembled import Couplings
 from warp_corot.kernels.stepping.pace import Pace
 from warp_corot.solvers.implicit.operator import Springs
 
@@ -20,6 +21,8 @@ from .rigid_forces import RigidForces
 
 #: The stiffness of a span over that of its point.
 STIFF = 32.0
+#: Maximum number of threads of launches over those that are listed.
+MOST_THREADS = 1 << 14
 #: Types of the arrays of ``Spans``, and of those of ``Touches`` that points need.
 FIELDS = {
     "listed": wp.int32,
@@ -119,14 +122,14 @@ class Spans:
         obstacles, arrays = self._rigid.obstacles, self._rigid.surface.arrays
         if which != finding.MISSING:
             start, offset, count, _nodes = self._carriers.nodes_of(self._k)
-            inputs = [start + offset, int(which), self._carriers.arrays, self._items[0].spans]
+            inputs = [start + offset, int(which), self._carriers.arrays, self._items[0].spans, self._items[-1].spans]
             wp.launch(finding.empty_spans, count, inputs, device=self.device)
         rigid = [int(which), obstacles.shapes, self._thickness, obstacles.motions, self._law, self._pace, arrays]
         for each in self._items:
             inputs = [*rigid, each.corners, d, self._carriers.arrays, each.touches, each.spans, changed]
             self._launch(each.locate, each, inputs)
         for each in self._items:
-            self._launch(finding.stiffen_spans, each, [*self._places(each), each.touches, each.spans])
+            self._on_listed(finding.stiffen_spans, each, [*self._places(each), each.touches, each.spans])
 
     def launch_judgement(
         self, scalars: wp.array, near: float, changed: wp.array, rounds: wp.array, most: int, going: wp.array
@@ -138,23 +141,30 @@ class Spans:
     def update(self, d: wp.array, *, is_solved: bool = False) -> None:
         """Launch forces and their derivatives after motions d, which are those of a solve if ``is_solved``."""
         for each in self._items:
-            self._launch(kernels.update_spans, each, [int(is_solved), *self._places(each), d, each.touches, each.spans])
+            self._on_listed(
+                kernels.update_spans, each, [int(is_solved), *self._places(each), d, each.touches, each.spans]
+            )
 
     def add_forces(self, y: wp.array) -> None:
         """Launch the addition of their forces at free nodes [N]."""
         for each in self._items:
-            self._launch(kernels.add_span_forces, each, [*self._places(each), each.touches, each.spans, y])
+            self._on_listed(kernels.add_span_forces, each, [*self._places(each), each.touches, each.spans, y])
 
     def add_products(self, x: wp.array, y: wp.array) -> None:
         """Launch the addition of their derivative times x."""
         for each in self._items:
-            self._launch(kernels.add_span_products, each, [*self._places(each), each.touches, each.spans, x, y])
+            self._on_listed(kernels.add_span_products, each, [*self._places(each), each.touches, each.spans, x, y])
+
+    def add_couplings(self, couplings: Couplings) -> None:
+        """Launch the addition of their derivative to an assembled matrix."""
+        for each in self._items:
+            self._on_listed(kernels.couple_spans, each, [*self._places(each), each.touches, each.spans, couplings])
 
     def add_slopes(self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array) -> None:
         """Launch the power along a change; see ``solvers.implicit.line_search``."""
         for each in self._items:
             inputs = [int(len(search) == 1), *self._places(each), each.touches, each.spans, d, change, search, slopes]
-            self._launch(kernels.add_span_slopes, each, inputs)
+            self._on_listed(kernels.add_span_slopes, each, inputs)
 
     def _update_springs(self) -> None:
         """Launch the stiffness of ``springs``, from the derivatives of the last ``update``."""
@@ -186,6 +196,8 @@ class Spans:
         for name, dtype in FIELDS.items():
             setattr(spans, name, wp.zeros(touches.force.shape, dtype=dtype, device=self.device))
         spans.count, spans.due, spans.solves = self._count, self._due, self._solves
+        spans.list = wp.zeros(touches.force.size, dtype=wp.int32, device=self.device)
+        spans.length = wp.zeros(1, dtype=wp.int32, device=self.device)
         spans.stiff = STIFF
         spans.are_borne = int(self._is_borne)
         return spans
@@ -211,6 +223,11 @@ class Spans:
 
     def _places(self, each: Items) -> list:
         return [self._rigid.surface.arrays, each.corners, self._carriers.arrays]
+
+    def _on_listed(self, kernel: wp.Kernel, each: Items, inputs: list) -> None:
+        """Launch a kernel over the spans that are listed."""
+        threads = 1 if self.device.is_cpu else min(each.spans.list.size, MOST_THREADS)
+        wp.launch(kernel, threads, [threads, *inputs], device=self.device)
 
     def _launch(self, kernel: wp.Kernel, each: Items, inputs: list) -> None:
         wp.launch(kernel, each.count, [each.start, *inputs], device=self.device)

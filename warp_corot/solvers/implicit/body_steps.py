@@ -16,6 +16,8 @@ from warp_corot.kernels.implicit import steps as kernels
 from warp_corot.kernels.stepping.integrate import follow_trajectory
 from warp_corot.solvers.ranks import ALONE
 
+from .assembled import AssembledSolve, suits
+from .chosen import ChosenSolve
 from .joined import JoinedSolve
 from .joined_newton import JoinedNewton
 from .lagged import Lagged
@@ -131,9 +133,13 @@ class BodySteps:
         self._preconditioner = preconditioner_of(
             options.preconditioner, self.operator, short_cycles=not exact, few_digits=True
         )
-        self.lagged: Lagged | None = None
+        self.lagged: Lagged | ChosenSolve | None = None
         if not exact and isinstance(self._preconditioner, Multigrid):
             self._preconditioner = self.lagged = Lagged(self._preconditioner, self.operator, system.ranks)
+            if options.preconditioner is None and shared.rows is None and suits(self.operator):
+                self._preconditioner = self.lagged = ChosenSolve(
+                    AssembledSolve(self.operator, touches=touches), self.lagged
+                )
         self._make_solvers()
         like = self.body.state.displacements
         self._none = wp.zeros(1, dtype=wp.vec4, device=self.device)
@@ -205,6 +211,8 @@ class BodySteps:
             *(each for each in self.system.forces if hasattr(each, "add_stiffness")),
             *self.shared.holds,
         )
+        if isinstance(self.lagged, ChosenSolve):
+            self.lagged.is_open = suits(self.operator)
         if self.shared.integrator.tolerance is None or self.touching_newton is not None:
             self.newton.solver.tolerance.fill_(self.shared.integrator.linear_tolerance)
         u = self.body.state.displacements

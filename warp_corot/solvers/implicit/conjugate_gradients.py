@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +33,21 @@ class SolveReport:
     converged: npt.NDArray[np.bool_]
     negative: npt.NDArray[np.bool_]
     broken: npt.NDArray[np.bool_]
+
+
+class Assembled(Protocol):
+    """A preconditioner whose matrix is assembled, so that a solve is one launch; see ``AssembledSolve``."""
+
+    def iterate(self, solver: ConjugateGradients, preconditioner: Preconditioner, x: wp.array, r: wp.array) -> None:
+        """Launch iterations from the residual r of x, in the worlds that run; ``preconditioner`` is what the solver was
+        given, with this one in it."""
+        ...
+
+
+def assembled_in(preconditioner: Preconditioner) -> Assembled | None:
+    """The assembled matrix that is or is in a preconditioner, if there is one."""
+    found: Any = getattr(preconditioner, "matrix", preconditioner)
+    return found if hasattr(found, "iterate") else None
 
 
 class ConjugateGradients:
@@ -98,6 +114,14 @@ class ConjugateGradients:
         self._running.zero_()
         outputs = [self.scalars, self.iterations, self.status, self._running]
         sums.launch_scalars(kernels.take_first, [self.tolerance, wp.float64(share)], outputs)
+        matrix = assembled_in(preconditioner)
+        if matrix is None:
+            self.launch_iterations(preconditioner, x)
+        else:
+            matrix.iterate(self, preconditioner, x, r)
+
+    def launch_iterations(self, preconditioner: Preconditioner, x: wp.array) -> None:
+        """Launch iterations one by one, in the worlds that run."""
         wp.capture_while(self._running, self._iterate, preconditioner=preconditioner, x=x)
 
     def _iterate(self, preconditioner: Preconditioner, x: wp.array) -> None:

@@ -11,9 +11,6 @@ from warp_corot.solvers.ranks import ALONE, Ranks
 
 from .sums import WorldSums
 
-#: Number of shares that are tried, with 0 and 1.
-TRIALS = 13
-
 
 class Contacts(Protocol):
     """Forces of contacts as functions of the motions in a step."""
@@ -56,6 +53,7 @@ class LineSearch:
         self._power, self._loss = (WorldSums(worlds, count, 1, device, self._ranks) for _ in range(2))
         self._search = wp.zeros((worlds, kernels.COLUMNS), dtype=wp.float64, device=device)
         self._slopes = wp.zeros(worlds, dtype=wp.float64, device=device)
+        self._searching = wp.zeros(1, dtype=wp.int32, device=device)
 
     def _add_slopes(self, d: wp.array, change: wp.array) -> None:
         self._contacts.add_slopes(d, change, self._search, self._slopes)
@@ -73,11 +71,14 @@ class LineSearch:
         self._loss.launch_products(change, product, 0)
         lanes = self._power.lanes
         inputs = [self._power.parts, self._loss.parts, lanes]
-        wp.launch(kernels.begin_search, (self._worlds, lanes), inputs, [self._search, self._slopes], device=self.device)
-        for number in range(TRIALS):
-            self._add_slopes(d, change)
-            self._launch(kernels.take_trial, self._worlds, [number, self._search, self._slopes])
+        outputs = [self._search, self._slopes, self._searching]
+        wp.launch(kernels.begin_search, (self._worlds, lanes), inputs, outputs, device=self.device)
+        wp.capture_while(self._searching, self._try, d=d, change=change)
         self._launch(kernels.add_share, self._worlds * self._count, [self._search, self._count, change, d])
+
+    def _try(self, d: wp.array, change: wp.array) -> None:
+        self._add_slopes(d, change)
+        self._launch(kernels.take_trial, self._worlds, [self._search, self._slopes, self._searching])
 
     def _launch(self, kernel: wp.Kernel, dim: int, inputs: list) -> None:
         wp.launch(kernel, dim, inputs, device=self.device)

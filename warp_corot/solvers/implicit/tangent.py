@@ -24,7 +24,8 @@ class TangentOperator:
         field: Its elastic forces.
         viscosity: Its viscous forces, D, or None.
         stiff_forces: Other forces that have a stiffness: ``add_stiffness(body, p, y)`` and
-            ``add_diagonal(body, blocks)``, as ``ForceField`` but at the body's present state.
+            ``add_diagonal(body, blocks)``, as ``ForceField`` but at the body's present state. Those that couple no two
+            nodes have a true ``is_diagonal``.
         exact: Whether K is the exact derivative, which may be indefinite, if the law has two.
         ranks: The ranks with other nodes of the body.
         number: The number of the body.

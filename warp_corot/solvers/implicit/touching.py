@@ -7,8 +7,11 @@ from typing import TYPE_CHECKING, Protocol
 
 import warp as wp
 
+from warp_corot.kernels.implicit.assembled import Couplings
 from warp_corot.kernels.implicit.tangent import end_rounds, find_rest, judge_round
 
+from .assembled import AssembledSolve
+from .chosen import ChosenSolve
 from .line_search import LineSearch, SharedLineSearch
 from .newton import Newton
 from .operator import LinearOperator, Preconditioner, Springs
@@ -65,6 +68,8 @@ class Held(Protocol):
     def launch_drag(self, x: wp.array, y: wp.array) -> None: ...
 
     def launch_friction(self, d: wp.array, r: wp.array) -> None: ...
+
+    def launch_couplings(self, couplings: Couplings) -> None: ...
 
     def add_slopes(
         self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array, *, apart: bool = False
@@ -175,12 +180,16 @@ class FreePreconditioner:
 
     def __init__(self, preconditioner: Preconditioner, held: Held, like: wp.array):
         self._preconditioner, self._held, self._r = preconditioner, held, wp.zeros_like(like)
+        self.matrix = preconditioner
 
     def update(self, operator: LinearOperator) -> None:
         self._preconditioner.update(operator)
 
     def take_springs(self) -> None:
         """Launch the exchange of the springs in B for the present ones."""
+        if isinstance(self.matrix, AssembledSolve | ChosenSolve):
+            self.matrix.take_contact(self._held)
+            return
         springs = self._held.springs
         if springs is not None and hasattr(self._preconditioner, "take_springs"):
             springs.update()
@@ -227,7 +236,12 @@ class TouchingSolve:
         """Launch the solve for ``newton.step``, from a guess; the residual must be known."""
         self.newton.linearise()
         self.iterations.zero_()
-        self.held.launch_begin(self.newton.body.state.displacements, self.newton.step, self._operator.diagonal_blocks())
+        solver = self.newton.preconditioner
+        if isinstance(solver, AssembledSolve | ChosenSolve):
+            blocks = solver.diagonal
+        else:
+            blocks = self._operator.diagonal_blocks()
+        self.held.launch_begin(self.newton.body.state.displacements, self.newton.step, blocks)
         self.launch_rounds()
         self.held.launch_end(self.newton.step)
 

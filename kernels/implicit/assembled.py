@@ -1,0 +1,324 @@
+"""Linear solves with an assembled matrix: block rows of a body, and contacts as products of vectors beside them.
+
+A contact that pushes adds sums of c c^T to the matrix, where c couples the nodes that bear it. Entries of the matrix
+are stored transposed, as in ``multigrid.values``. Nodes that obstacles hold move in the range of a projector S only.
+"""
+
+import functools
+
+import warp as wp
+
+from warp_corot.kernels.elements.dilatation import Dilatation
+from warp_corot.kernels.elements.elements import ForestElements, nodal_forces, rest_volume
+from warp_corot.kernels.elements.forces import in_local_frame, own_gradient
+from warp_corot.kernels.elements.lanes import COMPILER_FLAGS, constants, native
+from warp_corot.kernels.modules import unique_kernel
+
+from .conjugate_gradients import BROKEN, CONVERGED, END, LIMIT, NEGATIVE, RR, RUNNING, WITHIN
+from .multigrid.cycle import Rows
+from .multigrid.values import inverse_block
+
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": COMPILER_FLAGS})
+
+#: These solves leave smoother residuals than multigrid, so for the same errors of positions the square of the residual
+#: must be this much smaller: bunnies of 5 and 30 kPa were 3.1 and 1.2 times as far off.
+CLOSER = 0.1
+#: Maximum number of nodes that bear a contact: four for each corner of a triangle.
+PLACES = 12
+
+
+@wp.struct
+class Couplings:
+    """Contacts as products c c^T, [R, PLACES]; the first ``count`` are in use."""
+
+    count: wp.array[wp.int32]  # [1], which may exceed R
+    nodes: wp.array2d[wp.int32]  # in the vectors of all worlds; -1 where there is none
+    parts: wp.array2d[wp.vec4]  # of c at each node [sqrt(N/m)]
+    blocks: wp.array[wp.mat33]  # the diagonal blocks of the sum, by node [N/m]
+    projected: wp.array[wp.int32]  # whether an obstacle holds a node, by node
+    projectors: wp.array[wp.mat33]  # S, by node
+    drag: wp.array[wp.mat33]  # the derivative of friction at nodes that are held, by node [N/m]
+
+
+# --- the matrix -------------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def add_held_blocks(of: Dilatation) -> wp.Kernel:
+    """Add the stiffness of elements that are held from turning over, off the diagonal; see ``elements.dilatation``."""
+    measure, holding = of.measure, of.holding
+
+    @unique_kernel()
+    def add_held_blocks(
+        # In
+        world_elements: int,
+        count: int,
+        entries: int,
+        elements: ForestElements,
+        u: wp.array[wp.vec4],
+        lam: wp.array[float],
+        stride: int,
+        scales: wp.array[float],
+        starts: wp.array[wp.int32],
+        columns: wp.array[wp.int32],
+        # In and out
+        blocks: wp.array[wp.mat33],
+    ):
+        t = wp.tid()
+        theta, slope = measure(own_gradient(elements, t, u))
+        curvature = holding(theta)[2]
+        if curvature == 0.0:
+            return
+        world = t / world_elements
+        f0, f1, f2, f3 = nodal_forces(elements, t, in_local_frame(elements, t, slope))
+        f = wp.matrix_from_rows(f0, f1, f2, f3)
+        factor = scales[2] * curvature * lam[t * stride] / rest_volume(elements, t)
+        nodes = elements.nodes[t]
+        for m in range(4):
+            i = nodes[m] - world * count
+            for n in range(4):
+                if n != m:
+                    j = nodes[n] - world * count
+                    for k in range(starts[i], starts[i + 1]):
+                        if columns[k] == j:
+                            wp.atomic_add(blocks, world * entries + k, factor * wp.outer(f[n], f[m]))
+
+    return add_held_blocks
+
+
+@wp.func
+def write_planes(world: int, k: int, entries: int, block: wp.mat33, planes: wp.array[wp.float32]):
+    """Write the numbers of an entry each to a plane of its own, which CUDA reads."""
+    for a in range(3):
+        for b in range(3):
+            planes[(9 * world + 3 * a + b) * entries + k] = block[a, b]
+
+
+@wp.kernel(enable_backward=False)
+def lay_out(entries: int, blocks: wp.array[wp.mat33], planes: wp.array[wp.float32]):
+    world, k = wp.tid()
+    write_planes(world, k, entries, blocks[world * entries + k], planes)
+
+
+@wp.kernel(enable_backward=False)
+def finish_matrix(
+    # In
+    count: int,
+    entries: int,
+    diagonal: wp.array[wp.int32],
+    plain: wp.array[wp.mat33],
+    couplings: Couplings,
+    # Out
+    blocks: wp.array[wp.mat33],
+    damped: wp.array[wp.mat33],
+    inverses: wp.array[wp.mat33],
+    planes: wp.array[wp.float32],
+):
+    """The diagonal with friction; the same with contacts, in the range of S; and the inverse of that there."""
+    world, k = wp.tid()
+    i = world * count + k
+    own = plain[i]
+    inverse = wp.mat33()
+    whole = wp.mat33()
+    if wp.trace(own) > 0.0:
+        if couplings.projected[i] != 0:
+            own += couplings.drag[i]
+        whole = own + couplings.blocks[i]
+        whole = 0.5 * (whole + wp.transpose(whole))
+        if couplings.projected[i] != 0:
+            s = couplings.projectors[i]
+            away = (wp.trace(whole) / 3.0) * (wp.identity(n=3, dtype=float) - s)
+            whole = s * whole * s
+            inverse = s * inverse_block(whole + away) * s
+        else:
+            inverse = inverse_block(whole)
+    blocks[world * entries + diagonal[k]] = own
+    damped[i] = whole
+    inverses[i] = inverse
+    if planes.shape[0] > 1:
+        write_planes(world, diagonal[k], entries, own, planes)
+
+
+@wp.kernel(enable_backward=False)
+def keep_diagonal(
+    count: int, entries: int, diagonal: wp.array[wp.int32], blocks: wp.array[wp.mat33], plain: wp.array[wp.mat33]
+):
+    world, k = wp.tid()
+    plain[world * count + k] = blocks[world * entries + diagonal[k]]
+
+
+# --- contacts ---------------------------------------------------------------------------------------------------------
+
+
+@wp.func
+def root_columns(a: wp.mat33):
+    """A matrix G, column by column, with G G^T = a for a symmetric positive semidefinite a (Cholesky)."""
+    g = wp.mat33()
+    least = 1.0e-6 * (a[0, 0] + a[1, 1] + a[2, 2])
+    for j in range(3):
+        pivot = a[j, j]
+        for k in range(j):
+            pivot -= g[j, k] * g[j, k]
+        if pivot > least:
+            root = wp.sqrt(pivot)
+            g[j, j] = root
+            for i in range(j + 1, 3):
+                v = a[i, j]
+                for k in range(j):
+                    v -= g[i, k] * g[j, k]
+                g[i, j] = v / root
+    return g
+
+
+@wp.func
+def begin_coupling(couplings: Couplings):
+    """The number of a new product, -1 if there is no room."""
+    c = wp.atomic_add(couplings.count, 0, 1)
+    if c >= couplings.nodes.shape[0]:
+        return -1
+    return c
+
+
+@wp.func
+def couple(c: int, places: int, node: int, part: wp.vec3, couplings: Couplings):
+    """Add a node to a product that has ``places``; returns how many it has then."""
+    at = int(0)
+    while at < places and couplings.nodes[c, at] != node:
+        at += 1
+    if at == places:
+        couplings.nodes[c, at] = node
+        couplings.parts[c, at] = wp.vec4()
+    couplings.parts[c, at] = couplings.parts[c, at] + wp.vec4(part[0], part[1], part[2], 0.0)
+    return wp.max(places, at + 1)
+
+
+@wp.func
+def end_coupling(c: int, places: int, couplings: Couplings):
+    for k in range(places):
+        part = couplings.parts[c, k]
+        v = wp.vec3(part[0], part[1], part[2])
+        wp.atomic_add(couplings.blocks, couplings.nodes[c, k], wp.outer(v, v))
+    for k in range(places, PLACES):
+        couplings.nodes[c, k] = -1
+
+
+# --- solves -----------------------------------------------------------------------------------------------------------
+
+_NUMBERS = constants(
+    RUNNING=int(RUNNING),
+    CONVERGED=int(CONVERGED),
+    NEGATIVE=int(NEGATIVE),
+    LIMIT=int(LIMIT),
+    BROKEN=int(BROKEN),
+    RR=int(RR),
+    END=int(END),
+    WITHIN=int(WITHIN),
+    CLOSER=CLOSER,
+    PLACES=PLACES,
+)
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+{_NUMBERS}{native("persistent_cg")}
+#else
+#pragma clang fp contract(fast)
+{_NUMBERS}{native("ssor_cg")}
+#endif
+""")
+def solve_rows(
+    world: int,
+    worlds: int,
+    count: int,
+    entries: int,
+    per_team: int,
+    lanes: int,
+    most: int,
+    rows: Rows,
+    planes: wp.array[wp.float32],
+    diagonal: wp.array[wp.int32],
+    inverses: wp.array[wp.mat33],
+    damped: wp.array[wp.mat33],
+    projected: wp.array[wp.int32],
+    projectors: wp.array[wp.mat33],
+    coupled: wp.array[wp.int32],
+    couplings: Couplings,
+    x: wp.array[wp.vec4],
+    r: wp.array[wp.vec4],
+    scalars: wp.array2d[wp.float64],
+    status: wp.array[wp.int32],
+    iterations: wp.array[wp.int32],
+    u: wp.array[wp.vec4],
+    p: wp.array[wp.vec4],
+    q: wp.array[wp.vec4],
+    s: wp.array[wp.vec4],
+    added: wp.array[wp.vec4],
+    parts: wp.array[wp.float64],
+    barriers: wp.array[wp.uint32],
+): ...
+
+
+@wp.kernel(enable_backward=False)
+def solve(
+    # In
+    worlds: int,
+    count: int,
+    entries: int,
+    per_team: int,
+    lanes: int,
+    most: int,
+    rows: Rows,
+    planes: wp.array[wp.float32],
+    diagonal: wp.array[wp.int32],
+    inverses: wp.array[wp.mat33],
+    damped: wp.array[wp.mat33],
+    couplings: Couplings,
+    # In and out
+    x: wp.array[wp.vec4],
+    r: wp.array[wp.vec4],
+    scalars: wp.array2d[wp.float64],
+    status: wp.array[wp.int32],
+    # Out
+    iterations: wp.array[wp.int32],
+    # Work
+    u: wp.array[wp.vec4],
+    p: wp.array[wp.vec4],
+    q: wp.array[wp.vec4],
+    s: wp.array[wp.vec4],
+    added: wp.array[wp.vec4],
+    parts: wp.array[wp.float64],
+    barriers: wp.array[wp.uint32],
+):
+    """Iterate from the residual r of x until it is small enough: on the CPU a thread for each world, on CUDA resident
+    blocks.
+    """
+    solve_rows(
+        wp.tid(),
+        worlds,
+        count,
+        entries,
+        per_team,
+        lanes,
+        most,
+        rows,
+        planes,
+        diagonal,
+        inverses,
+        damped,
+        couplings.projected,
+        couplings.projectors,
+        couplings.count,
+        couplings,
+        x,
+        r,
+        scalars,
+        status,
+        iterations,
+        u,
+        p,
+        q,
+        s,
+        added,
+        parts,
+        barriers,
+    )
