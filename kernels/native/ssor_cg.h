@@ -54,7 +54,7 @@ const auto residual = [&]() {
     return total;
 };
 if (status.data[world] != RUNNING) return;
-const double end = numbers[END] > numbers[WITHIN] ? numbers[END] : CLOSER * numbers[WITHIN];
+const double end = CLOSER * numbers[END];
 forward(rest, half);
 double product = 0.0, now = numbers[RR];
 for (int i = 0; i < count; ++i) {
@@ -103,7 +103,7 @@ while (found == RUNNING) {
         now = residual();
         if (!(now <= 1e300)) found = BROKEN;
         else if (now <= end) found = CONVERGED;
-        else if (done >= most) found = now <= numbers[WITHIN] ? CONVERGED : LIMIT;
+        else if (done >= most) found = now <= numbers[END] ? CONVERGED : LIMIT;
     }
     const float beta = (float)(after / product);
     for (int i = 0; i < count; ++i)
