@@ -1,9 +1,10 @@
-"""Hooks for mkdocs: pages outside ``docs/``, and the targets of links to them.
+"""Hooks for mkdocs: pages outside ``docs/``, notebooks among them, and the targets of links to them.
 
 Pages link to one another by their paths in the repository, so that links work there, too. These hooks convert the links
 to those of the site.
 """
 
+import json
 import posixpath
 import re
 from pathlib import Path
@@ -18,8 +19,12 @@ PAGES = {
     "README.md": "index.md",
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
+    "AGENTS.md": "agents.md",
     "benchmarks/README.md": "figures.md",
     "benchmarks/bodies.md": "bodies.md",
+} | {
+    path.relative_to(ROOT).as_posix(): f"notebooks/{path.stem}.md"
+    for path in (ROOT / "examples" / "notebooks").glob("*.ipynb")
 }
 #: Files that pages link to and a browser can show.
 FILES = [
@@ -31,8 +36,18 @@ LINK = re.compile(r"(?<=\]\()(?!\w+:|#)([^)#\s]+)(?=[)#])")
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     for name, place in PLACES.items():
-        files.append(File.generated(config, place, content=(ROOT / name).read_text(encoding="utf-8")))
+        text = (ROOT / name).read_text(encoding="utf-8")
+        files.append(File.generated(config, place, content=in_markdown(text) if name.endswith(".ipynb") else text))
     return files
+
+
+def in_markdown(notebook: str) -> str:
+    """The cells of a notebook as a page; code is fenced."""
+    parts = []
+    for cell in json.loads(notebook)["cells"]:
+        text = "".join(cell["source"])
+        parts.append(f"```python\n{text}\n```" if cell["cell_type"] == "code" else text)
+    return "\n\n".join(parts) + "\n"
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:

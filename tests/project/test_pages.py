@@ -1,9 +1,10 @@
-"""README and docs: every block of code runs, every command is valid, every named file exists.
+"""README, docs and notebooks: every block of code runs, every command is valid, every named file exists.
 
 Rules apply to commands by their program: those of this project are parsed by its own parser, and run if they are
 cheap; those that install or check are compared with pyproject.toml. A command without a rule fails.
 """
 
+import json
 import os
 import re
 import shutil
@@ -14,7 +15,7 @@ from pathlib import Path
 import command_line
 import pytest
 import warp as wp
-from pages import EXTRAS, PAGES, ROOT, Session, blocks_of, commands_of
+from pages import EXTRAS, NOTEBOOKS, PAGES, ROOT, Session, blocks_of, commands_of, missing_extras
 
 import warp_corot as wc
 from warp_corot.cli import make_parser
@@ -22,7 +23,7 @@ from warp_corot.cli import make_parser
 #: Inputs that run in a second or two.
 CHEAP = ("box", "warp:bear")
 #: Programs of the extra ``dev`` that pages call.
-TOOLS = {"pytest", "ruff", "mypy", "mkdocs"}
+TOOLS = {"pytest", "ruff", "mypy", "mkdocs", "mike", "pre-commit"}
 #: Names in backticks that are files of this repository.
 FILE = re.compile(r"`((?:warp_corot|kernels|tests|benchmarks|examples|docs)/[\w./-]*)`")
 
@@ -70,7 +71,10 @@ RULES = {
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
-def test_blocks_run(page, folder, tmp_path_factory):
+def test_blocks_run(page, folder, tmp_path_factory, monkeypatch):
+    if page in NOTEBOOKS and (missing := missing_extras("".join(block.code for block in blocks_of(page)))):
+        pytest.skip(f"{page.name} needs {', '.join(missing)}")
+    monkeypatch.setenv("MPLBACKEND", "agg")
     session = Session(page, tmp_path_factory.mktemp("source"))
     with wp.ScopedDevice("cpu"):
         for block in blocks_of(page):
@@ -81,6 +85,15 @@ def test_blocks_run(page, folder, tmp_path_factory):
                     program = words[0].removeprefix(".venv/bin/")
                     assert program in RULES, f"{page.name}:{block.line}: no rule knows {' '.join(words)}"
                     RULES[program]([program, *words[1:]])
+
+
+@pytest.mark.parametrize("page", NOTEBOOKS, ids=lambda page: page.stem)
+def test_notebooks_are_kept_without_outputs(page):
+    cells = json.loads(page.read_text(encoding="utf-8"))["cells"]
+    code = [cell for cell in cells if cell["cell_type"] == "code"]
+    assert code
+    assert all(cell["outputs"] == [] and cell["execution_count"] is None for cell in code)
+    assert len({cell["id"] for cell in cells}) == len(cells)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
