@@ -108,7 +108,6 @@ THUMBNAILS = {
     "newton_scene": notebook("newton_scene"),
     "brain": picture("brain.png"),
     "remesh": picture("remesh.png"),
-    "newton": picture("newton.png"),
 }
 
 

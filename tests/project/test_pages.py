@@ -130,6 +130,14 @@ def test_a_file_format_is_added_as_the_recipe_says(tmp_path):
     assert "muscle" in done.stdout
 
 
+def test_pictures_are_shown_and_thumbnails_are_small():
+    folder = ROOT / "docs" / "images"
+    text = "".join(page.read_text(encoding="utf-8") for page in (*PAGES, ROOT / "benchmarks" / "README.md"))
+    pictures = [path for path in folder.rglob("*") if path.suffix in (".png", ".gif")]
+    assert [path.name for path in pictures if f"images/{path.relative_to(folder).as_posix()})" not in text] == []
+    assert all(path.stat().st_size <= 60_000 for path in pictures if path.parent.name == "gallery")
+
+
 def test_the_reference_has_every_public_name():
     text = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
     # Of modules their members.
