@@ -22,8 +22,8 @@ class Contact:
         flat_edges: Whether soft surfaces also touch where flat edges of both cross. Then pressure passes evenly between
             any two meshes, however coarse; there are several times as many pairs.
         on: What contact acts on. "surface": a body's own surface, if its mesh was made from a domain. "tetrahedra": the
-            boundary of its tetrahedra, which reaches beyond that surface. Implicit steps always use the boundary, and
-            so do meshes that have no other surface.
+            boundary of its tetrahedra, which reaches beyond that surface. Meshes without another surface always use
+            the boundary, and so do implicit steps on several ranks.
 
     Raises:
         InputError: A value out of its range.
