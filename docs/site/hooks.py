@@ -22,6 +22,7 @@ PAGES = {
     "AGENTS.md": "agents.md",
     "benchmarks/README.md": "figures.md",
     "benchmarks/bodies.md": "bodies.md",
+    "benchmarks/history.md": "history.md",
 } | {
     path.relative_to(ROOT).as_posix(): f"notebooks/{path.stem}.md"
     for path in (ROOT / "examples" / "notebooks").glob("*.ipynb")

@@ -103,6 +103,30 @@ def test_kernels(run, device, tmp_path):
     assert flops["factored"] < flops["sparse K_T by type"] < flops["dense 12x12"]
 
 
+def test_the_history_takes_runs_and_its_page_is_up_to_date(run, tmp_path):
+    lines = (BENCHMARKS / "history.jsonl").read_text(encoding="utf-8")
+    (tmp_path / "history.jsonl").write_text(lines, encoding="utf-8")
+    assert run("history.py", "--folder", tmp_path).returncode == 0
+    table = (tmp_path / "history.md").read_text(encoding="utf-8")
+    assert table == (BENCHMARKS / "history.md").read_text(encoding="utf-8")
+    rows = [{"stage": "whole force", "variant": "corotated, own rotations", "gtet_per_s": 12.34}]
+    report = {"name": "a card", "warp": "1", "warp_corot": "2", "tets": 3072, "rows": rows}
+    (tmp_path / "run.json").write_text(json.dumps(report), encoding="utf-8")
+    named = ("--commit", "abc", "--date", "2030-01-02", "--folder", tmp_path)
+    assert run("history.py", tmp_path / "run.json", *named).returncode == 0
+    newest = (tmp_path / "history.md").read_text(encoding="utf-8").splitlines()[9]
+    assert newest.startswith("| 2030-01-02 | `abc` | a card | 3,072 | 12.3 | –")
+    kept = (tmp_path / "history.jsonl").read_text(encoding="utf-8")
+    assert kept.startswith(lines)
+    for bad in ("{}", "not JSON", json.dumps(report | {"rows": []})):
+        (tmp_path / "run.json").write_text(bad, encoding="utf-8")
+        done = run("history.py", tmp_path / "run.json", *named)
+        assert done.returncode == 2
+        assert done.stderr.startswith("history.py: error: ")
+        assert done.stderr.count("\n") == 1
+        assert (tmp_path / "history.jsonl").read_text(encoding="utf-8") == kept
+
+
 @pytest.mark.slow
 def test_peers_that_are_not_there_are_left_out(device, tmp_path):
     for name in ("newton", "mujoco"):
