@@ -29,7 +29,12 @@ PAGES = {
 }
 #: Files that pages link to and a browser can show.
 FILES = [
-    path.relative_to(ROOT).as_posix() for folder in ("examples", "benchmarks") for path in (ROOT / folder).rglob("*.py")
+    "CITATION.cff",
+    *(
+        path.relative_to(ROOT).as_posix()
+        for folder in ("examples", "benchmarks")
+        for path in (ROOT / folder).rglob("*.py")
+    ),
 ]
 PLACES = PAGES | {name: f"source/{name}.txt" for name in FILES}
 LINK = re.compile(r"(?<=\]\()(?!\w+:|#)([^)#\s]+)(?=[)#])")
