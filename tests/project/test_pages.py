@@ -76,6 +76,7 @@ def test_blocks_run(page, folder, tmp_path_factory, monkeypatch):
     if page in NOTEBOOKS and (missing := missing_extras("".join(block.code for block in blocks_of(page)))):
         pytest.skip(f"{page.name} needs {', '.join(missing)}")
     monkeypatch.setenv("MPLBACKEND", "agg")
+    monkeypatch.setattr(wp.config, "log_level", wp.config.log_level)  # which notebooks change
     session = Session(page, tmp_path_factory.mktemp("source"))
     with wp.ScopedDevice("cpu"):
         for block in blocks_of(page):
