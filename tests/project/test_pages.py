@@ -52,9 +52,9 @@ def check_tool(words):
 
 
 def check_python(words):
-    """A script or a module must exist; a virtual environment may be made."""
+    """A script or a module must exist; a virtual environment and archives may be made."""
     if words[1] == "-m":
-        if words[2] == "venv":
+        if words[2] in ("venv", "build"):
             return
         path = ROOT / (words[2].replace(".", "/") + ".py")
     else:
