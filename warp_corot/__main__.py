@@ -13,9 +13,11 @@ def main() -> int:
         sys.stderr.write("warp-corot: interrupted\n")
         return 130
     finally:
+        import gc
         import signal
 
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # the rest of Python's shutdown takes no time
+        gc.freeze()  # else its last collections go through the syntax trees of all kernels, which takes a second
 
 
 if __name__ == "__main__":

@@ -176,7 +176,6 @@ def test_compiling_is_announced_only_if_kernels_are_compiled(tmp_path):
     [
         (["--version"], f"warp-corot {wc.__version__} (warp {wp.__version__})\n", "warp|numpy|scipy|pxr"),
         (["--help"], "usage: warp-corot [-h] [--version] COMMAND", "warp|numpy|scipy|pxr"),
-        (["simulate", "--help"], "usage: warp-corot simulate", "scipy|pxr|newton|meshio|vtk|viser|matplotlib"),
     ],
 )
 def test_imports_of_a_start(words, said, without, tmp_path):
@@ -187,3 +186,16 @@ def test_imports_of_a_start(words, said, without, tmp_path):
     assert out.startswith(said)
     assert re.search(r"\| +warp_corot.cli\n", imported)
     assert not re.search(rf"\| +({without})\n", imported)
+
+
+@pytest.mark.parametrize(("module", "frozen"), [("__main__", True), ("cli", False)])
+def test_the_end_of_the_command_collects_no_garbage(module, frozen):
+    """Nor does it skip what others registered for the end. A Python program's own end is its own."""
+    code = (
+        "import atexit, gc, sys\n"
+        "atexit.register(lambda: print(gc.get_freeze_count() > 0))\n"
+        f"from warp_corot.{module} import main\n"
+        "sys.argv[1:] = ['--version']\nmain()"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert out.splitlines()[-1] == str(frozen)

@@ -14,7 +14,7 @@ from command_line import run
 
 import warp_corot as wc
 from warp_corot.cli import make_parser
-from warp_corot.cli.options import add_options
+from warp_corot.cli.options.simulate import add_options
 from warp_corot.cli.parsing import StrictParser
 from warp_corot.cli.prepared import prepared
 from warp_corot.cli.run_file import bodies_of

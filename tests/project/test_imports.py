@@ -8,6 +8,9 @@ from pathlib import Path
 import pytest
 from imports import Import, against_the_floors, circles, floor_of, imports, modules
 
+from warp_corot import elasticity, solvers
+from warp_corot.cli.parsing import COMMANDS
+from warp_corot.inputs import choices
 from warp_corot.inputs.importing import modules_of_names, public_name
 
 #: Kernels of passes over a mesh that changes.
@@ -111,6 +114,22 @@ def test_a_body_imports_no_solvers():
     count, *rooms = said.splitlines()[-1].split()
     assert not {"solvers", "contact", "simulation", "viewing", "newton", "gradients", "cli"} & set(rooms), rooms
     assert int(count) < 150  # 130 of 497
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_imports_neither_warp_nor_numpy(command):
+    code = (
+        "import sys\nfrom warp_corot.cli import main\n"
+        f"try:\n    main(['{command}', '--help'])\nexcept SystemExit:\n    print(*sys.modules)"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.splitlines()
+    assert said[0].startswith(f"usage: warp-corot {command} ")
+    assert not {"warp", "numpy", "scipy", "pxr", "pint"} & set(said[-1].split())
+
+
+def test_names_in_the_help_are_those_of_the_registries():
+    assert {name: kind.__name__ for name, kind in elasticity.MODELS.items()} == choices.MODELS
+    assert {name: kind.__name__ for name, kind in solvers.INTEGRATORS.items()} == choices.INTEGRATORS
 
 
 def test_public_names_are_those_of_the_interface():

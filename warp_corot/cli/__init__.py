@@ -28,7 +28,7 @@ FAILED = (1, 2, 3)
 
 
 def subcommand(name: str) -> ModuleType:
-    """The module of a subcommand; it imports the whole package, which takes a while."""
+    """The module that runs a subcommand; it imports the whole package, which takes a while."""
     return import_module(f".{name}", __name__)
 
 
@@ -78,7 +78,7 @@ def make_parser(needed: Collection[str] = COMMANDS) -> argparse.ArgumentParser:
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=Parser)
     for name, line in COMMANDS.items():
         if name in needed:
-            subcommand(name).add_parser(subparsers)
+            import_module(f".options.{name}", __name__).add_parser(subparsers)
         else:
             subparsers.add_parser(name, help=line)
     return parser
@@ -159,13 +159,13 @@ def _run(argv: Sequence[str] | None) -> int:
     if not COMMANDS.keys() & named:
         make_parser(()).parse_args(words)  # prints help, the version or an error, and ends
     with leaving_at_once(), uncollected():
+        args = make_parser(tuple(named)).parse_args(words)
+        args.command_line = shlex.join(["warp-corot", *words])
         configure_warp()
         from warp_corot.inputs.starting import start_warp
 
         logging.basicConfig(format="warp-corot: warning: %(message)s", level=logging.WARNING)
-        parser = make_parser(tuple(named))
-    args = parser.parse_args(words)
-    args.command_line = shlex.join(["warp-corot", *words])
+        module = subcommand(args.command)
     try:
         start_warp()
     except OSError as error:
@@ -174,4 +174,4 @@ def _run(argv: Sequence[str] | None) -> int:
             "to in the environment variable WARP_CACHE_PATH"
         )
         return 1
-    return subcommand(args.command).run(args)
+    return module.run(args)

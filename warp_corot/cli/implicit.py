@@ -5,12 +5,6 @@ from __future__ import annotations
 import argparse
 
 from warp_corot.simulation.simulation import Simulation
-from warp_corot.solvers import INTEGRATORS, QuasiStatic
-
-#: The integrators that users choose from.
-STEPPING = tuple(name for name, integrator in INTEGRATORS.items() if integrator is not QuasiStatic)
-#: The step of implicit integrators if none is given [s].
-IMPLICIT_DT = 0.01
 
 
 def solved(sim: Simulation) -> str | None:

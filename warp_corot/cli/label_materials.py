@@ -15,13 +15,14 @@ from warp_corot.domain.units import in_units
 from warp_corot.errors import InputError
 from warp_corot.materials.isotropic import Isotropic
 
+from .options.defaults import LABEL
+
 if TYPE_CHECKING:
     from warp_corot.discretization.elements import Mesh
     from warp_corot.io.read.regions import Regions
     from warp_corot.io.read.volumes import LoadedVolume
     from warp_corot.mesh import TetForest, TetMesh
 
-FORM = "NAME[@NUMBER[+NUMBER...]]=YOUNG[:POISSON[:DENSITY]]"
 _ENTRY = re.compile(r"\s*(?P<name>[^@=:]+?)\s*(?:@\s*(?P<numbers>\d+(?:\s*\+\s*\d+)*)\s*)?=(?P<values>.*)")
 
 
@@ -74,7 +75,7 @@ def _entry(part: str, option: str, form: str | None = None) -> LabelMaterial:
     match = _ENTRY.fullmatch(part)
     values = match["values"].split(":") if match else []
     if not match or not 1 <= len(values) <= 3:
-        raise InputError(form or f"{option} {part.strip()!r}: it must be {FORM}, for example liver=3kPa:0.45")
+        raise InputError(form or f"{option} {part.strip()!r}: it must be {LABEL}, for example liver=3kPa:0.45")
     name = match["name"]
     numbers = tuple(int(number) for number in (match["numbers"] or "").split("+") if number)
     if not numbers and name.isdecimal():

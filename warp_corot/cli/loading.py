@@ -15,16 +15,14 @@ from warp_corot.domain.units import in_units
 from warp_corot.errors import InputError
 from warp_corot.inputs.keys import checked_times
 
+from .options.defaults import LOADS
 from .pressing import pressed, surface_of
-from .quantities import seconds
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
 
     from .patches import Patches
 
-#: Number of values after PATCH, and their names.
-FORMS = {"pull": (3, "DX DY DZ"), "twist": (1, "DEGREES"), "press": (1, "PASCALS")}
 #: Units of values that have none.
 UNITS = {"pull": "m", "twist": "degree", "press": "Pa"}
 #: Largest angle between keyframes of a twist [degrees]: nodes move straight in between.
@@ -70,28 +68,6 @@ class Load:
         return f"--{self.kind} {self.patch!r} {' '.join(f'{value:g}' for value in self.values)}"
 
 
-def add_load_options(group: argparse._ArgumentGroup) -> None:
-    """Add the options to a group of the command's parser."""
-    for kind, (count, names) in FORMS.items():
-        group.add_argument(
-            f"--{kind}",
-            action="append",
-            nargs=1 + count,
-            metavar=("PATCH", *names.split()),
-            help={
-                "pull": "move a patch by this much [m], for example 0 0 3cm",
-                "twist": "turn a patch about its mean normal, counter-clockwise seen from outside",
-                "press": "press on the surface of a patch, along its normals at rest; a negative pressure pulls",
-            }[kind],
-        )
-    group.add_argument(
-        "--ramp",
-        type=seconds,
-        metavar="T",
-        help="time in which pulls, twists and pressures grow to their full values [s] (default: half of the duration)",
-    )
-
-
 def loads_of(args: argparse.Namespace) -> list[Load]:
     """The loads in the options.
 
@@ -99,7 +75,7 @@ def loads_of(args: argparse.Namespace) -> list[Load]:
         InputError: A value is not a number.
     """
     found = list(getattr(args, "curves", ()))
-    for kind in FORMS:
+    for kind in LOADS:
         for patch, *texts in getattr(args, kind) or ():
             try:
                 found.append(Load(kind, patch, tuple(value_of(kind, text) for text in texts)))

@@ -14,10 +14,11 @@ from warp_corot.materials.isotropic import Isotropic
 from .applies import refuse_options
 from .label_materials import LabelMaterial, covers_all, label_material, numbers_by_name, parse_labels
 from .opened import offset_of, open_input
+from .options.defaults import BOX_LEVEL
 from .organs import as_options, domain_of, fineness_of
 from .say import complain
 from .several import bodies_in
-from .subject import BOX_LEVEL, Subject, box_subject
+from .subject import Subject, box_subject
 from .summary import pressure
 
 #: The options of surfaces and scans beside those of boxes.

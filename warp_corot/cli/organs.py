@@ -19,7 +19,7 @@ from warp_corot.mesh.lattice import checked_level
 
 from .label_materials import LabelMaterial, numbers_by_name, parse_labels
 from .opened import Opened, offset_of, placed_surface, placed_volume
-from .several import TETS
+from .options.defaults import CUBES_OF_LEVEL, MAX_LEVEL_FOR_ERROR, TETS
 from .subject import Subject
 
 if TYPE_CHECKING:
@@ -32,10 +32,8 @@ if TYPE_CHECKING:
 #: With a surface error or a level instead of a number of tetrahedra: the default number for each root cube in a cube of
 #: the body's length, which gives the size of root cubes.
 TETS_PER_CUBE = 30
-#: With a level: the number of root cubes along the body's longest side.
-CUBES_OF_LEVEL = 16
-#: Maximum number of bisections of cubes in this case, and of further levels for details between nodes.
-MAX_LEVEL_FOR_ERROR, DETAIL = 12, 6
+#: With a surface error: the number of further levels for details between nodes.
+DETAIL = 6
 #: Root cubes extend beyond the body by this fraction of its length.
 MARGIN = 1.0e-3
 #: If the body's box has more root cubes than this for each allowed tetrahedron, no body fits.

@@ -24,14 +24,6 @@ if TYPE_CHECKING:
 
     from .subject import Subject
 
-HELP = """patches, for --fix, --pull, --press, --twist and --probe, are expressions:
-  names      bottom top (tenths of the height), flat (the largest flat region), surface, all, none; labels of a scan;
-             regions and sets of nodes of the file (*NSET, groups of points and surfaces, point data); those of --patch
-  regions    sphere(x, y, z, radius), box(x, y, z, x, y, z), nearest(x, y, z), nearest(x, y, z, n): the n nearest nodes
-  numbers    x y z (rest coordinates [m], after --scale), xmin xmax ymin ymax zmin zmax, pi
-  operators  + - * / // % **   < <= > >= == !=   and or not   ( )
-  functions  abs sqrt exp log sin cos tan atan2 hypot min max"""
-
 Mask = npt.NDArray[np.bool_]
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from warp_corot.errors import InputError
 from warp_corot.io.pictures.film import FILMS, check_film, frames_shown, write_film
 
+from .options.defaults import VIEWS
 from .shown import DrawnBody, Shown, shown_now
 
 if TYPE_CHECKING:
@@ -29,39 +30,9 @@ if TYPE_CHECKING:
 
     from .bodies import Body
 
-#: Views by name: azimuth and elevation [°].
-VIEWS = {
-    "corner": (35.0, 14.0),
-    "front": (0.0, 0.0),
-    "right": (90.0, 0.0),
-    "back": (180.0, 0.0),
-    "left": (-90.0, 0.0),
-    "top": (0.0, 89.9),
-    "bottom": (0.0, -89.9),
-}
 MOST_PANELS, MOST_COLUMNS = 12, 4
 #: Pixels of each view of a film, and its approximate number of polygons.
 FILM_SIZE, FILM_PIECES = (640, 540), 15_000
-
-
-def add_preview_options(group: argparse._ArgumentGroup) -> None:
-    group.add_argument(
-        "--preview",
-        type=Path,
-        metavar="FILE",
-        help="also draw the last frame (.png), or a film of all frames (.gif, .mp4)",
-    )
-    group.add_argument(
-        "--preview-frames",
-        metavar="LIST",
-        help="draw these frames side by side into the .png, counted from 0, or back from -1, for example 0,12,-1",
-    )
-    group.add_argument(
-        "--preview-views",
-        metavar="LIST",
-        help=f"draw from these sides: {', '.join(VIEWS)}, or AZIMUTH:ELEVATION [°], for example front,left,35:14 "
-        "(default: corner)",
-    )
 
 
 @dataclass(frozen=True)

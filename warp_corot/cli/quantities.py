@@ -5,15 +5,19 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
-from warp_corot.domain.units import in_units, metres_per_unit
 from warp_corot.errors import InputError
+
+from .options.defaults import AUTO
 
 
 def quantity(unit: str) -> Callable[[str], float]:
     """A function that converts an option's text to a number in a unit, for ``add_argument(type=...)``."""
 
     def parse(text: str) -> float:
+        from warp_corot.domain.units import in_units
+
         try:
             return in_units(text, unit)
         except InputError as error:
@@ -84,8 +88,27 @@ def value_range(text: str) -> ValueRange:
 
 def unit_of_length(text: str) -> str:
     """A unit, or a length used as a unit: mm or 3.2cm."""
+    from warp_corot.domain.units import metres_per_unit
+
     try:
         metres_per_unit(text)
     except InputError as error:
         raise argparse.ArgumentTypeError(str(error).removeprefix("unit is ")) from None
     return text
+
+
+def ground_height(text: str) -> float | str:
+    """A height [m] or "auto", for ``add_argument(type=...)``."""
+    if text == AUTO:
+        return text
+    try:
+        return metres(text)
+    except argparse.ArgumentTypeError as error:
+        raise argparse.ArgumentTypeError(f"{error}; it must be a height or {AUTO} (INPUT stands before it)") from None
+
+
+def tool_shape(text: str) -> Any:
+    """A `ToolShape` from the text of ``--tool``."""
+    from .tool_paths import tool_shape as read
+
+    return read(text)

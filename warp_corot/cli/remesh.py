@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING
 from warp_corot.errors import InputError
 from warp_corot.remesh.online import OnlineRemesh
 
-from .quantities import number, whole_number
-
 if TYPE_CHECKING:
     from warp_corot.io.write.animate import Recording
     from warp_corot.simulation.simulation import Simulation
@@ -28,49 +26,6 @@ ARGUMENTS = {
 }
 #: Options that need ``--remesh``.
 OPTIONS = ("refine_above", "simplify_below", "remesh_levels", "remesh_every", "capacity")
-
-
-def add_remesh_options(group: argparse._ArgumentGroup) -> None:
-    """Add the options to a group of the command's parser."""
-    group.add_argument(
-        "--remesh",
-        action="store_true",
-        help="refine tetrahedra where they are stretched, and merge them again elsewhere",
-    )
-    group.add_argument(
-        "--refine-above",
-        type=number,
-        metavar="X",
-        help=f"bisect elements whose longest edge is more than X times as long as at rest (default: "
-        f"{OnlineRemesh.refine_above:g})",
-    )
-    group.add_argument(
-        "--simplify-below",
-        type=number,
-        metavar="X",
-        help=f"merge elements whose longest edge is less than X times as long as at rest (default: "
-        f"{OnlineRemesh.simplify_below:g})",
-    )
-    group.add_argument(
-        "--remesh-levels",
-        type=whole_number,
-        nargs=2,
-        metavar=("MIN", "MAX"),
-        help="minimum and maximum number of bisections of a cube (default: from the coarsest level at the start to "
-        "three more than the finest)",
-    )
-    group.add_argument(
-        "--remesh-every",
-        type=whole_number,
-        metavar="N",
-        help=f"steps from one pass of remeshing to the next (default: {OnlineRemesh.every})",
-    )
-    group.add_argument(
-        "--capacity",
-        type=whole_number,
-        metavar="N",
-        help="largest number of tetrahedra (default: four times the number at the start, or 100000)",
-    )
 
 
 def remesh_of(args: argparse.Namespace, kind: str) -> OnlineRemesh | None:

@@ -14,16 +14,10 @@ from typing import Any, NoReturn
 from warp_corot.errors import InputError
 from warp_corot.io.files.whole import written_whole
 
-from .loading import FORMS, Load, value_of
+from .loading import Load, value_of
+from .options.defaults import LOADS
+from .options.simulate import add_options
 from .parsing import StrictParser
-
-HELP = """a run file (.toml) has the options' names as keys: several values are a list, an option without a value is
-true. Options on the command line are added to all its bodies; paths are relative to the file:
-  input = "liver.stl"
-  unit = "mm"
-  fix = ["bottom"]
-  pull = [{ patch = "top", by = [0, 0, 0.02], times = [0, 1, 2], shares = [0, 1, 0] }]
-several bodies are tables [[body]], each with an input and its own options, for example offset = [0, 0, "5cm"]"""
 
 #: Options with paths, which are relative to the run file.
 PATHS = ("input", "output", "also", "preview", "csv", "tool_path")
@@ -141,8 +135,6 @@ def option_of(name: str) -> Callable[[str], Any]:
 
 
 def _parser(path: Path) -> tuple[_Parser, dict[str, argparse.Action]]:
-    from .options import add_options
-
     parser = _Parser(add_help=False, prog="simulate")
     parser.path = path
     parser._negative_number_matcher = _Numbers()  # type: ignore[assignment]
@@ -170,7 +162,7 @@ def _body_of(
         if name not in actions:
             likely = "".join(f", {near!r} is" for near in get_close_matches(name, actions, 1))
             raise InputError(f"{path}: {key!r} is not an option{likely}; see warp-corot simulate --help")
-        if name in FORMS and isinstance(value, list):
+        if name in LOADS and isinstance(value, list):
             curves += [_load(name, entry, path) for entry in value if isinstance(entry, dict)]
             value = [entry for entry in value if not isinstance(entry, dict)]
         if name in PATHS:
@@ -206,8 +198,8 @@ def _load(kind: str, table: dict[str, Any], path: Path) -> Load:
         raise InputError(f"{path}: {kind} of {table['patch']!r}: {error}") from None
     except (TypeError, ValueError):
         raise InputError(f"{path}: {kind} = {table!r}: a value in it is not a number; it must be one") from None
-    if len(values) != FORMS[kind][0] or (axis is not None and len(axis) != 3):
-        needed = f"{VALUES[kind]} must be {FORMS[kind][0]} numbers, an axis 3"
+    if len(values) != LOADS[kind][0] or (axis is not None and len(axis) != 3):
+        needed = f"{VALUES[kind]} must be {LOADS[kind][0]} numbers, an axis 3"
         raise InputError(f"{path}: {kind} of {table['patch']!r}: {needed}")
     return Load(kind, str(table["patch"]), values, times, shares, axis)
 
@@ -265,7 +257,7 @@ def _lines(body: argparse.Namespace, actions: dict[str, argparse.Action], folder
             value = [_relative(str(one), folder, name) for one in (value if several else [value])]
             value = value if several else value[0]
         key = action.option_strings[-1].lstrip("-") if action.option_strings else name
-        if name in FORMS:
+        if name in LOADS:
             value = [*([patch, *map(_number, texts)] for patch, *texts in value or ()), *curves]
         lines.append(f"{key} = {_toml(value)}")
     return lines

@@ -13,9 +13,8 @@ from warp_corot.io.read.surfaces import LoadedSurface
 from warp_corot.io.read.tetrahedra import LoadedMesh
 
 from .opened import Opened, loaded_tets, longest_side
+from .options.defaults import TETS
 
-#: Default number of tetrahedra, approximately.
-TETS = 20_000
 #: More objects are joined: otherwise each would be a body with its own mesh.
 MOST_BODIES = 32
 #: Minimum number of tetrahedra of each of several bodies that share a number.

@@ -13,7 +13,6 @@ from warp_corot.simulation.simulation import Simulation
 from .about import about
 from .bodies import Body
 from .in_parts import is_in_parts, run_in_parts
-from .options import add_parser
 from .prepared import Run, prepared
 from .previews import Previews, check_preview
 from .probing import Table, check_table_path
@@ -28,8 +27,6 @@ if TYPE_CHECKING:
     from warp_corot.io.write.animate import Progress, Recording
     from warp_corot.io.write.skins import OwnSurface
     from warp_corot.mesh.surfaces.bound import SurfaceMesh
-
-__all__ = ["add_parser", "run"]
 
 
 def run(args: argparse.Namespace) -> int:

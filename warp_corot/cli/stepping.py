@@ -14,7 +14,8 @@ from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import INTEGRATORS, Integrator, SymplecticEuler
 
 from .bodies import Body, gravity_of
-from .implicit import IMPLICIT_DT, integrator_name, is_static
+from .implicit import integrator_name, is_static
+from .options.defaults import IMPLICIT_DT
 from .ranks import Others, are_several, led_simulation, one_first
 from .remesh import as_remesh_options
 from .static import check_static, static_integrator

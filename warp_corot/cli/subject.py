@@ -13,11 +13,13 @@ import numpy as np
 from warp_corot.body.places import named_nodes
 from warp_corot.errors import InputError
 from warp_corot.experiments import paper
+from warp_corot.inputs.choices import SHORT_DURATION
 from warp_corot.io.read.tetrahedra import LoadedMesh
 from warp_corot.mesh import TetForest, TetMesh
 
 from .label_materials import of_regions, parse_labels
 from .opened import Opened, offset_of, placed_tets
+from .options.defaults import BOX_LEVEL, STIFFNESS_PER_WEIGHT
 from .several import merged_nodes
 
 if TYPE_CHECKING:
@@ -28,10 +30,6 @@ if TYPE_CHECKING:
     from warp_corot.mesh.surfaces.bound import SurfaceMesh
 
     from .label_materials import LabelMaterial
-
-#: Young's modulus over the weight of a column as high as the body: such bodies sag by roughly a tenth of their height.
-STIFFNESS_PER_WEIGHT = 20.0
-BOX_LEVEL = 6
 
 
 @dataclass
@@ -190,5 +188,5 @@ def box_subject(mesh: TetForest) -> Subject:
         fix="z <= zmin",
         gravity=paper.GRAVITY,
         damping=paper.Settings.damping,
-        duration=paper.SHORT_DURATION,
+        duration=SHORT_DURATION,
     )

@@ -6,7 +6,6 @@ import argparse
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,75 +21,22 @@ from warp_corot.solvers import INTEGRATORS
 
 from .holding import up_of
 from .implicit import integrator_name
-from .quantities import metres, number
+from .options.defaults import AUTO
 from .ranks import are_several
 from .summary import length
-from .tool_paths import make_tool, tool_shape
+from .tool_paths import make_tool
 
 if TYPE_CHECKING:
     from warp_corot.simulation.simulation import Simulation
 
     from .bodies import Body
 
-AUTO = "auto"
 #: Overlaps below this fraction of a body's height are rounding and are not reported.
 SMALL = 1e-5
 #: Tetrahedra that reach farther than this beyond the surface, relative to the height of the body, are said.
 FAR = 0.01
 
 Floats = np.ndarray
-
-
-def ground_height(text: str) -> float | str:
-    """A height [m] or "auto", for ``add_argument(type=...)``."""
-    if text == AUTO:
-        return text
-    try:
-        return metres(text)
-    except argparse.ArgumentTypeError as error:
-        raise argparse.ArgumentTypeError(f"{error}; it must be a height or {AUTO} (INPUT stands before it)") from None
-
-
-def add_touch_options(group: argparse._ArgumentGroup) -> None:
-    """Add the options to a group of the command's parser."""
-    group.add_argument(
-        "--ground",
-        type=ground_height,
-        nargs="?",
-        const=AUTO,
-        metavar="HEIGHT",
-        help="put a ground at this height against gravity [m], or just below the bodies (auto, the default height); "
-        "bodies stand on it, and nothing is fixed without --fix",
-    )
-    group.add_argument(
-        "--drop",
-        type=metres,
-        metavar="HEIGHT",
-        help="let the bodies fall freely onto a ground this far below them [m]",
-    )
-    group.add_argument(
-        "--tool",
-        type=tool_shape,
-        action="append",
-        metavar="SHAPE",
-        help="press with a rigid tool: sphere:r=5mm, capsule:r=4mm,l=100mm, cylinder:r=4mm,l=100mm or "
-        "box:x=2cm,y=2cm,z=5mm, with its axis along z; a friction=MU of its own may follow; can be given several times",
-    )
-    group.add_argument(
-        "--tool-path",
-        type=Path,
-        action="append",
-        metavar="PATH.csv",
-        help="how the tool moves: rows of time [s], x, y, z of its centre [m] and, if it turns, quaternions qx, qy, "
-        "qz, qw; one row for a tool that stays; one path for each --tool, in the same order",
-    )
-    group.add_argument(
-        "--touch", action="store_true", help="let the bodies touch one another; always on with a ground or a tool"
-    )
-    group.add_argument("--self-contact", action="store_true", help="let the bodies touch themselves, too")
-    group.add_argument(
-        "--friction", type=number, metavar="MU", help="coefficient of friction of all contacts (default: 0.3)"
-    )
 
 
 @dataclass(eq=False)

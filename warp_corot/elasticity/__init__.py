@@ -1,6 +1,7 @@
 """Elastic models, one file each, all from the same Young's modulus and Poisson's ratio. List new ones here."""
 
 from warp_corot.elasticity.corotated.model import Corotated
+from warp_corot.inputs import choices
 
 from .edge_stvk import EdgeStVK
 from .fibres import HolzapfelGasserOgden
@@ -13,18 +14,7 @@ from .prestress import Prestressed
 from .prony import Prony
 from .stvk import StVenantKirchhoff
 
-MODELS: dict[str, type[Model]] = {
-    "linear": Linear,
-    "corotated": Corotated,
-    "stvk": StVenantKirchhoff,
-    "neo-hookean": NeoHookean,
-    "ogden": Ogden,
-    "holzapfel-gasser-ogden": HolzapfelGasserOgden,
-    "prony": Prony,
-    "prestressed": Prestressed,
-    "edge-stvk": EdgeStVK,
-    "mass-spring": MassSpring,
-}
+MODELS: dict[str, type[Model]] = {name: globals()[kind] for name, kind in choices.MODELS.items()}
 
 __all__ = [
     "MODELS",

@@ -20,6 +20,7 @@ from warp_corot.body.soft_body import SoftBody
 from warp_corot.elasticity import Corotated, Linear, Model, NeoHookean, StVenantKirchhoff
 from warp_corot.elasticity.dilatation import ELEMENT
 from warp_corot.errors import InputError
+from warp_corot.inputs.choices import SHORT_DURATION
 from warp_corot.inputs.device import checked_device
 from warp_corot.materials.isotropic import Isotropic
 from warp_corot.mesh import TetForest
@@ -39,7 +40,6 @@ GRAVITY = (0.0, -9.8, 0.0)
 MATERIAL = {"young": 500.0, "poisson": 0.49, "density": 10.0}
 
 #: Simulated time [s]: the paper's, and a shorter one in which the beam comes to rest.
-FULL_DURATION, SHORT_DURATION = 80.0, 4.0
 
 #: Names of the reference models.
 REFERENCE, PEER, OWN = "stvk", "linear", "corotated"

@@ -14,6 +14,7 @@ from warp_corot.discretization.changing.checks import (
     checked_thresholds,
 )
 from warp_corot.inputs.checks import checked_count
+from warp_corot.inputs.choices import REFINE_ABOVE, REMESH_EVERY, SIMPLIFY_BELOW
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.lattice import MAX_LEVEL, check_levels
 
@@ -53,11 +54,11 @@ class OnlineRemesh:
             that is not positive.
     """
 
-    refine_above: float = 1.25
-    simplify_below: float = 1.08
+    refine_above: float = REFINE_ABOVE
+    simplify_below: float = SIMPLIFY_BELOW
     min_level: int | None = None
     max_level: int | None = None
-    every: int = 10
+    every: int = REMESH_EVERY
     capacity: int | None = None
     criterion: Any = None
     parameters: wp.array | None = None

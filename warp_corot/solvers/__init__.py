@@ -1,5 +1,6 @@
 """Time integrators, one file each. A new one is listed here."""
 
+from warp_corot.inputs import choices
 from warp_corot.solvers.explicit.symplectic_euler import SymplecticEuler
 from warp_corot.solvers.implicit.schemes import (
     BDF2,
@@ -13,14 +14,7 @@ from warp_corot.solvers.steps.stable_step import largest_frequency
 
 from .integrator import Integrator, Stepper
 
-INTEGRATORS: dict[str, type[Integrator]] = {
-    "symplectic-euler": SymplecticEuler,
-    "backward-euler": BackwardEuler,
-    "newmark": Newmark,
-    "bdf2": BDF2,
-    "generalized-alpha": GeneralizedAlpha,
-    "quasi-static": QuasiStatic,
-}
+INTEGRATORS: dict[str, type[Integrator]] = {name: globals()[kind] for name, kind in choices.INTEGRATORS.items()}
 
 __all__ = [
     "BDF2",

@@ -11,6 +11,7 @@ from warp_corot.discretization.discretization import Discretization, discretizat
 from warp_corot.elasticity.model import ForceField
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_choice, shown
+from warp_corot.inputs.choices import AUTO, ELEMENT, SHARED
 from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.materials.anisotropic import Anisotropic
 
@@ -18,8 +19,6 @@ from .field import DilatationField
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretized
-
-AUTO, ELEMENT, SHARED = "auto", "element", "shared"
 
 #: Poisson's ratio in any element from which "auto" means "shared".
 SHARED_FROM = 0.45
