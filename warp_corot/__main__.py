@@ -6,9 +6,11 @@ import sys
 def main() -> int:
     """Run the command line as a separate process; returns the exit status."""
     try:
+        import time
+
         from .cli import main as run
 
-        return run()
+        return run(spent=time.process_time())
     except KeyboardInterrupt:
         sys.stderr.write("warp-corot: interrupted\n")
         return 130

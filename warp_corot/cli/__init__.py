@@ -17,6 +17,7 @@ from typing import NoReturn
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.importing import uncollected
 from warp_corot.inputs.likely import meant
+from warp_corot.inputs.stopwatch import WATCH
 
 from .parsing import COMMANDS, StrictParser
 from .ranks import end_others, fall_silent, let_others_speak, speaks
@@ -84,8 +85,14 @@ def make_parser(needed: Collection[str] = COMMANDS) -> argparse.ArgumentParser:
     return parser
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit status."""
+def main(argv: Sequence[str] | None = None, spent: float = 0.0) -> int:
+    """Run the command line; returns the exit status.
+
+    Args:
+        argv: The words after the command's name; None: those of this process.
+        spent: Time that the process has taken for its start [s].
+    """
+    WATCH.begin("importing", spent)
     open_streams()
     is_silent = not speaks()
     if is_silent:
@@ -174,4 +181,5 @@ def _run(argv: Sequence[str] | None) -> int:
             "to in the environment variable WARP_CACHE_PATH"
         )
         return 1
+    WATCH.switch("preparing")
     return module.run(args)

@@ -15,12 +15,16 @@ from typing import Any
 
 import warp as wp
 
+from warp_corot.inputs.stopwatch import KERNELS, WATCH
+
 from .say import complain
 
 Say = Callable[[str], None]
 
 #: Called at the start of the next compilation.
 _waiting: list[Callable[[], None]] = []
+#: Whether this process has compiled kernels; otherwise they were in Warp's cache.
+has_compiled = False
 
 
 def say_plainly(text: str) -> None:
@@ -51,12 +55,26 @@ def compiling_said(device: wp.Device, say: Say = say_plainly) -> Iterator[None]:
 
 @functools.cache
 def _listen() -> None:
-    """Install the audit hook; cached, since hooks cannot be removed."""
+    """Install the audit hook, and let the stopwatch count Warp's loading of modules; cached, since hooks cannot be
+    removed."""
     sys.addaudithook(_heard)
+    load = wp.Module.load
+
+    @functools.wraps(load)
+    def counted(*args: Any, **options: Any) -> Any:
+        before = WATCH.switch(KERNELS)
+        try:
+            return load(*args, **options)
+        finally:
+            WATCH.switch(before)
+
+    wp.Module.load = counted
 
 
 def _heard(event: str, args: tuple[Any, ...]) -> None:
-    if event == "os.mkdir" and _waiting and _in_kernel_cache(args[0]):
+    global has_compiled
+    if event == "os.mkdir" and _in_kernel_cache(args[0]):
+        has_compiled = True
         told, _waiting[:] = _waiting[:], []
         for tell in told:
             tell()

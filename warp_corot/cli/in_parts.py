@@ -31,7 +31,7 @@ from .meshes_in_parts import (
 )
 from .ranks import are_several, hands_out
 from .say import complain, kept_so_far
-from .summary import aligned, length, milliseconds
+from .summary import aligned, length, milliseconds, wall_time
 from .waiting import progress_bar
 
 if TYPE_CHECKING:
@@ -221,7 +221,7 @@ def _summary(
         ("gravity", f"{' '.join(f'{g:g}' for g in sim.gravity)} m/s^2"),
         ("time step", f"{milliseconds(shortest)} to {milliseconds(longest)}"),
         ("speed", f"{done.steps / stepping:.0f} steps/s, {done.simulated / stepping:.3g} times real time"),
-        ("wall time", f"{done.stepping:.2f} s stepping, {done.writing:.2f} s writing"),
+        ("wall time", wall_time()),
         ("displacement", f"{length(done.largest_displacement)} largest, {length(done.final_displacement)} at the end"),
         ("device", f"{sim.device} ({sim.device.name}), {sim.size} ranks"),
         ("written", f"{done.path} and a piece for each rank, {done.frames} frames, {done.simulated:.4g} s"),

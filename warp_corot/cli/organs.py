@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import re
-import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from warp_corot.errors import InputError
+from warp_corot.inputs.stopwatch import WATCH
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.lattice import checked_level
 
@@ -65,15 +65,15 @@ def find_organ(opened: Opened, args: argparse.Namespace) -> Subject:
         InputError: It encloses no body, or an option is out of its range.
     """
     with as_options():
-        started = time.perf_counter()
+        started = WATCH.clock()
         if args.scale is not None and not (np.isfinite(args.scale) and args.scale > 0):
             raise InputError(f"scale is {args.scale:g}; it must be a positive number")
         entries: list[LabelMaterial] = []
         domain = domain_of(opened, args, entries)
-        meshing = time.perf_counter()
+        meshing = WATCH.clock()
         mesh = _mesh(args, domain)
         surface = mesh.surface()
-        done = time.perf_counter()
+        done = WATCH.clock()
         measured = _measured(args, mesh, domain, surface)
         skin = _own_surface(opened, args, domain)
     asset, loaded = opened.asset, opened.volume or opened.surface
@@ -87,7 +87,7 @@ def find_organ(opened: Opened, args: argparse.Namespace) -> Subject:
         fidelity=measured,
         skin=skin,
         labels=entries,
-        times={"domain": meshing - started, "mesh": done - meshing, "measuring": time.perf_counter() - done},
+        times={"domain": meshing - started, "mesh": done - meshing, "measuring": WATCH.clock() - done},
         notes=opened.notes,
     )
     if asset:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,6 +10,7 @@ import warp as wp
 
 from warp_corot.inputs.device import checked_device
 from warp_corot.inputs.loading import BODY, CONTACT, MESHING, STEPS, STEPS_ON_CPU, SURFACES, begin_loading
+from warp_corot.inputs.stopwatch import WATCH
 from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import INTEGRATORS
 
@@ -72,7 +72,7 @@ def prepared(options: Sequence[argparse.Namespace], others: Others | None = None
             with waiting(f"meshing {body.args.input}"):
                 body.subject = find_body(body)
         duration, count = _frames(shared, bodies, touched)
-        started = time.perf_counter()
+        started = WATCH.clock()
         for found in inputs:
             find_patches(found)
         for body in bodies:
@@ -85,7 +85,7 @@ def prepared(options: Sequence[argparse.Namespace], others: Others | None = None
         for body in bodies:
             press_patches(sim, body.soft, body.loads, body.patches, ramp_of(shared, duration))
         probes = [Probe(text, body.soft, body.patches) for body in bodies for text in body.probes]
-    bodies[0].subject.times["body"] = time.perf_counter() - started
+    bodies[0].subject.times["body"] = WATCH.clock() - started
     steps = 1.0 / (shared.fps * sim.dt)
     if steps > MANY_STEPS:
         bodies[0].subject.notes.append(f"{steps:.2g} steps of {sim.dt:.2g} s make a frame: this will take long")

@@ -6,7 +6,6 @@ import argparse
 import contextlib
 import sys
 import tempfile
-import time
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
@@ -62,9 +61,6 @@ class Previews:
         args: The command's arguments.
         count: Number of frames after the first one.
 
-    Attributes:
-        seconds: Wall time of storing and drawing frames [s].
-
     Raises:
         InputError: Invalid frames or views, or a package is missing.
     """
@@ -74,7 +70,6 @@ class Previews:
     frames: list[int] = field(init=False)
     views: list[tuple[float, float]] = field(init=False)
     fps: float = field(init=False)
-    seconds: float = 0.0
     _file: Any = None
     _places: list[int] = field(default_factory=list)
     _bodies: list[DrawnBody] = field(default_factory=list)
@@ -94,13 +89,11 @@ class Previews:
         """Store the current state if its frame is drawn."""
         if frame not in self.frames:
             return
-        started = time.perf_counter()
         if self._file is None:
             self._file = tempfile.TemporaryFile()  # noqa: SIM115 (closed in draw)
             self._bodies = [DrawnBody(body) for body in bodies]
         self._places.append(self._file.tell())
         shown_now(self._bodies, sim).write(self._file)
-        self.seconds += time.perf_counter() - started
 
     def draw(self, bodies: Sequence[Body], name: str) -> None:
         """Draw the stored frames.
@@ -116,7 +109,6 @@ class Previews:
             return
         from tqdm import tqdm
 
-        started = time.perf_counter()
         up_axis = bodies[0].soft.mesh.up_axis
         look = self._look(up_axis)
         with tqdm(
@@ -133,7 +125,6 @@ class Previews:
                     write_film(self.args.preview, drawing, self.fps)
             else:
                 self._draw_picture(name, up_axis, look, bar)
-        self.seconds += time.perf_counter() - started
 
     def _look(self, up_axis: str) -> Look:
         """The common view of all frames."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,10 +11,11 @@ import numpy as np
 
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.device import checked_device
+from warp_corot.inputs.stopwatch import WATCH
 
 from .compiling import compiling_said
 from .say import complain, interrupt_status, kept_so_far
-from .summary import length, milliseconds, pressure
+from .summary import length, milliseconds, pressure, wall_time
 from .waiting import progress_bar
 
 if TYPE_CHECKING:
@@ -70,14 +70,11 @@ def run(args: argparse.Namespace) -> int:
     try:
         with progress_bar(count) as progress:
             for frame in range(count + 1):
-                started = time.perf_counter()
                 if frame:
-                    sim.advance()
-                stepped = time.perf_counter()
-                with signals_held_back():
+                    with WATCH.part("stepping", into=done):
+                        sim.advance()
+                with WATCH.part("writing", into=done), signals_held_back():
                     _write(writer, sim, done)
-                done.stepping += stepped - started
-                done.writing += time.perf_counter() - stepped
                 progress(frame, count)
         _close(writer, done)
     except (KeyboardInterrupt, UnstableError, OSError) as error:
@@ -108,10 +105,8 @@ def _write(writer: SceneWriter, sim: StageSimulation, done: Recording) -> None:
 def _close(writer: SceneWriter, done: Recording) -> None:
     from warp_corot.io.write.animate import signals_held_back
 
-    started = time.perf_counter()
-    with signals_held_back():
+    with WATCH.part("writing", into=done), signals_held_back():
         writer.close()
-    done.writing += time.perf_counter() - started
 
 
 def _end(error: BaseException, writer: SceneWriter, done: Recording) -> int:
@@ -148,7 +143,7 @@ def _summary(source: Path, sim: StageSimulation, writer: SceneWriter, done: Reco
         ("gravity", f"{' '.join(f'{g:.4g}' for g in gravity)} m/s^2"),
         ("time step", _steps(sim)),
         ("speed", f"{done.steps / stepping:.0f} steps/s, {done.simulated / stepping:.3g} times real time"),
-        ("wall time", f"{done.stepping:.2f} s stepping, {done.writing:.2f} s writing"),
+        ("wall time", wall_time()),
         ("displacement", f"{length(_displacement(sim))} largest at the end"),
         ("stress", f"colours up to {pressure(writer.stress_range[1])} (von Mises)"),
         ("device", f"{parts.model.device} ({parts.model.device.name})"),

@@ -8,6 +8,7 @@ from contextlib import closing, nullcontext
 from typing import TYPE_CHECKING
 
 from warp_corot.errors import InputError, UnstableError
+from warp_corot.inputs.stopwatch import WATCH
 from warp_corot.simulation.simulation import Simulation
 
 from .about import about
@@ -52,10 +53,12 @@ def run(args: argparse.Namespace) -> int:
     try:
         if args.write_run is not None:
             write_run(args.write_run, options)
-        rested = rest(shared, ready.sim)
+        with WATCH.part("solving"):
+            rested = rest(shared, ready.sim)
         _record(args, shared, ready, done, table, previews)
         if previews is not None:
-            previews.draw(ready.bodies, title_of(ready.bodies))
+            with WATCH.part("drawing"):
+                previews.draw(ready.bodies, title_of(ready.bodies))
     except KeyboardInterrupt as signalled:
         complain(f"interrupted; {kept_so_far(done)}", kind="")
         return interrupt_status(signalled)
@@ -67,8 +70,7 @@ def run(args: argparse.Namespace) -> int:
         return 1
     finally:
         end()
-    drawing = previews.seconds if previews is not None else 0.0
-    print(summary(ready.bodies, ready.sim, done, ready.touched.rows, rested, drawing))
+    print(summary(ready.bodies, ready.sim, done, ready.touched.rows, rested))
     return 0
 
 
@@ -177,9 +179,11 @@ def _each_frame(
 
     def called(frame: int, count: int) -> None:
         if table is not None:
-            table.add()
+            with WATCH.part("writing"):
+                table.add()
         if previews is not None:
-            previews.add(frame, bodies, sim)
+            with WATCH.part("drawing"):
+                previews.add(frame, bodies, sim)
         progress(frame, count)
 
     return called

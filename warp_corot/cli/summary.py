@@ -12,9 +12,11 @@ from warp_corot.elasticity.dilatation import ELEMENT
 from warp_corot.elasticity.dilatation.options import shares_dilatation
 from warp_corot.holding.choice import NAMED
 from warp_corot.inputs.processes import process_count
+from warp_corot.inputs.stopwatch import KERNELS, WATCH
 from warp_corot.mesh import TetForest
 from warp_corot.solvers import INTEGRATORS
 
+from . import compiling
 from .implicit import solved
 from .remesh import remesh_rows
 
@@ -39,7 +41,6 @@ def summary(
     done: Recording,
     touched: Sequence[tuple[str, str]] = (),
     rested: Sequence[str] = (),
-    drawing: float = 0.0,
 ) -> str:
     """The run in a dozen lines.
 
@@ -49,7 +50,6 @@ def summary(
         done: The recording.
         touched: Lines on what the bodies touch.
         rested: Lines on the static answers of the bodies.
-        drawing: Wall time of drawing [s].
     """
     shared = bodies[0].args
     integrator = asdict(sim.integrator)  # type: ignore[call-overload]
@@ -60,7 +60,6 @@ def summary(
     height = max(body.subject.height for body in bodies)
     at_end = f"{length(done.final_displacement)} at the end ({done.final_displacement / height:.1%} of the height)"
     at_last = " (at the end)" if sim.remeshing.every else ""
-    drawn = f", {drawing:.2f} s drawing" if drawing else ""
     lines, ranks = [], process_count()
     for body in bodies:
         lines += [f"{body.subject.name}, {body.held.words}", *aligned(_of_body(body))]
@@ -71,7 +70,7 @@ def summary(
         *[("static", line) for line in rested],
         *_time_step(sim, at_last),
         ("speed", f"{done.steps / stepping:.0f} steps/s, {done.simulated / stepping:.3g} times real time"),
-        ("wall time", f"{done.stepping:.2f} s stepping, {done.writing:.2f} s writing{drawn}"),
+        ("wall time", wall_time()),
         ("displacement", f"{length(done.largest_displacement)} largest, {at_end}"),
         ("device", f"{sim.device} ({sim.device.name})" + (f", {ranks} ranks" if ranks > 1 else "")),
         ("written", f"{done.path}, {done.frames} frames, {done.simulated:.4g} s"),
@@ -81,6 +80,14 @@ def summary(
         if path:
             rows.append((name, str(path)))
     return "\n".join([*lines, *([] if len(bodies) == 1 else ["all together"]), *aligned(rows)])
+
+
+def wall_time() -> str:
+    """The wall time of the command so far, and its parts."""
+    WATCH.switch("preparing")
+    names = {KERNELS: "compiling kernels" if compiling.has_compiled else "loading kernels"}
+    parts = [f"{spent:.2f} s {names.get(part, part)}" for part, spent in WATCH.parts.items() if spent >= 0.005]
+    return f"{sum(WATCH.parts.values()):.2f} s: {', '.join(parts)}"
 
 
 def title_of(bodies: Sequence[Body]) -> str:

@@ -14,6 +14,8 @@ from importlib import import_module
 
 import warp as wp
 
+from .stopwatch import KERNELS, WATCH
+
 #: Modules of ``warp_corot.kernels`` for closed surfaces and for meshes of domains, the slowest to compile first.
 SURFACES = ("meshing.domain", "meshing.measuring", "meshing.windings")
 MESHING = (
@@ -49,8 +51,9 @@ def begin_loading(names: Iterable[str], device: wp.Device, kernels: Iterable[wp.
 def load(names: Iterable[str], device: wp.Device, kernels: Iterable[wp.Kernel] = ()) -> None:
     """Load modules as `begin_loading` does, and wait for them."""
     try:
-        for module in begin_loading(names, device, kernels):
-            module.result()
+        with WATCH.part(KERNELS):
+            for module in begin_loading(names, device, kernels):
+                module.result()
     except BaseException:
         give_up()
         raise

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import signal
 import threading
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -19,6 +18,7 @@ import numpy.typing as npt
 from warp_corot.contact.nodal import contact_at_nodes
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, checked_path, shown
+from warp_corot.inputs.stopwatch import WATCH
 from warp_corot.inputs.turns import in_turn
 from warp_corot.simulation.progress import hidden, is_shown
 from warp_corot.simulation.simulation import Simulation
@@ -237,10 +237,9 @@ def record(
     first_step, first_time = sim.total_steps, sim.total_time
     with _closed_whole(writer, done, others), _bar(count, wanted=progress is None) as bar:
         for frame in range(count + 1):
-            started = time.perf_counter()
-            sim.advance_until(first_time + frame / fps)
-            stepped = time.perf_counter()
-            with signals_held_back():
+            with WATCH.part("stepping", into=done):
+                sim.advance_until(first_time + frame / fps)
+            with WATCH.part("writing", into=done), signals_held_back():
                 if joined.has_changed():
                     bound = skins.on(joined.meshes) if skins else ()
                     writer.change_mesh(joined, fixed=joined.fixed, material=joined, skins=bound)
@@ -250,8 +249,6 @@ def record(
                     fields = fields_of(sim, joined.worlds, sim.total_time - first_time)
                     for other in others:
                         other.write(fields)
-            done.stepping += stepped - started
-            done.writing += time.perf_counter() - stepped
             done.steps = sim.total_steps - first_step
             done.simulated = sim.total_time - first_time
             (progress or bar)(frame, count)
@@ -311,12 +308,10 @@ def _closed_whole(writer: UsdWriter, done: Recording, others: Sequence[Writer] =
                 for other in others:
                     other.close()
         raise
-    started = time.perf_counter()
-    with signals_held_back():
+    with WATCH.part("writing", into=done), signals_held_back():
         writer.close()
         for other in others:
             other.close()
-    done.writing += time.perf_counter() - started
 
 
 @contextmanager
