@@ -1,11 +1,16 @@
 """``warp-corot simulate`` with ``--static`` and implicit integrators."""
 
+import re
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 from command_line import assert_refused, simulate
 from pxr import Usd, UsdGeom
 
 import warp_corot as wc
+from warp_corot.io.write.animate import shortening, steps_per_frame
+from warp_corot.solvers import INTEGRATORS
 
 BOX = ["box", "--device", "cpu"]
 
@@ -19,19 +24,19 @@ def frames_of(path):
 
 
 def test_static_writes_the_state_at_rest(tmp_path, capsys):
-    """The frames show what ``solve_static`` finds; the summary says what it took."""
+    """The only frame shows what ``solve_static`` finds; the summary says what it took, and nothing of steps."""
     path = tmp_path / "sag.usd"
-    assert simulate(*BOX, "--static", "--density", "5", "-o", path) == 0
-    out = capsys.readouterr().out
-    assert "at rest after" in out
-    assert "quasi-static" in out
+    assert simulate(*BOX, "--static", "--density", "5", "--duration", "2", "-o", path) == 0
+    out, err = capsys.readouterr()
+    assert "  static        at rest after" in out
+    assert not re.search(r"step|real time|solves| ms\b", out), out
+    assert "one frame shows it, whatever --duration is" in err
     mesh = wc.TetForest.box((1, 1, 3), 0.064, 6)
     body = wc.SoftBody(mesh, wc.Isotropic(500.0, 0.49, 5.0), device="cpu")
     body.fix(mesh.points[:, 2] == 0.0)
     assert wc.solve_static(body, gravity=(0, -9.8, 0)).converged
-    first, last = frames_of(path)
-    assert np.abs(first - body.positions.numpy()).max() < 1e-6
-    assert np.abs(last - first).max() < 1e-6
+    (frame,) = frames_of(path)
+    assert np.abs(frame - body.positions.numpy()).max() < 1e-6
 
 
 def test_static_follows_a_pull(tmp_path, capsys):
@@ -39,7 +44,9 @@ def test_static_follows_a_pull(tmp_path, capsys):
     path, table = tmp_path / "pulled.usd", tmp_path / "pulled.csv"
     pull = ["--pull", "z == zmax", "0", "0", "0.02", "--probe", "z == zmax", "--csv", table]
     assert simulate(*BOX, "--static", *pull, "--duration", "0.2", "--fps", "20", "-o", path) == 0
-    assert "did not converge" not in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "the first frame is at rest after" in out
+    assert "linear ones a frame\n" in out
     frames = frames_of(path)
     assert len(frames) == 5
     ends = [points[:, 2].max() - 0.192 for points in frames]
@@ -48,22 +55,19 @@ def test_static_follows_a_pull(tmp_path, capsys):
 
 
 def test_static_stands_on_the_ground(tmp_path, capsys):
-    """The ground carries the weight in the first row and the last, and so do the nodes in the stage."""
+    """The ground carries the weight in the table, and so do the nodes in the stage."""
     path, table = tmp_path / "stands.usd", tmp_path / "stands.csv"
     options = ["--young", "5kPa", "--poisson", "0.4", "--self-contact"]
     assert simulate(*BOX, "--static", "--ground", *options, "--csv", table, "-o", path) == 0
     assert "at rest in contact after" in capsys.readouterr().out
-    rows = np.genfromtxt(table, delimiter=",", skip_header=1)
+    row = np.genfromtxt(table, delimiter=",", skip_header=1)
     weight = 9.8 * 10.0 * 0.064 * 0.064 * 0.192
-    np.testing.assert_allclose(rows[:, 2], -weight, rtol=1e-4)
-    assert len(rows) == 2
-    first, last = frames_of(path)
-    assert np.abs(last - first).max() < 1e-6
+    np.testing.assert_allclose(row[2], -weight, rtol=1e-4)
+    assert len(frames_of(path)) == 1
     stage = Usd.Stage.Open(str(path))
     drawn = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/SoftBody/tetrahedra"))
-    for time in (0, stage.GetEndTimeCode()):
-        felt = np.array(drawn.GetPrimvar("contactForce").Get(time), float).sum(axis=0)
-        assert felt[1] == pytest.approx(weight, rel=1e-4)
+    felt = np.array(drawn.GetPrimvar("contactForce").Get(0), float).sum(axis=0)
+    assert felt[1] == pytest.approx(weight, rel=1e-4)
 
 
 def test_static_follows_a_tool(tmp_path, capsys):
@@ -84,17 +88,53 @@ def test_static_follows_a_tool(tmp_path, capsys):
 
 
 def test_an_implicit_run(tmp_path, capsys):
-    """Steps of 16 ms are shortened until a whole number of them makes a frame; the run file repeats the run."""
+    """Steps of 16 ms are shortened until a whole number of them makes a frame, and a note says so; the run file repeats
+    the run."""
     path, run = tmp_path / "swings.usd", tmp_path / "run.toml"
     options = ["--integrator", "backward-euler", "--dt", "16ms", "--duration", "0.1", "--fps", "30"]
     assert simulate(*BOX, *options, "--write-run", run, "-o", path) == 0
-    out = capsys.readouterr().out
-    assert "11.11 ms, backward-euler" in out or "16.67 ms, backward-euler" in out
+    out, err = capsys.readouterr()
+    assert "11.11 ms, backward-euler" in out
+    assert "note: steps take 11.11 ms, not 16 ms, since a whole number of them makes a frame of 33.33 ms" in err
     assert "linear ones a step" in out
     assert 'integrator = "backward-euler"' in run.read_text()
     first = frames_of(path)
     assert simulate(run, "-o", tmp_path / "again.usd") == 0
     assert np.array_equal(first[-1], frames_of(tmp_path / "again.usd")[-1])
+
+
+@pytest.mark.parametrize("dt", [16e-3, 0.1, 1 / 70, 3.3333e-4])
+def test_the_frame_rate_in_a_note_keeps_the_step(dt):
+    rate = re.search(r"with --fps ([\d.]+) they take that", shortening(dt, 24.0))[1]
+    steps = steps_per_frame(float(rate), dt)
+    assert 1.0 / (float(rate) * steps) == pytest.approx(dt, rel=1e-9)
+    assert shortening(dt, float(rate)) is None
+
+
+def test_a_step_that_has_no_frame_rate_is_named():
+    (used,) = re.findall(r"--dt ([\d.e-]+) says so exactly", shortening(0.0123456789, 24.0))
+    assert shortening(float(used), 24.0) is None
+
+
+@pytest.mark.parametrize(("fps", "taken"), [(24.0, "41.67 ms, not 16 s"), (1 / 16, "16 s")])
+def test_steps_longer_than_a_second_are_questioned(fps, taken):
+    said = shortening(16.0, fps)
+    assert said.startswith(f"steps take {taken}")
+    assert said.endswith("; did you mean --dt 16ms?")
+
+
+def test_unfinished_solves_are_named_with_their_cure(tmp_path, capsys, monkeypatch):
+    """A linear solve of one iteration does not reach its tolerance."""
+
+    @dataclass(frozen=True)
+    class Hasty(wc.BackwardEuler):
+        linear_iterations: int = 1
+
+    monkeypatch.setitem(INTEGRATORS, "backward-euler", Hasty)
+    options = ["--integrator", "backward-euler", "--dt", "10ms", "--duration", "0.1", "--fps", "20"]
+    assert simulate(*BOX, *options, "-o", tmp_path / "swings.usd") == 0
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  solves")]
+    assert "; 10 of 10 steps ended before their linear solve converged; shorten the steps (--dt)" in line
 
 
 def test_a_body_falls_in_implicit_steps(tmp_path, capsys):

@@ -6,6 +6,7 @@ import random
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -206,10 +207,35 @@ def test_pieces_are_written_without_being_asked_for(tmp_path):
     frames = list(frames_of(Cube, 3))
     write_frames(writer, frames[:1])
     assert not path.exists()  # a run that fails at once replaces nothing
-    while writer._store._flush_cost == 0.0:
+    while not path.exists():
         write_frames(writer, frames[1:2])
+    assert 1 <= frames_in(path) <= writer.frames
+    writer.flush()
     assert frames_in(path) == writer.frames
     writer.close()
+
+
+def test_frames_do_not_wait_for_the_disk(tmp_path, monkeypatch):
+    """Only the next piece does, and the end."""
+    there, sync = threading.Event(), usd_pieces.sync
+
+    def sync_late(path):
+        if path.name.startswith("part-0"):  # a piece
+            there.wait(60)
+        sync(path)
+
+    monkeypatch.setattr(usd_pieces, "sync", sync_late)
+    path = tmp_path / "out.usd"
+    writer = UsdWriter(path, Cube, fps=25, flush_seconds=0.0)
+    frames = list(frames_of(Cube, 5))
+    write_frames(writer, frames[:2])
+    assert writer._store._writing is not None
+    monkeypatch.setattr(writer._store, "_flush_seconds", 3600.0)
+    write_frames(writer, frames[2:])
+    assert not path.exists()
+    there.set()
+    writer.close()
+    assert_frames(path, 5)
 
 
 def test_no_frames_leave_no_file(tmp_path):

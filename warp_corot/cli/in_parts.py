@@ -118,7 +118,7 @@ def _simulation(args: argparse.Namespace, subject: Subject, duration: float) -> 
     """The simulation of this rank's part, held and moved, and its loads."""
     import warp_corot.distributed as wd
     from warp_corot.distributed import mpi
-    from warp_corot.io.write.animate import steps_per_frame
+    from warp_corot.io.write.animate import shortening, steps_per_frame
 
     loads, mesh = loads_of(args), subject.mesh
     comm = mpi.world()
@@ -139,6 +139,8 @@ def _simulation(args: argparse.Namespace, subject: Subject, duration: float) -> 
     dt = args.dt
     SymplecticEuler(dt, damping, args.viscosity or 0.0)  # checks all values
     if dt is not None:
+        if note := shortening(dt, args.fps):
+            complain(note, kind="note")
         dt = 1.0 / (args.fps * steps_per_frame(args.fps, dt))
     sim = wd.Simulation(
         body,

@@ -16,12 +16,13 @@ from warp_corot.solvers import INTEGRATORS
 
 from .bodies import Body, asked_bodies, find_body, find_patches, gravity_of, make_body
 from .compiling import compiling_said
-from .implicit import integrator_name
+from .implicit import integrator_name, is_static
 from .loading import ramp_of
 from .pressing import press_patches
 from .probing import Probe
 from .ranks import Others
 from .say import complain
+from .static import moves
 from .stepping import make_simulation
 from .touching import Touched, place_ground, say_overlaps, say_reach, touched_by
 from .waiting import waiting
@@ -107,12 +108,13 @@ def _frames(args: argparse.Namespace, bodies: Sequence[Body], touched: Touched) 
     """The duration [s], and the number of frames after the first one."""
     from warp_corot.io.write.animate import frame_count, rounding
 
-    duration = args.duration
+    duration, notes = args.duration, bodies[0].subject.notes
+    if is_static(args) and not moves(bodies, touched):
+        if duration is not None:
+            notes.append("nothing moves a body at rest: one frame shows it, whatever --duration is")
+        return 0.0, 0
     if duration is not None and (note := rounding(duration, args.fps)):
-        bodies[0].subject.notes.append(note)
-    moves = touched.moves or any(body.loads for body in bodies)
-    if duration is None and getattr(args, "static", False) and not moves:
-        duration = 1.0 / args.fps
+        notes.append(note)
     if duration is None:
         duration = max(body.subject.duration for body in bodies)
     return duration, frame_count(duration, args.fps)

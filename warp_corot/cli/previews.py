@@ -17,6 +17,7 @@ import numpy as np
 from warp_corot.errors import InputError
 from warp_corot.io.pictures.film import FILMS, check_film, frames_shown, write_film
 
+from .implicit import is_static
 from .options.defaults import VIEWS
 from .shown import DrawnBody, Shown, shown_now
 
@@ -162,14 +163,15 @@ class Previews:
         from warp_corot.io.pictures.preview import cameras_of, draw_strip, save_picture
 
         panels: list[Picture] = []
-        for shown in self._kept():
-            panels += self._pictures(shown, f"{shown.time:.3g} s" if len(self.frames) > 1 else "")
+        for frame, shown in zip(self.frames, self._kept(), strict=False):
+            when = f"frame {frame}" if is_static(self.args) else f"{shown.time:.3g} s"
+            panels += self._pictures(shown, when if len(self.frames) > 1 else "")
             bar.update()
         cameras = cameras_of(panels, up_axis, *VIEWS["corner"], look.box)
         size = (1200, 900) if len(panels) == 1 else None
         several = len(self.views) > 1 and len(self.frames) > 1
         columns = len(self.views) if several else min(len(panels), MOST_COLUMNS)
-        words = name if len(self.frames) > 1 or self.args.static else f"{name}; {shown.time:.3g} s"
+        words = name if len(self.frames) > 1 or is_static(self.args) else f"{name}; {shown.time:.3g} s"
         drawn = draw_strip(
             panels, cameras, value_range=look.limits, title=words, size=size, columns=columns, ground=look.ground
         )
@@ -194,7 +196,7 @@ class Previews:
                     ground=look.ground,
                     fineness=1,
                 )
-            yield strip.draw(views, f"{name}; {shown.time:.2f} s")
+            yield strip.draw(views, name if is_static(self.args) else f"{name}; {shown.time:.2f} s")
             bar.update()
 
     def _kept(self) -> Iterator[Shown]:

@@ -14,6 +14,7 @@ from warp_corot.inputs.device import checked_device
 from warp_corot.inputs.stopwatch import WATCH
 
 from .compiling import compiling_said
+from .implicit import unfinished
 from .say import complain, interrupt_status, kept_so_far
 from .summary import length, milliseconds, pressure, wall_time
 from .waiting import progress_bar
@@ -30,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: Newton is missing, bad options, or a bad stage; nothing was simulated or written.
     """
-    from warp_corot.io.write.animate import Recording, frame_count, rounding, signals_held_back
+    from warp_corot.io.write.animate import Recording, frame_count, rounding, shortening, signals_held_back
     from warp_corot.io.write.usd.pieces import PieceStore
     from warp_corot.newton.stages.stage import StageOptions
     from warp_corot.newton.stages.steps import StageSimulation
@@ -64,7 +65,8 @@ def run(args: argparse.Namespace) -> int:
         )
     count = frame_count(args.duration, sim.fps)
     writer = sim.writer(args.output, show_stress=args.show_stress, flatten=args.flatten)
-    for note in filter(None, [*sim.parts.notes, rounding(args.duration, sim.fps)]):
+    shortened = None if args.dt is None else shortening(args.dt, sim.fps)
+    for note in filter(None, [*sim.parts.notes, rounding(args.duration, sim.fps), shortened]):
         complain(note, kind="note")
     done = Recording(writer.path)
     try:
@@ -157,7 +159,7 @@ def _steps(sim: StageSimulation) -> str:
     if not solves.steps:
         return f"{milliseconds(sim.dt)}, largest stable one about {milliseconds(sim.solver.stable_dt)}"
     text = f"{milliseconds(sim.dt)}, implicit, {solves.linear_iterations / solves.steps:.0f} iterations each"
-    return text + (f"; {solves.unfinished} did not converge" if solves.unfinished else "")
+    return text + unfinished(solves, "steps", "shorten the steps (--dt)")
 
 
 def _displacement(sim: StageSimulation) -> float:

@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
         _record(args, shared, ready, done, table, previews)
         if previews is not None:
             with WATCH.part("drawing"):
-                previews.draw(ready.bodies, title_of(ready.bodies))
+                previews.draw(ready.bodies, title_of(ready.bodies, ready.sim.gravity))
     except KeyboardInterrupt as signalled:
         complain(f"interrupted; {kept_so_far(done)}", kind="")
         return interrupt_status(signalled)
@@ -154,7 +154,7 @@ def _record(
         record(
             sim,
             shared.output,
-            duration=ready.duration,
+            duration=ready.duration or None,
             fps=shared.fps,
             surface=_surfaces(bodies),
             tets=any(body.args.draw_tets for body in bodies) or None,

@@ -17,9 +17,6 @@ from .implicit import is_static
 from .ranks import are_several
 from .touching import Touched
 
-#: The linear tolerance of steps in which bodies stay at rest.
-STILL = 1e-6
-
 
 def check_static(args: argparse.Namespace, *, touches: bool, remeshes: bool) -> None:
     """Check the options for static answers.
@@ -80,7 +77,7 @@ def _rest_in_contact(sim: Simulation) -> str:
 
 
 def static_integrator(args: argparse.Namespace, bodies: Sequence[Body], touched: Touched) -> Integrator:
-    """The steps from one frame of a static answer to the next. Bodies that only contact holds stay at rest.
+    """The steps from one frame of a static answer to the next; there are none for bodies that only contact holds.
 
     Raises:
         InputError: They do not stay at rest, as something moves.
@@ -88,8 +85,13 @@ def static_integrator(args: argparse.Namespace, bodies: Sequence[Body], touched:
     held = all(body.soft.conditions.held_mask().any() for body in bodies)
     if touched.contact is None or held:
         return QuasiStatic(1.0 / args.fps)
-    if touched.moves or any(body.loads for body in bodies):
+    if moves(bodies, touched):
         raise InputError(
             "--static: tools and loads that move can only follow bodies that are held; add --fix, or leave out --static"
         )
-    return BackwardEuler(1.0 / args.fps, linear_tolerance=STILL)
+    return BackwardEuler(1.0 / args.fps)  # makes no step
+
+
+def moves(bodies: Sequence[Body], touched: Touched) -> bool:
+    """Whether loads or tools move, so that bodies at rest follow them from frame to frame."""
+    return touched.moves or any(body.loads for body in bodies)

@@ -29,13 +29,15 @@ def make_simulation(
 
     ``others`` are the ranks that get parts of the bodies, if there are any.
     """
-    from warp_corot.io.write.animate import steps_per_frame
+    from warp_corot.io.write.animate import shortening, steps_per_frame
 
     check_static(args, touches=touched.contact is not None, remeshes=any(body.remesh for body in bodies))
     first = bodies[0].subject
     damping = first.damping if args.damping is None else args.damping
     viscosity = args.viscosity or 0.0
     SymplecticEuler(args.dt, damping, viscosity)  # checks all values; the step is shortened later
+    if args.dt is not None and (note := shortening(args.dt, args.fps)):
+        first.notes.append(note)
     integrator: Integrator
     if is_static(args):
         integrator = static_integrator(args, bodies, touched)

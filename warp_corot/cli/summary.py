@@ -17,7 +17,7 @@ from warp_corot.mesh import TetForest
 from warp_corot.solvers import INTEGRATORS
 
 from . import compiling
-from .implicit import solved
+from .implicit import is_static, solved
 from .remesh import remesh_rows
 
 if TYPE_CHECKING:
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 #: Maximum number of regions whose materials are listed.
 MOST_KINDS = 8
+#: What loads do to a body, for its title.
+DONE = {"pull": "pulled", "twist": "twisted", "press": "pressed"}
 
 
 def summary(
@@ -52,28 +54,27 @@ def summary(
         rested: Lines on the static answers of the bodies.
     """
     shared = bodies[0].args
+    static = is_static(shared)
     integrator = asdict(sim.integrator)  # type: ignore[call-overload]
-    damping = f"damping {integrator['damping']:g} /s"
+    damping = "" if static else f", damping {integrator['damping']:g} /s"
     if integrator["viscosity"]:
         damping += f", viscosity {integrator['viscosity']:g} s"
-    stepping = max(done.stepping, 1e-9)
     height = max(body.subject.height for body in bodies)
     at_end = f"{length(done.final_displacement)} at the end ({done.final_displacement / height:.1%} of the height)"
-    at_last = " (at the end)" if sim.remeshing.every else ""
+    shown = "" if static else f", {done.simulated:.4g} s"
     lines, ranks = [], process_count()
     for body in bodies:
         lines += [f"{body.subject.name}, {body.held.words}", *aligned(_of_body(body))]
     rows = [
         *remesh_rows(sim, done),
         *touched,
-        ("gravity", f"{' '.join(f'{g:g}' for g in sim.gravity)} m/s^2, {damping}"),
-        *[("static", line) for line in rested],
-        *_time_step(sim, at_last),
-        ("speed", f"{done.steps / stepping:.0f} steps/s, {done.simulated / stepping:.3g} times real time"),
+        ("gravity", f"{' '.join(f'{g:g}' for g in sim.gravity)} m/s^2{damping}"),
+        *[("static", f"the first frame is {line}" if done.steps else line) for line in rested],
+        *_time_step(sim, done, static),
         ("wall time", wall_time()),
         ("displacement", f"{length(done.largest_displacement)} largest, {at_end}"),
         ("device", f"{sim.device} ({sim.device.name})" + (f", {ranks} ranks" if ranks > 1 else "")),
-        ("written", f"{done.path}, {done.frames} frames, {done.simulated:.4g} s"),
+        ("written", f"{done.path}, {done.frames} frame{'s' * (done.frames > 1)}{shown}"),
     ]
     rows += [("also written", str(path)) for path in shared.also or ()]
     for name, path in (("preview", shared.preview), ("table", shared.csv)):
@@ -90,12 +91,37 @@ def wall_time() -> str:
     return f"{sum(WATCH.parts.values()):.2f} s: {', '.join(parts)}"
 
 
-def title_of(bodies: Sequence[Body]) -> str:
-    """The title of a picture: the body, and its support."""
-    names, held = [body.subject.name for body in bodies], bodies[0].held
+def title_of(bodies: Sequence[Body], gravity: Sequence[float]) -> str:
+    """The title of a picture: the bodies, and what happens to them under this gravity [m/s^2]."""
+    names = [body.subject.name for body in bodies]
     left = len(names) - NAMED
-    name = ", ".join(names[:NAMED]) + (f" and {left} more" if left > 0 else "")
-    return f"{name}, {(held.title or held.words) if len(bodies) == 1 else 'dots where they are held'}"
+    words = [", ".join(names[:NAMED]) + (f" and {left} more" if left > 0 else "")]
+    if not any(body.remesh for body in bodies):
+        words.append(f"{sum(len(body.soft.mesh.tets) for body in bodies):,} elements")
+    young = np.unique(np.concatenate([np.ravel(body.soft.material.isotropic.young) for body in bodies]))
+    words += [pressure(float(young[0]))] if len(young) == 1 else []
+    return ", ".join([*words, *_happening(bodies, any(gravity))])
+
+
+def _happening(bodies: Sequence[Body], heavy: bool) -> list[str]:
+    """What happens to bodies, which may have weight, in words."""
+    args, held = bodies[0].args, [body.held for body in bodies if body.held.count]
+    kinds = {load.kind for body in bodies for load in body.loads}
+    words = ["at rest"] if is_static(args) else []
+    words += [word for kind, word in DONE.items() if kind in kinds]
+    if args.tool:
+        words.append("pressed by a tool" if len(args.tool) == 1 else f"pressed by {len(args.tool)} tools")
+    if args.drop is not None:
+        words.append("dropped on a ground")
+    elif args.ground is not None:
+        words.append("on a ground")
+    elif not held:
+        words.append("falling freely" if heavy else "moving freely")
+    elif heavy and not words:
+        words.append("under its weight" if len(bodies) == 1 else "under their weight")
+    if held:
+        words.append(held[0].title if len(bodies) == 1 and held[0].title else "held at the dots")
+    return words
 
 
 def _of_body(body: Body) -> list[tuple[str, str]]:
@@ -165,14 +191,23 @@ def _values(young: float, poisson: float, density: float) -> str:
     return f"E = {pressure(float(young))}, nu = {poisson:g}, rho = {density:g} kg/m^3"
 
 
-def _time_step(sim: Simulation, at_last: str) -> list[tuple[str, str]]:
-    """The length of steps, and their limit or the iterations that they needed."""
-    if not sim.integrator.is_implicit:
-        return [
-            ("time step", f"{_steps(sim)}; largest stable one at rest about {milliseconds(sim.stable_dt)}{at_last}")
-        ]
-    name = next(name for name, kind in INTEGRATORS.items() if type(sim.integrator) is kind)
-    return [("time step", f"{milliseconds(sim.dt)}, {name}"), ("solves", solved(sim) or "none")]
+def _time_step(sim: Simulation, done: Recording, static: bool) -> list[tuple[str, str]]:
+    """The length of steps, their limit or the iterations that they needed, and the speed; states of rest have no
+    steps in time."""
+    found = solved(sim, static)
+    rows = [("solves", found)] if found else []
+    if static:
+        return rows
+    stepping = max(done.stepping, 1e-9)
+    speed = ("speed", f"{done.steps / stepping:.0f} steps/s, {done.simulated / stepping:.3g} times real time")
+    if sim.integrator.is_implicit:
+        name = next(name for name, kind in INTEGRATORS.items() if type(sim.integrator) is kind)
+        return [("time step", f"{milliseconds(sim.dt)}, {name}"), *rows, speed]
+    at_last = " (at the end)" if sim.remeshing.every else ""
+    return [
+        ("time step", f"{_steps(sim)}; largest stable one at rest about {milliseconds(sim.stable_dt)}{at_last}"),
+        speed,
+    ]
 
 
 def _steps(sim: Simulation) -> str:

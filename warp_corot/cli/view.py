@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
         own=[body.subject.skin or body.subject.surface for body in ready.bodies],
         made=lambda sim: _carry_over(ready, asked[0], sim),
         run_file=lambda sim: run_text(asked, sim),
-        title=title_of(ready.bodies),
+        title=title_of(ready.bodies, ready.sim.gravity),
     )
     try:
         print(f"the page is at {page.address} (Ctrl-C ends it)", flush=True)

@@ -22,7 +22,7 @@ def record(
     sim: Simulation,
     path: str | PathLike[str],
     *,
-    duration: float,
+    duration: float | None,
     fps: float = 24.0,
     world: int | None = None,
     tets: bool = True,
@@ -40,7 +40,7 @@ def record(
     Args:
         sim: The simulation; it continues from its current state.
         path: A .usd, .usdc or .usda file in a folder that all ranks can see.
-        duration: Simulated time [s], rounded to whole frames.
+        duration: Simulated time [s], rounded to whole frames; None: the current state is the only frame.
         fps: Frames per second of simulated time.
         world: The world that is drawn; must be given if there are several.
         tets: Whether to write the tetrahedra; if not, only the surface is written.
@@ -59,7 +59,7 @@ def record(
     if not isinstance(sim, Simulation):
         raise InputError("sim must be a Simulation of warp_corot.distributed; warp_corot.record takes others")
     checked_path(path, "path")
-    count = frame_count(duration, fps)
+    count = 0 if duration is None else frame_count(duration, fps)
     if world is None and sim.worlds > 1:
         raise InputError(f"the simulation has {sim.worlds} worlds; choose the one to draw, for example world=0")
     if not 0 <= (world or 0) < sim.worlds:

@@ -153,11 +153,27 @@ def rounding(duration: float, fps: float) -> str | None:
     return f"the last frame shows {end:.4g} s, not {duration:.4g} s, since frames come every {1.0 / fps:.3g} s{cure}"
 
 
+def shortening(dt: float, fps: float) -> str | None:
+    """What to tell users about a step [s] that is shortened until a whole number makes a frame, or that is longer than
+    a second; None otherwise."""
+    steps = steps_per_frame(fps, dt)
+    used, asked = 1.0 / (fps * steps), f"{dt:g} s" if dt > 1.0 else f"{1e3 * dt:.4g} ms"
+    cure = f"; did you mean --dt {dt:g}ms?"
+    if dt <= 1.0:
+        rates = (f"{1.0 / (n * dt):.4g}" for n in (steps, *range(1, 100)))
+        exact = [rate for rate in rates if math.isclose((count := 1.0 / (float(rate) * dt)), round(count))]
+        cure = f"; with --fps {exact[0]} they take that" if exact else f"; --dt {used:.7g} says so exactly"
+    if not math.isclose(used, dt, rel_tol=1e-3):
+        whole = f"since a whole number of them makes a frame of {1e3 / fps:.4g} ms"
+        return f"steps take {1e3 * used:.4g} ms, not {asked}, {whole}{cure}"
+    return f"steps take {asked}{cure}" if dt > 1.0 else None
+
+
 def record(
     sim: Simulation,
     path: str | PathLike[str],
     *,
-    duration: float,
+    duration: float | None,
     fps: float = 24.0,
     world: int | None = None,
     surface: Surface | Sequence[Surface | None] | None = None,
@@ -180,7 +196,7 @@ def record(
     Args:
         sim: The simulation; it continues from its current state.
         path: A .usd, .usdc or .usda file; a former file stays until the first frames are complete.
-        duration: Simulated time [s], rounded to whole frames.
+        duration: Simulated time [s], rounded to whole frames; None: the current state is the only frame.
         fps: Frames per second of simulated time.
         world: The world that is drawn; must be given if there are several.
         surface: A surface in place of the mesh's own, for several bodies one each (None for the mesh's own): from
@@ -213,7 +229,7 @@ def record(
     if not isinstance(sim, Simulation):
         raise InputError(f"sim is {shown(sim)}; it must be a Simulation, for example Simulation(body)")
     checked_path(path, "path")
-    count = frame_count(duration, fps)
+    count = 0 if duration is None else frame_count(duration, fps)
     others = [also_writer(Path(other)) for other in also]
     if world is None and sim.worlds > 1:
         raise InputError(f"the simulation has {sim.worlds} worlds; choose the one to draw, for example world=0")

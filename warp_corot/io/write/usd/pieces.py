@@ -3,8 +3,9 @@
 If a process dies while it saves a USD file in place, the file does not open. So frames are collected and
 written as *pieces*, complete binary files in a folder ``NAME.usd.pieces`` beside the stage, each written under a
 temporary name, synced to disk and renamed. After each piece a small root stage that plays all of them (value clips)
-replaces the file at the final path in one rename. At the end everything is joined into one file, again written
-under a temporary name and renamed over the final path, and the pieces are removed.
+replaces the file at the final path in one rename. A thread waits for the disk while the next frames are made. At the
+end everything is joined into one file, again written under a temporary name and renamed over the final path, and the
+pieces are removed.
 
 Attributes that change only now and then, like the topology of a mesh, have a sample where they change. A clip does not
 play samples of former clips, so each piece begins with the current values. Between two samples of equal length OpenUSD
@@ -18,6 +19,7 @@ import re
 import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 from typing import IO, Any
 
@@ -43,8 +45,8 @@ class PieceStore:
 
     Args:
         path: The stage, .usd, .usda or .usdc. A former file stays until the first piece is complete.
-        flush_seconds: Approximate wall time [s] of frames that a sudden end may lose. It is doubled, and more, if
-            writing would otherwise take more than a fifth of the time.
+        flush_seconds: Approximate wall time [s] of frames that a sudden end may lose, besides those of a piece that is
+            just being written. It is doubled, and more, if writing would otherwise take more than a fifth of the time.
         flush_bytes: A piece is also written when this much data waits.
 
     Raises:
@@ -73,7 +75,9 @@ class PieceStore:
         self._carried: Samples = {}  # the values at the time of the last written piece
         self._pieces: list[tuple[float, float]] = []  # first and last time code of each
         self._repeated: list[frozenset[str]] = []  # the initial values of each piece that are not its own samples
-        self._pending: list[tuple[float, Samples]] = []
+        self._pending: list[tuple[float, Samples]] = []  # not yet in a complete piece
+        self._thread = ThreadPoolExecutor(1)
+        self._writing: tuple[int, Future[None]] | None = None  # the first waiting frames, which a thread writes now
         self._pending_bytes = 0
         self._flush_seconds = flush_seconds
         self._flush_bytes = flush_bytes
@@ -108,7 +112,7 @@ class PieceStore:
         unknown = samples.keys() - self._varying.keys()
         assert not unknown, f"not declared as varying: {unknown}"
         now = time.monotonic()
-        if not self._pieces and not self._pending:  # time before the first frame cannot lose a frame
+        if not self._last:  # time before the first frame cannot lose a frame
             self._last_flush = self._last_add = now
         held = self._held_over(samples)
         if held:
@@ -120,7 +124,7 @@ class PieceStore:
         interval = max(self._flush_seconds, 4.0 * self._flush_cost)
         # The next frame comes after another gap of this length, which must not exceed the interval.
         if now - self._last_flush + gap > interval or self._pending_bytes >= self._flush_bytes:
-            self.flush()
+            self._flush(now)
 
     def flush(self) -> None:
         """Write the waiting frames as a piece and let the stage play it.
@@ -128,17 +132,20 @@ class PieceStore:
         Raises:
             OSError: As in `add`.
         """
-        if not self._pending:
-            return
-        started = time.monotonic()
+        self._flush(time.monotonic(), settled=True)
+
+    def _flush(self, now: float, settled: bool = False) -> None:
         try:
-            self._write_piece(len(self._pending))
+            self._settle()
+            if self._pending:
+                self._begin_piece(len(self._pending))
+            if settled:
+                self._settle()
         except OSError as error:
             self._broken = True
             self._keep_what_fits(len(self._pending) // 2)
             raise OSError(f"{error}; {self._kept()}") from None
-        self._last_flush = time.monotonic()
-        self._flush_cost = self._last_flush - started
+        self._last_flush = now
 
     def finish(self, transform: Callable[[Samples], Mapping[str, Any]] | None = None) -> None:
         """Join all frames into one file at the final path and remove the pieces.
@@ -149,16 +156,15 @@ class PieceStore:
         Raises:
             OSError: The joined file could not be written. The pieces stay, and the stage plays them.
         """
-        if self._broken:  # the error was raised before; the root stage plays the written pieces
-            self._release()
-            return
-        if self._static is None or not (self._pieces or self._pending):
+        # After an error, which was raised before, the root stage plays the written pieces.
+        if self._broken or self._static is None or not self._last:
             self._release()
             return
         joined = Sdf.Layer.CreateAnonymous(self.path.suffix)
         joined.TransferContent(self._static)
         opened: list[Sdf.Layer] = []  # kept open, because the joined layer uses arrays in their mapped files
         try:
+            self._settle()
             for time_code, samples in self._with_bar(opened):
                 if transform:
                     samples = {**samples, **transform(samples)}
@@ -179,30 +185,49 @@ class PieceStore:
         self._remove_run(self._run)
         self._remove_stale_runs()
 
-    def _write_piece(self, count: int) -> None:
-        """Write the first ``count`` waiting frames as a piece, and let the stage play it.
+    def _begin_piece(self, count: int) -> None:
+        """Begin to write the first ``count`` waiting frames as a piece that the stage will play.
 
         Raises:
-            OSError: It cannot be written; all frames still wait.
+            OSError: The run's folder cannot be made.
         """
         if not self._is_open:
             self._open_run()
         frames = self._pending[:count]
         piece = self._run / f"piece-{len(self._pieces):06d}.usdc"
-        first, last = frames[0][0], frames[-1][0]
+        root = self._root_layer([*self._pieces, (frames[0][0], frames[-1][0])])
+        self._writing = count, self._thread.submit(self._write_piece, self._piece_layer(frames), piece, root)
+        self._pending_bytes = 0
+
+    def _write_piece(self, layer: Sdf.Layer, piece: Path, root: Sdf.Layer) -> None:
+        started = time.monotonic()
         try:
-            self._write(self._piece_layer(frames), piece)
-            self._write(self._root_layer([*self._pieces, (first, last)]), self.path)
+            self._write(layer, piece)
+            self._write(root, self.path)
         except OSError:
             with contextlib.suppress(OSError):
                 piece.unlink(missing_ok=True)
             raise
-        self._pieces.append((first, last))
+        self._flush_cost = time.monotonic() - started
+
+    def _settle(self) -> None:
+        """Wait for the piece that is being written, if any.
+
+        Raises:
+            OSError: It could not be written; its frames still wait.
+        """
+        if self._writing is None:
+            return
+        count, written = self._writing
+        wait([written])
+        self._writing = None
+        written.result()
+        frames = self._pending[:count]
+        self._pieces.append((frames[0][0], frames[-1][0]))
         self._repeated.append(frozenset(self._carried.keys() - frames[0][1].keys()))
         for _, samples in frames:
             self._carried |= samples
         self._pending = self._pending[count:]
-        self._pending_bytes = 0 if not self._pending else self._pending_bytes
         if len(self._pieces) == 1:
             self._remove_stale_runs()
 
@@ -214,7 +239,8 @@ class PieceStore:
                 count -= 1  # the values repeated just before a frame are written with it
                 continue
             try:
-                self._write_piece(count)
+                self._begin_piece(count)
+                self._settle()
             except OSError:
                 count //= 2
             else:
@@ -365,4 +391,5 @@ class PieceStore:
         if self._lock:
             self._lock.close()
             self._lock = None
+        self._thread.shutdown()
         self._pending, self._root = [], None
