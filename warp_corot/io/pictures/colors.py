@@ -51,12 +51,12 @@ class VertexAverage:
     """Averages values [T] of tetrahedra over the tetrahedra around each node, weighted (with their volumes), to [N]."""
 
     def __init__(self, tets: NDArray[np.int32], weights: NDArray[np.float64], nodes: int):
-        from scipy.sparse import csc_array
-
-        ends = np.arange(0, 4 * len(tets) + 1, 4)
-        sums = csc_array((np.repeat(weights, 4), np.ravel(tets), ends), (nodes, len(tets)), dtype=np.float64).tocsr()
-        total = sums.sum(axis=1)
-        self._matrix = sums.multiply(1.0 / np.where(total > 0.0, total, 1.0)[:, None]).tocsr()
+        self._corners = np.ascontiguousarray(tets).reshape(-1)
+        self._weights = np.asarray(weights, dtype=np.float64)
+        self._nodes = nodes
+        total = np.bincount(self._corners, np.repeat(self._weights, 4), minlength=nodes)
+        self._inverse = 1.0 / np.where(total > 0.0, total, 1.0)
 
     def __call__(self, values: ArrayLike) -> NDArray[np.float64]:
-        return self._matrix @ np.asarray(values, dtype=np.float64)
+        weighted = np.asarray(values, dtype=np.float64) * self._weights
+        return np.bincount(self._corners, np.repeat(weighted, 4), minlength=self._nodes) * self._inverse
