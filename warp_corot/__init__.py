@@ -30,7 +30,7 @@ else:  # hidden from type checkers, which would accept any name
                 globals()[name] = public_name(name)
             else:  # __all__, or a folder of the package
                 api = import_module(".api", __name__)
-                globals().update({"__all__": api.__all__} | {each: getattr(api, each) for each in api.__all__})
+                globals().update({"__all__": api.__all__} | {each: public_name(each) for each in api.__all__})
         if name not in globals():
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         return globals()[name]

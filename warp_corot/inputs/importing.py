@@ -31,9 +31,11 @@ def uncollected() -> Iterator[None]:
 
 def public_name(name: str) -> object:
     """The object that a name of the public interface stands for; imports no more modules than it needs."""
+    from .arguments import explained
+
     module = modules_of_names()[name]
     if module != PACKAGE and hasattr(source := import_module(module), name):
-        return getattr(source, name)
+        return explained(getattr(source, name))
     return import_module(f"{module}.{name}")
 
 

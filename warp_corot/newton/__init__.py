@@ -9,6 +9,8 @@ interface is used. It is imported when one of these names is first used, and ins
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from warp_corot.inputs.arguments import explained
+
 if TYPE_CHECKING:
     from warp_corot.newton.stages.material import StageOptions
     from warp_corot.newton.stages.steps import StageSimulation
@@ -47,7 +49,7 @@ _MODULES = {
 def __getattr__(name: str) -> Any:
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    found = getattr(import_module(_MODULES[name], __name__), name)
+    found = explained(getattr(import_module(_MODULES[name], __name__), name))
     globals()[name] = found
     return found
 
