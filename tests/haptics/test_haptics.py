@@ -210,6 +210,23 @@ def test_a_tool_follows_the_hand_and_the_thread_ends(device):
         loop.start()
 
 
+def test_a_report_without_readings_says_so():
+    sim, tool = scene("cpu")
+    said = str(HapticLoop(sim, tool, MouseDevice((0.02, 0.02, TOP + RADIUS))).report)
+    assert said.count("not measured yet") == 2
+    assert "nan" not in said
+
+
+def test_the_first_state_does_not_count_as_run_time(monkeypatch):
+    """For the first one kernels may be compiled for longer than the run."""
+    sim, tool = scene("cpu")
+    advance, naps = sim.advance, [0.3]
+    monkeypatch.setattr(sim, "advance", lambda every: (time.sleep(naps.pop() if naps else 0.0), advance(every)))
+    with HapticLoop(sim, tool, MouseDevice((0.02, 0.02, TOP + RADIUS))) as loop:
+        loop.run(0.1, every=0.002)
+    assert sim.total_time > 0.003
+
+
 class Failing(MouseDevice):
     """A device that is unplugged at the third reading, or at the third force."""
 

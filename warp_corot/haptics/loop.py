@@ -158,7 +158,7 @@ class HapticLoop:
         """Advance the simulation in real time, or as fast as it goes if that is slower.
 
         Args:
-            seconds: Wall time [s].
+            seconds: Wall time [s] after the first state, for which kernels may have to be compiled.
             every: Simulated time between two states that the loop reads [s].
 
         Returns:
@@ -171,6 +171,7 @@ class HapticLoop:
         """
         _positive(seconds, "seconds", "s")
         _positive(every, "every", "s")
+        self._sim.advance(every)
         begun, simulated = time.perf_counter(), self._sim.total_time
         while (past := time.perf_counter() - begun) < seconds:
             if self.error is not None:

@@ -47,11 +47,12 @@ class Report:
     stiffness: float
 
     def __str__(self) -> str:
+        each = f"; {1e6 * self.busy:.0f} us each" if self.readings else ""
         return "\n".join(
             [
-                f"readings   {self.readings}, {self.missed} periods without one; {1e6 * self.busy:.0f} us each",
-                f"period     {_ms(self.period)} median, {_ms(self.period_99)} 99 %, {_ms(self.period_most)} longest",
-                f"delay      {_ms(self.delay)} median, {_ms(self.delay_99)} 99 %, {_ms(self.delay_most)} longest",
+                f"readings   {self.readings}, {self.missed} periods without one{each}",
+                f"period     {_said(self.period, self.period_99, self.period_most)}",
+                f"delay      {_said(self.delay, self.delay_99, self.delay_most)}",
                 f"updates    {self.updates} states of the simulation, stiffness {self.stiffness:.3g} N/m at last",
                 f"energy     at most {1e3 * self.put_out:.3g} mJ more out than in; {self.damped} forces changed, "
                 f"{self.beyond} moves too fast for the bound",
@@ -82,5 +83,7 @@ class Times:
         return float(np.percentile(values, percent)) if len(values) else float("nan")
 
 
-def _ms(seconds: float) -> str:
-    return f"{1e3 * seconds:.3g} ms"
+def _said(median: float, share: float, longest: float) -> str:
+    if not median >= 0.0:
+        return "not measured yet"
+    return f"{1e3 * median:.3g} ms median, {1e3 * share:.3g} ms 99 %, {1e3 * longest:.3g} ms longest"
