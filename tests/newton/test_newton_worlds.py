@@ -1,5 +1,7 @@
 """Many worlds of a Newton model: independent, reset separately, recorded in graphs."""
 
+import warnings
+
 import numpy as np
 import pytest
 import warp as wp
@@ -129,6 +131,32 @@ def test_a_replayed_step_says_what_was_wrong(device):
     with pytest.raises(wc.InputError, match="state_in is not finite"):
         solver.check()
     solver.check()
+
+
+@pytest.mark.parametrize(
+    ("steps", "copied", "stuck"), [(1, False, True), (3, False, True), (2, False, False), (1, True, False)]
+)
+def test_a_recording_that_does_not_go_on_is_said_once(device, steps, copied, stuck):
+    """A graph with an odd number of swaps reads the same state again, unless the result is copied back."""
+    model = worlds(1, device)
+    solver = wn.SolverCorotated(model)
+    states = [model.state(), model.state()]
+    solver.step(states[0], states[0], None, None, 1e-4)
+    with wp.ScopedCapture(device=device) as capture:
+        for number in range(steps):
+            solver.step(states[number % 2], states[1 - number % 2], None, None, 1e-4)
+        if copied:
+            states[0].assign(states[1])
+    heights = []
+    for _ in range(2):
+        wp.capture_launch(capture.graph)
+        heights.append(states[steps % 2].particle_q.numpy()[:, 2].mean())
+    assert (heights[0] == heights[1]) == (stuck and steps == 1)  # else a replay repeats the last step of the one before
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        solver.check()
+        solver.check()
+    assert len([each for each in said if "nothing copies it back" in str(each.message)]) == stuck
 
 
 @pytest.mark.parametrize("recorded", [False, True])

@@ -19,6 +19,7 @@ from .following import Following
 from .implicit import ImplicitSteps
 from .library import CouplingInterface, SolverBase, newton
 from .others import Others
+from .recordings import Recordings
 from .stability import SAFETY, check_substep, stable_steps
 from .state import register_custom_attributes
 from .steps import Steps
@@ -140,6 +141,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
         self._contacts = Contacts(model, self_contact_margin)
         self._others = Others(model, rigid_solver, particle_contact)
         self._elsewhere = Elsewhere(model, self._others.has_bodies)
+        self._recordings = Recordings(self.device)
         self._is_implicit = integrator == "implicit"
         parts = (model, self.tetrahedra, self._contacts, self._others, damping)
         self._steps = ImplicitSteps(*parts) if self._is_implicit else Steps(*parts)
@@ -229,11 +231,13 @@ class SolverCorotated(SolverBase, CouplingInterface):
         else:
             self._steps.launch(step, count, following)
         self._elsewhere.keep(state_out)
+        self._recordings.follow(state_in, state_out)
         if self.device.is_cpu and not self.device.is_capturing:
             self.check()
 
     def check(self) -> None:
-        """Report errors since the last call, and warn of recorded steps with too few substeps.
+        """Report errors since the last call, and warn of recorded steps with too few substeps, and of recordings whose
+        replays do not go on from one another.
 
         Waits for the device.
 
@@ -252,6 +256,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
                 UserWarning,
                 stacklevel=2,
             )
+        self._recordings.check()
         self._steps.report.check(self.stable_dt, self._following)
         if self._following is not None and self._following.was_recorded:
             self._following.recover()
