@@ -110,7 +110,8 @@ def test_the_given_surface_is_drawn(folder, capsys):
     first, most, last = counts(capsys.readouterr().out)
     assert most > first or last < first
     stage, _ = opened(folder / "a.usd")
-    drawn = UsdGeom.Mesh.Get(stage, "/SoftBody/ball")
+    drawn = UsdGeom.Mesh.Get(stage, "/SoftBody/surface")
+    assert drawn.GetPrim().GetDisplayName() == "ball"
     assert len(drawn.GetFaceVertexCountsAttr().Get()) == len(surface.triangles)
     assert drawn.GetFaceVertexIndicesAttr().GetTimeSamples() == []
     assert len(drawn.GetPointsAttr().Get(4)) == len(drawn.GetPointsAttr().Get(0))

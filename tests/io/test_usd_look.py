@@ -62,7 +62,8 @@ def test_a_prim_keeps_its_faces_texture_and_materials(tmp_path, mirrored):
     sim.body.displacements = np.tile([0.0, 0.0, 0.3], (len(mesh.points), 1))
     path = tmp_path / "a.usd"
     stage = still(sim, path, surface=tmp_path / "models" / "cube.usda")
-    cube = UsdGeom.Mesh.Get(stage, "/SoftBody/Cube")
+    cube = UsdGeom.Mesh.Get(stage, "/SoftBody/surface")
+    assert cube.GetPrim().GetDisplayName() == "Cube"
     np.testing.assert_allclose(cube.GetPointsAttr().Get(0), world + np.array([0, 0, 0.3]), atol=1e-7)
     assert UsdGeom.Xformable(cube).GetLocalTransformation() == Gf.Matrix4d(1)
     assert list(cube.GetFaceVertexCountsAttr().Get()) == [4] * 6

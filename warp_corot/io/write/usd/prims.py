@@ -96,11 +96,11 @@ class SkinPrim:
             mesh.CreateOrientationAttr(handed)
         else:
             mesh = UsdGeom.Mesh.Define(stage, self._path)
-            mesh.GetPrim().SetDisplayName(self._skin.name)
             declare_triangles(mesh)
             if not self._changing:
                 for path, value in triangle_samples(self._path, surface.triangles).items():
                     stage.GetAttributeAtPath(path).Set(value)
+        mesh.GetPrim().SetDisplayName(self._skin.name)
         if self._with_normals:
             mesh.CreateNormalsAttr()
             mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
@@ -153,7 +153,9 @@ def _are_same(one: SurfaceMesh, other: SurfaceMesh) -> bool:
 
 
 def skin_paths(skins: Sequence[Skin]) -> list[str]:
-    """A distinct path for each skin, after its name."""
+    """The path of the only skin, or a distinct one for each, after its name."""
+    if len(skins) == 1:
+        return [SURFACE]
     taken = {TETS, MATERIALS, PHYSICS, OBSTACLES}
     paths = []
     for skin in skins:

@@ -57,9 +57,10 @@ class UsdWriter:
     Mirrored tetrahedra are written with two indices swapped, so that all are right-handed as the schema requires.
 
     With ``skins`` these surfaces replace ``surface``, and the TetMesh is only written if ``tets`` is set.
-    Each is a Mesh under its own name with ``points``, ``normals``, ``extent`` and the primvar ``vonMises`` (vertex
-    [Pa]) in each frame, coloured in the same way. A skin with a prim's look has that prim's faces, primvars, subsets
-    and materials (copied to ``/SoftBody/materials``) and colours instead, and vertex normals if the prim had normals.
+    A single one is the Mesh ``surface``; several are Meshes under their own names. Each has ``points``, ``normals``,
+    ``extent`` and the primvar ``vonMises`` (vertex [Pa]) in each frame, coloured in the same way. A skin with a prim's
+    look has that prim's faces, primvars, subsets and materials (copied to ``/SoftBody/materials``) and colours instead,
+    and vertex normals if the prim had normals.
 
     For a body whose mesh changes, ``tetVertexIndices`` and all attributes per tetrahedron, node or face are time
     samples too; those that are not given in each frame are given when the mesh changes, and hold until then. OpenUSD
