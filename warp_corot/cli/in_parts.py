@@ -30,9 +30,8 @@ from .meshes_in_parts import (
     organ_in_parts,
 )
 from .ranks import are_several, hands_out
-from .say import complain, kept_so_far
-from .summary import aligned, length, milliseconds, wall_time
-from .waiting import progress_bar
+from .say import complain, early_end
+from .summary import aligned, length, milliseconds, speed, wall_time
 
 if TYPE_CHECKING:
     from warp_corot.distributed import Simulation
@@ -86,7 +85,7 @@ def run_in_parts(args: argparse.Namespace) -> int:
         InputError: Bad options; nothing was simulated or written.
     """
     import warp_corot.distributed as wd
-    from warp_corot.io.write.animate import Recording, frame_count, rounding
+    from warp_corot.io.write.animate import Recording, frame_count, progress_bar, rounding
 
     done = Recording(args.output)
     with compiling_said(checked_device(args.device)):
@@ -104,12 +103,8 @@ def run_in_parts(args: argparse.Namespace) -> int:
                 progress(frame, count)
 
             wd.record(sim, args.output, duration=duration, fps=args.fps, progress=each_frame, recording=done)
-    except UnstableError as error:
-        complain(f"{error}; {kept_so_far(done)}")
-        return 3
-    except OSError as error:
-        complain(str(error))
-        return 1
+    except (UnstableError, OSError) as error:
+        return early_end(error, done)
     print(_summary(args, sim, loads, subject, done))
     return 0
 
@@ -213,7 +208,6 @@ def _summary(
     assert isinstance(mesh, ForestPart)
     nodes = sim.following[0].part.numbers.node_count
     held = " or ".join(args.fix or [str(subject.fix)])
-    stepping = max(done.stepping, 1e-9)
     shortest, longest = sim.dt_range
     rows = [
         ("mesh", f"{nodes} nodes, {mesh.element_count} tetrahedra; {sim.elements_here[0]} on rank 0"),
@@ -222,7 +216,7 @@ def _summary(
         *[("moved", str(load)) for load in loads],
         ("gravity", f"{' '.join(f'{g:g}' for g in sim.gravity)} m/s^2"),
         ("time step", f"{milliseconds(shortest)} to {milliseconds(longest)}"),
-        ("speed", f"{done.steps / stepping:.0f} steps/s, {done.simulated / stepping:.3g} times real time"),
+        ("speed", speed(done)),
         ("wall time", wall_time()),
         ("displacement", f"{length(done.largest_displacement)} largest, {length(done.final_displacement)} at the end"),
         ("device", f"{sim.device} ({sim.device.name}), {sim.size} ranks"),

@@ -9,6 +9,8 @@ import sys
 from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any, TextIO
 
+from warp_corot.errors import UnstableError
+
 if TYPE_CHECKING:
     from warp_corot.io.write.animate import Recording
 
@@ -57,6 +59,18 @@ def kept_so_far(done: Recording) -> str:
     if not done.frames:
         return "no frame was written"
     return f"{done.frames} frames, {done.simulated:.3g} s, are kept in {done.path}"
+
+
+def early_end(error: BaseException, done: Recording) -> int:
+    """Say what ended a recording early, and what is kept; returns the exit status."""
+    if isinstance(error, KeyboardInterrupt):
+        complain(f"interrupted; {kept_so_far(done)}", kind="")
+        return interrupt_status(error)
+    if isinstance(error, UnstableError):
+        complain(f"{error}; {kept_so_far(done)}")
+        return 3
+    complain(str(error))
+    return 1
 
 
 def complain(message: str, kind: str = "error") -> None:

@@ -15,9 +15,8 @@ from warp_corot.inputs.stopwatch import WATCH
 
 from .compiling import compiling_said
 from .implicit import unfinished
-from .say import complain, interrupt_status, kept_so_far
-from .summary import length, milliseconds, pressure, wall_time
-from .waiting import progress_bar
+from .say import complain, early_end
+from .summary import aligned, length, milliseconds, pressure, speed, wall_time
 
 if TYPE_CHECKING:
     from warp_corot.io.write.animate import Recording
@@ -31,7 +30,14 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: Newton is missing, bad options, or a bad stage; nothing was simulated or written.
     """
-    from warp_corot.io.write.animate import Recording, frame_count, rounding, shortening, signals_held_back
+    from warp_corot.io.write.animate import (
+        Recording,
+        frame_count,
+        progress_bar,
+        rounding,
+        shortening,
+        signals_held_back,
+    )
     from warp_corot.io.write.usd.pieces import PieceStore
     from warp_corot.newton.stages.stage import StageOptions
     from warp_corot.newton.stages.steps import StageSimulation
@@ -117,14 +123,7 @@ def _end(error: BaseException, writer: SceneWriter, done: Recording) -> int:
         _close(writer, done)
     except OSError as other:
         complain(str(other))
-    if isinstance(error, KeyboardInterrupt):
-        complain(f"interrupted; {kept_so_far(done)}", kind="")
-        return interrupt_status(error)
-    if isinstance(error, UnstableError):
-        complain(f"{error}; {kept_so_far(done)}")
-        return 3
-    complain(str(error))
-    return 1
+    return early_end(error, done)
 
 
 def _summary(source: Path, sim: StageSimulation, writer: SceneWriter, done: Recording) -> str:
@@ -139,19 +138,18 @@ def _summary(source: Path, sim: StageSimulation, writer: SceneWriter, done: Reco
         rows.append(("soft body", f"{body.prim.path}: {size}; {material}"))
     if parts.rigid:
         rows.append(("rigid bodies", ", ".join(parts.rigid)))
-    stepping = max(done.stepping, 1e-9)
     rows += [
         ("colliders", f"{parts.model.shape_count}" + (", with a ground" if parts.ground is not None else "")),
         ("gravity", f"{' '.join(f'{g:.4g}' for g in gravity)} m/s^2"),
         ("time step", _steps(sim)),
-        ("speed", f"{done.steps / stepping:.0f} steps/s, {done.simulated / stepping:.3g} times real time"),
+        ("speed", speed(done)),
         ("wall time", wall_time()),
         ("displacement", f"{length(_displacement(sim))} largest at the end"),
         ("stress", f"colours up to {pressure(writer.stress_range[1])} (von Mises)"),
         ("device", f"{parts.model.device} ({parts.model.device.name})"),
         ("written", f"{done.path}, {done.frames} frames, {done.simulated:.4g} s"),
     ]
-    return "\n".join([str(source), *(f"  {name:<14}{text}" for name, text in rows)])
+    return "\n".join([str(source), *aligned(rows)])
 
 
 def _steps(sim: StageSimulation) -> str:

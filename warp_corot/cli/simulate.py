@@ -19,10 +19,9 @@ from .previews import Previews, check_preview
 from .probing import Table, check_table_path
 from .ranks import Others, hands_out, leads, serve
 from .run_file import bodies_of, check_run_path, write_run
-from .say import complain, interrupt_status, kept_so_far
+from .say import early_end
 from .static import rest
 from .summary import summary, title_of
-from .waiting import progress_bar
 
 if TYPE_CHECKING:
     from warp_corot.io.write.animate import Progress, Recording
@@ -59,15 +58,8 @@ def run(args: argparse.Namespace) -> int:
         if previews is not None:
             with WATCH.part("drawing"):
                 previews.draw(ready.bodies, title_of(ready.bodies, ready.sim.gravity))
-    except KeyboardInterrupt as signalled:
-        complain(f"interrupted; {kept_so_far(done)}", kind="")
-        return interrupt_status(signalled)
-    except UnstableError as error:
-        complain(f"{error}; {kept_so_far(done)}")
-        return 3
-    except OSError as error:
-        complain(str(error))
-        return 1
+    except (KeyboardInterrupt, UnstableError, OSError) as error:
+        return early_end(error, done)
     finally:
         end()
     print(summary(ready.bodies, ready.sim, done, ready.touched.rows, rested))
@@ -147,7 +139,7 @@ def _record(
     previews: Previews | None,
 ) -> None:
     """Step the simulation and write its frames."""
-    from warp_corot.io.write.animate import record
+    from warp_corot.io.write.animate import progress_bar, record
 
     bodies, sim = ready.bodies, ready.sim
     with progress_bar(ready.count) as progress, nullcontext() if table is None else closing(table):

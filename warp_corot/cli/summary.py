@@ -198,16 +198,19 @@ def _time_step(sim: Simulation, done: Recording, static: bool) -> list[tuple[str
     rows = [("solves", found)] if found else []
     if static:
         return rows
-    stepping = max(done.stepping, 1e-9)
-    speed = ("speed", f"{done.steps / stepping:.0f} steps/s, {done.simulated / stepping:.3g} times real time")
     if sim.integrator.is_implicit:
         name = next(name for name, kind in INTEGRATORS.items() if type(sim.integrator) is kind)
-        return [("time step", f"{milliseconds(sim.dt)}, {name}"), *rows, speed]
-    at_last = " (at the end)" if sim.remeshing.every else ""
-    return [
-        ("time step", f"{_steps(sim)}; largest stable one at rest about {milliseconds(sim.stable_dt)}{at_last}"),
-        speed,
-    ]
+        step = f"{milliseconds(sim.dt)}, {name}"
+    else:
+        at_last = " (at the end)" if sim.remeshing.every else ""
+        step = f"{_steps(sim)}; largest stable one at rest about {milliseconds(sim.stable_dt)}{at_last}"
+    return [("time step", step), *rows, ("speed", speed(done))]
+
+
+def speed(done: Recording) -> str:
+    """The speed of stepping, in words."""
+    stepping = max(done.stepping, 1e-9)
+    return f"{done.steps / stepping:.0f} steps/s, {done.simulated / stepping:.3g} times real time"
 
 
 def _steps(sim: Simulation) -> str:

@@ -251,7 +251,7 @@ def record(
     told = {**provenance(sim, joined.fixed), **(about or {})}
     done = Recording(writer.path) if recording is None else recording
     first_step, first_time = sim.total_steps, sim.total_time
-    with _closed_whole(writer, done, others), _bar(count, wanted=progress is None) as bar:
+    with _closed_whole(writer, done, others), progress_bar(count, wanted=progress is None) as bar:
         for frame in range(count + 1):
             with WATCH.part("stepping", into=done):
                 sim.advance_until(first_time + frame / fps)
@@ -272,8 +272,8 @@ def record(
 
 
 @contextmanager
-def _bar(count: int, *, wanted: bool) -> Iterator[Progress]:
-    """A bar on a terminal for long runs."""
+def progress_bar(count: int, *, wanted: bool = True) -> Iterator[Progress]:
+    """A bar on a terminal for long runs, to be called with numbers of frames."""
     from tqdm import tqdm
 
     form = "{desc}  {percentage:3.0f} % |{bar}| frame {n_fmt} of {total_fmt}, {remaining} left"
