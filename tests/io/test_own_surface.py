@@ -67,7 +67,7 @@ def test_a_written_surface_is_an_input_again(folder):
     assert simulate("ball.ply", "-o", "a.usd", "--unit", "m", "--tets", 300, *SHORT) == 0
     assert simulate("a.usd", "-o", "b.usd", "--tets", 300, "--young", 5e3, *SHORT) == 0
     stages = [Usd.Stage.Open(str(folder / name)) for name in ("a.usd", "b.usd")]
-    first, again = (stage.GetPrimAtPath("/SoftBody/ball") for stage in stages)
+    first, again = (stage.GetPrimAtPath("/SoftBody/surface") for stage in stages)
     for name in ("primvars:vonMises", "primvars:displayColor:indices"):
         one, other = (np.array(prim.GetAttribute(name).Get(2)) for prim in (first, again))
         assert one.shape == other.shape
