@@ -51,12 +51,14 @@ class VertexAverage:
     """Averages values [T] of tetrahedra over the tetrahedra around each node, weighted (with their volumes), to [N]."""
 
     def __init__(self, tets: NDArray[np.int32], weights: NDArray[np.float64], nodes: int):
-        self._corners = np.ascontiguousarray(tets).reshape(-1)
+        self._corners = [np.ascontiguousarray(corner) for corner in np.transpose(tets)]
         self._weights = np.asarray(weights, dtype=np.float64)
         self._nodes = nodes
-        total = np.bincount(self._corners, np.repeat(self._weights, 4), minlength=nodes)
+        total = self._sums(self._weights)
         self._inverse = 1.0 / np.where(total > 0.0, total, 1.0)
 
     def __call__(self, values: ArrayLike) -> NDArray[np.float64]:
-        weighted = np.asarray(values, dtype=np.float64) * self._weights
-        return np.bincount(self._corners, np.repeat(weighted, 4), minlength=self._nodes) * self._inverse
+        return self._sums(np.asarray(values, dtype=np.float64) * self._weights) * self._inverse
+
+    def _sums(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.sum([np.bincount(corner, values, minlength=self._nodes) for corner in self._corners], axis=0)
