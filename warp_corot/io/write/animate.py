@@ -158,11 +158,12 @@ def shortening(dt: float, fps: float) -> str | None:
     a second; None otherwise."""
     steps = steps_per_frame(fps, dt)
     used, asked = 1.0 / (fps * steps), f"{dt:g} s" if dt > 1.0 else f"{1e3 * dt:.4g} ms"
-    cure = f"; did you mean --dt {dt:g}ms?"
-    if dt <= 1.0:
-        rates = (f"{1.0 / (n * dt):.4g}" for n in (steps, *range(1, 100)))
-        exact = [rate for rate in rates if math.isclose((count := 1.0 / (float(rate) * dt)), round(count))]
-        cure = f"; with --fps {exact[0]} they take that" if exact else f"; --dt {used:.7g} says so exactly"
+    near = sorted(range(max(steps - 50, 1), steps + 50), key=lambda count: abs(count - 1.0 / (fps * dt)))
+    rates = [f"{1.0 / (count * dt):.4g}" for count in near]
+    exact = [rate for rate in rates if math.isclose((count := 1.0 / (float(rate) * dt)), round(count))]
+    # A rate that is rounded up: otherwise the step would be a little too long, and another one would be needed.
+    rate = exact[0] if exact else f"{1.000005 / (steps * dt):.6g}"
+    cure = f"; did you mean --dt {dt:g}ms?" if dt > 1.0 else f"; with --fps {rate} they take that"
     if not math.isclose(used, dt, rel_tol=1e-3):
         whole = f"since a whole number of them makes a frame of {1e3 / fps:.4g} ms"
         return f"steps take {1e3 * used:.4g} ms, not {asked}, {whole}{cure}"
