@@ -104,7 +104,7 @@ def test_an_implicit_run(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("dt", "rate"), [(16e-3, "31.25"), (2e-3, "25"), (0.1, "10"), (1 / 70, "35"), (3e-4, None), (0.0123456789, None)]
+    ("dt", "rate"), [(16e-3, "31.25"), (2e-3, "25"), (0.1, "10"), (1 / 70, "35"), (7e-4, None), (0.0123456789, None)]
 )
 def test_the_frame_rate_in_a_note_keeps_the_step(dt, rate):
     (found,) = re.findall(r"with --fps ([\d.]+) they take that", shortening(dt, 24.0))
