@@ -4,9 +4,12 @@ import threading
 from types import SimpleNamespace
 
 import pytest
+import warp as wp
 
+from warp_corot.cli import compiling
 from warp_corot.inputs import stopwatch
-from warp_corot.inputs.stopwatch import KERNELS, Stopwatch
+from warp_corot.inputs.stopwatch import KERNELS, WATCH, Stopwatch
+from warp_corot.kernels.stepping import pace
 
 
 @pytest.fixture
@@ -46,3 +49,14 @@ def test_other_threads_do_not_count(now):
         thread.join()
     assert watch.parts["preparing"] == 5.0
     assert KERNELS not in watch.parts
+
+
+def test_loading_kernels_is_no_stepping():
+    """Once the command listens, whichever launch comes first."""
+    compiling._listen()
+    module = wp.get_module(pace.__name__)
+    module.unload()
+    WATCH.begin("", 0.0)
+    with WATCH.part("stepping"):
+        module.load(wp.get_device("cpu"))
+    assert 0.0 < WATCH.parts["stepping"] < WATCH.parts[KERNELS]

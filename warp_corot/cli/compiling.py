@@ -62,11 +62,8 @@ def _listen() -> None:
 
     @functools.wraps(load)
     def counted(*args: Any, **options: Any) -> Any:
-        before = WATCH.switch(KERNELS)
-        try:
+        with WATCH.part(KERNELS):
             return load(*args, **options)
-        finally:
-            WATCH.switch(before)
 
     wp.Module.load = counted
 

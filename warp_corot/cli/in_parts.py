@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warp_corot.body.soft_body import SoftBody
+from warp_corot.domain.units import length
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.device import checked_device
 from warp_corot.simulation.parts import checked_gravity
@@ -31,7 +32,7 @@ from .meshes_in_parts import (
 )
 from .ranks import are_several, hands_out
 from .say import complain, early_end
-from .summary import aligned, length, milliseconds, speed, wall_time
+from .summary import aligned, milliseconds, speed, wall_time
 
 if TYPE_CHECKING:
     from warp_corot.distributed import Simulation

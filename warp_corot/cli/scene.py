@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from warp_corot.domain.units import length
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.device import checked_device
 from warp_corot.inputs.stopwatch import WATCH
@@ -16,7 +17,7 @@ from warp_corot.inputs.stopwatch import WATCH
 from .compiling import compiling_said
 from .implicit import unfinished
 from .say import complain, early_end
-from .summary import aligned, length, milliseconds, pressure, speed, wall_time
+from .summary import aligned, milliseconds, pressure, speed, wall_time
 
 if TYPE_CHECKING:
     from warp_corot.io.write.animate import Recording

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from warp_corot.domain.units import length
 from warp_corot.elasticity import MODELS
 from warp_corot.elasticity.dilatation import ELEMENT
 from warp_corot.elasticity.dilatation.options import shares_dilatation
@@ -224,11 +225,6 @@ def _steps(sim: Simulation) -> str:
 
 def milliseconds(seconds: float) -> str:
     return f"{1e3 * seconds:.4g} ms"
-
-
-def length(metres: float) -> str:
-    """A length to three digits, in mm or m."""
-    return f"{metres:.3g} m" if metres >= 1.0 else f"{1e3 * metres:.3g} mm"
 
 
 def pressure(pascals: float) -> str:

@@ -15,6 +15,7 @@ from warp_corot.contact.options import Contact, checked_friction
 from warp_corot.contact.shapes import Capsule, Cylinder, Ground
 from warp_corot.contact.skin import own_surface
 from warp_corot.contact.tool import Obstacle, Tool
+from warp_corot.domain.units import length
 from warp_corot.errors import InputError
 from warp_corot.kernels.contact.overlaps import find_gaps
 from warp_corot.solvers import INTEGRATORS
@@ -23,7 +24,6 @@ from .holding import up_of
 from .implicit import integrator_name
 from .options.defaults import AUTO
 from .ranks import are_several
-from .summary import length
 from .tool_paths import make_tool
 
 if TYPE_CHECKING:
