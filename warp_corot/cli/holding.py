@@ -36,12 +36,10 @@ class Held:
     Attributes:
         nodes: Mask bool [N].
         words: Text for the summary: "standing on its lowest 10 %", "free".
-        title: A shorter text for the picture if there are many pieces; empty: ``words``.
     """
 
     nodes: npt.NDArray[np.bool_]
     words: str
-    title: str = ""
 
     @property
     def count(self) -> int:
@@ -88,7 +86,7 @@ def held_by_default(
     )
     lines = holds.reasons()
     subject.notes += [*lines[:-1], f"{lines[-1]} (--fix chooses others)"]
-    held = Held(holds.nodes, holds.words, holds.title)
+    held = Held(holds.nodes, holds.words)
     if not (1.0 < holds.stiffer < np.inf):
         return held, 1.0
     if may_stiffen:

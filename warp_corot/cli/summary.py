@@ -106,7 +106,7 @@ def title_of(bodies: Sequence[Body], gravity: Sequence[float]) -> str:
 
 def _happening(bodies: Sequence[Body], heavy: bool) -> list[str]:
     """What happens to bodies, which may have weight, in words."""
-    args, held = bodies[0].args, [body.held for body in bodies if body.held.count]
+    args = bodies[0].args
     kinds = {load.kind for body in bodies for load in body.loads}
     words = ["at rest"] if is_static(args) else []
     words += [word for kind, word in DONE.items() if kind in kinds]
@@ -116,12 +116,10 @@ def _happening(bodies: Sequence[Body], heavy: bool) -> list[str]:
         words.append("dropped on a ground")
     elif args.ground is not None:
         words.append("on a ground")
-    elif not held:
+    elif not any(body.held.count for body in bodies):
         words.append("falling freely" if heavy else "moving freely")
-    elif heavy and not words:
-        words.append("under its weight" if len(bodies) == 1 else "under their weight")
-    if held:
-        words.append(held[0].title if len(bodies) == 1 and held[0].title else "held at the dots")
+    elif not words:
+        words.append(f"under {'its' if len(bodies) == 1 else 'their'} weight" if heavy else "held at the dots")
     return words
 
 

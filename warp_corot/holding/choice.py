@@ -92,12 +92,6 @@ class Holds:
         each = [f"piece {number} {words}" for number, words in enumerate(named, start=1)]
         return ", ".join(each) + (f", and {left} more" if left > 0 else "")
 
-    @property
-    def title(self) -> str:
-        """A short form: "piece 1 standing on its lowest 10 %, and 5 more"."""
-        left = len(self.pieces) - 1
-        return f"piece 1 {_words_of(self.pieces[0])}, and {left} more" if left else self.words
-
     def reasons(self) -> list[str]:
         """What a user should know about each piece, a line for each."""
         several = len(self.pieces) > 1
