@@ -107,7 +107,7 @@ def main(argv: Sequence[str] | None = None, spent: float = 0.0) -> int:
         if "warp" in sys.modules:
             from warp_corot.inputs.loading import give_up
 
-            give_up()
+            give_up(settled=True)
         if is_silent and status in FAILED:
             let_others_speak()
     if found in FAILED and not is_silent:

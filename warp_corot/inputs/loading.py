@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import cache
 from importlib import import_module
 
@@ -59,10 +59,13 @@ def load(names: Iterable[str], device: wp.Device, kernels: Iterable[wp.Kernel] =
         raise
 
 
-def give_up() -> None:
-    """Load none of the modules that wait for a thread; otherwise Python would load them before it ends."""
+def give_up(settled: bool = False) -> None:
+    """Load none of the modules that wait for a thread, otherwise Python would load them before it ends; and wait for
+    those that are being loaded, if ``settled``, as Python would."""
     for key in [key for key, module in _begun.items() if module.cancel()]:
         del _begun[key]
+    if settled:
+        wait(_begun.values())
 
 
 @cache
