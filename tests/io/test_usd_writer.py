@@ -287,7 +287,7 @@ import numpy as np
 sys.path[:0] = {path!r}
 from written import Cube, frames_of
 from warp_corot.io.write.usd.writer import UsdWriter
-with UsdWriter({out!r}, Cube, fps=25, flush_seconds=60.0) as writer:
+with UsdWriter({out!r}, Cube, fps=25, flush_seconds={flush_seconds}) as writer:
     print("ready", flush=True)
     for x, v, stress in frames_of(Cube, {count}):
         writer.write(x, velocities=v, von_mises=stress)
@@ -297,14 +297,13 @@ with UsdWriter({out!r}, Cube, fps=25, flush_seconds=60.0) as writer:
 """
 
 
-def run_code(out: Path, count: int, flush_every: int) -> str:
-    return RUN.format(
-        path=[str(Path(written.__file__).parent), *sys.path], out=str(out), count=count, flush_every=flush_every
-    )
+def run_code(out: Path, count: int, flush_every: int, flush_seconds: float = 60.0) -> str:
+    path = [str(Path(written.__file__).parent), *sys.path]
+    return RUN.format(path=path, out=str(out), count=count, flush_every=flush_every, flush_seconds=flush_seconds)
 
 
-def start_run(out: Path, flush_every: int) -> subprocess.Popen:
-    code = run_code(out, 10**6, flush_every)
+def start_run(out: Path, flush_every: int, flush_seconds: float) -> subprocess.Popen:
+    code = run_code(out, 10**6, flush_every, flush_seconds)
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     assert process.stdout.readline() == "ready\n"
@@ -312,15 +311,16 @@ def start_run(out: Path, flush_every: int) -> subprocess.Popen:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="needs SIGKILL")
-@pytest.mark.parametrize("attempts", [2, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("attempts", [3, pytest.param(21, marks=pytest.mark.slow)])
 def test_kill_at_any_moment_leaves_a_stage_that_opens(attempts, tmp_path):
-    """Runs are killed at random moments, mostly while writing; each overwrites the one before."""
+    """Runs are killed at random moments, mostly while writing; each overwrites the one before. They wait for pieces of
+    one frame or of five, or leave them to the thread."""
     moments = random.Random(7)
     out = tmp_path / "out.usd"
     out.write_text("a good file")
     for attempt in range(attempts):
         before = out.read_bytes()
-        process = start_run(out, flush_every=1 if attempt % 2 else 5)
+        process = start_run(out, *((5, 60.0), (1, 60.0), (10**6, 0.0))[attempt % 3])
         time.sleep(moments.uniform(0.0, 0.25))
         # On a busy machine none of them may have come so far; the last one does.
         latest = time.monotonic() + 60.0
