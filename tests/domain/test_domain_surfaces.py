@@ -56,6 +56,28 @@ def test_disorder_makes_no_difference(device, rng):
     same(Domain.from_surface((points, np.concatenate([triangles, triangles[:, ::-1]])), device=device), right, rng)
 
 
+@pytest.mark.parametrize("copies", ["alike", "both ways round", "nearly in place"])
+def test_triangles_that_are_there_twice_make_no_holes(copies, device, rng):
+    points, triangles = arrays(trimesh.creation.icosphere(1))
+    right, again = Domain.from_surface((points, triangles), device=device), triangles[::2]
+    if copies == "both ways round":
+        again = again[:, ::-1]
+    if copies == "nearly in place":
+        near = points[again].reshape(-1, 3) + 1e-8 * rng.standard_normal((3 * len(again), 3))
+        points, again = np.concatenate([points, near]), len(points) + np.arange(len(near)).reshape(-1, 3)
+    doubled = Domain.from_surface((points, np.concatenate([triangles, again])), device=device)
+    same(doubled, right, rng)
+    assert {"closed", "40 triangles without area or there twice left out"} <= set(doubled.report())
+
+
+def test_a_shell_that_is_there_both_ways_round_is_no_cavity(device):
+    outer, inner = (trimesh.creation.icosphere(1, radius=r) for r in (1.0, 0.5))
+    points, triangles = arrays(trimesh.util.concatenate([outer, inner, inner]))
+    triangles[80:160] = triangles[80:160, ::-1]
+    domain = Domain.from_surface((points, triangles), device=device)
+    assert (domain.phi([[0, 0, 0], [0.7, 0, 0]]) < 0).all()
+
+
 def test_two_boxes_with_a_wall_between_are_one(device, rng):
     box = trimesh.creation.box((1.0, 1.0, 1.0))
     # Mirrored, so that the diagonals of the wall meet.
@@ -159,11 +181,22 @@ def bow_tie() -> tuple[np.ndarray, np.ndarray]:
     return points, np.array(side + lids)
 
 
+def walled() -> tuple[np.ndarray, np.ndarray]:
+    """A flat box of eight boxes, with each of their faces once."""
+    cube = trimesh.creation.box(bounds=[[0, 0, 0], [1, 1, 1]])
+    mirrors = [np.diag([x, y, z, 1.0]) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
+    points, triangles = arrays(trimesh.util.concatenate([cube.copy().apply_transform(each) for each in mirrors]))
+    points, place = np.unique(points + 0.0, axis=0, return_inverse=True)
+    _, first = np.unique(np.sort(place[triangles], axis=1), axis=0, return_index=True)
+    return points * [1.0, 1.0, 0.1], place[triangles][first]
+
+
 SQUARE = (np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float), np.array([[0, 1, 2], [0, 2, 3]]))
 CUBE = arrays(trimesh.creation.box((1.0, 1.0, 1.0)))
 
 REFUSED = {
     "a sheet": (SQUARE, "is open: 4 edges in 1 hole, and closing takes 100%"),
+    "a box with walls": (walled(), "walls inside it, .*: 24 edges join three or more triangles"),
     "a sheet of two sides": ((SQUARE[0], np.concatenate([SQUARE[1], SQUARE[1][:, ::-1]])), "zero thickness"),
     "a flattened cube": ((CUBE[0] * [1, 1, 0], CUBE[1]), "zero thickness"),
     "a cube flattened to less than a hair": ((CUBE[0] * [1, 1, 1e-6], CUBE[1]), "zero thickness"),

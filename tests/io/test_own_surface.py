@@ -5,6 +5,7 @@ import pytest
 import trimesh
 from command_line import SHORT, simulate
 from pxr import Usd, UsdGeom, UsdShade
+from stages import drawn, still
 
 import warp_corot as wc
 
@@ -44,6 +45,50 @@ def test_a_surface_is_drawn_as_it_was_given(folder):
     last = np.array(mesh.GetPointsAttr().Get(2))
     assert (last - points)[:, 1].min() < -1e-5
     assert len(mesh.GetPrim().GetAttribute("primvars:vonMises").Get(0)) == len(points)
+
+
+def ball_with_cavity(path, *turned):
+    """A ball of 6 cm with a cavity of 2 cm beside its centre, in millimetres, with some of its triangles turned round;
+    its volume [m^3]."""
+    outer, inner = trimesh.creation.icosphere(3, radius=30.0), trimesh.creation.icosphere(2, radius=10.0)
+    inner.apply_translation([8.0, 0.0, 0.0]).invert()
+    both = trimesh.util.concatenate([outer, inner])
+    for some in turned:
+        both.faces[some] = both.faces[some][:, ::-1]
+    both.export(path)
+    return 1e-9 * (outer.volume + inner.volume)
+
+
+ALL, SOME = slice(None), slice(None, None, 3)
+
+
+@pytest.mark.parametrize("turned", [(ALL,), (SOME,), (ALL, SOME)])
+def test_surfaces_are_drawn_wound_as_their_bodies(turned, folder):
+    """In the stage, its normals and previews, whatever the file's winding; a cavity stays turned inwards."""
+    volume = ball_with_cavity("ball.ply", *turned)
+    assert simulate("ball.ply", "--unit", "mm", "--tets", 600, "-o", "a.usd", *SHORT) == 0
+    stage, (mesh,) = meshes_in("a.usd")
+    surface = drawn(stage, str(mesh.GetPath()))
+    assert surface.volume == pytest.approx(volume, rel=1e-3)
+    assert mesh.GetOrientationAttr().Get() == "rightHanded"
+    assert not mesh.GetDoubleSidedAttr().Get()
+    normals = np.array(mesh.GetNormalsAttr().Get(0))
+    assert (np.einsum("ij,ij->i", normals, surface.vertex_normals) > 0.9).all()
+    tets = wc.TetForest.box((2, 2, 2), 0.04, 3, origin=(-0.04, -0.04, -0.04))
+    given = trimesh.load("ball.ply", process=False)
+    assert tets.bind(1e-3 * given.vertices, given.faces).volume == pytest.approx(volume, rel=1e-3)
+    body = wc.SoftBody(tets, wc.Isotropic(1e4, 0.4, 1e3), device="cpu")
+    given.apply_scale(1e-3).export("metres.ply")
+    shown = still(wc.Simulation(body), folder / "b.usd", surface="metres.ply")
+    assert drawn(shown, "/SoftBody/metres").volume == pytest.approx(volume, rel=1e-3)
+
+
+def test_a_surface_with_a_hole_shows_its_inside(folder):
+    ball = trimesh.creation.icosphere(3, radius=30.0)
+    trimesh.Trimesh(ball.vertices, ball.faces[ball.triangles_center[:, 2] < 25.0]).export("bowl.stl")
+    assert simulate("bowl.stl", "--unit", "mm", "--tets", 400, "-o", "a.usd", *SHORT) == 0
+    _, (mesh,) = meshes_in("a.usd")
+    assert mesh.GetDoubleSidedAttr().Get()
 
 
 def test_the_marched_surface_is_the_other_choice(folder):

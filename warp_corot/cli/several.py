@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from warp_corot.errors import InputError
 from warp_corot.io.read.surfaces import LoadedSurface
 from warp_corot.io.read.tetrahedra import LoadedMesh
 
@@ -35,10 +36,16 @@ def bodies_in(opened: Opened, args: argparse.Namespace) -> list[tuple[Opened, ar
     surface = opened.surface
     if surface is None or args.join or not 2 <= len(surface.objects) <= MOST_BODIES:
         return [(opened, args)]
+    from warp_corot.domain.closing import close_surface
+
     parts = _parts(surface)
-    volumes = np.array([_volume(part) for part in parts])
-    if not all(map(_is_closed, parts)) or not (volumes > 0.0).all() or not np.isfinite(volumes.sum()):
+    try:
+        whole, *closed = (close_surface(part.points, part.triangles) for part in (surface, *parts))
+    except InputError:
         return [(opened, args)]
+    if whole.cavities or any(part.caps for part in closed):
+        return [(opened, args)]
+    volumes = np.array([part.volume for part in closed])
     opened.notes.append(_told(parts))
     size = longest_side(surface.points[np.unique(surface.triangles)])
     found = []
@@ -116,20 +123,3 @@ def _parts(surface: LoadedSurface) -> list[LoadedSurface]:
         points, own = surface.points[used], renumbered.reshape(-1, 3).astype(np.int32)
         parts.append(replace(surface, points=points, triangles=own, name=name, objects=[]))
     return [part for part in parts if len(part.triangles)]
-
-
-def _is_closed(part: LoadedSurface) -> bool:
-    """Whether each edge occurs equally often in both directions."""
-    _, place = _welded(part.points)
-    corners = place[part.triangles]
-    edges = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
-    edges = edges[edges[:, 0] != edges[:, 1]]
-    keys = edges.min(axis=1) * (place.max() + 1) + edges.max(axis=1)
-    _, where = np.unique(keys, return_inverse=True)
-    return not np.bincount(where, np.where(edges[:, 0] < edges[:, 1], 1.0, -1.0)).any()
-
-
-def _volume(part: LoadedSurface) -> float:
-    with np.errstate(over="ignore", invalid="ignore"):
-        corners = part.points[part.triangles] - part.points.mean(axis=0)
-        return float(np.linalg.det(corners).sum() / 6.0)

@@ -37,6 +37,8 @@ class ClosedSurface:
         turned: Triangles that were wound against their neighbours and were reversed.
         inside_out: Closed parts that were inside out and were reversed.
         dropped: Triangles left out: without area, repeated, or facing each other.
+        crowded: Edges that three or more triangles share, so that one of these has the body on both sides.
+        was_inwards: Whether each given triangle was wound inwards, bool.
         pieces: Parts that enclose something.
         cavities: Parts inside another that are wound inwards.
         volume: Enclosed volume.
@@ -53,6 +55,8 @@ class ClosedSurface:
     turned: int
     inside_out: int
     dropped: int
+    crowded: int
+    was_inwards: npt.NDArray[np.bool_]
     pieces: int
     cavities: int
     volume: float
@@ -69,12 +73,16 @@ def close_surface(points: np.ndarray, triangles: np.ndarray) -> ClosedSurface:
         InputError: It encloses nothing: all triangles degenerate, open for more than a third of its area, or of zero
             thickness.
     """
-    given = len(triangles)
-    points, triangles, edges = weld(points, triangles)
-    triangles, twofold = drop_useless(triangles, edges)
-    if not len(triangles):
-        raise InputError(f"none of the {given} triangles has an area; the surface is degenerate")
-    dropped = given - len(triangles)
+    points, welded, edges = weld(points, triangles)
+    given = len(welded)
+    kept, place, two_sided = drop_useless(welded, edges)
+    if not len(kept):
+        raise InputError(
+            "the surface has zero thickness: its triangles lie on one another, facing both ways"
+            if two_sided.any()
+            else f"none of the {given} triangles has an area; the surface is degenerate"
+        )
+    triangles, dropped = welded[kept], given - len(kept)
     edges = Edges(triangles) if dropped else edges
     triangles, turned = wind_alike(triangles, edges)
     edges = Edges(triangles) if turned else edges
@@ -84,15 +92,20 @@ def close_surface(points: np.ndarray, triangles: np.ndarray) -> ClosedSurface:
         raise InputError(f"none of the {given} triangles has an area; the surface is degenerate")
     points, caps, cap_parts, open_edges, holes = cones(points, triangles, parts, edges)
     cap_share = float(areas(points, caps).sum()) / area
+    crowded = int(np.count_nonzero((edges.sharers > 2) & (edges.sharers % 2 == 1)))
     if cap_share > LARGEST_HOLES:
-        if twofold:
-            raise InputError("the surface has zero thickness: its triangles lie on one another, facing both ways")
+        repaired = f", after {dropped} triangles without area or there twice were left out" if dropped else ""
+        if crowded == open_edges:
+            raise InputError(
+                f"the surface has walls inside it, which cannot be told from it: {crowded} edges join three or more "
+                f"triangles{repaired}; it must be without them, or closed around each part"
+            )
         raise InputError(
             f"the surface is open: {open_edges} edges in {holes} hole{'s'[: holes != 1]}, and closing takes "
-            f"{cap_share:.0%} of its own area; it must take at most {LARGEST_HOLES:.0%}"
+            f"{cap_share:.0%} of its own area{repaired}; it must take at most {LARGEST_HOLES:.0%}"
         )
     closed, all_parts = np.concatenate([triangles, caps]), np.concatenate([parts, cap_parts])
-    closed, inside_out, cavities = wind_outwards(points, closed, all_parts)
+    closed, inside_out, cavities = wind_outwards(points, closed, all_parts, two_sided=parts[two_sided[kept]])
     edges = Edges(closed) if len(caps) or inside_out else edges
     volume = float(part_volumes(points, closed, np.zeros(len(closed), int)).sum())
     size = float(np.ptp(points[closed.ravel()], axis=0).max())
@@ -104,8 +117,27 @@ def close_surface(points: np.ndarray, triangles: np.ndarray) -> ClosedSurface:
     pieces = int(all_parts.max()) + 1 - cavities
     return ClosedSurface(
         points, closed.astype(np.int32), edges, all_parts.astype(np.int32), len(caps), open_edges, holes, cap_share,
-        turned, inside_out, dropped, pieces, cavities, volume,
+        turned, inside_out, dropped, crowded, _runs_back(welded, closed[place]) & (place >= 0), pieces, cavities,
+        volume,
     )  # fmt: skip
+
+
+def turned_inwards(points: np.ndarray, triangles: np.ndarray) -> tuple[npt.NDArray[np.bool_], bool]:
+    """Which triangles [T] of a surface are wound inwards, bool [T], and whether it has holes.
+
+    A surface that encloses no body has no inside, and counts as wound well.
+    """
+    try:
+        closed = close_surface(np.asarray(points, np.float64), np.asarray(triangles, np.int64))
+    except InputError:
+        return np.zeros(len(triangles), bool), True
+    return closed.was_inwards, closed.caps > 0
+
+
+def _runs_back(triangles: np.ndarray, others: np.ndarray) -> npt.NDArray[np.bool_]:
+    """Whether triangles [T, 3] name the points of others in the opposite order, bool [T]."""
+    after = (np.argmax(others == triangles[:, :1], axis=1) + 1) % 3
+    return others[np.arange(len(others)), after] != triangles[:, 1]
 
 
 def weld(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, Edges]:
@@ -127,9 +159,9 @@ def weld(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndar
     rims = np.unique(edges.net()[0])
     if len(rims):
         near = WELD * float(np.ptp(points, axis=0).max())
-        pairs = cKDTree(points[rims]).query_pairs(near, output_type="ndarray")
-        if len(pairs):
-            a, b = rims[pairs].T
+        pairs = cKDTree(points[rims]).sparse_distance_matrix(cKDTree(points), near, output_type="ndarray")
+        a, b = rims[pairs["i"]], pairs["j"]
+        if (a != b).any():
             count, place = linked(a, b, len(points))
             first = np.full(count, len(points))
             np.minimum.at(first, place, np.arange(len(points)))
@@ -151,27 +183,48 @@ def _without_twins(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return ordered[new], place
 
 
-def drop_useless(triangles: np.ndarray, edges: Edges) -> tuple[np.ndarray, bool]:
-    """Remove triangles that name a point twice, repeat another, or coincide with one that faces the other way.
+def drop_useless(triangles: np.ndarray, edges: Edges) -> tuple[np.ndarray, np.ndarray, npt.NDArray[np.bool_]]:
+    """Choose the triangles that matter: none that names a point twice, and one of those with the same three points.
 
-    If at least half of the triangles coincide with one that faces the other way, they are two sides of one sheet: one
-    of each pair stays, and the second value is True.
+    Of a patch whose triangles are there both ways round, nothing stays if its rim lies within the rest, as that of a
+    wall between two bodies or of a fin does; one of each stays if the patch fills a hole of the rest or is closed.
+
+    Returns:
+        The chosen triangles, ascending [K]; the place among them of the one with the same points as each triangle, -1
+        for none [T]; and whether each triangle is there both ways round, bool [T].
     """
+    every = np.arange(len(triangles))
     a, b, c = triangles.T
-    good = (a != b) & (b != c) & (c != a)
-    if good.all() and not _coincide(triangles, edges):
-        return triangles, False
-    triangles = triangles[good]
-    if not len(triangles):
-        return triangles, False
-    order = np.argsort(triangles, axis=1)
-    key = np.take_along_axis(triangles, order, axis=1)
+    good = np.flatnonzero((a != b) & (b != c) & (c != a))
+    place, two_sided = np.full(len(triangles), -1), np.zeros(len(triangles), bool)
+    if len(good) == len(triangles) and not _coincide(triangles, edges):
+        return every, every, two_sided
+    if not len(good):
+        return good, place, two_sided
+    order = np.argsort(triangles[good], axis=1)
+    key = np.take_along_axis(triangles[good], order, axis=1)
     # Even permutations of three: 012, 120, 201.
     parity = np.where((order[:, 1] - order[:, 0]) % 3 == 1, 1, -1)
-    _, first, place = np.unique(key, axis=0, return_index=True, return_inverse=True)
-    net = np.bincount(place.ravel(), weights=parity)
-    twofold = bool((net == 0).sum() * 2 >= len(net))
-    return triangles[np.sort(first if twofold else first[net != 0])], twofold
+    _, first, same = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    first, same = good[first], same.ravel()
+    both = np.bincount(same, weights=parity) == 0
+    two_sided[good] = both[same]
+    stays = ~both
+    stays[both] = _fill(triangles[first[both]], Edges(triangles[first[~both]]))
+    kept = np.sort(first[stays])
+    place[good] = np.where(stays, np.searchsorted(kept, first), -1)[same]
+    return kept, place, two_sided
+
+
+def _fill(patches: np.ndarray, rest: Edges) -> npt.NDArray[np.bool_]:
+    """Whether the patch of each triangle, of those connected by edges, is closed or fills a hole of the rest, bool."""
+    edges = Edges(patches)
+    parts = edge_parts(patches, edges)
+    rim, holes = edges.sharers % 2 == 1, rest.ends[rest.sharers % 2 == 1]
+    count = 1 + max(int(edges.ending.max(initial=0)), int(rest.ending.max(initial=0)))
+    fits = np.isin(edges.ends[rim] @ [count, 1], holes @ [count, 1])
+    of_part = parts[edges.order[edges.starts[rim]] // 3]
+    return (np.bincount(of_part, np.where(fits, 1.0, -1.0), len(patches)) >= 0.0)[parts]
 
 
 def _coincide(triangles: np.ndarray, edges: Edges) -> bool:

@@ -205,7 +205,8 @@ def surface_domain(surface: Surface, unit: str | float | None, up_axis: str | No
         raise InputError(f"{source}{error}") from None
     doubts = [unlikely_size(float(np.ptp(domain.bounds, axis=0).max()), metres)]
     if closed.cap_share > LARGE_HOLES:
-        doubts.append(f"the surface is open: its {closed.holes} holes took {closed.cap_share:.1%} of its area to close")
+        where = f"walls inside it at {closed.crowded} edges" if closed.crowded else f"its {closed.holes} holes"
+        doubts.append(f"the surface is open: {where} took {closed.cap_share:.1%} of its area to close")
     for doubt in filter(None, doubts):
         domain.notes.append(doubt)
         warnings.warn(f"{source}{doubt}", UserWarning, stacklevel=3)

@@ -73,9 +73,11 @@ def _along(order: np.ndarray, parent: np.ndarray, differs: np.ndarray) -> np.nda
         parity, up = further, up[up]
 
 
-def wind_outwards(points: np.ndarray, triangles: np.ndarray, parts: np.ndarray) -> tuple[np.ndarray, int, int]:
+def wind_outwards(
+    points: np.ndarray, triangles: np.ndarray, parts: np.ndarray, two_sided: np.ndarray
+) -> tuple[np.ndarray, int, int]:
     """Reverse parts that are inside out; return their number, and the number of cavities: parts within another that are
-    wound inwards.
+    wound inwards, and are not among those that were given both ways round.
     """
     volumes = part_volumes(points, triangles, parts)
     flip = np.zeros(len(volumes), bool)
@@ -85,7 +87,7 @@ def wind_outwards(points: np.ndarray, triangles: np.ndarray, parts: np.ndarray) 
     groups = Parts(points, triangles, parts)
     cavities = 0
     for part in inward:
-        if groups.is_within_others(int(part)):
+        if part not in two_sided and groups.is_within_others(int(part)):
             cavities += 1
         else:
             flip[part] = not flip[part]

@@ -195,6 +195,8 @@ class TetMesh:
     def bind(self, points: npt.ArrayLike, triangles: npt.ArrayLike | None = None) -> BoundPoints:
         """Bind your own points, or with triangles [F, 3] a surface, to the mesh, so that they follow it.
 
+        A closed surface is wound outwards, as `Domain.from_surface` winds it.
+
         Raises:
             InputError: As for `embed`, or triangles name points that do not exist.
         """

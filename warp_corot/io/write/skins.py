@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from warp_corot.domain.closing import turned_inwards
 from warp_corot.errors import InputError
 from warp_corot.mesh.surfaces.bodies import boundary_surface
 from warp_corot.mesh.surfaces.bound import SurfaceMesh
@@ -70,7 +71,7 @@ class OwnSurface:
             own = np.stack([used.min(axis=0), used.max(axis=0)])
             scale = length / max(float(np.ptp(own, axis=0).max()), 1e-300)
             if np.abs(scale * own - given).max() <= SAME * length:
-                return cls([look.placed(scale, moved) for look in some])
+                return cls(_outwards([look.placed(scale, moved) for look in some]))
         return None
 
 
@@ -210,14 +211,24 @@ def _check_nodes(surface: SurfaceMesh, count: int) -> None:
 def _bound_prims(mesh: Any, path: str | PathLike[str]) -> list[Skin]:
     from warp_corot.io.read.usd.look import read_looks
 
-    return _bound_looks(mesh, read_looks(path))
+    return _bound_looks(mesh, _outwards(read_looks(path)))
+
+
+def _outwards(looks: Sequence[Look]) -> list[Look]:
+    """The parts of a surface wound as the body that they enclose together."""
+    firsts = np.cumsum([0, *(len(look.points) for look in looks)])
+    triangles = [look.triangles + first for look, first in zip(looks, firsts, strict=False)]
+    turned, is_open = turned_inwards(np.concatenate([look.points for look in looks]), np.concatenate(triangles))
+    ends = np.cumsum([len(look.triangles) for look in looks])
+    return [look.wound(own, is_open) for look, own in zip(looks, np.split(turned, ends[:-1]), strict=True)]
 
 
 def _bound_looks(mesh: Any, looks: Sequence[Look]) -> list[Skin]:
     skins = []
     for look in looks:
         _check_size(look, mesh.points)
-        skins.append(Skin(look.name, mesh.bind(look.points, look.triangles), look))
+        bound = mesh.bind(look.points)
+        skins.append(Skin(look.name, SurfaceMesh(look.points, bound.nodes, bound.weights, look.triangles), look))
     return skins
 
 

@@ -175,7 +175,7 @@ def vertex_normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def bound(points: np.ndarray, nodes: np.ndarray, weights: np.ndarray, triangles: npt.ArrayLike | None) -> BoundPoints:
-    """A user's points bound to nodes; with triangles [F, 3], a surface.
+    """A user's points bound to nodes; with triangles [F, 3], a surface, wound outwards if it is closed.
 
     Args:
         points: Rest positions [m], [V, 3].
@@ -194,4 +194,8 @@ def bound(points: np.ndarray, nodes: np.ndarray, weights: np.ndarray, triangles:
     if faces.ndim != 2 or faces.shape[1] != 3:
         raise InputError(f"triangles has shape {faces.shape}; it must be [F, 3]")
     checked_indices(faces.ravel(), len(rest), "point")
+    from warp_corot.domain.closing import turned_inwards  # whose package imports meshes
+
+    turned, _ = turned_inwards(rest, faces)
+    faces = np.where(turned[:, None], faces[:, ::-1], faces)
     return SurfaceMesh(rest, nodes, weights, faces.astype(np.int32))

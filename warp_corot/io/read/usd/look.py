@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pxr import Sdf, Usd, UsdGeom, UsdShade
+from pxr import Sdf, Usd, UsdGeom, UsdShade, Vt
 
 from warp_corot.errors import InputError
 from warp_corot.io.files.usd import metres_per_unit, open_stage, reads_stage
@@ -37,7 +37,9 @@ class Look:
         source: The file.
         points: Points in the world [m], float64 [V, 3].
         triangles: Fans of its faces, int32 [F, 3], counter-clockwise seen from outside.
-        left_handed: Whether the listed faces have the other orientation in the world.
+        faces: The listed face of each triangle, int64 [F].
+        turned: Whether that face is listed clockwise seen from outside, bool [F].
+        is_open: Whether it has holes, through which one sees its inside.
         had_normals: Whether the prim gives normals.
         smooth: Whether it is a subdivision surface, which needs no normals.
         is_plain: Whether it has neither a material nor its own colours, so that stress may colour it.
@@ -48,7 +50,9 @@ class Look:
     source: Path
     points: NDArray[np.float64]
     triangles: NDArray[np.int32]
-    left_handed: bool
+    faces: NDArray[np.int64]
+    turned: NDArray[np.bool_]
+    is_open: bool
     had_normals: bool
     smooth: bool
     is_plain: bool
@@ -57,6 +61,11 @@ class Look:
     def placed(self, scale: float, offset: NDArray[np.float64]) -> Look:
         """The same look with its points scaled by a factor and then moved."""
         return replace(self, points=scale * self.points + offset)
+
+    def wound(self, turned: NDArray[np.bool_], is_open: bool) -> Look:
+        """The same look with some triangles [F] turned round."""
+        triangles = np.where(turned[:, None], self.triangles[:, ::-1], self.triangles)
+        return replace(self, triangles=triangles, turned=self.turned ^ turned, is_open=is_open)
 
     def copy_to(self, layer: Sdf.Layer, target: str, materials: str) -> None:
         """Copy the prim, without points, normals and transform, to a path of a layer, and the materials of the prim and
@@ -72,10 +81,32 @@ class Look:
             if child.typeName != "GeomSubset":
                 del spec.nameChildren[child.name]
         _without_stale(spec)
+        self._wind(layer, target)
         bound = [(self.path, target)]
         bound += [(f"{self.path}/{child.name}", f"{target}/{child.name}") for child in spec.nameChildren]
         for here, there in bound:
             self._bind_material(layer, here, there, materials)
+
+    def _wind(self, layer: Sdf.Layer, target: str) -> None:
+        """List the corners of each face of a copy counter-clockwise seen from outside, with their primvars."""
+        stage = Usd.Stage.Open(layer)
+        mesh = UsdGeom.Mesh.Get(stage, target)
+        mesh.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
+        if self.is_open:
+            mesh.CreateDoubleSidedAttr(True)
+        if not self.turned.any():
+            return
+        counts = np.asarray(mesh.GetFaceVertexCountsAttr().Get())
+        face = np.repeat(np.arange(len(counts)), counts)
+        first = (np.cumsum(counts) - counts)[face]
+        place = np.arange(len(face)) - first
+        order = first + np.where(np.isin(face, self.faces[self.turned]), -place % counts[face], place)
+        corners = mesh.GetFaceVertexIndicesAttr()
+        corners.Set(Vt.IntArray.FromNumpy(np.asarray(corners.Get())[order]))
+        for primvar in UsdGeom.PrimvarsAPI(mesh).GetPrimvars():
+            if primvar.GetInterpolation() == UsdGeom.Tokens.faceVarying:
+                indices = np.asarray(primvar.GetIndices()) if primvar.IsIndexed() else np.arange(len(order))
+                primvar.SetIndices(Vt.IntArray.FromNumpy(indices[order].astype(np.int32)))
 
     def _bind_material(self, layer: Sdf.Layer, here: str, there: str, materials: str) -> None:
         """Bind a prim of the layer to a copy of its original's material."""
@@ -161,7 +192,9 @@ def _look(drawn: DrawnMesh, stage: Any, source: Path, metres: float) -> Look:
         source,
         metres * drawn.points,
         drawn.triangles.astype(np.int32),
-        drawn.left_handed,
+        drawn.faces,
+        np.full(len(drawn.triangles), drawn.left_handed),
+        False,
         bool(normals),
         drawn.smooth,
         _is_plain(prim),

@@ -21,6 +21,7 @@ class DrawnMesh(NamedTuple):
         mesh: The prim, a `UsdGeom.Mesh`.
         points: Points in the world, in the stage's unit, float64 [N, 3].
         triangles: Fans of its faces without holes, int64 [T, 3], counter-clockwise seen from outside.
+        faces: The face of each triangle, int64 [T].
         left_handed: Whether the listed faces have the other orientation in the world.
         smooth: Whether it is a subdivision surface.
     """
@@ -28,6 +29,7 @@ class DrawnMesh(NamedTuple):
     mesh: Any
     points: NDArray[np.float64]
     triangles: NDArray[np.int64]
+    faces: NDArray[np.int64]
     left_handed: bool
     smooth: bool
 
@@ -44,7 +46,7 @@ def drawn_meshes(stage: Any, path: Path) -> Iterator[DrawnMesh]:
         mesh = UsdGeom.Mesh(prim)
         if not mesh or mesh.ComputePurpose() in ("guide", "proxy"):
             continue
-        points, triangles = _triangles(mesh, path, time)
+        points, triangles, faces = _triangles(mesh, path, time)
         if not len(triangles):
             continue
         world = np.array(cache.GetLocalToWorldTransform(prim), dtype=np.float64)
@@ -54,6 +56,7 @@ def drawn_meshes(stage: Any, path: Path) -> Iterator[DrawnMesh]:
             mesh,
             points @ world[:3, :3] + world[3, :3],
             triangles[:, ::-1] if left_handed else triangles,
+            faces,
             left_handed,
             mesh.GetSubdivisionSchemeAttr().Get() != UsdGeom.Tokens.none,
         )
@@ -87,8 +90,10 @@ def read_usd_surface(
     return np.concatenate(points), np.concatenate(triangles), metres, up_axis, notes, objects
 
 
-def _triangles(mesh: UsdGeom.Mesh, path: Path, time: Usd.TimeCode) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Points and the fans of a mesh's polygons, without holes."""
+def _triangles(
+    mesh: UsdGeom.Mesh, path: Path, time: Usd.TimeCode
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
+    """Points, the fans of a mesh's polygons, without holes, and the polygon of each triangle."""
     points = np.asarray(_earliest(mesh.GetPointsAttr(), time), dtype=np.float64).reshape(-1, 3)
     counts = np.asarray(_earliest(mesh.GetFaceVertexCountsAttr(), time), dtype=np.int64)
     indices = np.asarray(_earliest(mesh.GetFaceVertexIndicesAttr(), time), dtype=np.int64)
@@ -104,7 +109,8 @@ def _triangles(mesh: UsdGeom.Mesh, path: Path, time: Usd.TimeCode) -> tuple[NDAr
     fans = counts[kept] - 2
     first = np.repeat(starts, fans)
     step = np.arange(fans.sum()) - np.repeat(np.cumsum(fans) - fans, fans)
-    return points, np.stack([indices[first], indices[first + step + 1], indices[first + step + 2]], axis=1)
+    triangles = np.stack([indices[first], indices[first + step + 1], indices[first + step + 2]], axis=1)
+    return points, triangles, np.repeat(np.flatnonzero(kept), fans)
 
 
 def _earliest(attribute: Usd.Attribute, time: Usd.TimeCode) -> Any:

@@ -92,8 +92,6 @@ class SkinPrim:
         if look is not None:
             look.copy_to(stage.GetRootLayer(), self._path, MATERIALS)
             mesh = UsdGeom.Mesh.Get(stage, self._path)
-            handed = UsdGeom.Tokens.leftHanded if look.left_handed else UsdGeom.Tokens.rightHanded
-            mesh.CreateOrientationAttr(handed)
         else:
             mesh = UsdGeom.Mesh.Define(stage, self._path)
             declare_triangles(mesh)
