@@ -119,6 +119,24 @@ def test_bear_sags_by_a_tenth_and_comes_to_rest(folder, capsys, options):
     assert speeds[1] < 0.02 * speeds[0]
 
 
+@pytest.mark.parametrize(
+    ("size", "said"),
+    [
+        (2.9, "taken as m, .* 2.9 m long"),
+        (4.4, "taken as cm, .* 44 mm"),
+        (49, "taken as mm, .* 49 mm"),
+        (50, "taken as mm, .* 50 mm"),
+    ],
+)
+def test_a_unit_that_no_file_names_is_the_likeliest_and_said_first(size, said, folder, capsys):
+    write_vtk(folder / "cube.vtk", size / np.ptp(CUBE.points) * CUBE.points, CUBE.tets)
+    for options in ([], ["--unit", "m"], ["--scale", "1"]):
+        assert simulate("cube.vtk", "-o", "a.usd", *SHORT, *options) == 0
+        first = capsys.readouterr().err.splitlines()[0]
+        assert bool(re.search(f"cube.vtk: names no unit: its {size:g} units are {said}", first)) == (not options)
+        assert ("unit" in first) == (not options)
+
+
 def test_any_mesh_needs_no_options(folder, capsys):
     """A mesh in millimetres with some wrongly wound tetrahedra and a stray node is reported and simulated."""
     tets = CUBE.tets.copy()
@@ -126,7 +144,9 @@ def test_any_mesh_needs_no_options(folder, capsys):
     write_vtk(folder / "cube.vtk", 1e3 * points, tets)
     assert simulate("cube.vtk", "-o", "a.usd", *SHORT) == 0
     out, err = capsys.readouterr()
-    assert "the coordinates are taken to be in mm: the file names no unit" in err
+    assert err.startswith(
+        "warp-corot: note: cube.vtk: names no unit: its 100 units are taken as mm, so that it is 100 mm"
+    )
     assert simulate("cube.vtk", "-o", "a.usd", "--scale", 0.001, *SHORT) == 0
     out, err = capsys.readouterr()
     repaired = int((np.linalg.det(points[tets[:, 1:]] - points[tets[:, :1]]) < 0).sum())
@@ -134,7 +154,7 @@ def test_any_mesh_needs_no_options(folder, capsys):
     assert f"{repaired} wound wrongly and repaired, 1 nodes in no tetrahedron" in out
     assert "the body stands on its lowest 10 %" in err
     assert "Young's modulus is" in err
-    assert "coordinates" not in err
+    assert "unit" not in err
     first, *_, last = frames(folder / "a.usd")
     bottom = np.append(CUBE.points[:, 2] == 0, False)  # meshio's formats have no up axis: Z
     np.testing.assert_array_equal(last[bottom], first[bottom])

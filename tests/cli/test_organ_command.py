@@ -177,16 +177,17 @@ def test_unlikely_units_cause_a_warning(folder, capsys):
     trimesh.creation.icosphere(2, 1500.0).export(folder / "organ.obj")
     assert simulate("organ.obj", "-o", "a.usd", "--tets", 300, "--duration", 0.05, "--fps", 20) == 0
     err = capsys.readouterr().err
-    assert (
-        "warning: organ.obj: the body is 3e+03 m long: if its coordinates are in mm, give --unit 'mm' (a factor" in err
+    assert err.startswith(
+        "warp-corot: note: organ.obj: names no unit: its 3000 units are taken as mm, so that it is 3 m"
     )
     assert simulate("organ.obj", "-o", "a.usd", "--tets", 300, "--unit", "0.05mm", *SHORT) == 0
     out, err = capsys.readouterr()
     assert "warning" not in err
     assert "bounds 150 mm x 150 mm x 150 mm" in out
-    trimesh.creation.icosphere(2, 15.0).export(folder / "large.obj")
-    assert simulate("large.obj", "-o", "a.usd", "--tets", 300, *SHORT) == 0
-    assert "note: the body is taken to be 30 m long: the file names no unit" in capsys.readouterr().err
+    trimesh.creation.icosphere(2, 2.2).export(folder / "large.glb")
+    assert simulate("large.glb", "-o", "a.usd", "--tets", 300, *SHORT) == 0
+    said = "note: large.glb: the body is 4.4 m long: if its coordinates are in cm, give --unit 'cm' (a factor of 0.01"
+    assert said in capsys.readouterr().err
 
 
 def test_compiling_is_said_once_for_mesh_and_body(folder, capsys, monkeypatch):

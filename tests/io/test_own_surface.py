@@ -83,10 +83,13 @@ def test_surfaces_are_drawn_wound_as_their_bodies(turned, folder):
     assert drawn(shown, "/SoftBody/metres").volume == pytest.approx(volume, rel=1e-3)
 
 
-def test_a_surface_with_a_hole_shows_its_inside(folder):
+def test_a_surface_with_a_hole_shows_its_inside(folder, capsys):
     ball = trimesh.creation.icosphere(3, radius=30.0)
     trimesh.Trimesh(ball.vertices, ball.faces[ball.triangles_center[:, 2] < 25.0]).export("bowl.stl")
-    assert simulate("bowl.stl", "--unit", "mm", "--tets", 400, "-o", "a.usd", *SHORT) == 0
+    assert simulate("bowl.stl", "--tets", 400, "-o", "a.usd", *SHORT) == 0
+    first, *others = capsys.readouterr().err.splitlines()
+    assert "names no unit: its 60 units are taken as mm" in first
+    assert "warning: bowl.stl: the surface is open" in others[-1]
     _, (mesh,) = meshes_in("a.usd")
     assert mesh.GetDoubleSidedAttr().Get()
 

@@ -20,7 +20,7 @@ from .applies import refuse_options
 from .holding import Held, held_as_told, held_by_default, up_of
 from .label_materials import covers_all, label_material, region_material
 from .loading import Load, loads_of, move_patches, ramp_of
-from .opened import Opened, open_input
+from .opened import Opened, open_input, with_unit
 from .organs import find_organ
 from .patches import Patches
 from .probing import probes_body
@@ -69,7 +69,7 @@ def asked_bodies(args: argparse.Namespace) -> list[Body]:
     opened = open_input(args.input)
     refuse_options(args, opened)
     remesh, loads = remesh_of(args, opened.kind), loads_of(args)
-    return [Body(own, part, model, remesh, loads) for part, own in bodies_in(opened, args)]
+    return [Body(own, part, model, remesh, loads) for part, own in bodies_in(with_unit(opened, args), args)]
 
 
 def find_body(body: Body) -> Subject:

@@ -13,7 +13,7 @@ from warp_corot.materials.isotropic import Isotropic
 
 from .applies import refuse_options
 from .label_materials import LabelMaterial, covers_all, label_material, numbers_by_name, parse_labels
-from .opened import offset_of, open_input
+from .opened import offset_of, open_input, with_unit
 from .options.defaults import BOX_LEVEL
 from .organs import as_options, domain_of, fineness_of
 from .say import complain
@@ -60,6 +60,7 @@ def organ_in_parts(args: argparse.Namespace) -> Subject:
 
     opened = open_input(args.input)
     refuse_options(args, opened)
+    opened = with_unit(opened, args)
     if args.scale is not None and not args.scale > 0.0:
         raise InputError(f"scale is {args.scale:g}; it must be a positive number")
     entries: list[LabelMaterial] = []

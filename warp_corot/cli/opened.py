@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from warp_corot.domain.units import LARGEST, likely_unit, metres_per_unit
+from warp_corot.domain.units import length, likely_unit, metres_per_unit, unlikely_size
 from warp_corot.errors import InputError
 from warp_corot.io.read import FileMesh, read_mesh_file
 from warp_corot.io.read.assets import Asset, find_asset
@@ -16,9 +16,6 @@ from warp_corot.io.read.files import suffix_of
 from warp_corot.io.read.surfaces import UP_AXES, LoadedSurface, load_surface
 from warp_corot.io.read.tetrahedra import USD_SUFFIXES, LoadedMesh, check_file, load_tets, unknown_format
 from warp_corot.io.read.volumes import LoadedVolume, is_volume, load_volume, volume_of_image
-
-#: Larger meshes [m] get a note that they may be in millimetres.
-LARGEST_PLAUSIBLE = 10.0
 
 
 @dataclass
@@ -32,9 +29,9 @@ class Opened:
         found: The content of its mesh file, if it is one.
         surface: Its triangles, if it is a surface.
         volume: Its voxels, if it is a scan.
-        tets: Its tetrahedra in the file's unit [m if it has one], for one of several bodies in the file.
+        tets: Its tetrahedra; see `with_unit`.
         notes: Notes for the user, one line each.
-        size: Longest side in the file's unit of everything in it, for one of several bodies.
+        unit: The unit of its coordinates; see `with_unit`. None: that of the asset.
     """
 
     name: str
@@ -45,7 +42,7 @@ class Opened:
     volume: LoadedVolume | None = None
     tets: LoadedMesh | None = None
     notes: list[str] = field(default_factory=list)
-    size: float | None = None
+    unit: str | float | None = None
 
     @property
     def source(self) -> Path:
@@ -95,36 +92,58 @@ def open_input(name: str) -> Opened:
     raise InputError(f"{path}: has no tetrahedra and no triangles (cell types: {found.kinds()})")
 
 
-def placed_tets(opened: Opened, args: argparse.Namespace) -> LoadedMesh:
-    """The tetrahedra in metres.
+def with_unit(opened: Opened, args: argparse.Namespace) -> Opened:
+    """The input with the unit of its coordinates, and with its tetrahedra if it has any [m, or in that unit if the file
+    and ``--unit`` name none].
+
+    ``--unit`` and ``--scale`` decide without a word. Otherwise the first note says which unit the coordinates are taken
+    in if the file names none, or that a body is of unlikely size.
 
     Raises:
         InputError: See `load_tets`.
     """
-    loaded = opened.tets or loaded_tets(opened, args)
-    asset, scale = opened.asset, 1.0 if args.scale is None else args.scale
+    named: str | float | None = None
+    if opened.kind == "tets":
+        given = None if args.unit is None else metres_per_unit(args.unit)
+        tets = load_tets(opened.name, unit=given, regions=args.regions_by, found=opened.found)
+        opened, size, named = (
+            replace(opened, tets=tets),
+            _longest(tets.points, tets.tets),
+            1.0 if tets.says_unit else None,
+        )
+    elif opened.surface is not None:
+        size, named = _longest(opened.surface.points, opened.surface.triangles), opened.surface.metres
+    elif opened.volume is not None:
+        steps = np.linalg.norm(opened.volume.affine[:3, :3], axis=0)
+        size, named = float((opened.volume.values.shape * steps).max()), opened.volume.unit
+    else:
+        return opened
+    if args.unit is not None or args.scale is not None or opened.asset:
+        return replace(opened, unit=args.unit or named or (None if opened.asset else "m"))
+    unit = named or likely_unit(size, scan=opened.kind == "scan")
+    metres = metres_per_unit(unit)
+    doubt = (unlikely_size(size * metres, metres) or "").replace("unit=", "--unit ")
+    if not named:
+        doubt = (
+            f"names no unit: its {size:.4g} units are taken as {unit}, so that it is {length(size * metres)} long "
+            "(--unit names another)"
+        )
+    if doubt:
+        opened.notes.insert(0, f"{opened.source}: {doubt}")
+    return replace(opened, unit=unit)
+
+
+def placed_tets(opened: Opened, args: argparse.Namespace) -> LoadedMesh:
+    """The tetrahedra in metres."""
+    loaded, asset = opened.tets, opened.asset
+    assert loaded is not None
+    scale = 1.0 if args.scale is None else args.scale
     if asset and args.scale is None and args.unit is None:
         scale = asset.scale
-    points = loaded.points * scale
-    size = opened.size * scale if opened.size else longest_side(points[np.unique(loaded.tets)])
-    if args.unit is None and not loaded.says_unit:
-        likely = likely_unit(size / scale)
-        if likely and args.scale is None:
-            points = points * metres_per_unit(likely)
-            opened.notes.append(_guessed(likely, size))
-        elif size > LARGEST_PLAUSIBLE:
-            opened.notes.append(f"the mesh is {size:.3g} m long; if its coordinates are in mm, add --unit mm")
+    if args.unit is None and not loaded.says_unit and not asset:
+        scale *= metres_per_unit(opened.unit or 1.0)
     opened.notes += loaded.notes
-    return replace(loaded, points=points + offset_of(args), up_axis=args.up or loaded.up_axis)
-
-
-def loaded_tets(opened: Opened, args: argparse.Namespace) -> LoadedMesh:
-    """All tetrahedra of an input, before scale and offset.
-
-    Raises:
-        InputError: See `load_tets`.
-    """
-    return load_tets(opened.name, unit=_unit(args), regions=args.regions_by, found=opened.found)
+    return replace(loaded, points=loaded.points * scale + offset_of(args), up_axis=args.up or loaded.up_axis)
 
 
 def offset_of(args: argparse.Namespace) -> np.ndarray:
@@ -132,45 +151,29 @@ def offset_of(args: argparse.Namespace) -> np.ndarray:
     return np.zeros(3) if args.offset is None else np.array(args.offset, dtype=np.float64)
 
 
-def placed_surface(opened: Opened, args: argparse.Namespace) -> tuple[LoadedSurface, str | None]:
-    """The triangles, scaled, and their unit if it is not the file's own."""
+def placed_surface(opened: Opened, args: argparse.Namespace) -> LoadedSurface:
+    """The triangles, scaled and moved, in `Opened.unit`."""
     loaded = opened.surface
     assert loaded is not None
-    unit, scale = args.unit, 1.0 if args.scale is None else args.scale
+    scale = 1.0 if args.scale is None else args.scale
     own_notes = loaded.notes
     if opened.asset and (args.unit is not None or args.scale is not None):
         # The requested size replaces the asset's own scale.
         scale, own_notes = scale / opened.asset.scale, []
-    if unit is None and loaded.metres is None and args.scale is None:
-        size = opened.size or longest_side(loaded.points[np.unique(loaded.triangles)])
-        unit = likely_unit(size)
-        if unit:
-            opened.notes.append(_guessed(unit, size))
-        elif LARGEST_PLAUSIBLE < size <= LARGEST:  # for larger ones, there is a warning
-            opened.notes.append(f"the body is taken to be {size:.3g} m long: the file names no unit (--unit)")
     notes = [*own_notes, *([f"scaled by {args.scale:g}, as asked for"] if args.scale is not None else [])]
-    points = loaded.points * scale + offset_of(args) / (metres_per_unit(unit) if unit else loaded.metres or 1.0)
-    return replace(loaded, points=points, up_axis=args.up or loaded.up_axis, notes=notes), unit
+    points = loaded.points * scale + offset_of(args) / metres_per_unit(opened.unit or loaded.metres or 1.0)
+    return replace(loaded, points=points, up_axis=args.up or loaded.up_axis, notes=notes)
 
 
-def placed_volume(opened: Opened, args: argparse.Namespace) -> tuple[LoadedVolume, str | None]:
-    """The voxels, scaled, and their unit if it is not the file's own."""
+def placed_volume(opened: Opened, args: argparse.Namespace) -> LoadedVolume:
+    """The voxels, scaled and moved, in `Opened.unit`."""
     loaded = opened.volume
     assert loaded is not None
-    unit, scale = args.unit, 1.0 if args.scale is None else args.scale
-    if unit is None and loaded.unit is None:
-        size = float((np.array(loaded.values.shape) * np.linalg.norm(loaded.affine[:3, :3], axis=0)).max())
-        unit = likely_unit(size, scan=True)
-        if unit:
-            opened.notes.append(_guessed(unit, size, "scan"))
+    scale = 1.0 if args.scale is None else args.scale
     affine = np.diag([scale, scale, scale, 1.0]) @ loaded.affine
-    affine[:3, 3] += offset_of(args) / metres_per_unit(unit or loaded.unit or 1.0)
+    affine[:3, 3] += offset_of(args) / metres_per_unit(opened.unit or 1.0)
     notes = [*loaded.notes, *([f"scaled by {args.scale:g}, as asked for"] if args.scale is not None else [])]
-    return replace(loaded, affine=affine, notes=notes), unit
-
-
-def _unit(args: argparse.Namespace) -> float | None:
-    return None if args.unit is None else metres_per_unit(args.unit)
+    return replace(loaded, affine=affine, notes=notes)
 
 
 def longest_side(points: np.ndarray) -> float:
@@ -179,8 +182,6 @@ def longest_side(points: np.ndarray) -> float:
         return float(np.ptp(points, axis=0).max()) if len(points) else 0.0
 
 
-def _guessed(unit: str, size: float, what: str = "body") -> str:
-    return (
-        f"the coordinates are taken to be in {unit}: the file names no unit, and the {what} is {size:.4g} units long "
-        "(--unit names another)"
-    )
+def _longest(points: np.ndarray, cells: np.ndarray) -> float:
+    """The longest side of the box around the points that cells name."""
+    return longest_side(points[np.unique(cells)])

@@ -112,15 +112,14 @@ def fineness_of(args: argparse.Namespace, domain: Domain) -> dict[str, Any]:
 def _surface(opened: Opened, args: argparse.Namespace) -> Domain:
     from warp_corot.domain import Domain
 
-    loaded, unit = placed_surface(opened, args)
-    return Domain.from_surface(loaded, unit=unit, device=args.device)
+    return Domain.from_surface(placed_surface(opened, args), unit=opened.unit, device=args.device)
 
 
 def _scan(opened: Opened, args: argparse.Namespace, entries: list[LabelMaterial]) -> Domain:
     """The domain of a scan; ``entries`` are filled with the materials of its labels."""
     from warp_corot.domain import Domain
 
-    volume, unit = placed_volume(opened, args)
+    volume, unit = placed_volume(opened, args), opened.unit
     if args.threshold is None:
         volume = _without_nan(volume, opened.notes)
     option, text = ("--labels", args.labels) if args.labels is not None else ("--materials", args.materials)

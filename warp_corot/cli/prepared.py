@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -53,12 +54,24 @@ class Run:
 
 
 def prepared(options: Sequence[argparse.Namespace], others: Others | None = None) -> Run:
-    """Read and mesh the bodies, and set up their simulation.
+    """Read and mesh the bodies, set up their simulation, and print their notes, and then warnings.
 
     Args:
         options: Options of each input.
         others: The ranks that get parts of the bodies, if there are any.
     """
+    with warnings.catch_warnings(record=True) as heard:
+        ready = _made_ready(options, others)
+    for body in ready.bodies:
+        name = f"{body.subject.name}: " if len(ready.bodies) > 1 else ""
+        for note in body.subject.notes:
+            complain(f"{name}{note}", kind="note")
+    for each in heard or ():
+        warnings.showwarning(each.message, each.category, each.filename, each.lineno)
+    return ready
+
+
+def _made_ready(options: Sequence[argparse.Namespace], others: Others | None) -> Run:
     shared = options[0]
     device = checked_device(shared.device)
     touched = touched_by(options)
@@ -90,7 +103,6 @@ def prepared(options: Sequence[argparse.Namespace], others: Others | None = None
     steps = 1.0 / (shared.fps * sim.dt)
     if steps > MANY_STEPS:
         bodies[0].subject.notes.append(f"{steps:.2g} steps of {sim.dt:.2g} s make a frame: this will take long")
-    _say_notes(bodies)
     return Run(bodies, sim, probes, duration, count, touched)
 
 
@@ -118,10 +130,3 @@ def _frames(args: argparse.Namespace, bodies: Sequence[Body], touched: Touched) 
     if duration is None:
         duration = max(body.subject.duration for body in bodies)
     return duration, frame_count(duration, args.fps)
-
-
-def _say_notes(bodies: Sequence[Body]) -> None:
-    for body in bodies:
-        name = f"{body.subject.name}: " if len(bodies) > 1 else ""
-        for note in body.subject.notes:
-            complain(f"{name}{note}", kind="note")

@@ -13,7 +13,7 @@ from warp_corot.errors import InputError
 from warp_corot.io.read.surfaces import LoadedSurface
 from warp_corot.io.read.tetrahedra import LoadedMesh
 
-from .opened import Opened, loaded_tets, longest_side
+from .opened import Opened, longest_side
 from .options.defaults import TETS
 
 #: More objects are joined: otherwise each would be a body with its own mesh.
@@ -32,7 +32,7 @@ def bodies_in(opened: Opened, args: argparse.Namespace) -> list[tuple[Opened, ar
     tetrahedra are separate bodies, too.
     """
     if opened.kind == "tets":
-        return _of_tets(opened, args)
+        return [(part, args) for part in _of_tets(opened, args.join)]
     surface = opened.surface
     if surface is None or args.join or not 2 <= len(surface.objects) <= MOST_BODIES:
         return [(opened, args)]
@@ -47,33 +47,29 @@ def bodies_in(opened: Opened, args: argparse.Namespace) -> list[tuple[Opened, ar
         return [(opened, args)]
     volumes = np.array([part.volume for part in closed])
     opened.notes.append(_told(parts))
-    size = longest_side(surface.points[np.unique(surface.triangles)])
     found = []
     for place, (part, share) in enumerate(zip(parts, volumes / volumes.sum(), strict=True)):
         own = argparse.Namespace(**vars(args))
         fineness = (args.level, args.max_level, args.surface_error, args.cell_size)
         if args.tets is not None or all(given is None for given in fineness):
             own.tets = max(FEWEST_TETS, int((args.tets or TETS) * share))
-        found.append((replace(opened, surface=part, size=size, notes=opened.notes if place == 0 else []), own))
+        found.append((replace(opened, surface=part, notes=opened.notes if place == 0 else []), own))
     return found
 
 
-def _of_tets(opened: Opened, args: argparse.Namespace) -> list[tuple[Opened, argparse.Namespace]]:
+def _of_tets(opened: Opened, join: bool) -> list[Opened]:
     """The parts of a file with tetrahedra, which share no nodes."""
-    loaded = loaded_tets(opened, args)
-    if args.join or not 2 <= len(loaded.objects) <= MOST_BODIES:
-        return [(replace(opened, tets=loaded), args)]
+    loaded = opened.tets
+    assert loaded is not None
+    if join or not 2 <= len(loaded.objects) <= MOST_BODIES:
+        return [opened]
     ends = np.cumsum([count for _, count in loaded.objects])
     parts = [
         _part(loaded, name, tets)
         for (name, _), tets in zip(loaded.objects, np.split(np.arange(len(loaded.tets)), ends[:-1]), strict=True)
     ]
     opened.notes.append(_told(parts))
-    size = longest_side(loaded.points[np.unique(loaded.tets)])
-    return [
-        (replace(opened, tets=part, size=size, notes=opened.notes if place == 0 else []), args)
-        for place, part in enumerate(parts)
-    ]
+    return [replace(opened, tets=part, notes=opened.notes if place == 0 else []) for place, part in enumerate(parts)]
 
 
 def _part(loaded: LoadedMesh, name: str, chosen: npt.NDArray[np.integer]) -> LoadedMesh:

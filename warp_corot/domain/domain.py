@@ -90,8 +90,8 @@ class Domain(SignedFunction):
                 has zero thickness, or it crosses itself so that part of the body is inside out.
 
         Warns:
-            UserWarning: The body is longer than 100 m or shorter than 1 mm, or holes are more than one per cent of the
-                surface's area.
+            UserWarning: The body is longer than 3 m or shorter than 1 mm and no unit was given, or holes are more than
+                one per cent of the surface's area.
         """
         from .surface import surface_domain
 
@@ -138,7 +138,7 @@ class Domain(SignedFunction):
                 spacing or no unit, or does not have a label; the message lists the labels that exist.
 
         Warns:
-            UserWarning: The body is longer than 100 m or shorter than 1 mm.
+            UserWarning: The body is longer than 3 m or shorter than 1 mm, and no unit was given.
         """
         from .labels import label_domain
 

@@ -153,7 +153,7 @@ def label_domain(
     """See `Domain.from_labels`."""
     grid = placed_grid(given, spacing, origin, affine, unit)
     numbers, names = numbered_labels(grid.values, labels)
-    return _domain(grid, numbers, names, smoothing, up_axis, device)
+    return _domain(grid, numbers, names, smoothing, up_axis, device, unit)
 
 
 def probability_domain(
@@ -178,17 +178,17 @@ def probability_domain(
     numbers = labels_from_probabilities({name: grid.values for name, grid in grids.items()}, certain=certain)
     if not numbers.any():
         raise InputError("no voxel of the maps is likelier inside than outside; are they in the range 0 to certain?")
-    return _domain(first, numbers.astype(np.int16), list(maps), smoothing, up_axis, device)
+    return _domain(first, numbers.astype(np.int16), list(maps), smoothing, up_axis, device, unit)
 
 
 def _domain(
-    grid: Grid, numbers: np.ndarray, names: Sequence[str], smoothing: float, up_axis: str, device: Any
+    grid: Grid, numbers: np.ndarray, names: Sequence[str], smoothing: float, up_axis: str, device: Any, unit: Any
 ) -> SignedFunction:
     if not 0.0 <= checked_number(smoothing, "smoothing", "m") < np.inf:
         raise InputError(f"smoothing is {smoothing!r}; it must be a length [m], 0 for none")
     domain = LabelDomain(numbers, grid.affine, names, smoothing, grid.notes, up_axis=up_axis, device=device)
     doubt = unlikely_size(float(np.ptp(domain.bounds, axis=0).max()), grid.metres)
-    if doubt:
+    if unit is None and doubt:
         domain.notes.append(doubt)
         warnings.warn(doubt, UserWarning, stacklevel=4)
     return domain

@@ -203,7 +203,7 @@ def surface_domain(surface: Surface, unit: str | float | None, up_axis: str | No
         domain = SurfaceDomain(closed, notes, up_axis=axis, device=device)
     except InputError as error:
         raise InputError(f"{source}{error}") from None
-    doubts = [unlikely_size(float(np.ptp(domain.bounds, axis=0).max()), metres)]
+    doubts = [] if unit is not None else [unlikely_size(float(np.ptp(domain.bounds, axis=0).max()), metres)]
     if closed.cap_share > LARGE_HOLES:
         where = f"walls inside it at {closed.crowded} edges" if closed.crowded else f"its {closed.holes} holes"
         doubts.append(f"the surface is open: {where} took {closed.cap_share:.1%} of its area to close")
@@ -287,7 +287,8 @@ def _given(
     if unit is not None:
         metres = metres_per_unit(unit)
         other = loaded.metres is not None and not np.isclose(loaded.metres, metres)
-        notes.append(f"unit {unit}" + (f", as asked for, though the file says {loaded.metres:g} m" if other else ""))
+        said = unit if isinstance(unit, str) else length(unit)
+        notes.append(f"unit {said}" + (f", as asked for, though the file says {loaded.metres:g} m" if other else ""))
     elif loaded.metres is not None:
         metres = loaded.metres
         notes.append(f"unit {length(metres)}, as the file says")

@@ -38,10 +38,10 @@ LEAST_UNIT, MOST_UNIT = 1.0e-18, 1.0e18
 UNITS = {"m": 1.0, "cm": 1.0e-2, "mm": 1.0e-3}
 #: The pattern of a number at the beginning of a quantity.
 _NUMBER = re.compile(r"\s*[-+]?(?:(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|inf(?![a-z])|nan(?![a-z]))")
-#: Bodies and scans of this length are assumed to be in mm if no unit is named: organs, limbs, people.
-SMALLEST_IN_MM, SMALLEST_SCAN, LARGEST_IN_MM = 50.0, 10.0, 2500.0
-#: Bodies outside this range [m] are probably given in a different unit.
-SMALLEST, LARGEST = 1.0e-3, 100.0
+#: Bodies outside this range [m] are probably given in a different unit: organs, limbs and people lie in it.
+SMALLEST, LARGEST = 1.0e-3, 3.0
+#: Bodies shorter than this [m] if their coordinates are in mm are taken to be in cm, scans are not.
+SMALLEST_IN_MM = 0.01
 #: Lengths [m], and distances from the origin in lengths, that float32 computes with.
 FLOAT32_SIZES = 1.0e-6, 1.0e6
 FLOAT32_DISTANCE = 1.0e4
@@ -116,14 +116,16 @@ def _registry() -> Any:
     return pint.UnitRegistry(cache_folder=None)
 
 
-def likely_unit(size: float, scan: bool = False) -> str | None:
-    """The most likely unit of a body's coordinates; None if its size does not tell.
+def likely_unit(size: float, scan: bool = False) -> str:
+    """The most likely unit of a body's coordinates: metres if that is no unlikely size, else cm or mm.
 
     Args:
         size: Its longest side in that unit.
         scan: Whether the body comes from a scan, whose unit is usually mm.
     """
-    return "mm" if (SMALLEST_SCAN if scan else SMALLEST_IN_MM) <= size <= LARGEST_IN_MM else None
+    if size <= LARGEST:
+        return "m"
+    return "mm" if scan or size * UNITS["mm"] >= SMALLEST_IN_MM else "cm"
 
 
 def length(metres: float) -> str:

@@ -29,8 +29,8 @@ def add_body_options(parser: argparse.ArgumentParser) -> None:
         "--unit",
         type=unit_of_length,
         metavar="LENGTH",
-        help="unit of the file's coordinates: mm, inch, 3.2cm, ... (default: the file's own; if it has none, mm "
-        "for a length of 50 to 2500, else m)",
+        help="unit of the file's coordinates: mm, inch, 3.2cm, ... (default: the file's own; if it has none, m "
+        "for up to 3 units, else mm, or cm for bodies of up to 10)",
     )
     body.add_argument(
         "--join",
