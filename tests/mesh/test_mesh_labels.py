@@ -7,6 +7,7 @@ from bodies import ball
 from meshes import as_trimesh, assert_balanced, assert_bound, held
 
 import warp_corot as wc
+from warp_corot.domain.fidelity import fidelity, held_volumes
 from warp_corot.mesh.surfaces.separating import separated
 
 
@@ -80,3 +81,47 @@ def test_random_labels_have_closed_surfaces_that_fill_the_box(seed):
         assert one.volume > 0
         total += one.volume
     assert total == pytest.approx(-surface.of_label(1).volume, rel=1e-9)
+
+
+def five_labels() -> wc.Domain:
+    """A scan of 905 ml, with labels from 860 ml to 783 mm^3 in it."""
+    x = np.stack(np.meshgrid(*[1.5 * (np.arange(120) - 59.5)] * 3, indexing="ij"), axis=-1)
+    voxels = np.zeros(x.shape[:3], np.uint8)
+    for label, (middle, half) in enumerate(
+        [
+            ((0, 0, 0), (80, 60, 45)),
+            ((30, 10, 5), (20, 20, 20)),
+            ((-35, -10, 0), (12, 18, 10)),
+            ((-5, 20, 10), (30, 3.5, 3.5)),
+            ((10, -25, -12), (5.8, 5.8, 5.8)),
+        ],
+        start=1,
+    ):
+        voxels[(((x - middle) / half) ** 2).sum(axis=-1) < 1.0] = label
+    return wc.Domain.from_labels(voxels, (1.5, 1.5, 1.5), unit="mm", device="cpu")
+
+
+def test_each_label_has_its_share_of_elements_and_its_volume():
+    scan = five_labels()
+    mesh = wc.TetForest.from_domain(scan, target_elements=5_000, device="cpu")
+    found = fidelity(mesh, scan, samples=500)
+    assert [label.name for label in found.labels] == ["1", "2", "3", "4", "5"]
+    for label in found.labels:
+        assert label.elements >= 40  # 64, less what borders of few elements take
+        assert abs(label.error) < 0.05
+        assert label.volume == pytest.approx(held_volumes(mesh)[mesh.elements_of(label.name)].sum())
+    assert sum("label" in line for line in found.report()) == 5
+    assert found.doubts() == []
+
+
+def test_the_number_of_elements_that_a_warning_names_is_enough():
+    scan = five_labels()
+    few = fidelity(wc.TetForest.from_domain(scan, target_elements=700, device="cpu"), scan, samples=500)
+    off = [label for label in few.labels if abs(label.error) > 0.05]
+    assert off
+    for label in off:
+        said = f"label {label.name}: its volume is {label.error:+.1%} off in its {label.elements} tetrahedra; "
+        assert f"{said}about {label.needed} tetrahedra in all would do" in few.doubts()
+    needed = max(label.needed for label in off)
+    more = fidelity(wc.TetForest.from_domain(scan, target_elements=needed, device="cpu"), scan, samples=500)
+    assert not any("label" in doubt for doubt in more.doubts())

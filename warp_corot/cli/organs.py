@@ -226,7 +226,8 @@ def _measured(args: argparse.Namespace, mesh: TetForest, domain: Domain, surface
         more = int(float(f"{found.needed:.1e}"))
         through = ", of which one fits through the thinnest walls"
     for doubt in found.doubts():
-        warnings.warn(doubt.replace("more tetrahedra", f"more tetrahedra (--tets {more}{through})"), stacklevel=2)
+        said = doubt.replace("more tetrahedra", f"more tetrahedra (--tets {more}{through})")
+        warnings.warn(said.replace("tetrahedra in all", "tetrahedra in all (--tets)"), stacklevel=2)
     off = max(found.distance_95)
     if args.surface_error is not None and off > args.surface_error:
         helps = (

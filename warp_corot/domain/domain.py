@@ -256,8 +256,12 @@ class _Made(Domain):
     def corners(self) -> np.ndarray:
         return self._kind.corners()
 
-    def point_in(self, name: str) -> np.ndarray | None:
-        return self._kind.point_in(name)
+    def points_in(self, name: str, count: int) -> np.ndarray:
+        return self._kind.points_in(name, count)
+
+    @property
+    def label_volumes(self) -> np.ndarray:
+        return self._kind.label_volumes
 
     def _phi(self, points: wp.array) -> wp.array:
         return self._kind._phi(points)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -23,8 +24,34 @@ if TYPE_CHECKING:
 
 #: Sample points on each of the two surfaces.
 SAMPLES = 20_000
-#: A relative error of the volume above this draws a warning.
-LARGEST_VOLUME_ERROR = 0.03
+#: A relative error of the volume, or of a label's, above this draws a warning.
+LARGEST_VOLUME_ERROR, LARGEST_LABEL_ERROR = 0.03, 0.05
+#: Labels with this many elements have their volume, whatever their shape, unless they are thinner than the elements.
+ENOUGH_ELEMENTS = 64
+
+
+@dataclass(frozen=True)
+class LabelFidelity:
+    """A label of a mesh compared with that of the scan.
+
+    Attributes:
+        name: Its name.
+        volume: Volume of the body inside its elements [m^3].
+        input_volume: Volume of its voxels [m^3].
+        elements: Number of its elements.
+        needed: About the number of elements of the whole mesh with which the volumes would agree; 0 if they do.
+    """
+
+    name: str
+    volume: float
+    input_volume: float
+    elements: int
+    needed: int = 0
+
+    @property
+    def error(self) -> float:
+        """The excess volume of the mesh, as a share of the scan's."""
+        return self.volume / self.input_volume - 1.0
 
 
 @dataclass(frozen=True)
@@ -40,6 +67,7 @@ class Fidelity:
         input_pieces: Number of pieces of the given body. Parts of a surface that touch, cross or contain one another
             are one piece, and so are voxels that touch, even in a corner.
         lost_pieces: Pieces of the body that are in no element.
+        labels: The labels of a scan, without those that no element has.
         lost_labels: Names of labels that no element has.
         watertight: Whether every edge of the mesh's surface is used once in each direction.
         smallest_dihedral: The sharpest angle between two faces of an element.
@@ -55,6 +83,7 @@ class Fidelity:
     pieces: int
     input_pieces: int
     lost_pieces: int
+    labels: tuple[LabelFidelity, ...]
     lost_labels: tuple[str, ...]
     watertight: bool
     smallest_dihedral: float
@@ -75,6 +104,7 @@ class Fidelity:
             f"the input's from it {length(back)}, {length(far_back)}",
             f"pieces {self.pieces}, of the input {self.input_pieces}"
             + (f"; labels lost: {', '.join(self.lost_labels)}" if self.lost_labels else ""),
+            *(f"label {x.name}: {volume(x.volume)} of {volume(x.input_volume)} ({x.error:+.2%})" for x in self.labels),
         ]
 
     def doubts(self) -> list[str]:
@@ -100,6 +130,12 @@ class Fidelity:
                 "than a tetrahedron have grown together; more tetrahedra would help, or a file or object of its own "
                 "for each piece, which then is a body of its own"
             )
+        for label in self.labels:
+            if label.needed:
+                found.append(
+                    f"label {label.name}: its volume is {label.error:+.1%} off in its {label.elements} tetrahedra; "
+                    f"about {label.needed} tetrahedra in all would do"
+                )
         if self.lost_labels:
             found.append(
                 f"no tetrahedron has the label{'s'[: len(self.lost_labels) != 1]} {', '.join(self.lost_labels)}: "
@@ -135,13 +171,14 @@ def fidelity(
     back = _distances(surface, given.points, domain.device)
     lost = tuple(n for n in domain.label_names if not (n in _labels(mesh) and mesh.elements_of(n).any()))
     found = Fidelity(
-        volume=held_volume(mesh),
+        volume=float(held_volumes(mesh).sum()),
         input_volume=given.volume,
         distance_mean=(float(forth.mean()), float(back.mean())),
         distance_95=(float(np.quantile(forth, 0.95)), float(np.quantile(back, 0.95))),
         pieces=int(pieces_of(mesh.tets).max()) + 1,
         input_pieces=given.pieces,
         lost_pieces=_lost_pieces(mesh, given.points, given.piece, back),
+        labels=tuple(_of_labels(mesh, domain)),
         lost_labels=lost,
         watertight=not len(net_edges(surface.triangles.astype(np.int64))[0]),
         smallest_dihedral=smallest_dihedral(mesh),
@@ -162,10 +199,29 @@ def mesh_volumes(mesh: TetForest | TetMesh) -> np.ndarray:
     return np.abs(signed_volumes(mesh.points, mesh.tets)) if volumes is None else volumes
 
 
-def held_volume(mesh: TetForest | TetMesh) -> float:
-    """Volume of a mesh's elements [m^3]; elements that a surface cuts count with the part inside."""
+def held_volumes(mesh: TetForest | TetMesh) -> np.ndarray:
+    """Volumes of a mesh's elements [m^3]; elements that a surface cuts count with the part inside."""
     volumes, fill = mesh_volumes(mesh), getattr(mesh, "fill", None)
-    return float(np.sum(volumes if fill is None else volumes * fill))
+    return volumes if fill is None else volumes * fill
+
+
+def _of_labels(mesh: TetForest | TetMesh, domain: Domain) -> Iterator[LabelFidelity]:
+    volumes = held_volumes(mesh)
+    for name, wanted in zip(domain.label_names, domain.label_volumes.tolist(), strict=True):
+        own = mesh.elements_of(name) if name in _labels(mesh) and wanted > 0.0 else np.zeros(len(volumes), bool)
+        if not own.any():
+            continue
+        found = LabelFidelity(name, float(volumes[own].sum()), wanted, int(own.sum()))
+        off, all_of_its_size = abs(found.error) / LARGEST_LABEL_ERROR, found.elements * volumes.sum() / wanted
+        if off > 1.0:
+            # A label gets its elements first, but none smaller than a voxel. Then it gets more when the others are as
+            # small as its own, and the error falls with the square of their size. Most are at the surface.
+            few, few_voxels = (n < ENOUGH_ELEMENTS for n in (found.elements, len(domain.points_in(name, 512))))
+            more = len(volumes) * (ENOUGH_ELEMENTS / found.elements) ** 0.5 if few else all_of_its_size * off**1.5
+            if few_voxels:
+                more = 4.0 * all_of_its_size * ENOUGH_ELEMENTS / found.elements
+            found = replace(found, needed=int(float(f"{max(more, 2 * len(volumes)):.1e}")))
+        yield found
 
 
 def smallest_dihedral(mesh: TetForest | TetMesh) -> float:

@@ -107,15 +107,20 @@ class LabelDomain(SignedFunction):
         wp.launch(kernels.read_voxels, points.size, given, [labels], device=points.device)
         return labels
 
-    def point_in(self, name: str) -> np.ndarray | None:
-        """See `Domain.point_in`: the voxel of the label that is nearest to their centre."""
+    def points_in(self, name: str, count: int) -> np.ndarray:
+        """See `Domain.points_in`: centres of voxels, from the one nearest to their centre to the farthest."""
         if name not in self.label_names:
-            return None
+            return super().points_in(name, count)
         voxels = np.argwhere(self.numbers == self.label_names.index(name) + 1)
-        if not len(voxels):
-            return None
-        chosen = voxels[np.argmin(((voxels - voxels.mean(axis=0)) ** 2).sum(axis=1))]
-        return self.affine[:3, :3] @ chosen + self.affine[:3, 3]
+        away = ((voxels - voxels.mean(axis=0)) ** 2).sum(axis=1) if len(voxels) else np.empty(0)
+        chosen = voxels[np.argsort(away, kind="stable")[:: max(1, -(-len(voxels) // count))]]
+        return chosen @ self.affine[:3, :3].T + self.affine[:3, 3]
+
+    @property
+    def label_volumes(self) -> np.ndarray:
+        """See `Domain.label_volumes`."""
+        counts = np.bincount(self.numbers.ravel(), minlength=len(self.label_names) + 1)[1:]
+        return counts * abs(float(np.linalg.det(self.affine[:3, :3])))
 
     def part(self, name: str) -> SignedFunction:
         """See `Domain.part`."""
@@ -128,9 +133,8 @@ class LabelDomain(SignedFunction):
     def _details(self) -> list[str]:
         steps = " x ".join(length(step) for step in self.spacing)
         sizes = pieces(self.numbers > 0)
-        count = np.bincount(self.numbers.ravel(), minlength=len(self.label_names) + 1)[1:]
-        voxel = abs(float(np.linalg.det(self.affine[:3, :3])))
-        shares = ", ".join(f"{name} {volume(n * voxel)}" for name, n in zip(self.label_names, count, strict=True))
+        volumes = zip(self.label_names, self.label_volumes.tolist(), strict=True)
+        shares = ", ".join(f"{name} {volume(own)}" for name, own in volumes)
         parted = f", the largest has {sizes[0] / sizes.sum():.2%} of the voxels" if len(sizes) > 1 else ""
         return [
             f"voxels of {steps}: {sizes.sum()} in {len(sizes)} piece{'s'[: len(sizes) > 1]}{parted}",

@@ -144,9 +144,15 @@ class SignedFunction:
             lines.append(f"labels: {', '.join(self.label_names)}")
         return lines
 
-    def point_in(self, name: str) -> np.ndarray | None:
-        """A point with a label [m], float64 [3]; None if none is known without a search."""
-        return None
+    def points_in(self, name: str, count: int) -> np.ndarray:
+        """Up to ``count`` points with a label, the first near their middle [m], float64 [n, 3]; none if none is known
+        without a search."""
+        return np.empty((0, 3))
+
+    @property
+    def label_volumes(self) -> np.ndarray:
+        """The volumes of the labels [m^3], float64 [labels]; NaN if they are not known without a search."""
+        return np.full(len(self.label_names), np.nan)
 
     # Methods that each kind of body defines.
 

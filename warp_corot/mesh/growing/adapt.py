@@ -12,7 +12,8 @@ import warp as wp
 
 from warp_corot.errors import InputError
 from warp_corot.mesh.bisection import path_tetrahedra
-from warp_corot.mesh.lattice import LATTICE_BITS, MAX_CELLS, MAX_LEVEL
+from warp_corot.mesh.lattice import LATTICE_BITS, MAX_CELLS, MAX_LEVEL, volume_shares
+from warp_corot.mesh.surfaces.embedding import leaves_at
 from warp_corot.mesh.tree import LIVE, Tree
 
 from .growth import Growth
@@ -208,6 +209,20 @@ class Growing:
         first = self.growth.element_count
         self.growth.bisect(self.judge.off())
         self.run(first)
+
+    def run_around(self, points: np.ndarray, largest: np.ndarray) -> None:
+        """Bisect elements that hold points [n, 3] [m] until each is at most as large as its limit [m^3]."""
+        growth, judge = self.growth, self.judge
+        cell_size = float(judge.lengths[0])
+        while True:
+            tree = growth.tree()
+            leaves = leaves_at(tree, self.cells, self.origin, cell_size, points)
+            large = (leaves >= 0) & (cell_size**3 * volume_shares(tree.level[leaves]) > largest)
+            if not large.any():
+                break
+            first = growth.element_count
+            growth.bisect(wp.array(np.unique(leaves[large]), dtype=wp.int32, device=growth.device))
+            self.run(first)
 
     def look_closer(self, closer: Closer) -> None:
         """Continue in elements that do not represent the surface well."""

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from warp_corot.mesh.surfaces.embedding import leaves_at
+
 from .adapt import Closer, Enough, Growing
 from .judging import GAP_ELEMENTS, THIN_NEED, Wishes
 from .resolved import Coarsening, Resolved
@@ -53,6 +55,9 @@ AMPLE, SLOW = 1.3, 2.0
 #: ones would improve the rest of the surface little and shorten the time step. From this many elements on, too few are
 #: at the surface for that. Thin parts may have finer ones.
 MAX_LEVEL, MANY, MAX_LEVEL_THIN = 7, 300_000, 13
+#: Each label of a scan gets at least this many elements, but none smaller than a voxel, before the surface gets any;
+#: of all elements at most this share is for that.
+LABEL_ELEMENTS, OF_LABELS = 64, 0.5
 #: How finely the body is sampled: the first and the last surface error over a cube's edge, and the number of tetrahedra
 #: of all levels for each requested one, or a fixed number if that is larger.
 FIRST_ERROR, CLOSE_ERROR, CLOSE_LEVEL = 0.25, 0.01, 8
@@ -220,11 +225,39 @@ def _of_cubes(
     room = (CLOSE_ELEMENTS if target <= MANY else CLOSE_ELEMENTS_OF_MANY) * target + 40_000
     if growing.growth.element_count + LEAST_CLOSER < room:
         growing.look_closer(Closer(CLOSER_LEVELS, CLOSER_ERROR, room))
+    points, largest = label_floor(domain, target)
+    growing.run_around(points, largest)
     resolved = Resolved(growing.grown(), size, domain)
     needs = needs_of(resolved, domain, budget.min_layers, most, deepest)
+    needs = resolved.largest(np.maximum(needs, floor_needs(resolved, points, largest, deepest))).astype(np.float32)
     found = Meshes(resolved, needs, budget.surface_error, sliver)
     found.choose(int(NEAR * target))
     return found
+
+
+def label_floor(domain: Domain, target: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points in the labels of a scan [n, 3] [m], and the largest element at each that gives its label enough [m^3]."""
+    count = max(int(min(LABEL_ELEMENTS, OF_LABELS * target / max(len(domain.label_names), 1))), 1)
+    found, largest = [np.empty((0, 3))], [np.empty(0)]
+    for name, volume in zip(domain.label_names, domain.label_volumes, strict=True):
+        found.append(domain.points_in(name, 8 * count))
+        largest.append(np.full(len(found[-1]), volume / min(count, len(found[-1])) if len(found[-1]) else 0.0))
+    return np.concatenate(found), np.concatenate(largest)
+
+
+def floor_needs(resolved: Resolved, points: np.ndarray, largest: np.ndarray, deepest: int) -> np.ndarray:
+    """The need of tetrahedra that hold points and are larger than their limits, the more so the larger: more than any
+    other need [m], float64 [M]."""
+    grown, needs = resolved.grown, np.zeros(len(resolved.held))
+    tree, size = grown.tree, resolved.cell_size
+    at = leaves_at(tree, grown.cells, grown.origin, size, points)
+    while (at >= 0).any():
+        at, largest = at[at >= 0], largest[at >= 0]
+        ratio = size**3 * resolved.volume[at] / largest
+        chosen = (ratio > 1.0) & (tree.level[at] < deepest)
+        np.maximum.at(needs, at[chosen], size * np.cbrt(ratio[chosen]))
+        at = tree.parent[at]
+    return needs
 
 
 def needs_of(resolved: Resolved, domain: Domain, layers: float, most: int, deepest: int) -> np.ndarray:

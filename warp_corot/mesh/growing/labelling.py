@@ -25,6 +25,11 @@ Ints = npt.NDArray[np.int32]
 Longs = npt.NDArray[np.int64]
 Floats = npt.NDArray[np.float64]
 
+#: Volumes are summed in whole numbers of this fraction of a root cube.
+UNITS = 2.0**34
+#: The rounds in which weights bring the volumes of labels nearer to what they take, the largest change in the first,
+#: and how fast changes become smaller.
+ROUNDS, STEEPEST, DAMPING = 40, 2.0, 0.25
 #: Number of points of an element at which labels are sampled, if few elements have several.
 MOST_POINTS_EACH = 64
 
@@ -70,9 +75,8 @@ def labels_of(
     """
     count = len(domain.label_names)
     whose, label, total = _parts(resolved, child, elements, domain, growers)
-    labels = np.zeros(len(elements), np.int32)
-    order = np.argsort(total, kind="stable")
-    labels[whose[order]] = label[order]
+    known = np.append(np.nan, domain.label_volumes / resolved.cell_size**3)
+    labels = _assigned(whose, label, total, len(elements), known, growers)
     there = np.sum(growers.gathered(np.bincount(labels, minlength=count + 1)), axis=0)
     lost = np.flatnonzero((there[label] == 0) & (label > 0))
     told = label[lost], growers.first + whose[lost], total[lost], labels[whose[lost]]
@@ -172,15 +176,50 @@ def _given_to_lost(label: Longs, element: Longs, total: Floats, own: Ints, *, th
     return given
 
 
+def _assigned(
+    whose: np.ndarray, label: np.ndarray, total: np.ndarray, elements: int, known: Floats, growers: Growers
+) -> Ints:
+    """The label of each element: the one that takes most of it, times a weight of the label with which the elements of
+    each label hold together its volume if that is known, else what it takes of all elements.
+
+    Without weights small labels lose: elements at their borders are mostly others'.
+    """
+    # Whole numbers, so that sums do not depend on how many processes there are.
+    units = np.rint(total * UNITS).astype(np.int64)
+    held = np.zeros(elements, np.int64)
+    np.add.at(held, whose, units)
+
+    def summed(labels: np.ndarray, values: np.ndarray) -> Floats:
+        of_label = np.zeros(len(known), np.int64)
+        np.add.at(of_label, labels, values)
+        return np.maximum(np.sum(growers.gathered(of_label), axis=0), 1).astype(np.float64)
+
+    wanted, weights = np.where(known > 0.0, known * UNITS, summed(label, units)), np.ones(len(known))
+    labels = np.zeros(elements, np.int32)
+    labels[whose] = label
+    shared = np.bincount(whose, minlength=elements)[whose] > 1
+    whose, label, total = whose[shared], label[shared], total[shared]
+    best, least = labels, np.inf
+    for trial in range(ROUNDS):
+        order = np.argsort(total * weights[label], kind="stable")
+        labels = labels.copy()
+        labels[whose[order]] = label[order]
+        ratio = wanted / summed(labels, held)
+        off = float(np.abs(np.log(ratio)).sum())
+        if off < least:
+            best, least = labels, off
+        weights *= np.clip(ratio, 1.0 / STEEPEST, STEEPEST) ** (1.0 / (1.0 + DAMPING * trial))
+    return best
+
+
 def _with_points(labels: Ints, forest: ForestArrays, domain: Domain, growers: Growers) -> Ints:
     """The labels, with those that no element has at an element each, if a point of them is known and the element is not
     another label's only one."""
     there = np.sum(growers.gathered(np.bincount(labels, minlength=len(domain.label_names) + 1)), axis=0)
     for number, name in enumerate(domain.label_names, start=1):
-        point = None if there[number] else domain.point_in(name)
-        if point is None:
+        if there[number] or not len(points := domain.points_in(name, 1)):
             continue
-        depth, element = _at(forest, point, growers)
+        depth, element = _at(forest, points[0], growers)
         told = growers.gathered((depth, -growers.first - element, int(labels[element])))
         own = max(told)
         if there[own[2]] > 1:

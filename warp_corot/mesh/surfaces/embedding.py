@@ -9,7 +9,7 @@ import warp as wp
 from warp_corot.kernels.meshing import embedding as kernels
 from warp_corot.mesh.forest_arrays import ForestArrays
 from warp_corot.mesh.lattice import LATTICE_BITS
-from warp_corot.mesh.tree import VOID
+from warp_corot.mesh.tree import VOID, Tree
 
 from .boundary import boundary_faces
 from .locating import FARTHEST, checked_points, nearest_faces
@@ -21,7 +21,10 @@ _WALKS = np.array([[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1,
 def embed(forest: ForestArrays, points: npt.ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """See `TetForest.embed`."""
     points = checked_points(points)
-    elements = _descended(forest, points)
+    found = leaves_at(forest.tree, forest.cells, forest.origin, forest.cell_size, points)
+    number = np.full(len(forest.tree.level) + 1, -1, np.int32)
+    number[forest.tree.leaves] = np.arange(len(forest.tree.leaves), dtype=np.int32)
+    elements = number[found]
     outside = np.flatnonzero(elements < 0)
     if len(outside):
         elements[outside] = _nearest(forest, points[outside])
@@ -36,10 +39,12 @@ def barycentric(forest: ForestArrays, elements: np.ndarray, points: np.ndarray) 
     return np.column_stack([1 - later.sum(axis=1), later])
 
 
-def _descended(forest: ForestArrays, points: np.ndarray) -> np.ndarray:
-    """The live leaf that contains each point, int32 [n], -1 if there is none."""
-    cells = np.array(forest.cells)
-    scaled = (points - np.asarray(forest.origin)) / forest.cell_size
+def leaves_at(
+    tree: Tree, grid: tuple[int, int, int], origin: npt.ArrayLike, cell_size: float, points: np.ndarray
+) -> np.ndarray:
+    """The live leaf of a tree, by its number there, that contains each point, int32 [n], -1 if there is none."""
+    cells = np.array(grid)
+    scaled = (points - np.asarray(origin)) / cell_size
     within = np.flatnonzero(((scaled >= 0) & (scaled <= cells)).all(axis=1))
     found = np.full(len(points), -1, np.int32)
     if not len(within):
@@ -51,8 +56,8 @@ def _descended(forest: ForestArrays, points: np.ndarray) -> np.ndarray:
     walk = np.argmax((order[:, None] == _WALKS).all(axis=2), axis=1)
     down = np.take_along_axis(rest, order, axis=1)
     weights = np.column_stack([1 - down[:, 0], down[:, 0] - down[:, 1], down[:, 1] - down[:, 2], down[:, 2]])
-    roots = 6 * np.ravel_multi_index(tuple(cube.T), forest.cells) + walk
-    tree, device = forest.tree, wp.get_device("cpu")
+    roots = 6 * np.ravel_multi_index(tuple(cube.T), grid) + walk
+    device = wp.get_device("cpu")
     inputs = [
         wp.array(roots, dtype=wp.int32, device=device),
         wp.array(weights, dtype=wp.vec4d, device=device),
@@ -61,9 +66,7 @@ def _descended(forest: ForestArrays, points: np.ndarray) -> np.ndarray:
     ]
     leaves = wp.empty(len(within), dtype=wp.int32, device=device)
     wp.launch(kernels.descend, len(within), inputs, [leaves], device=device)
-    number = np.full(len(tree.level) + 1, -1, np.int32)
-    number[tree.leaves] = np.arange(len(tree.leaves), dtype=np.int32)
-    found[within] = number[leaves.numpy()]
+    found[within] = leaves.numpy()
     return found
 
 
