@@ -25,10 +25,10 @@ class Removal:
 
 
 @wp.func
-def offer_node(i: int, min_level: int, pools: Pools, carried: Carried, removal: Removal):
+def offer_node(i: int, min_level: int, kept: int, pools: Pools, carried: Carried, removal: Removal):
     """If this and the next leaf are a pair that may be merged, count them at the node that would be removed."""
     e = pools.leaves[i]
-    if e < pools.roots or (e - pools.roots) % 2 == 1 or pools.leaves[i + 1] != e + 1:
+    if e < kept or (e - pools.roots) % 2 == 1 or pools.leaves[i + 1] != e + 1:
         return
     level = pools.level[e] - 1
     if level < min_level or pools.first_child[e] != LIVE or pools.first_child[e + 1] != LIVE:
@@ -49,6 +49,7 @@ def offer_nodes(
     # In
     threads: int,
     min_level: int,
+    kept: int,  # tetrahedra with lower numbers stay
     carried: Carried,
     # In and out
     pools: Pools,
@@ -56,7 +57,7 @@ def offer_nodes(
 ):
     for i in range(wp.tid(), pools.counts[LEAVES] - 1, threads):
         if pools.marks[i] == SIMPLIFY and pools.marks[i + 1] == SIMPLIFY:
-            offer_node(i, min_level, pools, carried, removal)
+            offer_node(i, min_level, kept, pools, carried, removal)
 
 
 @wp.func

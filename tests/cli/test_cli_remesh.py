@@ -29,7 +29,7 @@ def test_the_mesh_follows_the_motion(folder, capsys):
     assert "warning" not in err
     first, most, last = counts(out)
     assert first == 1152 < last <= most
-    assert "every 10 steps, above 1.03, below 1.01, levels 6 to 9" in out
+    assert "every 10 steps, above 1.03, below 1.01, levels that of the start to 9" in out
     assert "(at the end)" in out
     stage, _ = opened(folder / "a.usd")
     assert stage.GetEndTimeCode() == 5
@@ -99,6 +99,17 @@ def test_a_pressure_stays_the_same_while_the_mesh_changes(folder, capsys):
     assert simulate("box", "-o", "b.usd", *still, *press, *probes, "--csv", "b.csv") == 0
     stays = table(folder / "b.csv")["z > zmax - 1e-6 uy [m]"][-1]
     assert columns["z > zmax - 1e-6 uy [m]"][-1] == pytest.approx(stays, rel=0.1)
+
+
+def test_a_body_stays_near_the_number_of_elements_that_was_asked_for(folder, capsys):
+    trimesh.creation.capsule(0.1, 0.03).export(folder / "organ.stl")
+    asked = ["--unit", "m", "--tets", 2000, "--remesh", "--duration", 0.2, "--fps", 10, "--device", "cpu"]
+    assert simulate("organ.stl", "-o", "a.usd", *asked) == 0
+    first, most, last = counts(capsys.readouterr().out)
+    assert 1800 <= first <= last <= most <= 2200
+    assert simulate("organ.stl", "-o", "b.usd", *asked, "--remesh-levels", 0, 9) == 0
+    first, _, last = counts(capsys.readouterr().out)
+    assert last < 0.8 * first
 
 
 def test_the_given_surface_is_drawn(folder, capsys):

@@ -96,6 +96,22 @@ def test_simplification_leads_back_to_the_coarsest_mesh(device, rng):
     assert np.allclose(adaptive.carriage.arrays.mass.numpy(), mass, rtol=1e-12)
 
 
+def test_without_a_least_level_simplification_leads_back_to_the_first_mesh(device, rng):
+    """Also where that was refined, and after its tetrahedra were renumbered."""
+    forest = wc.TetForest.box((2, 1, 1), CUBE, 2)
+    forest = forest.refine(rng.random(len(forest.tets)) < 0.2)
+    adaptive = moving(forest, device, rng)
+    remesh = RemeshPass(adaptive, min_level=None)
+    for _ in range(3):
+        for _ in range(4):
+            remesh.apply(random_marks(adaptive, rng, 0.3, 0.1))
+        assert adaptive.leaf_count > 2 * len(forest.tets)
+        adaptive.compact()
+        for _ in range(30):
+            remesh.apply(np.full(adaptive.leaf_count, -1))
+        assert leaf_list(assert_sound(adaptive)) == leaf_list(forest)
+
+
 def state_by_point(device):
     """The lattice point of each node, its ends' points and everything it carries, in the order of the points."""
     places = device.nodes_in_use

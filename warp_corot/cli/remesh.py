@@ -74,6 +74,7 @@ def remesh_rows(sim: Simulation, done: Recording) -> list[tuple[str, str]]:
         return []
     options, first, last = changing.options, done.elements[0], done.elements[-1]
     limits = f"above {options.refine_above:g}, below {options.simplify_below:g}"
-    levels = f"levels {options.min_level} to {options.max_level}"
+    low = "that of the start" if options.min_level is None else options.min_level
+    levels = f"levels {low} to {options.max_level}"
     counts = f"{first} tetrahedra in the first frame, {max(done.elements)} at most, {last} in the last"
     return [("remeshing", counts), ("", f"every {options.every} steps, {limits}, {levels}")]

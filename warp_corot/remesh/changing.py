@@ -48,7 +48,7 @@ class Changing:
 
     Attributes:
         body: The body.
-        options: The user's options with all defaults filled in.
+        options: The user's options with defaults filled in; see `OnlineRemesh.on`.
         forest: The pools.
         passes: The passes that change the pools.
         carried_material: The material data that elements carry.
@@ -71,7 +71,6 @@ class Changing:
         self.carried_material = carried_material(body.discretization)
         self.carried_material.values |= {name: Column(0.0, int(MEAN_OF_CONTENTS)) for name in carried}
         assert self.options.capacity is not None
-        assert self.options.min_level is not None
         assert self.options.max_level is not None
         self.forest = DeviceForest(
             mesh,
@@ -245,7 +244,7 @@ class Changing:
 
 
 def fitted(options: OnlineRemesh, body: SoftBody) -> OnlineRemesh:
-    """The options with all defaults filled in from the body's mesh.
+    """The options with defaults filled in from the body's mesh; see `OnlineRemesh.on`.
 
     Raises:
         InputError: A general mesh, more than one world, options that do not fit the mesh, parameters on another device,

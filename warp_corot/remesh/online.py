@@ -39,7 +39,8 @@ class OnlineRemesh:
         refine_above, simplify_below: Thresholds in the criterion's unit; the first is the larger one. By default they
             apply to the elongation of an element's longest edge, deformed over rest length (Tagawa et al. 2013).
         min_level, max_level: Elements at these levels are not simplified and not refined, 0 to 48; three levels halve
-            the edge length. None: the coarsest level of the mesh, and three beyond its finest.
+            the edge length. None: the mesh is nowhere coarser than at the start, and at most three levels finer than
+            its finest.
         every: Steps between passes.
         capacity: Largest number of elements; None: four times those of the mesh, at least 100,000. When it is
             reached, refinement stops with one warning, and the simulation continues.
@@ -74,16 +75,13 @@ class OnlineRemesh:
         checked_parameters(self.parameters, self.criterion)
 
     def on(self, mesh: TetForest) -> OnlineRemesh:
-        """The same options with all defaults filled in from a mesh.
+        """The same options with all defaults but ``min_level`` filled in from a mesh.
 
         Raises:
             InputError: The mesh has more elements than ``capacity``.
         """
-        levels, count = mesh.levels, len(mesh.tets)
-        low, high = self.min_level, self.max_level
+        count, high = len(mesh.tets), self.max_level
         if high is None:
-            high = min(max(int(levels.max()) + 3, low or 0), MAX_LEVEL)
-        if low is None:
-            low = min(int(levels.min()), high)
+            high = min(max(int(mesh.levels.max()) + 3, self.min_level or 0), MAX_LEVEL)
         capacity = max(4 * count, 100_000) if self.capacity is None else self.capacity
-        return replace(self, min_level=low, max_level=high, capacity=checked_capacity(capacity, count))
+        return replace(self, max_level=high, capacity=checked_capacity(capacity, count))

@@ -149,8 +149,8 @@ def _add_remesh_options(group: argparse._ArgumentGroup) -> None:
         type=whole_number,
         nargs=2,
         metavar=("MIN", "MAX"),
-        help="minimum and maximum number of bisections of a cube (default: from the coarsest level at the start to "
-        "three more than the finest)",
+        help="minimum and maximum number of bisections of a cube (default: nowhere fewer than at the start, and up to "
+        "three more than its most)",
     )
     group.add_argument(
         "--remesh-every",

@@ -53,7 +53,8 @@ def _nodes_in_order(forest: DeviceForest) -> Index:
 
 
 def _elements_in_order(forest: DeviceForest) -> Index:
-    """All places for tetrahedra: roots, pairs in the order of the first leaf below, parents first, then free pairs."""
+    """All places for tetrahedra: roots, pairs of the beginning, other pairs, free pairs; each in the order of the first
+    leaf below, parents first."""
     pools = forest.pools
     level, parent = pools.level.numpy(), pools.parent.numpy()
     place = np.full(forest.tree_capacity, forest.capacity, np.int64)
@@ -64,7 +65,7 @@ def _elements_in_order(forest: DeviceForest) -> Index:
         np.minimum.at(place, parent[below], place[below])
     firsts = np.arange(pools.roots, forest.tree_capacity, 2)
     used = firsts[level[firsts] != kernels.UNUSED]
-    used = used[np.lexsort((level[used], np.minimum(place[used], place[used + 1])))]
+    used = used[np.lexsort((level[used], np.minimum(place[used], place[used + 1]), used >= forest.begun_with))]
     pairs = np.concatenate([used, firsts[level[firsts] == kernels.UNUSED]])
     both = np.stack([pairs, pairs + 1], axis=1).ravel()
     return np.concatenate([np.arange(pools.roots), both]).astype(np.int32)

@@ -36,7 +36,8 @@ class RemeshPass:
         criterion: A Warp function of a ``kernels.remesh.mark.ElementState`` and an array of numbers; the elongation of
             the longest edge, deformed over rest, if none is given.
         refine_above, simplify_below: Thresholds, in the criterion's unit; the first is the larger one.
-        min_level, max_level: Leaves of these levels are not simplified and not refined.
+        min_level, max_level: Leaves of these levels are not simplified and not refined. Without a ``min_level``, the
+            mesh is nowhere coarser than it was at the beginning.
         parameters: Numbers for the criterion, float32 [n] on the device, which may change between passes.
         lame: Lamé's parameters for the criterion [Pa], or the names under which elements carry them.
 
@@ -51,7 +52,7 @@ class RemeshPass:
         criterion: Any = elongation,
         refine_above: float = 1.25,
         simplify_below: float = 1.08,
-        min_level: int = 0,
+        min_level: int | None = 0,
         max_level: int = MAX_LEVEL,
         parameters: wp.array | None = None,
         lame: tuple[float, float] | tuple[str, str] = (0.0, 0.0),
@@ -60,7 +61,8 @@ class RemeshPass:
         check_levels(min_level, max_level)
         self.forest = forest
         self.device = forest.device
-        self.levels = (int(min_level), int(max_level))
+        self.levels = (int(min_level or 0), int(max_level))
+        self._kept = forest.pools.roots if min_level is not None else forest.begun_with
         self.parameters = wp.zeros(1, dtype=wp.float32, device=self.device) if parameters is None else parameters
         self._mark = marking_kernel(checked_criterion(criterion))
         self._origin = wp.vec3d(*forest.source.origin)
@@ -112,7 +114,7 @@ class RemeshPass:
         self._many(remesh_edges.heat_wanted, pools, edges, self._blocks)
         self._once(remesh_bisect.begin_rounds, pools, self._goes_on)
         wp.capture_while(self._goes_on, self._launch_round)
-        self._many(remesh_simplify.offer_nodes, self.levels[0], carried, pools, removal)
+        self._many(remesh_simplify.offer_nodes, self.levels[0], self._kept, carried, pools, removal)
         self._many(remesh_simplify.remove_nodes, pools, carried, removal)
         self._once(pool_kernels.give_back, pools)
         self._many(remesh_state.settle_ends, pools, carried)

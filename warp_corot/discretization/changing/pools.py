@@ -73,6 +73,7 @@ class DeviceForest:
         pools: ``kernels.remesh.pools.Pools``.
         carriage: The quantities that nodes and tetrahedra carry.
         source: The forest that this began as.
+        begun_with: Number of tetrahedra of all levels at the beginning, which keep the first places.
         capacity, node_capacity, tree_capacity: Places for leaves, nodes, and tetrahedra of all levels.
         remembered: The state to which ``restart`` returns.
         virtual_count: Nodes that only void tetrahedra name.
@@ -104,7 +105,7 @@ class DeviceForest:
             nodes + (more + 1) // 2 if node_capacity is None else checked_count(node_capacity, "node_capacity", nodes)
         )
         self.virtual_count = nodes - forest.node_count
-        self.tree_capacity = elements + 2 * more
+        self.begun_with, self.tree_capacity = elements, elements + 2 * more
         if self.tree_capacity >= 2**31:
             raise InputError(f"capacity is {capacity}: that is {self.tree_capacity} tetrahedra; there can be 2**31 - 1")
         self.threads = threads_on(self.device)
