@@ -194,9 +194,9 @@ def test_compiling_is_said_once_for_mesh_and_body(folder, capsys, monkeypatch):
     """Python reports folders made in Warp's cache (PEP 578): here one before the mesh, one before the body."""
 
     def compiled_before(function):
-        def compiled(*args):
+        def compiled(*args, **options):
             sys.audit("os.mkdir", os.path.join(wp.config.kernel_cache_dir, "module"), 511, -1)
-            return function(*args)
+            return function(*args, **options)
 
         return compiled
 

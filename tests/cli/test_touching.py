@@ -11,6 +11,7 @@ from command_line import SHORT, assert_refused, run, simulate
 from input_files import write_vtk
 from PIL import Image
 from pxr import Usd, UsdGeom, UsdValidation
+from stages import drawn
 
 import warp_corot as wc
 from warp_corot.cli.tool_paths import read_tool_path
@@ -276,3 +277,24 @@ def test_obstacles_of_every_form_are_in_a_stage(folder):
     np.testing.assert_allclose(ends, (1, 0.01, 0.005), atol=1e-6)
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     assert UsdValidation.ValidationContext(validators).Validate(stage) == []
+
+
+def test_an_organ_without_flat_feet_lies_on_a_ground(folder, capsys):
+    trimesh.creation.capsule(0.08, 0.03).export(folder / "organ.stl")
+    trimesh.creation.cylinder(0.04, 0.03).export(folder / "drum.stl")
+    asked = ["--unit", "m", "--tets", 400, "--duration", 0.3, "--fps", 10, "--device", "cpu", "-o", "a.usd"]
+    assert simulate("organ.stl", *asked, "--csv", "a.csv") == 0
+    out, err = capsys.readouterr()
+    assert "the body lies on a ground, since it has no flat feet, and nothing is fixed (--no-ground or --fix" in err
+    assert "organ, lying on a ground" in out
+    assert "touches       ground: at -0.0" in out
+    points = [np.array(drawn(Usd.Stage.Open("a.usd"), "/SoftBody/organ", k).vertices) for k in (0, 3)]
+    assert points[1][:, 2].min() > points[0][:, 2].min() - 1e-3
+    assert points[1][:, 2].max() < points[0][:, 2].max() - 1e-3
+    held = (["--no-ground"], ["--fix", "bottom"], ["--pull", "top", 0, 0, "1mm"], ["--static"], ["--gravity", 0, 0, 0])
+    for option in held:
+        assert simulate("organ.stl", *asked, *option) == 0
+        assert "ground" not in "".join(capsys.readouterr()).replace("--no-ground", "")
+    assert simulate("drum.stl", *asked) == 0
+    assert "the body stands on its lowest 10 %" in capsys.readouterr().err
+    assert_refused(folder, capsys, "--no-ground is given with --ground", "drum.stl", "--no-ground", "--ground", *asked)

@@ -1,6 +1,7 @@
 """Scans from files: the same volume in every format, errors and warnings."""
 
 import os
+import warnings
 
 import numpy as np
 import pytest
@@ -98,8 +99,11 @@ def test_a_unit_taken_wrongly_draws_a_warning():
     volume, _ = ball(0.1)
     with pytest.warns(UserWarning, match=r"give unit='mm'"):
         Domain.from_labels(volume, 1e3 * SPACING)
-    with pytest.warns(UserWarning, match=r"give unit='m'"):
-        Domain.from_labels(volume, SPACING, unit="mm")
+    with pytest.warns(UserWarning, match="is its unit right"):
+        Domain.from_labels(volume, 1e-3 * SPACING)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Domain.from_labels(volume, SPACING, unit="mm")  # as asked for
 
 
 VOLUME = np.pad(np.ones((2, 2, 2), int), 1)

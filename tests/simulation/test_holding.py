@@ -95,6 +95,29 @@ def test_a_patch_that_is_not_chosen_lets_the_body_topple():
     assert largest_displacement(mesh, tip, soft(mesh), 0.5) > 1.0
 
 
+@pytest.mark.parametrize(
+    ("shape", "lies"),
+    [
+        (trimesh.creation.icosphere(3), "it has no flat feet"),
+        (trimesh.creation.capsule(2.0, 1.0), "it has no flat feet"),
+        (trimesh.creation.torus(1.0, 0.3), ""),
+        (trimesh.creation.cylinder(1.0, 2.0), ""),
+        (trimesh.creation.box((0.1, 0.1, 2.0)), "it would topple on its lowest 10 %"),
+    ],
+    ids=["ball", "capsule", "ring", "drum", "reed"],
+)
+def test_a_body_without_flat_feet_may_lie(shape, lies):
+    shape = shape.copy().apply_scale(0.05)
+    domain = wc.Domain.from_surface((shape.vertices, shape.faces), up_axis="Z", device="cpu")
+    mesh = wc.TetForest.from_domain(domain, target_elements=800, device="cpu")
+    given = {"young": soft(mesh), "density": DENSITY, "surface": mesh.surface()}
+    found = holds_of(mesh, gravity=GRAVITY, may_lie=True, **given)
+    assert found.lies == lies
+    assert found.nodes.any() == (not lies)
+    for other in ({"gravity": GRAVITY}, {"gravity": (0, 0, 0), "may_lie": True}):
+        assert holds_of(mesh, **given, **other).nodes.any()
+
+
 def test_a_standing_body_stays_standing():
     cube = wc.TetForest.box((2, 2, 2), 0.05, 3)
     (hold,) = held(cube).pieces

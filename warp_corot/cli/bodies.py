@@ -18,6 +18,7 @@ from warp_corot.simulation.parts import checked_gravity
 
 from .applies import refuse_options
 from .holding import Held, held_as_told, held_by_default, up_of
+from .implicit import is_static
 from .label_materials import covers_all, label_material, region_material
 from .loading import Load, loads_of, move_patches, ramp_of
 from .opened import Opened, open_input, with_unit
@@ -103,8 +104,8 @@ def find_patches(bodies: Sequence[Body]) -> None:
             raise InputError(f"--probe {text!r}: is in none of the bodies")
 
 
-def make_body(body: Body, duration: float) -> None:
-    """Make the body with its fixed nodes and moving patches."""
+def make_body(body: Body, duration: float, *, alone: bool) -> None:
+    """Make the body with its fixed nodes and moving patches; if it is alone, it may lie on a ground."""
     args, subject = body.args, body.subject
     gravity = gravity_of(args, subject)
     material, chosen = _material(args, subject, body.patches)
@@ -113,7 +114,10 @@ def make_body(body: Body, duration: float) -> None:
     if expressions is None and subject.fix is not None:
         expressions = [subject.fix]
     if expressions is None:
-        body.held, stiffer = held_by_default(subject, material, gravity, may_stiffen=chosen is not None)
+        may_lie = alone and not (body.loads or args.no_ground or is_static(args))
+        body.held, stiffer = held_by_default(
+            subject, material, gravity, may_stiffen=chosen is not None, may_lie=may_lie
+        )
         if stiffer > 1.0:
             material, chosen = _material(args, subject, body.patches, stiffer)
     else:

@@ -36,10 +36,12 @@ class Held:
     Attributes:
         nodes: Mask bool [N].
         words: Text for the summary: "standing on its lowest 10 %", "free".
+        lies: Whether the body needs a ground to lie on.
     """
 
     nodes: npt.NDArray[np.bool_]
     words: str
+    lies: bool = False
 
     @property
     def count(self) -> int:
@@ -70,7 +72,7 @@ def held_as_told(subject: Subject, patches: Patches, expressions: Sequence[str],
 
 
 def held_by_default(
-    subject: Subject, material: Isotropic, gravity: npt.NDArray[np.float64], *, may_stiffen: bool
+    subject: Subject, material: Isotropic, gravity: npt.NDArray[np.float64], *, may_stiffen: bool, may_lie: bool
 ) -> tuple[Held, float]:
     """The support of the body, and a factor on its stiffness: above one if no patch would support it with its present
     stiffness.
@@ -80,10 +82,21 @@ def held_by_default(
         material: The body's material.
         gravity: Acceleration [m/s^2].
         may_stiffen: Whether Young's modulus was not given.
+        may_lie: Whether the body may lie on a ground.
     """
     holds = holds_of(
-        subject.mesh, young=material.young, density=material.density, gravity=gravity, surface=subject.surface
+        subject.mesh,
+        young=material.young,
+        density=material.density,
+        gravity=gravity,
+        surface=subject.surface,
+        may_lie=may_lie,
     )
+    if holds.lies:
+        subject.notes.append(
+            f"the body lies on a ground, since {holds.lies}, and nothing is fixed (--no-ground or --fix holds it)"
+        )
+        return Held(holds.nodes, "lying on a ground", lies=True), 1.0
     lines = holds.reasons()
     subject.notes += [*lines[:-1], f"{lines[-1]} (--fix chooses others)"]
     held = Held(holds.nodes, holds.words)

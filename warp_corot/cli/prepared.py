@@ -90,7 +90,7 @@ def _made_ready(options: Sequence[argparse.Namespace], others: Others | None) ->
         for found in inputs:
             find_patches(found)
         for body in bodies:
-            make_body(body, duration)
+            make_body(body, duration, alone=len(bodies) == 1)
         place_ground(touched, shared, bodies, gravity_of(shared, bodies[0].subject))
         with waiting("preparing the simulation"):
             sim = make_simulation(shared, bodies, touched, others)

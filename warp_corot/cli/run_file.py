@@ -26,7 +26,7 @@ SHARED = (
     *("output", "also", "preview", "preview_frames", "preview_views", "csv"),
     *("gravity", "damping", "viscosity", "duration", "fps", "dt", "device", "ramp"),
     *("integrator", "static"),
-    *("ground", "drop", "tool", "tool_path", "touch", "self_contact", "friction"),
+    *("ground", "no_ground", "drop", "tool", "tool_path", "touch", "self_contact", "friction"),
 )
 #: Keys in tables of loads, besides times and shares.
 VALUES = {"pull": "by", "twist": "degrees", "press": "pressure"}

@@ -88,6 +88,8 @@ def touched_by(options: Sequence[argparse.Namespace]) -> Touched:
             f"--tool is given {len(shapes)} times and --tool-path {len(paths)} times; each tool must have one path"
         )
     _check_drop(options)
+    if shared.no_ground and (shared.ground is not None or shared.drop is not None):
+        raise InputError("--no-ground is given with --ground or --drop, which put a ground below the bodies")
     touches = bool(shapes) or shared.ground is not None or shared.drop is not None
     touches = touches or shared.touch or shared.self_contact
     if shared.friction is not None:
@@ -118,15 +120,16 @@ def _check_drop(options: Sequence[argparse.Namespace]) -> None:
 
 
 def place_ground(touched: Touched, args: argparse.Namespace, bodies: Sequence[Body], gravity: Floats) -> None:
-    """Add the ground of ``--ground`` or ``--drop`` to the obstacles.
+    """Add the ground of ``--ground`` or ``--drop``, or of a body that lies, to the obstacles.
 
     Raises:
         InputError: ``--touch`` for a single body.
     """
     if args.touch and len(bodies) == 1:
         raise InputError("--touch is for several bodies, and there is one (--self-contact is for one body)")
-    if args.ground is None and args.drop is None:
+    if args.ground is None and args.drop is None and not any(body.held.lies for body in bodies):
         return
+    touched.contact = touched.contact or Contact()
     up = up_of(bodies[0].subject, gravity)
     height = args.ground
     if height in (None, AUTO):

@@ -1,5 +1,5 @@
 """Where a body is fixed if the user names no nodes: at the part it stands on, if that supports it, else at its largest
-flat region or a broad side. Each separate piece is fixed by itself."""
+flat region or a broad side. Each separate piece is fixed by itself. A body of one piece may lie on a ground instead."""
 
 from __future__ import annotations
 
@@ -62,12 +62,14 @@ class Holds:
     """How a body is fixed, piece by piece, the largest first.
 
     Attributes:
-        pieces: One entry for each piece.
+        pieces: One entry for each piece; none if the body lies on a ground.
         count: Number of nodes of the mesh.
+        lies: The reason why it lies on a ground, in words; empty if it does not.
     """
 
     pieces: Sequence[Hold]
     count: int
+    lies: str = ""
 
     @property
     def nodes(self) -> npt.NDArray[np.bool_]:
@@ -195,6 +197,7 @@ def holds_of(
     density: npt.ArrayLike,
     gravity: npt.ArrayLike,
     surface: Any = None,
+    may_lie: bool = False,
 ) -> Holds:
     """Fix a body as a person would, so that it neither falls nor topples.
 
@@ -209,6 +212,8 @@ def holds_of(
         density: Density [kg/m^3], a number or [T].
         gravity: Acceleration [m/s^2], [3].
         surface: A ``SurfaceMesh`` bound to the mesh, if the body ends within its tetrahedra; None: their boundary.
+        may_lie: Whether a body may lie on a ground: it does if it has no flat feet or does not stand on them, and all
+            pieces but one are small.
     """
     g = np.asarray(gravity, dtype=np.float64)
     up = np.eye(3)["XYZ".index(mesh.up_axis)] if not g.any() else -g / np.linalg.norm(g)
@@ -223,15 +228,20 @@ def holds_of(
     of_node = piece_of_nodes(mesh, of_tet)
     of_triangle = of_node[bound[triangles[:, 0]]]
     holds, count = [], int(of_tet.max()) + 1
-    largest = float(np.bincount(of_tet, volumes).max())
+    of_piece = np.bincount(of_tet, volumes)
+    small = (np.bincount(of_tet) < SMALL_PIECE) | (of_piece < SMALL_SHARE * of_piece.max())
+    may_lie &= g.any() and np.count_nonzero(~small) == 1
     for number in range(count):
         inside, around = of_tet == number, triangles[of_triangle == number]
         tets = mesh.tets[inside]
         shape = Shape(points, np.unique(tets), drawn, around, up, elements)
         own_young, own_density = (np.broadcast_to(np.ravel(a), len(of_tet))[inside] for a in (young, density))
         piece = _Piece(shape, tets, volumes[inside], own_young, own_density, g)
-        small = len(tets) < SMALL_PIECE or volumes[inside].sum() < SMALL_SHARE * largest
-        holds.append(piece.held_simply() if small and count > 1 else piece.hold())
+        if may_lie and not small[number] and not shape.has_flat_feet:
+            return Holds([], len(points), "it has no flat feet")
+        holds.append(piece.held_simply() if small[number] and count > 1 else piece.hold())
+        if may_lie and not holds[-1].stands:
+            return Holds([], len(points), holds[-1].why_not)
     return Holds(holds, len(points))
 
 

@@ -16,6 +16,9 @@ LEAST_NODES = 0.1
 #: A region is flat if its triangles face the same direction within this angle, in a layer of this fraction of the
 #: body's size, and if it is at least this fraction of the surface.
 SAME_WAY, LAYER, LEAST_FLAT = np.cos(np.radians(15.0)), 0.03, 0.08
+#: A body has flat feet if its surface within this fraction of its height from the lowest point spans at least this
+#: fraction of the area that it covers; of a ball it is 4 %.
+FEET, LEAST_SPAN = 0.01, 0.25
 #: Nodes whose distances to it differ by less than this fraction are in one layer.
 SAME_LAYER = 1.0e-6
 #: Directions in which regions are searched.
@@ -39,10 +42,12 @@ class Patch:
 
 @dataclass(frozen=True)
 class Footprint:
-    """The convex hull of points on the ground, as half-planes a x + b y + c <= 0, [E, 3]; empty if it has no area."""
+    """The convex hull of points on the ground, as half-planes a x + b y + c <= 0, [E, 3], empty if it has no area, and
+    its area [m^2]."""
 
     across: Array
     edges: Array
+    area: float
 
     def holds(self, point: Array) -> bool:
         """Whether a point is above it."""
@@ -112,9 +117,16 @@ class Shape:
         from scipy.spatial import ConvexHull, QhullError
 
         try:
-            return Footprint(self.across, ConvexHull(points @ self.across.T).equations)
+            hull = ConvexHull(points @ self.across.T)
         except (QhullError, ValueError):
-            return Footprint(self.across, np.empty((0, 3)))
+            return Footprint(self.across, np.empty((0, 3)), 0.0)
+        return Footprint(self.across, hull.equations, float(hull.volume))
+
+    @property
+    def has_flat_feet(self) -> bool:
+        """Whether it touches the ground with more than a rounded underside."""
+        feet = self.skin[self.skin @ self.up <= self.lowest + FEET * self.height]
+        return self.footprint(feet).area >= LEAST_SPAN * self.footprint(self.skin).area
 
     def beyond(self, direction: Array, share: float, *, least: float = 0.0) -> Indices:
         """Nodes of the piece in the outermost fraction of its extent along a direction, at least a fraction of them."""

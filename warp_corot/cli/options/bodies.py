@@ -113,7 +113,7 @@ def add_body_options(parser: argparse.ArgumentParser) -> None:
         action="append",
         metavar="PATCH",
         help='fix these nodes, for example bottom or "z < 0.01"; none fixes nothing; can be given several times '
-        "(default: what the body stands on, if that supports it, else its largest flat region or a broad side)",
+        "(default: what the body stands on, if that is flat and supports it; else nothing, and it lies on a ground)",
     )
 
     _add_organ_options(parser.add_argument_group("a body from a surface or a scan"))

@@ -95,6 +95,12 @@ def _add_touch_options(group: argparse._ArgumentGroup) -> None:
         "bodies stand on it, and nothing is fixed without --fix",
     )
     group.add_argument(
+        "--no-ground",
+        action="store_true",
+        help="hold a body that would lie on a ground, because it has no flat feet to stand on, at a flat region or a "
+        "broad side",
+    )
+    group.add_argument(
         "--drop",
         type=metres,
         metavar="HEIGHT",

@@ -67,9 +67,10 @@ def ground_corners(ground: Ground, points: npt.ArrayLike) -> Floats:
     """A square of the ground below points [m], [4, 3], counter-clockwise seen from above."""
     x = np.asarray(points, dtype=np.float64)
     turn = _rotation(ground.quaternion)
-    flat = turn.inv().apply(x - ground.position)[:, :2]
-    low, high = flat.min(axis=0), flat.max(axis=0)
-    center, half = 0.5 * (low + high), GROUND_SIZE * 0.5 * float((high - low).max())
+    above = turn.inv().apply(x - ground.position)
+    low, high = above.min(axis=0), above.max(axis=0)
+    # A body that is higher than wide may fall over.
+    center, half = 0.5 * (low + high)[:2], GROUND_SIZE * 0.5 * float((high - low).max())
     corners = np.array([(-half, -half, 0.0), (half, -half, 0.0), (half, half, 0.0), (-half, half, 0.0)])
     return turn.apply(corners + np.array([*center, 0.0])) + ground.position
 

@@ -20,9 +20,9 @@ from .surfaces import DrawnMesh, drawn_meshes
 
 #: Properties that frames give, or that become invalid when a prim's points are in world coordinates.
 STALE = ("points", "extent", "normals", "velocities", "accelerations", "primvars:normals", "tetraIndices")
-#: Properties that a simulation wrote: the stress, which the colours show.
+#: Properties that a simulation wrote: the stress, which the colours show, and contact.
 STRESS = "primvars:vonMises"
-COLORS = (STRESS, "primvars:displayColor", "primvars:displayColor:indices")
+COLORS = (STRESS, "primvars:displayColor", "primvars:displayColor:indices", "primvars:contactPressure")
 #: Bindings are made again; if there are several, the first of these purposes is used.
 PURPOSES = (UsdShade.Tokens.allPurpose, UsdShade.Tokens.preview, UsdShade.Tokens.full)
 
