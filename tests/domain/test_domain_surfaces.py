@@ -78,6 +78,14 @@ def test_a_shell_that_is_there_both_ways_round_is_no_cavity(device):
     assert (domain.phi([[0, 0, 0], [0.7, 0, 0]]) < 0).all()
 
 
+def test_a_cavity_with_triangles_both_ways_round_stays_hollow(device):
+    outer, inner = (trimesh.creation.icosphere(1, radius=r) for r in (1.0, 0.5))
+    inner.invert()
+    points, triangles = arrays(trimesh.util.concatenate([outer, inner]))
+    domain = Domain.from_surface((points, np.concatenate([triangles, triangles[80:120, ::-1]])), device=device)
+    assert np.array_equal(domain.phi([[0, 0, 0], [0.7, 0, 0]]) < 0, [False, True])
+
+
 def test_two_boxes_with_a_wall_between_are_one(device, rng):
     box = trimesh.creation.box((1.0, 1.0, 1.0))
     # Mirrored, so that the diagonals of the wall meet.

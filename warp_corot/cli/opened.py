@@ -106,11 +106,8 @@ def with_unit(opened: Opened, args: argparse.Namespace) -> Opened:
     if opened.kind == "tets":
         given = None if args.unit is None else metres_per_unit(args.unit)
         tets = load_tets(opened.name, unit=given, regions=args.regions_by, found=opened.found)
-        opened, size, named = (
-            replace(opened, tets=tets),
-            _longest(tets.points, tets.tets),
-            1.0 if tets.says_unit else None,
-        )
+        size, named = _longest(tets.points, tets.tets), 1.0 if tets.says_unit else None
+        opened = replace(opened, tets=tets)
     elif opened.surface is not None:
         size, named = _longest(opened.surface.points, opened.surface.triangles), opened.surface.metres
     elif opened.volume is not None:

@@ -105,7 +105,8 @@ def close_surface(points: np.ndarray, triangles: np.ndarray) -> ClosedSurface:
             f"{cap_share:.0%} of its own area{repaired}; it must take at most {LARGEST_HOLES:.0%}"
         )
     closed, all_parts = np.concatenate([triangles, caps]), np.concatenate([parts, cap_parts])
-    closed, inside_out, cavities = wind_outwards(points, closed, all_parts, two_sided=parts[two_sided[kept]])
+    two_sided_parts = np.flatnonzero(np.bincount(parts, weights=~two_sided[kept]) == 0)
+    closed, inside_out, cavities = wind_outwards(points, closed, all_parts, two_sided_parts)
     edges = Edges(closed) if len(caps) or inside_out else edges
     volume = float(part_volumes(points, closed, np.zeros(len(closed), int)).sum())
     size = float(np.ptp(points[closed.ravel()], axis=0).max())

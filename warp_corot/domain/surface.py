@@ -284,17 +284,14 @@ def _given(
         return *surface, metres_per_unit(unit), "Y" if up_axis is None else up_axis, "", [f"unit {unit}"]
     loaded = surface if isinstance(surface, LoadedSurface) else load_surface(surface)
     notes = list(loaded.notes)
-    if unit is not None:
-        metres = metres_per_unit(unit)
-        other = loaded.metres is not None and not np.isclose(loaded.metres, metres)
-        said = unit if isinstance(unit, str) else length(unit)
-        notes.append(f"unit {said}" + (f", as asked for, though the file says {loaded.metres:g} m" if other else ""))
-    elif loaded.metres is not None:
-        metres = loaded.metres
+    metres = (loaded.metres or 1.0) if unit is None else metres_per_unit(unit)
+    if loaded.metres is not None and np.isclose(loaded.metres, metres):
         notes.append(f"unit {length(metres)}, as the file says")
-    else:
-        metres = 1.0
+    elif unit is None:
         notes.append("unit m: the file names none, none was given")
+    else:
+        other = "" if loaded.metres is None else f", as asked for, though the file says {loaded.metres:g} m"
+        notes.append(f"unit {unit}{other}")
     axis = up_axis or loaded.up_axis or UP_AXES.get(loaded.source.suffix.lower(), "Z")
     if not (up_axis or loaded.up_axis):
         notes.append(f"{axis} taken as up: the file names no up axis")

@@ -230,7 +230,7 @@ def holds_of(
     holds, count = [], int(of_tet.max()) + 1
     of_piece = np.bincount(of_tet, volumes)
     small = (np.bincount(of_tet) < SMALL_PIECE) | (of_piece < SMALL_SHARE * of_piece.max())
-    may_lie &= g.any() and np.count_nonzero(~small) == 1
+    may_lie = may_lie and bool(g.any()) and np.count_nonzero(~small) == 1
     for number in range(count):
         inside, around = of_tet == number, triangles[of_triangle == number]
         tets = mesh.tets[inside]

@@ -1,4 +1,4 @@
-"""Labels of a mesh's elements: each has the one that takes most of it, and none is lost.
+"""Labels of a mesh's elements: each label has its volume, in the elements of which it takes most, and none is lost.
 
 Processes that grow a mesh together find the labels of the whole one, each those of its own elements.
 """
@@ -61,9 +61,9 @@ def labels_of(
 ) -> Ints:
     """Labels of elements of a mesh, int32 [T].
 
-    An element has the label that takes most of it. A label that would be in none has the element of which it takes
-    most, unless that is another's only one. A label that takes nothing of any element, but of which a point is known,
-    has the element at this point.
+    An element has the label that takes most of it, with weights that give each label its volume; see `_assigned`. A
+    label that would be in none has the element of which it takes most, unless that is another's only one. A label that
+    takes nothing of any element, but of which a point is known, has the element at this point.
 
     Args:
         resolved: What the body has of a grown forest.
