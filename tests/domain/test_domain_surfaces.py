@@ -58,8 +58,8 @@ def test_disorder_makes_no_difference(device, rng):
 
 @pytest.mark.parametrize("copies", ["alike", "both ways round", "nearly in place"])
 def test_triangles_that_are_there_twice_make_no_holes(copies, device, rng):
-    points, triangles = arrays(trimesh.creation.icosphere(1))
-    right, again = Domain.from_surface((points, triangles), device=device), triangles[::2]
+    points, triangles = arrays(trimesh.creation.icosphere(2))
+    right, again = Domain.from_surface((points, triangles), device=device), triangles[::8]
     if copies == "both ways round":
         again = again[:, ::-1]
     if copies == "nearly in place":
