@@ -27,7 +27,8 @@ def linked(a: np.ndarray, b: np.ndarray, count: int) -> tuple[int, np.ndarray]:
     """Groups of ``count`` items that are connected by links a[i]-b[i]: the number of groups, and the group of each
     item.
     """
-    return connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(count, count)), directed=False)
+    groups, group = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(count, count)), directed=False)
+    return groups, group.astype(np.int64)  # since callers multiply
 
 
 def wind_alike(triangles: np.ndarray, edges: Edges) -> tuple[np.ndarray, int]:
@@ -47,7 +48,8 @@ def wind_alike(triangles: np.ndarray, edges: Edges) -> tuple[np.ndarray, int]:
     heads = np.unique(parts, return_index=True)[1]
     rows, columns = np.append(a, np.full(len(heads), count)), np.append(b, heads)
     links = coo_array((np.ones(len(rows)), (rows, columns)), shape=(count + 1, count + 1)).tocsr()
-    order, parent = breadth_first_order(links, count, directed=False)
+    # In 64 bits, since keys are products.
+    order, parent = (each.astype(np.int64) for each in breadth_first_order(links, count, directed=False))
     keys = np.minimum(a, b) * (count + 1) + np.maximum(a, b)
     sort = np.argsort(keys)
     here, above = order[1:], parent[order[1:]]
