@@ -122,10 +122,12 @@ def test_bear_sags_by_a_tenth_and_comes_to_rest(folder, capsys, options):
 @pytest.mark.parametrize(
     ("size", "said"),
     [
-        (2.9, "taken as m, .* 2.9 m long"),
+        (5e-4, "taken as m, .* 500 um long, which is unlikely"),
+        (2.9, "taken as m, .* 2.9 m long .--unit"),
         (4.4, "taken as cm, .* 44 mm"),
         (49, "taken as mm, .* 49 mm"),
         (50, "taken as mm, .* 50 mm"),
+        (5000, "taken as mm, .* 5 m long, which is unlikely"),
     ],
 )
 def test_a_unit_that_no_file_names_is_the_likeliest_and_said_first(size, said, folder, capsys):
@@ -133,7 +135,7 @@ def test_a_unit_that_no_file_names_is_the_likeliest_and_said_first(size, said, f
     for options in ([], ["--unit", "m"], ["--scale", "1"]):
         assert simulate("cube.vtk", "-o", "a.usd", *SHORT, *options) == 0
         first = capsys.readouterr().err.splitlines()[0]
-        assert bool(re.search(f"cube.vtk: names no unit: its {size:g} units are {said}", first)) == (not options)
+        assert bool(re.search(f"cube.vtk: names no unit: its {size:.4g} units are {said}", first)) == (not options)
         assert ("unit" in first) == (not options)
 
 

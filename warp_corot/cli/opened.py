@@ -121,9 +121,10 @@ def with_unit(opened: Opened, args: argparse.Namespace) -> Opened:
     metres = metres_per_unit(unit)
     doubt = (unlikely_size(size * metres, metres) or "").replace("unit=", "--unit ")
     if not named:
+        unlikely = ", which is unlikely" if doubt else ""
         doubt = (
-            f"names no unit: its {size:.4g} units are taken as {unit}, so that it is {length(size * metres)} long "
-            "(--unit names another)"
+            f"names no unit: its {size:.4g} units are taken as {unit}, so that it is {length(size * metres)} long"
+            f"{unlikely} (--unit names another)"
         )
     if doubt:
         opened.notes.insert(0, f"{opened.source}: {doubt}")

@@ -72,9 +72,10 @@ class Domain(SignedFunction):
         """The body that a closed triangle surface encloses.
 
         The distance to the surface is exact; a point is inside if the winding number is above one half (Jacobson,
-        Kavan and Sorkine-Hornung 2013, by Warp's meshes). Before that, triangles wound against their neighbours and
-        parts that are inside out are reversed, and holes are closed by cones over their rims. The report says how open
-        the surface was. Parts that overlap count as one body; a part inside another that is wound inwards is a cavity.
+        Kavan and Sorkine-Hornung 2013, by Warp's meshes). Before that, points in one place are welded, triangles that
+        are there twice count once, triangles wound against their neighbours and parts that are inside out are reversed,
+        and holes are closed by cones over their rims. The report says what was repaired, and how open the surface was.
+        Parts that overlap count as one body; a part inside another that is wound inwards is a cavity.
 
         Args:
             surface: A file (.obj .stl .ply .off .glb .gltf through trimesh, USD, or one of the formats of
@@ -86,8 +87,8 @@ class Domain(SignedFunction):
             device: The device that evaluates it; None: Warp's default.
 
         Raises:
-            InputError: The argument is not a surface, or encloses no body: more than a third of its area is open, it
-                has zero thickness, or it crosses itself so that part of the body is inside out.
+            InputError: The argument is not a surface, or encloses no body: more than a third of its area is open or
+                walls inside it, it has zero thickness, or it crosses itself so that part of the body is inside out.
 
         Warns:
             UserWarning: The body is longer than 3 m or shorter than 1 mm and no unit was given, or holes are more than
