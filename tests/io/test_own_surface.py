@@ -83,6 +83,19 @@ def test_surfaces_are_drawn_wound_as_their_bodies(turned, folder):
     assert drawn(shown, "/SoftBody/metres").volume == pytest.approx(volume, rel=1e-3)
 
 
+def test_the_objects_of_a_file_are_drawn_each_wound_as_its_body(folder, capsys):
+    balls = [trimesh.creation.icosphere(2, radius=30.0).apply_translation([x, 0.0, 0.0]) for x in (0.0, 90.0)]
+    volume = 1e-9 * balls[0].volume
+    for ball in balls:
+        ball.invert()
+    trimesh.Scene({"left": balls[0], "right": balls[1]}).export("pair.obj")
+    assert simulate("pair.obj", "--unit", "mm", "--tets", 800, "-o", "a.usd", *SHORT) == 0
+    assert "2 separate bodies" in capsys.readouterr().err
+    stage, meshes = meshes_in("a.usd")
+    assert {str(mesh.GetPath()) for mesh in meshes} == {"/SoftBody/left", "/SoftBody/right"}
+    assert [drawn(stage, str(mesh.GetPath())).volume for mesh in meshes] == pytest.approx([volume, volume], rel=1e-3)
+
+
 def test_a_surface_with_a_hole_shows_its_inside(folder, capsys):
     ball = trimesh.creation.icosphere(3, radius=30.0)
     trimesh.Trimesh(ball.vertices, ball.faces[ball.triangles_center[:, 2] < 25.0]).export("bowl.stl")

@@ -28,7 +28,8 @@ def stage_of_file(path: Path) -> Any:
         import trimesh
 
         with quietly(), bounded(path):
-            scene = trimesh.load_scene(path, process=False, maintain_order=True)
+            options = {"split_objects": True} if path.suffix.lower() == ".obj" else {}
+            scene = trimesh.load_scene(path, process=False, maintain_order=True, **options)
         nodes = [(scene.geometry[name], matrix, name) for matrix, name in map(scene.graph.get, _drawn(scene))]
     except ImportError:
         raise InputError(f'{path}: reading {path.suffix} files needs: pip install "warp-corot[surface]"') from None
