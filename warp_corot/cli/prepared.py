@@ -16,6 +16,7 @@ from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import INTEGRATORS
 
 from .bodies import Body, asked_bodies, find_body, find_patches, gravity_of, make_body
+from .choosing import choose_steps
 from .compiling import compiling_said
 from .implicit import integrator_name, is_static
 from .loading import ramp_of
@@ -92,6 +93,7 @@ def _made_ready(options: Sequence[argparse.Namespace], others: Others | None) ->
         for body in bodies:
             make_body(body, duration, alone=len(bodies) == 1)
         place_ground(touched, shared, bodies, gravity_of(shared, bodies[0].subject))
+        choose_steps(shared, bodies, touched, device)
         with waiting("preparing the simulation"):
             sim = make_simulation(shared, bodies, touched, others)
             say_overlaps(touched, bodies, sim)

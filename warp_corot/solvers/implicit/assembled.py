@@ -62,12 +62,13 @@ class AssembledSolve:
         touches: Whether there may be contacts.
 
     Attributes:
+        touches: As given.
         diagonal: The blocks on the diagonal without contacts, mat33 [worlds * nodes + 1].
         couplings: The contacts of the present solve.
     """
 
     def __init__(self, operator: TangentOperator, *, touches: bool):
-        self._operator, self.device, self._touches, self._version = operator, operator.device, touches, -1
+        self._operator, self.device, self.touches, self._version = operator, operator.device, touches, -1
         self.follow()
 
     def follow(self) -> None:
@@ -107,7 +108,7 @@ class AssembledSolve:
         self._find_launch(count, worlds)
 
     def _make_couplings(self, nodes: int) -> None:
-        self.couplings, room = kernels.Couplings(), max(ROOM * nodes, LEAST_ROOM) if self._touches else 1
+        self.couplings, room = kernels.Couplings(), max(ROOM * nodes, LEAST_ROOM) if self.touches else 1
         for name, dtype, size in (
             ("count", wp.int32, 1),
             ("nodes", wp.int32, (room, kernels.PLACES)),

@@ -137,8 +137,9 @@ class BodySteps:
         if not exact and isinstance(self._preconditioner, Multigrid):
             self._preconditioner = self.lagged = Lagged(self._preconditioner, self.operator, system.ranks)
             if options.preconditioner is None and shared.rows is None and suits(self.operator):
+                assembled = AssembledSolve(self.operator, touches=touches)
                 self._preconditioner = self.lagged = ChosenSolve(
-                    AssembledSolve(self.operator, touches=touches), self.lagged
+                    assembled, self.lagged, shares=self.field.shares_dilatation
                 )
         self._make_solvers()
         like = self.body.state.displacements

@@ -1,0 +1,40 @@
+"""Explicit or implicit steps, if the user does not say which."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from command_line import simulate
+
+import warp_corot as wc
+from warp_corot.cli.choosing import _stable_step
+
+
+def steps_of(capsys, *options):
+    assert simulate("box", "--device", "cpu", "--duration", "0.05", *options) == 0
+    out, err = capsys.readouterr()
+    return "backward-euler" in out, "--integrator symplectic-euler" in err
+
+
+def test_stiff_bodies_take_implicit_steps_and_say_why(tmp_path, capsys):
+    path = ["-o", tmp_path / "box.usd"]
+    assert steps_of(capsys, *path, "--young", "30MPa") == (True, True)
+    assert steps_of(capsys, *path) == (False, False)
+
+
+@pytest.mark.parametrize(
+    "given", [["--integrator", "symplectic-euler"], ["--dt", "2us"], ["--viscosity", "1us"], ["--self-contact"]]
+)
+def test_users_choose(tmp_path, capsys, given):
+    path = ["-o", tmp_path / "box.usd", "--fps", "100"]
+    assert steps_of(capsys, *path, "--duration", "0.01", "--young", "3MPa", *given) == (False, False)
+
+
+@pytest.mark.parametrize("poisson", [0.3, 0.44])
+def test_the_estimate_of_the_stable_step(device, poisson):
+    """Where elements are of several sizes, and some stiffer than others."""
+    mesh = wc.TetForest.box((2, 1, 1), 0.05, 4)
+    mesh.refine(np.flatnonzero(mesh.points[mesh.tets].mean(axis=1)[:, 0] < 0.03))
+    young = np.where(mesh.points[mesh.tets].mean(axis=1)[:, 2] < 0.02, 2e4, 5e3)
+    body = wc.SoftBody(mesh, wc.Isotropic(young, poisson, 1000.0), device=device)
+    assert _stable_step(SimpleNamespace(soft=body)) == pytest.approx(wc.Simulation(body).stable_dt, rel=0.25)

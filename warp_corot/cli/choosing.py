@@ -1,0 +1,82 @@
+"""The choice between explicit and implicit steps, if the user makes none."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from warp_corot.elasticity import Corotated
+from warp_corot.mesh import TetForest
+
+from .bodies import Body
+from .implicit import is_static
+from .options.defaults import IMPLICIT_DT
+from .ranks import are_several
+from .touching import Touched
+
+#: The steps that follow the state, over the largest stable one at rest.
+SHORTER = 0.75
+#: Implicit steps are chosen if they are faster by this factor, since explicit ones resolve more of the motion.
+FASTER = 2.0
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a step takes [s]: at least, for each element, and the factor of both with contact."""
+
+    least: float
+    element: float
+    touching: float
+
+    def of(self, elements: int, touches: bool) -> float:
+        return (self.least + self.element * elements) * (self.touching if touches else 1.0)
+
+
+#: Explicit and implicit steps of organs on a CPU core, and on an H200. They are rough: the choice must not depend on
+#: how busy a machine is.
+ON_CPU = Cost(3e-5, 25e-9, 2.4), Cost(1e-3, 0.7e-6, 6.0)
+ON_CUDA = Cost(12e-6, 25e-12, 40.0), Cost(1.5e-3, 50e-9, 3.0)
+
+
+def choose_steps(args: argparse.Namespace, bodies: Sequence[Body], touched: Touched, device: wp.Device) -> None:
+    """Set ``integrator`` of a body's options to implicit steps if explicit ones would be slower than real time, and
+    much slower than these; a note of the body says so.
+
+    The choice is made for one body of the corotated law on a forest, which touches neither itself nor other bodies.
+    """
+    given = args.integrator or args.dt or args.viscosity or is_static(args) or are_several()
+    if given or args.self_contact or len(bodies) > 1 or bodies[0].remesh is not None:
+        return
+    body = bodies[0]
+    model, mesh = body.model, body.soft.mesh
+    if not (isinstance(model, Corotated) and model.level is None and isinstance(mesh, TetForest)):
+        return
+    explicit, implicit = ON_CUDA if device.is_cuda else ON_CPU
+    size = len(mesh.tets), touched.contact is not None
+    slow = SHORTER * _stable_step(body) / explicit.of(*size)
+    fast = IMPLICIT_DT / implicit.of(*size)
+    if slow >= 1.0 or fast < FASTER * slow:
+        return
+    args.integrator = "backward-euler"
+    body.subject.notes.append(
+        f"implicit steps, since explicit ones would be about {fast / slow:.1g} times as slow "
+        "(--integrator symplectic-euler makes those)"
+    )
+
+
+def _stable_step(body: Body) -> float:
+    """An estimate of the largest stable step at rest [s], within some 10 %: the smallest height of an element over the
+    speed of sound."""
+    mesh, material = body.soft.mesh, body.soft.discretization
+    x = mesh.points[mesh.tets].astype(float)
+    faces = np.array([(1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2)])
+    a, b, c = np.moveaxis(x[:, faces], 2, 0)
+    areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=2)
+    volumes = np.abs(np.linalg.det(x[:, 1:] - x[:, :1])) / 6.0
+    heights = 3.0 * volumes / areas.max(axis=1)
+    stiffness = material.lam.numpy().astype(float) + 2.0 * material.mu.numpy()
+    return float((heights * np.sqrt(np.asarray(body.soft.material.density, dtype=float) / stiffness)).min())
