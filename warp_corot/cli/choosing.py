@@ -48,8 +48,7 @@ def choose_steps(args: argparse.Namespace, bodies: Sequence[Body], touched: Touc
 
     The choice is made for one body of the corotated law on a forest, which touches neither itself nor other bodies.
     """
-    given = args.integrator or args.dt or args.viscosity or is_static(args) or are_several()
-    if given or args.self_contact or len(bodies) > 1 or bodies[0].remesh is not None:
+    if not may_choose(bodies):
         return
     body = bodies[0]
     model, mesh = body.model, body.soft.mesh
@@ -66,6 +65,13 @@ def choose_steps(args: argparse.Namespace, bodies: Sequence[Body], touched: Touc
         f"implicit steps, since explicit ones would be about {fast / slow:.1g} times as slow "
         "(--integrator symplectic-euler makes those)"
     )
+
+
+def may_choose(bodies: Sequence[Body]) -> bool:
+    """Whether the options leave the choice open."""
+    args = bodies[0].args
+    given = args.integrator or args.dt or args.viscosity or is_static(args) or are_several()
+    return not (given or args.self_contact or len(bodies) > 1 or bodies[0].remesh is not None)
 
 
 def _stable_step(body: Body) -> float:

@@ -10,13 +10,13 @@ from dataclasses import dataclass
 import warp as wp
 
 from warp_corot.inputs.device import checked_device
-from warp_corot.inputs.loading import BODY, CONTACT, MESHING, STEPS, STEPS_ON_CPU, SURFACES, begin_loading
+from warp_corot.inputs.loading import BODY, CONTACT, IMPLICIT, MESHING, STEPS, STEPS_ON_CPU, SURFACES, begin_loading
 from warp_corot.inputs.stopwatch import WATCH
 from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import INTEGRATORS
 
 from .bodies import Body, asked_bodies, find_body, find_patches, gravity_of, make_body
-from .choosing import choose_steps
+from .choosing import choose_steps, may_choose
 from .compiling import compiling_said
 from .implicit import integrator_name, is_static
 from .loading import ramp_of
@@ -115,7 +115,8 @@ def _modules(bodies: Sequence[Body], touched: Touched, device: wp.Device) -> lis
     if device.is_cuda:
         return [*names, *BODY, *STEPS]
     explicit = not INTEGRATORS[integrator_name(bodies[0].args)].is_implicit
-    return [*names, *(CONTACT if touched.contact is not None and explicit else ()), *BODY, *STEPS_ON_CPU]
+    names += [*(CONTACT if touched.contact is not None and explicit else ()), *BODY, *STEPS_ON_CPU]
+    return [*names, *(IMPLICIT if meshed and touched.contact is None and may_choose(bodies) else ())]
 
 
 def _frames(args: argparse.Namespace, bodies: Sequence[Body], touched: Touched) -> tuple[float, int]:

@@ -22,8 +22,9 @@ from warp_corot.discretization.nodal import vec3_view
 from warp_corot.elasticity import Corotated, Model
 from warp_corot.errors import InputError, StabilityWarning, depth_of_user
 from warp_corot.inputs.checks import checked_count, checked_flag, checked_number, refuse_tape
-from warp_corot.inputs.loading import CONTACT, STEPS, STEPS_ON_CPU, load
+from warp_corot.inputs.loading import CONTACT, IMPLICIT, STEPS, STEPS_ON_CPU, load
 from warp_corot.inputs.turns import TURN, in_turn
+from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.stepping.gauge import find_strains
 from warp_corot.remesh.online import OnlineRemesh
 from warp_corot.remesh.remeshing import Remeshing
@@ -150,7 +151,10 @@ class Simulation(Clock, FormerNames):
         explicit = not self.integrator.is_implicit
         kernels = [find_strains(body.discretization.element_kind) for body in self.bodies if self.integrator.dt is None]
         kernels += [kernel for field in self.fields for kernel in field.kernels]
-        load((*(CONTACT if touches and explicit else ()), *STEPS_ON_CPU), self.device, kernels)
+        if not explicit and any(body.discretization.element_kind is ForestElements for body in self.bodies):
+            load((*STEPS_ON_CPU, *IMPLICIT), self.device, kernels)
+        else:
+            load((*(CONTACT if touches and explicit else ()), *STEPS_ON_CPU), self.device, kernels)
 
     # --- stepping --------------------------------------------------------------------------------------------------
 
