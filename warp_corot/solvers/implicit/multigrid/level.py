@@ -124,7 +124,6 @@ class Level(SmoothedLevel):
         worlds, ranks, free, degree: As for every level.
         is_bounded: Whether the bound on the eigenvalues of D^-1 A must be kept by smaller inverses, as where groups of
             more than four nodes share a dilatation.
-        is_half: Whether the cycle uses the matrix in half precision.
 
     Attributes:
         blocks: Values of the entries, transposed, mat33 [worlds * entries + 1].
@@ -139,7 +138,6 @@ class Level(SmoothedLevel):
         free: wp.array,
         degree: int,
         is_bounded: bool = False,
-        is_half: bool = False,
     ):
         super().__init__(pattern.count, worlds, ranks, free, degree)
         self.pattern = pattern
@@ -147,24 +145,11 @@ class Level(SmoothedLevel):
         self.blocks = wp.zeros(worlds * pattern.entries + 1, dtype=wp.mat33, device=self.device)
         self.rows = cycle.Rows()
         self.rows.starts, self.rows.columns, self.rows.blocks = pattern.starts, pattern.columns, self.blocks
-        if is_half:
-            self.rows.packed = wp.zeros(12 * worlds * pattern.entries, dtype=wp.uint16, device=self.device)
-            self.rows.sums = wp.zeros_like(self.inverses)
-            self.rows.units = wp.zeros(worlds * self.count, dtype=wp.float32, device=self.device)
-        self._is_half = is_half
         self._unbounded = wp.zeros_like(self.inverses) if is_bounded else None
         rows = worlds * self.count
         self.lanes = next((lanes for most, lanes in LANES if rows > most), MOST_LANES)
         if self.device.is_cpu:
             self.lanes = 1
-
-    def pack(self) -> None:
-        """Launch the copy of the matrix that the cycle uses, if that is one in half precision."""
-        if not self._is_half:
-            return
-        pattern, rows = self.pattern, self.rows
-        inputs: list[Any] = [self.lanes, self.count, pattern.entries, pattern.starts, pattern.columns, self.blocks]
-        self.launch(cycle.pack_rows, self.count * self.lanes, inputs, [rows.packed, rows.sums, rows.units])
 
     def find_residual(self) -> None:
         inputs = [self.lanes, self.count, self.pattern.entries, self.rows, self.r, self.z]

@@ -64,7 +64,6 @@ class Multigrid:
         most_lambda: Lambda is at most this many times mu.
         most_shared: The same for groups that share their dilatation.
         members: Returns the groups of elements, among those below a number, that share their dilatation; None: none do.
-        half: Whether the cycle uses matrices in half precision; only where lambda is less than some 64 times mu.
         sweeps: Number of Gauss-Seidel sweeps that smooth, only on the CPU; zero: Chebyshev's iteration.
         assembled: Whether the finest level has its matrix; False: it goes over subtrees if these are all of the mesh.
 
@@ -89,7 +88,6 @@ class Multigrid:
         most_lambda: float = np.inf,
         most_shared: float = np.inf,
         members: Callable[[int], Members] | None = None,
-        half: bool = False,
         sweeps: int = 0,
         assembled: bool = True,
     ):
@@ -102,7 +100,7 @@ class Multigrid:
         self.most_shared = min(most_shared, 1e30)
         self.most_lambda, self.rise, self.few_nodes = most_lambda, rise, few_nodes
         self._find_members = members
-        self._is_half, self.sweeps, self._assembled = half, sweeps, assembled
+        self.sweeps, self._assembled = sweeps, assembled
         self.revision, self._version = -1, -1
         self._springs: SpringsOnLevels | None = None
         self.follow()
@@ -138,9 +136,6 @@ class Multigrid:
     def _update_coarser(self) -> None:
         for transfer in self._transfers:
             transfer.coarse.gather_from(transfer.fine)
-        for level in self.levels if self._coarsest is None else self.levels[:-1]:
-            if isinstance(level, Level):
-                level.pack()
         if self._coarsest is not None:
             self._coarsest.update()
         if self._springs is not None:
@@ -260,7 +255,7 @@ class Multigrid:
 
     def _subtrees(self, members: Members | None) -> tuple[Batch, ...] | None:
         """The subtrees of which the finest level consists, if it goes without its matrix."""
-        if self._assembled or self.sweeps or self._is_half or self.stride != 3 or self.count <= self.few_nodes:
+        if self._assembled or self.sweeps or self.stride != 3 or self.count <= self.few_nodes:
             return None
         batches = suitable_batches(self.discretization)
         if members is not None and members.count != sum(batch.count for batch in batches or ()):
@@ -312,7 +307,7 @@ class Multigrid:
             sweeps = COARSEST_SWEEPS if k == len(counts) - 1 else self.sweeps
             return SweptLevel(found, worlds, ranks, self._free, sweeps)
         is_bounded = k > 0 and self._members is not None
-        return Level(found, worlds, ranks, self._free, self._degrees[k], is_bounded, self._is_half)
+        return Level(found, worlds, ranks, self._free, self._degrees[k], is_bounded)
 
     def _find_degrees(self, counts: list[int], roots_depth: int | None) -> list[int]:
         """The degree of each level's smoother. ``roots_depth`` is the level of the roots of subtrees, if the finest
