@@ -1,12 +1,12 @@
-"""Checkpoints of older versions resume as they would have then."""
+"""Checkpoints have one version, and know the time from before a reset."""
 
 import json
 
 import numpy as np
 import pytest
-from older_checkpoints import as_version
 
 import warp_corot as wc
+from warp_corot.io.checkpoint.archive import VERSION
 
 
 def beam(worlds=2):
@@ -17,42 +17,16 @@ def beam(worlds=2):
     return body
 
 
-@pytest.mark.parametrize("version", [2, 3, 4])
-def test_versions_of_one_step_go_on_with_it(tmp_path, version):
-    """Version 2 had one material and no domains, 3 no changing mesh, 4 no step that follows the state."""
-    sim = wc.Simulation(beam(), integrator=wc.SymplecticEuler(dt=1e-3))
-    sim.advance_steps(10)
-    sim.reset(worlds=1)
-    sim.advance_steps(5)
-    sim.save(tmp_path / "now.npz")
-    as_version(tmp_path / "now.npz", tmp_path / "old.npz", version)
-    old = wc.Simulation.load(tmp_path / "old.npz")
-    assert (old.worlds, old.steps, old.dt) == (2, 15, sim.dt)
-    for each in (sim, old):
-        each.advance_steps(15)
-    np.testing.assert_array_equal(old.body.positions.numpy(), sim.body.positions.numpy())
-    assert old.time == old.total_time == sim.time
-
-
-def test_version_5_goes_on_with_the_step_that_it_had(tmp_path):
-    """It stored neither the state's step at the last check nor the length of the last step, but how the step
-    had changed, and whether a user had written velocities."""
-    sim = wc.Simulation(beam(worlds=1))
-    sim.advance(0.2)
-    sim.save(tmp_path / "now.npz")
+@pytest.mark.parametrize("version", [VERSION - 1, VERSION + 1])
+def test_other_versions_are_refused_in_a_line(tmp_path, version):
+    wc.Simulation(beam()).save(tmp_path / "now.npz")
     with np.load(tmp_path / "now.npz") as archive:
         arrays = dict(archive)
-    header = json.loads(arrays["header"].tobytes()) | {"version": 5}
+    header = json.loads(arrays["header"].tobytes()) | {"version": version}
     arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
-    arrays["kept.control"] = np.insert(arrays["kept.control"][:-1], (5, 6), 0.0)
-    arrays["kept.seconds"] = arrays["kept.seconds"][:2]
-    arrays["guard.counted"] = arrays["guard.counted"][:6]
-    del arrays["guard.lately"]
-    np.savez(tmp_path / "old.npz", **arrays)
-    old = wc.Simulation.load(tmp_path / "old.npz")
-    assert (old.steps, old.time, old.dt) == (sim.steps, sim.time, sim.dt)
-    old.advance(0.1)
-    assert old.time == pytest.approx(0.3)
+    np.savez(tmp_path / "other.npz", **arrays)
+    with pytest.raises(wc.InputError, match=f"has version {version}; this warp_corot reads version {VERSION} only"):
+        wc.Simulation.load(tmp_path / "other.npz")
 
 
 def test_time_from_before_a_reset_is_kept(tmp_path):

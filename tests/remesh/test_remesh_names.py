@@ -2,9 +2,6 @@
 
 from __future__ import annotations  # so that annotations are text, which Warp looks up among the function's globals
 
-import importlib
-import sys
-
 import numpy as np
 import pytest
 import warp as wp
@@ -56,19 +53,9 @@ def test_a_users_criterion_needs_only_exported_names(device):
 
 @pytest.mark.parametrize("name", ["strain", "von_mises_stress", "nearness", "longest_edge", "green_strain"])
 def test_names_are_those_of_the_kernels(name):
-    """Criteria written with the former import path are the same ones, and checkpoints know them."""
+    """Criteria written with the path of the kernels are the same ones, and checkpoints know them."""
     assert getattr(wc.remesh, name) is getattr(remesh_criteria, name)
     assert wc.remesh.ElementState is remesh_mark.ElementState
     assert wc.remesh.elongation is remesh_mark.elongation
     assert wc.remesh.OnlineRemesh is wc.OnlineRemesh
     assert {name, "ElementState", "elongation"} <= set(wc.remesh.__all__)
-
-
-@pytest.mark.parametrize(("module", "names"), [("remesh_mark", remesh_mark), ("remesh_criteria", remesh_criteria)])
-def test_former_places_give_the_same_and_warn(module, names):
-    sys.modules.pop(f"warp_corot.kernels.{module}", None)
-    with pytest.warns(DeprecationWarning, match="use warp_corot.remesh"):
-        former = importlib.import_module(f"warp_corot.kernels.{module}")
-    assert former.__all__
-    assert all(getattr(former, name) is getattr(names, name) for name in former.__all__)
-    assert all(hasattr(wc.remesh, name) for name in former.__all__)

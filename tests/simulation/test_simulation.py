@@ -13,7 +13,6 @@ MODELS = [
     wc.Linear(),
     wc.Corotated(),
     wc.Corotated(rotation_level=1),
-    wc.Corotated(rotation="warm"),
     wc.StVenantKirchhoff(),
     wc.NeoHookean(),
     wc.EdgeStVK(),
@@ -214,17 +213,6 @@ def test_hooks_are_called_after_every_nth_step(device):
     assert all_steps == list(range(1, 32))
 
 
-def test_former_names_of_hooks_give_the_same_and_warn():
-    sim = bar("cpu", dt=5e-4)
-    called = []
-    sim.on_step(called.append, every=10)
-    with pytest.warns(DeprecationWarning, match=r"hooks\.intervals"):
-        assert sim.hook_intervals == sim.hooks.intervals == [10]
-    with pytest.warns(DeprecationWarning, match=r"hooks\.call"):
-        sim.call_hooks()
-    assert called == [sim]
-
-
 def test_steps_that_a_hook_makes_count(device):
     sim = bar(device, dt=5e-4)
     seen = []
@@ -384,7 +372,7 @@ SIMULATION_MISTAKES = {
     "going back in time": (lambda b: wc.Simulation(b).advance(-1.0), "cannot advance"),
     "hooks every half step": (lambda b: wc.Simulation(b).on_step(print, every=0.5), "every is 0.5"),
     "rotation level below the roots": (lambda b: wc.Corotated(rotation_level=-1), "rotation_level is -1"),
-    "unknown rotation": (lambda b: wc.Corotated(rotation="qr"), "'byers-xu', 'svd' or 'warm'"),
+    "unknown rotation": (lambda b: wc.Corotated(rotation="qr"), "'byers-xu' or 'svd'"),
     "unknown stiffness": (lambda b: wc.Corotated(stiffness="full"), "'factored', 'sparse' or 'dense'"),
     "one iteration": (lambda b: wc.Corotated(iterations=1), "iterations is 1"),
     "unknown springs": (lambda b: wc.EdgeStVK(springs="cubic"), "biquadratic"),

@@ -11,14 +11,12 @@ import warp_corot as wc
 FOREST_MODELS = [
     wc.Corotated(rotation_level=0),
     wc.Corotated(rotation_level=1),
-    wc.Corotated(rotation="warm", rotation_level=0),
     wc.Corotated(stiffness="sparse"),
     wc.Corotated(stiffness="dense", rotation_level=1),
     wc.Corotated(subtrees=False),
 ]
 ALL_MODELS = [
     wc.Corotated(),
-    wc.Corotated(rotation="warm"),
     wc.Corotated(rotation="svd"),
     wc.Corotated(iterations=4),
     wc.Linear(),
@@ -30,7 +28,7 @@ ALL_MODELS = [
 ]
 #: Uniform forests are covered by adaptive ones, except for the grouping of subtrees.
 CASES = [
-    *(("uniform", model) for model in (FOREST_MODELS[0], ALL_MODELS[0], ALL_MODELS[4])),
+    *(("uniform", model) for model in (FOREST_MODELS[0], ALL_MODELS[0], ALL_MODELS[3])),
     *(("adaptive", model) for model in FOREST_MODELS + ALL_MODELS),
     *(("general", model) for model in ALL_MODELS),
 ]

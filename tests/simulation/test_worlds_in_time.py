@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import warp as wp
 from cases import random_displacement
-from older_checkpoints import as_version
 from pxr import Usd, UsdGeom
 from worlds import CUBE, DT, MESHES, WORLDS, Scene, assert_same, beam, simulated, states
 
@@ -109,8 +108,7 @@ def test_reset_of_chosen_worlds(way, device):
     [
         ("uniform", wc.Corotated()),
         ("adaptive", wc.Corotated(rotation_level=1)),
-        ("adaptive", wc.Corotated(rotation="warm")),
-        ("uniform", wc.Corotated(rotation="warm", rotation_level=0)),
+        ("uniform", wc.Corotated(rotation_level=0)),
         ("general", wc.Corotated()),
         ("general", wc.NeoHookean()),
     ],
@@ -252,7 +250,7 @@ def test_a_reset_before_the_check_forgets_an_unstable_world(device):
 # --- kept, drawn, summed -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("model", [wc.Corotated(), wc.Corotated(rotation="warm"), wc.MassSpring()], ids=repr)
+@pytest.mark.parametrize("model", [wc.Corotated(), wc.MassSpring()], ids=repr)
 def test_a_checkpoint_keeps_all_worlds(model, device, tmp_path, rng):
     scene = Scene(MESHES["adaptive"](), rng)
     sims = [simulated(scene.together(device), model, deterministic=True) for _ in range(2)]
@@ -270,19 +268,6 @@ def test_a_checkpoint_keeps_all_worlds(model, device, tmp_path, rng):
             sim.advance_steps(9)
         assert_same(device, states(resumed.body), states(sims[1].body))
     np.testing.assert_array_equal(resumed.body.constrained, sims[1].body.constrained)
-
-
-def test_a_checkpoint_of_version_1_is_one_world(tmp_path, rng):
-    scene = Scene(MESHES["adaptive"](), rng)
-    sim = simulated(scene.alone(0, "cpu"))
-    sim.advance_steps(12)
-    sim.save(tmp_path / "now.npz")
-    as_version(tmp_path / "now.npz", tmp_path / "old.npz", 1)
-    old = wc.Simulation.load(tmp_path / "old.npz")
-    assert (old.worlds, old.deterministic, old.steps) == (1, False, 12)
-    for s in (sim, old):
-        s.advance_steps(15)
-    np.testing.assert_array_equal(states(old.body, 1), states(sim.body, 1))
 
 
 def test_one_world_is_recorded(device, tmp_path):

@@ -47,7 +47,7 @@ def keep_again(contacts: Contacts, rooms: list[list[int]], room: int, kept: dict
     arrays = kept_arrays(contacts)
     for name, array in arrays.items():
         if name not in kept:
-            # Files of former versions do not have what is found again in every step.
+            # A file of another device may lack what each step finds again.
             continue
         values = kept[name]
         if values.shape[: array.ndim] != array.shape:

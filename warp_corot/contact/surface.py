@@ -225,8 +225,7 @@ class ContactSurface:
             least = _sizes(skin)
             sizes = [int(more * size) for size in least]
             if rooms is not None:
-                # Files of former versions know no bearers.
-                sizes = [max(int(room), size) for room, size in zip([*rooms[k], 0], least, strict=False)]
+                sizes = [max(int(room), size) for room, size in zip(rooms[k], least, strict=True)]
             nodes, triangles, edges, bearers = sizes
             starts = (start, triangle_start, edge_start, bearer_start)
             self.parts.append(Part(*starts, nodes, triangles, edges, bearers, skin, body.version))

@@ -22,6 +22,7 @@ from warp_corot.io.checkpoint.archive import (
     FORMAT_IN_PARTS,
     GUARDED,
     VERSION,
+    check_version,
     described_of,
     pack_body,
     rebuilt,
@@ -108,7 +109,10 @@ def load(path: str | PathLike[str], device: str | wp.Device | None) -> SimpleNam
             header = json.loads(archive["header"].tobytes())
             if header["format"] != FORMAT_IN_PARTS:
                 return None
+            check_version(header, target)
             guard = {name: archive[f"guard.{name}"] for name in GUARDED}
+    except InputError:
+        raise
     except Exception:  # whoever reads it as another checkpoint says what is wrong
         return None
     try:

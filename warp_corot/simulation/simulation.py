@@ -38,7 +38,6 @@ from warp_corot.solvers.system import NEVER, Forces, System
 
 from .clock import Clock
 from .energy import Energy, WorldEnergies, find_energies
-from .former import FormerNames
 from .hooks import Hooks
 from .parts import (
     check_constraints,
@@ -55,7 +54,7 @@ from .running import Running
 from .solves import Solves
 
 
-class Simulation(Clock, FormerNames):
+class Simulation(Clock):
     """One or several soft bodies, stepped together.
 
     Args:
@@ -364,8 +363,8 @@ class Simulation(Clock, FormerNames):
             remesh: Replaces the saved options, which do not include a criterion of your own; the capacity stays.
 
         Raises:
-            InputError: The file does not exist, is not a checkpoint or was written by a newer version, the device does
-                not exist, or a criterion is missing.
+            InputError: The file does not exist, is not a checkpoint or has another version, the device does not exist,
+                or a criterion is missing.
         """
         from warp_corot.io.checkpoint.archive import load_checkpoint
 

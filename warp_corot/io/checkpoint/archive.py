@@ -38,10 +38,8 @@ if TYPE_CHECKING:
 Remesh = OnlineRemesh | Sequence[OnlineRemesh | None] | None
 
 FORMAT, FORMAT_IN_PARTS = "warp-corot checkpoint", "warp-corot checkpoint in parts"
-#: 2: worlds, deterministic runs. 3: anisotropic materials, activation, forests made from domains. 4: meshes that
-#: change, steps of changing length. 5: a step that follows the state, starts of worlds in seconds. 6: the step at the
-#: last check. 7: contact. 8: how a run that went back continues. All are read.
-VERSION = 8
+#: The version of checkpoints that is written, and the only one that is read.
+VERSION = 9
 
 #: What the guard continues from.
 GUARDED = ("scale", "drift", "lately", "counted", "work")
@@ -166,7 +164,7 @@ def load_checkpoint(
             if not isinstance(array, np.ndarray):
                 raise InputError(f"{what}: {name} is not an array")
         header = json.loads(arrays["header"].tobytes())
-        newer = header["version"] > VERSION
+        check_version(header, source)
         if header["format"] == FORMAT_IN_PARTS:
             raise InputError(f"{source} is a checkpoint of bodies in parts; warp_corot.distributed.Simulation loads it")
         if header["format"] != FORMAT:
@@ -175,11 +173,7 @@ def load_checkpoint(
         raise
     except Exception as error:  # any error of NumPy, zip files or JSON
         raise InputError(what) from error
-    if newer:
-        raise InputError(f"{source} has version {header['version']}; this warp_corot reads versions up to {VERSION}")
     try:
-        if header["version"] < VERSION:
-            _upgrade(header, arrays)
         return _rebuilt_simulation(header, arrays, device, remesh)
     except (LookupError, TypeError) as error:
         raise InputError(f"{what}: {error} is missing or wrong") from error
@@ -189,51 +183,10 @@ def load_checkpoint(
         raise InputError(f"{what}: {' '.join(str(error).split())[:160]}") from error
 
 
-def _upgrade(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
-    """Add what an older version did not store, with the only value that it had then."""
-    if header["version"] < 2:
-        header |= {"worlds": 1, "deterministic": False}
-        for number in range(len(header["bodies"])):
-            arrays[f"body{number}.world_starts"] = np.zeros(1, np.int64)
-    for described in header["bodies"]:
-        if header["version"] < 3:
-            described |= {"material": Isotropic.__name__, "activations": 0}
-            described["mesh"] |= {"of_domain": [], "label_names": []}
-        if header["version"] < 4:
-            described["remesh"] = None
-    if header["version"] < 4:
-        header |= {"stable_dt": None, "epoch": 0.0, "steps_before_reset": 0, "time_before_reset": 0.0}
-    if header["version"] < 5:
-        _upgrade_steps(header, arrays)
-    if header["version"] < 6:
-        if "kept.control" in arrays:
-            # Drops the last shortening of the step and whether velocities were the user's; adds one entry.
-            arrays["kept.control"] = np.append(np.delete(arrays["kept.control"], (5, 7)), 0.0)
-        arrays["kept.seconds"] = np.append(arrays["kept.seconds"], 0.0)
-        arrays["guard.lately"] = np.zeros((4, header["worlds"]))
-        arrays["guard.counted"] = np.full((7, header["worlds"]), np.nan)
-    if header["version"] < 7:
-        header["contact"] = None
-        arrays["guard.counted"] = np.vstack([arrays["guard.counted"], np.zeros((1, header["worlds"]))])
-    if header["version"] < 8:
-        header["running"] = {"returns": 0, "wrong_until": 0.0, "judged": 0}
-        arrays["guard.work"] = np.zeros(2)
-
-
-def _upgrade_steps(header: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
-    """Convert steps of constant length, found or given, and starts of worlds that were counted in steps."""
-    dt, epoch = header["dt"], header["epoch"]
-    header["integrator"]["values"]["dt"] = dt
-    header["kept"] = ["counts", "seconds"]
-    # Whole steps since the epoch give the same time as before, digit for digit.
-    arrays["kept.counts"] = np.array([header["steps"], 0], np.int64)
-    arrays["kept.seconds"] = np.array([dt, -epoch * dt])
-    for name in ("scale", "drift"):
-        arrays[f"guard.{name}"] = np.zeros(header["worlds"])
-    arrays["guard.counted"] = np.full((6, header["worlds"]), np.nan)
-    for number in range(len(header["bodies"])):
-        starts = arrays[f"body{number}.world_starts"]
-        arrays[f"body{number}.world_starts"] = (starts - epoch) * dt
+def check_version(header: dict[str, Any], source: Path) -> None:
+    """Refuse a checkpoint of another version."""
+    if header["version"] != VERSION:
+        raise InputError(f"{source} has version {header['version']}; this warp_corot reads version {VERSION} only")
 
 
 def _rebuilt_simulation(

@@ -10,7 +10,7 @@ import numpy as np
 from warp_corot.contact.contacts import Contacts
 from warp_corot.contact.grasp import Grasp
 from warp_corot.contact.keeping import keep_again, kept_arrays
-from warp_corot.contact.options import TETRAHEDRA, Contact
+from warp_corot.contact.options import Contact
 from warp_corot.contact.sampled import SignedDistance, TriangleMesh
 from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, Shape, Sphere
 from warp_corot.contact.tool import Obstacle, Tool
@@ -46,15 +46,9 @@ def pack_contact(contacts: Contacts | None, grasps: Sequence[Grasp], arrays: Arr
         arrays[f"contact.{name}"] = array.numpy()
     for number, body in enumerate(contacts.system.bodies):
         arrays[f"contact.forces{number}"] = body.state.contact_forces.numpy()
-    options, law, tools = contacts.options, contacts.law, contacts.obstacles.tools
-    given = zip(contacts.obstacles.given, tools, strict=True)
-    return {
-        "friction": options.friction,
-        "self_contact": options.self_contact,
-        "flat_edges": options.flat_edges,
-        "on": options.on,
+    law = contacts.law
+    return pack_obstacles(contacts, arrays) | {
         "law": [law.tolerance, law.recovery, law.grain],
-        "obstacles": [_pack_tool(tool, each is tool, f"tool{k}.", arrays) for k, (each, tool) in enumerate(given)],
         "rooms": contacts.surface.rooms,
         "room": 0 if contacts.pairs is None else contacts.pairs.room,
         "grasps": [_pack_grasp(contacts, grasp, f"grasp{k}.", arrays) for k, grasp in enumerate(grasps)],
@@ -71,6 +65,7 @@ def pack_obstacles(contacts: Contacts, arrays: Arrays) -> dict[str, Any]:
     return {
         "friction": options.friction,
         "self_contact": options.self_contact,
+        "flat_edges": options.flat_edges,
         "on": options.on,
         "obstacles": [_pack_tool(tool, each is tool, f"tool{k}.", arrays) for k, (each, tool) in enumerate(given)],
     }
@@ -81,14 +76,8 @@ def obstacles_of(described: dict[str, Any] | None, arrays: Arrays) -> dict[str, 
     if described is None:
         return {}
     obstacles = [_unpacked_tool(each, f"tool{k}.", arrays) for k, each in enumerate(described["obstacles"])]
-    # Files of former versions do not say on what contact acts.
-    contact = Contact(
-        described["friction"],
-        bool(described["self_contact"]),
-        bool(described.get("flat_edges", False)),
-        described.get("on", TETRAHEDRA),
-    )
-    return {"obstacles": obstacles, "contact": contact}
+    options = {name: described[name] for name in ("friction", "self_contact", "flat_edges", "on")}
+    return {"obstacles": obstacles, "contact": Contact(**options)}
 
 
 def unpack_contact(contacts: Contacts | None, described: dict[str, Any] | None, arrays: Arrays) -> None:
@@ -96,8 +85,7 @@ def unpack_contact(contacts: Contacts | None, described: dict[str, Any] | None, 
     if described is None or contacts is None:
         return
     kept = {name.removeprefix("contact."): values for name, values in arrays.items() if name.startswith("contact.")}
-    # Files of former versions do not say in which grains forces are added up.
-    for name, value in zip(("tolerance", "recovery", "grain"), described["law"], strict=False):
+    for name, value in zip(("tolerance", "recovery", "grain"), described["law"], strict=True):
         setattr(contacts.law, name, value)
     keep_again(contacts, described["rooms"], described["room"], kept)
     bodies = contacts.system.bodies
