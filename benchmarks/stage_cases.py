@@ -9,11 +9,11 @@ import stages
 import warp as wp
 import work
 from measure import WRONG, Case
-from problem import GROUP_LEVELS, SUBTREE_LEVELS, Problem, oracle, padded, relative_error
+from problem import GROUP_LEVELS, SUBTREE_LEVELS, Problem, oracle, relative_error
 
 from warp_corot.discretization.elements import forest_elements
 from warp_corot.elasticity.polar import rotation_function
-from warp_corot.kernels.corotated.corotated import extract_rotations, extract_warm_rotations
+from warp_corot.kernels.corotated.corotated import extract_rotations
 from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.math.rotation import byers_xu
 
@@ -30,7 +30,6 @@ def rotation_cases(problem: Problem) -> list[Case]:
         _rotation_case(problem, "Byers-Xu, to tolerance", byers_xu, 0, work.rotation_flops(tested=True)),
         _rotation_case(problem, "Byers-Xu, 4 iterations", rotation_function("byers-xu", 4), 0),
         _rotation_case(problem, "SVD (McAdams et al.)", rotation_function("svd"), 0, None, SVD_WRONG),
-        _warm_case(problem),
     ]
     for up in (1, 3, 6):
         if up <= problem.level:
@@ -67,31 +66,6 @@ def _rotation_case(
         flops = share * (work.gradient_flops((problem.level - levels_up) % 3) + work.FRAME_ADDED + flops)
     floor = _rotation_bytes(problem, tets)
     return Case("rotation", name, run, error, problem.tet_count, floor, flops, wrong=wrong)
-
-
-def _warm_case(problem: Problem) -> Case:
-    """The warm start, back and forth between two states a thousandth of an edge apart, like the motion of a step."""
-    units, _unit = problem.units(0)
-    elements = forest_elements(problem.mesh, units, problem.device)
-    count = len(units)
-    rotations = wp.zeros(count, dtype=wp.mat33, device=problem.device)
-    quaternions = wp.array(np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), dtype=wp.quat, device=problem.device)
-    kernel = extract_warm_rotations(ForestElements)
-    rng = np.random.default_rng(2)
-    moved = problem.u + (1e-3 * problem.edge * rng.uniform(-1, 1, problem.u.shape)).astype(np.float32)
-    states = [wp.array(padded(moved), dtype=wp.vec4, device=problem.device), problem.body.state.displacements]
-
-    def run() -> None:
-        for u in states:
-            wp.launch(kernel, count, [elements, u], [quaternions, rotations], device=problem.device)
-
-    def error() -> float:
-        run()
-        some = _some(count)
-        return relative_error(rotations.numpy()[some], problem.rotations_of(problem.mesh.tets[some]))
-
-    floor = _rotation_bytes(problem, problem.mesh.tets) + 2 * work.QUATERNION
-    return Case("rotation", "warm quaternion, 0.1 % of h moved", run, error, count, floor, None, repeats=2)
 
 
 def _rotation_bytes(problem: Problem, tets: np.ndarray) -> float:

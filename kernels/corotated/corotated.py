@@ -30,7 +30,7 @@ from warp_corot.kernels.elements.elements import (
 )
 from warp_corot.kernels.elements.shapes import rest_shape
 from warp_corot.kernels.elements.stiffness import stiffness_product, vec12
-from warp_corot.kernels.math.rotation import identity3, warm_rotation
+from warp_corot.kernels.math.rotation import identity3
 from warp_corot.kernels.modules import unique_kernel
 
 wp.set_module_options({"enable_backward": False})
@@ -103,37 +103,6 @@ def extract_rotations(Elements: type, rotation: wp.Function) -> wp.Kernel:
         rotations[t] = rotation(q + local_gradient(units, t, u)) * wp.transpose(q)
 
     return extract_rotations
-
-
-@functools.cache
-def extract_warm_rotations(Elements: type) -> wp.Kernel:
-    """As ``extract_rotations``, starting from the unit's quaternion of the step before, which is then replaced."""
-
-    @unique_kernel()
-    def extract_warm_rotations(
-        # In
-        units: Elements,
-        u: wp.array[wp.vec4],
-        # Out
-        quaternions: wp.array[wp.quat],
-        rotations: wp.array[wp.mat33],
-    ):
-        t = wp.tid()
-        q = frame(units, t)
-        f = (q + local_gradient(units, t, u)) * wp.transpose(q)
-        quaternion = warm_rotation(f, quaternions[t])
-        quaternions[t] = quaternion
-        rotations[t] = wp.quat_to_matrix(quaternion)
-
-    return extract_warm_rotations
-
-
-@wp.kernel(enable_backward=False)
-def reset_quaternions(chosen: wp.array[wp.int32], world_unit_count: int, quaternions: wp.array[wp.quat]):
-    """Start the warm rotations of chosen worlds from the identity again."""
-    t = wp.tid()
-    if chosen[t // world_unit_count] != 0:
-        quaternions[t] = wp.quat_identity()
 
 
 # --- the explicit 12x12 product ------------------------------------------------------------------------------------

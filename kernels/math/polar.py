@@ -6,8 +6,6 @@ import warp as wp
 
 from warp_corot.kernels.modules import unique_kernel
 
-from .rotation import warm_rotation
-
 wp.set_module_options({"enable_backward": False})
 
 
@@ -19,10 +17,3 @@ def rotate_all(rotation: wp.Function) -> wp.Kernel:
         rotations[i] = rotation(matrices[i])
 
     return rotate_all
-
-
-@wp.kernel(enable_backward=False)
-def turn_all(matrices: wp.array[wp.mat33], guesses: wp.array[wp.mat33], rotations: wp.array[wp.mat33]):
-    i = wp.tid()
-    guess = wp.normalize(wp.quat_from_matrix(guesses[i]))
-    rotations[i] = wp.quat_to_matrix(warm_rotation(matrices[i], guess))

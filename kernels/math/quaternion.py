@@ -3,17 +3,13 @@
 ``robust_rotation``: tr(R^T F) = q^T K q for the quaternion q of R and a symmetric 4x4 matrix K of F's entries
 (Davenport; Horn 1987; Higham and Noferini 2016), so this quaternion is K's dominant eigenvector for every F. It
 takes some four hundred operations without a branch, the same for every F, and no SVD.
-``turn_quaternion`` iterates on a quaternion that the caller keeps (Müller et al. 2016), with the exact Hessian where it
-is positive definite (Kugelstadt, Koschier and Bender 2018).
 """
 
 import warp as wp
 
-from .matrices import all_finite, cofactor, column, identity3, largest_entry, reciprocal, reciprocal_root, square_root
+from .matrices import cofactor, column, identity3, largest_entry, reciprocal, reciprocal_root, square_root
 
 wp.set_module_options({"enable_backward": False})
-
-MAX_TURNS = wp.constant(40)
 
 # The largest eigenvalue of K for |F| = 1: number of steps of Laguerre's method, and the smallest denominator of a step.
 # The value that replaces the eigenvalue lies above it where the characteristic polynomial has the minimum slope, but at
@@ -26,89 +22,6 @@ MOST_SHIFT = wp.constant(0.02)
 SMALL = wp.constant(1.0e-20)
 LARGE = wp.constant(1.0e20)
 POWER_OF_TWO = wp.constant(2.0**100)
-
-
-@wp.func
-def leading_eigenvector(s: wp.mat33, scale: float):
-    """Approximate eigenvector of the largest eigenvalue of a symmetric matrix with entries up to ``scale``."""
-    m = s / scale + 3.0 * identity3()
-    for _ in range(5):
-        m = m * m
-        m = m / largest_entry(m)
-    v = column(m, 0)
-    for j in range(1, 3):
-        if wp.length_sq(column(m, j)) > wp.length_sq(v):
-            v = column(m, j)
-    return wp.normalize(v)
-
-
-@wp.func
-def slope_and_hessian(f: wp.mat33, q: wp.quat):
-    """b = R^T F, the slope of tr(R^T F) with respect to a rotation vector in the rotated frame, and minus its
-    Hessian."""
-    b = wp.transpose(wp.quat_to_matrix(q)) * f
-    axial = wp.vec3(b[2, 1] - b[1, 2], b[0, 2] - b[2, 0], b[1, 0] - b[0, 1])
-    return b, axial, wp.trace(b) * identity3() - 0.5 * (b + wp.transpose(b))
-
-
-@wp.func
-def newton_turn(axial: wp.vec3, h: wp.mat33, scale: float):
-    """Newton's step towards the maximum, and whether h is well above singular, so that it is one."""
-    minor = h[0, 0] * h[1, 1] - h[0, 1] * h[0, 1]
-    det = wp.determinant(h)
-    sound = h[0, 0] > 1.0e-3 * scale and minor > 1.0e-4 * scale * scale and det > 1.0e-6 * scale * scale * scale
-    w = wp.vec3()
-    if sound:
-        w = wp.transpose(cofactor(h)) * axial / det
-    return w, sound
-
-
-@wp.func
-def turned_by(q: wp.quat, w: wp.vec3):
-    return wp.normalize(q * wp.quat(0.5 * w[0], 0.5 * w[1], 0.5 * w[2], 1.0))
-
-
-@wp.func
-def turn(f: wp.mat33, q: wp.quat):
-    """The rotation vector, in the rotated frame, that carries q towards the maximum of tr(R^T F)."""
-    b, axial, h = slope_and_hessian(f, q)
-    scale = wp.max(largest_entry(b), 1.0e-30)
-    w, sound = newton_turn(axial, h, scale)
-    if not sound:
-        # Beyond the reach of Newton's step. Where the slope is small the iteration would creep along a saddle, so it
-        # leaves about the axis of upward curvature.
-        trace = wp.trace(b)
-        w = axial / (wp.abs(trace) + scale)
-        axis = leading_eigenvector(trace * identity3() - h, scale)
-        if wp.dot(axis, h * axis) < -1.0e-3 * scale:
-            w += wp.where(wp.dot(axis, axial) < 0.0, -0.7, 0.7) * axis
-    return w
-
-
-@wp.func
-def turn_quaternion(f: wp.mat33, guess: wp.quat, iterations: int, tolerance: float):
-    """The rotation of F as a quaternion, by at most ``iterations`` steps from ``guess``; F of order one."""
-    q = guess
-    for _ in range(iterations):
-        w = turn(f, q)
-        q = turned_by(q, w)
-        if wp.length_sq(w) < tolerance * tolerance:
-            break
-    return q
-
-
-@wp.func
-def warm_rotation(f: wp.mat33, guess: wp.quat):
-    """The rotation of any F as a quaternion, starting from ``guess``; a non-finite or zero F returns the guess."""
-    m = largest_entry(f)
-    q = guess
-    if all_finite(f) and m > 0.0:
-        # After a step of 1e-4 the next would be of order 1e-8: quadratic convergence is complete.
-        q = turn_quaternion(f / m, guess, MAX_TURNS, 1.0e-4)
-    return q
-
-
-# --- without a guess -------------------------------------------------------------------------------------------------
 
 
 @wp.func

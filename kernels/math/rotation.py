@@ -13,7 +13,7 @@ Newton's iteration has no result for a singular F and gives a reflection for an 
 import warp as wp
 
 from .matrices import all_finite, cofactor, column, frobenius, identity3, largest_entry, reciprocal
-from .quaternion import robust_rotation, warm_rotation  # noqa: F401 (other modules import them from here)
+from .quaternion import robust_rotation
 
 wp.set_module_options({"enable_backward": False})
 

@@ -7,7 +7,7 @@ import warp as wp
 from warp_corot.kernels.elements.constitutive import corotated_strain, hooke
 from warp_corot.kernels.elements.elements import GeneralElements
 from warp_corot.kernels.elements.forces import von_mises
-from warp_corot.kernels.math.rotation import byers_xu, identity3, warm_rotation
+from warp_corot.kernels.math.rotation import byers_xu, identity3
 from warp_corot.kernels.modules import unique_kernel
 
 from .elements import difference_gradient, place_in_model
@@ -40,7 +40,7 @@ def split_materials(
 
 
 @functools.cache
-def write_attributes(has_rotation: bool, has_stress: bool, has_von_mises: bool, is_warm: bool) -> wp.Kernel:
+def write_attributes(has_rotation: bool, has_stress: bool, has_von_mises: bool) -> wp.Kernel:
     """Write rotation and Cauchy stress of every element, as far as the state has attributes for them."""
 
     @unique_kernel()
@@ -52,7 +52,6 @@ def write_attributes(has_rotation: bool, has_stress: bool, has_von_mises: bool, 
         fill: wp.array[wp.float32],
         fill_stride: int,
         q: wp.array[wp.vec3],
-        guesses: wp.array[wp.quat],
         # Out
         rotations: wp.array[wp.quat],
         stresses: wp.array[wp.mat33],
@@ -60,16 +59,9 @@ def write_attributes(has_rotation: bool, has_stress: bool, has_von_mises: bool, 
     ):
         t = wp.tid()
         gradient = difference_gradient(elements, t, q)
-        r = wp.mat33()
-        if wp.static(is_warm):
-            turned = warm_rotation(gradient, guesses[t])
-            r = wp.quat_to_matrix(turned)
-            if wp.static(has_rotation):
-                rotations[t] = turned
-        else:
-            r = byers_xu(gradient)
-            if wp.static(has_rotation):
-                rotations[t] = wp.normalize(wp.quat_from_matrix(r))
+        r = byers_xu(gradient)
+        if wp.static(has_rotation):
+            rotations[t] = wp.normalize(wp.quat_from_matrix(r))
         share = 1.0 / fill[t * fill_stride]
         stress = share * hooke(corotated_strain(gradient - identity3(), identity3(), r), mu[t], lam[t])
         if wp.static(has_stress):

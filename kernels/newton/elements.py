@@ -20,7 +20,7 @@ from warp_corot.kernels.elements.general_cuda import (
 )
 from warp_corot.kernels.elements.lanes import ELEMENTS, ISOTROPIC, native, scatter_lanes
 from warp_corot.kernels.elements.law_lanes import LAWS
-from warp_corot.kernels.math.rotation import byers_xu, cofactor, identity3, warm_rotation
+from warp_corot.kernels.math.rotation import byers_xu, cofactor, identity3
 from warp_corot.kernels.modules import unique_kernel
 
 wp.set_module_options({"enable_backward": False})
@@ -117,25 +117,6 @@ def scatter_posed(rotation: wp.Function, damped: bool, rounds: int = 1) -> wp.Ke
         add(elements, t, n, p, f)
 
     return scatter_posed
-
-
-@wp.kernel(enable_backward=False)
-def scatter_posed_warm(
-    # In
-    elements: GeneralElements,
-    mu: wp.array[wp.float32],
-    lam: wp.array[wp.float32],
-    ids: wp.array[wp.int32],
-    x: wp.array[wp.vec4],
-    guesses: wp.array[wp.quat],
-    # Out
-    f: wp.array[wp.vec4],
-):
-    """Elastic forces with the rotations in the input state; ``ids`` are the elements' indices there."""
-    t = wp.tid()
-    gradient = deformation_gradient(elements, t, x)
-    r = wp.quat_to_matrix(warm_rotation(gradient, guesses[place_in_model(ids, 0, t)]))
-    scatter_stress(elements, t, corotated_stress(gradient, r, mu[t], lam[t]), f)
 
 
 # --- the same on the CPU, eight elements in the lanes of vector registers; see ``elements.lanes`` ---------------------

@@ -212,7 +212,6 @@ REFUSED_MODELS = {
     "EdgeStVK": wc.EdgeStVK(),
     "rotation_level is 0": wc.Corotated(rotation_level=0),
     "stiffness is 'sparse'": wc.Corotated(stiffness="sparse"),
-    "rotation is 'warm'": wc.Corotated(rotation="warm"),
 }
 
 

@@ -18,7 +18,6 @@ FIBRES = {
 MODELS = [
     wc.Corotated(),
     wc.Corotated(rotation_level=2),
-    wc.Corotated(rotation="warm"),
     wc.Corotated(stiffness="sparse"),
     wc.Corotated(subtrees=False),
     wc.Linear(),

@@ -95,11 +95,10 @@ def test_some_elements_are_left_to_the_second_kernel(name, device, rng):
     [
         wc.Corotated(subtrees=False),
         wc.Corotated(iterations=4),
-        wc.Corotated(rotation="warm"),
         wc.Corotated(stiffness="sparse"),
         wc.Corotated(stiffness="dense"),
     ],
-    ids=["leaf by leaf", "4 iterations", "warm", "sparse", "dense"],
+    ids=["leaf by leaf", "4 iterations", "sparse", "dense"],
 )
 def test_other_forms_of_the_corotated_force(model, device, rng):
     mesh = meshed("mixed levels")

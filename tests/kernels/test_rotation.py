@@ -1,4 +1,4 @@
-"""Polar rotations of any matrix, by every method, and the state that simulations keep of them."""
+"""Polar rotations of any matrix, by every method."""
 
 import numpy as np
 import oracle
@@ -8,10 +8,10 @@ from sequential import Bisection
 
 import warp_corot as wc
 
-METHODS = ("byers-xu", "svd", "warm")
+METHODS = ("byers-xu", "svd")
 # Error of the polar factor (Frobenius): median, 99th percentile, largest. The SVD of McAdams et al. stops after a fixed
 # number of Jacobi sweeps, which leaves some matrices with nearly equal singular values unfinished: it is a baseline.
-ACCURACY = {"byers-xu": (5e-7, 2e-6, 2e-5), "warm": (5e-7, 2e-6, 2e-5), "svd": (1e-6, 1e-3, 0.2)}
+ACCURACY = {"byers-xu": (5e-7, 2e-6, 2e-5), "svd": (1e-6, 1e-3, 0.2)}
 
 
 def matrices(rng, count):
@@ -142,8 +142,6 @@ def test_bad_arguments(device):
         wc.polar_rotation(np.ones((5, 3, 2)), device=device)
     with pytest.raises(wc.InputError, match="iterations"):
         wc.polar_rotation(np.eye(3)[None], iterations=0, device=device)
-    with pytest.raises(wc.InputError, match="guess has shape"):
-        wc.polar_rotation(np.eye(3)[None], method="warm", guess=np.eye(4), device=device)
     with pytest.raises(wc.InputError, match="rotation"):
         wc.Corotated(rotation="newton")
     with pytest.raises(wc.InputError, match="level"):
@@ -164,37 +162,6 @@ def test_methods_agree_in_the_force(method, device, rng):
     lame = oracle.lame(MATERIAL["young"], MATERIAL["poisson"])
     _, expected = oracle.evaluate("corotated", reference, mesh.points + u.astype(float), *lame)
     assert np.abs(sim.forces().numpy() - expected).max() < 1e-5 * np.abs(expected).max()
-
-
-def test_warm_start_keeps_its_state(device, rng):
-    """Half a turn in small steps: the stored rotation follows, and computing forces changes nothing."""
-    mesh = wc.TetForest.box((1, 1, 1), 0.064, 3)
-    small = random_displacement(mesh, rng, 0.05)
-    reference = oracle_mesh(mesh)
-    lame = oracle.lame(MATERIAL["young"], MATERIAL["poisson"])
-    sim, body = simulation(mesh, wc.Corotated(rotation="warm"), device)
-    for angle in np.linspace(0, np.pi, 20):
-        cos, sin = np.cos(angle), np.sin(angle)
-        turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
-        u = ((mesh.points + small) @ turn.T - mesh.points).astype(np.float32)
-        place(body, u)
-        _, expected = oracle.evaluate("corotated", reference, mesh.points + u.astype(float), *lame)
-        for _ in range(2):
-            assert np.abs(sim.forces().numpy() - expected).max() < 1e-5 * np.abs(expected).max()
-
-
-def test_warm_start_finds_the_rotation_from_anywhere(device, rng):
-    """From any guess: the answer, a random one, and half a turn away about a principal axis, where there is no
-    slope."""
-    F = np.eye(3) + 0.5 * rng.uniform(-1, 1, (3000, 3, 3))
-    F[:1000, :, 2] *= -1
-    F = F[gap(F) > 0.1].astype(np.float32)
-    exact = oracle.polar(F.astype(float))
-    Vt = np.linalg.svd(F.astype(float))[2]
-    half_turns = [exact @ (np.swapaxes(Vt, 1, 2) @ np.diag(d) @ Vt) for d in ([1, -1, -1], [-1, 1, -1], [-1, -1, 1])]
-    for guess in (exact, oracle.polar(rng.standard_normal(F.shape)), *half_turns):
-        R = wc.polar_rotation(F, method="warm", guess=guess, device=device)
-        assert np.abs(R - exact).max() < 1e-5
 
 
 # --- rotations of tree levels -----------------------------------------------------------------------------------------

@@ -123,15 +123,14 @@ class TestAttributes:
         add_grid(made, pos=(0.0, 2.0, 0.0))
         return made.finalize(device=device)
 
-    @pytest.mark.parametrize("rotation", ["byers-xu", "warm"])
-    def test_of_a_stretched_and_turned_body(self, device, rotation):
+    def test_of_a_stretched_and_turned_body(self, device):
         model = self.model(device, forest=True)
         turn = wp.quat_from_axis_angle(wp.normalize(wp.vec3(1.0, 2.0, -1.0)), 1.0)
         Q = np.array(wp.quat_to_matrix(turn)).reshape(3, 3)
         U = np.diag([1.1, 0.95, 1.0])
         before, after = model.state(), model.state()
         before.particle_q.assign((model.particle_q.numpy() @ (Q @ U).T).astype(np.float32))
-        wn.SolverCorotated(model, rotation=rotation).step(before, after, None, None, 1e-8)
+        wn.SolverCorotated(model).step(before, after, None, None, 1e-8)
         mu, lam = (model.tet_materials.numpy().reshape(-1, 3)[:, k, None, None] for k in (0, 1))
         stress = Q @ (2 * mu * (U - np.eye(3)) + lam * np.trace(U - np.eye(3)) * np.eye(3)) @ Q.T
         q = after.warp_corot.rotation.numpy()
@@ -146,7 +145,7 @@ class TestAttributes:
         model = self.model(device)
         before, after, copied = model.state(), model.state(), model.state()
         before.particle_q.assign(model.particle_q.numpy() + 0.01 * rng.standard_normal((36, 3)).astype(np.float32))
-        solver = wn.SolverCorotated(model, rotation="warm")
+        solver = wn.SolverCorotated(model)
         solver.step(before, after, None, None, 1e-4)
         copied.assign(after)
         np.testing.assert_array_equal(copied.warp_corot.rotation.numpy(), after.warp_corot.rotation.numpy())
@@ -187,27 +186,6 @@ class TestAttributes:
         restored.step(state, ends[1], None, None, 1e-4)
         np.testing.assert_allclose(ends[1].particle_qd.numpy(), ends[0].particle_qd.numpy(), atol=1e-5)
 
-    def test_warm_rotations_of_inverted_elements_are_continuous(self, device):
-        """A tetrahedron is pushed through itself: the rotation never jumps."""
-        made = builder(gravity=(0.0, 0.0, 0.0))
-        wn.SolverCorotated.register_custom_attributes(made)
-        for corner in ([0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]):
-            made.add_particle(wp.vec3(*corner), wp.vec3(), 0.0)
-        made.add_tetrahedron(0, 1, 2, 3, 1e4, 1e4, 0.0)
-        model = made.finalize(device=device)
-        solver = wn.SolverCorotated(model, rotation="warm")
-        now, after = model.state(), model.state()
-        turned = []
-        for height in np.linspace(0.1, -0.1, 80):
-            x = now.particle_q.numpy()
-            x[3] = [0.02, 0.01, height]
-            now.particle_q.assign(x)
-            solver.step(now, after, None, None, 1e-4)
-            now, after = after, now
-            turned.append(now.warp_corot.rotation.numpy()[0])
-        turned = np.array(turned)
-        assert np.abs(np.sum(turned[1:] * turned[:-1], axis=1)).min() > 0.97
-
 
 class TestBadInput:
     def expect(self, message, model, **options):
@@ -228,11 +206,9 @@ class TestBadInput:
         model = grid_model(device)
         for name, value in (
             ("lame", "newton"),
-            ("rotation", "svd"),
             ("damping", -1.0),
             ("lame", None),
             ("lame", ["documented"]),
-            ("rotation", None),
             ("damping", None),
             ("damping", "1"),
             ("damping", np.nan),
@@ -248,8 +224,6 @@ class TestBadInput:
             ("rigid_solver", "mujoco"),
         ):
             self.expect(f"{name} is ", model, **{name: value})
-        with pytest.raises(wc.InputError, match="register_custom_attributes"):
-            wn.SolverCorotated(model, rotation="warm").step(model.state(), model.state(), None, None, 1e-4)
 
     def test_a_step_beyond_stability(self, device):
         model = grid_model(device)

@@ -263,8 +263,6 @@ def test_wrong_input_is_named(device):
         wc.Simulation(body, remesh=3)
     with pytest.raises(wc.InputError, match="MassSpring has springs along the edges"):
         wc.Simulation(body, model=wc.MassSpring(), remesh=wc.OnlineRemesh())
-    with pytest.raises(wc.InputError, match="rotation is 'warm'"):
-        wc.Simulation(body, model=wc.Corotated(rotation="warm"), remesh=wc.OnlineRemesh())
     many = wc.SoftBody(body.mesh, SOFT, worlds=2, device=device)
     with pytest.raises(wc.InputError, match="worlds is 2; only a body in one world"):
         wc.Simulation(many, remesh=wc.OnlineRemesh())

@@ -38,7 +38,7 @@ def is_short(rotation, case_and_level):
 
 @pytest.mark.parametrize(
     ("rotation", "case_and_level"),
-    crossed(["byers-xu", "warm", "svd"], [(case, level) for case in CRUSHED for level in (0, 3)], is_short),
+    crossed(["byers-xu", "svd"], [(case, level) for case in CRUSHED for level in (0, 3)], is_short),
 )
 def test_crushed_cube_comes_to_rest(case_and_level, rotation, device, rng):
     """Energy never rises, and the cube ends in an equilibrium, not always the rest shape: inverted elements allow
@@ -46,7 +46,7 @@ def test_crushed_cube_comes_to_rest(case_and_level, rotation, device, rng):
 
     How many recover, of ten that differ by noise of 1e-7 m (Byers-Xu, this step and damping, CPU):
     six elements: plane 10, skew plane 10, line 7, point 9, shuffled 7;
-    48 elements: plane 4, skew plane 4, line 3, point 3, shuffled none (1 in 10 with the warm start);
+    48 elements: plane 4, skew plane 4, line 3, point 3, shuffled none;
     384 elements (of three, half the step): skew plane 1, none of the others.
     The others keep 0.2 to 5 % of the energy. Noise decides, so the test does not check the shape.
     """

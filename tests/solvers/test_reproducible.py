@@ -54,12 +54,11 @@ COROTATED = [
     wc.Corotated(rotation_level=3),
     wc.Corotated(rotation_level=1),
     wc.Corotated(rotation_level=4),
-    wc.Corotated(rotation="warm", rotation_level=2),
+    wc.Corotated(rotation="svd", rotation_level=2),
     wc.Corotated(stiffness="sparse"),
     wc.Corotated(subtrees=False),
 ]
 OTHERS = [
-    wc.Corotated(rotation="warm"),
     wc.Corotated(rotation="svd"),
     wc.Linear(),
     wc.StVenantKirchhoff(),

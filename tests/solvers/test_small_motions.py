@@ -35,7 +35,6 @@ PATHS = {
     "corotated": (TISSUE, wc.Corotated()),
     "corotated, leaf by leaf": (TISSUE, wc.Corotated(subtrees=False)),
     "corotated, SVD": (TISSUE, wc.Corotated(rotation="svd")),
-    "corotated, warm": (TISSUE, wc.Corotated(rotation="warm")),
     "corotated, explicit stiffness": (TISSUE, wc.Corotated(stiffness="sparse")),
     "rotations shared by 2 leaves": (TISSUE, wc.Corotated(rotation_level=5)),
     "rotations shared by 8 leaves": (TISSUE, wc.Corotated(rotation_level=3)),
@@ -43,7 +42,7 @@ PATHS = {
     "muscle": (MUSCLE, wc.Corotated()),
     "muscle, leaf by leaf": (MUSCLE, wc.Corotated(subtrees=False)),
 }
-ON_GENERAL = ("neo-Hookean", "edge springs", "mass-spring", "corotated", "corotated, warm", "muscle")
+ON_GENERAL = ("neo-Hookean", "edge springs", "mass-spring", "corotated", "muscle")
 #: Rotations shared at a fixed level have no energy: at 1 m/s the float64 law gains this much in 5,000, 10,000, 15,000
 #: and 20,000 steps.
 GAINED = {

@@ -67,8 +67,6 @@ def check_supported(
     for model in models:
         if not isinstance(model, MODELS):
             raise InputError(f"{type(model).__name__} does not work on several ranks yet; take a law of elements")
-        if getattr(model, "rotation", None) == "warm":
-            raise InputError("rotation 'warm' does not work on several ranks yet; it must be 'byers-xu' or 'svd'")
     for body in bodies:
         if body.changing is not None and not isinstance(others.get("remesh"), Passes):
             raise InputError("a body that is remeshed does not work on several ranks yet")

@@ -11,16 +11,16 @@ import warp as wp
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_choice, checked_count, checked_numbers
 from warp_corot.inputs.device import checked_device
-from warp_corot.kernels.math.polar import rotate_all, turn_all
+from warp_corot.kernels.math.polar import rotate_all
 from warp_corot.kernels.math.rotation import byers_xu, byers_xu_fixed, mcadams_svd
 
-METHODS = ("byers-xu", "svd", "warm")
+METHODS = ("byers-xu", "svd")
 MAX_ITERATIONS = 12
 
 
 @functools.cache
 def rotation_function(method: str, iterations: int | None = None) -> wp.Function:
-    """The device function of a method that keeps no state.
+    """The device function of a method.
 
     Raises:
         InputError: Unknown method, or a number of iterations that it does not take.
@@ -40,21 +40,19 @@ def polar_rotation(
     method: str = "byers-xu",
     *,
     iterations: int | None = None,
-    guess: npt.ArrayLike | None = None,
     device: str | wp.Device | None = None,
 ) -> npt.NDArray[np.float32]:
     """The proper rotation R nearest to each matrix, the maximiser of tr(R^T F) with det R = +1.
 
     For det F > 0 this is the rotation of the polar decomposition. Inverted, singular, huge and tiny matrices have one
-    too; a zero or non-finite matrix gives the identity (for "warm": the guess). Computed in float32.
+    too; a zero or non-finite matrix gives the identity. Computed in float32.
 
     Args:
         F: Matrices [n, 3, 3] (or one, [3, 3]).
         method: "byers-xu": Newton's iteration with the scaling of Byers and Xu (2008), to the paper's tolerance;
             "svd": U V^T of Warp's 3x3 SVD (McAdams et al. 2011), the baseline, off by up to 0.07 if singular values of
-            an inverted F nearly coincide; "warm": iteration on a quaternion (Müller et al. 2016).
+            an inverted F nearly coincide.
         iterations: For "byers-xu": this many iterations (2 to 12) in place of the tolerance.
-        guess: For "warm": rotations to start from [n, 3, 3]; the identity by default.
         device: The device of the computation; None for Warp's default.
 
     Returns:
@@ -69,22 +67,11 @@ def polar_rotation(
     matrices = checked_numbers(F, "F", "[n, 3, 3]")
     if matrices.shape[-2:] != (3, 3) or matrices.ndim not in (2, 3):
         raise InputError(f"F has shape {matrices.shape}; it must be [n, 3, 3]")
-    if guess is not None and method != "warm":
-        raise InputError(f"a guess is given; the method must be 'warm', not {method!r}")
     where = checked_device(device)
     with np.errstate(over="ignore"):
         flat = np.ascontiguousarray(matrices.reshape(-1, 3, 3), dtype=np.float32)
     rotations = wp.empty(len(flat), dtype=wp.mat33, device=where)
     inputs = [wp.array(flat, dtype=wp.mat33, device=where)]
-    if method == "warm":
-        rotation_function("byers-xu" if iterations is None else method, iterations)
-        given = checked_numbers(np.eye(3) if guess is None else guess, "guess", "[n, 3, 3]").astype(np.float32)
-        if given.shape not in ((3, 3), flat.shape):
-            raise InputError(f"guess has shape {given.shape}; it must be [{len(flat)}, 3, 3]")
-        start = np.broadcast_to(given, flat.shape)
-        inputs.append(wp.array(np.ascontiguousarray(start), dtype=wp.mat33, device=where))
-        kernel = turn_all
-    else:
-        kernel = rotate_all(rotation_function(method, iterations))
+    kernel = rotate_all(rotation_function(method, iterations))
     wp.launch(kernel, dim=len(flat), inputs=inputs, outputs=[rotations], device=where)
     return rotations.numpy().reshape(matrices.shape)

@@ -14,7 +14,6 @@ from .library import ModelView, newton
 from .state import STATE, attribute_of
 from .tetrahedra import LAME
 
-ROTATIONS = ("byers-xu", "warm")
 INTEGRATORS = ("explicit", "implicit")
 
 
@@ -34,7 +33,6 @@ def check_options(
     model: Any,
     *,
     lame: Any,
-    rotation: Any,
     damping: Any,
     integrator: Any,
     substeps: Any,
@@ -48,7 +46,7 @@ def check_options(
     """
     if not isinstance(model, newton.Model) and not isinstance(model, ModelView):
         raise InputError(f"model is {_named(model)}; it must be a newton.Model, the result of builder.finalize()")
-    choices = (("lame", lame, LAME), ("rotation", rotation, ROTATIONS), ("integrator", integrator, INTEGRATORS))
+    choices = (("lame", lame, LAME), ("integrator", integrator, INTEGRATORS))
     for name, value, among in choices:
         if not isinstance(value, str) or value not in among:
             raise InputError(f"{name} is {value!r}; it must be one of {', '.join(among)}")
@@ -67,19 +65,18 @@ def check_options(
         )
 
 
-def check_step(step: Step, model: newton.Model, warm: bool) -> None:
+def check_step(step: Step, model: newton.Model) -> None:
     """Check the arguments of ``SolverCorotated.step`` except dt.
 
     Args:
         step: The arguments.
         model: The model.
-        warm: Whether states must hold rotations.
 
     Raises:
         InputError: An argument belongs to another model, or is on another device.
     """
     for name, state in (("state_in", step.state_in), ("state_out", step.state_out)):
-        _check_state(name, state, model, warm)
+        _check_state(name, state, model)
     device, control, contacts = model.device, step.control, step.contacts
     if control is not None and control.tet_activations is not None:
         activations = control.tet_activations
@@ -123,7 +120,7 @@ def is_finite(value: Any) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _check_state(name: str, state: Any, model: newton.Model, warm: bool) -> None:
+def _check_state(name: str, state: Any, model: newton.Model) -> None:
     if getattr(state, "particle_q", model) is model:
         raise InputError(f"{name} is {_named(state)}; it must be a newton.State, the result of model.state()")
     if state.particle_q is None or len(state.particle_q) != model.particle_count:
@@ -131,11 +128,6 @@ def _check_state(name: str, state: Any, model: newton.Model, warm: bool) -> None
         raise InputError(f"{name} has {there} particles; the model has {model.particle_count}")
     if state.particle_q.device != model.device:
         raise InputError(f"{name} is on {state.particle_q.device}; the model is on {model.device}")
-    if warm and attribute_of(state, "rotation") is None:
-        raise InputError(
-            f"{name} has no rotations, which rotation='warm' needs: call "
-            "SolverCorotated.register_custom_attributes(builder) before finalize"
-        )
     for attribute in STATE:
         array = attribute_of(state, attribute)
         if array is not None and len(array) != model.tet_count:

@@ -141,7 +141,7 @@ class Following:
             self._launch(gauge.probe_directions, [self._scale, inverse_mass, base], outputs)
             for at, f in ((base, self._f), (probed, self._f_probed)):
                 by_positions = base is tets.x
-                tets.add_elastic_forces(state, at if by_positions else None, None if by_positions else at, f)
+                tets.add_elastic_forces(at if by_positions else None, None if by_positions else at, f)
             inputs = [inverse_mass, base, probed, self._f, self._f_probed]
             self._launch(gauge.find_curvatures, inputs, [self._directions, self._of_model])
         ahead = max(dt, INTERVAL * substep)

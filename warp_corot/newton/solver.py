@@ -82,9 +82,6 @@ class SolverCorotated(SolverBase, CouplingInterface):
         integrator: "explicit", symplectic Euler, or "implicit", backward Euler.
         substeps: Number of substeps of a step; None: as many as the current state needs to be stable, see
             ``safe_dt``; with ``integrator="implicit"``, one.
-        rotation: "byers-xu", or "warm": starting from the rotation in the state, ``state.warp_corot.rotation``, so that
-            it is continuous in time for inverted elements, too. This needs ``register_custom_attributes``, and the
-            tetrahedra of forests are then computed one by one.
         rotation_level: Level of shared rotations in forests; see ``Corotated``.
         rigid_solver: The solver of rigid bodies: "semi-implicit"; another solver, made for this model, which also gets
             their forces; or None: no solver, and reactions are added to ``state_in.body_f`` for another program, which
@@ -117,7 +114,6 @@ class SolverCorotated(SolverBase, CouplingInterface):
         damping: float = 0.0,
         integrator: str = "explicit",
         substeps: int | None = None,
-        rotation: str = "byers-xu",
         rotation_level: int | None = None,
         rigid_solver: SolverBase | str | None = "semi-implicit",
         particle_contact: bool = False,
@@ -127,7 +123,6 @@ class SolverCorotated(SolverBase, CouplingInterface):
         check_options(
             model,
             lame=lame,
-            rotation=rotation,
             damping=damping,
             integrator=integrator,
             substeps=substeps,
@@ -137,7 +132,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
         super().__init__(model)
         self._substeps = None if substeps is None else int(substeps)
         self._given_stable_dt = stable_dt
-        self.tetrahedra = Tetrahedra(model, lame, rotation == "warm", rotation_level)
+        self.tetrahedra = Tetrahedra(model, lame, rotation_level)
         self._contacts = Contacts(model, self_contact_margin)
         self._others = Others(model, rigid_solver, particle_contact)
         self._elsewhere = Elsewhere(model, self._others.has_bodies)
@@ -221,7 +216,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
         self.validate_observables(observables, contacts)
         reported = None if observables is None else observables.contact_f
         step, following = Step(state_in, state_out, control, contacts, dt, reported), self._following
-        check_step(step, self.model, self.tetrahedra.warm)
+        check_step(step, self.model)
         self._steps.report.check_earlier(following)
         self._see_surfaces(contacts)
         self._elsewhere.look(state_in)
@@ -284,7 +279,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
 
         Use it for states that this solver does not write, for example those of Newton's coupled solvers.
         """
-        self.tetrahedra.write_attributes(state, state)
+        self.tetrahedra.write_attributes(state)
 
     def notify_model_changed(self, flags: int) -> None:
         """Read changes of the model; stable steps are found again if they may have changed.

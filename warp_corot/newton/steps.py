@@ -111,8 +111,8 @@ class Steps:
             self._launch_motion(substep, fastest)
             self._launch_undoing(state_out, *before)
             number, left, done = number + 1, left - 1, done + each
-            if self.tetrahedra.warm or not left:
-                self.tetrahedra.write_attributes(state_out, now)
+            if not left:
+                self.tetrahedra.write_attributes(state_out)
             now = state_out
         if following is not None:
             following.made = number

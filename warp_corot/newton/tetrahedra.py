@@ -21,7 +21,6 @@ from warp_corot.kernels.newton.elements import (
     scatter_damping_and_activation,
     scatter_posed,
     scatter_posed_lanes,
-    scatter_posed_warm,
 )
 
 from .forests import ForestGroup, forest_groups
@@ -51,7 +50,6 @@ class Tetrahedra:
     Args:
         model: The model.
         lame: A key of ``LAME``.
-        warm: Whether rotations start from those in the state.
         rotation_level: Level of shared rotations in forests; see ``Corotated``.
 
     Attributes:
@@ -62,19 +60,19 @@ class Tetrahedra:
         InputError: There are no tetrahedra, or a material is not positive definite.
     """
 
-    def __init__(self, model: newton.Model, lame: str, warm: bool, rotation_level: int | None):
+    def __init__(self, model: newton.Model, lame: str, rotation_level: int | None):
         if not model.tet_count:
             raise InputError(why_none(model))
-        self.model, self.lame, self.warm = model, lame, warm
+        self.model, self.lame = model, lame
         self.device = model.device
         self.tets = model.tet_indices.numpy().reshape(-1, 4)
         self.elements = self._elements(np.arange(model.tet_count))
         #: mu, lambda, k_lambda [Pa] and k_damp [Pa s] of all tetrahedra.
         self._materials = self._room_for_materials(model.tet_count)
         self.mu, self.lam = self._materials[:2]
-        self.groups: list[ForestGroup] = [] if warm else forest_groups(model, self.tets, rotation_level)
+        self.groups: list[ForestGroup] = forest_groups(model, self.tets, rotation_level)
         #: Whether the elastic kernel of single tetrahedra includes activation and damping.
-        self._fused = self.device.is_cuda and not warm
+        self._fused = self.device.is_cuda
         single = np.ones(model.tet_count, bool)
         for group in self.groups:
             single[group.tets] = False
@@ -84,7 +82,6 @@ class Tetrahedra:
         self._make_room_for_nodes()
         fill = attribute_of(model, "fill")
         self._fill = wp.ones(1, dtype=wp.float32, device=self.device) if fill is None else fill
-        self._no_rotations = wp.empty(0, dtype=wp.quat, device=self.device)
         self._nothing = {name: wp.empty(0, dtype=dtype, device=self.device) for name, dtype in STATE.items()}
         #: Materials and inverse masses at the last ``refresh``.
         self._seen: list[np.ndarray] = [np.empty(0), np.empty(0)]
@@ -129,7 +126,7 @@ class Tetrahedra:
     def add_forces(self, state: newton.State, activation: wp.array, f: wp.array) -> None:
         """Add the forces [N] for a state, whose positions have been gathered, to f, vec4 [P]."""
         q, v = state.particle_q, state.particle_qd
-        self._add_forces(state, self.x, self.u, activation, v, f)
+        self._add_forces(self.x, self.u, activation, v, f)
         # On the CPU a check costs less than a launch; a recorded step must handle all cases.
         looks = self.device.is_cpu and not self.device.is_capturing and not self.damped
         if looks and not activation.numpy().any():
@@ -139,15 +136,14 @@ class Tetrahedra:
             threads = -(-part.count // int(EACH))
             self._launch(scatter_damping_and_activation(self.damped), threads, inputs, [f])
 
-    def add_elastic_forces(self, state: newton.State, x: wp.array | None, u: wp.array | None, f: wp.array) -> None:
+    def add_elastic_forces(self, x: wp.array | None, u: wp.array | None, f: wp.array) -> None:
         """Add the elastic forces [N] for given positions to f, vec4 [P].
 
         Args:
-            state: The state with the rotations from which warm ones start.
             x: Positions; None: elements that need them are left out.
             u: Displacements; None: elements that need them are left out.
         """
-        self._add_forces(state, x, u, self._no_activation, self._no_velocities, f)
+        self._add_forces(x, u, self._no_activation, self._no_velocities, f)
 
     def add_linear_forces(self, u: wp.array, f: wp.array) -> None:
         """Add the elastic forces of small displacements from rest shapes [N] to f, vec4 [P]."""
@@ -170,15 +166,14 @@ class Tetrahedra:
         """Particles of elements whose forces are found from displacements."""
         return self._nodes[1]
 
-    def write_attributes(self, state: newton.State, before: newton.State) -> None:
+    def write_attributes(self, state: newton.State) -> None:
         """Write rotations and stresses for a state's positions, if it has attributes for them."""
         there = {name: attribute_of(state, name) for name in STATE}
         if all(array is None for array in there.values()):
             return
-        kernel = write_attributes(*(array is not None for array in there.values()), self.warm)
-        guesses = attribute_of(before, "rotation") if self.warm else self._no_rotations
+        kernel = write_attributes(*(array is not None for array in there.values()))
         fill = [self._fill, int(len(self._fill) == self.model.tet_count)]
-        inputs = [self.elements, self.mu, self.lam, *fill, state.particle_q, guesses]
+        inputs = [self.elements, self.mu, self.lam, *fill, state.particle_q]
         outputs = [self._nothing[name] if array is None else array for name, array in there.items()]
         self._launch(kernel, self.model.tet_count, inputs, outputs)
 
@@ -193,7 +188,6 @@ class Tetrahedra:
 
     def _add_forces(
         self,
-        state: newton.State,
         x: wp.array | None,
         u: wp.array | None,
         activation: wp.array,
@@ -202,15 +196,11 @@ class Tetrahedra:
     ) -> None:
         """Add elastic forces, and others in the same kernel."""
         if self.single_count and x is not None:
-            elastic = [self._single, *self._single_materials[:2]]
-            if self.warm:
-                inputs = [*elastic, self._single_ids, x, attribute_of(state, "rotation")]
-                self._launch(scatter_posed_warm, self.single_count, inputs, [f])
-            elif self._fused:
+            if self._fused:
                 inputs = [self._single, *self._single_materials, self._single_ids, activation, x, v]
                 self._launch(scatter_posed(quick_rotation, self.damped), self.single_count, inputs, [f], BLOCK)
             else:
-                material = self._single_isotropic(*elastic[1:])
+                material = self._single_isotropic(*self._single_materials[:2])
                 inputs = [self._single, self.single_count, material, x]
                 self._launch(scatter_posed_lanes, -(-self.single_count // LANES), inputs, [f, self._left_out])
                 repair = repair_forces(GeneralElements, IsotropicMaterial, posed_stress)

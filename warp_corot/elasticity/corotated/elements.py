@@ -20,12 +20,10 @@ from warp_corot.elasticity.tangent import Tangent
 from warp_corot.errors import InputError
 from warp_corot.kernels.corotated.corotated import (
     extract_rotations,
-    extract_warm_rotations,
     given_cauchy,
     given_density,
     given_stress,
     own_stress,
-    reset_quaternions,
     scatter_matrix_product,
 )
 from warp_corot.kernels.corotated.energy import own_density
@@ -104,22 +102,16 @@ class CorotatedField(ForceField):
         super().__init__(discretization, deterministic)
         kind = discretization.element_kind
         self._shared: Rotations | None = None
-        self._fused = model.level is None and model.rotation != "warm" and model.stiffness == "factored"
-        self._state: dict[str, wp.array] = {}
+        self._fused = model.level is None and model.stiffness == "factored"
         self._rotated = Kept(rotated_material)
-        if model.rotation == "warm":
-            self._state["quaternions"] = wp.empty(self.unit_count, dtype=wp.quat, device=self.device)
-            self.reset(wp.ones(discretization.worlds, dtype=wp.int32, device=self.device))
-            self._extract = extract_warm_rotations(kind)
-        else:
-            self._extract = extract_rotations(kind, model.own_rotation)
-            self._own = scatter_forces(kind, IsotropicMaterial, own_stress(model.own_rotation))
+        self._extract = extract_rotations(kind, model.own_rotation)
+        self._own = scatter_forces(kind, IsotropicMaterial, own_stress(model.own_rotation))
         if model.stiffness == "factored":
             self._forces = scatter_forces(kind, RotatedMaterial, given_stress)
         else:
             self._forces = scatter_matrix_product(model.stiffness == "sparse")
         self._energies = element_energies(kind, RotatedMaterial, given_density)
-        in_one = model.level is None and model.rotation != "warm" and model.own_rotation is quick_rotation
+        in_one = model.level is None and model.own_rotation is quick_rotation
         self._own_energies = element_energies(kind, IsotropicMaterial, own_density) if in_one else None
         self._von_mises = element_von_mises(kind, RotatedMaterial, given_cauchy)
 
@@ -130,15 +122,6 @@ class CorotatedField(ForceField):
     @property
     def _force_kernels(self) -> list[wp.Kernel]:
         return [self._own if self._fused else self._forces]
-
-    @property
-    def state(self) -> dict[str, wp.array]:
-        return self._state
-
-    def reset(self, chosen: wp.array) -> None:
-        for quaternions in self._state.values():
-            in_world = len(quaternions) // self.discretization.worlds
-            self.launch(reset_quaternions, len(quaternions), [chosen, in_world], [quaternions])
 
     @property
     def rotation_level(self) -> int | None:
@@ -158,10 +141,9 @@ class CorotatedField(ForceField):
 
     def extract_rotations(self, u: wp.array) -> wp.array:
         """The rotation of every unit, mat33 [units]."""
-        shared = self._sharing()
-        units = shared.units
-        self.launch(self._extract, units.count, [units.elements, u], [*self.state.values(), shared.rotations])
-        return shared.rotations
+        rotations = self._sharing().rotations
+        self.write_rotations(u, rotations)
+        return rotations
 
     def add_rotated_forces(self, u: wp.array, f: wp.array) -> None:
         """Add forces with the rotations that were extracted last."""
@@ -201,21 +183,18 @@ class CorotatedField(ForceField):
         derivative.
         """
         if exact and self.model.rotation_level is None:
-            rotation = byers_xu if self.model.rotation == "warm" else self.model.own_rotation
             if self.device.is_cpu and self.plan.counts is None:
-                return KeptExactTangent(self, rotation)
-            return ExactTangent(self, rotation)
-        own = self.model.level is None and self.model.tolerance is None and self.model.rotation != "warm"
+                return KeptExactTangent(self, self.model.own_rotation)
+            return ExactTangent(self, self.model.own_rotation)
+        own = self.model.level is None and self.model.tolerance is None
         if own and self.device.is_cpu and self.plan.counts is None:
             return KeptTangent(self)
         return RotatedTangent(self)
 
     def write_rotations(self, u: wp.array, rotations: wp.array) -> None:
-        """Write the rotation of every unit, mat33 [units]; the state stays unchanged."""
-        is_warm, kind = self.model.rotation == "warm", self.discretization.element_kind
+        """Write the rotation of every unit, mat33 [units]."""
         units = self._sharing().units
-        kernel = extract_rotations(kind, byers_xu) if is_warm else self._extract
-        self.launch(kernel, units.count, [units.elements, u], [rotations])
+        self.launch(self._extract, units.count, [units.elements, u], [rotations])
 
     def stiffness_with(self, rotations: wp.array) -> tuple[ElementStiffness, RotatedMaterial]:
         """The stiffness with fixed rotations of the units, and the material that it reads."""
@@ -223,20 +202,18 @@ class CorotatedField(ForceField):
         return ElementStiffness(self.discretization, given_differential, RotatedMaterial), material
 
     def used_rotations(self, u: wp.array) -> wp.array:
-        """The rotation of every unit, as forces use it; the state stays unchanged."""
-        with self.state_kept():
-            return self.extract_rotations(u)
+        """The rotation of every unit, as forces use it."""
+        return self.extract_rotations(u)
 
     def _tangent(self, u: wp.array, exact: bool) -> tuple[ElementStiffness, IsotropicMaterial | RotatedMaterial]:
         """The stiffness at displacements u, and the material that it reads."""
-        isotropic, is_warm = self.isotropic, self.model.rotation == "warm"
+        isotropic = self.isotropic
         if exact:
             if self.model.rotation_level is not None:
                 level = self.model.rotation_level
                 raise InputError(f"rotation_level is {level!r}; for the exact stiffness it must be None")
-            rotation = byers_xu if is_warm else self.model.own_rotation
-            return ElementStiffness(self.discretization, exact_differential(rotation)), isotropic
-        if self.model.rotation_level is None and not is_warm:
+            return ElementStiffness(self.discretization, exact_differential(self.model.own_rotation)), isotropic
+        if self.model.rotation_level is None:
             return ElementStiffness(self.discretization, own_differential(self.model.own_rotation)), isotropic
         return self.stiffness_with(self.used_rotations(u))
 
@@ -245,7 +222,7 @@ class CorotatedField(ForceField):
         """See ``ForceField.stress_law``; None with shared rotations."""
         if self.model.rotation_level is not None:
             return None
-        rotation = byers_xu if self.model.rotation == "warm" else self.model.own_rotation
+        rotation = self.model.own_rotation
         return StressLaw(own_stress(rotation), exact_differential(rotation), self.isotropic)
 
     def write_energies(self, u: wp.array, energies: wp.array) -> None:

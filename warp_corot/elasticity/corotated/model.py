@@ -55,7 +55,7 @@ class Corotated(Model):
             the own rotations of its leaves. Each evaluation decides this for each subtree from its displacements.
             "auto": 0.1. Then the error w of an element's rotation is at most 2 tolerance, and that of its stress at
             most (2 mu + 3 lambda) (3 w |U - I| + w^2 |U|); energies use own rotations.
-        rotation: "byers-xu" (the paper's), "svd" (McAdams et al. 2011) or "warm" (a quaternion kept from step to step).
+        rotation: "byers-xu" (the paper's) or "svd" (McAdams et al. 2011).
         iterations: For "byers-xu": None iterates to the paper's tolerance 3.85e-5; an int from 2 to 12 is the number.
         stiffness: "factored" (sums and differences), "sparse" (the paper's explicit K_T by type, zeros skipped) or
             "dense" (the same with all 144 products); the last two for forests only. All agree to rounding.
@@ -99,10 +99,6 @@ class Corotated(Model):
             return None
         return AUTO_TOLERANCE if level == "auto" else float(level)
 
-    @property
-    def kept_of_elements(self) -> str | None:
-        return "rotation is 'warm', which is kept from step to step" if self.rotation == "warm" else None
-
     def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:
         return bind_law(self._bind, VOLUME, self.dilatation, body, deterministic)
 
@@ -134,8 +130,6 @@ class Corotated(Model):
         ):
             if given != wanted:
                 raise InputError(f"{name} is {given!r}; with an anisotropic material it must be {wanted!r}")
-        if self.rotation == "warm":
-            raise InputError("rotation is 'warm'; with an anisotropic material it must be 'byers-xu' or 'svd'")
         quick = self.own_rotation is quick_rotation
         if quick and discretization.device.is_cuda and not deterministic:
             subtrees = discretization.prefers_subtrees

@@ -108,7 +108,7 @@ class SubtreeField(CorotatedField):
         return True
 
     def tangent(self, *, exact: bool = False) -> Tangent:
-        own = self.model.level is None and self.model.tolerance is None and self.model.rotation != "warm"
+        own = self.model.level is None and self.model.tolerance is None
         if not exact and own and self._listed and self.element_count >= FEWEST:
             batches = subtrees_of(self.plan)
             if batches is not None:
