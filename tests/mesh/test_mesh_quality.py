@@ -5,9 +5,11 @@ import pytest
 import trimesh
 from meshes import assert_balanced, assert_conforming, assert_well_shaped
 from scipy.ndimage import gaussian_filter
+from studies import study
 
 import warp_corot as wc
-from warp_corot.experiments.meshes import draw, ratios_by_error, ratios_by_level, study, table
+
+SAVINGS = study("mesh_savings")
 
 
 def scan():
@@ -49,7 +51,7 @@ def deepest(request):
 
 @pytest.fixture(scope="module")
 def points(deepest):
-    return study(levels=tuple(range(9, deepest + 1, 3)), errors=(16e-3, 8e-3))
+    return SAVINGS.study(levels=tuple(range(9, deepest + 1, 3)), errors=(16e-3, 8e-3))
 
 
 def test_adaptive_meshes_are_as_near_as_uniform_ones(points, deepest):
@@ -62,16 +64,16 @@ def test_adaptive_meshes_are_as_near_as_uniform_ones(points, deepest):
 
 def test_adaptive_meshes_need_fewer_tetrahedra(points, deepest):
     """Tetrahedra of a surface scale with 1/h^2, of a volume with 1/h^3: in the end the ratio halves in three levels."""
-    ratio = ratios_by_level(points)
+    ratio = SAVINGS.ratios_by_level(points)
     assert 0.4 < ratio[15] < 0.5
     assert ratio[deepest] / ratio[deepest - 3] == pytest.approx({15: 0.64, 18: 0.55}[deepest], abs=0.06)
     if deepest == 18:  # uniform meshes need that level to come as near
-        spiny = ratios_by_error(points)
+        spiny = SAVINGS.ratios_by_error(points)
         assert spiny
         assert max(spiny.values()) < 0.1
 
 
 def test_study_is_written(points, tmp_path):
-    assert len(table(points)) == len(points) + 3
-    draw(points, tmp_path / "lod.png")
+    assert len(SAVINGS.table(points)) == len(points) + 3
+    SAVINGS.draw(points, tmp_path / "lod.png")
     assert (tmp_path / "lod.png").read_bytes().startswith(b"\x89PNG")

@@ -5,13 +5,15 @@ import functools
 import numpy as np
 import pytest
 import warp as wp
+from studies import study
 
 import warp_corot as wc
 from warp_corot.discretization.changing.passes import RemeshPass
 from warp_corot.discretization.changing.pools import DeviceForest
-from warp_corot.experiments.remeshing import CELL, SCENES, TISSUE, run, table
 from warp_corot.kernels.remesh.criteria import nearness, strain, von_mises_stress
 
+SAVINGS = study("remesh_savings")
+CELL, SCENES, TISSUE, run, table = (getattr(SAVINGS, name) for name in ("CELL", "SCENES", "TISSUE", "run", "table"))
 SLOW = [pytest.param("bar", each, marks=pytest.mark.slow) for each in ("elongation", "strain")]
 CASES = [*SLOW, ("slab", "nearness")]
 LEVELS = [9, pytest.param(10, marks=pytest.mark.slow), pytest.param(11, marks=pytest.mark.slow)]

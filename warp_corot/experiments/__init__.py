@@ -1,5 +1,4 @@
-"""Experiments: the paper's, with its timing, claims, report and figures; and what adaptive meshes and remeshing
-save."""
+"""The paper's experiment, with its timing, claims, report and figures."""
 
 from .paper import Results, Run, Settings, run_experiment
 

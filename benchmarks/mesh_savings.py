@@ -1,6 +1,6 @@
 """How many tetrahedra a surface needs: adaptive and uniform meshes of a ball and of a body with fine features.
 
-``python -m warp_corot.experiments.meshes -o lod.png`` measures and draws it.
+``python benchmarks/mesh_savings.py -o lod.png`` measures and draws it.
 """
 
 from __future__ import annotations
@@ -16,10 +16,9 @@ import numpy as np
 
 from warp_corot.domain import Domain
 from warp_corot.errors import InputError
+from warp_corot.experiments.style import FAINT, INK, LINEAR, OWN_COLOR, new_figure, save, tidy
 from warp_corot.io.pictures.preview import check_picture_path
 from warp_corot.mesh import TetForest
-
-from .style import FAINT, INK, LINEAR, OWN_COLOR, new_figure, save, tidy
 
 #: Edge of a root cube [m]; the bodies fit into one cube or a few.
 CELL = 1.0

@@ -1,6 +1,6 @@
 """What remeshing saves: a notched bar in tension and a pressed slab, on remeshed and on uniform meshes.
 
-``python -m warp_corot.experiments.remeshing`` measures the reaction force, the displacements and the wall time.
+``python benchmarks/remesh_savings.py`` measures the reaction force, the displacements and the wall time.
 """
 
 from __future__ import annotations
