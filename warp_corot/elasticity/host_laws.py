@@ -81,20 +81,21 @@ def _stvk_differential(f: Tensors, df: Tensors, mu: Any, lam: Any) -> Tensors:
     return df @ _hooke(0.5 * (_turned(f) @ f - _I), mu, lam) + f @ _hooke(_symmetric(_turned(f) @ df), mu, lam)
 
 
-def _rotation(f: Tensors) -> Tensors:
+def rotation(f: Tensors) -> Tensors:
+    """The proper rotations nearest to F."""
     u, _, vt = np.linalg.svd(f)
     u[..., :, 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
     return u @ vt
 
 
 def _corotated_stress(f: Tensors, mu: Any, lam: Any) -> Tensors:
-    r = _rotation(f)
+    r = rotation(f)
     return 2.0 * mu * (f - r) + lam * (_product(r, f) - 3.0) * r
 
 
 def _corotated_differential(f: Tensors, df: Tensors, mu: Any, lam: Any) -> Tensors:
     """With dR = R [w]x, (tr(S) I - S) w = axial(R^T dF)."""
-    r = _rotation(f)
+    r = rotation(f)
     stretch, b = _symmetric(_turned(r) @ f), _turned(r) @ df
     axial = np.stack([b[..., 2, 1] - b[..., 1, 2], b[..., 0, 2] - b[..., 2, 0], b[..., 1, 0] - b[..., 0, 1]], axis=-1)
     w = np.linalg.solve(_trace(stretch) * _I - stretch, axial[..., None])[..., 0]

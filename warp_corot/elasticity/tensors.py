@@ -6,19 +6,17 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_corot.elasticity.corotated.model import Corotated
-from warp_corot.kernels.elements.constitutive import CONTINUED_BELOW
 from warp_corot.kernels.elements.ogden import part_of_volume, stretch_limits
 from warp_corot.materials.isotropic import Isotropic
 
 from .edge_stvk import EdgeStVK
+from .host_laws import LAWS, Tensors, rotation
 from .linear import Linear
 from .mass_spring import MassSpring
 from .model import Model
 from .neo_hookean import NeoHookean
 from .ogden import Ogden
 from .stvk import StVenantKirchhoff
-
-Tensors = npt.NDArray[np.float64]
 
 #: Keeps |J| away from zero, as in ``kernels/elements/constitutive.py``.
 LEAST_J = 1.0e-3
@@ -66,34 +64,18 @@ def cauchy_stress(model: Model, f: Tensors, young: npt.ArrayLike, poisson: npt.A
     mu, lam = e / (2.0 * (1.0 + nu)), e * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
     if isinstance(model, MassSpring):
         mu = lam = 0.4 * e  # springs have a Poisson's ratio of 1/4
-
-    def hooke(strain: Tensors) -> Tensors:
-        return 2.0 * mu * strain + lam * _trace(strain) * np.eye(3)
-
-    if isinstance(model, Linear):
-        return hooke(0.5 * (f + np.swapaxes(f, 1, 2)) - np.eye(3))
-    if isinstance(model, Corotated):
-        r = _rotations(f)
-        stretch = np.swapaxes(r, 1, 2) @ f
-        return r @ hooke(0.5 * (stretch + np.swapaxes(stretch, 1, 2)) - np.eye(3)) @ np.swapaxes(r, 1, 2)
-    det = np.linalg.det(f)[:, None, None]
-    if isinstance(model, NeoHookean):
-        piola = _neo_hookean(f, det, mu, lam)
-    elif isinstance(model, Ogden):
+    if isinstance(model, Ogden):
         part = sum(part_of_volume(*term) for term in model.terms)
-        piola = _neo_hookean(f, det, part * mu, lam) + mu * _ogden_excess(f, model.terms)
+        kirchhoff = LAWS[NeoHookean].stress(f, part * mu, lam) @ np.swapaxes(f, 1, 2)
+        kirchhoff = kirchhoff + mu * _ogden_excess(f, model.terms)
     else:
-        piola = f @ hooke(green_strain(f)) @ np.swapaxes(f, 1, 2)
-    return piola / np.maximum(np.abs(det), LEAST_J)
-
-
-def _neo_hookean(f: Tensors, det: Tensors, mu: Tensors, lam: Tensors) -> Tensors:
-    """P F^T = mu (F F^T - J I) + V'(J) J I with the volumetric energy's slope V', continued as in the kernels."""
-    d = np.maximum(det, CONTINUED_BELOW)
-    slope = (lam * np.log(d) + mu * (d - 1.0)) / d
-    curvature = (mu + lam * (1.0 - np.log(CONTINUED_BELOW))) / CONTINUED_BELOW**2
-    slope = slope + np.minimum(det - CONTINUED_BELOW, 0.0) * curvature
-    return mu * (f @ np.swapaxes(f, 1, 2) - det * np.eye(3)) + slope * det * np.eye(3)
+        piola = LAWS.get(type(model), LAWS[StVenantKirchhoff]).stress(f, mu, lam)
+        if isinstance(model, Linear):
+            return piola
+        if isinstance(model, Corotated):
+            return piola @ np.swapaxes(rotation(f), 1, 2)
+        kirchhoff = piola @ np.swapaxes(f, 1, 2)
+    return kirchhoff / np.maximum(np.abs(np.linalg.det(f)), LEAST_J)[:, None, None]
 
 
 def _ogden_excess(f: Tensors, terms: tuple[tuple[float, float], ...]) -> Tensors:
@@ -109,14 +91,3 @@ def _ogden_excess(f: Tensors, terms: tuple[tuple[float, float], ...]) -> Tensors
         slope += m * (power - 1.0) - (m - part) * (1.0 / c - 1.0) + (squares - c) * curvature
     turned = f @ axes
     return (turned * slope[:, None, :]) @ np.swapaxes(turned, 1, 2)
-
-
-def _trace(a: Tensors) -> Tensors:
-    return np.trace(a, axis1=1, axis2=2)[:, None, None]
-
-
-def _rotations(f: Tensors) -> Tensors:
-    """The proper rotations nearest to F."""
-    u, _, vt = np.linalg.svd(f)
-    u[:, :, 2] *= np.sign(np.linalg.det(u @ vt))[:, None]
-    return u @ vt
