@@ -4,8 +4,9 @@ Smoothing is Chebyshev's iteration with the inverse diagonal blocks. It needs a 
 D^-1 A. The matrix of each element, and of each ancestor, is positive semidefinite and couples four nodes, so it is at
 most four times its own diagonal blocks: 4 is a bound on all levels.
 
-On a CPU one thread computes a row of a matrix. On CUDA several lanes share it: they read neighbouring entries together,
-and a small level takes no longer than its longest sum.
+On a CPU one thread of each world moves values between levels, because a launch over all nodes takes longer to count
+them, and one thread computes a row of a matrix. On CUDA several lanes share a row: they read neighbouring entries
+together, and a small level takes no longer than its longest sum.
 """
 
 import warp as wp
@@ -97,9 +98,150 @@ def product_of(rows: Rows, world: int, i: int, lane: int, lanes: int, count: int
     return sum_over_lanes(part, lanes)
 
 
+#: Native code of transfers: the vectors of one world, and its flags of free nodes. Warp's own loops over vec4 arrays
+#: take two to three times as long on a CPU.
+_MOVES = """
+#if defined(__CUDA_ARCH__)
+    struct alignas(16) four {
+        float x, y, z, w;
+        __device__ four operator+(const four& b) const { return {x + b.x, y + b.y, z + b.z, w + b.w}; }
+        __device__ four operator*(float s) const { return {s * x, s * y, s * z, s * w}; }
+    };
+#else
+    typedef float four __attribute__((vector_size(16)));
+#endif
+    const auto vectors = [&](const auto& all, int nodes) {
+        return reinterpret_cast<four*>(all.data) + (long long)world * nodes;
+    };
+    const unsigned char* is_free = free.data + (long long)world * ranks;
+    const four zero = {0.0f, 0.0f, 0.0f, 0.0f};
+"""
+
+
+@wp.func_native(
+    _MOVES
+    + """
+    const four* from = vectors(given, mesh_nodes);
+    four* to = vectors(r, ranks);
+    for (int i = thread; i < ranks; i += threads) {
+        const int node = nodes.data[i];
+        to[i] = node < mesh_nodes && is_free[i] ? from[node] : zero;
+    }
+"""
+)
+def take_nodes(
+    world: int,
+    thread: int,
+    threads: int,
+    ranks: int,
+    mesh_nodes: int,
+    nodes: wp.array[wp.int32],
+    free: wp.array[wp.uint8],
+    given: wp.array[wp.vec4],
+    r: wp.array[wp.vec4],
+): ...
+
+
+@wp.func_native(
+    _MOVES
+    + """
+    const four *from = vectors(z, ranks), *held = vectors(given, mesh_nodes);
+    four* to = vectors(result, mesh_nodes);
+    for (int i = thread; i < ranks; i += threads) {
+        const int node = nodes.data[i];
+        if (node < mesh_nodes) to[node] = is_free[i] ? from[i] : held[node];
+    }
+"""
+)
+def hand_nodes(
+    world: int,
+    thread: int,
+    threads: int,
+    ranks: int,
+    mesh_nodes: int,
+    nodes: wp.array[wp.int32],
+    free: wp.array[wp.uint8],
+    given: wp.array[wp.vec4],
+    z: wp.array[wp.vec4],
+    result: wp.array[wp.vec4],
+): ...
+
+
+@wp.func_native(
+    _MOVES
+    + """
+    const four* from = vectors(residual, fine);
+    four* to = vectors(r, coarse);
+    for (int i = thread; i < coarse; i += threads) {
+        four total = zero;
+        if (is_free[i]) {
+            for (int p = starts.data[i]; p < starts.data[i + 1]; ++p) total = total + from[midpoints.data[p]];
+            total = total * 0.5f + from[i];
+        }
+        to[i] = total;
+    }
+"""
+)
+def restrict_nodes(
+    world: int,
+    thread: int,
+    threads: int,
+    ranks: int,
+    coarse: int,
+    fine: int,
+    free: wp.array[wp.uint8],
+    starts: wp.array[wp.int32],
+    midpoints: wp.array[wp.int32],
+    residual: wp.array[wp.vec4],
+    r: wp.array[wp.vec4],
+): ...
+
+
+@wp.func_native(
+    _MOVES
+    + """
+    const four* from = vectors(correction, coarse);
+    four* to = vectors(z, fine);
+    for (int i = thread; i < fine; i += threads)
+        if (is_free[i]) to[i] = to[i] + (i < coarse ? from[i] : (from[ends.data[i][0]] + from[ends.data[i][1]]) * 0.5f);
+"""
+)
+def prolongate_nodes(
+    world: int,
+    thread: int,
+    threads: int,
+    ranks: int,
+    coarse: int,
+    fine: int,
+    free: wp.array[wp.uint8],
+    ends: wp.array[wp.vec2i],
+    correction: wp.array[wp.vec4],
+    z: wp.array[wp.vec4],
+): ...
+
+
+@wp.func
+def make_first_step(
+    world: int,
+    thread: int,
+    threads: int,
+    count: int,
+    alpha: float,
+    inverses: wp.array[wp.mat33],
+    r: wp.array[wp.vec4],
+    z: wp.array[wp.vec4],
+):
+    """The smoother's first step from zero, unless alpha is zero."""
+    if alpha != 0.0:
+        for i in range(thread, count, threads):
+            at = world * count + i
+            store_node(z, at, alpha * (inverses[at] * load_node(r, at)))
+
+
 @wp.kernel(enable_backward=False)
 def take_in(
     # In
+    threads: int,
     ranks: int,
     mesh_nodes: int,
     alpha: float,
@@ -112,19 +254,15 @@ def take_in(
     z: wp.array[wp.vec4],
 ):
     """Sort the residual by rank, zero at held nodes, and make the first step from zero."""
-    world, i = wp.tid()
-    node = nodes[i]
-    at = world * ranks + i
-    value = wp.vec3()
-    if node < mesh_nodes and free[at] != wp.uint8(0):
-        value = load_node(given, world * mesh_nodes + node)
-    store_node(r, at, value)
-    store_node(z, at, alpha * (inverses[at] * value))
+    world, thread = wp.tid()
+    take_nodes(world, thread, threads, ranks, mesh_nodes, nodes, free, given, r)
+    make_first_step(world, thread, threads, ranks, alpha, inverses, r, z)
 
 
 @wp.kernel(enable_backward=False)
 def hand_out(
     # In
+    threads: int,
     ranks: int,
     mesh_nodes: int,
     nodes: wp.array[wp.int32],
@@ -135,16 +273,8 @@ def hand_out(
     result: wp.array[wp.vec4],
 ):
     """Sort the result by node; held nodes have the identity."""
-    world, i = wp.tid()
-    node = nodes[i]
-    if node >= mesh_nodes:
-        return
-    at = world * ranks + i
-    to = world * mesh_nodes + node
-    if free[at] != wp.uint8(0):
-        store_node(result, to, load_node(z, at))
-    else:
-        store_node(result, to, load_node(given, to))
+    world, thread = wp.tid()
+    hand_nodes(world, thread, threads, ranks, mesh_nodes, nodes, free, given, z, result)
 
 
 @wp.kernel(enable_backward=False)
@@ -207,6 +337,7 @@ def find_residual(
 @wp.kernel(enable_backward=False)
 def restrict_residual(
     # In
+    threads: int,
     ranks: int,
     coarse: int,
     fine: int,
@@ -221,20 +352,15 @@ def restrict_residual(
     z: wp.array[wp.vec4],
 ):
     """P^T of the finer level's residual, zero at held nodes, and the first step from zero."""
-    world, i = wp.tid()
-    at = world * coarse + i
-    total = wp.vec3()
-    if free[world * ranks + i] != wp.uint8(0):
-        for p in range(starts[i], starts[i + 1]):
-            total += load_node(residual, world * fine + midpoints[p])
-        total = 0.5 * total + load_node(residual, world * fine + i)
-    store_node(r, at, total)
-    store_node(z, at, alpha * (inverses[at] * total))
+    world, thread = wp.tid()
+    restrict_nodes(world, thread, threads, ranks, coarse, fine, free, starts, midpoints, residual, r)
+    make_first_step(world, thread, threads, coarse, alpha, inverses, r, z)
 
 
 @wp.kernel(enable_backward=False)
 def prolongate_correction(
     # In
+    threads: int,
     ranks: int,
     coarse: int,
     fine: int,
@@ -245,15 +371,5 @@ def prolongate_correction(
     z: wp.array[wp.vec4],
 ):
     """z += P of the coarser level's correction, at free nodes."""
-    world, i = wp.tid()
-    if free[world * ranks + i] == wp.uint8(0):
-        return
-    first = world * coarse
-    value = wp.vec3()
-    if i < coarse:
-        value = load_node(correction, first + i)
-    else:
-        pair = ends[i]
-        value = 0.5 * (load_node(correction, first + pair[0]) + load_node(correction, first + pair[1]))
-    at = world * fine + i
-    store_node(z, at, load_node(z, at) + value)
+    world, thread = wp.tid()
+    prolongate_nodes(world, thread, threads, ranks, coarse, fine, free, ends, correction, z)

@@ -67,13 +67,13 @@ class SmoothedLevel:
             nodes: The node number of each rank, int32.
             given: The residual by number, vec4.
         """
-        inputs = [self.count, mesh_nodes, self.factors[0][0], nodes, self.free, self.inverses, given]
-        self.launch(cycle.take_in, self.count, inputs, [self.r, self.z])
+        inputs = [self.count, mesh_nodes, self._first_factor, nodes, self.free, self.inverses, given]
+        self._move(cycle.take_in, self.count, inputs, [self.r, self.z])
 
     def hand_out(self, mesh_nodes: int, nodes: wp.array, given: wp.array, result: wp.array) -> None:
         """Launch the finest level's correction by number; held nodes have what is given."""
         inputs = [self.count, mesh_nodes, nodes, self.free, given, self.z]
-        self.launch(cycle.hand_out, self.count, inputs, [result])
+        self._move(cycle.hand_out, self.count, inputs, [result])
 
     def smooth_before(self) -> None:
         """Smooth from zero; ``z`` already has the first step."""
@@ -101,15 +101,24 @@ class SmoothedLevel:
         if fine.factors:
             fine.find_residual()
         residual = fine.other if fine.factors else fine.r
-        first = self.factors[0][0] if self.factors else 0.0
-        inputs: list[Any] = [self.ranks, self.count, fine.count, first, self.free]
+        inputs: list[Any] = [self.ranks, self.count, fine.count, self._first_factor, self.free]
         inputs += [midpoints.starts, midpoints.midpoints, self.inverses, residual]
-        self.launch(cycle.restrict_residual, self.count, inputs, [self.r, self.z])
+        self._move(cycle.restrict_residual, self.count, inputs, [self.r, self.z])
 
     def take_correction(self, coarse: SmoothedLevel, ends: wp.array) -> None:
         """Add the correction of the coarser level to this one's."""
         inputs = [self.ranks, coarse.count, self.count, self.free, ends, coarse.z]
-        self.launch(cycle.prolongate_correction, self.count, inputs, [self.z])
+        self._move(cycle.prolongate_correction, self.count, inputs, [self.z])
+
+    @property
+    def _first_factor(self) -> float:
+        """The factor of the smoother's first step from zero; zero: none is made."""
+        return self.factors[0][0] if self.factors else 0.0
+
+    def _move(self, kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any]) -> None:
+        """Launch a kernel whose threads share ``count`` nodes of each world; on a CPU there is one."""
+        threads = 1 if self.device.is_cpu else count
+        self.launch(kernel, threads, [threads, *inputs], outputs)
 
     def launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any]) -> None:
         """Launch a kernel with ``count`` threads for each world."""

@@ -1,5 +1,4 @@
-"""A level that the CPU smooths by Gauss-Seidel sweeps; see ``kernels.implicit.multigrid.sweeps``, and
-``transfers_cpu`` there."""
+"""A level that the CPU smooths by Gauss-Seidel sweeps; see ``kernels.implicit.multigrid.sweeps``."""
 
 from __future__ import annotations
 
@@ -8,10 +7,9 @@ from typing import Any
 import warp as wp
 
 from warp_corot.kernels.implicit.multigrid import sweeps as kernels
-from warp_corot.kernels.implicit.multigrid import transfers_cpu as transfers
 
-from .level import Level, SmoothedLevel
-from .pattern import Midpoints, Pattern
+from .level import Level
+from .pattern import Pattern
 
 
 class SweptLevel(Level):
@@ -27,27 +25,6 @@ class SweptLevel(Level):
         super().__init__(pattern, worlds, ranks, free, degree=1)
         self._sweeps = sweeps
 
-    def take_in(self, mesh_nodes: int, nodes: wp.array, given: wp.array) -> None:
-        """Launch the finest level's residual; sweeps begin by themselves."""
-        inputs = [self.count, mesh_nodes, nodes, self.free, given]
-        self._launch_worlds(transfers.take_in, inputs, [self.r])
-
-    def hand_out(self, mesh_nodes: int, nodes: wp.array, given: wp.array, result: wp.array) -> None:
-        inputs = [self.count, mesh_nodes, nodes, self.free, given, self.z]
-        self._launch_worlds(transfers.hand_out, inputs, [result])
-
-    def restrict_from(self, fine: SmoothedLevel, midpoints: Midpoints) -> None:
-        """Restrict the finer level's residual."""
-        if fine.factors:
-            fine.find_residual()
-        inputs = [self.ranks, self.count, fine.count, self.free, midpoints.starts, midpoints.midpoints]
-        inputs += [fine.other if fine.factors else fine.r]
-        self._launch_worlds(transfers.restrict_residual, inputs, [self.r])
-
-    def take_correction(self, coarse: SmoothedLevel, ends: wp.array) -> None:
-        inputs = [self.ranks, coarse.count, self.count, self.free, ends, coarse.z]
-        self._launch_worlds(transfers.prolongate_correction, inputs, [self.z])
-
     def smooth_before(self) -> None:
         inputs = [*self._sizes, self.rows, self.pattern.diagonal, self.inverses, self.r]
         self._launch_worlds(kernels.sweep_from_zero, inputs, [self.z, self.other])
@@ -61,6 +38,11 @@ class SweptLevel(Level):
     def find_residual(self) -> None:
         inputs = [*self._sizes, self._sweeps == 1, self.rows, self.pattern.diagonal, self.r, self.z, self.inverses]
         self._launch_worlds(kernels.find_rest, inputs, [self.other])
+
+    @property
+    def _first_factor(self) -> float:
+        """Zero: sweeps begin by themselves."""
+        return 0.0
 
     def _sweep(self, *, backward: bool) -> None:
         inputs = [*self._sizes, backward, self.rows, self.inverses, self.r]
