@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 from command_line import SHORT, simulate
-from foreign_meshes import grid, vtk_grid, write_gmsh_1, write_with_vtk
+from foreign_meshes import grid, vtk_grid, write_gmsh, write_with_vtk
 from input_files import write_scan, write_surface
 from pxr import Usd, UsdGeom
 from stages import TETS
@@ -26,7 +26,7 @@ def two_regions(folder, suffix=".vtu", size=0.1):
     which = np.where(middles < np.median(middles), 7, 9)
     path = folder / f"cubes{suffix}"
     if suffix == ".msh":
-        return write_gmsh_1(path, size * points, [(5, int(n), row) for n, row in zip(which, rows, strict=True)])
+        return write_gmsh(path, size * points, [(5, int(n), row) for n, row in zip(which, rows, strict=True)])
     return write_with_vtk(path, vtk_grid(size * points, [(12, row) for row in rows], {"tissue": which}))
 
 
@@ -85,7 +85,7 @@ def test_options_without_effect_are_refused(folder, args, said, capsys):
 def test_units_and_factors_of_every_input(folder, capsys):
     """A length of 100 in the file is 100 mm unless options say otherwise; a guess is reported."""
     write_surface(folder / "organ.obj", True)
-    write_gmsh_1(folder / "tet.msh", 100 * np.eye(4, 3, k=-1), [(4, 1, [0, 1, 2, 3])])
+    write_gmsh(folder / "tet.msh", 100 * np.eye(4, 3, k=-1), [(4, 1, [0, 1, 2, 3])])
     write_scan(folder / "scan.nii", unit="unknown")
     for name, size in (("organ.obj", "60 mm x 80 mm x 100 mm"), ("scan.nii", "80 mm x 80 mm x 80 mm")):
         for args, factor in (([], 1), (["--unit", "2mm"], 2), (["--scale", 3, "--unit", "mm"], 3)):
@@ -104,7 +104,7 @@ def test_units_and_factors_of_every_input(folder, capsys):
 
 
 def test_up(folder):
-    write_gmsh_1(folder / "tet.msh", 0.1 * np.eye(4, 3, k=-1), [(4, 1, [0, 1, 2, 3])])
+    write_gmsh(folder / "tet.msh", 0.1 * np.eye(4, 3, k=-1), [(4, 1, [0, 1, 2, 3])])
     for up, axis in (("y", 1), ("Y", 1), (None, 2)):
         args = [] if up is None else ["--up", up]
         assert simulate("tet.msh", "-o", f"{up}.usda", "--fix", "all and x + y + z > 0.05", *args, *SHORT) == 0
@@ -223,14 +223,14 @@ def test_objects_of_a_file_are_bodies_or_one(folder, suffix, capsys):
 def test_joined_nodes(folder, capsys):
     """Two tetrahedra whose common face has the same positions and different numbers."""
     points = [*(0.1 * np.eye(4, 3, k=-1)), *(0.1 * np.eye(4, 3, k=-1)[1:]), (0.1, 0.1, 0.1)]
-    write_gmsh_1(folder / "two.msh", points, [(4, 1, [0, 1, 2, 3]), (4, 1, [4, 5, 6, 7])])
+    write_gmsh(folder / "two.msh", points, [(4, 1, [0, 1, 2, 3]), (4, 1, [4, 5, 6, 7])])
     assert simulate("two.msh", "--join", "--fix", "x + y + z < 0.05", "-o", "a.usd", *SHORT) == 0
     out, err = capsys.readouterr()
     assert "3 nodes coincide with others and are merged" in err
     assert "5 nodes, 2 tetrahedra" in out
     assert simulate("two.msh", "--fix", "x + y + z < 0.05", "-o", "a.usd", *SHORT) == 0
     assert "no two tetrahedra share a node (--join" in capsys.readouterr().err
-    write_gmsh_1(folder / "one.msh", points[:4], [(4, 1, [0, 1, 2, 3])])
+    write_gmsh(folder / "one.msh", points[:4], [(4, 1, [0, 1, 2, 3])])
     assert simulate("one.msh", "--join", "-o", "b.usd", *SHORT) == 2
     assert "no two nodes coincide" in capsys.readouterr().err
 

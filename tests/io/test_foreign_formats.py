@@ -11,7 +11,7 @@ from foreign_meshes import (
     VTK_KINDS,
     grid,
     vtk_grid,
-    write_gmsh_1,
+    write_gmsh,
     write_netgen,
     write_tetgen,
     write_with_vtk,
@@ -139,15 +139,15 @@ def test_polygons_and_strips_are_surfaces(tmp_path, suffix):
         load_tets(tmp_path / f"box{suffix}")
 
 
-def test_gmsh_1(tmp_path, mixed):
+def test_gmsh(tmp_path, mixed):
     """Numbers of nodes begin at 11; physical groups are regions; triangles and points do no harm."""
     points, cells = mixed
     rows = [(GMSH_KINDS[kind], int(n), row) for (kind, row), n in zip(cells, halves(points, cells), strict=True)]
-    path = write_gmsh_1(tmp_path / "a.msh", points, [(15, 0, [0]), (2, 1, [0, 1, 2]), *rows])
+    path = write_gmsh(tmp_path / "a.msh", points, [(15, 0, [0]), (2, 1, [0, 1, 2]), *rows])
     check(path, ("7", "9"), len(points))
     cut = tmp_path / "cut.msh"
     cut.write_text(path.read_text(encoding="utf-8")[:-200])
-    with pytest.raises(InputError, match=r"cut\.msh: is not a \.msh file that can be read .*element \d+ is incomplete"):
+    with pytest.raises(InputError, match=r"cut\.msh: is not a \.msh file that can be read \(.*meshio: "):
         load_tets(cut)
 
 
@@ -243,7 +243,7 @@ def test_abaqus_parts_and_instances(tmp_path):
 def test_second_order_cells_are_said(tmp_path):
     corners = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], float)
     middles = [(corners[a] + corners[b]) / 2 for a, b in ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3))]
-    path = write_gmsh_1(tmp_path / "a.msh", [*corners, *middles], [(11, 0, list(range(10)))])
+    path = write_gmsh(tmp_path / "a.msh", [*corners, *middles], [(11, 0, list(range(10)))])
     loaded = load_tets(path)
     assert loaded.tets.tolist() == [[0, 1, 2, 3]]
     assert loaded.notes == ["second-order cells (tetra) are taken by their corners, with straight edges"]
@@ -298,6 +298,6 @@ def test_a_reader_that_crashes_hangs_or_exhausts_memory_is_reported(tmp_path, mo
 
 def test_orientation_of_split_cells_is_positive(tmp_path, mixed):
     points, cells = mixed
-    path = write_gmsh_1(tmp_path / "a.msh", points, [(GMSH_KINDS[kind], 1, row) for kind, row in cells])
+    path = write_gmsh(tmp_path / "a.msh", points, [(GMSH_KINDS[kind], 1, row) for kind, row in cells])
     loaded = load_tets(path)
     assert (signed_volumes(loaded.points, loaded.tets) > 0).all()

@@ -63,13 +63,14 @@ def grid(n: int, rng: np.random.Generator, kinds: list[str]) -> tuple[np.ndarray
 VOLUME = float(np.linalg.det([[1.0, 0.1, 0.0], [0.0, 1.2, 0.2], [0.1, 0.0, 0.9]]))
 
 
-def write_gmsh_1(path: Path, points, cells: list[tuple[int, int, list[int]]]) -> Path:
-    """Gmsh's format 1; cells are an element type, a physical group and corners."""
-    lines = ["$NOD", str(len(points)), *(f"{k + 11} {x} {y} {z}" for k, (x, y, z) in enumerate(points)), "$ENDNOD"]
-    lines += ["$ELM", str(len(cells))]
+def write_gmsh(path: Path, points, cells: list[tuple[int, int, list[int]]]) -> Path:
+    """Gmsh's format 2.2; cells are an element type, a physical group and corners."""
+    lines = ["$MeshFormat", "2.2 0 8", "$EndMeshFormat", "$Nodes", str(len(points))]
+    lines += [*(f"{k + 11} {x} {y} {z}" for k, (x, y, z) in enumerate(points)), "$EndNodes"]
+    lines += ["$Elements", str(len(cells))]
     for k, (kind, group, nodes) in enumerate(cells):
-        lines.append(f"{k + 1} {kind} {group} 1 {len(nodes)} {' '.join(str(n + 11) for n in nodes)}")
-    path.write_text("\n".join([*lines, "$ENDELM", ""]))
+        lines.append(f"{k + 1} {kind} 2 {group} 1 {' '.join(str(n + 11) for n in nodes)}")
+    path.write_text("\n".join([*lines, "$EndElements", ""]))
     return path
 
 

@@ -122,12 +122,6 @@ def _nastran(folder: Path) -> Path:
     return folder / "seed.bdf"
 
 
-def _gmsh_1(folder: Path) -> Path:
-    from foreign_meshes import write_gmsh_1
-
-    return write_gmsh_1(folder / "seed.msh", POINTS, [(4, 1 + k, row) for k, row in enumerate(TETS.tolist())])
-
-
 def _abaqus(folder: Path) -> Path:
     (folder / "nodes.inp").write_text(ABAQUS_PART)
     (folder / "seed.inp").write_text(ABAQUS)
@@ -145,13 +139,6 @@ def _netgen_gz(folder: Path) -> Path:
     (folder / "seed.vol.gz").write_bytes(gzip.compress(plain.read_bytes(), mtime=0))
     plain.unlink()
     return folder / "seed.vol.gz"
-
-
-def _neutral(folder: Path) -> Path:
-    places = [" ".join(map(str, point)) for point in POINTS.tolist()]
-    cells = [f"1 {' '.join(str(node + 1) for node in tet)}" for tet in TETS.tolist()]
-    (folder / "seed.mesh").write_text("\n".join([str(len(places)), *places, str(len(cells)), *cells, "0", ""]))
-    return folder / "seed.mesh"
 
 
 def _tetgen(folder: Path) -> Path:
@@ -382,7 +369,6 @@ SEEDS: dict[str, Callable[[Path], Path]] = {
     "usda-tets": _stage(".usda", tets=True),
     "usdc-tets": _stage(".usdc", tets=True),
     "scene": _scene,
-    "msh-1": _gmsh_1,
     "msh-2": _meshio(".msh", file_format="gmsh22", binary=False),
     "msh-2-binary": _meshio(".msh", file_format="gmsh22", binary=True),
     "msh-4": _meshio(".msh", file_format="gmsh", binary=False),
@@ -394,7 +380,6 @@ SEEDS: dict[str, Callable[[Path], Path]] = {
     "tetgen": _tetgen,
     "vol": _netgen,
     "vol.gz": _netgen_gz,
-    "neutral": _neutral,
     "vtk": _vtk(".vtk"),
     "vtk-4": _vtk(".vtk", version=42),
     "vtk-text": _vtk(".vtk", binary=False),

@@ -49,7 +49,6 @@ TETRAHEDRA = {
     "tetgen",
     "vol",
     "vol.gz",
-    "neutral",
     "run",
     "mesh",
     "meshb",

@@ -35,7 +35,6 @@ class Reader:
 
 VTK = Reader("VTK", "vtk_files", "vtkmodules", "mesh")
 GMSH = Reader("Gmsh", "gmsh_files", "gmsh", "gmsh")
-GMSH_1 = Reader("the reader of Gmsh's format 1", "gmsh_1")
 MESHIO = Reader("meshio", "meshio_files", "meshio", "mesh")
 ABAQUS = Reader("the reader of Abaqus input files", "abaqus")
 NETGEN = Reader("the reader of NetGen's files", "netgen")
@@ -43,8 +42,8 @@ TETGEN = Reader("the reader of TetGen's files", "tetgen")
 
 #: Readers by extension, starting with the most complete one.
 READERS: dict[str, tuple[Reader, ...]] = {
-    ".msh": (GMSH_1, GMSH, MESHIO),
-    ".mesh": (NETGEN, GMSH, MESHIO),
+    ".msh": (GMSH, MESHIO),
+    ".mesh": (GMSH, MESHIO),
     ".meshb": (GMSH, MESHIO),
     ".unv": (GMSH,),
     ".bdf": (GMSH, MESHIO),

@@ -1,4 +1,4 @@
-"""NetGen's files: its own .vol and .vol.gz, and the neutral format .mesh that begins with the number of points."""
+"""NetGen's own files, .vol and .vol.gz."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ SURFACES = {3: "triangle", 6: "triangle", 4: "quad", 8: "quad"}
 MATERIAL = "material"
 
 
-def read(path: Path) -> FileMesh | None:
-    """Elements with the numbers and names of their materials; None for a .mesh file of another program.
+def read(path: Path) -> FileMesh:
+    """Elements with the numbers and names of their materials.
 
     Raises:
         Unreadable: The file is truncated or its numbers are inconsistent.
@@ -31,8 +31,6 @@ def read(path: Path) -> FileMesh | None:
         first = next(lines, "")
         if first == "mesh3d":
             return _volume(lines)
-        if path.suffix.lower() == ".mesh":
-            return _neutral(first, lines) if first.isdecimal() else None
         raise Unreadable(f"it begins with {first[:20]!r}; it must begin with mesh3d")
 
 
@@ -55,12 +53,6 @@ def _volume(lines: Iterator[str]) -> FileMesh:
         elif line == "endmesh":
             break
     return _mesh(points, [(row[0], row[2 : 2 + row[1]]) for row in map(_counted, solids)], surfaces, names)
-
-
-def _neutral(first: str, lines: Iterator[str]) -> FileMesh:
-    points = [_reals(row) for row in _rows(lines, "points", first)]
-    rows = [_wholes(row) for row in _rows(lines, "volume elements")]
-    return _mesh(points, [(row[0], row[1:]) for row in rows], [], {})
 
 
 def _mesh(
@@ -90,9 +82,9 @@ def _mesh(
     return FileMesh(np.array(points, np.float64), blocks, named, notes=notes)
 
 
-def _rows(lines: Iterator[str], what: str, count: str | None = None) -> list[str]:
+def _rows(lines: Iterator[str], what: str) -> list[str]:
     """The lines of a section, whose first line has their number."""
-    said = next(lines, "") if count is None else count
+    said = next(lines, "")
     if not said.isdecimal():
         raise Unreadable(f"the number of {what} is {said[:20]!r}")
     rows = list(islice(lines, int(said)))
