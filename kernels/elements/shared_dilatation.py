@@ -1,7 +1,7 @@
 """Kernels of a dilatation that elements share; see ``dilatation``.
 
 There are three passes. The first measures elements: theta, and its change along a direction if there is one. The second
-replaces these by the law's values for the shared ones, of groups or at nodes. The third, a thread an element again,
+replaces these by the law's values for the shared ones of groups. The third, a thread an element again,
 adds forces, products or energies. Between them stands one vec4 an element: (theta, change, 0, 0) and then (w, w', w''
 change, w''), at the elements' places in the mesh.
 
@@ -17,7 +17,7 @@ from warp_corot.kernels.modules import unique_kernel
 
 from .constitutive import IsotropicMaterial
 from .dilatation import Dilatation, mean_of, pressure_stress_of
-from .elements import add_force, add_nodal_forces, rest_volume
+from .elements import add_nodal_forces, rest_volume
 from .forces import in_local_frame, own_gradient
 
 wp.set_module_options({"enable_backward": False})
@@ -144,75 +144,6 @@ def share_in_groups(Elements: type, law: wp.Function) -> wp.Kernel:
 
 
 # --- the second pass: nodes -------------------------------------------------------------------------------------------
-
-
-@functools.cache
-def add_to_nodes(Elements: type) -> wp.Kernel:
-    """Add lambda V / 4 times an element's dilatation, one, and the change to the sums of its nodes."""
-
-    @unique_kernel()
-    def add_to_nodes(
-        # In
-        elements: Elements,
-        places: wp.array[wp.int32],
-        live: wp.array[wp.int32],
-        material: IsotropicMaterial,
-        shared: wp.array[wp.vec4],
-        # In and out
-        sums: wp.array[wp.vec4],
-    ):
-        t = wp.tid()
-        if not is_live(live, t):
-            return
-        place = place_of(places, t)
-        weight = 0.25 * material.lam[place * material.stride] * rest_volume(elements, t)
-        own = shared[place]
-        part = weight * wp.vec3(own[0], 1.0, own[1])
-        targets = elements.targets[t]
-        for n in range(4):
-            add_force(sums, targets[n], part)
-
-    return add_to_nodes
-
-
-@functools.cache
-def law_at_nodes(law: wp.Function) -> wp.Kernel:
-    """Replace the sums at nodes by the law's values; a thread a node."""
-
-    @unique_kernel()
-    def law_at_nodes(
-        # In and out
-        sums: wp.array[wp.vec4],
-    ):
-        i = wp.tid()
-        sum = sums[i]
-        sums[i] = law(mean_of(sum[0], sum[1]), mean_of(sum[2], sum[1]))
-
-    return law_at_nodes
-
-
-@functools.cache
-def share_at_nodes(Elements: type) -> wp.Kernel:
-    """The mean of the law's values at an element's four nodes."""
-
-    @unique_kernel()
-    def share_at_nodes(
-        # In
-        elements: Elements,
-        places: wp.array[wp.int32],
-        live: wp.array[wp.int32],
-        nodal: wp.array[wp.vec4],
-        # Out
-        shared: wp.array[wp.vec4],
-    ):
-        t = wp.tid()
-        if not is_live(live, t):
-            return
-        nodes = elements.nodes[t]
-        value = nodal[nodes[0]] + nodal[nodes[1]] + nodal[nodes[2]] + nodal[nodes[3]]
-        shared[place_of(places, t)] = 0.25 * value
-
-    return share_at_nodes
 
 
 # --- the third pass ---------------------------------------------------------------------------------------------------

@@ -263,6 +263,9 @@ def test_wrong_input_is_named(device):
         wc.Simulation(body, remesh=3)
     with pytest.raises(wc.InputError, match="MassSpring has springs along the edges"):
         wc.Simulation(body, model=wc.MassSpring(), remesh=wc.OnlineRemesh())
+    stiff = wc.SoftBody(body.mesh, wc.Isotropic(1e4, 0.49, 1000.0), device=device)
+    with pytest.raises(wc.InputError, match="leaf by leaf"):
+        wc.Simulation(stiff, model=wc.Corotated(subtrees=False), remesh=wc.OnlineRemesh())
     many = wc.SoftBody(body.mesh, SOFT, worlds=2, device=device)
     with pytest.raises(wc.InputError, match="worlds is 2; only a body in one world"):
         wc.Simulation(many, remesh=wc.OnlineRemesh())

@@ -29,7 +29,7 @@ from warp_corot.mesh import TetForest
 
 from .clustered import ClusteredGroups
 from .others import Others
-from .tangent import NodalTangent, SharedTangent
+from .tangent import SharedTangent
 
 
 class DilatationField(ForceField):
@@ -93,7 +93,7 @@ class DilatationField(ForceField):
     def _join_clusters(self) -> ClusteredGroups | None:
         """Let the launch of elements in clusters add the forces of their shared dilatation, if there is one (CUDA)."""
         found = self.shear.in_clusters
-        if found is None or self.slots is not None or self._others.are_nodal:
+        if found is None or self.slots is not None:
             return None
         scatter, kept = found
         there = [batch for batch in self.plan.batches if not any(batch is other for other in kept)]
@@ -194,32 +194,20 @@ class DilatationField(ForceField):
                 rotations and of the gradient of J, which is positive semidefinite; True: the exact derivative.
         """
         self._law("add_stiffness", exact)(u, p, y)
-        self.add_shared_product(u, p, y, exact)
-
-    def add_shared_product(self, u: wp.array, p: wp.array, y: wp.array, exact: bool | None = None) -> None:
-        """The part of ``add_stiffness`` that comes from the shared dilatation."""
         inputs = [self.elements, self.isotropic, u, p, self._share(u, p), self.turning(exact)]
         self.launch(kernels.add_product(self.kind, self.of), self.element_count, inputs, [y])
 
     def add_diagonal(self, u: wp.array, blocks: wp.array, *, exact: bool | None = None) -> None:
-        """Add the 3x3 blocks on the diagonal of the same K(u) to those of the nodes [N/m]; see ``add_stiffness``.
-
-        If dilatations are at nodes, the blocks are larger than those of K.
-        """
+        """Add the 3x3 blocks on the diagonal of the same K(u) to those of the nodes [N/m]; see ``add_stiffness``."""
         self._law("add_diagonal", exact)(u, blocks)
-        self.add_shared_diagonal(u, blocks, exact)
-
-    def add_shared_diagonal(self, u: wp.array, blocks: wp.array, exact: bool | None = None) -> None:
-        """The part of ``add_diagonal`` that comes from the shared dilatation."""
         turning, shared = self.turning(exact), self._share(u, self._still)
         kernel = shared_diagonal.add_diagonal_of_groups(self.kind, self.of)
         for starts, members, live, count in self.batches_of_groups():
             inputs = [starts, members, live, self.elements, self.isotropic, u, shared, turning]
             self.launch(kernel, count, inputs, [blocks])
-        self._others.add_nodal_diagonal(self.isotropic, u, shared, turning, blocks)
 
     def tangent(self, *, exact: bool = False) -> Tangent:
-        return (NodalTangent if self._others.are_nodal else SharedTangent)(self, exact)
+        return SharedTangent(self, exact)
 
     def _law(self, name: str, exact: bool | None) -> Callable[..., None]:
         method = getattr(self.shear, name)
@@ -279,16 +267,12 @@ class DilatationField(ForceField):
     def kind(self) -> type:
         return self.discretization.element_kind
 
-    def prepare_sums(self, u: wp.array) -> None:
-        """Make room for sums at the nodes of displacements u; not while launches are recorded."""
-        self._others.prepare_sums(len(u))
-
     def _make_room(self) -> None:
         """Allocate the arrays of all elements that one pass leaves for the next."""
         self._shared = wp.zeros(self.element_count, dtype=wp.vec4, device=self.device)
 
     def groups(self) -> list[npt.NDArray[np.int32]]:
-        """The elements of each group that shares a dilatation, of all worlds; none if dilatations are at nodes."""
+        """The elements of each group that shares a dilatation, of all worlds."""
         found = []
         for starts, members, _live, count in self.batches_of_groups():
             begins, of_groups = starts.numpy(), members.numpy()
@@ -299,11 +283,9 @@ class DilatationField(ForceField):
                     found.append(np.arange(begins[g], begins[g] + 8, dtype=np.int32))
         return found
 
-    def group_numbers(self) -> npt.NDArray[np.int32] | None:
-        """The number of each element's group, int32 [T] of all worlds; None if dilatations are at nodes."""
+    def group_numbers(self) -> npt.NDArray[np.int32]:
+        """The number of each element's group, int32 [T] of all worlds."""
         groups = self.groups()
-        if sum(map(len, groups)) < self.element_count:
-            return None
         numbers = np.empty(self.element_count, np.int32)
         numbers[np.concatenate(groups)] = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
         return numbers
@@ -316,8 +298,8 @@ class DilatationField(ForceField):
         return [(b.subtrees.first, self._all, b.live or self._all, b.count) for b in batches]
 
     @property
-    def find_members(self) -> Callable[[int], Members] | None:
-        return None if self._others.are_nodal else self.members
+    def find_members(self) -> Callable[[int], Members]:
+        return self.members
 
     def members(self, below: int | None = None) -> Members:
         """The nodes of groups, of all elements or those below a number; waits for the device."""
@@ -337,7 +319,6 @@ class DilatationField(ForceField):
         kernel = kernels.share_in_groups(self.kind, law)
         for starts, members, live, count in self.batches_of_groups():
             self.launch(kernel, count, [starts, members, live, self.elements, self.isotropic], [shared])
-        self._others.share_at_nodes(self.isotropic, len(u), shared, law)
         return shared
 
 

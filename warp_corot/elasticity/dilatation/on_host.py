@@ -80,16 +80,9 @@ class HostDilatation:
 
 
 def sharing_of(field: DilatationField) -> Any:
-    """The elements of one world that share a dilatation, sparse [groups, T]: one for each element of a group, or a
-    quarter for each of an element's nodes.
-    """
-    mesh = field.discretization.mesh
-    count = len(mesh.tets)
+    """The elements of one world that share a dilatation, sparse [groups, T]: one for each element of a group."""
+    count = len(field.discretization.mesh.tets)
     groups = [group for group in field.groups() if group[0] < count]
-    if not groups:
-        tets = np.asarray(mesh.tets)
-        places = (tets.ravel(), np.repeat(np.arange(count), 4))
-        return csr_matrix(coo_matrix((np.full(4 * count, 0.25), places), (len(mesh.points), count)))
     rows = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
     columns = np.concatenate(groups)
     return csr_matrix(coo_matrix((np.ones(len(columns)), (rows, columns)), (len(groups), count)))

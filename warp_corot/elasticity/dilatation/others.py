@@ -1,4 +1,4 @@
-"""Elements outside complete subtrees, which share their dilatation in groups or at nodes."""
+"""Elements outside complete subtrees, which share their dilatation in groups."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from warp_corot.discretization.groups import Groups
 from warp_corot.discretization.plan import Plan
 from warp_corot.elasticity.paths.grouped import GroupedLanes
 from warp_corot.elasticity.paths.lanes import as_general
+from warp_corot.errors import InputError
 from warp_corot.kernels.elements import dilatation_lanes as lanes
-from warp_corot.kernels.elements import shared_diagonal
 from warp_corot.kernels.elements import shared_dilatation as kernels
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import Dilatation
@@ -25,8 +25,7 @@ from warp_corot.mesh import TetForest
 class Others:
     """The elements of a plan that are outside complete subtrees.
 
-    They are in groups, which are found again whenever a forest changes. Only in a forest whose plan has no subtrees are
-    their dilatations at nodes.
+    Their groups are found again whenever a forest changes.
 
     Call ``follow`` before anything is launched, once it is known whether they are joined.
 
@@ -39,6 +38,9 @@ class Others:
         count: Number of elements in launches.
         grouped: The elements in groups on the CPU, for the law's own launches.
         are_joined: Whether the law's own launches add their forces.
+
+    Raises:
+        InputError: The forest changes, and the law computes forces leaf by leaf.
     """
 
     def __init__(self, discretization: Discretization, plan: Plan, of: Dilatation):
@@ -46,22 +48,25 @@ class Others:
         self._device, self._kind = discretization.device, discretization.element_kind
         self._none = wp.empty(0, dtype=wp.int32, device=self._device)
         self._still = wp.empty(0, dtype=wp.vec4, device=self._device)
-        self._sums = wp.empty(0, dtype=wp.vec4, device=self._device)
-        self._slot_sums = None if plan.slots is None else wp.zeros_like(plan.slots.values)
-        self._groups: Groups | ChangingGroups | None = None
         mesh = discretization.mesh
+        self._groups: Groups | ChangingGroups
         if isinstance(plan, DevicePlan):
-            self._groups = ChangingGroups(plan) if plan.kinds else None
-        elif isinstance(mesh, TetForest) and (plan.kinds or len(plan.flat)):
+            if not plan.kinds:
+                raise InputError(
+                    "this model computes forces leaf by leaf, where elements of a body that is remeshed cannot share "
+                    "their dilatation; take dilatation='element', or the model's default rotations and stiffness"
+                )
+            self._groups = ChangingGroups(plan)
+        elif isinstance(mesh, TetForest):
             leaves = plan.flat.leaves.numpy()
             leaves = leaves[: len(leaves) // discretization.worlds]
             self._groups = Groups.of_leaves(mesh, leaves, self._device, discretization.worlds)
-        elif not isinstance(mesh, TetForest):
+        else:
             self._groups = Groups.of_elements(mesh, self._device, discretization.worlds)
         self.grouped: GroupedLanes | None = None
         self.count, self.are_joined = 0, False
         groups = self._groups
-        if groups is not None and not self._device.is_cuda:
+        if not self._device.is_cuda:
             live = groups.live if isinstance(groups, ChangingGroups) else self._none
             self.grouped = GroupedLanes(plan, self._kind, of, groups.starts, groups.members, live)
         self.derive()
@@ -89,11 +94,6 @@ class Others:
             self._general = self._general or as_general(self._elements, rest_matrices, [self._elements])
 
     @property
-    def are_nodal(self) -> bool:
-        """Whether dilatations are at nodes."""
-        return self._groups is None and self.count > 0
-
-    @property
     def kernels(self) -> list[wp.Kernel]:
         """All kernels that forces may launch."""
         if self.are_joined:
@@ -102,10 +102,7 @@ class Others:
             passes = [kernels.measure_elements(self._kind, self._of), kernels.scatter_pressures(self._kind, self._of)]
         else:
             passes = [lanes.measure_in_lanes(self._of), lanes.scatter_in_lanes(self._of)]
-        if self._groups is not None:
-            return [*passes, kernels.share_in_groups(self._kind, kernels.law_at(self._of))]
-        at_nodes = [kernels.add_to_nodes(self._kind), kernels.law_at_nodes(self._of)]
-        return [*passes, *at_nodes, kernels.share_at_nodes(self._kind)]
+        return [*passes, kernels.share_in_groups(self._kind, kernels.law_at(self._of))]
 
     def scatter(self, material: IsotropicMaterial, u: wp.array, shared: wp.array, f: wp.array) -> None:
         """Add the forces of displacements u to f; ``shared`` has room for all elements of the mesh."""
@@ -115,12 +112,9 @@ class Others:
         else:
             blocks, where = -(-self.count // LANES), [self._general, self.count, self._places, self._live]
             self._launch(lanes.measure_in_lanes(self._of), [*where, u], [shared], blocks)
-        if self._groups is not None:
-            starts, members, live, count = self.groups[0]
-            inputs = [starts, members, live, self._plan.elements, material]
-            self._launch(kernels.share_in_groups(self._kind, kernels.law_at(self._of)), inputs, [shared], count)
-        else:
-            self.share_at_nodes(material, len(u), shared)
+        starts, members, live, count = self.groups[0]
+        inputs = [starts, members, live, self._plan.elements, material]
+        self._launch(kernels.share_in_groups(self._kind, kernels.law_at(self._of)), inputs, [shared], count)
         if self._device.is_cuda:
             kernel = kernels.scatter_pressures(self._kind, self._of)
             self._launch(kernel, [*where, material, u, shared], [f])
@@ -129,45 +123,13 @@ class Others:
 
     @property
     def groups(self) -> list[tuple[wp.array, wp.array, wp.array, int]]:
-        """The groups in the form of ``kernels.share_in_groups``, and their number; empty without groups."""
+        """The groups in the form of ``kernels.share_in_groups``, and their number; empty without elements."""
         groups = self._groups
-        if groups is None or not self.count:
+        if not self.count:
             return []
         if isinstance(groups, ChangingGroups):
             return [(groups.starts, groups.members, groups.live, self.count)]
         return [(groups.starts, groups.members, self._none, len(groups))]
-
-    def prepare_sums(self, nodes: int) -> None:
-        """Allocate sums for this many nodes; not while launches are recorded."""
-        if self._groups is None and len(self._sums) < nodes:
-            self._sums = wp.zeros(nodes, dtype=wp.vec4, device=self._device)
-
-    def share_at_nodes(
-        self, material: IsotropicMaterial, nodes: int, shared: wp.array, law: wp.Function | None = None
-    ) -> None:
-        """Launch the second pass for the elements outside groups, of a mesh with this many nodes."""
-        if self._groups is not None or not self.count:
-            return
-        self.prepare_sums(nodes)
-        sums = self._sums[:nodes]
-        sums.zero_()
-        to = sums if self._slot_sums is None else self._slot_sums
-        to.zero_()
-        where = [self._elements, self._places, self._live]
-        self._launch(kernels.add_to_nodes(self._kind), [*where, material, shared], [to])
-        if self._slot_sums is not None:
-            assert self._plan.slots is not None
-            self._plan.slots.gather(sums, self._slot_sums)
-        self._launch(kernels.law_at_nodes(law or kernels.law_at(self._of)), [], [sums], nodes)
-        self._launch(kernels.share_at_nodes(self._kind), [*where, sums], [shared])
-
-    def add_nodal_diagonal(
-        self, material: IsotropicMaterial, u: wp.array, shared: wp.array, turning: float, blocks: wp.array
-    ) -> None:
-        """Add the diagonal blocks of the elements outside groups."""
-        if self._groups is None and self.count:
-            inputs = [self._elements, self._places, self._live, material, u, shared, turning]
-            self._launch(shared_diagonal.add_diagonal(self._kind, self._of), inputs, [blocks])
 
     def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list, count: int | None = None) -> None:
         wp.launch(kernel, self.count if count is None else count, inputs, outputs, device=self._device)

@@ -78,35 +78,3 @@ class SharedTangent(Tangent):
             inputs += [float(self._turns)]
             kernel = shared_diagonal.add_diagonal(field.kind, field.of)
             field.launch(kernel, field.element_count, inputs, [blocks])
-
-
-class NodalTangent(Tangent):
-    """K of a field whose dilatations are at nodes.
-
-    Args:
-        field: The field.
-        exact: As for ``ForceField.tangent``.
-    """
-
-    field: DilatationField
-
-    def __init__(self, field: DilatationField, exact: bool):
-        super().__init__(field)
-        self.shear, self._exact = field.shear.tangent(exact=exact), exact
-
-    def prepare(self, u: wp.array) -> None:
-        super().prepare(u)
-        self.shear.prepare(u)
-        self.field.prepare_sums(u)
-
-    def take(self, u: wp.array) -> None:
-        super().take(u)
-        self.shear.take(u)
-
-    def add_product(self, p: wp.array, y: wp.array) -> None:
-        self.shear.add_product(p, y)
-        self.field.add_shared_product(self.displacements, p, y, self._exact)
-
-    def add_diagonal(self, blocks: wp.array) -> None:
-        self.shear.add_diagonal(blocks)
-        self.field.add_shared_diagonal(self.displacements, blocks, self._exact)

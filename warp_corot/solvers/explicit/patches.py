@@ -78,8 +78,6 @@ class PatchSteps:
         if not _suits(body, law):
             return None
         groups = None if sharing is None else sharing.group_numbers()
-        if sharing is not None and groups is None:
-            return None
         count = min(count or max(len(body.mesh.tets) // PATCH_ELEMENTS, 1), body.device.sm_count)
         room = body.device.max_shared_memory_per_block - TILE_BYTES
         sizes = THREADS if threads is None else ((threads, MOST_ELEMENTS * threads),)
