@@ -9,9 +9,10 @@ from typing import Any
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
-from warp_corot.kernels.stepping.integrate import by_vectors, symplectic_euler_velocity, vector_at
-from warp_corot.kernels.stepping.pace import DT, Pace, length_before
+from warp_corot.kernels.stepping.integrate import by_vectors
+from warp_corot.kernels.stepping.pace import Pace
 
+from .begin import foreseen
 from .law import SETTLING
 from .motion import Motions
 from .shapes import carried
@@ -70,32 +71,18 @@ def hold_in_tool(
     k = wp.tid()
     i = nodes[k]
     forces[k] = wp.vec3()
-    w = inverse_mass[i]
-    if w == 0.0:
+    if inverse_mass[i] == 0.0:
         return
     world = k / per_world
-    dt = float(pace.seconds[DT])
-    before = dt
-    if offset == 0:
-        before = float(length_before(pace))
-    kick = 0.5 * (before + dt)
-    damped = 1.0 / (1.0 + dt * damping)
-    pull = load_node(f, i)
-    others = pull
-    if has_load != 0:
-        others += vector_at(load, i)
-    velocity = load_node(v, i)
-    d = dt * symplectic_euler_velocity(velocity, others, w, gravity, kick, damped)
-    yielding = dt * kick * w * damped
+    own = foreseen(i, damping, gravity, inverse_mass, has_load, load, pace, offset, rest, f, u, v)
     now = motions.now[world, o]
-    x = load_node(rest, i) + load_node(u, i)
-    way = carried(now, motions.later[world, o], x) - d
-    off = wp.transform_point(now, places[k]) - x
-    force = (way + SETTLING * off) / yielding
+    way = carried(now, motions.later[world, o], own.x) - own.d
+    off = wp.transform_point(now, places[k]) - own.x
+    force = (way + SETTLING * off) / own.yielding
     if stiffness > 0.0:
-        force = (stiffness / (1.0 + stiffness * yielding)) * (way + off)
+        force = (stiffness / (1.0 + stiffness * own.yielding)) * (way + off)
     forces[k] = force
-    store_node(f, i, pull + force)
+    store_node(f, i, load_node(f, i) + force)
     store_node(contact_forces, i, load_node(contact_forces, i) + force)
 
 

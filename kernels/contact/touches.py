@@ -124,28 +124,6 @@ def find_touch(
         touches.more[o, t] = force
 
 
-@wp.func
-def find_among(
-    thread: int,
-    threads: int,
-    near: Near,
-    shapes: Shapes,
-    motions: Motions,
-    law: Law,
-    surface: Surface,
-    triangles: wp.array[wp.vec3i],
-    touches: Touches,
-):
-    k = thread
-    count = near.touch_count[0]
-    all_triangles = triangles.shape[0]
-    while k < count:
-        o = near.touches[k] // all_triangles
-        t = near.touches[k] % all_triangles
-        k += threads
-        find_touch(o, t, shapes, motions, law, surface, triangles, touches)
-
-
 @wp.kernel(enable_backward=False)
 def find_touches(
     # In
@@ -160,4 +138,11 @@ def find_touches(
     touches: Touches,
 ):
     """Find the points where obstacles come close to triangles but not to their corners."""
-    find_among(wp.tid(), threads, near, shapes, motions, law, surface, triangles, touches)
+    k = wp.tid()
+    count = near.touch_count[0]
+    all_triangles = triangles.shape[0]
+    while k < count:
+        o = near.touches[k] // all_triangles
+        t = near.touches[k] % all_triangles
+        k += threads
+        find_touch(o, t, shapes, motions, law, surface, triangles, touches)

@@ -85,37 +85,6 @@ def crowd_at(
     return total
 
 
-@wp.func
-def crowd_among(
-    thread: int,
-    threads: int,
-    near: Near,
-    shapes: Shapes,
-    motions: Motions,
-    law: Law,
-    dt: float,
-    surface: Surface,
-    skin: Skin,
-    corner_yielding: wp.array[wp.float32],
-    touches: Touches,
-    forces: wp.array2d[wp.vec3],
-    beside: Beside,
-    crowd: wp.array[wp.float32],
-):
-    k = thread
-    count = near.count[0]
-    while k < count:
-        s = near.nodes[k]
-        k += threads
-        total = float(0.0)
-        if (near.flags[s] & AROUND) != 0:
-            total = crowd_at(s, law, dt, surface, skin, corner_yielding, touches)
-        if (near.flags[s] & BESIDE) != 0 and is_borne(s, surface):
-            _more, pushing = push_borne(s, 0.0, shapes, motions, law, dt, beside, surface, forces)
-            total += pushing
-        crowd[s] = total
-
-
 @wp.kernel(enable_backward=False)
 def crowd_nodes(
     # In
@@ -141,22 +110,18 @@ def crowd_nodes(
         corner_yielding: ``yielding`` of the surface, also for nodes that another process moves.
     """
     dt = float(pace.seconds[DT])
-    crowd_among(
-        wp.tid(),
-        threads,
-        near,
-        shapes,
-        motions,
-        law,
-        dt,
-        surface,
-        skin,
-        corner_yielding,
-        touches,
-        forces,
-        beside,
-        crowd,
-    )
+    k = wp.tid()
+    count = near.count[0]
+    while k < count:
+        s = near.nodes[k]
+        k += threads
+        total = float(0.0)
+        if (near.flags[s] & AROUND) != 0:
+            total = crowd_at(s, law, dt, surface, skin, corner_yielding, touches)
+        if (near.flags[s] & BESIDE) != 0 and is_borne(s, surface):
+            _more, pushing = push_borne(s, 0.0, shapes, motions, law, dt, beside, surface, forces)
+            total += pushing
+        crowd[s] = total
 
 
 @wp.func
@@ -198,32 +163,6 @@ def solve_touch(
     touches.more[o, t] = force - before
 
 
-@wp.func
-def solve_among(
-    thread: int,
-    threads: int,
-    near: Near,
-    law: Law,
-    dt: float,
-    surface: Surface,
-    triangles: wp.array[wp.vec3i],
-    crowd: wp.array[wp.float32],
-    corner_yielding: wp.array[wp.float32],
-    touches: Touches,
-):
-    k = thread
-    count = near.touch_count[0]
-    while k < count:
-        o = near.touches[k] // triangles.shape[0]
-        t = near.touches[k] % triangles.shape[0]
-        k += threads
-        if touches.acts[o, t] != 0:
-            eases = wp.vec3()
-            for n in range(3):
-                eases[n] = ease(triangles[t][n], crowd, corner_yielding, surface)
-            solve_touch(o, t, law, dt, surface, triangles[t], eases, corner_yielding, touches)
-
-
 @wp.kernel(enable_backward=False)
 def solve_touches(
     # In
@@ -244,7 +183,17 @@ def solve_touches(
         corner_yielding: ``yielding`` of the surface, also for nodes that another process moves.
     """
     dt = float(pace.seconds[DT])
-    solve_among(wp.tid(), threads, near, law, dt, surface, triangles, crowd, corner_yielding, touches)
+    k = wp.tid()
+    count = near.touch_count[0]
+    while k < count:
+        o = near.touches[k] // triangles.shape[0]
+        t = near.touches[k] % triangles.shape[0]
+        k += threads
+        if touches.acts[o, t] != 0:
+            eases = wp.vec3()
+            for n in range(3):
+                eases[n] = ease(triangles[t][n], crowd, corner_yielding, surface)
+            solve_touch(o, t, law, dt, surface, triangles[t], eases, corner_yielding, touches)
 
 
 @wp.func
@@ -322,58 +271,6 @@ def gather_borne(
         anchor(s, shapes, motions, surface, forces, beside)
 
 
-@wp.func
-def push_among(
-    thread: int,
-    threads: int,
-    near: Near,
-    parts: int,
-    skin: Skin,
-    shapes: Shapes,
-    motions: Motions,
-    law: Law,
-    dt: float,
-    touches: Touches,
-    crowd: wp.array[wp.float32],
-    surface: Surface,
-    forces: wp.array2d[wp.vec3],
-    beside: Beside,
-):
-    k = thread
-    count = near.count[0]
-    while k < count:
-        s = near.nodes[k]
-        k += threads
-        flags = near.flags[s]
-        if is_borne(s, surface):
-            gather_borne(s, flags, parts, skin, shapes, motions, law, dt, touches, crowd, surface, forces, beside)
-        else:
-            push_node(s, flags, parts, skin, shapes, motions, law, dt, touches, surface, forces, beside)
-
-
-@wp.func
-def settle_among(
-    thread: int,
-    threads: int,
-    near: Near,
-    parts: int,
-    shapes: Shapes,
-    motions: Motions,
-    surface: Surface,
-    forces: wp.array2d[wp.vec3],
-    beside: Beside,
-):
-    k = thread
-    count = near.count[0]
-    while k < count:
-        s = near.nodes[k]
-        k += threads
-        if is_borne(s, surface):
-            give_way(s, surface)
-            if (parts & END) != 0 and (near.flags[s] & BESIDE) != 0:
-                anchor(s, shapes, motions, surface, forces, beside)
-
-
 @wp.kernel(enable_backward=False)
 def push_nodes(
     # In
@@ -401,7 +298,16 @@ def push_nodes(
             other forces have moved nodes since. END: update the anchors of sticking nodes.
     """
     dt = float(pace.seconds[DT])
-    push_among(wp.tid(), threads, near, parts, skin, shapes, motions, law, dt, touches, crowd, surface, forces, beside)
+    k = wp.tid()
+    count = near.count[0]
+    while k < count:
+        s = near.nodes[k]
+        k += threads
+        flags = near.flags[s]
+        if is_borne(s, surface):
+            gather_borne(s, flags, parts, skin, shapes, motions, law, dt, touches, crowd, surface, forces, beside)
+        else:
+            push_node(s, flags, parts, skin, shapes, motions, law, dt, touches, surface, forces, beside)
 
 
 @wp.kernel(enable_backward=False)
@@ -418,4 +324,12 @@ def settle_places(
     beside: Beside,
 ):
     """Move borne places by the forces that were gathered; with END in ``parts``, update their anchors."""
-    settle_among(wp.tid(), threads, near, parts, shapes, motions, surface, forces, beside)
+    k = wp.tid()
+    count = near.count[0]
+    while k < count:
+        s = near.nodes[k]
+        k += threads
+        if is_borne(s, surface):
+            give_way(s, surface)
+            if (parts & END) != 0 and (near.flags[s] & BESIDE) != 0:
+                anchor(s, shapes, motions, surface, forces, beside)
