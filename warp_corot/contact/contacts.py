@@ -43,9 +43,6 @@ SLACK, FINE = 0.0005, 0.2
 CLOSING = 0.25
 #: Number of rounds for obstacles between the nodes, and with places that nodes bear.
 ROUNDS, ROUNDS_OF_BORNE = 3, 4
-#: On CUDA steps do not ask any more whether contact may sleep, after so many runs at whose end something was near; they
-#: ask again after as many at whose end nothing was.
-PERSISTENT = 16
 #: Number of grains in the force that moves the heaviest node across the smallest element in a step; the maximum is
 #: 2^63.
 GRAINS = 2.0**48
@@ -70,8 +67,6 @@ class Contacts:
         obstacles: The rigid obstacles.
         rigid: Forces of obstacles; None without.
         search: The search for nearby surfaces.
-        asks: Whether steps ask whether contact may sleep.
-        persistent: ``PERSISTENT``, or None: steps always ask.
 
     Raises:
         InputError: As ``Obstacles``.
@@ -111,9 +106,6 @@ class Contacts:
         #: Steps while nothing is near; None where the device cannot leave anything out.
         self.sleep = Sleep(system, made, self.obstacles, self.search) if self.search.can_sleep else None
         self._revision = 0
-        #: The number of runs in a row that speak against the present choice of ``asks``.
-        self._against, self.asks = 0, self.sleep is not None
-        self.persistent = None if self.device.is_cpu else PERSISTENT
         self._is_looked_at = self._has_crushed = False
         self._make_arrays()
 
@@ -131,7 +123,6 @@ class Contacts:
         return {name: array for name, array in arrays.items() if array.size}
 
     def prepare(self) -> None:
-        self._choose_questions()
         if self.is_full:
             self.grow()
         if self.surface.is_outdated:
@@ -188,7 +179,7 @@ class Contacts:
         self._has_crushed = self._has_crushed or warn_of_crushed(self)
 
     def launch(self, offset: int, damping: float) -> None:
-        if self.sleep is not None and self.asks:
+        if self.sleep is not None:
             self.sleep.launch(offset, partial(self._act, offset, damping))
         else:
             self.obstacles.launch_targets()
@@ -198,7 +189,7 @@ class Contacts:
         """Launch the forces of a step; ``moves``: and the motion of obstacles."""
         system, surface = self.system, self.surface
         self._predict(offset, damping, begins=True, moves=moves)
-        self.search.launch(offset, follows=True, sleeps=self.sleep is not None and self.asks)
+        self.search.launch(offset, follows=True, sleeps=self.sleep is not None)
         self._solve()
         self._ranks.clear_surface(surface.arrays.f)
         follows = bool(self.search.finders) and not surface.is_whole
@@ -309,17 +300,6 @@ class Contacts:
             carried.give_back()
 
     # --- pieces ----------------------------------------------------------------------------------------------------
-
-    def _choose_questions(self) -> None:
-        """Choose whether steps ask whether contact may sleep, which takes longer on CUDA than it saves where something
-        is near in most runs."""
-        if self.sleep is None or self.persistent is None or self.search.count == 0:
-            return
-        self._against = self._against + 1 if (self.search.most_near > 0) == self.asks else 0
-        if self._against >= self.persistent:
-            self.asks, self._against = not self.asks, 0
-            self._revision += 1
-            self.search.forget()
 
     def _follow(self, revision: int) -> None:
         """Update to the present surfaces, which have changed since that revision."""
