@@ -4,8 +4,10 @@ world. A column of a block is a vector register, so that a contribution takes so
 
 import warp as wp
 
-from warp_corot.kernels.elements.elements import LEVEL_MASK, ForestElements
+from warp_corot.kernels.elements.elements import LEVEL_MASK
 from warp_corot.kernels.elements.lanes import COMPILER_FLAGS, constants, on_cpu
+
+from .values import Leaves
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": COMPILER_FLAGS})
 
@@ -14,9 +16,13 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": COMPILER_
     on_cpu(
         constants(LEVELS=int(LEVEL_MASK)),
         """
+    const auto &upper = leaves.upper, &places = leaves.places, &pairs = leaves.pairs;
+    const auto &starts = leaves.starts, &codes = leaves.codes;
+    const auto &mu = leaves.mu, &lam = leaves.lam;
+    const int stride = leaves.stride;
     const float scale = scales.data[2] + scales.data[1] * stiffening;
-    const long long first = (long long)world * world_elements, first_row = (long long)world * row_entries;
-    const auto row = [&](int place) { return *reinterpret_cast<const four*>(&rows.data[first_row + place]); };
+    const long long first = (long long)world * leaves.world_elements, first_row = (long long)world * leaves.row_entries;
+    const auto row = [&](int place) { return *reinterpret_cast<const four*>(&leaves.rows.data[first_row + place]); };
     const auto turned = [](const float* q, const float* g) {
         const four x = {q[0], q[3], q[6], 0.0f}, y = {q[1], q[4], q[7], 0.0f}, z = {q[2], q[5], q[8], 0.0f};
         return x * g[0] + y * g[1] + z * g[2];
@@ -31,7 +37,7 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": COMPILER_
                 const four a = row(pairs.data[-2 - codes.data[at]][0]), b = a * a[3];
                 for (int j = 0; j < 3; ++j) c[j] += a * b[j];
             }
-            float* to = &more.data[(long long)world * ranks + upper.data[u][0]].data[0][0];
+            float* to = &more.data[(long long)world * leaves.ranks + upper.data[u][0]].data[0][0];
             for (int j = 0; j < 3; ++j)
                 for (int i = 0; i < 3; ++i) to[3 * j + i] = scale * c[j][i];
             continue;
@@ -44,8 +50,8 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": COMPILER_
                 continue;
             }
             const long long t = first + (code >> 4);
-            const float* g = &gradients.data[4 * ((elements.code.data[t] & LEVELS) % 3)][0];
-            const float* q = &frames.data[t].data[0][0];
+            const float* g = &leaves.gradients.data[4 * ((leaves.elements.code.data[t] & LEVELS) % 3)][0];
+            const float* q = &leaves.frames.data[t].data[0][0];
             const four a = turned(q, g + 3 * ((code >> 2) & 3)), b = turned(q, g + 3 * (code & 3));
             const float m = mu.data[t * stride], l = lam.data[t * stride], most = most_lambda * m;
             const four la = a * (l < most ? l : most), mb = b * m, ab = a * mb;
@@ -54,8 +60,8 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": COMPILER_
             c[1] += la * b[1] + mb * a[1] + four{0.0f, d, 0.0f, 0.0f};
             c[2] += la * b[2] + mb * a[2] + four{0.0f, 0.0f, d, 0.0f};
         }
-        float* own = &blocks.data[(long long)world * entries + places.data[u][0]].data[0][0];
-        float* mirrored = &blocks.data[(long long)world * entries + places.data[u][1]].data[0][0];
+        float* own = &blocks.data[(long long)world * leaves.entries + places.data[u][0]].data[0][0];
+        float* mirrored = &blocks.data[(long long)world * leaves.entries + places.data[u][1]].data[0][0];
         for (int j = 0; j < 3; ++j) {
             c[j] *= scale;
             for (int i = 0; i < 3; ++i) {
@@ -69,25 +75,10 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": COMPILER_
 )
 def gather_entries(
     world: int,
-    world_elements: int,
-    entries: int,
-    elements: ForestElements,
-    frames: wp.array[wp.mat33],
-    gradients: wp.array[wp.vec3],
-    mu: wp.array[float],
-    lam: wp.array[float],
-    stride: int,
+    leaves: Leaves,
     scales: wp.array[float],
     stiffening: float,
     most_lambda: float,
-    upper: wp.array[wp.vec2i],
-    starts: wp.array[wp.int32],
-    codes: wp.array[wp.int32],
-    places: wp.array[wp.vec2i],
-    ranks: int,
-    row_entries: int,
-    pairs: wp.array[wp.vec2i],
-    rows: wp.array[wp.vec4],
     blocks: wp.array[wp.mat33],
     more: wp.array[wp.mat33],
 ): ...
@@ -96,51 +87,13 @@ def gather_entries(
 @wp.kernel(enable_backward=False)
 def gather_leaves_on_cpu(
     # In
-    world_elements: int,
-    entries: int,
-    elements: ForestElements,
-    frames: wp.array[wp.mat33],
-    gradients: wp.array[wp.vec3],
-    mu: wp.array[float],
-    lam: wp.array[float],
-    stride: int,
+    leaves: Leaves,
     scales: wp.array[float],
     stiffening: float,
     most_lambda: float,
-    upper: wp.array[wp.vec2i],
-    starts: wp.array[wp.int32],
-    codes: wp.array[wp.int32],
-    places: wp.array[wp.vec2i],
-    ranks: int,
-    row_entries: int,
-    pairs: wp.array[wp.vec2i],
-    rows: wp.array[wp.vec4],
     # Out
     blocks: wp.array[wp.mat33],
     more: wp.array[wp.mat33],
 ):
     """As ``values.gather_leaves``."""
-    gather_entries(
-        wp.tid(),
-        world_elements,
-        entries,
-        elements,
-        frames,
-        gradients,
-        mu,
-        lam,
-        stride,
-        scales,
-        stiffening,
-        most_lambda,
-        upper,
-        starts,
-        codes,
-        places,
-        ranks,
-        row_entries,
-        pairs,
-        rows,
-        blocks,
-        more,
-    )
+    gather_entries(wp.tid(), leaves, scales, stiffening, most_lambda, blocks, more)

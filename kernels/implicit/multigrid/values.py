@@ -85,71 +85,78 @@ def write_frames(is_turned: bool) -> wp.Kernel:
     return write_frames
 
 
+@wp.struct
+class Leaves:
+    """What the entries of the finest matrix come from. ``gradients`` come from ``tables.shapes``, [shape, node]; pairs
+    and rows come from ``shared``."""
+
+    elements: ForestElements
+    world_elements: int
+    frames: wp.array[wp.mat33]
+    gradients: wp.array[wp.vec3]
+    mu: wp.array[float]
+    lam: wp.array[float]
+    stride: int
+    upper: wp.array[wp.vec2i]
+    starts: wp.array[wp.int32]
+    codes: wp.array[wp.int32]
+    places: wp.array[wp.vec2i]
+    entries: int
+    ranks: int
+    row_entries: int
+    pairs: wp.array[wp.vec2i]
+    rows: wp.array[wp.vec4]
+
+
 @wp.kernel(enable_backward=False)
 def gather_leaves(
     # In
-    world_elements: int,
-    entries: int,
-    elements: ForestElements,
-    frames: wp.array[wp.mat33],
-    gradients: wp.array[wp.vec3],
-    mu: wp.array[float],
-    lam: wp.array[float],
-    stride: int,
+    leaves: Leaves,
     scales: wp.array[float],
     stiffening: float,
     most_lambda: float,
-    upper: wp.array[wp.vec2i],
-    starts: wp.array[wp.int32],
-    codes: wp.array[wp.int32],
-    places: wp.array[wp.vec2i],
-    ranks: int,
-    row_entries: int,
-    pairs: wp.array[wp.vec2i],
-    rows: wp.array[wp.vec4],
     # Out
     blocks: wp.array[wp.mat33],
     more: wp.array[wp.mat33],
 ):
-    """Find the entries off the diagonal. ``gradients`` come from ``tables.shapes``, [shape, node]; viscous damping
-    counts as ``stiffening`` b K, and lambda as ``most_lambda`` mu at most. Pairs and rows come from ``shared``;
-    ``more`` is the addition of their weights to the diagonal, by rank, or one entry if there are none.
+    """Find the entries off the diagonal. Viscous damping counts as ``stiffening`` b K, and lambda as ``most_lambda`` mu
+    at most. ``more`` is the addition of the rows' weights to the diagonal, by rank, or one entry if there are none.
     """
     world, u = wp.tid()
     scale = scales[2] + scales[1] * stiffening
-    if upper[u][0] == upper[u][1]:
+    if leaves.upper[u][0] == leaves.upper[u][1]:
         if more.shape[0] > 1:
             weighted = wp.mat33()
-            for at in range(starts[u], starts[u + 1]):
-                if codes[at] < -1:
-                    place = world * row_entries + pairs[-2 - codes[at]][0]
-                    weighted += wp.outer(rows[place][3] * row_at(rows, place), row_at(rows, place))
-            more[world * ranks + upper[u][0]] = scale * weighted
+            for at in range(leaves.starts[u], leaves.starts[u + 1]):
+                if leaves.codes[at] < -1:
+                    place = world * leaves.row_entries + leaves.pairs[-2 - leaves.codes[at]][0]
+                    weighted += wp.outer(leaves.rows[place][3] * row_at(leaves.rows, place), row_at(leaves.rows, place))
+            more[world * leaves.ranks + leaves.upper[u][0]] = scale * weighted
         return
-    first = world * world_elements
+    first = world * leaves.world_elements
     total = wp.mat33()
-    for at in range(starts[u], starts[u + 1]):
-        code = codes[at]
+    for at in range(leaves.starts[u], leaves.starts[u + 1]):
+        code = leaves.codes[at]
         if code < 0:
-            pair = pairs[-2 - code]
-            first_row = world * row_entries
-            total += wp.outer(row_at(rows, first_row + pair[0]), row_at(rows, first_row + pair[1]))
+            pair = leaves.pairs[-2 - code]
+            first_row = world * leaves.row_entries
+            total += wp.outer(row_at(leaves.rows, first_row + pair[0]), row_at(leaves.rows, first_row + pair[1]))
             continue
         t = first + (code >> 4)
-        row = 4 * shape_of(elements.code[t])
-        q = frames[t]
-        a = q * gradients[row + ((code >> 2) & 3)]
-        b = q * gradients[row + (code & 3)]
-        m = mu[t * stride]
-        total += wp.outer(wp.min(lam[t * stride], most_lambda * m) * a, b) + wp.outer(m * b, a)
+        row = 4 * shape_of(leaves.elements.code[t])
+        q = leaves.frames[t]
+        a = q * leaves.gradients[row + ((code >> 2) & 3)]
+        b = q * leaves.gradients[row + (code & 3)]
+        m = leaves.mu[t * leaves.stride]
+        total += wp.outer(wp.min(leaves.lam[t * leaves.stride], most_lambda * m) * a, b) + wp.outer(m * b, a)
         d = m * wp.dot(a, b)
         total[0, 0] += d
         total[1, 1] += d
         total[2, 2] += d
     total = scale * total
-    where = places[u]
-    blocks[world * entries + where[0]] = wp.transpose(total)
-    blocks[world * entries + where[1]] = total
+    where = leaves.places[u]
+    blocks[world * leaves.entries + where[0]] = wp.transpose(total)
+    blocks[world * leaves.entries + where[1]] = total
 
 
 @wp.func

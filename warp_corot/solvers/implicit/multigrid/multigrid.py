@@ -239,11 +239,15 @@ class Multigrid:
             inputs += [operator.displacements, discretization.mu, discretization.lam, discretization.material_stride]
             inputs += [self.most_shared]
             finest.launch(shared.write_rows(self._members.law), self._members.count, inputs, [self._rows])
-        inputs = [discretization.sizes.world_elements, found.entries, elements, self._frames, self._gradients]
-        inputs += [discretization.mu, discretization.lam, discretization.material_stride, scales, self.stiffening]
-        inputs += [self.most_lambda if self._members is None else 0.0]
-        inputs += [found.upper, found.sum_starts, found.codes, found.places, self.count]
-        inputs += [0 if self._members is None else self._members.entries, self._pairs, self._rows]
+        given = values.Leaves()
+        given.elements, given.world_elements = elements, discretization.sizes.world_elements
+        given.frames, given.gradients = self._frames, self._gradients
+        given.mu, given.lam, given.stride = discretization.mu, discretization.lam, discretization.material_stride
+        given.upper, given.starts, given.codes, given.places = found.upper, found.sum_starts, found.codes, found.places
+        given.entries, given.ranks = found.entries, self.count
+        given.row_entries = 0 if self._members is None else self._members.entries
+        given.pairs, given.rows = self._pairs, self._rows
+        inputs = [given, scales, self.stiffening, self.most_lambda if self._members is None else 0.0]
         outputs = [finest.blocks, self._more]
         if self.device.is_cpu:
             wp.launch(gather_leaves_on_cpu, self.discretization.worlds, inputs, outputs, device=self.device)
