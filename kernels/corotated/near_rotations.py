@@ -1,7 +1,7 @@
 """Which leaves of complete subtrees share their root's rotation within a tolerance, element by element.
 
-The kernels that add forces decide this themselves (``subtrees.forces.shared_forces``, ``native/near_leaves.h``). This
-one decides by the same rule and writes the rotation that each leaf uses.
+The kernels that add forces decide this themselves (``native/near_leaves.h``). This one decides by the same rule and
+writes the rotation that each leaf uses.
 """
 
 import functools

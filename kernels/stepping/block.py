@@ -24,7 +24,7 @@ from warp_corot.kernels.math.matrices import column, identity3
 from warp_corot.kernels.math.quaternion import robust_rotation
 from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.subtrees.dilatation import dilatation_sums_of, dilating_forces_of, pressure_forces_of
-from warp_corot.kernels.subtrees.forces import columns_of, leaf_forces_of, mat10, near_forces, shared_forces
+from warp_corot.kernels.subtrees.forces import columns_of, leaf_forces_of, mat10, own_forces, shared_forces
 from warp_corot.kernels.subtrees.laws import turn_in, turn_out
 from warp_corot.kernels.tables.block_layout import (
     FIRST_SHIFT,
@@ -239,7 +239,7 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
     """
     shape, shared, uniform, parts = layout.shape, layout.shared, layout.uniform, layout.parts
     capacity, threads, zero_slot = layout.subtrees, layout.threads, layout.slot_count
-    own = [near_forces(shape, uniform, layout.tolerance, layout.leaves(part)) for part in range(parts)]
+    own = [own_forces(shape, uniform, layout.leaves(part)) for part in range(parts)]
     turned = [shared_forces(shape, uniform, False, layout.leaves(part)) for part in range(parts)]
     needs, places = [layout.needs(part) for part in range(parts)], layout.places
     displacement, velocity = shared_vectors(layout.nodes, "displacements"), shared_vectors(layout.nodes, "velocities")
@@ -249,7 +249,7 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
     slope_of = of.slope
     measure = [dilatation_sums_of(shape, uniform, of, layout.leaves(part)) for part in range(parts)]
     # Law and pressure are one pass, after a first pass for the sums if two threads share a subtree.
-    at_once = dilating and not shared and layout.tolerance is None
+    at_once = dilating and not shared
     dilate = [dilating_forces_of(shape, uniform, layout.leaves(part)) for part in range(parts)]
     press = [pressure_forces_of(shape, uniform, of, layout.leaves(part)) for part in range(parts)]
     sums = shared_numbers(max(layout.sum_count, 1), "sums of dilatations")

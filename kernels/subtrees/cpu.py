@@ -79,9 +79,10 @@ def scatter_subtrees_near(shape: int, shared: Dilatation | None = None) -> wp.Ke
     subtrees.
 
     It is near if the displacement gradient E that it leaves in each leaf has |skew E| <= tolerance [rad] and
-    |sym E| <= 1/2, and the subtree as one element is strained by no more than 1/2. ``forces.shared_forces`` bounds the
-    error of the stress. Otherwise every leaf has its own rotation, and the forces are bit for bit those of
-    ``scatter_law_subtrees``. With a shared dilatation the material is a ``DilatingMaterial``.
+    |sym E| <= 1/2, and the subtree as one element is strained by no more than 1/2. Then F = I + E = exp(w) U with
+    |w| <= 2 tolerance, and the error of the stress is at most (2 mu + 3 lambda) (3 |w| |U - I| + |w|^2 |U|).
+    Otherwise every leaf has its own rotation, and the forces are bit for bit those of ``scatter_law_subtrees``. With a
+    shared dilatation the material is a ``DilatingMaterial``.
     """
     code = LAWS["corotated"] + native("rotation") + ISOTROPIC_PART + begin(shape) + product(shape) + near_test(shape)
     code += (

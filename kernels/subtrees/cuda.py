@@ -28,7 +28,7 @@ from warp_corot.kernels.elements.elements import (
 from warp_corot.kernels.elements.merging import add_four_forces
 from warp_corot.kernels.modules import unique_kernel
 
-from .forces import leaf_stress, mat10, near_forces, shared_forces
+from .forces import leaf_stress, mat10, own_forces, shared_forces
 from .in_warps import is_mostly_left_out, scatter_one_by_one
 from .left_out import WARP, LeftOut, append, list_of, reserve
 from .memory import BLOCK, add_single, group_memory, load_single, memory_of
@@ -55,18 +55,15 @@ class Stretch:
 
 
 @functools.cache
-def scatter_subtrees_own(
-    shape: int, grouped: bool, uniform: bool, listed: bool, tolerance: float | None = None
-) -> wp.Kernel:
+def scatter_subtrees_own(shape: int, grouped: bool, uniform: bool, listed: bool) -> wp.Kernel:
     """Corotated forces of subtrees of one type, every leaf with its own rotation. Launch with block_dim BLOCK.
 
     If ``listed``, subtrees with left-out leaves are put on a list, and a warp whose former bits in ``flagged`` say that
-    most of its leaves were left out computes them one by one. With a ``tolerance``, leaves use the root's rotation
-    where it is near enough (``forces.shared_forces``).
+    most of its leaves were left out computes them one by one.
     """
     load, add = memory_of(shape, grouped)
-    forces = near_forces(shape, uniform, tolerance)
-    resident = RESIDENT[shape] if uniform and tolerance is None else min(RESIDENT)
+    forces = own_forces(shape, uniform)
+    resident = RESIDENT[shape] if uniform else min(RESIDENT)
 
     @unique_kernel(
         grid_stride=False,
@@ -109,15 +106,15 @@ def scatter_subtrees_own(
 
 
 @functools.cache
-def scatter_subtrees_in_blocks(shape: int, grouped: bool, uniform: bool, tolerance: float | None = None) -> wp.Kernel:
+def scatter_subtrees_in_blocks(shape: int, grouped: bool, uniform: bool) -> wp.Kernel:
     """The same as ``scatter_subtrees_own``, but each block also computes the leaves that it left out, a thread a leaf.
 
     That saves a launch and the list, and is faster for bodies of up to some millions of elements. Launch with block_dim
     BLOCK.
     """
     load, add = memory_of(shape, grouped)
-    forces = near_forces(shape, uniform, tolerance)
-    resident = RESIDENT[shape] if uniform and tolerance is None else min(RESIDENT)
+    forces = own_forces(shape, uniform)
+    resident = RESIDENT[shape] if uniform else min(RESIDENT)
 
     @unique_kernel(
         grid_stride=False,
@@ -197,10 +194,10 @@ def scatter_subtrees_shared(shape: int, grouped: bool, uniform: bool, given: boo
 
 
 @functools.cache
-def _scatter_subtree(shape: int, uniform: bool, tolerance: float | None) -> wp.Function:
+def _scatter_subtree(shape: int, uniform: bool) -> wp.Function:
     """One subtree of a stretch; all shapes use the same shared memory for groups."""
     load_group, merge_group = group_memory((0, 1, 2))
-    forces = near_forces(shape, uniform, tolerance)
+    forces = own_forces(shape, uniform)
 
     @wp.func
     def scatter_subtree(
@@ -230,12 +227,12 @@ def _scatter_subtree(shape: int, uniform: bool, tolerance: float | None) -> wp.F
 
 
 @functools.cache
-def scatter_stretches(uniform: bool, tolerance: float | None = None) -> wp.Kernel:
+def scatter_stretches(uniform: bool) -> wp.Kernel:
     """Corotated forces of all subtrees and other leaves of a body, every leaf with its own rotation.
 
     Launch with block_dim BLOCK and whole blocks.
     """
-    subtree0, subtree1, subtree2 = (_scatter_subtree(shape, uniform, tolerance) for shape in range(3))
+    subtree0, subtree1, subtree2 = (_scatter_subtree(shape, uniform) for shape in range(3))
     add_neighbours = add_four_forces(2)
 
     @unique_kernel(grid_stride=False, launch_bounds=(BLOCK, min(RESIDENT)))

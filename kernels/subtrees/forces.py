@@ -179,27 +179,17 @@ def turned_back_of(shape: int) -> wp.Function:
 
 
 @functools.cache
-def shared_forces(
-    shape: int, uniform: bool, given: bool, chosen: range = range(8), tolerance: float | None = None
-) -> wp.Function:
+def shared_forces(shape: int, uniform: bool, given: bool, chosen: range = range(8)) -> wp.Function:
     """Forces of the chosen leaves from ten displacements, all with one rotation, and a mask of those left out: none or
     all.
 
     The rotation is that of the subtree's root, or a given one; ``turn`` is the given one times the subtree's frame
     ``q``. The ten displacements are turned back once; then the leaves are linear elements in the subtree's own frame.
-
-    With a ``tolerance`` [rad] the chosen leaves share the root's rotation only if the displacement gradients E that it
-    leaves have |skew E| <= tolerance and |sym E| <= 1/2. Then F = I + E = exp(w) U with |w| <= 2 tolerance, and the
-    error of the stress is at most (2 mu + 3 lambda) (3 |w| |U - I| + |w|^2 |U|). Otherwise each leaf has its own
-    rotation.
     """
     columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
     leaves, frames, at = LEAVES[shape], FRAMES[shape], POSITIONS[shape]
     into_leaf, out_of_leaf = turns_of(shape)
     turned_back = turned_back_of(shape)
-    turned_forces = turned_forces_of(shape, uniform, chosen)
-    adaptive = tolerance is not None
-    inverse_square = 0.0 if tolerance is None else 1.0 / tolerance**2
     begin, end = chosen.start, chosen.stop
     volume = VOLUME[shape]
 
@@ -237,16 +227,11 @@ def shared_forces(
             r2 = wp.static(0.5**ITERATIONS) * z2
             if not trusted:
                 left_out = wp.static(sum(1 << leaf for leaf in chosen))
-                if wp.static(adaptive):
-                    r0 = q0
-                    r1 = q1
-                    r2 = q2
         y = turned_back(x, inv_h, q0, q1, q2, r0, r1, r2)
         m = mu[first]
         k = lam[first]
         area = wp.static(volume) * h * h
         g = mat10()
-        apart = float(0.0)
         for leaf in range(wp.static(begin), wp.static(end)):
             if wp.static(not uniform):
                 m = mu[first + leaf]
@@ -258,14 +243,6 @@ def shared_forces(
                 y[wp.static(leaves[leaf][3])],
             )
             e = into_leaf(leaf, wp.matrix_from_cols(b0, b1, b2))
-            if wp.static(adaptive):
-                # A sum with zero, because with a plain copy the compiler keeps more leaves than there are registers
-                # for.
-                e = wp.mat33() + e
-                axial = wp.vec3(e[0, 1] - e[1, 0], e[0, 2] - e[2, 0], e[1, 2] - e[2, 1])
-                # Of the Frobenius norm, |E|^2 = |sym E|^2 + |skew E|^2.
-                skew = 0.5 * wp.dot(axial, axial)
-                apart = wp.max(apart, wp.max(wp.static(inverse_square) * skew, 4.0 * (wp.ddot(e, e) - skew)))
             double_mu = 2.0 * m * area
             pressure = k * area * (e[0, 0] + e[1, 1] + e[2, 2])
             s01 = m * area * (e[0, 1] + e[1, 0])
@@ -288,35 +265,11 @@ def shared_forces(
             g[wp.static(leaves[leaf][1])] += f1
             g[wp.static(leaves[leaf][2])] += f2
             g[wp.static(leaves[leaf][3])] += f3
-        if wp.static(adaptive):
-            # A comparison with NaN is false.
-            if left_out == 0 and apart <= 1.0:
-                left_out = 0
-            else:
-                # In the frame that turns with the subtree, y takes the place of displacements.
-                g, left_out = turned_forces(y, h, mu, lam, first)
         for n in range(10):
             force = g[n]
             g[n] = force[0] * r0 + force[1] * r1 + force[2] * r2
-        if wp.static(not adaptive) and left_out != 0:
+        if left_out != 0:
             g = mat10()
         return g, left_out
 
     return shared_forces
-
-
-@functools.cache
-def near_forces(shape: int, uniform: bool, tolerance: float | None, chosen: range = range(8)) -> wp.Function:
-    """``own_forces`` without a tolerance; with one, the root's rotation where ``shared_forces`` allows it."""
-    if tolerance is None:
-        return own_forces(shape, uniform, chosen)
-    forces = shared_forces(shape, uniform, False, chosen, tolerance)
-
-    @wp.func
-    def near_forces(
-        x: mat10, q: wp.mat33, h: float, mirror: float, mu: wp.array[wp.float32], lam: wp.array[wp.float32], first: int
-    ):
-        g, left_out = forces(x, q, h, mirror, wp.mat33(), mu, lam, first)
-        return g, left_out
-
-    return near_forces

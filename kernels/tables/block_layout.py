@@ -40,7 +40,6 @@ class Layout:
         subtrees: Room for subtrees, whole warps of them.
         nodes: Room for nodes.
         tasks: Sums that make up the nodes' forces, whole warps of them; see ``TASK_SLOTS``.
-        tolerance: How near the subtree root's rotation must be to be used in place of own ones [rad]; None: never.
         dilating: Whether the leaves of a subtree share their dilatation.
     """
 
@@ -51,7 +50,6 @@ class Layout:
     subtrees: int
     nodes: int
     tasks: int = 0
-    tolerance: float | None = None
     dilating: bool = False
 
     @property
@@ -110,5 +108,5 @@ class Layout:
         """Which of a subtree's ten nodes a part reads: among them the first, to which all are relative, and for a
         shared rotation the root's.
         """
-        needs_root = self.shared or self.tolerance is not None
+        needs_root = self.shared
         return [place >= 0 or node == 0 or (needs_root and node < 4) for node, place in enumerate(self.places[part])]

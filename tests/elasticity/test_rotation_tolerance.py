@@ -5,34 +5,20 @@ import oracle
 import pytest
 import warp as wp
 from cases import edge_scale, oracle_mesh
-from shortened import crossed
 
 import warp_corot as wc
 from warp_corot.discretization.planning.fixed import ForcePlan
 from warp_corot.elasticity.corotated.model import AUTO_TOLERANCE
 from warp_corot.elasticity.structs import isotropic_material
 from warp_corot.kernels.subtrees import cpu as subtree_cpu
-from warp_corot.kernels.subtrees import cuda as subtree_cuda
-from warp_corot.kernels.subtrees.left_out import LeftOut
 
 MU, LAM = oracle.lame(1e4, 0.4)
 ROUNDING = 1e-5  # of the largest force
 
 
-#: Both force paths: eight subtrees in the lanes of a CPU, and CUDA's kernel without groups.
-LANES, SUBTREES = "lanes", "subtrees"
-WAYS = [LANES, SUBTREES]
-#: For the second path, each tolerance and each type of subtrees compiles its own kernels.
-TOLERANCES = crossed(
-    [6, 7, 8],
-    [(way, tolerance) for way in WAYS for tolerance in (0.01, AUTO_TOLERANCE, 0.3)],
-    lambda level, way: way[0] == LANES or (level == 6 and way[1] == AUTO_TOLERANCE),
-)
-
-
-def forces(forest, u, tolerance, way, device):
-    """Forces, and the omitted leaves as bits of subtrees."""
-    body = wc.SoftBody(forest, wc.Isotropic(1e4, 0.4, 1000.0), device=device)
+def forces(forest, u, tolerance):
+    """Forces of eight subtrees in the lanes of a CPU, and the omitted leaves as bits of subtrees."""
+    body = wc.SoftBody(forest, wc.Isotropic(1e4, 0.4, 1000.0), device="cpu")
     body.displacements = u
     plan = ForcePlan.of_forest(forest, None, body.device, grouped=False)
     (batch,) = plan.batches
@@ -42,24 +28,13 @@ def forces(forest, u, tolerance, way, device):
         body.state.displacements,
         [f, batch.flagged],
     )
-    if way == LANES:
-        if body.device.is_cuda:
-            pytest.skip("for the CPU")
-        kernel, of_kernel = subtree_cpu.scatter_law_subtrees(batch.shape), isotropic_material([*material, 0])
-        if tolerance is not None:
-            kernel, near = subtree_cpu.scatter_subtrees_near(batch.shape), subtree_cpu.NearMaterial()
-            near.isotropic, near.tolerance = of_kernel, tolerance
-            of_kernel = near
-        inputs = [batch.subtrees, batch.count, of_kernel, u]
-        wp.launch(kernel, -(-batch.count // 8), inputs, outputs, device=body.device)
-    else:
-        if body.device.is_cpu:
-            nodes = wp.array(np.ascontiguousarray(batch.subtrees.nodes.numpy().T), dtype=wp.int32, device=body.device)
-            batch.subtrees.nodes = batch.subtrees.targets = nodes
-        kernel = subtree_cuda.scatter_subtrees_own(batch.shape, False, True, False, tolerance)
-        outputs.append(LeftOut())
-        inputs = [plan.elements, batch.subtrees, isotropic_material([*material, 0]), u]
-        wp.launch(kernel, batch.count, inputs, outputs, device=body.device, block_dim=subtree_cuda.BLOCK)
+    kernel, of_kernel = subtree_cpu.scatter_law_subtrees(batch.shape), isotropic_material([*material, 0])
+    if tolerance is not None:
+        kernel, near = subtree_cpu.scatter_subtrees_near(batch.shape), subtree_cpu.NearMaterial()
+        near.isotropic, near.tolerance = of_kernel, tolerance
+        of_kernel = near
+    inputs = [batch.subtrees, batch.count, of_kernel, u]
+    wp.launch(kernel, -(-batch.count // 8), inputs, outputs, device=body.device)
     return f.numpy()[:, :3], batch.flagged.numpy()[: batch.count]
 
 
@@ -89,43 +64,41 @@ def bound(reference, F, tolerance, mu=MU, lam=LAM):
     return found
 
 
-@pytest.mark.parametrize(("level", "way_and_tolerance"), TOLERANCES)
+@pytest.mark.parametrize("tolerance", [0.01, AUTO_TOLERANCE, 0.3])
+@pytest.mark.parametrize("level", [6, 7, 8])
 @pytest.mark.parametrize("radius", [10.0, 1.0, 0.3])
-def test_error_of_the_force_is_bounded(level, radius, way_and_tolerance, device):
+def test_error_of_the_force_is_bounded(level, radius, tolerance):
     """At every node by the sum of V |grad N| (2 mu + 3 lambda) (3 w |U - I| + w^2 |U|) with w = 2 tolerance."""
-    way, tolerance = way_and_tolerance
     forest = wc.TetForest.box((1, 1, 3), 0.1, level)
     u = bent(forest.points, radius)
-    found, _ = forces(forest, u, tolerance, way, device)
+    found, _ = forces(forest, u, tolerance)
     reference, F, expected = own(forest, u)
     error = np.linalg.norm(found - expected, axis=1)
     assert (error < bound(reference, F, tolerance) + ROUNDING * np.abs(expected).max()).all()
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_both_kinds_are_used(way, device):
+def test_both_kinds_are_used():
     """One end of a bar is bent, the other is straight: the straight part shares rotations, as the error there shows."""
     forest = wc.TetForest.box((1, 1, 3), 0.1, 9)
     z = forest.points[:, 2]
     u = np.where(
         (z > 0.15)[:, None], bent(forest.points - [0, 0, 0.15], 0.07), bent(forest.points - [0, 0, 0.15], 20.0)
     )
-    found, _ = forces(forest, u, AUTO_TOLERANCE, way, device)
+    found, _ = forces(forest, u, AUTO_TOLERANCE)
     _, _, expected = own(forest, u)
     error = np.linalg.norm(found - expected, axis=1) / np.abs(expected).max()
     assert error[z < 0.1].max() > 1e-6  # shared
     assert error[z > 0.2].max() < ROUNDING  # own ones
 
 
-@pytest.mark.parametrize(("way", "tolerance"), [(LANES, 0.5), (SUBTREES, AUTO_TOLERANCE)])
-def test_strongly_strained_leaves_keep_their_own_rotations(way, tolerance, device, rng):
+def test_strongly_strained_leaves_keep_their_own_rotations(rng):
     """Inverted, flat and strongly strained leaves never share: their forces are those of own rotations, or they are
     left out as without a tolerance."""
     forest = wc.TetForest.box((1, 1, 1), 0.1, 9)
     far = rng.random((len(forest.points), 1)) < 0.1
     u = np.where(far, 1.2, 0.02) * edge_scale(forest) * rng.uniform(-1, 1, forest.points.shape)
-    shared, left_out = forces(forest, u, tolerance, way, device)
-    plain, left_out_plain = forces(forest, u, None, way, device)
+    shared, left_out = forces(forest, u, 0.5)
+    plain, left_out_plain = forces(forest, u, None)
     _, F, _ = own(forest, u)
     strained = np.linalg.norm(F @ np.swapaxes(F, 1, 2) - np.eye(3), axis=(1, 2)).reshape(-1, 8).max(1) > 5.0
     assert 0.05 < strained.mean() < 0.95
@@ -134,18 +107,16 @@ def test_strongly_strained_leaves_keep_their_own_rotations(way, tolerance, devic
     certain = np.ones(len(forest.points), bool)
     certain[subtrees[~strained]] = False
     assert certain.any()
-    # In lanes bit for bit; on CUDA they are computed in the root's frame.
-    assert np.abs(shared - plain)[certain].max() <= (0.0 if way == LANES else ROUNDING * np.abs(plain).max())
+    assert np.array_equal(shared[certain], plain[certain])
 
 
-@pytest.mark.parametrize("way", WAYS)
-def test_rotations_of_the_whole_body_do_not_matter(way, device, rng):
+def test_rotations_of_the_whole_body_do_not_matter(rng):
     """The decision uses only what remains after removing the root's rotation: forces rotate with the body."""
     forest = wc.TetForest.box((1, 1, 3), 0.1, 6)
     turn = oracle.polar(rng.standard_normal((3, 3)))
     u = bent(forest.points, 1.0)
     turned = (forest.points + u) @ turn.T - forest.points
-    there, here = (forces(forest, v, AUTO_TOLERANCE, way, device)[0] for v in (turned, u))
+    there, here = (forces(forest, v, AUTO_TOLERANCE)[0] for v in (turned, u))
     assert np.abs(there - here @ turn.T).max() < 3 * ROUNDING * np.abs(here).max()
 
 
@@ -167,7 +138,7 @@ def test_materials_of_elements(device, rng):
     assert np.abs(with_own - expected).max() < rounding
     error = np.linalg.norm(near - expected, axis=1)
     assert (error < bound(reference, F, AUTO_TOLERANCE, *lame) + rounding).all()
-    if body.device.is_cpu:  # on CUDA so few leaves are computed in clusters, where sharing would save nothing
+    if body.device.is_cpu:  # on CUDA every element has its own rotation
         assert error.max() > 100 * rounding
 
 

@@ -52,7 +52,8 @@ class Corotated(Model):
             the tree, or an element's own if it is above that level (forests only). Levels three or more above the
             leaves use the fast path; one or two levels above are computed leaf by leaf and are slower than own
             rotations. A float: the tolerance [rad] within which the rotation of the ancestor three levels up replaces
-            the own rotations of its leaves. Each evaluation decides this for each subtree from its displacements.
+            the own rotations of its leaves. Each evaluation decides this for each subtree from its displacements, on
+            the CPU; on CUDA every element has its own.
             "auto": 0.1. Then the error w of an element's rotation is at most 2 tolerance, and that of its stress at
             most (2 mu + 3 lambda) (3 w |U - I| + w^2 |U|); energies use own rotations.
         rotation: "byers-xu" (the paper's) or "svd" (McAdams et al. 2011).

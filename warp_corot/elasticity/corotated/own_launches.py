@@ -50,7 +50,6 @@ class OwnLaunches:
     Args:
         plan: The units of work.
         material: Lamé's parameters.
-        tolerance: The largest angle at which a subtree root's rotation replaces own ones [rad]; None: never.
         changing: Adds the forces of all leaves in clusters if the mesh changes.
         awaited: Nodes whose values arrive later; None if all are present.
 
@@ -62,13 +61,12 @@ class OwnLaunches:
         self,
         plan: Plan,
         material: IsotropicMaterial,
-        tolerance: float | None = None,
         changing: ChangingClusterScatter | None = None,
         awaited: Awaited | None = None,
     ):
         self._elements = plan.elements
         self._device = plan.elements.nodes.device
-        self._material, self._tolerance = material, tolerance
+        self._material = material
         batches, self._flat = list(plan.batches), plan.flat
         self._clusters: Callable[[IsotropicMaterial, wp.array, wp.array], None] | None = None
         if plan.counts is None:
@@ -109,9 +107,9 @@ class OwnLaunches:
         return 8 * sum(batch.count for batch in plan.batches if batch.grouped) < UNIFORM_LEAVES
 
     @staticmethod
-    def load(uniform: bool, tolerance: float | None, device: wp.Device) -> None:
+    def load(uniform: bool, device: wp.Device) -> None:
         """Compile the kernels that launches over a changing mesh will need."""
-        wp.load_module(scatter_stretches(uniform, tolerance).module, device, block_dim=BLOCK)
+        wp.load_module(scatter_stretches(uniform).module, device, block_dim=BLOCK)
 
     def scatter_forces(self, u: wp.array, f: wp.array, left_out: LeftOut) -> None:
         """Add the forces of displacements u to f, both vec4, and put subtrees with leaves left out on a list."""
@@ -121,7 +119,7 @@ class OwnLaunches:
             return
         if self._stretches is not None:
             wp.launch(
-                scatter_stretches(material.stride == 0, self._tolerance),
+                scatter_stretches(material.stride == 0),
                 dim=self._blocks * BLOCK,
                 inputs=[self._stretches, self._flat.elements, self._flat.leaves, material.mu, material.lam, u],
                 outputs=[f, left_out],
@@ -144,9 +142,9 @@ class OwnLaunches:
         uniform = material.stride == 0
         inputs, outputs = [self._elements, batch.subtrees, material, u], [f, batch.flagged]
         if self._in_blocks:
-            kernel = scatter_subtrees_in_blocks(batch.shape, True, uniform, self._tolerance)
+            kernel = scatter_subtrees_in_blocks(batch.shape, True, uniform)
         else:
-            kernel = scatter_subtrees_own(batch.shape, True, uniform, True, self._tolerance)
+            kernel = scatter_subtrees_own(batch.shape, True, uniform, True)
             outputs.append(left_out)
         wp.launch(kernel, batch.count, inputs=inputs, outputs=outputs, device=self._device, block_dim=BLOCK)
 

@@ -71,8 +71,8 @@ class BlockSteps:
         if len(plan.batches) != 1 or len(plan.flat) or plan.batches[0].sharing is Sharing.ABOVE:
             return None
         batch = plan.batches[0]
-        by_root, tolerance = batch.sharing is Sharing.ROOT, law.model.tolerance
-        layouts = _layouts(body, batch.shape, by_root, batch.count, tolerance, dilating=sharing is not None)
+        by_root = batch.sharing is Sharing.ROOT
+        layouts = _layouts(body, batch.shape, by_root, batch.count, dilating=sharing is not None)
         layout = next((layout for layout in layouts if layout.fits), None)
         if layout is None:
             return None
@@ -113,9 +113,7 @@ class BlockSteps:
         )
 
 
-def _layouts(
-    body: SoftBody, shape: int, shared: bool, subtrees: int, tolerance: float | None = None, *, dilating: bool = False
-) -> list[Layout]:
+def _layouts(body: SoftBody, shape: int, shared: bool, subtrees: int, *, dilating: bool = False) -> list[Layout]:
     """The layouts of a body in a block, the fastest first.
 
     A single world is fastest with the leaves of a subtree split between two threads. With more worlds than
@@ -125,10 +123,7 @@ def _layouts(
     capacity = -(-subtrees // WARP) * WARP
     uniform = body.discretization.is_uniform
     nodes = body.world_node_count
-    return [
-        Layout(shape, shared, uniform, count, capacity, nodes, tolerance=tolerance, dilating=dilating)
-        for count in parts
-    ]
+    return [Layout(shape, shared, uniform, count, capacity, nodes, dilating=dilating) for count in parts]
 
 
 def _tasks(layout: Layout, slots: list[list[int]]) -> tuple[np.ndarray, np.ndarray]:
