@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy.typing as npt
 
 from warp_corot.contact.tool import Obstacle, Tool
 from warp_corot.errors import InputError
+from warp_corot.io.files.whole import check_output
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
@@ -185,9 +185,4 @@ def check_table_path(path: Path) -> None:
     """
     if path.suffix.lower() != ".csv":
         raise InputError(f"{path}: extension {path.suffix or '(none)'}; it must be .csv")
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder; it must be a file name")
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: output folder {path.parent} does not exist")
-    if not os.access(path if path.exists() else path.parent, os.W_OK):
-        raise InputError(f"{path}: cannot be written to")
+    check_output(path)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from warp_corot.errors import InputError
-from warp_corot.io.files.whole import written_whole
+from warp_corot.io.files.whole import check_output, written_whole
 
 from .loading import Load, value_of
 from .options.defaults import LOADS
@@ -104,12 +104,9 @@ def check_run_path(path: Path, source: str) -> None:
     """
     if path.suffix.lower() != ".toml":
         raise InputError(f"{path}: extension {path.suffix or '(none)'}; it must be .toml")
-    if path.is_dir() or not path.parent.is_dir():
-        raise InputError(f"{path}: {'is a folder' if path.is_dir() else f'output folder {path.parent} does not exist'}")
+    check_output(path)
     if path.exists() and Path(source).exists() and path.samefile(source):
         raise InputError(f"{path}: is the input; it must be another file")
-    if not os.access(path if path.exists() else path.parent, os.W_OK):
-        raise InputError(f"{path}: cannot be written to")
 
 
 def option_of(name: str) -> Callable[[str], Any]:

@@ -84,7 +84,6 @@ class Others:
             self.count, self._elements, self._places, live = len(flat), flat.elements, flat.leaves, flat.live
         else:
             self.count, self._elements = self._discretization.sizes.launch_elements, plan.elements
-            live = plan.counts.now if plan.counts is not None else None
         self._live = self._none if live is None else live
         if self.grouped is not None:
             self.grouped.count = sum(count for *_, count in self.groups)

@@ -4,7 +4,6 @@ import functools
 import math
 import os
 import re
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, TypeVar
@@ -16,6 +15,7 @@ from warp_corot.errors import InputError
 
 from .isolated import read_isolated
 from .quiet import USD_MEMORY, bounded, quietly
+from .whole import check_output
 
 try:
     import fcntl
@@ -165,18 +165,7 @@ def check_stage_path(path: Path) -> None:
     if path.suffix.lower() not in STAGE_SUFFIXES:
         raise InputError(f"{path}: extension {path.suffix or '(none)'}; it must be {', '.join(STAGE_SUFFIXES)}")
     usd_name(path)
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder; it must be a file name")
-    folder = path.parent
-    if not folder.is_dir():
-        raise InputError(f"{path}: output folder {folder} {'is a file' if folder.exists() else 'does not exist'}")
-    if path.exists() and not os.access(path, os.W_OK):
-        raise InputError(f"{path}: is write-protected")
-    try:
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise InputError(f"{path}: output folder {folder} cannot be written to ({error.strerror})") from None
+    check_output(path)
 
 
 def take_lock(lock: int) -> None:

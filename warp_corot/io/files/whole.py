@@ -3,10 +3,34 @@
 from __future__ import annotations
 
 import os
+import tempfile
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+from warp_corot.errors import InputError
+
+
+def check_output(path: Path) -> None:
+    """Check, before a long run, that a file can be written.
+
+    Raises:
+        InputError: A folder with this name, a folder of the file that does not exist or cannot be written to, or a
+            write-protected file.
+    """
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; it must be a file name")
+    folder = path.parent
+    if not folder.is_dir():
+        raise InputError(f"{path}: output folder {folder} {'is a file' if folder.exists() else 'does not exist'}")
+    if path.exists() and not os.access(path, os.W_OK):
+        raise InputError(f"{path}: is write-protected")
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputError(f"{path}: output folder {folder} cannot be written to ({error.strerror})") from None
 
 
 @contextmanager

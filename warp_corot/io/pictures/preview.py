@@ -1,6 +1,5 @@
 """Pictures of deformed bodies as PNG files: one body, or several side by side."""
 
-import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warp_corot.errors import InputError
-from warp_corot.io.files.whole import written_whole
+from warp_corot.io.files.whole import check_output, written_whole
 
 from .camera import Array, Camera
 from .drawing import INK, checked_surface, draw_body, draw_silhouette, value_limits
@@ -315,12 +314,7 @@ def check_picture_path(path: str | Path, suffixes: Sequence[str] = (".png",)) ->
     target = Path(path)
     if target.suffix.lower() not in suffixes:
         raise InputError(f"{target}: extension {target.suffix or '(none)'}; it must be {' or '.join(suffixes)}")
-    if target.is_dir():
-        raise InputError(f"{target}: is a folder; it must be a file name")
-    if not target.parent.is_dir():
-        raise InputError(f"{target}: output folder {target.parent} does not exist")
-    if not os.access(target if target.exists() else target.parent, os.W_OK):
-        raise InputError(f"{target}: cannot be written to")
+    check_output(target)
     return target
 
 

@@ -7,14 +7,13 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Protocol
 
 from warp_corot.errors import InputError
-from warp_corot.io.files.whole import written_whole
+from warp_corot.io.files.whole import check_output, written_whole
 
 from .fields import Fields
 
@@ -52,21 +51,10 @@ def check_also(path: Path) -> None:
         raise InputError(f"{path}: extension {path.suffix or '(none)'}; it must be {', '.join(PACKAGES)}")
     if importlib.util.find_spec(package) is None:
         raise InputError(f'{path}: writing {path.suffix} files needs: pip install "warp-corot[paraview]"')
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder; it must be a file name")
-    folder = path.parent
-    if not folder.is_dir():
-        raise InputError(f"{path}: output folder {folder} {'is a file' if folder.exists() else 'does not exist'}")
-    if path.exists() and not os.access(path, os.W_OK):
-        raise InputError(f"{path}: is write-protected")
+    check_output(path)
     frames = _frames_folder(path)
     if path.suffix.lower() == ".pvd" and frames.exists() and not frames.is_dir():
         raise InputError(f"{frames}: is a file; it must be a folder for the frames of {path.name}")
-    try:
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise InputError(f"{path}: output folder {folder} cannot be written to ({error.strerror})") from None
 
 
 def also_writer(path: Path) -> Writer:
