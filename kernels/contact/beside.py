@@ -2,11 +2,10 @@
 
 import warp as wp
 
-from .law import Law
-from .motion import Motions, Surface
 from .near import AROUND, BESIDE, Near, leave_room, mark
-from .shapes import GROUND, Shapes, distance_to, sure_distance
+from .shapes import GROUND, distance_to, sure_distance
 from .touches import Touches
+from .vertices import Rigid
 from .watch import FARTHEST, Watch
 
 wp.set_module_options({"enable_backward": False})
@@ -22,14 +21,9 @@ def horizon(watch: Watch):
 def find_nodes_beside(
     # In
     watch: Watch,
-    shapes: Shapes,
-    motions: Motions,
-    law: Law,
-    surface: Surface,
     # Out
     near: Near,
-    forces: wp.array2d[wp.vec3],
-    anchors: wp.array2d[wp.vec4],
+    rigid: Rigid,
     crowd: wp.array[wp.float32],
 ):
     """Mark nodes that may touch an obstacle before the next search. Obstacles exert no forces on other nodes."""
@@ -37,28 +31,27 @@ def find_nodes_beside(
     if watch.due[0] == 0:
         return
     crowd[s] = 0.0
-    if surface.node[s] >= 0:
-        world = surface.world[s]
-        for o in range(forces.shape[0]):
-            far = watch.reach[s] + watch.reach_of[world, o] + law.tolerance
-            gap, _normal = distance_to(shapes, o, motions.now[world, o], surface.x[s], far + horizon(watch))
+    if rigid.surface.node[s] >= 0:
+        world = rigid.surface.world[s]
+        for o in range(rigid.forces.shape[0]):
+            far = watch.reach[s] + watch.reach_of[world, o] + rigid.law.tolerance
+            gap, _normal = distance_to(
+                rigid.shapes, o, rigid.motions.now[world, o], rigid.surface.x[s], far + horizon(watch)
+            )
             if gap <= far:
                 mark(near, s, BESIDE)
                 return
-            leave_room(sure_distance(shapes, o, gap) - far, watch)
-    for o in range(forces.shape[0]):
-        forces[o, s] = wp.vec3()
-        anchors[o, s] = wp.vec4()
+            leave_room(sure_distance(rigid.shapes, o, gap) - far, watch)
+    for o in range(rigid.forces.shape[0]):
+        rigid.forces[o, s] = wp.vec3()
+        rigid.anchors[o, s] = wp.vec4()
 
 
 @wp.kernel(enable_backward=False)
 def find_triangles_beside(
     # In
     watch: Watch,
-    shapes: Shapes,
-    motions: Motions,
-    law: Law,
-    surface: Surface,
+    rigid: Rigid,
     triangles: wp.array[wp.vec3i],
     # Out
     near: Near,
@@ -71,19 +64,19 @@ def find_triangles_beside(
     if watch.due[0] == 0:
         return
     corners = triangles[t]
-    if shapes.kind[o] != GROUND and corners[0] >= 0:
-        world = surface.world[corners[0]]
-        a = surface.x[corners[0]]
-        b = surface.x[corners[1]]
-        c = surface.x[corners[2]]
+    if rigid.shapes.kind[o] != GROUND and corners[0] >= 0:
+        world = rigid.surface.world[corners[0]]
+        a = rigid.surface.x[corners[0]]
+        b = rigid.surface.x[corners[1]]
+        c = rigid.surface.x[corners[2]]
         middle = (a + b + c) / 3.0
         size = wp.max(wp.length(a - middle), wp.max(wp.length(b - middle), wp.length(c - middle)))
         reach = wp.max(watch.reach[corners[0]], wp.max(watch.reach[corners[1]], watch.reach[corners[2]]))
         # The centre moves, and the corners move relative to it.
-        far = size + 3.0 * reach + watch.reach_of[world, o] + law.tolerance
-        gap, _normal = distance_to(shapes, o, motions.now[world, o], middle, far + horizon(watch))
+        far = size + 3.0 * reach + watch.reach_of[world, o] + rigid.law.tolerance
+        gap, _normal = distance_to(rigid.shapes, o, rigid.motions.now[world, o], middle, far + horizon(watch))
         if gap > far:
-            leave_room(sure_distance(shapes, o, gap) - far, watch)
+            leave_room(sure_distance(rigid.shapes, o, gap) - far, watch)
         else:
             near.touches[wp.atomic_add(near.touch_count, 0, 1)] = o * triangles.shape[0] + t
             for k in range(3):

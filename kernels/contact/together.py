@@ -12,11 +12,8 @@ from warp_corot.kernels.stepping.pace import DT, Pace
 from warp_corot.kernels.stepping.threads import synchronize_block
 
 from .bearing import is_borne
-from .law import Law
-from .motion import Motions, Surface
 from .near import BESIDE, Near
 from .rows import Meeting, Rows, row_count
-from .shapes import Shapes
 from .together_items import (
     Sums,
     begin_row,
@@ -31,7 +28,7 @@ from .together_items import (
 )
 from .touches import Touches
 from .triangles import BEGIN, CORRECT, END
-from .vertices import Beside
+from .vertices import Rigid
 
 wp.set_module_options({"enable_backward": False})
 
@@ -60,17 +57,12 @@ def act(
     on_rows: bool,
     are_borne: int,
     near: Near,
-    shapes: Shapes,
-    motions: Motions,
-    law: Law,
     dt: float,
     triangles: wp.array[wp.vec3i],
     meeting: Meeting,
     rows: Rows,
     touches: Touches,
-    surface: Surface,
-    forces: wp.array2d[wp.vec3],
-    beside: Beside,
+    rigid: Rigid,
     turn: int,
     sums: Sums,
 ):
@@ -82,11 +74,11 @@ def act(
         pairs = row_count(rows)
         while k < pairs:
             if number == LOCATE:
-                begin_row(k, law, surface, meeting, rows, turn, sums)
+                begin_row(k, rigid.law, rigid.surface, meeting, rows, turn, sums)
             elif solves != 0:
-                correct_row(k, law, dt, surface, meeting.friction, rows, turn, sums)
+                correct_row(k, rigid.law, dt, rigid.surface, meeting.friction, rows, turn, sums)
             else:
-                weigh_row(k, law, dt, surface, rows, sums)
+                weigh_row(k, rigid.law, dt, rigid.surface, rows, sums)
             k += threads
         return
     count = near.touch_count[0]
@@ -97,15 +89,15 @@ def act(
             o = near.touches[k] // triangles.shape[0]
             t = near.touches[k] % triangles.shape[0]
             if number == FIND:
-                begin_touch(o, t, shapes, motions, law, surface, triangles, touches, turn, sums)
+                begin_touch(o, t, rigid, triangles, touches, turn, sums)
             elif solves != 0:
-                correct_touch(o, t, law, dt, surface, triangles[t], touches, turn, sums)
+                correct_touch(o, t, rigid.law, dt, rigid.surface, triangles[t], touches, turn, sums)
             else:
-                weigh_touch(o, t, law, dt, surface, triangles[t], touches, sums)
+                weigh_touch(o, t, rigid.law, dt, rigid.surface, triangles[t], touches, sums)
         elif k >= first:
             s = near.nodes[k - first]
-            if (near.flags[s] & BESIDE) != 0 and is_borne(s, surface):
-                press_borne(s, number == FIND, solves, shapes, motions, law, dt, surface, forces, beside, turn, sums)
+            if (near.flags[s] & BESIDE) != 0 and is_borne(s, rigid.surface):
+                press_borne(s, number == FIND, solves, dt, rigid, turn, sums)
         k += threads
 
 
@@ -117,17 +109,12 @@ def push_together(
     rounds: int,
     are_borne: int,
     triangles: wp.array[wp.vec3i],
-    shapes: Shapes,
-    motions: Motions,
-    law: Law,
     pace: Pace,
     meeting: Meeting,
     # In and out
     rows: Rows,
     touches: Touches,
-    surface: Surface,
-    forces: wp.array2d[wp.vec3],
-    beside: Beside,
+    rigid: Rigid,
     sums: Sums,
 ):
     """Make all rounds of a step: in each the forces on triangles, those of pairs, and those on nodes.
@@ -167,17 +154,12 @@ def push_together(
                     on_rows,
                     are_borne,
                     near,
-                    shapes,
-                    motions,
-                    law,
                     dt,
                     triangles,
                     meeting,
                     rows,
                     touches,
-                    surface,
-                    forces,
-                    beside,
+                    rigid,
                     turn,
                     sums,
                 )
@@ -186,7 +168,7 @@ def push_together(
         k = int(thread)
         while k < near.count[0]:
             s = near.nodes[k]
-            push_place(s, near.flags[s], parts, shapes, motions, law, dt, surface, forces, beside, turn, sums)
+            push_place(s, near.flags[s], parts, dt, rigid, turn, sums)
             k += threads
         synchronize_block()
         turn = 1 - turn
@@ -196,6 +178,6 @@ def push_together(
     # The last pass has left what moved the places.
     k = int(thread)
     while are_borne != 0 and k < near.count[0]:
-        if is_borne(near.nodes[k], surface):
-            clear_bearers(near.nodes[k], 1 - turn, surface)
+        if is_borne(near.nodes[k], rigid.surface):
+            clear_bearers(near.nodes[k], 1 - turn, rigid.surface)
         k += threads

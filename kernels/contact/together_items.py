@@ -8,14 +8,13 @@ import warp as wp
 
 from .bearing import is_borne
 from .law import Law
-from .motion import Motions, Surface
+from .motion import Surface
 from .near import BESIDE
 from .pairs import SHARES, grains_of, judge_row, locate_row, solve_row
 from .rows import Meeting, Rows
-from .shapes import Shapes
 from .touches import Touches, find_touch
 from .triangles import BEGIN, CORRECT, END, judge_touch, solve_touch
-from .vertices import Beside, anchor, begin_borne, push_borne, touch
+from .vertices import Rigid, anchor, begin_borne, push_borne, touch
 
 wp.set_module_options({"enable_backward": False})
 
@@ -87,22 +86,11 @@ def ease_of(s: int, sums: Sums, surface: Surface):
 
 
 @wp.func
-def begin_touch(
-    o: int,
-    t: int,
-    shapes: Shapes,
-    motions: Motions,
-    law: Law,
-    surface: Surface,
-    triangles: wp.array[wp.vec3i],
-    touches: Touches,
-    turn: int,
-    sums: Sums,
-):
+def begin_touch(o: int, t: int, rigid: Rigid, triangles: wp.array[wp.vec3i], touches: Touches, turn: int, sums: Sums):
     """Find a contact on a triangle, with the force with which it begins."""
-    find_touch(o, t, shapes, motions, law, surface, triangles, touches)
+    find_touch(o, t, rigid, triangles, touches)
     if touches.acts[o, t] != 0:
-        push_corners(touches.shares[o, t], touches.force[o, t], triangles[t], law, turn, surface, sums)
+        push_corners(touches.shares[o, t], touches.force[o, t], triangles[t], rigid.law, turn, rigid.surface, sums)
 
 
 @wp.func
@@ -162,33 +150,20 @@ def correct_row(row: int, law: Law, dt: float, surface: Surface, friction: float
 
 
 @wp.func
-def press_borne(
-    s: int,
-    begins: bool,
-    solves: int,
-    shapes: Shapes,
-    motions: Motions,
-    law: Law,
-    dt: float,
-    surface: Surface,
-    forces: wp.array2d[wp.vec3],
-    beside: Beside,
-    turn: int,
-    sums: Sums,
-):
+def press_borne(s: int, begins: bool, solves: int, dt: float, rigid: Rigid, turn: int, sums: Sums):
     """The forces of obstacles on a borne place itself: the first ones, or which push, or their corrections."""
     if begins:
-        force = begin_borne(s, shapes, motions, law, beside, surface, forces)
-        add_force(s, force, law, turn, surface, sums)
+        force = begin_borne(s, rigid)
+        add_force(s, force, rigid.law, turn, rigid.surface, sums)
         return
     yielding = float(0.0)
     if solves != 0:
-        yielding = ease_of(s, sums, surface)
-    more, pushing = push_borne(s, yielding, shapes, motions, law, dt, beside, surface, forces)
+        yielding = ease_of(s, sums, rigid.surface)
+    more, pushing = push_borne(s, yielding, dt, rigid)
     if solves != 0:
-        add_force(s, more, law, turn, surface, sums)
+        add_force(s, more, rigid.law, turn, rigid.surface, sums)
     elif pushing > 0.0:
-        add_crowd(s, pushing, surface, sums)
+        add_crowd(s, pushing, rigid.surface, sums)
 
 
 @wp.func
@@ -215,35 +190,22 @@ def clear_bearers(s: int, turn: int, surface: Surface):
 
 
 @wp.func
-def push_place(
-    s: int,
-    flags: int,
-    parts: int,
-    shapes: Shapes,
-    motions: Motions,
-    law: Law,
-    dt: float,
-    surface: Surface,
-    forces: wp.array2d[wp.vec3],
-    beside: Beside,
-    turn: int,
-    sums: Sums,
-):
+def push_place(s: int, flags: int, parts: int, dt: float, rigid: Rigid, turn: int, sums: Sums):
     """Give a place what was added: it moves, and the contacts of a node follow."""
     grains = sums.added[s]
     if grains[0] != wp.int64(0) or grains[1] != wp.int64(0) or grains[2] != wp.int64(0):
-        force = force_of(grains, law.grain)
+        force = force_of(grains, rigid.law.grain)
         sums.added[s] = wp.vec3l()
-        surface.f[s] = surface.f[s] + force
-        if not is_borne(s, surface):
-            surface.d[s] = surface.d[s] + surface.yielding[s] * force
+        rigid.surface.f[s] = rigid.surface.f[s] + force
+        if not is_borne(s, rigid.surface):
+            rigid.surface.d[s] = rigid.surface.d[s] + rigid.surface.yielding[s] * force
     corrects = (parts & (BEGIN | CORRECT)) != 0
-    if is_borne(s, surface):
-        move_borne(s, law, turn, surface)
+    if is_borne(s, rigid.surface):
+        move_borne(s, rigid.law, turn, rigid.surface)
         corrects = False
     sums.crowd[s] = 0
     if (flags & BESIDE) != 0:
         if corrects:
-            touch(s, (parts & BEGIN) != 0, shapes, motions, law, dt, beside, surface, forces)
+            touch(s, (parts & BEGIN) != 0, dt, rigid)
         if (parts & END) != 0:
-            anchor(s, shapes, motions, surface, forces, beside)
+            anchor(s, rigid)

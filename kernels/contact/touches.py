@@ -3,11 +3,10 @@
 import warp as wp
 
 from .closest import deepest_on_triangle, on_triangle, point_of, segment_to_triangle
-from .law import LOST, Law, allowed, held_back
-from .motion import Motions, Surface
+from .law import LOST, allowed, held_back
 from .near import Near
 from .shapes import CAPSULE, SPHERE, Shapes, carried, distance_to
-from .vertices import across
+from .vertices import Rigid, across
 
 wp.set_module_options({"enable_backward": False})
 
@@ -64,41 +63,33 @@ def nearest(shapes: Shapes, o: int, pose: wp.transform, most: float, a: wp.vec3,
 
 
 @wp.func
-def find_touch(
-    o: int,
-    t: int,
-    shapes: Shapes,
-    motions: Motions,
-    law: Law,
-    surface: Surface,
-    triangles: wp.array[wp.vec3i],
-    touches: Touches,
-):
+def find_touch(o: int, t: int, rigid: Rigid, triangles: wp.array[wp.vec3i], touches: Touches):
     was = touches.force[o, t]
     side = touches.normal[o, t]
     touches.shares[o, t] = wp.vec3()
     touches.force[o, t] = wp.vec3()
     touches.acts[o, t] = 0
     corners = triangles[t]
-    pose = motions.now[surface.world[corners[0]], o]
-    later = motions.later[surface.world[corners[0]], o]
-    a = surface.x[corners[0]]
-    b = surface.x[corners[1]]
-    c = surface.x[corners[2]]
+    pose = rigid.motions.now[rigid.surface.world[corners[0]], o]
+    later = rigid.motions.later[rigid.surface.world[corners[0]], o]
+    a = rigid.surface.x[corners[0]]
+    b = rigid.surface.x[corners[1]]
+    c = rigid.surface.x[corners[2]]
     middle = (a + b + c) / 3.0
     size = wp.max(wp.length(a - middle), wp.max(wp.length(b - middle), wp.length(c - middle)))
     far = wp.max(
-        wp.length(surface.d[corners[0]]), wp.max(wp.length(surface.d[corners[1]]), wp.length(surface.d[corners[2]]))
+        wp.length(rigid.surface.d[corners[0]]),
+        wp.max(wp.length(rigid.surface.d[corners[1]]), wp.length(rigid.surface.d[corners[2]])),
     )
-    far += wp.length(carried(pose, later, middle)) + law.tolerance
-    distance, _away = distance_to(shapes, o, pose, middle, size + far)
+    far += wp.length(carried(pose, later, middle)) + rigid.law.tolerance
+    distance, _away = distance_to(rigid.shapes, o, pose, middle, size + far)
     if distance > size + far:
         return
-    w, gap, n = nearest(shapes, o, pose, size + far, a, b, c)
-    if wp.dot(was, was) > 0.0 and wp.dot(n, side) < 0.0 and shapes.kind[o] == CAPSULE:
+    w, gap, n = nearest(rigid.shapes, o, pose, size + far, a, b, c)
+    if wp.dot(was, was) > 0.0 and wp.dot(n, side) < 0.0 and rigid.shapes.kind[o] == CAPSULE:
         # The axis has passed through since the last step.
         n = -n
-        gap = -2.0 * shapes.size[o][0] - gap
+        gap = -2.0 * rigid.shapes.size[o][0] - gap
     if gap > far or wp.max(w) > CORNER:
         return
     allowance = touches.allowance[o, t]
@@ -108,7 +99,7 @@ def find_touch(
         gap += allowance
         if gap > far:
             return
-    friction = wp.where(gap < -SKEWERED * shapes.thickness[o], 0.0, shapes.friction[o])
+    friction = wp.where(gap < -SKEWERED * rigid.shapes.thickness[o], 0.0, rigid.shapes.friction[o])
     touches.shares[o, t] = w
     touches.normal[o, t] = n
     touches.gap[o, t] = gap
@@ -129,10 +120,7 @@ def find_touches(
     # In
     threads: int,
     near: Near,
-    shapes: Shapes,
-    motions: Motions,
-    law: Law,
-    surface: Surface,
+    rigid: Rigid,
     triangles: wp.array[wp.vec3i],
     # In and out
     touches: Touches,
@@ -145,4 +133,4 @@ def find_touches(
         o = near.touches[k] // all_triangles
         t = near.touches[k] % all_triangles
         k += threads
-        find_touch(o, t, shapes, motions, law, surface, triangles, touches)
+        find_touch(o, t, rigid, triangles, touches)

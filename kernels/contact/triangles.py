@@ -11,12 +11,11 @@ from warp_corot.kernels.stepping.pace import DT, Pace
 
 from .bearing import ease, give_way, is_borne, loose_share
 from .law import Law, held_back, least_motion, left_to_held
-from .motion import Motions, Surface
+from .motion import Surface
 from .near import AROUND, BESIDE, Near
-from .shapes import Shapes
 from .supports import left_at_triangle
 from .touches import Touches
-from .vertices import Beside, across, anchor, begin_borne, push_borne, touch
+from .vertices import Rigid, across, anchor, begin_borne, push_borne, touch
 
 wp.set_module_options({"enable_backward": False})
 
@@ -90,14 +89,9 @@ def crowd_nodes(
     # In
     threads: int,
     near: Near,
-    shapes: Shapes,
-    motions: Motions,
-    law: Law,
+    rigid: Rigid,
     pace: Pace,
-    surface: Surface,
     skin: Skin,
-    forces: wp.array2d[wp.vec3],
-    beside: Beside,
     corner_yielding: wp.array[wp.float32],
     # In and out
     touches: Touches,
@@ -117,9 +111,9 @@ def crowd_nodes(
         k += threads
         total = float(0.0)
         if (near.flags[s] & AROUND) != 0:
-            total = crowd_at(s, law, dt, surface, skin, corner_yielding, touches)
-        if (near.flags[s] & BESIDE) != 0 and is_borne(s, surface):
-            _more, pushing = push_borne(s, 0.0, shapes, motions, law, dt, beside, surface, forces)
+            total = crowd_at(s, rigid.law, dt, rigid.surface, skin, corner_yielding, touches)
+        if (near.flags[s] & BESIDE) != 0 and is_borne(s, rigid.surface):
+            _more, pushing = push_borne(s, 0.0, dt, rigid)
             total += pushing
         crowd[s] = total
 
@@ -210,48 +204,23 @@ def share_of(s: int, skin: Skin, touches: Touches):
 
 
 @wp.func
-def push_node(
-    s: int,
-    flags: int,
-    parts: int,
-    skin: Skin,
-    shapes: Shapes,
-    motions: Motions,
-    law: Law,
-    dt: float,
-    touches: Touches,
-    surface: Surface,
-    forces: wp.array2d[wp.vec3],
-    beside: Beside,
-):
+def push_node(s: int, flags: int, parts: int, skin: Skin, dt: float, touches: Touches, rigid: Rigid):
     """Some of the parts of ``push_nodes`` for a place that is a node."""
     if (parts & ADD) != 0 and (flags & AROUND) != 0:
         total = share_of(s, skin, touches)
         if wp.dot(total, total) > 0.0:
-            surface.f[s] = surface.f[s] + total
-            surface.d[s] = surface.d[s] + surface.yielding[s] * total
+            rigid.surface.f[s] = rigid.surface.f[s] + total
+            rigid.surface.d[s] = rigid.surface.d[s] + rigid.surface.yielding[s] * total
     if (flags & BESIDE) != 0:
         if (parts & (BEGIN | CORRECT)) != 0:
-            touch(s, (parts & BEGIN) != 0, shapes, motions, law, dt, beside, surface, forces)
+            touch(s, (parts & BEGIN) != 0, dt, rigid)
         if (parts & END) != 0:
-            anchor(s, shapes, motions, surface, forces, beside)
+            anchor(s, rigid)
 
 
 @wp.func
 def gather_borne(
-    s: int,
-    flags: int,
-    parts: int,
-    skin: Skin,
-    shapes: Shapes,
-    motions: Motions,
-    law: Law,
-    dt: float,
-    touches: Touches,
-    crowd: wp.array[wp.float32],
-    surface: Surface,
-    forces: wp.array2d[wp.vec3],
-    beside: Beside,
+    s: int, flags: int, parts: int, skin: Skin, dt: float, touches: Touches, crowd: wp.array[wp.float32], rigid: Rigid
 ):
     """The same for a borne place: its own forces are corrected together with those on triangles."""
     if (parts & ADD) != 0:
@@ -260,15 +229,15 @@ def gather_borne(
             total = share_of(s, skin, touches)
         if (flags & BESIDE) != 0:
             if (parts & BEGIN) != 0:
-                total += begin_borne(s, shapes, motions, law, beside, surface, forces)
+                total += begin_borne(s, rigid)
             else:
-                yielding = ease(s, crowd, surface.yielding, surface)
-                more, _count = push_borne(s, yielding, shapes, motions, law, dt, beside, surface, forces)
+                yielding = ease(s, crowd, rigid.surface.yielding, rigid.surface)
+                more, _count = push_borne(s, yielding, dt, rigid)
                 total += more
-        surface.bearing.gathered[s] = total
-        surface.f[s] = surface.f[s] + total
+        rigid.surface.bearing.gathered[s] = total
+        rigid.surface.f[s] = rigid.surface.f[s] + total
     elif (parts & END) != 0 and (flags & BESIDE) != 0:
-        anchor(s, shapes, motions, surface, forces, beside)
+        anchor(s, rigid)
 
 
 @wp.kernel(enable_backward=False)
@@ -278,16 +247,11 @@ def push_nodes(
     near: Near,
     parts: int,
     skin: Skin,
-    shapes: Shapes,
-    motions: Motions,
-    law: Law,
     pace: Pace,
     touches: Touches,
     crowd: wp.array[wp.float32],
     # In and out
-    surface: Surface,
-    forces: wp.array2d[wp.vec3],
-    beside: Beside,
+    rigid: Rigid,
 ):
     """Do the work on nodes one by one, without their neighbours. Borne places are moved afterwards, by
     ``settle_places``.
@@ -304,32 +268,21 @@ def push_nodes(
         s = near.nodes[k]
         k += threads
         flags = near.flags[s]
-        if is_borne(s, surface):
-            gather_borne(s, flags, parts, skin, shapes, motions, law, dt, touches, crowd, surface, forces, beside)
+        if is_borne(s, rigid.surface):
+            gather_borne(s, flags, parts, skin, dt, touches, crowd, rigid)
         else:
-            push_node(s, flags, parts, skin, shapes, motions, law, dt, touches, surface, forces, beside)
+            push_node(s, flags, parts, skin, dt, touches, rigid)
 
 
 @wp.kernel(enable_backward=False)
-def settle_places(
-    # In
-    threads: int,
-    near: Near,
-    parts: int,
-    shapes: Shapes,
-    motions: Motions,
-    # In and out
-    surface: Surface,
-    forces: wp.array2d[wp.vec3],
-    beside: Beside,
-):
+def settle_places(threads: int, near: Near, parts: int, rigid: Rigid):
     """Move borne places by the forces that were gathered; with END in ``parts``, update their anchors."""
     k = wp.tid()
     count = near.count[0]
     while k < count:
         s = near.nodes[k]
         k += threads
-        if is_borne(s, surface):
-            give_way(s, surface)
+        if is_borne(s, rigid.surface):
+            give_way(s, rigid.surface)
             if (parts & END) != 0 and (near.flags[s] & BESIDE) != 0:
-                anchor(s, shapes, motions, surface, forces, beside)
+                anchor(s, rigid)

@@ -12,7 +12,7 @@ from warp_corot.kernels.contact.law import Law
 from warp_corot.kernels.contact.rows import Meeting, Rows
 from warp_corot.kernels.contact.together import BLOCK, push_together
 from warp_corot.kernels.contact.together_items import Sums
-from warp_corot.kernels.contact.vertices import Beside
+from warp_corot.kernels.contact.vertices import Rigid
 from warp_corot.kernels.stepping.pace import Pace
 from warp_corot.solvers.ranks import ALONE, Ranks
 
@@ -82,10 +82,8 @@ class RigidForces:
         self.totals = wp.zeros_like(self.forces)
         self.kinds = wp.zeros((obstacles, count), dtype=wp.int32, device=device)
         self.anchors = wp.zeros((obstacles, count), dtype=wp.vec4, device=device)
-        self._beside = Beside()
-        self._beside.anchors, self._beside.moved = self.anchors, wp.zeros_like(self.forces)
-        self._beside.away = wp.zeros_like(self.anchors)
-        self.allowances = self._beside.allowance = wp.zeros((obstacles, count), dtype=wp.float32, device=device)
+        self._away, self._moved = wp.zeros_like(self.anchors), wp.zeros_like(self.forces)
+        self.allowances = wp.zeros((obstacles, count), dtype=wp.float32, device=device)
         self.touches = touches.Touches()
         shape = (obstacles, self.surface.triangle_count if self.have_edges else 0)
         for name in ("shares", "normal", "moved", "force", "more"):
@@ -167,8 +165,8 @@ class RigidForces:
         pairs = self._pairs
         meeting, rows = (Meeting(), Rows()) if pairs is None else (pairs.meeting, pairs.rows)
         inputs = [threads, self.search.near, rounds, int(self.surface.is_borne), self.surface.triangles]
-        inputs += [self.obstacles.shapes, self.obstacles.motions, self._law, self._pace, meeting]
-        outputs = [rows, self.touches, self.surface.arrays, self.forces, self._beside, self._sums]
+        inputs += [self._pace, meeting]
+        outputs = [rows, self.touches, self._rigid, self._sums]
         wp.launch(push_together, threads, inputs, outputs, device=self.device, block_dim=threads)
 
     def _launch_begin(self, *, is_end: bool) -> None:
@@ -176,9 +174,7 @@ class RigidForces:
         parts = triangles.BEGIN | (triangles.END if is_end else 0)
         if self.have_edges:
             self._yielding = self._ranks.completed_yielding(self.surface.arrays.yielding)
-            rigid = [self.obstacles.shapes, self.obstacles.motions]
-            inputs = [*rigid, self._law, self.surface.arrays, self.surface.triangles, self.touches]
-            self._on_touches(touches.find_touches, inputs)
+            self._on_touches(touches.find_touches, [self._rigid, self.surface.triangles, self.touches])
         if self.has_rounds:
             parts |= triangles.ADD
         self._push(parts)
@@ -187,13 +183,20 @@ class RigidForces:
         """Launch one round of the forces between nodes; their sums at the nodes follow."""
         if not self.has_rounds:
             return
-        step, rigid = [self._law, self._pace, self.surface.arrays], [self.obstacles.shapes, self.obstacles.motions]
         self._ranks.complete_surface(self.surface.arrays.d)
-        inputs = [*rigid, *step, self._skin, self.forces, self._beside, self._yielding, self.touches, self._crowd]
+        inputs = [self._rigid, self._pace, self._skin, self._yielding, self.touches, self._crowd]
         self._on_nodes(triangles.crowd_nodes, inputs)
         self._ranks.complete_surface(self._crowd)
         if self.have_edges:
-            inputs = [*step, self.surface.triangles, self._crowd, self._yielding, self.touches]
+            inputs = [
+                self._law,
+                self._pace,
+                self.surface.arrays,
+                self.surface.triangles,
+                self._crowd,
+                self._yielding,
+                self.touches,
+            ]
             self._on_touches(triangles.solve_touches, inputs)
 
     def launch_totals(self) -> wp.array:
@@ -206,23 +209,28 @@ class RigidForces:
 
     def _find(self) -> None:
         """Launch the search for nodes and triangles near obstacles."""
-        watch, near, arrays = self.search.watch, self.search.near, self.surface.arrays
-        inputs = [watch, self.obstacles.shapes, self.obstacles.motions, self._law, arrays]
-        outputs = [near, self.forces, self.anchors, self._crowd]
-        wp.launch(beside.find_nodes_beside, self.surface.count, inputs, outputs, device=self.device)
+        watch, near, rigid = self.search.watch, self.search.near, self._rigid
+        outputs = [near, rigid, self._crowd]
+        wp.launch(beside.find_nodes_beside, self.surface.count, [watch], outputs, device=self.device)
         if self.have_edges:
-            inputs += [self.surface.triangles]
-            dim = (self.obstacles.count, self.surface.triangle_count)
+            dim, inputs = (self.obstacles.count, self.surface.triangle_count), [watch, rigid, self.surface.triangles]
             wp.launch(beside.find_triangles_beside, dim, inputs, [near, self.touches], device=self.device)
 
     def _push(self, parts: int) -> None:
         """Launch some of the parts that act on one node at a time."""
-        rigid = [self.obstacles.shapes, self.obstacles.motions]
-        inputs = [parts, self._skin, *rigid, self._law, self._pace, self.touches, self._crowd]
-        own = [self.surface.arrays, self.forces, self._beside]
-        self._on_nodes(triangles.push_nodes, [*inputs, *own])
+        inputs = [parts, self._skin, self._pace, self.touches, self._crowd, self._rigid]
+        self._on_nodes(triangles.push_nodes, inputs)
         if parts & triangles.ADD and self.surface.is_borne:
-            self._on_nodes(triangles.settle_places, [parts, *rigid, *own])
+            self._on_nodes(triangles.settle_places, [parts, self._rigid])
+
+    @property
+    def _rigid(self) -> Rigid:
+        """The obstacles, the surfaces and what is between them, as they are now."""
+        rigid = Rigid()
+        rigid.shapes, rigid.motions, rigid.law = self.obstacles.shapes, self.obstacles.motions, self._law
+        rigid.surface, rigid.forces, rigid.anchors = self.surface.arrays, self.forces, self.anchors
+        rigid.away, rigid.moved, rigid.allowance = self._away, self._moved, self.allowances
+        return rigid
 
     def _on_nodes(self, kernel: wp.Kernel, inputs: list) -> None:
         among = self.search.at_nodes
