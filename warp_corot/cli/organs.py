@@ -36,8 +36,6 @@ TETS_PER_CUBE = 30
 DETAIL = 6
 #: Root cubes extend beyond the body by this fraction of its length.
 MARGIN = 1.0e-3
-#: If the body's box has more root cubes than this for each allowed tetrahedron, no body fits.
-CUBES_PER_TET = 1000
 #: Names of Python's arguments on the command line.
 ARGUMENTS = {
     "unit": "--unit",
