@@ -187,6 +187,9 @@ def prepared(scenes: bool) -> None:
     for name, module in list(sys.modules.items()):
         if name.startswith("warp_corot") and hasattr(module, "read_isolated"):
             module.read_isolated = read_here
+        if name.startswith("warp_corot") and hasattr(module, "begin_loading"):
+            # A fork of a process whose other threads load kernels would wait for their locks for ever.
+            module.begin_loading = lambda *_, **__: []
     warnings.simplefilter("ignore")
     wp.config.log_level = wp.LOG_ERROR
     with suppress(Exception):  # without Newton there are no scenes
