@@ -31,7 +31,7 @@ IMPLICIT = (
     *("implicit.steps", "implicit.multigrid.values", "implicit.multigrid.pattern", "plan.levels", "implicit.newton"),
     *("implicit.tangent", "implicit.turning", "corotated.kept_gradients", "implicit.assembled"),
     *("implicit.multigrid.leaves_cpu", "implicit.conjugate_gradients", "implicit.multigrid.sweeps"),
-    *("implicit.multigrid.transfers_cpu", "implicit.lagged", "implicit.sums", "implicit.chosen"),
+    *("implicit.lagged", "implicit.sums", "implicit.chosen"),
 )
 #: Modules for explicit contact with obstacles on the CPU.
 CONTACT = (

@@ -153,10 +153,15 @@ class AssembledSolve:
             inputs = [body.sizes.world_elements, members.entries, members.arrays, elements, u]
             inputs += [body.mu, body.lam, body.material_stride, 1e30]
             self._launch(shared.write_rows(members.law), members.count, inputs, [self._group_rows])
-        inputs = [body.sizes.world_elements, found.entries, elements, self._frames, self._gradients]
-        inputs += [body.mu, body.lam, body.material_stride, scales, 0.0, 1e30 if members is None else 0.0]
-        inputs += [found.upper, found.sum_starts, found.codes, found.places, count]
-        inputs += [0 if members is None else members.entries, self._pairs, self._group_rows]
+        given = values.Leaves()
+        given.elements, given.world_elements = elements, body.sizes.world_elements
+        given.frames, given.gradients = self._frames, self._gradients
+        given.mu, given.lam, given.stride = body.mu, body.lam, body.material_stride
+        given.upper, given.starts, given.codes, given.places = found.upper, found.sum_starts, found.codes, found.places
+        given.entries, given.ranks = found.entries, count
+        given.row_entries = 0 if members is None else members.entries
+        given.pairs, given.rows = self._pairs, self._group_rows
+        inputs = [given, scales, 0.0, 1e30 if members is None else 0.0]
         if self.device.is_cpu:
             wp.launch(gather_leaves_on_cpu, self._worlds, inputs, [blocks, self._more], device=self.device)
         else:
