@@ -49,7 +49,7 @@ def test_options_are_those_of_simulate():
 
 
 def test_what_simulate_refuses_view_refuses(folder, capsys):
-    pytest.importorskip("viser")
+    pytest.importorskip("websockets")
     for words, said in (
         (["box", "--young", "-1"], "--young is -1"),
         (["box", "--refine-above", "2"], "--refine-above is for --remesh"),
@@ -64,7 +64,7 @@ def test_what_simulate_refuses_view_refuses(folder, capsys):
 
 
 def test_a_port_in_use_is_reported_before_meshing(capsys):
-    pytest.importorskip("viser")
+    pytest.importorskip("websockets")
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -73,8 +73,8 @@ def test_a_port_in_use_is_reported_before_meshing(capsys):
     assert re.search(r"port \d+ of 127.0.0.1 cannot be opened \(Address already in use\)", line)
 
 
-def test_without_viser_one_line_says_what_to_install(monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "viser", None)
+def test_without_websockets_one_line_says_what_to_install(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "websockets", None)
     assert run("view", "box") == 2
     assert 'pip install "warp-corot[view]"' in capsys.readouterr().err
 
@@ -85,7 +85,7 @@ def test_without_viser_one_line_says_what_to_install(monkeypatch, capsys):
     [(signal.SIGINT, 0), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.slow)],
 )
 def test_ctrl_c_ends_it_quietly(number, status, tmp_path):
-    pytest.importorskip("viser")
+    pytest.importorskip("websockets")
     command = [sys.executable, "-m", "warp_corot", "view", "box", "--port", "0", "--device", "cpu"]
     process = subprocess.Popen(
         command,

@@ -20,7 +20,7 @@ def program():
 @contextmanager
 def browser():
     """A browser, driven by Playwright."""
-    pytest.importorskip("viser", reason="the page needs viser")
+    pytest.importorskip("websockets", reason="the page needs websockets")
     playwright = pytest.importorskip("playwright.sync_api", reason="a browser is driven by playwright")
     found = program()
     if found is None:

@@ -1,14 +1,10 @@
 """Cuts: closed surfaces of the right volume and section, which move with the body."""
 
-import json
-import struct
-
 import numpy as np
 import pytest
 
 import warp_corot as wc
 from warp_corot.viewing.cutting import Plane, cut
-from warp_corot.viewing.glb import colored_mesh
 from warp_corot.viewing.shown import MARCHED, surfaces_of
 
 
@@ -63,22 +59,3 @@ def test_a_plane_beyond_the_body_leaves_it_whole():
     surface = next(iter(surfaces_of(mesh).values()))
     assert cut(surface, mesh, Plane(0, 1.5)).volume == pytest.approx(surface.volume)
     assert len(cut(surface, mesh, Plane(0, -0.5)).triangles) == 0
-
-
-def test_a_coloured_mesh_is_what_gltf_says(rng):
-    points = rng.random((7, 3)).astype(np.float32)
-    triangles = rng.integers(0, 7, (5, 3)).astype(np.int32)
-    colors = rng.integers(0, 256, (7, 3)).astype(np.uint8)
-    data = colored_mesh(points, triangles, colors)
-    magic, version, total, length, kind = struct.unpack_from("<4sIII4s", data)
-    assert (magic, version, total, kind) == (b"glTF", 2, len(data), b"JSON")
-    told = json.loads(data[20 : 20 + length])
-    binary = data[28 + length :]
-    view = told["bufferViews"]
-    found = [binary[v["byteOffset"] : v["byteOffset"] + v["byteLength"]] for v in view]
-    np.testing.assert_array_equal(np.frombuffer(found[0], np.float32).reshape(-1, 3), points)
-    np.testing.assert_array_equal(np.frombuffer(found[2], np.uint16).reshape(-1, 3), triangles)
-    assert told["accessors"][0]["max"] == pytest.approx(points.max(axis=0).tolist())
-    linear = np.frombuffer(found[1], np.uint8).reshape(-1, 4)[:, :3]
-    assert (np.argsort(linear[:, 0], kind="stable") == np.argsort(colors[:, 0], kind="stable")).mean() > 0.7
-    assert total % 4 == 0

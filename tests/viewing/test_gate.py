@@ -1,14 +1,16 @@
 """Access to the page: without a token from this computer only, with one for those who bring it; everything else is
 refused."""
 
+import contextlib
 import http.client
+import json
 import socket
+import time
 
 import pytest
 from hands import block
 
 import warp_corot as wc
-from warp_corot.viewing import server as servers
 from warp_corot.viewing.gate import Gate, is_loopback
 from warp_corot.viewing.view import View
 
@@ -87,7 +89,7 @@ def test_the_address_tells_the_token():
 
 @pytest.fixture
 def opened():
-    pytest.importorskip("viser")
+    pytest.importorskip("websockets")
     pages = []
 
     def open_page(**options):
@@ -114,13 +116,13 @@ def test_the_server_asks_of_files_and_websockets_alike(opened):
         for path in ("/", "/index.html", "/?token=", "/?token=wrong", "/no-such-file"):
             code, _, body = answered(page, path, **headers)
             assert code == 403, (path, headers)
-            assert b"viser" not in body.lower()
+            assert b"<html" not in body.lower()
     code, told, _ = answered(page, "/?token=word")
     assert code == 303
     cookie = told["Set-Cookie"].partition(";")[0]
     code, _, body = answered(page, "/", Cookie=cookie)
     assert code == 200
-    assert len(body) > 10_000
+    assert b"<canvas" in body
     assert answered(page, "/", Cookie=cookie, **WEBSOCKET)[0] == 101
     assert answered(page, "/?token=word", **WEBSOCKET)[0] == 101
 
@@ -133,19 +135,82 @@ def test_the_server_without_a_token_is_this_computer_s(opened):
     assert answered(page, **WEBSOCKET)[0] == 101
 
 
-def test_a_server_that_does_not_ask_is_not_opened(opened, monkeypatch):
-    """As another version of viser might be, which takes its own way to begin."""
-    from contextlib import nullcontext
+def test_the_server_gives_out_the_page_s_files_only(opened):
+    page = opened()
+    for name, kind in (("index.html", "text/html"), ("page.js", "text/javascript"), ("style.css", "text/css")):
+        code, told, _ = answered(page, f"/{name}?1")
+        assert (code, told["Content-Type"].partition(";")[0]) == (200, kind)
+        assert "default-src 'self'" in told["Content-Security-Policy"]
+    for path in ("/../view.py", "/page/index.html", "/%2e%2e/view.py", "/__init__.py"):
+        assert answered(page, path)[0] == 404
 
-    monkeypatch.setattr(servers, "guarded", lambda gate: nullcontext())
-    with pytest.raises(wc.InputError, match="does not ask who may enter"):
-        opened(token="word")
+
+def test_messages_that_ask_for_nothing_do_no_harm(opened):
+    from websockets.sync.client import connect
+
+    page = opened()
+    with connect(page.address.replace("http", "ws")) as socket:
+        for message in (
+            "{",
+            "[]",
+            "3",
+            '{"do": "import"}',
+            '{"do": "press", "body": -1, "at": [0, 0, 0]}',
+            b"no picture",
+        ):
+            socket.send(message)
+        wrong = [
+            {"do": "change", "what": {"fps": 1e9}},
+            {"do": "change", "what": {"speed": float("inf")}},
+            {"do": "tissue", "what": {"young": "__import__"}},
+            {"do": "save", "what": "/etc/passwd", "seconds": 1},
+            {"do": "use tool", "name": "ball", "at": [1, 2]},
+        ]
+        for asked in wrong:
+            before = page.session.controls
+            socket.send(json.dumps(asked))
+            until(lambda: page.session._commands.qsize(), "the message has come")
+            page.session.note = ""
+            page.session.take_commands()
+            assert page.session.note, asked
+            assert page.session.controls == before
+    page.session.advance()
 
 
-def test_no_visitor_can_have_a_tunnel(opened):
-    from viser import _messages
+def test_a_browser_gets_frames_as_fast_as_it_draws_them(opened):
+    from websockets.sync.client import connect
 
-    assert _messages.ShareUrlRequest not in opened()._server._connection._incoming_handlers
+    page = opened()
+    with connect(page.address.replace("http", "ws"), max_size=None) as socket:
+        until(lambda: page._server.visitors, "the visitor is there")
+
+        def kinds():
+            """What comes after ten frames' time."""
+            for _ in range(10):
+                page._show()
+            found = []
+            with contextlib.suppress(TimeoutError):
+                while True:
+                    message = socket.recv(timeout=0.5)
+                    found.append(json.loads(message[4 : 4 + int.from_bytes(message[:4], "little")])["kind"])
+            return found
+
+        assert kinds() == ["page", "topology", "frame", "frame"]
+        socket.send('{"do": "drawn"}')
+        until(lambda: page._server.visitors[0]._credit._value == 1, "it is known")
+        assert kinds() == ["frame"]
+        page.session.change(colors="displacement")
+        socket.send('{"do": "drawn"}')
+        until(lambda: page._server.visitors[0]._credit._value == 1, "it is known")
+        assert kinds() == ["page", "frame"]
+
+
+def until(true, what):
+    """Wait until a condition holds."""
+    end = time.monotonic() + 10.0
+    while not true():
+        assert time.monotonic() < end, f"{what}: not within 10 s"
+        time.sleep(0.01)
 
 
 def test_a_port_that_is_taken_is_one_clear_line(opened):
@@ -166,10 +231,10 @@ def test_a_port_that_is_taken_is_one_clear_line(opened):
         wc.view(block(level=3), wait="x")
 
 
-def test_without_viser_the_page_says_what_to_install(monkeypatch):
+def test_without_websockets_the_page_says_what_to_install(monkeypatch):
     import sys
 
-    monkeypatch.setitem(sys.modules, "viser", None)
+    monkeypatch.setitem(sys.modules, "websockets", None)
     with pytest.raises(wc.InputError, match=r'pip install "warp-corot\[view\]"'):
         View(block(level=3), port=0)
 

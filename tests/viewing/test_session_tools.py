@@ -1,15 +1,12 @@
 """A session with rigid tools, and of several worlds: hands on tools, switches, and the world that is shown."""
 
-import asyncio
-from types import SimpleNamespace
-from unittest.mock import MagicMock
-
 import numpy as np
 import pytest
 from hands import TOP, block
 
 import warp_corot as wc
 from warp_corot.viewing.session import Session
+from warp_corot.viewing.tissue import TISSUES, present, switched
 
 UP = np.array([0.0, 0.0, 0.004])
 
@@ -211,20 +208,47 @@ def test_tools_that_a_visitor_cannot_move_are_named():
     assert "no tissue is within" in page.note
 
 
-def test_a_dragged_tool_goes_as_far_as_the_mouse():
-    """The browser tells where the place that was pressed is now: it moves with the tool."""
-    pytest.importorskip("viser")
-    from warp_corot.viewing.scene import EXTENT, Scene
+@pytest.mark.parametrize("name", ["ball", "rod"])
+def test_a_visitor_puts_a_tool_into_the_scene_presses_with_it_and_takes_it_away(name):
+    page = Session(block())
+    former = page.sim
+    page.use_tool(name, (0.05, 0.05, 0.15))  # inside the block
+    assert page.tool == name
+    (tool,) = page.sim.obstacles
+    assert page.sim.time == former.time
+    still(page, 0.05)
+    assert np.linalg.norm(tool.wrench.numpy()) == 0.0  # it begins clear of the body
+    page.press_tool(1, 0)
+    page.move(1, np.array([0.05, 0.05, 0.19]) - tool.present_pose[0, :3])
+    assert np.linalg.norm(still(page, 0.5).forces[1]) > 0.01
+    page.use_tool("")
+    assert (page.tool, page.sim.obstacles, page.sim.contact) == ("", (), None)
+    assert not page.hands
 
+
+def test_a_tool_of_the_page_leaves_those_of_the_user_where_they_are():
     page, tool = with_tool()
-    server = MagicMock()
-    Scene(server, page)
-    dragged = server.scene.add_mesh_simple.return_value.on_drag.call_args_list[-1].args[0]
-    scale, way = EXTENT / page.size, np.zeros(3)
-    for phase, share in (("start", 0.0), ("update", 0.3), ("update", 0.7), ("update", 1.0)):
-        start = scale * np.array([0.0, 0.0, 0.01])
-        event = {"client_id": 1, "phase": phase, "start_position": start + scale * way}
-        asyncio.run(dragged(SimpleNamespace(**event, end_position=start + scale * share * UP)))
-        still(page, 0.1)
-        way = share * UP
-        np.testing.assert_allclose(tool.present_pose[0, :3] - way, [0.05, 0.05, 0.2202], atol=1e-6)
+    tool.move((0.05, 0.05, 0.2152))
+    still(page, 0.2)
+    before = tool.present_pose.copy()
+    page.use_tool("ball", (0.3, 0.0, 0.1))
+    page.use_tool("rod", (-0.3, 0.0, 0.1))
+    assert len(page.sim.obstacles) == 3
+    np.testing.assert_allclose(tool.present_pose, before, atol=1e-9)
+    assert tool.wrench.numpy().shape == (1, 6)
+    page.ask(lambda: page.use_tool("saw"))
+    page.take_commands()
+    assert "name is 'saw'" in page.note
+    assert (len(page.sim.obstacles), page.tool) == (3, "rod")
+    page.use_tool("")
+    assert len(page.sim.obstacles) == 2
+
+
+def test_tissues_are_those_of_their_sources():
+    page = Session(block())
+    liver = next(each for each in TISSUES if each.name == "liver")
+    page.switch(**switched(page.sim, present(page.sim) | {"young": liver.young, "density": liver.density}))
+    material = page.sim.body.material
+    assert (material.young, material.density) == (pytest.approx(5.5e3), pytest.approx(1060.0))
+    assert material.poisson == pytest.approx(0.4)
+    assert switched(page.sim, present(page.sim)) == {}

@@ -139,10 +139,15 @@ class Obstacles:
         self._bind()
 
     def continue_from(self, former: Obstacles) -> None:
-        """Take the places of another simulation's obstacles, now and after a reset."""
-        wp.copy(self.initial, former.initial)
-        for name in ("now", "later", "target"):
-            wp.copy(getattr(self.motions, name), getattr(former.motions, name))
+        """Take the places of another simulation's obstacles that are also here, now and after a reset."""
+        here = [number for number, each in enumerate(self.given) if each in former.given]
+        there = [former.given.index(self.given[number]) for number in here]
+        arrays = [(self.initial, former.initial)]
+        arrays += [(getattr(self.motions, name), getattr(former.motions, name)) for name in ("now", "later", "target")]
+        for mine, other in arrays:
+            poses = np.array(mine.numpy())
+            poses[:, here] = other.numpy()[:, there]
+            mine.assign(poses)
 
     def send(self, number: int, pose: npt.NDArray[np.float64]) -> None:
         """Send a tool to a place in all worlds."""

@@ -1,4 +1,4 @@
-"""A new simulation from the present state of another, with other laws, materials or remeshing."""
+"""A new simulation from the present state of another, with other laws, materials, remeshing or obstacles."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.grasp import Grasp
+from warp_corot.contact.options import Contact
+from warp_corot.contact.tool import Obstacle
 from warp_corot.elasticity import Model
 from warp_corot.errors import InputError
 from warp_corot.materials.isotropic import Material
@@ -26,6 +28,8 @@ def remade(
     materials: Sequence[Material] | None = None,
     remesh: Sequence[OnlineRemesh | None] | None = None,
     grasps: Sequence[Grasp] | None = None,
+    obstacles: Sequence[Obstacle] | None = None,
+    contact: Contact | None = None,
 ) -> Simulation:
     """A new simulation that continues this one: new bodies with the present meshes, states, loads, supports and
     motions, at the same time. The given simulation is not changed, and must not be stepped any further.
@@ -38,6 +42,8 @@ def remade(
         materials: Materials of the present elements of each body; None: the present ones.
         remesh: How each body is remeshed from now on; None: not at all.
         grasps: The grasps that go on; None: all.
+        obstacles: The obstacles from now on; None: the present ones, with their contact.
+        contact: The options of contact with them.
 
     Raises:
         InputError: A body is remeshed and follows keyframes; or as ``Simulation``. The given simulation is unchanged.
@@ -51,11 +57,10 @@ def remade(
             gravity=sim.gravity,
             deterministic=sim.deterministic,
             remesh=remesh if remesh is not None and any(remesh) else None,
-            obstacles=() if sim.contact is None else sim.contact.obstacles.given,
-            contact=None if sim.contact is None else sim.contact.options,
+            obstacles=sim.obstacles if obstacles is None else obstacles,
+            contact=contact if obstacles is not None or sim.contact is None else sim.contact.options,
         )
-        if sim.contact is not None:
-            assert again.contact is not None
+        if sim.contact is not None and again.contact is not None:
             again.contact.obstacles.continue_from(sim.contact.obstacles)
         for grasp in sim.grasps if grasps is None else grasps:
             grasp.again(again.bodies[sim.bodies.index(grasp.body)])

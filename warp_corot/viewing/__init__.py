@@ -1,4 +1,5 @@
 """The page: a simulation in a browser, and a person's hands on it.
 
-``session`` steps and does not depend on browsers; ``page`` shows a session with viser; ``gate`` decides who may enter.
+``session`` steps and does not depend on browsers; ``messages`` tell browsers what it shows, and ``commands`` do what
+they ask for. ``server`` brings both to them, ``gate`` decides who may enter, and ``page/`` is what they load.
 """

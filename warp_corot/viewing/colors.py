@@ -1,4 +1,4 @@
-"""The colours of a surface: sources of values by name, and their colours."""
+"""The colours of a surface: sources of values by name, and the range of the colours."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.nodal import pressure_at_nodes
-from warp_corot.io.pictures.colors import TISSUE, color_index, round_limit, stress_colors
+from warp_corot.io.pictures.colors import round_limit
 from warp_corot.kernels.viewing import values as kernels
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.surfaces.boundary import signed_volumes
@@ -22,10 +22,11 @@ from .shown import Shown
 
 Values: TypeAlias = npt.NDArray[np.floating]
 
-#: The colour map, uint8 [256, 3].
-_TABLE = np.rint(255.0 * stress_colors()).astype(np.uint8)
 #: A range of colours that is more than this many times too wide becomes narrower.
 TOO_WIDE = 3.0
+#: Colours end at this displacement over the body's size and this stress over Young's modulus at least: smaller ones are
+#: no news, and after a reset there is only rounding.
+LEAST_MOTION, LEAST_STRESS = 1e-3, 1e-2
 
 
 @dataclass(frozen=True)
@@ -33,13 +34,17 @@ class Source:
     """Values that colours can show.
 
     Attributes:
+        label: What the values are, for people.
         unit: The unit of the values.
         values: The values at the points of a shown surface, [V], for a simulation and one of its bodies.
+        least: The least end of the colours for a shown surface.
         applies: Whether a body has such values.
     """
 
+    label: str
     unit: str
     values: Callable[[Simulation, Shown], Values]
+    least: Callable[[Shown], float] = lambda _: 0.0
     applies: Callable[[SoftBody], bool] = lambda _: True
 
 
@@ -115,13 +120,25 @@ def contact_pressure(sim: Simulation, shown: Shown) -> Values:
     return np.einsum("vn,vn->v", shown.binding.weights.numpy(), nodal[shown.binding.nodes.numpy()])
 
 
+def _least_motion(shown: Shown) -> float:
+    return LEAST_MOTION * float(np.ptp(shown.rest, axis=0).max(initial=0.0))
+
+
+def _least_stress(shown: Shown) -> float:
+    return LEAST_STRESS * float(np.mean(shown.body.material.isotropic.young))
+
+
 def sources() -> dict[str, Source]:
     """The sources by name. Sources that keep data of a body belong to one session."""
     return {
-        "stress": Source("Pa", ElementValues(_stress)),
-        "displacement": Source("m", displacement),
-        "contact pressure": Source("Pa", contact_pressure, lambda body: body.state.is_touched),
-        "level": Source("", ElementValues(_level), lambda body: isinstance(body.mesh, TetForest)),
+        "stress": Source("von Mises stress", "Pa", ElementValues(_stress), _least_stress),
+        "displacement": Source("displacement", "m", displacement, _least_motion),
+        "contact pressure": Source(
+            "contact pressure", "Pa", contact_pressure, _least_stress, lambda body: body.state.is_touched
+        ),
+        "level": Source(
+            "level of the mesh", "", ElementValues(_level), applies=lambda body: isinstance(body.mesh, TetForest)
+        ),
     }
 
 
@@ -131,20 +148,9 @@ class Range:
     def __init__(self) -> None:
         self.highest = 0.0
 
-    def follow(self, largest: float) -> float:
-        """The upper end of the range, after values with this maximum."""
+    def follow(self, largest: float, least: float) -> float:
+        """The upper end of the range, after values with this maximum; not below ``least``."""
+        largest = max(largest, least)
         if largest > self.highest or largest < self.highest / TOO_WIDE:
             self.highest = round_limit(largest)
         return self.highest
-
-
-def colored(values: Values | None, highest: float, count: int) -> npt.NDArray[np.uint8]:
-    """Colours of values from zero to ``highest``, uint8 [V, 3]; without values, the colour of tissue.
-
-    Args:
-        values: [V].
-        count: V.
-    """
-    if values is None:
-        return np.tile(np.rint(255.0 * np.array(TISSUE)).astype(np.uint8), (count, 1))
-    return _TABLE[color_index(values, 0.0, highest)]

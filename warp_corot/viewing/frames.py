@@ -51,7 +51,7 @@ class Frame:
         number: The version of the surfaces' topology, which changes with the triangles.
         positions: The shown points of each body [m], float32 [V, 3].
         triangles: int32 [F, 3] for each body.
-        colors: uint8 [V, 3] for each body.
+        shades: The number of each point's colour in a table of 256, uint8 [V] for each body; None: without colours.
         highest: The value of the last colour.
         poses: Position [m] and quaternion (x, y, z, w) of each obstacle, float64 [7].
         time: Simulated time [s].
@@ -64,7 +64,7 @@ class Frame:
     number: int
     positions: Sequence[npt.NDArray[np.float32]]
     triangles: Sequence[npt.NDArray[np.int32]]
-    colors: Sequence[npt.NDArray[np.uint8]]
+    shades: Sequence[npt.NDArray[np.uint8] | None]
     highest: float
     poses: Sequence[Vector]
     time: float

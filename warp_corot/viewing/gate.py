@@ -1,4 +1,4 @@
-"""Access control: a check of every request to viser's server before anything is answered.
+"""Access control: a check of every request to the page's server before anything is answered.
 
 Any page in a browser can send requests. Without a token, a request must name this computer itself, so that no other
 name on the network can be made to mean it, and websockets must come from the page itself. With a token, every request
@@ -9,13 +9,9 @@ from __future__ import annotations
 
 import hmac
 import http
-import http.client
 import http.cookies
 import secrets
 import socket
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from ipaddress import ip_address
 from typing import Any
 from urllib.parse import parse_qs, quote, urlsplit
@@ -25,10 +21,6 @@ from warp_corot.inputs.checks import checked_count, shown
 
 #: Names by which a browser may address its own computer.
 LOOPBACK = ("localhost", "127.0.0.1", "::1")
-#: The longest time that the server may take to answer a test [s].
-PATIENCE = 5.0
-#: Servers are started one at a time, because a name of the module ``websockets`` is replaced meanwhile.
-_starting = threading.Lock()
 
 
 def is_loopback(host: str) -> bool:
@@ -115,53 +107,6 @@ class Gate:
     def _is_token(self, given: str) -> bool:
         assert self.token is not None
         return hmac.compare_digest(given.encode(errors="surrogatepass"), self.token.encode())
-
-
-@contextmanager
-def guarded(gate: Gate) -> Iterator[None]:
-    """Servers that start inside ask the gate about each request, for the page's files and for websockets."""
-    import websockets.asyncio.server as servers
-    from websockets.datastructures import Headers
-    from websockets.http11 import Response
-
-    with _starting:
-        serve = servers.serve
-
-        def asking(*args: Any, process_request: Any = None, **options: Any) -> Any:
-            def process(connection: Any, request: Any) -> Any:
-                refused = gate.refusal(request.path, request.headers)
-                if refused is None:
-                    return None if process_request is None else process_request(connection, request)
-                status, told = refused
-                body = b"" if told else b"The page is closed to this request; open the address with its token.\n"
-                headers = Headers(**{"Content-Type": "text/plain", "Content-Length": str(len(body)), **told})
-                return Response(status, status.phrase, headers, body)
-
-            return serve(*args, process_request=process, **options)
-
-        servers.serve = asking
-        try:
-            yield
-        finally:
-            servers.serve = serve
-
-
-def is_closed(gate: Gate, port: int) -> bool:
-    """Whether the server refuses the requests that the gate refuses: from elsewhere, or without the token."""
-    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(gate.host, gate.host)
-    upgrade = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13"}
-    upgrade["Sec-WebSocket-Key"] = "dGhlIHNhbXBsZSBub25jZQ=="
-    for headers in ({}, upgrade):
-        connection = http.client.HTTPConnection(host, port, timeout=PATIENCE)
-        try:
-            connection.request("GET", "/?token=", headers={"Host": "elsewhere.invalid", **headers})
-            if connection.getresponse().status != http.HTTPStatus.FORBIDDEN:
-                return False
-        except (OSError, http.client.HTTPException):
-            return False
-        finally:
-            connection.close()
-    return True
 
 
 def check_port(host: str, port: int) -> None:

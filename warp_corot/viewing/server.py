@@ -1,70 +1,209 @@
-"""viser's server, behind the gate and without its tunnel."""
+"""The web server of a page: its files, and a websocket for each visitor, both behind the gate.
+
+Messages to the browser are binary: the length of a header, the header as JSON, and arrays. Messages from it are JSON,
+or a picture that it was asked for.
+"""
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
-import io
-from typing import TYPE_CHECKING, Any
+import http
+import itertools
+import json
+import queue
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from importlib import resources
+from typing import Any
+
+import numpy.typing as npt
 
 from warp_corot.errors import InputError
 
-from .gate import Gate, check_port, guarded, is_closed
+from .gate import Gate, check_port
 
-if TYPE_CHECKING:
-    from viser import ViserServer
+#: The page's files, and their types.
+FILES = {
+    "index.html": "text/html",
+    "style.css": "text/css",
+    "page.js": "text/javascript",
+    "scene.js": "text/javascript",
+}
+#: The browser loads nothing from elsewhere.
+POLICY = "default-src 'self'; img-src 'self' data: blob:"
+#: The longest message of a browser, which is a picture [bytes].
+LONGEST = 1 << 24
+#: Frames on their way to a browser: while it draws one, the next is sent.
+AHEAD = 2
 
 
 def library() -> Any:
-    """The package viser.
+    """The package that speaks the protocol of websockets.
 
     Raises:
         InputError: It is not installed.
     """
     try:
-        import viser
+        import websockets.asyncio.server as servers
     except ImportError as error:
-        raise InputError(f'the page needs viser ({error}): pip install "warp-corot[view]"') from None
-    return viser
+        raise InputError(f'the page needs websockets ({error}): pip install "warp-corot[view]"') from None
+    return servers
 
 
-def open_server(gate: Gate, port: int, title: str) -> ViserServer:
-    """Start the server.
+def packed(header: dict[str, Any], *arrays: npt.NDArray[Any] | bytes) -> bytes:
+    """A message to a browser: a header's length, the header, and arrays, each of which begins at a multiple of four."""
+    text = json.dumps(header, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    parts = [len(text).to_bytes(4, "little"), text]
+    for array in arrays:
+        part = array if isinstance(array, bytes) else array.tobytes()
+        parts += [b"\0" * (-len(parts[-1]) % 4), part]
+    return b"".join(parts)
+
+
+class Visitor:
+    """A browser that has the page open.
+
+    Attributes:
+        number: Its number.
+        sent: What it knows already, by kind.
+    """
+
+    def __init__(self, number: int, socket: Any, loop: asyncio.AbstractEventLoop):
+        self.number, self.sent = number, dict[str, Any]()
+        self._socket, self._loop = socket, loop
+        self._credit = threading.BoundedSemaphore(AHEAD)
+        self._pictures: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+
+    def takes_frame(self) -> bool:
+        """Whether it has drawn enough of the last frames to get another one; it is then expected to get one."""
+        return self._credit.acquire(blocking=False)
+
+    def send(self, message: bytes) -> None:
+        """Send a message; may be called from any thread."""
+        with contextlib.suppress(RuntimeError):  # the server has ended
+            asyncio.run_coroutine_threadsafe(self._send(message), self._loop)
+
+    def drawn(self, width: int, height: int, patience: float) -> bytes:
+        """The picture that it shows now, as PNG.
+
+        Args:
+            width, height: Pixels.
+            patience: The longest time to wait [s].
+
+        Raises:
+            RuntimeError: The browser has left, or does not draw.
+        """
+        while not self._pictures.empty():
+            self._pictures.get()
+        self.send(packed({"kind": "draw", "width": width, "height": height}))
+        try:
+            return self._pictures.get(timeout=patience)
+        except queue.Empty:
+            raise RuntimeError("the browser does not draw; its tab must be visible") from None
+
+    def got(self, message: str | bytes) -> Any:
+        """The command in a message of the browser; None if there is none."""
+        if isinstance(message, bytes):
+            self._pictures.put(message)
+            return None
+        command = json.loads(message)
+        if command == {"do": "drawn"}:
+            self._credit.release()
+            return None
+        return command
+
+    async def _send(self, message: bytes) -> None:
+        with contextlib.suppress(Exception):  # it has left
+            await self._socket.send(message)
+
+
+class Server:
+    """The web server.
 
     Args:
         gate: Decides who may enter.
         port: The port, 0 for any free one.
-        title: The title of the page.
+        take: Called with each command and its visitor, on the server's thread.
+        left: Called with each visitor that has left, on the server's thread.
+
+    Attributes:
+        port: The port.
+        visitors: Who has the page open, by number.
 
     Raises:
-        InputError: viser is not installed, the port is taken, or this version of viser would not ask the gate.
+        InputError: websockets is not installed, or the port is taken.
     """
-    viser = library()
-    check_port(gate.host, port)
-    with guarded(gate), contextlib.redirect_stdout(io.StringIO()):
-        server = viser.ViserServer(host=gate.host, port=port, label=title, verbose=False)
-    bound = server.get_port()
-    try:
-        if port not in (0, bound):
-            raise InputError(f"port is {port}, which is taken; it must be free, or 0 for any")
-        if not is_closed(gate, bound):
-            raise InputError(f"viser {viser.__version__} does not ask who may enter; the page needs another version")
-        _without_tunnel(server)
-    except BaseException:
-        stop(server)
-        raise
-    return server
+
+    def __init__(self, gate: Gate, port: int, take: Callable[[Visitor, Any], None], left: Callable[[Visitor], None]):
+        self._library = library()
+        check_port(gate.host, port)
+        self._gate, self._take, self._left = gate, take, left
+        self.visitors: dict[int, Visitor] = {}
+        self._numbers = itertools.count()
+        folder = resources.files(__package__) / "page"
+        self._files = {name: (folder / name).read_bytes() for name in FILES}
+        self._loop, self._over = asyncio.new_event_loop(), asyncio.Event()
+        opened: Future[int] = Future()
+        self._thread = threading.Thread(target=self._run, args=(port, opened), name="warp_corot server", daemon=True)
+        self._thread.start()
+        self.port = opened.result()
+
+    def close(self) -> None:
+        """Stop, and send everyone away."""
+        with contextlib.suppress(RuntimeError):  # it has stopped already
+            self._loop.call_soon_threadsafe(self._over.set)
+        self._thread.join()
+
+    def _run(self, port: int, opened: Future[int]) -> None:
+        try:
+            self._loop.run_until_complete(self._serve(port, opened))
+        except OSError as error:
+            opened.set_exception(InputError(f"port {port} of {self._gate.host} cannot be opened ({error.strerror})"))
+        finally:
+            self._loop.close()
+
+    async def _serve(self, port: int, opened: Future[int]) -> None:
+        options = {"process_request": self._answer, "compression": None, "max_size": LONGEST}
+        host = self._gate.host.strip("[]")
+        async with self._library.serve(self._visit, host, port, close_timeout=1.0, **options) as server:
+            opened.set_result(next(iter(server.sockets)).getsockname()[1])
+            await self._over.wait()
+
+    def _answer(self, connection: Any, request: Any) -> Any:
+        """The answer to a request; None for a websocket that may be opened."""
+        refused = self._gate.refusal(request.path, request.headers)
+        if refused is not None:
+            status, told = refused
+            body = b"" if told else b"The page is closed to this request; open the address with its token.\n"
+            return _response(status, body, {"Content-Type": "text/plain", **told})
+        if (request.headers.get("Upgrade") or "").lower() == "websocket":
+            return None
+        name = request.path.partition("?")[0].strip("/") or "index.html"
+        if name not in self._files:
+            return _response(http.HTTPStatus.NOT_FOUND, b"There is no such file.\n", {"Content-Type": "text/plain"})
+        told = {"Content-Type": f"{FILES[name]}; charset=utf-8", "Content-Security-Policy": POLICY}
+        return _response(http.HTTPStatus.OK, self._files[name], {"Cache-Control": "no-cache", **told})
+
+    async def _visit(self, socket: Any) -> None:
+        visitor = Visitor(next(self._numbers), socket, self._loop)
+        self.visitors[visitor.number] = visitor
+        try:
+            async for message in socket:
+                with contextlib.suppress(ValueError):  # no JSON, or a frame that was not sent
+                    command = visitor.got(message)
+                    if command is not None:
+                        self._take(visitor, command)
+        finally:
+            del self.visitors[visitor.number]
+            self._left(visitor)
 
 
-def stop(server: ViserServer) -> None:
-    """Stop the server, quietly."""
-    with contextlib.redirect_stdout(io.StringIO()):
-        server.stop()
+def _response(status: http.HTTPStatus, body: bytes, told: dict[str, str]) -> Any:
+    from websockets.datastructures import Headers
+    from websockets.http11 import Response
 
-
-def _without_tunnel(server: ViserServer) -> None:
-    """Prevent visitors from publishing the page through a tunnel."""
-    from viser import _messages
-
-    server._connection.unregister_handler(_messages.ShareUrlRequest)
-    server.gui.configure_theme(show_logo=False, show_share_button=False)
-    server.gui.main_panel.dock_right()
+    headers = Headers(**{"Content-Length": str(len(body)), "X-Content-Type-Options": "nosniff", **told})
+    return Response(status, status.phrase, headers, body)

@@ -16,18 +16,20 @@ import numpy.typing as npt
 
 from warp_corot.contact.tool import Tool
 from warp_corot.errors import InputError, UnstableError
+from warp_corot.inputs.loading import CONTACT, load
+from warp_corot.io.pictures.colors import color_index
 from warp_corot.mesh.surfaces.bound import SurfaceMesh
 from warp_corot.simulation.remade import remade, tools_lent
 from warp_corot.simulation.simulation import Simulation
 
-from .colors import Range, Source, colored, sources
+from .colors import Range, Source, sources
 from .cutting import cut
 from .frames import Controls, Frame, Vector
 from .hands import HANDS, SpringHand
 from .implicit_springs import springs_of
 from .pacing import Pace
 from .shown import Shown, surfaces_of
-from .tools import ToolHand
+from .tools import ToolHand, new_tool
 
 
 class Session:
@@ -44,7 +46,7 @@ class Session:
         shown: The shown surfaces of each body.
         hands: The hands that hold something, by who moves them.
         note: A note for the person, or "".
-        sending: How long the last frame took to send [s]; the sender sets it.
+        tool: The name of the tool that the page has put into the scene, or "".
         busy: Whether something is being saved, so that the simulation must not be replaced.
     """
 
@@ -57,9 +59,10 @@ class Session:
         self.sim, self.controls, self.note, self.busy = sim, Controls(), "", False
         self._own = list(own or [None] * len(sim.bodies))
         self._made = made
+        self.tool, self._given = "", (sim.obstacles, None if sim.contact is None else sim.contact.options)
         self._commands: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self.hands: dict[Any, SpringHand | ToolHand] = {}
-        self.pace, self.sending = Pace(), 0.0
+        self.pace = Pace()
         self.number = 0
         self._versions: list[int] = []
         self._steps_asked = 0
@@ -122,6 +125,22 @@ class Session:
         self._close()
         self.sim = again
         self._open()
+
+    def use_tool(self, name: str, place: npt.ArrayLike = (0.0, 0.0, 0.0)) -> None:
+        """Put a tool of the page into the scene in place of the last one; "" takes that away. All hands let go.
+
+        Args:
+            name: A name in ``SHAPES``, or "".
+            place: Where it begins [m], [3], or near there, where it is clear of the bodies.
+
+        Raises:
+            InputError: As ``new_tool`` and ``switch``; then nothing has changed.
+        """
+        given, contact = self._given
+        points = np.concatenate([shown.positions for shown in self.shown])
+        added = [new_tool(name, self.size, self.up, place, points, self.sim.integrator.dt)] if name else []
+        self.switch(obstacles=[*given, *added], contact=contact)
+        self.tool = name
 
     def close(self) -> None:
         """Release everything and leave the simulation as it is."""
@@ -186,11 +205,19 @@ class Session:
             hand.release()
         self.hands.clear()
 
+    def prepare(self) -> None:
+        """Compile what frames, hands and the page's tools launch, several modules at a time."""
+        explicit = not self.sim.system.is_implicit
+        hands = "viewing.hands" if explicit else "viewing.implicit_hands"
+        contact = CONTACT if explicit and not self.sim.device.is_cuda else ()
+        load(["viewing.values", hands, *contact], self.sim.device)
+        self.sim.advance_steps(1)
+        self.frame()
+
     # --- time ------------------------------------------------------------------------------------------------------
 
-    def tick(self) -> Frame:
-        """Take commands, advance as far as a frame's time allows, and return the frame."""
-        started = time.perf_counter()
+    def advance(self) -> None:
+        """Take commands, and advance as far as a frame's time allows."""
         self.take_commands()
         before = self.sim.total_time
         stepping = -time.perf_counter()
@@ -204,11 +231,7 @@ class Session:
             self.controls = replace(self.controls, running=False)
         stepping += time.perf_counter()
         self._steps_asked = 0
-        frame = self.frame()
-        simulated = self.sim.total_time - before
-        # Sending counts as time of the frame; waiting for the next frame does not.
-        self.pace.took(simulated, stepping, time.perf_counter() - started - stepping + self.sending)
-        return frame
+        self.pace.took(self.sim.total_time - before, stepping)
 
     def frame(self) -> Frame:
         """The present frame."""
@@ -219,12 +242,14 @@ class Session:
         positions = [shown.read() for shown in self.shown]
         source = self.sources.get(self.controls.colors)
         values = [self._values(source, shown) for shown in self.shown]
-        highest = self._range.follow(max((float(v.max(initial=0.0)) for v in values if v is not None), default=0.0))
+        largest = max((float(v.max(initial=0.0)) for v in values if v is not None), default=0.0)
+        least = 0.0 if source is None else max(map(source.least, self.shown))
+        highest = self._range.follow(largest, least)
         return Frame(
             number=self.number,
             positions=positions,
             triangles=[shown.triangles for shown in self.shown],
-            colors=[colored(v, highest, len(p)) for v, p in zip(values, positions, strict=True)],
+            shades=[None if v is None else color_index(v, 0.0, highest).astype(np.uint8) for v in values],
             highest=highest,
             poses=[tool.present_pose[self.controls.world] for tool in self.tools],
             time=self.sim.time,
@@ -240,6 +265,14 @@ class Session:
     def size(self) -> float:
         """The longest side of the box around all bodies at rest [m]."""
         return float(np.ptp(self.bounds, axis=0).max())
+
+    @property
+    def up(self) -> Vector:
+        """The direction against gravity; without weight, the bodies' own upward axis. Float64 [3]."""
+        against = -np.asarray(self.sim.gravity, dtype=np.float64)
+        if not against.any():
+            against = np.eye(3)["XYZ".index(self.sim.bodies[0].mesh.up_axis)]
+        return against / np.linalg.norm(against)
 
     @property
     def bounds(self) -> Vector:

@@ -1,9 +1,9 @@
-"""Controls that continue the motion with another law, material or remeshing."""
+"""What the tissue of a page is, and others: laws, moduli, and tissues of the literature."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -11,69 +11,86 @@ from warp_corot.elasticity import MODELS, Corotated, EdgeStVK, MassSpring, Model
 from warp_corot.elasticity.dilatation import AUTO
 from warp_corot.materials.isotropic import Isotropic
 from warp_corot.mesh import TetForest
-from warp_corot.remesh.online import OnlineRemesh
-
-if TYPE_CHECKING:
-    from viser import ViserServer
-
-    from .session import Session
+from warp_corot.simulation.simulation import Simulation
 
 #: The name of the choice that gives every element its own rotation.
 OWN = "own"
 
 
-class Tissue:
-    """The folder of these controls. A button applies all choices at once.
+class Tissue(NamedTuple):
+    """A tissue that a visitor may choose.
 
-    Args:
-        server: viser's server.
-        session: The session of the page.
+    Attributes:
+        name: Its name.
+        young: Young's modulus [Pa].
+        density: [kg/m^3], of Mech. Mater. 44 (2012) 174, table 3.
+        source: The source of Young's modulus.
+        poisson: Poisson's ratio; all are nearly incompressible, and a larger one takes longer.
     """
 
-    def __init__(self, server: ViserServer, session: Session):
-        self._session, gui, sim = session, server.gui, session.sim
-        meshes = [body.mesh for body in sim.bodies]
-        material = sim.bodies[0].material
-        with gui.add_folder("tissue", expand_by_default=False):
-            law = next(name for name, kind in MODELS.items() if type(sim.models[0]) is kind)
-            self._law = gui.add_dropdown(
-                "law",
-                [name for name in MODELS if name == law or name not in ("prestressed", "prony")],
-                initial_value=law,
-            )
-            self._rotations = gui.add_dropdown(
-                "rotations", _levels(meshes, sim.models[0]), initial_value=_level_of(sim.models[0]), hint="corotated"
-            )
-            self._stiffness = gui.add_slider("stiffness ×", 0.1, 5.0, 0.1, 1.0, hint="over what it was at first")
-            self._poisson = gui.add_slider(
-                "Poisson's ratio", 0.0, 0.49, 0.01, _mean_poisson(material), disabled=type(material) is not Isotropic
-            )
-            self._remeshing = gui.add_checkbox(
-                "remeshing",
-                bool(sim.remeshing.every),
-                disabled=sim.worlds > 1 or not all(isinstance(mesh, TetForest) for mesh in meshes),
-            )
-            button = gui.add_button("switch", hint="hands let go, motion goes on")
-        self._options = OnlineRemesh()
-        self._then = self._values()
-        button.on_click(lambda _: session.ask(self._switch))
+    name: str
+    young: float
+    density: float
+    source: str
+    poisson: float = 0.45
 
-    def _values(self) -> tuple[Any, ...]:
-        return self._law.value, self._rotations.value, self._stiffness.value, self._poisson.value
 
-    def _switch(self) -> None:
-        """Called on the session's thread."""
-        sim, now = self._session.sim, self._values()
-        law, rotations, stiffness, poisson = self._then
-        models = None
-        if now[:2] != (law, rotations):
-            models = [model_of(now[0], now[1], sim.models[0])] * len(sim.bodies)
-        own = now[3] if now[3] != poisson else None
-        materials = [changed(body.material, now[2] / stiffness, own) for body in sim.bodies]
-        former = [None if each is None else each.options for each in sim.remeshing.changing]
-        remesh = [(each or self._options) if self._remeshing.value else None for each in former]
-        self._session.switch(models=models, materials=materials, remesh=remesh)
-        self._then = now
+_ARDA = "Arda et al., AJR 197 (2011) 532: shear waves"
+TISSUES = (
+    Tissue("brain", 1.9e3, 1040.0, "Budday et al., J. Mech. Behav. Biomed. 46 (2015) 318: white matter, indented"),
+    Tissue("fat", 3.25e3, 950.0, "Samani et al., Phys. Med. Biol. 52 (2007) 1565: of the breast, indented"),
+    Tissue("kidney", 5.0e3, 1050.0, f"{_ARDA} in the cortex"),
+    Tissue("liver", 5.5e3, 1060.0, "Roulot et al., J. Hepatol. 48 (2008) 606: transient elastography, 429 people"),
+    Tissue("muscle", 11.1e3, 1050.0, f"{_ARDA} in the gastrocnemius"),
+)
+
+
+def present(sim: Simulation) -> dict[str, Any]:
+    """The present tissue of the first body, by the names of ``switched``."""
+    material, model = sim.bodies[0].material, sim.models[0]
+    mean = material.isotropic
+    return {
+        "law": next(name for name, kind in MODELS.items() if type(model) is kind),
+        "rotations": _level_of(model),
+        "young": float(np.mean(mean.young)),
+        "poisson": float(np.mean(mean.poisson)),
+        "density": float(np.mean(material.density)),
+        "remesh": bool(sim.remeshing.every),
+    }
+
+
+def choices(sim: Simulation) -> dict[str, Any]:
+    """The laws and rotations that can be chosen, and whether Poisson's ratio and remeshing can be."""
+    meshes = [body.mesh for body in sim.bodies]
+    levels = [int(mesh.levels.max()) for mesh in meshes if isinstance(mesh, TetForest)]
+    are_forests = len(levels) == len(meshes)
+    now, names = present(sim), [OWN]
+    if are_forests:
+        names += ["auto", *map(str, range(min(levels)))]
+    return {
+        "laws": [name for name in MODELS if name == now["law"] or name not in ("prestressed", "prony")],
+        "rotations": list(dict.fromkeys([*names, now["rotations"]])),
+        "poisson": all(type(body.material) is Isotropic for body in sim.bodies),
+        "remesh": sim.worlds == 1 and are_forests,
+    }
+
+
+def switched(sim: Simulation, wanted: dict[str, Any]) -> dict[str, Any]:
+    """The models and materials of ``remade`` for a wanted tissue; what stays as it is is left out.
+
+    Args:
+        wanted: Values by the names of ``present``.
+    """
+    now, found = present(sim), dict[str, Any]()
+    changes = {name for name, value in now.items() if wanted.get(name, value) != value}
+    if changes & {"law", "rotations"}:
+        model = model_of(wanted["law"], wanted["rotations"], sim.models[0])
+        found["models"] = [model] * len(sim.bodies)
+    if changes & {"young", "poisson", "density"}:
+        poisson = wanted["poisson"] if "poisson" in changes else None
+        stiffer, heavier = wanted["young"] / now["young"], wanted["density"] / now["density"]
+        found["materials"] = [changed(body.material, stiffer, poisson, heavier) for body in sim.bodies]
+    return found
 
 
 def model_of(law: str, rotations: str, former: Model | None = None) -> Model:
@@ -94,22 +111,16 @@ def model_of(law: str, rotations: str, former: Model | None = None) -> Model:
     return kind(**options)
 
 
-def changed(material: Any, scale: float, poisson: float | None) -> Any:
-    """The material with its stiffness times a factor and, if it is isotropic and one is given, another Poisson's
-    ratio.
+def changed(material: Any, stiffer: float, poisson: float | None, heavier: float = 1.0) -> Any:
+    """The material with its stiffness and its density times factors and, if it is isotropic and one is given, another
+    Poisson's ratio.
     """
     stiff = [name for name in vars(material) if name.startswith(("young", "shear", "k1"))]
-    values = {name: getattr(material, name) * scale for name in stiff}
+    values = {name: getattr(material, name) * stiffer for name in stiff}
+    values["density"] = material.density * heavier
     if poisson is not None and type(material) is Isotropic:
         values["poisson"] = poisson
     return replace(material, **values)
-
-
-def _levels(meshes: list[Any], model: Model) -> list[str]:
-    names = [OWN]
-    if all(isinstance(mesh, TetForest) for mesh in meshes):
-        names += ["auto", *(str(level) for level in range(min(int(mesh.levels.max()) for mesh in meshes)))]
-    return list(dict.fromkeys([*names, _level_of(model)]))
 
 
 def _level_of(model: Model) -> str:
@@ -124,7 +135,3 @@ def _number(text: str) -> int | float | str:
         except ValueError:
             continue
     return text
-
-
-def _mean_poisson(material: Any) -> float:
-    return float(np.clip(np.round(np.mean(material.isotropic.poisson), 2), 0.0, 0.49))

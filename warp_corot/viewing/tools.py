@@ -1,8 +1,8 @@
-"""The hand that moves a rigid tool of the simulation, and may grasp tissue with it."""
+"""The hand that moves a rigid tool of the simulation, and may grasp tissue with it; the tools that the page offers."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -10,10 +10,49 @@ import numpy.typing as npt
 
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.grasp import Grasp
+from warp_corot.contact.obstacles import LARGEST_SHARE
+from warp_corot.contact.shapes import Capsule, Shape, Sphere, turn_from_z
 from warp_corot.contact.tool import Tool
 from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_choice, checked_vector
 
 Vector = npt.NDArray[np.float64]
+
+#: The shapes of the tools that a visitor may put into the scene, for a size of the bodies [m].
+SHAPES: dict[str, Callable[..., Shape]] = {
+    "ball": lambda size, **pose: Sphere(radius=0.1 * size, **pose),
+    "rod": lambda size, **pose: Capsule(radius=0.04 * size, length=0.5 * size, **pose),
+}
+#: The highest speed of these tools over the size of the bodies [1/s].
+BRISK = 5.0
+
+
+def new_tool(
+    name: str, size: float, up: Vector, place: npt.ArrayLike, bodies: npt.NDArray[np.floating], dt: float | None
+) -> Tool:
+    """A tool that the page offers.
+
+    Args:
+        name: A name in ``SHAPES``.
+        size: The size of the bodies [m].
+        up: The direction in which a rod points, [3].
+        place: Its first place [m], [3]; it is moved away until it is clear of the box around the bodies.
+        bodies: Points of the bodies [m], [V, 3].
+        dt: The length of steps if it is given [s]; the tool is slow enough for it.
+
+    Raises:
+        InputError: There is no such tool, or the place is not three finite numbers.
+    """
+    checked_choice(name, "name", SHAPES)
+    there = checked_vector(place, "place")
+    away = there - bodies.mean(axis=0) + 1e-3 * size
+    reach = 1.1 * SHAPES[name](size).reach
+    low, high = bodies.min(axis=0) - reach, bodies.max(axis=0) + reach
+    while (low < there).all() and (there < high).all():
+        there = there + 0.1 * size * away / np.linalg.norm(away)
+    shape = SHAPES[name](size, position=there, quaternion=turn_from_z(up))
+    speed = BRISK * size
+    return Tool(shape, speed=speed if dt is None else min(speed, 0.99 * LARGEST_SHARE * shape.thickness / dt))
 
 
 class ToolHand:
@@ -56,7 +95,9 @@ class ToolHand:
             if len(near):
                 self.grasps.append(Grasp(body, near, tool=self.tool))
         if not self.grasps:
-            raise InputError(f"no tissue is within {1e3 * reach:.3g} mm of the tool, which grasps nothing")
+            raise InputError(
+                f"no tissue is within {1e3 * reach:.3g} mm of the tool: bring it there, then press on it again"
+            )
 
     def move(self, motion: Vector) -> None:
         """Move to the mouse's present distance from where it was pressed [m], [3]."""

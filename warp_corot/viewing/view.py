@@ -14,15 +14,15 @@ from warp_corot.inputs.checks import checked_flag
 from warp_corot.inputs.checks import shown as as_shown
 from warp_corot.simulation.simulation import Simulation
 
+from .commands import Commands
 from .frames import Frame
-from .gate import Gate, is_loopback, new_token
-from .panel import Panel
+from .gate import Gate, check_port, is_loopback, new_token
+from .messages import frame_told, page_told, topology
 from .saving import Saving
-from .scene import Scene
-from .server import open_server, stop
+from .server import Server, Visitor, library
 from .session import Session
 
-#: The default port of the page: viser's own.
+#: The default port of the page.
 PORT = 8080
 
 
@@ -66,19 +66,19 @@ class View:
         if not isinstance(sim, Simulation):
             raise InputError(f"sim is {as_shown(sim)}; it must be a Simulation, as Simulation(body) makes one")
         gate = Gate(host, token if token is not None or is_loopback(host) else new_token())
-        self._server = open_server(gate, port, title)
-        self.port = self._server.get_port()
-        self.address = gate.address(self.port)
-        self._lock, self._over = threading.RLock(), threading.Event()
+        library()
+        check_port(gate.host, port)
+        self._lock, self._over, self._title = threading.RLock(), threading.Event(), title
         self._thread: threading.Thread | None = None
-        try:
-            self.session = Session(sim, own, made)
-            self._scene, self._panel = Scene(self._server, self.session), Panel(self._server, self.session)
-            Saving(self._server, self.session, lambda: self._send(self.session.frame()), run_file)
-            self._show()
-        except BaseException:
-            stop(self._server)
-            raise
+        self._is_closed = False
+        self.session = Session(sim, own, made)
+        self._saving = Saving(self.session, lambda: self._send(self.session.frame()), run_file)
+        # Whoever comes finds a page that moves: all kernels are compiled.
+        self.session.prepare()
+        commands = Commands(self.session, self._saving)
+        self._server = Server(gate, port, commands.take, commands.left)
+        self.port = self._server.port
+        self.address = gate.address(self.port)
 
     @property
     def sim(self) -> Simulation:
@@ -117,19 +117,30 @@ class View:
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join()
         with self._lock:
-            if self._server is not None:
+            if not self._is_closed:
+                self._is_closed = True
                 self.session.close()
-                stop(self._server)
-                self._server = None
+                self._server.close()
 
     def _show(self) -> None:
-        self._send(self.session.tick())
-
-    def _send(self, frame: Frame) -> None:
+        self.session.advance()
         started = time.perf_counter()
-        self._scene.show(frame, colored=bool(self.session.controls.colors))
-        self._panel.tell(frame, started)
-        self.session.sending = time.perf_counter() - started
+        waiting = [each for each in list(self._server.visitors.values()) if each.takes_frame()]
+        if waiting:
+            self._send(self.session.frame(), waiting)
+            self.session.pace.showed(time.perf_counter() - started)
+
+    def _send(self, frame: Frame, visitors: Sequence[Visitor] | None = None) -> None:
+        """Send a frame to visitors, and what they do not know yet; None: to all, whether they wait for it or not."""
+        told = page_told(self.session, self._title, self._saving.kinds)
+        drawn = frame_told(self.session, frame)
+        for visitor in list(self._server.visitors.values()) if visitors is None else visitors:
+            if visitor.sent.get("page") != told:
+                visitor.send(told)
+            if visitor.sent.get("number") != frame.number:
+                visitor.send(topology(self.session, frame))
+            visitor.sent.update(page=told, number=frame.number)
+            visitor.send(drawn)
 
     def __enter__(self) -> View:
         return self
@@ -173,7 +184,7 @@ def view(
         The page; ``close`` ends it.
 
     Raises:
-        InputError: viser is not installed, the port is taken, or an argument is out of its range.
+        InputError: websockets is not installed, the port is taken, or an argument is out of its range.
     """
     if wait is not None:
         checked_flag(wait, "wait")

@@ -18,7 +18,7 @@ def add_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParse
         "view",
         help=COMMANDS["view"],
         description="Opens a page in which a soft body moves and can be dragged, pressed, held and cut with the mouse. "
-        'Needs viser: pip install "warp-corot[view]".',
+        'Needs websockets: pip install "warp-corot[view]".',
         epilog="""examples:
   warp-corot view warp:bear
   warp-corot view liver.stl --unit mm --young 5kPa --tets 20000
