@@ -1,7 +1,7 @@
-"""How many frames a second the page's server makes, and what takes the time.
+"""How many frames a second the page's server makes, how fast time passes, and what takes the time.
 
 ``python benchmarks/viewing.py [INPUT] [OPTION ...]`` takes the input and options of ``warp-corot view``. A visitor in
-another process, without a screen, receives everything that is sent. The script needs the extra ``view``.
+another process, without a screen, receives everything and draws nothing. The script needs the extra ``view``.
 """
 
 from __future__ import annotations
@@ -12,19 +12,23 @@ import time
 
 from warp_corot.cli import make_parser
 from warp_corot.cli.prepared import prepared
+from warp_corot.viewing.messages import frame_told
 from warp_corot.viewing.view import View
 
 #: Duration of a measurement, and of the time before it [s].
 SECONDS, BEFORE = 10.0, 3.0
 
 
-def visitor(address: str, protocol: str, count) -> None:
-    """Receive everything that a page sends, and count the bytes."""
+def visitor(address: str, count) -> None:
+    """Receive everything that a page sends, say of each frame that it is drawn, and count the bytes."""
     from websockets.sync.client import connect
 
-    with connect(address, subprotocols=[protocol], max_size=None, compression=None) as socket:
+    with connect(address, max_size=None, compression=None) as socket:
         while True:
-            count.value += len(socket.recv())
+            message = socket.recv()
+            count.value += len(message)
+            if b'"kind":"frame"' in message[4:24]:
+                socket.send('{"do": "drawn"}')
 
 
 def timed(work, seconds: float) -> float:
@@ -37,17 +41,14 @@ def timed(work, seconds: float) -> float:
 
 
 def main() -> None:
-    import viser
-
     given = sys.argv[1:] or ["warp:bunny", "--tets", "20000"]
     args = make_parser().parse_args(["view", *given])
     ready = prepared([args])
     own = [body.subject.skin or body.subject.surface for body in ready.bodies]
     count = multiprocessing.get_context("spawn").Value("q", 0)
     with View(ready.sim, port=0, own=own) as page:
-        address, protocol = f"ws://127.0.0.1:{page.port}/", f"viser-v{viser.__version__}"
         process = multiprocessing.get_context("spawn").Process(
-            target=visitor, args=(address, protocol, count), daemon=True
+            target=visitor, args=(f"ws://127.0.0.1:{page.port}/", count), daemon=True
         )
         process.start()
         session, shown = page.session, page.session.shown
@@ -79,7 +80,7 @@ def main() -> None:
             session.change(running=False)
             print(f"    reading {timed(session.frame, 2.0):.2f} ms, ", end="")
             frame = session.frame()
-            print(f"sending {timed(lambda f=frame, n=name: page._scene.show(f, bool(n)), 2.0):.2f} ms a frame")
+            print(f"packing {timed(lambda f=frame: frame_told(session, f), 2.0):.2f} ms a frame")
             session.change(running=True)
         process.kill()
 

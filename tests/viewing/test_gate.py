@@ -145,6 +145,20 @@ def test_the_server_gives_out_the_page_s_files_only(opened):
         assert answered(page, path)[0] == 404
 
 
+def test_visitors_that_break_off_leave_no_trace(opened, capfd):
+    from websockets.sync.client import connect
+
+    page = opened()
+    with socket.create_connection(("127.0.0.1", page.port)) as broken:
+        broken.sendall(b"no HTTP\r\n\r\n")
+    visitor = connect(page.address.replace("http", "ws"))
+    until(lambda: page._server.visitors, "the visitor is there")
+    visitor.socket.shutdown(socket.SHUT_RDWR)
+    until(lambda: not page._server.visitors, "the visitor has left")
+    page.close()
+    assert capfd.readouterr().err == ""
+
+
 def test_messages_that_ask_for_nothing_do_no_harm(opened):
     from websockets.sync.client import connect
 

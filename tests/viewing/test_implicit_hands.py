@@ -74,7 +74,7 @@ def test_a_visitor_drags_on_the_page():
 
 
 def test_a_page_opens():
-    pytest.importorskip("viser")
+    pytest.importorskip("websockets")
     page = wc.view(block(integrator=EULER), port=0, wait=False)
     assert page.sim.integrator is EULER
     page.close()

@@ -16,6 +16,7 @@ from .frames import Frame
 from .server import packed
 from .session import Session
 from .tissue import TISSUES, choices, present
+from .tools import ToolHand
 
 #: The table of the colours, as one word of hexadecimal digits.
 _COLORS = np.rint(255.0 * stress_colors()).astype(np.uint8).tobytes().hex()
@@ -79,7 +80,12 @@ def topology(session: Session, frame: Frame) -> bytes:
 
 def frame_told(session: Session, frame: Frame) -> bytes:
     """What changes from frame to frame: 13 bytes a point."""
-    hands = [{"place": frame.ends[owner][0].tolist(), "force": force.tolist()} for owner, force in frame.forces.items()]
+    # Tools that nobody drags need no mark.
+    hands = [
+        {"place": frame.ends[owner][0].tolist(), "force": force.tolist(), "dragged": isinstance(owner, int)}
+        for owner, force in frame.forces.items()
+        if isinstance(owner, int) or not isinstance(session.hands[owner], ToolHand)
+    ]
     source = session.sources.get(session.controls.colors)
     header = {
         "kind": "frame",
@@ -88,6 +94,7 @@ def frame_told(session: Session, frame: Frame) -> bytes:
         "slow": bool(frame.slow),
         "highest": frame.highest if source is not None else 0.0,
         "shaded": [shades is not None for shades in frame.shades],
+        "force": float(np.linalg.norm(sum(frame.forces.values(), np.zeros(3)))),
         "hands": hands,
         "poses": [pose.tolist() for pose in frame.poses],
     }

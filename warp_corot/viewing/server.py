@@ -11,6 +11,7 @@ import contextlib
 import http
 import itertools
 import json
+import logging
 import queue
 import threading
 from collections.abc import Callable
@@ -166,7 +167,9 @@ class Server:
             self._loop.close()
 
     async def _serve(self, port: int, opened: Future[int]) -> None:
-        options = {"process_request": self._answer, "compression": None, "max_size": LONGEST}
+        quiet = logging.getLogger(__name__)
+        quiet.addHandler(logging.NullHandler())  # else visitors that break off are reported on stderr
+        options = {"process_request": self._answer, "compression": None, "max_size": LONGEST, "logger": quiet}
         host = self._gate.host.strip("[]")
         async with self._library.serve(self._visit, host, port, close_timeout=1.0, **options) as server:
             opened.set_result(next(iter(server.sockets)).getsockname()[1])
@@ -188,17 +191,18 @@ class Server:
         return _response(http.HTTPStatus.OK, self._files[name], {"Cache-Control": "no-cache", **told})
 
     async def _visit(self, socket: Any) -> None:
+        from websockets.exceptions import ConnectionClosed
+
         visitor = Visitor(next(self._numbers), socket, self._loop)
         self.visitors[visitor.number] = visitor
-        try:
+        with contextlib.suppress(ConnectionClosed):
             async for message in socket:
                 with contextlib.suppress(ValueError):  # no JSON, or a frame that was not sent
                     command = visitor.got(message)
                     if command is not None:
                         self._take(visitor, command)
-        finally:
-            del self.visitors[visitor.number]
-            self._left(visitor)
+        del self.visitors[visitor.number]
+        self._left(visitor)
 
 
 def _response(status: http.HTTPStatus, body: bytes, told: dict[str, str]) -> Any:

@@ -227,7 +227,7 @@ class Session:
             elif self._steps_asked:
                 self.sim.advance_steps(self._steps_asked)
         except UnstableError as error:
-            self.note = f"{error}; the simulation is paused, and reset goes back to the beginning"
+            self.note = f"{error}; the simulation is paused, and 'Start again' goes back to the beginning"
             self.controls = replace(self.controls, running=False)
         stepping += time.perf_counter()
         self._steps_asked = 0

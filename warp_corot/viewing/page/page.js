@@ -4,7 +4,7 @@ import { Scene, add } from './scene.js';
 const $ = id => document.getElementById(id), panel = $('panel');
 const HINTS = {
   'drag,': 'Drag the body to pull it', 'press,': 'Press on the body and move the mouse away to push in', 'grasp,': 'Drag the body; it stays where you leave it',
-  'drag,ball': 'Drag the ball against the body', 'drag,rod': 'Drag the rod against the body', 'grasp,ball': 'Drag the ball to the body, then press on it again to grip',
+  'drag,ball': 'Drag the ball against the body', 'drag,rod': 'Drag the rod against the body', 'grasp,ball': 'Bring the ball to the body, then press on it again to grip',
 };
 const WINDOW = 10;  // seconds in the graph
 const NAMES = { stress: 'stress', displacement: 'displacement', 'contact pressure': 'contact pressure', level: 'mesh level' };
@@ -61,9 +61,8 @@ const TOLD = {
     });
     frame = header;
     scene.setFrame(header, points, shades);
-    const force = header.hands.reduce((sum, hand) => add(sum, hand.force), [0, 0, 0]);
     if (samples.length && header.time < samples.at(-1)[0]) samples.length = 0;
-    if (!samples.length || header.time > samples.at(-1)[0]) samples.push([header.time, Math.hypot(...force)]);
+    if (!samples.length || header.time > samples.at(-1)[0]) samples.push([header.time, header.force]);
     while (samples[0][0] < header.time - WINDOW) samples.shift();
     waiting += 1;
     if (!fitted) { fitted = true; fit(); }
@@ -106,14 +105,14 @@ function fit() {
 function showArrows() {
   const svg = $('arrows');
   svg.querySelectorAll(':scope > :not(defs)').forEach(each => each.remove());
-  for (const { place, force } of frame.hands) {
-    const size = Math.hypot(...force), long = page.size * (0.06 + 0.2 * size / highest()) / size;
+  for (const { place, force, dragged } of frame.hands) {
+    const size = Math.hypot(...force), long = page.size * (0.04 + 0.1 * size / highest()) / size;
     const a = scene.project(place), b = size ? scene.project(add(place, force, long)) : a;
     const mark = (name, values) => { const made = document.createElementNS(svg.namespaceURI, name); Object.entries(values).forEach(([key, value]) => made.setAttribute(key, value)); svg.append(made); return made; };
     mark('circle', { cx: a[0], cy: a[1], r: 4 });
-    if (!size) continue;
+    if (!size || !dragged) continue;
     mark('line', { x1: a[0], y1: a[1], x2: b[0], y2: b[1], 'marker-end': 'url(#head)' });
-    mark('text', { x: b[0] + 10, y: b[1] - 8 }).textContent = withUnit(size, 'N');
+    mark('text', { x: Math.max(b[0] + 10, 10), y: Math.max(b[1] - 8, 16) }).textContent = withUnit(size, 'N');
   }
 }
 
@@ -156,12 +155,12 @@ function drawBar() {
 
 // The upper end of the forces in the graph; a force that would hardly be felt is no news.
 function highest() {
-  const most = Math.max(...samples.map(s => s[1]), 1e-5 * page.tissue.young * page.size ** 2), power = 10 ** Math.floor(Math.log10(most));
+  const most = Math.max(...samples.map(s => s[1]), 1e-5 * page.tissue.young * page.size ** 2, 1e-3), power = 10 ** Math.floor(Math.log10(most));
   return [1, 2, 5, 10].find(step => step * power >= most * 0.999) * power;
 }
 
 function showGraph() {
-  const canvas = $('curve'), ratio = devicePixelRatio, width = 250, height = 104, left = 38, bottom = 30, top = 8, most = highest();
+  const canvas = $('curve'), ratio = devicePixelRatio, width = 250, height = 104, left = 44, bottom = 30, top = 8, most = highest();
   if (canvas.width !== width * ratio) { canvas.width = width * ratio; canvas.height = height * ratio; }
   const paint = canvas.getContext('2d'), last = samples.length ? samples.at(-1)[0] : 0, first = Math.max(last - WINDOW, 0);
   const [size, unit] = scaled(most, 'N'), x = t => left + (t - first) / WINDOW * (width - left - 8), y = f => height - bottom - f / most * (height - bottom - top);
@@ -178,7 +177,7 @@ function showGraph() {
   for (let t = Math.ceil(first / 2) * 2; t <= first + WINDOW; t += 2) { paint.moveTo(x(t), y(0)); paint.lineTo(x(t), y(0) + 4); paint.fillText(t, x(t), y(0) + 5); }
   paint.stroke();
   paint.fillText('time [s]', (left + width) / 2, height - 12);
-  paint.save(); paint.translate(5, (height - bottom) / 2 + 4); paint.rotate(-Math.PI / 2); paint.textBaseline = 'middle'; paint.fillText(`force [${unit}]`, 0, 0); paint.restore();
+  paint.save(); paint.translate(6, (height - bottom) / 2 + 4); paint.rotate(-Math.PI / 2); paint.textBaseline = 'middle'; paint.fillText(`force [${unit}]`, 0, 0); paint.restore();
   paint.strokeStyle = '#1458c8'; paint.lineWidth = 2;
   paint.beginPath();
   samples.forEach(([t, f], k) => (k ? paint.lineTo : paint.moveTo).call(paint, x(t), y(f)));
@@ -199,7 +198,7 @@ function showPage() {
   const { controls, tissue, choices } = page, mode = `${controls.hand},${page.tool}`;
   $('title').textContent = page.title;
   $('elements').textContent = `${page.elements.toLocaleString('en')} tetrahedra`;
-  $('hint').textContent = `${HINTS[mode] || HINTS['drag,']} · drag beside it to turn the view · wheel: zoom · right button: move · double click: fit`;
+  $('hint').textContent = `${HINTS[mode] || HINTS['drag,']} · drag beside it to turn · wheel: zoom · right button: move · double click: fit`;
   const hand = panel.querySelector(`[name=hand][value="${mode}"]`);
   if (hand) hand.checked = true;
   for (const name of ['radius', 'strength', 'speed']) if (document.activeElement !== panel[name]) setRange(panel[name], controls[name]);

@@ -112,14 +112,12 @@ const turnBy = (q, v) => add(v, cross(q, add(cross(q, v), v, q[3])), 2);
 export class Scene {
   constructor(canvas) {
     this.canvas = canvas;
-    const options = { alpha: false, stencil: true, antialias: false, preserveDrawingBuffer: false };
-    let gl = canvas.getContext('webgl2', options);
-    if (!gl) throw new Error('this browser has no WebGL 2, which the page needs to draw');
-    this.gl = gl;
-    // Without a graphics card, every pixel takes the time of the simulation.
-    const info = gl.getExtension('WEBGL_debug_renderer_info');
-    const renderer = gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
-    this.isSoftware = /swiftshader|llvmpipe|software/i.test(renderer);
+    const probe = document.createElement('canvas').getContext('webgl2');
+    if (!probe) throw new Error('This browser has no WebGL 2, which the page needs to draw.');
+    // Without a graphics card, every pixel takes time from the simulation.
+    const info = probe.getExtension('WEBGL_debug_renderer_info');
+    this.isSoftware = /swiftshader|llvmpipe|software/i.test(probe.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : probe.RENDERER));
+    const gl = this.gl = canvas.getContext('webgl2', { alpha: false, stencil: true, antialias: !this.isSoftware });
     this.solid = this.program(SOLID, LIT);
     this.plane = this.program(PLANE, FADING);
     this.colors = gl.createTexture();
