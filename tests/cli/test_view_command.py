@@ -120,11 +120,13 @@ def test_the_run_file_has_the_state_of_the_page(folder):
     options = [body.args]
     stiffer = wc.Isotropic(young=1e3, poisson=0.3, density=10.0)
     sim = remade(ready.sim, models=[wc.StVenantKirchhoff()], materials=[stiffer], remesh=[wc.OnlineRemesh()])
+    light = remade(ready.sim, gravity=(0.0, 0.0, 0.0))
     text = run_text(options, sim)
     told = tomllib.loads(text.decode())
     assert told["model"] == "stvk"
     assert told["young"] == 1e3
-    assert told["poisson"] == 0.3
+    assert (told["poisson"], told["density"]) == (0.3, 10.0)
+    assert tomllib.loads(run_text(options, light).decode())["gravity"] == [0.0, 0.0, 0.0]
     assert told["remesh"] is True
     assert told["gravity"] == [0.0, 0.0, -1.0]
     (folder / "run.toml").write_bytes(text)

@@ -247,8 +247,12 @@ def test_a_tool_of_the_page_leaves_those_of_the_user_where_they_are():
 def test_tissues_are_those_of_their_sources():
     page = Session(block())
     liver = next(each for each in TISSUES if each.name == "liver")
-    page.switch(**switched(page.sim, present(page.sim) | {"young": liver.young, "density": liver.density}))
+    page.switch(**switched(page.sim, present(page.sim) | {"young": liver.young, "density": liver.density}, (0, 0, 0)))
     material = page.sim.body.material
     assert (material.young, material.density) == (pytest.approx(5.5e3), pytest.approx(1060.0))
     assert material.poisson == pytest.approx(0.4)
-    assert switched(page.sim, present(page.sim)) == {}
+    assert switched(page.sim, present(page.sim), (0, 0, 0)) == {}
+    assert not present(page.sim)["weight"]
+    page.switch(**switched(page.sim, present(page.sim) | {"weight": True}, (0.0, 0.0, -9.81)))
+    page.sim.advance(0.1)
+    assert page.sim.body.displacements.numpy()[:, 2].min() < -1e-4

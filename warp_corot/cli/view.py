@@ -97,9 +97,12 @@ def run_text(asked: Sequence[argparse.Namespace], sim: Simulation) -> bytes:
         now.remesh = remesh is not None
         if not now.remesh:
             now.refine_above = now.simplify_below = now.remesh_levels = now.remesh_every = now.capacity = None
+        if not any(sim.gravity):
+            now.gravity = [0.0, 0.0, 0.0]
         material = sim.bodies[0].material
         if len(sim.bodies) == 1 and type(material) is Isotropic and np.ndim(material.young) == 0:
             now.young, now.poisson = float(material.young), float(material.poisson)
+            now.density = float(np.mean(material.density))
         if os.path.exists(now.input):
             now.input = os.path.abspath(now.input)
         found.append(now)

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
@@ -30,6 +31,7 @@ def remade(
     grasps: Sequence[Grasp] | None = None,
     obstacles: Sequence[Obstacle] | None = None,
     contact: Contact | None = None,
+    gravity: npt.ArrayLike | None = None,
 ) -> Simulation:
     """A new simulation that continues this one: new bodies with the present meshes, states, loads, supports and
     motions, at the same time. The given simulation is not changed, and must not be stepped any further.
@@ -44,6 +46,7 @@ def remade(
         grasps: The grasps that go on; None: all.
         obstacles: The obstacles from now on; None: the present ones, with their contact.
         contact: The options of contact with them.
+        gravity: [m/s^2]; None: the present one.
 
     Raises:
         InputError: A body is remeshed and follows keyframes; or as ``Simulation``. The given simulation is unchanged.
@@ -54,7 +57,7 @@ def remade(
             bodies,
             model=sim.models if models is None else models,
             integrator=sim.integrator,
-            gravity=sim.gravity,
+            gravity=sim.gravity if gravity is None else gravity,
             deterministic=sim.deterministic,
             remesh=remesh if remesh is not None and any(remesh) else None,
             obstacles=sim.obstacles if obstacles is None else obstacles,

@@ -15,7 +15,7 @@ from .hands import HANDS
 from .saving import Saving
 from .server import Visitor
 from .session import Session
-from .tissue import choices, present, switched
+from .tissue import choices, collapses, present, switched
 
 Command = Callable[[], None]
 
@@ -109,11 +109,22 @@ class Commands:
             "poisson": partial(_between, 0.0, 0.499),
             "density": partial(_between, 1.0, 1e5, unit="kg/m^3"),
             "remesh": checked_flag,
+            "weight": checked_flag,
         }
-        wanted = present(sim) | {name: checks[name](value, name) for name, value in what.items()}
+        now = present(sim)
+        wanted = now | {name: checks[name](value, name) for name, value in what.items()}
+        gravity, size = session.gravity, session.size
+        falls = "weight" not in what and collapses(wanted, gravity, size) > collapses(now, gravity, size)
+        wanted["weight"] &= not falls
         former = [None if each is None else each.options for each in sim.remeshing.changing]
         remesh = [(each or self._options) if wanted["remesh"] else None for each in former]
-        return lambda: session.switch(**switched(sim, wanted), remesh=remesh)
+
+        def switch() -> None:
+            session.switch(**switched(sim, wanted, gravity), remesh=remesh)
+            if falls:
+                session.note = "So soft a body of this size would collapse under its weight: Weight is off now."
+
+        return switch
 
     def _save(self, visitor: Visitor, asked: dict[str, Any]) -> Command:
         seconds = _between(0.1, 600.0, asked["seconds"], "seconds", "s")

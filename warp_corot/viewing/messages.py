@@ -50,7 +50,7 @@ def page_told(session: Session, title: str, saves: Collection[str]) -> bytes:
             "surfaces": list(dict.fromkeys(name for each in session.surfaces for name in each)),
             "worlds": sim.worlds,
             "tissue": present(sim),
-            "choices": choices(sim),
+            "choices": {**choices(sim), "weight": any(session.gravity)},
             "tissues": [each._asdict() for each in TISSUES],
             "saves": list(saves),
             "busy": session.busy,

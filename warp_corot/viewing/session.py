@@ -46,6 +46,7 @@ class Session:
         shown: The shown surfaces of each body.
         hands: The hands that hold something, by who moves them.
         note: A note for the person, or "".
+        gravity: Gravity at the beginning [m/s^2], [3].
         tool: The name of the tool that the page has put into the scene, or "".
         busy: Whether something is being saved, so that the simulation must not be replaced.
     """
@@ -59,7 +60,8 @@ class Session:
         self.sim, self.controls, self.note, self.busy = sim, Controls(), "", False
         self._own = list(own or [None] * len(sim.bodies))
         self._made = made
-        self.tool, self._given = "", (sim.obstacles, None if sim.contact is None else sim.contact.options)
+        self.tool, self.gravity = "", sim.gravity
+        self._given = sim.obstacles, None if sim.contact is None else sim.contact.options
         self._commands: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self.hands: dict[Any, SpringHand | ToolHand] = {}
         self.pace = Pace()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -13,6 +14,8 @@ from warp_corot.materials.isotropic import Isotropic
 from warp_corot.mesh import TetForest
 from warp_corot.simulation.simulation import Simulation
 
+#: Weight over stiffness, density g L / E, from which on a body of length L hardly keeps its shape.
+COLLAPSING = 0.15
 #: The name of the choice that gives every element its own rotation.
 OWN = "own"
 
@@ -56,6 +59,7 @@ def present(sim: Simulation) -> dict[str, Any]:
         "poisson": float(np.mean(mean.poisson)),
         "density": float(np.mean(material.density)),
         "remesh": bool(sim.remeshing.every),
+        "weight": any(sim.gravity),
     }
 
 
@@ -75,22 +79,31 @@ def choices(sim: Simulation) -> dict[str, Any]:
     }
 
 
-def switched(sim: Simulation, wanted: dict[str, Any]) -> dict[str, Any]:
-    """The models and materials of ``remade`` for a wanted tissue; what stays as it is is left out.
+def switched(sim: Simulation, wanted: dict[str, Any], gravity: Sequence[float]) -> dict[str, Any]:
+    """The models, materials and gravity of ``remade`` for a wanted tissue; what stays as it is is left out.
 
     Args:
         wanted: Values by the names of ``present``.
+        gravity: Gravity of bodies with weight [m/s^2], [3].
     """
     now, found = present(sim), dict[str, Any]()
     changes = {name for name, value in now.items() if wanted.get(name, value) != value}
     if changes & {"law", "rotations"}:
         model = model_of(wanted["law"], wanted["rotations"], sim.models[0])
         found["models"] = [model] * len(sim.bodies)
+    if "weight" in changes:
+        found["gravity"] = gravity if wanted["weight"] else (0.0, 0.0, 0.0)
     if changes & {"young", "poisson", "density"}:
         poisson = wanted["poisson"] if "poisson" in changes else None
         stiffer, heavier = wanted["young"] / now["young"], wanted["density"] / now["density"]
         found["materials"] = [changed(body.material, stiffer, poisson, heavier) for body in sim.bodies]
     return found
+
+
+def collapses(tissue: dict[str, Any], gravity: Sequence[float], size: float) -> bool:
+    """Whether bodies of a size [m] would hardly keep their shape under gravity [m/s^2]."""
+    weight = tissue["density"] * float(np.linalg.norm(gravity)) * size if tissue["weight"] else 0.0
+    return weight > COLLAPSING * tissue["young"]
 
 
 def model_of(law: str, rotations: str, former: Model | None = None) -> Model:

@@ -7,13 +7,12 @@ const HINTS = {
   'drag,ball': 'Drag the ball against the body', 'drag,rod': 'Drag the rod against the body', 'grasp,ball': 'Bring the ball to the body, then press on it again to grip',
 };
 const WINDOW = 10;  // seconds in the graph
-const NAMES = { stress: 'stress', displacement: 'displacement', 'contact pressure': 'contact pressure', level: 'mesh level' };
 const SAVES = {
   picture: ['Picture', 'The scene as you see it, as PNG'], film: ['Film', 'The scene from now on, as MP4 or GIF'], animation: ['Animation', 'A USD animation, for Blender, Houdini or Omniverse'],
   checkpoint: ['Checkpoint', 'The state of the simulation, for Simulation.load'], 'run file': ['Run file', 'The options of this run, for warp-corot simulate'],
 };
 
-let scene, socket, page = null, frame = null, waiting = 0, dirty = true, fitted = false, wanted = '', noted = '';
+let scene, socket, page = null, frame = null, waiting = 0, dirty = true, fitted = false, noted = '';
 let held = null, lastMove = null, isLeftOut = false;
 const drawnAt = [], samples = [];
 
@@ -40,6 +39,7 @@ function connect() {
 const TOLD = {
   page(header) {
     fitted &&= page.tool === header.tool;  // a tool that comes or goes is seen, too
+    if (!page) drawBar(header.colormap);
     page = header;
     document.title = page.title;
     scene.setPage(page);
@@ -148,9 +148,9 @@ function showLegend() {
   $('ticks').replaceChildren(...[0, 0.25, 0.5, 0.75, 1].map(share => Object.assign(document.createElement('span'), { textContent: +(share * frame.highest / size).toPrecision(3) })));
 }
 
-function drawBar() {
+function drawBar(colormap) {
   const paint = $('bar').getContext('2d');
-  page.colormap.match(/.{6}/g).forEach((color, k) => { paint.fillStyle = `#${color}`; paint.fillRect(k, 0, 1, 1); });
+  colormap.match(/.{6}/g).forEach((color, k) => { paint.fillStyle = `#${color}`; paint.fillRect(k, 0, 1, 1); });
 }
 
 // The upper end of the forces in the graph; a force that would hardly be felt is no news.
@@ -202,7 +202,7 @@ function showPage() {
   const hand = panel.querySelector(`[name=hand][value="${mode}"]`);
   if (hand) hand.checked = true;
   for (const name of ['radius', 'strength', 'speed']) if (document.activeElement !== panel[name]) setRange(panel[name], controls[name]);
-  options(panel.colors, [...Object.keys(page.sources).map(name => [name, NAMES[name]]), ['', 'none']], controls.colors);
+  options(panel.colors, [...Object.entries(page.sources).map(([name, [label]]) => [name, label]), ['', 'none']], controls.colors in page.sources ? controls.colors : '');
   options(panel.surface, asWords(page.surfaces), controls.surface || page.surfaces[0]);
   options(panel.world, asWords(Array.from({ length: page.worlds }, (_, k) => String(k))), controls.world);
   $('worlds').hidden = page.worlds < 2;
@@ -211,7 +211,7 @@ function showPage() {
   options(panel.law, asWords(choices.laws), tissue.law);
   options(panel.rotations, asWords(choices.rotations), tissue.rotations);
   panel.rotations.disabled = tissue.law !== 'corotated';
-  panel.remesh.checked = tissue.remesh; panel.remesh.disabled = !choices.remesh;
+  for (const name of ['remesh', 'weight']) { panel[name].checked = tissue[name]; panel[name].disabled = !choices[name]; }
   panel.poisson.disabled = !choices.poisson;
   for (const [name, size] of [['young', 1e3], ['poisson', 1], ['density', 1]]) if (document.activeElement !== panel[name]) panel[name].value = +(tissue[name] / size).toPrecision(4);
   const same = page.tissues.find(each => ['young', 'poisson', 'density'].every(name => Math.abs(each[name] / tissue[name] - 1) < 1e-3));
@@ -225,11 +225,11 @@ function showPage() {
   }
   for (const button of $('saves').children) button.disabled = (button.name === 'end early') !== page.busy;
   if (page.note !== noted) {
-    $('note').textContent = noted = page.note;
+    noted = page.note;
+    if (noted) $('note').textContent = noted;
     clearTimeout(showPage.timer);
-    if (!page.busy) showPage.timer = setTimeout(() => { $('note').textContent = ''; }, 10000);
+    if (!page.busy) showPage.timer = setTimeout(() => { $('note').textContent = ''; }, noted ? 10000 : 3000);
   }
-  drawBar();
 }
 
 function setRange(input, value) {
@@ -242,7 +242,7 @@ function listen() {
   for (const name of ['colors', 'surface', 'world']) panel[name].onchange = () => { change({ [name]: panel[name].value }); panel[name].blur(); };
   for (const [name, size] of [['young', 1e3], ['poisson', 1], ['density', 1]]) panel[name].onchange = () => panel[name].checkValidity() && panel[name].value && send({ do: 'tissue', what: { [name]: size * panel[name].value } });
   for (const name of ['law', 'rotations']) panel[name].onchange = () => { send({ do: 'tissue', what: { [name]: panel[name].value } }); panel[name].blur(); };
-  panel.remesh.onchange = () => send({ do: 'tissue', what: { remesh: panel.remesh.checked } });
+  for (const name of ['remesh', 'weight']) panel[name].onchange = () => send({ do: 'tissue', what: { [name]: panel[name].checked } });
   $('tissue').onchange = () => {
     const chosen = page.tissues.find(each => each.name === $('tissue').value);
     if (chosen) send({ do: 'tissue', what: { young: chosen.young, density: chosen.density, ...(page.choices.poisson && { poisson: chosen.poisson }) } });

@@ -166,15 +166,15 @@ export class Scene {
   }
 
   setPage(page) {
+    this.page = page;
+    if (this.axes) return;
+    this.axes = axesOf(page.up);
     const gl = this.gl, table = Uint8Array.from(page.colormap.match(/../g), word => parseInt(word, 16));
     gl.bindTexture(gl.TEXTURE_2D, this.colors);
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB8, table.length / 3, 1, 0, gl.RGB, gl.UNSIGNED_BYTE, table);
     for (const name of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, name, gl.CLAMP_TO_EDGE);
     for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.LINEAR);
-    this.page = page;
-    this.axes = axesOf(page.up);
-    this.floor = null;
   }
 
   setTopology(header, parts) {
@@ -193,7 +193,7 @@ export class Scene {
     this.bodies = made.slice(0, header.bodies.length);
     this.solids = made.slice(header.bodies.length);
     this.movable = header.movable; this.grounds = header.grounds;
-    this.floor = null;
+    this.lowest = Infinity;
   }
 
   setFrame(header, points, shades) {
@@ -203,19 +203,9 @@ export class Scene {
     let lowest = Infinity;
     for (const p of points) for (let i = 0; i < p.length; i += 3) lowest = Math.min(lowest, p[i] * up[0] + p[i + 1] * up[1] + p[i + 2] * up[2]);
     // Without a ground, a floor is drawn below everything that has been seen.
-    if (!this.floor || lowest < this.floor.height) this.floor = this.floorAt(lowest);
-  }
-
-  floorAt(height) {
-    const { page } = this, [number] = this.grounds;
-    let normal = page.up;
-    if (number !== undefined) {
-      const pose = this.poses[number];
-      normal = turnBy(pose.slice(3), [0, 0, 1]);
-      height = -Infinity;
-      return { normal, level: dot(normal, pose), height, axes: axesOf(normal) };
-    }
-    return { normal, level: height, height, axes: axesOf(normal) };
+    this.lowest = Math.min(this.lowest, lowest);
+    const pose = this.poses[this.grounds[0]], normal = pose ? turnBy(pose.slice(3), [0, 0, 1]) : up;
+    this.floor = { normal, level: pose ? dot(normal, pose) : this.lowest, axes: axesOf(normal) };
   }
 
   // --- the camera
