@@ -174,4 +174,4 @@ def _opened(frames: list[Path]) -> Iterator[Image]:
 
 
 def _send(visitor: Visitor, name: str, content: bytes) -> None:
-    visitor.send(packed({"kind": "file", "name": name}, content))
+    visitor.send(packed({"kind": "file", "name": name, "size": len(content)}, content))

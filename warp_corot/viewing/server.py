@@ -25,13 +25,8 @@ from warp_corot.errors import InputError
 
 from .gate import Gate, check_port
 
-#: The page's files, and their types.
-FILES = {
-    "index.html": "text/html",
-    "style.css": "text/css",
-    "page.js": "text/javascript",
-    "scene.js": "text/javascript",
-}
+#: The types of the page's files, by the ends of their names.
+TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript"}
 #: The browser loads nothing from elsewhere.
 POLICY = "default-src 'self'; img-src 'self' data: blob:"
 #: The longest message of a browser, which is a picture [bytes].
@@ -145,7 +140,7 @@ class Server:
         self.visitors: dict[int, Visitor] = {}
         self._numbers = itertools.count()
         folder = resources.files(__package__) / "page"
-        self._files = {name: (folder / name).read_bytes() for name in FILES}
+        self._files = {path.name: path.read_bytes() for path in folder.iterdir()}
         self._loop, self._over = asyncio.new_event_loop(), asyncio.Event()
         opened: Future[int] = Future()
         self._thread = threading.Thread(target=self._run, args=(port, opened), name="warp_corot server", daemon=True)
@@ -187,7 +182,7 @@ class Server:
         name = request.path.partition("?")[0].strip("/") or "index.html"
         if name not in self._files:
             return _response(http.HTTPStatus.NOT_FOUND, b"There is no such file.\n", {"Content-Type": "text/plain"})
-        told = {"Content-Type": f"{FILES[name]}; charset=utf-8", "Content-Security-Policy": POLICY}
+        told = {"Content-Type": f"{TYPES[name.rpartition('.')[2]]}; charset=utf-8", "Content-Security-Policy": POLICY}
         return _response(http.HTTPStatus.OK, self._files[name], {"Cache-Control": "no-cache", **told})
 
     async def _visit(self, socket: Any) -> None:

@@ -6,7 +6,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 from warp_corot.errors import InputError
@@ -16,10 +16,10 @@ from warp_corot.simulation.simulation import Simulation
 
 from .commands import Commands
 from .frames import Frame
-from .gate import Gate, check_port, is_loopback, new_token
+from .gate import Gate, is_loopback, new_token
 from .messages import frame_told, page_told, topology
 from .saving import Saving
-from .server import Server, Visitor, library
+from .server import Server, Visitor
 from .session import Session
 
 #: The default port of the page.
@@ -66,17 +66,18 @@ class View:
         if not isinstance(sim, Simulation):
             raise InputError(f"sim is {as_shown(sim)}; it must be a Simulation, as Simulation(body) makes one")
         gate = Gate(host, token if token is not None or is_loopback(host) else new_token())
-        library()
-        check_port(gate.host, port)
         self._lock, self._over, self._title = threading.RLock(), threading.Event(), title
         self._thread: threading.Thread | None = None
-        self._is_closed = False
+        self._is_closed, self._state, self._told = False, (), b""
         self.session = Session(sim, own, made)
         self._saving = Saving(self.session, lambda: self._send(self.session.frame()), run_file)
-        # Whoever comes finds a page that moves: all kernels are compiled.
-        self.session.prepare()
         commands = Commands(self.session, self._saving)
-        self._server = Server(gate, port, commands.take, commands.left)
+        with ExitStack() as undone:
+            undone.callback(self.session.close)
+            self._server = Server(gate, port, commands.take, commands.left)
+            undone.callback(self._server.close)
+            self.session.prepare()
+            undone.pop_all()
         self.port = self._server.port
         self.address = gate.address(self.port)
 
@@ -132,14 +133,17 @@ class View:
 
     def _send(self, frame: Frame, visitors: Sequence[Visitor] | None = None) -> None:
         """Send a frame to visitors, and what they do not know yet; None: to all, whether they wait for it or not."""
-        told = page_told(self.session, self._title, self._saving.kinds)
-        drawn = frame_told(self.session, frame)
+        session = self.session
+        state = (session.sim, session.number, session.controls, session.tool, session.busy, session.note)
+        if state != self._state:
+            self._state, self._told = state, page_told(session, self._title, self._saving.kinds)
+        drawn = frame_told(session, frame)
         for visitor in list(self._server.visitors.values()) if visitors is None else visitors:
-            if visitor.sent.get("page") != told:
-                visitor.send(told)
+            if visitor.sent.get("page") is not self._told:
+                visitor.send(self._told)
             if visitor.sent.get("number") != frame.number:
-                visitor.send(topology(self.session, frame))
-            visitor.sent.update(page=told, number=frame.number)
+                visitor.send(topology(session, frame))
+            visitor.sent.update(page=self._told, number=frame.number)
             visitor.send(drawn)
 
     def __enter__(self) -> View:
