@@ -68,7 +68,9 @@ class View:
         gate = Gate(host, token if token is not None or is_loopback(host) else new_token())
         self._lock, self._over, self._title = threading.RLock(), threading.Event(), title
         self._thread: threading.Thread | None = None
-        self._is_closed, self._state, self._told = False, (), b""
+        self._is_closed = False
+        self._state: tuple[Any, ...] = ()
+        self._told = b""
         self.session = Session(sim, own, made)
         self._saving = Saving(self.session, lambda: self._send(self.session.frame()), run_file)
         commands = Commands(self.session, self._saving)
