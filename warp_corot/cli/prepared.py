@@ -54,15 +54,16 @@ class Run:
     touched: Touched
 
 
-def prepared(options: Sequence[argparse.Namespace], others: Others | None = None) -> Run:
+def prepared(options: Sequence[argparse.Namespace], others: Others | None = None, *, touches: bool = False) -> Run:
     """Read and mesh the bodies, set up their simulation, and print their notes, and then warnings.
 
     Args:
         options: Options of each input.
         others: The ranks that get parts of the bodies, if there are any.
+        touches: Whether something may come that the bodies touch.
     """
     with warnings.catch_warnings(record=True) as heard:
-        ready = _made_ready(options, others)
+        ready = _made_ready(options, others, touches)
     for body in ready.bodies:
         name = f"{body.subject.name}: " if len(ready.bodies) > 1 else ""
         for note in body.subject.notes:
@@ -72,7 +73,7 @@ def prepared(options: Sequence[argparse.Namespace], others: Others | None = None
     return ready
 
 
-def _made_ready(options: Sequence[argparse.Namespace], others: Others | None) -> Run:
+def _made_ready(options: Sequence[argparse.Namespace], others: Others | None, touches: bool) -> Run:
     shared = options[0]
     device = checked_device(shared.device)
     touched = touched_by(options)
@@ -82,7 +83,7 @@ def _made_ready(options: Sequence[argparse.Namespace], others: Others | None) ->
             inputs.append(asked_bodies(each))
     bodies = [body for found in inputs for body in found]
     with compiling_said(device):
-        begin_loading(_modules(bodies, touched, device), device)
+        begin_loading(_modules(bodies, touches or touched.contact is not None, device), device)
         for body in bodies:
             with waiting(f"meshing {body.args.input}"):
                 body.subject = find_body(body)
@@ -108,15 +109,15 @@ def _made_ready(options: Sequence[argparse.Namespace], others: Others | None) ->
     return Run(bodies, sim, probes, duration, count, touched)
 
 
-def _modules(bodies: Sequence[Body], touched: Touched, device: wp.Device) -> list[str]:
+def _modules(bodies: Sequence[Body], touches: bool, device: wp.Device) -> list[str]:
     """Modules of kernels that the run is known to launch, in the order in which it needs them."""
     meshed = any(body.opened.kind in ("surface", "scan") for body in bodies)
     names = [*SURFACES, *MESHING] if meshed else []
     if device.is_cuda:
         return [*names, *BODY, *STEPS]
     explicit = not INTEGRATORS[integrator_name(bodies[0].args)].is_implicit
-    names += [*(CONTACT if touched.contact is not None and explicit else ()), *BODY, *STEPS_ON_CPU]
-    return [*names, *(IMPLICIT if meshed and touched.contact is None and may_choose(bodies) else ())]
+    names += [*(CONTACT if touches and explicit else ()), *BODY, *STEPS_ON_CPU]
+    return [*names, *(IMPLICIT if meshed and not touches and may_choose(bodies) else ())]
 
 
 def _frames(args: argparse.Namespace, bodies: Sequence[Body], touched: Touched) -> tuple[float, int]:

@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     library()
     check_port(args.host, args.port)
     asked = bodies_of(args)
-    ready = prepared(asked)
+    ready = prepared(asked, touches=True)
     with compiling_said(ready.sim.device):
         page = View(
             ready.sim,
