@@ -30,7 +30,11 @@ FAILED = (1, 2, 3)
 
 def subcommand(name: str) -> ModuleType:
     """The module that runs a subcommand; it imports the whole package, which takes a while."""
-    return import_module(f".{name}", __name__)
+    return import_module(f".{_file_of(name)}", __name__)
+
+
+def _file_of(name: str) -> str:
+    return name.replace("-", "_")
 
 
 class Parser(StrictParser):
@@ -79,7 +83,7 @@ def make_parser(needed: Collection[str] = COMMANDS) -> argparse.ArgumentParser:
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=Parser)
     for name, line in COMMANDS.items():
         if name in needed:
-            import_module(f".options.{name}", __name__).add_parser(subparsers)
+            import_module(f".options.{_file_of(name)}", __name__).add_parser(subparsers)
         else:
             subparsers.add_parser(name, help=line)
     return parser

@@ -5,12 +5,13 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-#: The subcommands of ``warp-corot``, each a module of this package, and their lines in its help.
+#: The subcommands of ``warp-corot``, each a module of this package with _ for -, and their lines in its help.
 COMMANDS = {
     "simulate": "simulate a soft body and write its motion as a USD animation",
     "sweep": "repeat a run with many combinations of parameters, and write a table of the results",
     "view": "take hold of a soft body in a browser",
     "scene": "step a USD stage: soft bodies, rigid bodies, ground",
+    "warm-up": "compile the kernels of frequent runs, so that these start at once",
     "paper": "run the paper's experiment: a table, results.json and figures 5 to 8",
 }
 
