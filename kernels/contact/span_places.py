@@ -54,6 +54,7 @@ def take_span(
     touches.force[o, t] = wp.vec3()
     touches.acts[o, t] = 0
     if not found.is_near:
+        spans.most[o, t] = 0.0
         return
     n = found.normal
     if was_listed:

@@ -110,7 +110,7 @@ def finish_matrix(
     couplings: Couplings,
     # Out
     blocks: wp.array[wp.mat33],
-    damped: wp.array[wp.mat33],
+    pivots: wp.array[wp.mat33],
     inverses: wp.array[wp.mat33],
     planes: wp.array[wp.float32],
 ):
@@ -133,7 +133,7 @@ def finish_matrix(
         else:
             inverse = inverse_block(whole)
     blocks[world * entries + diagonal[k]] = own
-    damped[i] = whole
+    pivots[i] = whole
     inverses[i] = inverse
     if planes.shape[0] > 1:
         write_planes(world, diagonal[k], entries, own, planes)
@@ -237,10 +237,7 @@ def solve_rows(
     planes: wp.array[wp.float32],
     diagonal: wp.array[wp.int32],
     inverses: wp.array[wp.mat33],
-    damped: wp.array[wp.mat33],
-    projected: wp.array[wp.int32],
-    projectors: wp.array[wp.mat33],
-    coupled: wp.array[wp.int32],
+    pivots: wp.array[wp.mat33],
     couplings: Couplings,
     x: wp.array[wp.vec4],
     r: wp.array[wp.vec4],
@@ -270,7 +267,7 @@ def solve(
     planes: wp.array[wp.float32],
     diagonal: wp.array[wp.int32],
     inverses: wp.array[wp.mat33],
-    damped: wp.array[wp.mat33],
+    pivots: wp.array[wp.mat33],
     couplings: Couplings,
     # In and out
     x: wp.array[wp.vec4],
@@ -303,10 +300,7 @@ def solve(
         planes,
         diagonal,
         inverses,
-        damped,
-        couplings.projected,
-        couplings.projectors,
-        couplings.count,
+        pivots,
         couplings,
         x,
         r,

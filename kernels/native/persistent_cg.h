@@ -2,7 +2,7 @@
 // thread blocks (CUDA). A team of blocks solves one world after another; each block owns a range of its nodes. The
 // scalars of an iteration come from one reduction (Chronopoulos and Gear 1989), so it has two barriers of the team, or
 // three with contacts.
-// In: count, entries, worlds, per_team, lanes, rows (without blocks), planes, inverses, projectors, projected, coupled, couplings, most.
+// In: count, entries, worlds, per_team, lanes, rows (without blocks), planes, inverses, couplings, most.
 // In and out: x, r, scalars, status, added (zero), barriers (zero). Out: iterations. Work: u, p, q, s, parts.
 constexpr unsigned ALL = 0xffffffffu;
 __shared__ double warp_sums[3][32], totals[3];
@@ -56,7 +56,7 @@ const auto times = [](const float* m, const float4& v) {
 };
 const int* starts = rows.starts.data;
 const int* columns = rows.columns.data;
-const int contacts = min(coupled.data[0], couplings.nodes.shape[0]);
+const int contacts = min(couplings.count.data[0], couplings.nodes.shape[0]);
 const int lo = (long long)count * member / per_team, hi = (long long)count * (member + 1) / per_team;
 const int lane = thread % lanes, group = thread / lanes, groups = threads / lanes;
 for (int world = team; world < worlds; world += teams) {
@@ -128,7 +128,7 @@ for (int world = team; world < worlds; world += teams) {
                     w.x += v.x; w.y += v.y; w.z += v.z;
                     *more = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
                 }
-                if (projected.data[first + i]) w = times(&projectors.data[first + i].data[0][0], w);
+                if (couplings.projected.data[first + i]) w = times(&couplings.projectors.data[first + i].data[0][0], w);
                 *four_at(q, first + i) = w;
                 const float4 v = __ldcg(given + i), rest = *four_at(r, first + i);
                 gamma += (double)rest.x * v.x + (double)rest.y * v.y + (double)rest.z * v.z;

@@ -3,7 +3,7 @@
 // With A = L + D + U, the matrix of all contacts, and M = (P + L) P^-1 (P + U), where P is D with the diagonal blocks
 // of the contacts, the iteration runs in (P + L)^-1 r, so that a product and its preconditioner together read each block
 // once (Eisenstat 1981): with t = (P + U)^-1 p, (P + L)^-1 A t = t + (P + L)^-1 (p + (A - L - U - 2 P) t).
-// In: world, count, entries, rows, diagonal, inverses, damped, projectors, projected, coupled, couplings, most.
+// In: world, count, entries, rows, diagonal, inverses, pivots, couplings, most.
 // In and out: x, r, scalars, status. Out: iterations. Work: u, p, q, s.
 typedef float four __attribute__((vector_size(16), aligned(4)));
 const int* starts = rows.starts.data;
@@ -12,7 +12,7 @@ const int* own = diagonal.data;
 const long long first = (long long)world * count;
 const float* blocks = &rows.blocks.data[(long long)world * entries].data[0][0];
 const float* inverse = &inverses.data[first].data[0][0];
-const float* middle = &damped.data[first].data[0][0];
+const float* pivot = &pivots.data[first].data[0][0];
 const auto at = [&](const auto& a) { return reinterpret_cast<four*>(a.data) + first; };
 four *solution = at(x), *rest = at(r), *half = at(u), *direction = at(p), *image = at(q), *turned = at(s);
 double* numbers = &wp::index(scalars, world, 0);
@@ -47,8 +47,8 @@ const auto residual = [&]() {
     double total = 0.0;
     for (int i = 0; i < count; ++i) {
         four v = sum(half, starts[i], own[i]);
-        if (projected.data[first + i]) v = times(&projectors.data[first + i].data[0][0], v);
-        v += times(middle + 9ll * i, half[i]);
+        if (couplings.projected.data[first + i]) v = times(&couplings.projectors.data[first + i].data[0][0], v);
+        v += times(pivot + 9ll * i, half[i]);
         total += dot(v, v);
     }
     return total;
@@ -58,7 +58,7 @@ const double end = CLOSER * numbers[END];
 forward(rest, half);
 double product = 0.0, now = numbers[RR];
 for (int i = 0; i < count; ++i) {
-    direction[i] = times(middle + 9ll * i, half[i]);
+    direction[i] = times(pivot + 9ll * i, half[i]);
     product += dot(half[i], direction[i]);
 }
 int found = RUNNING, done = 0;
@@ -68,8 +68,8 @@ while (found == RUNNING) {
     for (int i = count - 1; i >= 0; --i)
         turned[i] = times(inverse + 9ll * i, direction[i] - sum(turned, own[i] + 1, starts[i + 1]));
     for (int i = 0; i < count; ++i)
-        image[i] = direction[i] + times(blocks + 9ll * own[i], turned[i]) - times(middle + 9ll * i, turned[i]) * 2.0f;
-    const int contacts = coupled.data[0] < couplings.nodes.shape[0] ? coupled.data[0] : couplings.nodes.shape[0];
+        image[i] = direction[i] + times(blocks + 9ll * own[i], turned[i]) - times(pivot + 9ll * i, turned[i]) * 2.0f;
+    const int contacts = couplings.count.data[0] < couplings.nodes.shape[0] ? couplings.count.data[0] : couplings.nodes.shape[0];
     for (int c = 0; c < contacts; ++c) {
         const int* node = &wp::index(couplings.nodes, c, 0);
         const four* part = reinterpret_cast<const four*>(&wp::index(couplings.parts, c, 0));
@@ -96,7 +96,7 @@ while (found == RUNNING) {
     for (int i = 0; i < count; ++i) {
         solution[i] += turned[i] * alpha;
         half[i] -= (image[i] + turned[i]) * alpha;
-        after += dot(half[i], times(middle + 9ll * i, half[i]));
+        after += dot(half[i], times(pivot + 9ll * i, half[i]));
     }
     // The residual's own norm costs half a product, so it is asked for rarely until the end is near.
     if (done % 4 == 0 || done >= most || !(after > 0.0)) {
@@ -107,7 +107,7 @@ while (found == RUNNING) {
     }
     const float beta = (float)(after / product);
     for (int i = 0; i < count; ++i)
-        direction[i] = times(middle + 9ll * i, half[i]) + direction[i] * beta;
+        direction[i] = times(pivot + 9ll * i, half[i]) + direction[i] * beta;
     product = after;
 }
 numbers[RR] = now;

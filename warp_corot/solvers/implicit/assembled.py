@@ -94,7 +94,7 @@ class AssembledSolve:
         self._group_rows = wp.zeros(entries, dtype=wp.vec4, device=device)
         self._free = wp.zeros(nodes, dtype=wp.uint8, device=device)
         # One more, since products read past the last.
-        self.diagonal, self._inverses, self._damped = (
+        self.diagonal, self._inverses, self._pivots = (
             wp.zeros(nodes + 1, dtype=wp.mat33, device=device) for _ in range(3)
         )
         self._rows = Rows()
@@ -191,7 +191,7 @@ class AssembledSolve:
         if self._per_team > 1:
             self._barriers.zero_()
         inputs = [self._worlds, self._count, found.entries, self._per_team, self._lanes, solver.most, self._rows]
-        inputs += [self._planes, found.diagonal, self._inverses, self._damped, self.couplings]
+        inputs += [self._planes, found.diagonal, self._inverses, self._pivots, self.couplings]
         outputs = [x, r, solver.scalars, solver.status, solver.iterations, *self._vectors, self._parts, self._barriers]
         wp.launch(kernels.solve, self._dim, inputs, outputs, device=self.device, block_dim=self._block)
 
@@ -205,7 +205,7 @@ class AssembledSolve:
     def _finish(self) -> None:
         found = self._pattern
         inputs = [self._count, found.entries, found.diagonal, self.diagonal, self.couplings]
-        outputs = [self._rows.blocks, self._damped, self._inverses, self._planes]
+        outputs = [self._rows.blocks, self._pivots, self._inverses, self._planes]
         self._launch(kernels.finish_matrix, self._count, inputs, outputs)
 
     def _launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any]) -> None:

@@ -94,7 +94,7 @@ class ChosenSolve:
             self.lagged.judge(iterations, status)
             return
         wp.capture_if(self._is_assembled, None, lambda: self.lagged.judge(iterations, status))
-        inputs = [iterations, self._cost]
+        inputs = [iterations, status, int(self.assembled.touches), self._cost, self.assembled.couplings]
         wp.launch(kernels.choose, 1, inputs, [self._counts, self._is_assembled], device=self.device)
 
     def _either(self, assembled: Callable[[], None], other: Callable[[], None]) -> None:

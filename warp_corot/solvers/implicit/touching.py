@@ -10,7 +10,6 @@ import warp as wp
 from warp_corot.kernels.implicit.assembled import Couplings
 from warp_corot.kernels.implicit.tangent import end_rounds, find_rest, judge_round
 
-from .assembled import AssembledSolve
 from .chosen import ChosenSolve
 from .line_search import LineSearch, SharedLineSearch
 from .newton import Newton
@@ -187,7 +186,7 @@ class FreePreconditioner:
 
     def take_springs(self) -> None:
         """Launch the exchange of the springs in B for the present ones."""
-        if isinstance(self.matrix, AssembledSolve | ChosenSolve):
+        if isinstance(self.matrix, ChosenSolve):
             self.matrix.take_contact(self._held)
             return
         springs = self._held.springs
@@ -237,7 +236,7 @@ class TouchingSolve:
         self.newton.linearise()
         self.iterations.zero_()
         solver = self.newton.preconditioner
-        if isinstance(solver, AssembledSolve | ChosenSolve):
+        if isinstance(solver, ChosenSolve):
             blocks = solver.diagonal
         else:
             blocks = self._operator.diagonal_blocks()
