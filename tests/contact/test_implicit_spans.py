@@ -19,7 +19,7 @@ def test_a_block_rests_on_two_rods_between_its_nodes(device, integrator):
     angle = 0.7 * np.arctan(0.4)
     gravity = (9.81 * np.sin(angle), 0.0, -9.81 * np.cos(angle))
     sim = wc.Simulation(body, obstacles=rods, contact=wc.Contact(friction=0.4), gravity=gravity, integrator=integrator)
-    sim.advance_steps(30)
+    sim.advance_steps(40)
     before = body.positions.numpy().astype(float)
     sim.advance_steps(10)
     assert np.abs(body.positions.numpy() - before).max() < 2e-6

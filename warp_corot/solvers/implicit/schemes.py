@@ -53,7 +53,8 @@ class ImplicitIntegrator(Integrator):
         iterations: Maximum number of iterations of Newton's method in a step, with a tolerance.
         linear_tolerance: Residual of the linear solve over its right side, without a tolerance.
         linear_iterations: Maximum number of iterations of a linear solve.
-        preconditioner: The preconditioner of the linear solves, as for ``solve_static``.
+        preconditioner: "multigrid", "diagonal", or None: multigrid or the assembled matrix on a forest, whichever has
+            been faster, and the diagonal's blocks on a general mesh.
 
     Raises:
         InputError: A value out of its range.
