@@ -230,7 +230,7 @@ def test_forces_that_couple_nodes_are_solved_for_with_multigrid(device):
         swinging(device, forces=springs, preconditioner=name).body.displacements.numpy() for name in (None, "multigrid")
     )
     assert np.abs(u - plain).max() > 0.1 * np.abs(plain).max()
-    np.testing.assert_allclose(u, expected, rtol=0, atol=0 if device == "cpu" else 1e-4 * np.abs(u).max())
+    np.testing.assert_allclose(u, expected, rtol=0, atol=0 if device == "cpu" else 1e-3 * np.abs(u).max())
 
 
 @pytest.mark.parametrize(("young", "length", "ends_assembled"), [(2e3, 8, True), (1e8, 24, False)])
@@ -246,7 +246,7 @@ def test_the_choice_and_resumed_runs(young, length, ends_assembled, device, tmp_
     for each in (sim, later):
         each.advance_steps(8)
     u, resumed = (each.body.displacements.numpy() for each in (sim, later))
-    np.testing.assert_allclose(resumed, u, rtol=0, atol=0 if device == "cpu" else 1e-4 * np.abs(u).max())
+    np.testing.assert_allclose(resumed, u, rtol=0, atol=0 if device == "cpu" else 1e-3 * np.abs(u).max())
     if device == "cpu":
         np.testing.assert_array_equal(later.kept["setup.0.choice"].numpy(), sim.kept["setup.0.choice"].numpy())
 

@@ -37,12 +37,9 @@ ROOM, LEAST_ROOM = 2, 4096
 def suits(operator: TangentOperator) -> bool:
     """Whether an operator's matrix can be assembled: corotated elements of a forest, each with its own rotation."""
     field = operator.field.shear if isinstance(operator.field, DilatationField) else operator.field
-    if operator.field.shares_dilatation and operator.field.find_members is None:
-        return False
     return (
         isinstance(field, CorotatedField)
-        and field.model.level is None
-        and field.model.tolerance is None
+        and field.model.rotation_level is None
         and operator.body.discretization.element_kind is ForestElements
         and not isinstance(operator.body.material, Directional)
         and operator.viscosity is None

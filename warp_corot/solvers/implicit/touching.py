@@ -236,10 +236,7 @@ class TouchingSolve:
         self.newton.linearise()
         self.iterations.zero_()
         solver = self.newton.preconditioner
-        if isinstance(solver, ChosenSolve):
-            blocks = solver.diagonal
-        else:
-            blocks = self._operator.diagonal_blocks()
+        blocks = solver.diagonal if isinstance(solver, ChosenSolve) else self._operator.diagonal_blocks()
         self.held.launch_begin(self.newton.body.state.displacements, self.newton.step, blocks)
         self.launch_rounds()
         self.held.launch_end(self.newton.step)
