@@ -13,7 +13,8 @@ def one_run(monkeypatch):
 def test_it_makes_its_runs_and_says_how_long_they_take(capfd):
     assert main(["warm-up", "--device", "cpu"]) == 0
     out, err = capfd.readouterr()
-    assert out.startswith("1 of 1: a box ... ") and out.endswith(" s\n")
+    assert out.startswith("1 of 1: a box ... ")
+    assert out.endswith(" s\n")
     assert not err
 
 

@@ -145,6 +145,49 @@ def write_rows(of: Dilatation) -> wp.Kernel:
     return write_rows
 
 
+@functools.cache
+def add_held_blocks(of: Dilatation) -> wp.Kernel:
+    """Add the stiffness of elements that are held from turning over, off the diagonal; see ``elements.dilatation``."""
+    measure, holding = of.measure, of.holding
+
+    @unique_kernel()
+    def add_held_blocks(
+        # In
+        world_elements: int,
+        count: int,
+        entries: int,
+        elements: ForestElements,
+        u: wp.array[wp.vec4],
+        lam: wp.array[float],
+        stride: int,
+        scales: wp.array[float],
+        starts: wp.array[wp.int32],
+        columns: wp.array[wp.int32],
+        # In and out
+        blocks: wp.array[wp.mat33],
+    ):
+        t = wp.tid()
+        theta, slope = measure(own_gradient(elements, t, u))
+        curvature = holding(theta)[2]
+        if curvature == 0.0:
+            return
+        world = t / world_elements
+        f0, f1, f2, f3 = nodal_forces(elements, t, in_local_frame(elements, t, slope))
+        f = wp.matrix_from_rows(f0, f1, f2, f3)
+        factor = scales[2] * curvature * lam[t * stride] / rest_volume(elements, t)
+        nodes = elements.nodes[t]
+        for m in range(4):
+            i = nodes[m] - world * count
+            for n in range(4):
+                if n != m:
+                    j = nodes[n] - world * count
+                    for k in range(starts[i], starts[i + 1]):
+                        if columns[k] == j:
+                            wp.atomic_add(blocks, world * entries + k, factor * wp.outer(f[n], f[m]))
+
+    return add_held_blocks
+
+
 @wp.kernel(enable_backward=False)
 def bound_diagonal(
     # In

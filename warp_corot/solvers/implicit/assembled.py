@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
 
 from warp_corot.elasticity.corotated.elements import CorotatedField
 from warp_corot.elasticity.dilatation.field import DilatationField
-from warp_corot.kernels.elements.dilatation import not_held
 from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.implicit import assembled as kernels
-from warp_corot.kernels.implicit.multigrid import shared, values
+from warp_corot.kernels.implicit.multigrid import values
 from warp_corot.kernels.implicit.multigrid.cycle import Rows
-from warp_corot.kernels.implicit.multigrid.leaves_cpu import gather_leaves_on_cpu
-from warp_corot.kernels.tables.shapes import GRADIENT
 from warp_corot.materials.directional import Directional
 
+from .multigrid.leaf_matrix import LeafMatrix
 from .multigrid.pattern import PatternFinder
 from .operator import LinearOperator, Preconditioner
 from .tangent import TangentOperator
@@ -78,18 +76,13 @@ class AssembledSolve:
         self._version = sizes.version
         self._count, self._worlds, nodes = count, worlds, count * worlds
         members = operator.field.find_members
-        self._members = None if members is None else members(sizes.world_elements)
         self._nodes = wp.array(np.arange(count), dtype=wp.int32, device=device)
-        elements = cast("ForestElements", operator.body.discretization.elements)
-        finder = PatternFinder(wp.zeros(count, dtype=wp.vec2i, device=device))
-        found, self._pairs = finder.of_leaves(elements.nodes, sizes.world_elements, self._nodes, self._members)
-        self._pattern = found
-        self._frames = wp.zeros(sizes.elements, dtype=wp.mat33, device=device)
-        weights = np.swapaxes(np.array(GRADIENT), 1, 2).reshape(12, 3)
-        self._gradients = wp.array(weights, dtype=wp.vec3, device=device)
-        entries = 0 if self._members is None else worlds * self._members.entries
-        self._group_rows = wp.zeros(entries, dtype=wp.vec4, device=device)
         self._free = wp.zeros(nodes, dtype=wp.uint8, device=device)
+        finder = PatternFinder(wp.zeros(count, dtype=wp.vec2i, device=device))
+        groups = None if members is None else members(sizes.world_elements)
+        given = [operator.body.discretization, finder, self._nodes, self._nodes, count, self._free, groups]
+        self._leaves = LeafMatrix(*given)
+        self._pattern = found = self._leaves.pattern
         # One more, since products read past the last.
         self.diagonal, self._inverses, self._pivots = (
             wp.zeros(nodes + 1, dtype=wp.mat33, device=device) for _ in range(3)
@@ -99,7 +92,6 @@ class AssembledSolve:
         self._rows.blocks = wp.zeros(worlds * found.entries + 1, dtype=wp.mat33, device=device)
         planes = 9 * worlds * found.entries if device.is_cuda else 1
         self._planes = wp.zeros(planes, dtype=wp.float32, device=device)
-        self._more = wp.zeros(1, dtype=wp.mat33, device=device)
         self._vectors = [wp.zeros(nodes, dtype=wp.vec4, device=device) for _ in range(5)]
         self._make_couplings(nodes)
         self._find_launch(count, worlds)
@@ -140,37 +132,9 @@ class AssembledSolve:
 
     def update(self, operator: LinearOperator) -> None:
         """Launch the computation of the matrix at the operator's displacements and scales, without contacts."""
-        body, found, count = self._operator.body.discretization, self._pattern, self._count
-        elements, members = cast("ForestElements", body.elements), self._members
-        u, scales, blocks = operator.displacements, operator.scales, self._rows.blocks
-        inputs: list[Any] = [count, count, self._nodes, operator.inverse_mass]
-        self._launch(values.find_free, count, inputs, [self._free])
-        wp.launch(values.write_frames(True), body.sizes.elements, [elements, u], [self._frames], device=self.device)
-        if members is not None:
-            inputs = [body.sizes.world_elements, members.entries, members.arrays, elements, u]
-            inputs += [body.mu, body.lam, body.material_stride, 1e30]
-            self._launch(shared.write_rows(members.law), members.count, inputs, [self._group_rows])
-        given = values.Leaves()
-        given.elements, given.world_elements = elements, body.sizes.world_elements
-        given.frames, given.gradients = self._frames, self._gradients
-        given.mu, given.lam, given.stride = body.mu, body.lam, body.material_stride
-        given.upper, given.starts, given.codes, given.places = found.upper, found.sum_starts, found.codes, found.places
-        given.entries, given.ranks = found.entries, count
-        given.row_entries = 0 if members is None else members.entries
-        given.pairs, given.rows = self._pairs, self._group_rows
-        inputs = [given, scales, 0.0, 1e30 if members is None else 0.0]
-        if self.device.is_cpu:
-            wp.launch(gather_leaves_on_cpu, self._worlds, inputs, [blocks, self._more], device=self.device)
-        else:
-            self._launch(values.gather_leaves, len(found.upper), inputs, [blocks, self._more])
-        if members is not None and members.law.holding is not not_held:
-            inputs = [body.sizes.world_elements, count, found.entries, elements, u, body.lam, body.material_stride]
-            inputs += [scales, found.starts, found.columns]
-            kernel = kernels.add_held_blocks(members.law)
-            wp.launch(kernel, body.sizes.elements, inputs, [blocks], device=self.device)
-        inputs = [count, count, found.entries, self._nodes, operator.inverse_mass, scales, self._free]
-        inputs += [found.starts, found.columns, found.diagonal, operator.other_blocks(), self._more]
-        self._launch(values.finish_leaves, count, inputs, [blocks, self._inverses])
+        found, count, blocks = self._pattern, self._count, self._rows.blocks
+        self._launch(values.find_free, count, [count, count, self._nodes, operator.inverse_mass], [self._free])
+        self._leaves.gather(operator, blocks, self._inverses, holds=True)
         self._launch(kernels.keep_diagonal, count, [count, found.entries, found.diagonal, blocks], [self.diagonal])
         if self.device.is_cuda:
             self._launch(kernels.lay_out, found.entries, [found.entries, blocks], [self._planes])

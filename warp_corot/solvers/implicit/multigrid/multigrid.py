@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import warp as wp
@@ -15,12 +15,11 @@ from warp_corot.discretization.members import Members
 from warp_corot.discretization.subtrees import Batch
 from warp_corot.errors import InputError
 from warp_corot.kernels.elements.elements import ForestElements
-from warp_corot.kernels.implicit.multigrid import pattern, shared, values
-from warp_corot.kernels.implicit.multigrid.leaves_cpu import gather_leaves_on_cpu
-from warp_corot.kernels.tables.shapes import GRADIENT
+from warp_corot.kernels.implicit.multigrid import pattern, values
 from warp_corot.solvers.implicit.operator import LinearOperator, Springs
 
 from .coarsest import DenseInverse
+from .leaf_matrix import LeafMatrix
 from .level import Level, SmoothedLevel
 from .pattern import Midpoints, Pattern, PatternFinder
 from .springs import SpringsOnLevels
@@ -125,13 +124,21 @@ class Multigrid:
 
     def update_finest(self, operator: LinearOperator) -> None:
         """Launch the computation of the finest level's matrix."""
-        finest, inverse_mass, others = self.levels[0], operator.inverse_mass, operator.other_blocks()
+        finest, inverse_mass = self.levels[0], operator.inverse_mass
         free_inputs = [self.count, self._mesh_nodes, self._nodes, inverse_mass]
         finest.launch(values.find_free, self.count, free_inputs, [self._free])
         if isinstance(finest, SubtreeLevel):
-            finest.update(operator, self._mesh_nodes, self._nodes, others)
+            finest.update(operator, self._mesh_nodes, self._nodes, operator.other_blocks())
         else:
-            self._gather_leaves(operator, others)
+            assert isinstance(finest, Level)
+            self._leaves.gather(
+                operator,
+                finest.blocks,
+                finest.inverses,
+                stiffening=self.stiffening,
+                most_lambda=self.most_lambda,
+                most_shared=self.most_shared,
+            )
 
     def _update_coarser(self) -> None:
         for transfer in self._transfers:
@@ -211,51 +218,11 @@ class Multigrid:
 
     def _leaf_level(self, finder: PatternFinder, rank: wp.array, members: Members | None, counts: list[int]) -> Level:
         """The finest level with a matrix, and what it is computed from."""
-        sizes, device = self.discretization.sizes, self.device
-        elements = cast("ForestElements", self.discretization.elements)
-        self._frames = wp.zeros(sizes.elements, dtype=wp.mat33, device=device)
-        weights = np.swapaxes(np.array(GRADIENT), 1, 2).reshape(12, 3)
-        self._gradients = wp.array(weights, dtype=wp.vec3, device=device)
-        found, self._pairs = finder.of_leaves(elements.nodes, sizes.world_elements, rank, members)
-        rows = 0 if members is None else sizes.worlds * members.entries
         # Sweeps need no bound on eigenvalues.
-        nodes = 1 if members is None or self.sweeps else sizes.worlds * self.count
-        self._rows = wp.zeros(rows, dtype=wp.vec4, device=device)
-        self._more = wp.zeros(nodes, dtype=wp.mat33, device=device)
-        return self._level(found, counts)
-
-    def _gather_leaves(self, operator: LinearOperator, others: wp.array) -> None:
-        """Launch the finest matrix."""
-        discretization, finest = self.discretization, cast("Level", self.levels[0])
-        elements = cast("ForestElements", discretization.elements)
-        inverse_mass, scales = operator.inverse_mass, operator.scales
-        kernel = values.write_frames(self.is_turned)
-        leaves = discretization.sizes.elements
-        inputs: list[Any] = [elements, operator.displacements]
-        wp.launch(kernel, dim=leaves, inputs=inputs, outputs=[self._frames], device=self.device)
-        found = finest.pattern
-        if self._members is not None:
-            inputs = [discretization.sizes.world_elements, self._members.entries, self._members.arrays, elements]
-            inputs += [operator.displacements, discretization.mu, discretization.lam, discretization.material_stride]
-            inputs += [self.most_shared]
-            finest.launch(shared.write_rows(self._members.law), self._members.count, inputs, [self._rows])
-        given = values.Leaves()
-        given.elements, given.world_elements = elements, discretization.sizes.world_elements
-        given.frames, given.gradients = self._frames, self._gradients
-        given.mu, given.lam, given.stride = discretization.mu, discretization.lam, discretization.material_stride
-        given.upper, given.starts, given.codes, given.places = found.upper, found.sum_starts, found.codes, found.places
-        given.entries, given.ranks = found.entries, self.count
-        given.row_entries = 0 if self._members is None else self._members.entries
-        given.pairs, given.rows = self._pairs, self._rows
-        inputs = [given, scales, self.stiffening, self.most_lambda if self._members is None else 0.0]
-        outputs = [finest.blocks, self._more]
-        if self.device.is_cpu:
-            wp.launch(gather_leaves_on_cpu, self.discretization.worlds, inputs, outputs, device=self.device)
-        else:
-            finest.launch(values.gather_leaves, len(found.upper), inputs, outputs)
-        inputs = [self.count, self._mesh_nodes, found.entries, self._nodes, inverse_mass, scales, self._free]
-        inputs += [found.starts, found.columns, found.diagonal, others, self._more]
-        finest.launch(values.finish_leaves, self.count, inputs, [finest.blocks, finest.inverses])
+        bounded = members is not None and not self.sweeps
+        given = [self.discretization, finder, self._nodes, rank, self._mesh_nodes, self._free, members]
+        self._leaves = LeafMatrix(*given, is_turned=self.is_turned, is_bounded=bounded)
+        return self._level(self._leaves.pattern, counts)
 
     def _subtrees(self, members: Members | None) -> tuple[Batch, ...] | None:
         """The subtrees of which the finest level consists, if it goes without its matrix."""
