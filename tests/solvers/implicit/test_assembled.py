@@ -120,6 +120,7 @@ def test_contact_is_in_the_matrix(scene, device, rng):
     newton, held, solve = steps.newton, steps.held, steps.lagged.assembled
     operator, count = FreeOperator(newton.operator, held), 2 * newton.operator.node_count
     solve.update(newton.operator)
+    held.launch_friction(newton.step, wp.zeros_like(newton.step))
     solve.take_contact(held)
     couplings, b = solve.couplings, on_device(rng.standard_normal((count, 3)), newton.operator)
     if held.nodes is not None:
@@ -135,6 +136,7 @@ def test_contact_is_in_the_matrix(scene, device, rng):
         found[nodes[nodes >= 0]] += (c * x[nodes[nodes >= 0]]).sum() * c
     expected = product(operator.apply, x, device)
     assert (is_held.sum() > 10) == (scene != "own surface")
+    assert couplings.drag.numpy()[is_held].any() == (scene != "own surface")
     assert (used > 0) == (scene != "held")
     error = np.abs(np.einsum("nij,nj->ni", projectors, found) - expected).max() / np.abs(expected).max()
     print(f"{used} products, {error:.1e} of the largest value")
