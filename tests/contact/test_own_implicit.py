@@ -174,7 +174,7 @@ def test_worlds_resumed_and_remeshed_runs(ball, device, tmp_path):
     one = wc.SoftBody(ball, SOFT, device=device)
     probe = wc.Tool(wc.Sphere(0.006))
     probe.follow([0.0, 0.1], [(0.0, 0.0, 0.0262), (0.0, 0.0, 0.022)])
-    given = {"obstacles": [ground(), probe], "remesh": wc.OnlineRemesh(2000, every=3), "integrator": EULER}
+    given = {"obstacles": [ground(), probe], "remesh": wc.OnlineRemesh(2000, every=3, min_level=0), "integrator": EULER}
     sim = wc.Simulation(one, gravity=DOWN, **given)
     sim.advance_steps(12)
     assert len(one.mesh.tets) != len(ball.tets)
