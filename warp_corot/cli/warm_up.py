@@ -10,10 +10,10 @@ from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from warp_corot.inputs.choices import MODELS
 from warp_corot.inputs.device import checked_device
 
 from . import make_parser, simulate
+from .options.bodies import CHOICES
 
 EXPLICIT, IMPLICIT = (["--integrator", name] for name in ("symplectic-euler", "backward-euler"))
 #: Options of runs, by what they are called.
@@ -28,7 +28,7 @@ RUNS = {
 }
 #: The same for ``--all``.
 MORE = {
-    **{f"the model {name}": ["box", "--model", name, *EXPLICIT] for name in MODELS},
+    **{f"the model {name}": ["box", "--model", name, *EXPLICIT] for name in CHOICES},
     "remeshing": ["box", "--remesh", *EXPLICIT],
     "a state of rest": ["box", "--static"],
     "a body that touches itself": ["warp:bunny", "--tets", "3000", "--ground", "--self-contact", *EXPLICIT],

@@ -156,6 +156,18 @@ class AssembledSolve:
         outputs = [x, r, solver.scalars, solver.status, solver.iterations, *self._vectors, self._parts, self._barriers]
         wp.launch(kernels.solve, self._dim, inputs, outputs, device=self.device, block_dim=self._block)
 
+    # --- on the host -------------------------------------------------------------------------------------------------
+
+    def largest_frequency(self) -> float:
+        """The largest frequency of a free node among fixed ones at the present displacements [rad/s]; waits for the
+        device."""
+        operator, mass = self._operator, self._operator.body.conditions.inverse_mass.numpy()
+        operator.take(operator.body.state.displacements)
+        blocks = wp.zeros(len(mass), dtype=wp.mat33, device=self.device)
+        operator.tangent.add_diagonal(blocks)
+        squares = np.trace(blocks.numpy().astype(float), axis1=1, axis2=2) / 3.0 * mass
+        return float(np.sqrt(max(squares.max(initial=0.0), 0.0)))
+
     # --- pieces ------------------------------------------------------------------------------------------------------
 
     def _empty(self) -> None:

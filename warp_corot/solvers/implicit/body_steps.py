@@ -139,7 +139,7 @@ class BodySteps:
             if options.preconditioner is None and shared.rows is None and suits(self.operator):
                 assembled = AssembledSolve(self.operator, touches=touches)
                 self._preconditioner = self.lagged = ChosenSolve(
-                    assembled, self.lagged, shares=self.field.shares_dilatation
+                    assembled, self.lagged, shares=self.field.shares_dilatation, dt=options.dt
                 )
         self._make_solvers()
         like = self.body.state.displacements
