@@ -12,7 +12,7 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-#: Fraction of the remaining gap, or of the distance to an anchor, that closes in a step.
+#: Fraction of the remaining gap, or of the distance to an anchor, that closes in a step; see ``settled``.
 SETTLING = wp.constant(0.1)
 #: Places and triangles of a mesh that has just changed may begin inside obstacles, because the mesh hung through
 #: between its former places. They may stay as deep, by an allowance of which this fraction is lost in each step.
@@ -24,6 +24,7 @@ class Law:
     tolerance: float  # gaps of the size of rounding errors [m]
     recovery: float  # speed at which overlapping surfaces are pushed apart [m/s]
     settling: float  # share of an overlap by which they are pushed apart in a step at most
+    whole: float  # steps that are shorter than this close less of a gap, so that they throw nothing [s]
     slack: float  # gaps at own surfaces of up to this size may stay as they are in implicit steps [m]
     closing: (
         float  # gaps at own surfaces of more than this, besides their own motion, do not close in an explicit step [m]
@@ -32,11 +33,18 @@ class Law:
 
 
 @wp.func
+def settled(law: Law, dt: float):
+    """The share of a gap, or of the distance to an anchor, that closes in this step."""
+    return law.settling * wp.where(dt < law.whole, dt / law.whole, 1.0)
+
+
+@wp.func
 def least_motion(gap: float, law: Law, dt: float):
     """How far a contact must open in this step [m]; if negative, how far it may close."""
+    share = settled(law, dt)
     if gap > law.tolerance:
-        return -(gap - (1.0 - law.settling) * law.tolerance)
-    return wp.min(-law.settling * gap, law.recovery * dt)
+        return -(gap - (1.0 - share) * law.tolerance)
+    return wp.min(-share * gap, law.recovery * dt)
 
 
 @wp.func

@@ -3,7 +3,7 @@
 import warp as wp
 
 from .bearing import loose_share
-from .law import LOST, SETTLING, Law, allowed, held_back, least_motion, left_to_held
+from .law import LOST, Law, allowed, held_back, least_motion, left_to_held, settled
 from .motion import Motions, Surface
 from .shapes import MESH, Shapes, carried, distance_to
 from .supports import left_at_place
@@ -96,7 +96,7 @@ def touch(s: int, is_first: bool, dt: float, rigid: Rigid):
                     anchor = rigid.anchors[o, s]
                     if anchor[3] > 0.0:
                         held = wp.transform_point(now, wp.vec3(anchor[0], anchor[1], anchor[2]))
-                        slip += SETTLING * across(x - held, n)
+                        slip += settled(rigid.law, dt) * across(x - held, n)
                     sideways = held_back(across(before, n) - slip / yielding, normal_force, rigid.shapes.friction[o])
                 force = normal_force * n + sideways
                 d += yielding * (force - before)
@@ -165,7 +165,7 @@ def push_borne(s: int, yielding: float, dt: float, rigid: Rigid):
                     anchor = rigid.anchors[o, s]
                     if anchor[3] > 0.0:
                         held = wp.transform_point(now, wp.vec3(anchor[0], anchor[1], anchor[2]))
-                        slip += SETTLING * across(x - held, n)
+                        slip += settled(rigid.law, dt) * across(x - held, n)
                     sideways = held_back(across(before, n) - slip / yielding, normal_force, rigid.shapes.friction[o])
                     force = normal_force * n + sideways
                     rigid.forces[o, s] = force

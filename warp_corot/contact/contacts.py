@@ -288,7 +288,7 @@ class Contacts:
 
         Forces are carried if every rank has the whole surfaces, and forgotten if each has only a part.
         """
-        for name in ("tolerance", "recovery", "closing", "grain"):
+        for name in ("tolerance", "recovery", "whole", "closing", "grain"):
             setattr(self.law, name, getattr(former.law, name))
         self.obstacles.continue_from(former.obstacles)
         wp.copy(self.obstacles.wrenches, former.obstacles.wrenches)
@@ -320,7 +320,7 @@ class Contacts:
     def _law(self, stable_dt: float) -> Law:
         points = [np.abs(self.system.ranks.bounds(body)).max() for body in self.system.bodies]
         law = Law()
-        law.settling = float(SETTLING)
+        law.settling, law.whole = float(SETTLING), stable_dt if np.isfinite(stable_dt) else 0.0
         law.tolerance = ROUNDINGS * 2.0**-24 * max(*points, 1e-3)
         law.recovery = RECOVERY * self.smallest / stable_dt if np.isfinite(stable_dt) else 0.1
         heaviest = self.system.ranks.most(max(float(body.masses.max()) for body in self.system.bodies))

@@ -127,7 +127,7 @@ def _places(here: Contacts, following: Following) -> tuple[npt.NDArray[np.bool_]
 
 def _take_common(to: Contacts, other: Contacts) -> None:
     """Copy what is the same on all ranks: poses and wrenches of obstacles, and the law."""
-    for name in ("tolerance", "recovery", "grain"):
+    for name in ("tolerance", "recovery", "whole", "grain"):
         setattr(to.law, name, getattr(other.law, name))
     for name in ("now", "later", "target"):
         getattr(to.obstacles.motions, name).assign(getattr(other.obstacles.motions, name).numpy())

@@ -51,7 +51,7 @@ def pack_touch(here: Contacts, following: Following, piece: Arrays) -> dict[str,
         obstacles[f"motions.{name}"] = getattr(here.obstacles.motions, name).numpy()
     obstacles["wrenches"] = here.obstacles.wrenches.numpy()
     piece |= {f"same/contact.{name}": values for name, values in obstacles.items()}
-    return described | {"law": [here.law.tolerance, here.law.recovery]}
+    return described | {"law": [here.law.tolerance, here.law.recovery, here.law.whole]}
 
 
 def obstacles_in(described: dict[str, Any] | None, arrays: Arrays) -> dict[str, Any]:
@@ -86,7 +86,8 @@ def resume_touch(
     forces = following.whole.state.contact_forces
     assert forces is not None
     forces.assign(arrays["contact.body"])
-    here.law.tolerance, here.law.recovery = described["law"]
+    for name, value in zip(("tolerance", "recovery", "whole"), described["law"], strict=False):
+        setattr(here.law, name, value)
     for name in COMMON:
         getattr(here.obstacles.motions, name).assign(arrays[f"contact.motions.{name}"])
     here.obstacles.wrenches.assign(arrays["contact.wrenches"])

@@ -48,7 +48,7 @@ def pack_contact(contacts: Contacts | None, grasps: Sequence[Grasp], arrays: Arr
         arrays[f"contact.forces{number}"] = body.state.contact_forces.numpy()
     law = contacts.law
     return pack_obstacles(contacts, arrays) | {
-        "law": [law.tolerance, law.recovery, law.grain],
+        "law": [law.tolerance, law.recovery, law.grain, law.whole],
         "rooms": contacts.surface.rooms,
         "room": 0 if contacts.pairs is None else contacts.pairs.room,
         "grasps": [_pack_grasp(contacts, grasp, f"grasp{k}.", arrays) for k, grasp in enumerate(grasps)],
@@ -85,7 +85,7 @@ def unpack_contact(contacts: Contacts | None, described: dict[str, Any] | None, 
     if described is None or contacts is None:
         return
     kept = {name.removeprefix("contact."): values for name, values in arrays.items() if name.startswith("contact.")}
-    for name, value in zip(("tolerance", "recovery", "grain"), described["law"], strict=True):
+    for name, value in zip(("tolerance", "recovery", "grain", "whole"), described["law"], strict=True):
         setattr(contacts.law, name, value)
     keep_again(contacts, described["rooms"], described["room"], kept)
     bodies = contacts.system.bodies
