@@ -49,7 +49,7 @@ def test_bodies_touch_where_their_surface_is(ball, device, on, apart):
 
 
 def test_a_short_step_throws_nothing(brick, device):
-    """A run that ends at a given time may end with a step of any length; gaps close no faster in it than in others."""
+    """A run that ends at a given time may end with a step of any length; gaps hardly close in it."""
     body, below = wc.SoftBody(brick, SOFT, device=device), ground(-0.007)
     calm = wc.SymplecticEuler(damping=20.0)
     sim = wc.Simulation(body, obstacles=below, gravity=(0.0, 0.0, -9.81), integrator=calm)

@@ -35,6 +35,8 @@ from .whole_surface import WholeSurface
 ROUNDINGS = 16.0
 #: Overlapping surfaces are pushed apart at this fraction of the speed of waves.
 RECOVERY = 0.05
+#: Steps of less than this fraction of the stable one close less of a gap.
+WHOLE = 0.5
 #: Gaps at bodies' own surfaces of up to this fraction of the smallest element may stay as they are in implicit steps:
 #: places share nodes, so that forces that close all gaps exactly take many solves. In static answers times ``FINE``.
 SLACK, FINE = 0.0005, 0.2
@@ -320,7 +322,7 @@ class Contacts:
     def _law(self, stable_dt: float) -> Law:
         points = [np.abs(self.system.ranks.bounds(body)).max() for body in self.system.bodies]
         law = Law()
-        law.settling, law.whole = float(SETTLING), stable_dt if np.isfinite(stable_dt) else 0.0
+        law.settling, law.whole = float(SETTLING), WHOLE * stable_dt if np.isfinite(stable_dt) else 0.0
         law.tolerance = ROUNDINGS * 2.0**-24 * max(*points, 1e-3)
         law.recovery = RECOVERY * self.smallest / stable_dt if np.isfinite(stable_dt) else 0.1
         heaviest = self.system.ranks.most(max(float(body.masses.max()) for body in self.system.bodies))
