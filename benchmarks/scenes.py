@@ -6,10 +6,11 @@
         [--errors] [--json FILE]
 
 Explicit steps follow the state; implicit ones are ``BackwardEuler`` of 1/60 s. A row simulates ``--duration`` seconds,
-or as much of them as ``--limit`` seconds of wall time allow, in frames of 1/60 s. Its real-time factor is simulated
-over wall time after the first frame. That one is given apart, because it has what is compiled or recorded when steps
-begin. A scene that ends in an error or in positions that are not finite is a failure. ``--errors`` compares positions
-at the end with the same scene in a quarter of the step and with a tenth of the tolerances, over the body's size.
+or as much of them as ``--limit`` seconds of wall time after the first frame allow, in frames of 1/60 s. Its real-time
+factor is simulated over wall time after the first frame. That one is given apart, because it has what is compiled or
+recorded when steps begin. A scene that ends in an error or in positions that are not finite is a failure. ``--errors``
+compares positions at the end with the same scene in a quarter of the step and with a tenth of the tolerances, over the
+body's size.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ from warp_corot.inputs.device import checked_device
 FRAME = 1.0 / 60.0
 DOWN = (0.0, -9.81, 0.0)
 HEADER = (
-    *("scene", "elements", "kPa", "nu", "steps", "real time", "ms a frame", "ms a step", "steps a frame"),
+    *("scene", "elements", "kPa", "nu", "steps", "simulated, s", "real time", "ms a frame", "ms a step"),
+    "steps a frame",
     *("iterations", "unfinished", "first frame, s", "ready, s", "error, %"),
 )
 
@@ -213,12 +215,14 @@ def measured(scene: Callable[[Setting], wc.Simulation], at: Setting, duration: f
         wp.synchronize_device(at.device)
         row["ready"] = time.perf_counter() - started
         row["elements"] = sum(body.sizes.elements for body in sim.bodies)
-        frames, begun = [], time.perf_counter()
+        frames, begun = [], 0.0
         for number_ in range(round(duration / FRAME)):
             started, steps = time.perf_counter(), sim.steps
             sim.advance(FRAME)
             wp.synchronize_device(at.device)
             frames.append((time.perf_counter() - started, sim.steps - steps))
+            if number_ == 0:
+                begun = time.perf_counter()
             if number_ > 3 and time.perf_counter() - begun > limit:
                 break
         row |= {"first": frames[0][0], "simulated": sim.time} | of_frames(frames[1:])
@@ -259,7 +263,14 @@ def words(row: dict[str, Any]) -> list[str]:
     own = [row["scene"], str(row["elements"]), f"{row['young'] / 1e3:g}", f"{row['poisson']:g}", row["steps"]]
     if "failure" in row:
         return [*own, *["–"] * (len(HEADER) - len(own) - 1), row["failure"][:60]]
-    scaled = [row["factor"], 1e3 * row["frame"], 1e3 * row["step"], row["a_frame"], row.get("iterations")]
+    scaled = [
+        row["simulated"],
+        row["factor"],
+        1e3 * row["frame"],
+        1e3 * row["step"],
+        row["a_frame"],
+        row.get("iterations"),
+    ]
     rest = [number(each) for each in scaled]
     error = row.get("error")
     ends = [str(row.get("unfinished", "–")), number(row["first"]), number(row["ready"])]
