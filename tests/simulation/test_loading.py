@@ -2,6 +2,10 @@
 
 import subprocess
 import sys
+import time
+from concurrent.futures import Future
+
+from warp_corot.inputs import loading
 
 STEPS = """
 import warp_corot as wc
@@ -30,3 +34,17 @@ def test_steps_load_no_kernels():
     for number, words in enumerate(found):
         if words == ["steps"]:
             assert found[number + 1] == ["end"], found[number + 1]
+
+
+def test_progress_counts_the_modules_that_are_being_loaded(monkeypatch):
+    """It counts from the last time when nothing was left, and estimates the time left by the time so far."""
+    ended, waits = Future(), Future()
+    ended.set_result(None)
+    begun = {("earlier", "cpu"): ended, ("first", "cpu"): ended, ("second", "cpu"): waits, ("third", "cpu"): waits}
+    monkeypatch.setattr(loading, "_begun", begun)
+    monkeypatch.setattr(loading, "_since", [(time.monotonic() - 3.0, 1)])
+    done, count, left = loading.progress()
+    assert (done, count) == (1, 3)
+    assert 6.0 <= left < 60.0
+    waits.set_result(None)
+    assert loading.progress() is None

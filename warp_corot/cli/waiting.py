@@ -1,4 +1,4 @@
-"""Progress on a terminal: after two seconds the activity and its time."""
+"""Progress on a terminal: after two seconds the activity and its time, and how many kernels are still to compile."""
 
 from __future__ import annotations
 
@@ -39,4 +39,14 @@ def _show(what: str, over: threading.Event) -> None:
     with tqdm(desc=what, leave=False, file=sys.stderr, bar_format="{desc}, {elapsed}") as line:
         line.start_t -= SILENT
         while not over.wait(EVERY):
-            line.refresh()
+            line.set_description_str(what + _left_to_compile())
+
+
+def _left_to_compile() -> str:
+    from warp_corot.inputs.loading import progress
+
+    found = progress()
+    if found is None:
+        return ""
+    done, count, left = found
+    return f", compiling {done + 1} of {count} modules, about {left:.0f} s left"

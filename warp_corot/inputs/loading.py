@@ -7,6 +7,7 @@ are those that every run of a kind launches; fields name the kernels that factor
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import cache
@@ -41,6 +42,8 @@ CONTACT = (
 
 #: What was begun: modules by device.
 _begun: dict[tuple[wp.Module, str], Future] = {}
+#: When loading last began [s], and how many modules were loaded then.
+_since = [(0.0, 0)]
 
 
 def begin_loading(names: Iterable[str], device: wp.Device, kernels: Iterable[wp.Kernel] = ()) -> list[Future]:
@@ -50,9 +53,21 @@ def begin_loading(names: Iterable[str], device: wp.Device, kernels: Iterable[wp.
     for module in (*modules, *(kernel.module for kernel in kernels)):
         key = (module, str(device))
         if key not in _begun:
+            if all(each.done() for each in _begun.values()):
+                _since[0] = time.monotonic(), len(_begun)
             _begun[key] = _threads().submit(wp.load_module, module, device)
         found.append(_begun[key])
     return found
+
+
+def progress() -> tuple[int, int, float] | None:
+    """The number of modules that have been loaded since loading last began, and of all that are asked for so far, and
+    an estimate of the time left [s]; None if all are loaded."""
+    began, before = _since[0]
+    done, count = sum(each.done() for each in _begun.values()) - before, len(_begun) - before
+    if done >= count:
+        return None
+    return done, count, (time.monotonic() - began) * (count - done) / max(done, 1)
 
 
 def load(names: Iterable[str], device: wp.Device, kernels: Iterable[wp.Kernel] = ()) -> None:
