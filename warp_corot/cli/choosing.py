@@ -62,7 +62,7 @@ def choose_steps(args: argparse.Namespace, bodies: Sequence[Body], touched: Touc
         return
     args.integrator = "backward-euler"
     body.subject.notes.append(
-        f"implicit steps, since explicit ones would be about {fast / slow:.1g} times as slow "
+        f"implicit steps, which damp vibrations, since explicit ones would be about {fast / slow:.1g} times as slow "
         "(--integrator symplectic-euler makes those)"
     )
 
