@@ -288,7 +288,7 @@ def test_an_organ_without_flat_feet_lies_on_a_ground(folder, capsys):
     assert "the body lies on a ground, since it has no flat feet, and nothing is fixed (--no-ground or --fix" in err
     assert "organ, lying on a ground" in out
     assert "touches       ground: at -0.0" in out
-    points = [np.array(drawn(Usd.Stage.Open("a.usd"), "/SoftBody/organ", k).vertices) for k in (0, 3)]
+    points = [np.array(drawn(Usd.Stage.Open("a.usd"), "/SoftBody/surface", k).vertices) for k in (0, 3)]
     assert points[1][:, 2].min() > points[0][:, 2].min() - 1e-3
     assert points[1][:, 2].max() < points[0][:, 2].max() - 1e-3
     held = (["--no-ground"], ["--fix", "bottom"], ["--pull", "top", 0, 0, "1mm"], ["--static"], ["--gravity", 0, 0, 0])

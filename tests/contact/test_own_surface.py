@@ -261,7 +261,7 @@ def test_worlds_and_remeshed_bodies(ball, device):
     one = wc.SoftBody(ball, SOFT, device=device)
     probe = wc.Tool(wc.Sphere(0.006))
     probe.follow([0.0, 0.03], [(0.0, 0.0, 0.0262), (0.0, 0.0, 0.019)])
-    remesh = wc.OnlineRemesh(2000, every=20)
+    remesh = wc.OnlineRemesh(2000, every=20, min_level=0)
     given = {"obstacles": [ground(), probe], "remesh": remesh, "integrator": integrator}
     sim = wc.Simulation(one, gravity=(0.0, 0.0, -9.81), **given)
     sim.advance(0.04)

@@ -80,7 +80,7 @@ def test_surfaces_are_drawn_wound_as_their_bodies(turned, folder):
     body = wc.SoftBody(tets, wc.Isotropic(1e4, 0.4, 1e3), device="cpu")
     given.apply_scale(1e-3).export("metres.ply")
     shown = still(wc.Simulation(body), folder / "b.usd", surface="metres.ply")
-    assert drawn(shown, "/SoftBody/metres").volume == pytest.approx(volume, rel=1e-3)
+    assert drawn(shown, "/SoftBody/surface").volume == pytest.approx(volume, rel=1e-3)
 
 
 def test_the_objects_of_a_file_are_drawn_each_wound_as_its_body(folder, capsys):

@@ -71,6 +71,14 @@ RULES = {
 }
 
 
+@pytest.fixture(autouse=True)
+def closed_figures():
+    """Notebooks leave their figures open."""
+    yield
+    if "matplotlib.pyplot" in sys.modules:
+        sys.modules["matplotlib.pyplot"].close("all")
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_blocks_run(page, folder, tmp_path_factory, monkeypatch):
     if page in NOTEBOOKS and (missing := missing_extras("".join(block.code for block in blocks_of(page)))):

@@ -20,6 +20,8 @@ from .touching import Touched
 
 #: The steps that follow the state, over the largest stable one at rest.
 SHORTER = 0.75
+#: Bodies with shorter stable steps than this [s] are left to the explicit ones, which refuse them.
+SHORTEST = 1e-12
 #: Implicit steps are chosen if they are faster by this factor, since explicit ones resolve more of the motion.
 FASTER = 2.0
 
@@ -56,7 +58,10 @@ def choose_steps(args: argparse.Namespace, bodies: Sequence[Body], touched: Touc
         return
     explicit, implicit = ON_CUDA if device.is_cuda else ON_CPU
     size = len(mesh.tets), touched.contact is not None
-    slow = SHORTER * _stable_step(body) / explicit.of(*size)
+    step = _stable_step(body)
+    if step < SHORTEST:
+        return
+    slow = SHORTER * step / explicit.of(*size)
     fast = IMPLICIT_DT / implicit.of(*size)
     if slow >= 1.0 or fast < FASTER * slow:
         return

@@ -165,8 +165,8 @@ class AssembledSolve:
         operator.take(operator.body.state.displacements)
         blocks = wp.zeros(len(mass), dtype=wp.mat33, device=self.device)
         operator.tangent.add_diagonal(blocks)
-        squares = np.trace(blocks.numpy().astype(float), axis1=1, axis2=2) / 3.0 * mass
-        return float(np.sqrt(max(squares.max(initial=0.0), 0.0)))
+        stiffness = np.nan_to_num(np.trace(blocks.numpy().astype(float), axis1=1, axis2=2) / 3.0, posinf=1e38)
+        return float(np.sqrt(max((stiffness * mass).max(initial=0.0), 0.0)))
 
     # --- pieces ------------------------------------------------------------------------------------------------------
 
