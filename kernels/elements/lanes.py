@@ -18,9 +18,6 @@ import warp as wp
 
 from warp_corot.kernels.modules import unique_kernel
 
-#: The vectors are as wide as this machine's registers.
-COMPILER_FLAGS = "-march=native -ffp-contract=fast"
-
 LANES = 8
 
 #: Native code in files of its own. Each file states its inputs and outputs. The files are parts of one function and

@@ -16,10 +16,9 @@ from .constitutive import IsotropicMaterial
 from .dilatation import Dilatation, mean_of
 from .elements import nodal_forces, rest_volume
 from .forces import in_local_frame, own_gradient
-from .lanes import COMPILER_FLAGS
 from .shared_dilatation import is_live, place_of, range_of, scatter
 
-wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": COMPILER_FLAGS})
+wp.set_module_options({"enable_backward": False})
 
 #: Threads that share a group on CUDA.
 THREADS = 8
@@ -217,6 +216,7 @@ def write_rows(Elements: type, of: Dilatation) -> wp.Kernel:
         for (int a = 0; a < 3; ++a) atomicAdd(to + a, force[a]);
     }
 #else
+    #pragma clang fp contract(fast)
     typedef float float4 __attribute__((vector_size(16), aligned(4)));
     const int* node = nodes.data;
     const float4* g = reinterpret_cast<const float4*>(rows.data);

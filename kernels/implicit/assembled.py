@@ -6,13 +6,13 @@ are stored transposed, as in ``multigrid.values``. Nodes that obstacles hold mov
 
 import warp as wp
 
-from warp_corot.kernels.elements.lanes import COMPILER_FLAGS, constants, native
+from warp_corot.kernels.elements.lanes import constants, native
 
 from .conjugate_gradients import BROKEN, CONVERGED, END, LIMIT, NEGATIVE, RR, RUNNING
 from .multigrid.cycle import Rows
 from .multigrid.values import inverse_block
 
-wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": COMPILER_FLAGS})
+wp.set_module_options({"enable_backward": False})
 
 #: These solves leave smoother residuals than multigrid, so for the same errors of positions the square of the residual
 #: must be this much smaller: bunnies of 5 and 30 kPa were 3.1 and 1.2 times as far off.

@@ -25,6 +25,11 @@ class Tangent:
         self.field, self._options = field, options
         self.displacements = wp.zeros(0, dtype=wp.vec4, device=field.device)
 
+    @property
+    def kernels(self) -> list[wp.Kernel]:
+        """Kernels of factories that products launch; each that is named is loaded beside others."""
+        return []
+
     def prepare(self, u: wp.array) -> None:
         """Allocate memory for displacements like these; not while launches are recorded."""
         if len(self.displacements) != len(u):

@@ -26,13 +26,14 @@ MESHING = (
 #: Modules for bodies, and for their explicit steps.
 BODY = ("plan.lists", "plan.batches", "stepping.conditions")
 STEPS = ("stepping.integrate", "stepping.balance", "stepping.lanczos", "stepping.gauge", "stepping.pace")
-STEPS_ON_CPU = ("subtrees.repair", *STEPS, "stepping.subnormals")
+STEPS_ON_CPU = ("elements.general_cpu", "subtrees.repair", *STEPS, "stepping.subnormals")
 #: Modules for implicit steps of bodies on forests on the CPU.
 IMPLICIT = (
     *("implicit.steps", "implicit.multigrid.values", "implicit.multigrid.pattern", "plan.levels", "implicit.newton"),
-    *("implicit.tangent", "implicit.turning", "corotated.kept_gradients", "implicit.assembled"),
-    *("implicit.multigrid.leaves_cpu", "implicit.conjugate_gradients", "implicit.multigrid.sweeps"),
-    *("implicit.lagged", "implicit.sums", "implicit.chosen"),
+    *("elements.shared_rows", "implicit.tangent", "implicit.turning", "implicit.multigrid.shared"),
+    *("corotated.kept_gradients", "implicit.assembled", "implicit.multigrid.leaves_cpu"),
+    *("implicit.conjugate_gradients", "implicit.multigrid.sweeps", "implicit.multigrid.cycle", "implicit.lagged"),
+    *("implicit.sums", "implicit.chosen"),
 )
 #: Modules for explicit contact with obstacles on the CPU.
 CONTACT = (

@@ -12,9 +12,8 @@ together, and a small level takes no longer than its longest sum.
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
-from warp_corot.kernels.elements.lanes import COMPILER_FLAGS
 
-wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": COMPILER_FLAGS})
+wp.set_module_options({"enable_backward": False})
 
 
 @wp.func_native("""
@@ -45,6 +44,7 @@ def sum_over_lanes(part: wp.vec3, lanes: int) -> wp.vec3:
     }
     return total;
 #else
+    #pragma clang fp contract(fast)
     typedef float float4 __attribute__((vector_size(16)));
     typedef float float4u __attribute__((vector_size(16), aligned(4)));
     // Sums that do not wait for one another.

@@ -5,11 +5,11 @@ the inverse.
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
-from warp_corot.kernels.elements.lanes import COMPILER_FLAGS, native
+from warp_corot.kernels.elements.lanes import native
 
 from .cycle import sum_over_lanes
 
-wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": COMPILER_FLAGS})
+wp.set_module_options({"enable_backward": False})
 
 #: Added to the diagonal, which is scaled to one: the inverse stays finite for a body that nothing holds.
 SHIFT = wp.constant(wp.float64(1.0e-5))

@@ -5,11 +5,11 @@ world. A column of a block is a vector register, so that a contribution takes so
 import warp as wp
 
 from warp_corot.kernels.elements.elements import LEVEL_MASK
-from warp_corot.kernels.elements.lanes import COMPILER_FLAGS, constants, on_cpu
+from warp_corot.kernels.elements.lanes import constants, on_cpu
 
 from .values import Leaves
 
-wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": COMPILER_FLAGS})
+wp.set_module_options({"enable_backward": False})
 
 
 @wp.func_native(

@@ -7,11 +7,11 @@ iteration of degree 2, which costs four.
 
 import warp as wp
 
-from warp_corot.kernels.elements.lanes import COMPILER_FLAGS, on_cpu
+from warp_corot.kernels.elements.lanes import on_cpu
 
 from .cycle import Rows
 
-wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": COMPILER_FLAGS})
+wp.set_module_options({"enable_backward": False})
 
 #: Shared code: the sum of a range of a row's blocks times x, and the product of an inverse and a vector.
 _ROWS = """

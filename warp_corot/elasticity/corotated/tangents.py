@@ -81,6 +81,10 @@ class KeptTangent(Tangent):
         self._none = wp.zeros(0, dtype=wp.int32, device=field.device)
         self._material = Kept(_kept_gradients)
 
+    @property
+    def kernels(self) -> list[wp.Kernel]:
+        return [self._take, self._product]
+
     def prepare(self, u: wp.array) -> None:
         super().prepare(u)
         self._rotated.prepare(u)

@@ -34,6 +34,11 @@ class SharedTangent(Tangent):
         self._version = -1
         self._shared, self._empty = (wp.zeros(0, dtype=kind, device=field.device) for kind in (wp.vec4, wp.int32))
 
+    @property
+    def kernels(self) -> list[wp.Kernel]:
+        of = self.field.kind, self.field.of
+        return [*self.shear.kernels, kernels.write_rows(*of), *([kernels.add_held(*of)] if self._holds else [])]
+
     def prepare(self, u: wp.array) -> None:
         super().prepare(u)
         self.shear.prepare(u)

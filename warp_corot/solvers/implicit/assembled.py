@@ -128,6 +128,11 @@ class AssembledSolve:
         self._parts = wp.zeros(3 * teams * self._per_team, dtype=wp.float64, device=self.device)
         self._barriers = wp.zeros(STRIDE * teams, dtype=wp.uint32, device=self.device)
 
+    @property
+    def kernels(self) -> list[wp.Kernel]:
+        """Kernels of factories that it launches."""
+        return self._leaves.kernels
+
     # --- launches ----------------------------------------------------------------------------------------------------
 
     def update(self, operator: LinearOperator) -> None:
@@ -163,9 +168,10 @@ class AssembledSolve:
         device."""
         operator, mass = self._operator, self._operator.body.conditions.inverse_mass.numpy()
         operator.take(operator.body.state.displacements)
-        blocks = wp.zeros(len(mass), dtype=wp.mat33, device=self.device)
-        operator.tangent.add_diagonal(blocks)
-        stiffness = np.nan_to_num(np.trace(blocks.numpy().astype(float), axis1=1, axis2=2) / 3.0, posinf=1e38)
+        operator.set_scales(0.0, 0.0, 1.0)
+        self.update(operator)
+        blocks = self.diagonal.numpy()[: len(mass)].astype(float)
+        stiffness = np.nan_to_num(np.trace(blocks, axis1=1, axis2=2) / 3.0, posinf=1e38)
         return float(np.sqrt(max((stiffness * mass).max(initial=0.0), 0.0)))
 
     # --- pieces ------------------------------------------------------------------------------------------------------

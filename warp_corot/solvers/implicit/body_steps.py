@@ -9,6 +9,7 @@ import warp as wp
 
 from warp_corot.elasticity.viscosity import Viscosity
 from warp_corot.errors import InputError
+from warp_corot.inputs.loading import load
 from warp_corot.kernels.elements.prony import set_elapsed
 from warp_corot.kernels.implicit import conjugate_gradients
 from warp_corot.kernels.implicit import newton as kernels_of_newton
@@ -141,6 +142,9 @@ class BodySteps:
                 self._preconditioner = self.lagged = ChosenSolve(
                     assembled, self.lagged, shares=self.field.shares_dilatation, dt=options.dt
                 )
+        if self.device.is_cpu:
+            chosen = self.lagged.assembled.kernels if isinstance(self.lagged, ChosenSolve) else []
+            load((), self.device, [*self.operator.tangent.kernels, *chosen])
         self._make_solvers()
         like = self.body.state.displacements
         self._none = wp.zeros(1, dtype=wp.vec4, device=self.device)

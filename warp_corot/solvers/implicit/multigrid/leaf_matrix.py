@@ -63,6 +63,14 @@ class LeafMatrix:
         self._more = wp.zeros(more, dtype=wp.mat33, device=self.device)
 
     @property
+    def kernels(self) -> list[wp.Kernel]:
+        """Kernels of factories that it launches."""
+        if self._members is None:
+            return [self._write_frames]
+        law = self._members.law
+        return [self._write_frames, shared.write_rows(law), shared.add_held_blocks(law)]
+
+    @property
     def _elements(self) -> ForestElements:
         return cast("ForestElements", self._discretization.elements)
 
