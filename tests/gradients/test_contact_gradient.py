@@ -132,8 +132,10 @@ def test_places_that_friction_holds_stay_where_they_are(device, rng):
         other.fix(held)
         other.fix(stuck)
         other.load([pushed], load)
-        assert wc.solve_static(other, gravity=gravity).converged
-        return np.sum(weights * other.positions.numpy().astype(float))
+        # Differences of answers in float32 scatter by half a percent.
+        report = wc.solve_static(other, gravity=gravity, precision="float64")
+        assert report.converged
+        return np.sum(weights * (mesh.points + report.displacements))
 
     size = np.abs(found.obstacles).max()
     assert found.young == pytest.approx((value(young=5.1e3) - value(young=4.9e3)) / 200.0, rel=2e-3)

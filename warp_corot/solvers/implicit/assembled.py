@@ -166,11 +166,13 @@ class AssembledSolve:
     def largest_frequency(self) -> float:
         """The largest frequency of a free node among fixed ones at the present displacements [rad/s]; waits for the
         device."""
-        operator, mass = self._operator, self._operator.body.conditions.inverse_mass.numpy()
+        operator, nodes = self._operator, self._worlds * self._count
         operator.take(operator.body.state.displacements)
         operator.set_scales(0.0, 0.0, 1.0)
         self.update(operator)
-        blocks = self.diagonal.numpy()[: len(mass)].astype(float)
+        # The arrays of a mesh that changes have more room.
+        mass = operator.inverse_mass.numpy()[:nodes]
+        blocks = self.diagonal.numpy()[:nodes].astype(float)
         stiffness = np.nan_to_num(np.trace(blocks, axis1=1, axis2=2) / 3.0, posinf=1e38)
         return float(np.sqrt(max((stiffness * mass).max(initial=0.0), 0.0)))
 
