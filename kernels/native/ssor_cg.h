@@ -1,7 +1,7 @@
 // Conjugate gradients for one world by one thread, preconditioned by a symmetric sweep (SSOR) over block rows.
 //
-// With A = L + D + U, the matrix of all contacts, and M = (P + L) P^-1 (P + U), where P is D with the diagonal blocks
-// of the contacts, the iteration runs in (P + L)^-1 r, so that a product and its preconditioner together read each block
+// The matrix with contacts is A; L and U are the parts of its rows below and above the diagonal, without contacts, and
+// P is its diagonal with them. With M = (P + L) P^-1 (P + U) the iteration runs in (P + L)^-1 r, so that a product and its preconditioner together read each block
 // once (Eisenstat 1981): with t = (P + U)^-1 p, (P + L)^-1 A t = t + (P + L)^-1 (p + (A - L - U - 2 P) t).
 // In: world, count, entries, rows, diagonal, inverses, pivots, couplings, most.
 // In and out: x, r, scalars, status. Out: iterations. Work: u, p, q, s.

@@ -43,6 +43,7 @@ def test_an_organ_rests_on_its_surface(brick, device, integrator):
     np.testing.assert_allclose(sum(point.force for point in sim.contacts()), felt, atol=1e-5 * weight(body))
     before = sim.solves.linear_iterations
     sim.advance_steps(5)
+    # An iteration of an assembled solve costs a fifth of one with multigrid, which takes less than 8 a step here.
     assert sim.solves.linear_iterations - before < 5 * 20
 
 
@@ -58,7 +59,7 @@ def test_an_organ_slips_at_the_angle_of_friction(brick, device, share):
     x, v = (array.numpy()[:, 0].astype(float).mean() for array in (body.positions, body.velocities))
     before = sim.solves.linear_iterations
     sim.advance_steps(30)
-    assert sim.solves.linear_iterations - before < 30 * 40
+    assert sim.solves.linear_iterations - before < 30 * 40  # less than 10 with multigrid
     if share < 1.0:
         assert abs(body.positions.numpy()[:, 0].mean() - x) < 1e-6
     else:

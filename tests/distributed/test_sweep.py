@@ -120,6 +120,15 @@ def test_values_of_options():
             values_of(text)
 
 
+def test_all_runs_have_the_same_kind_of_steps(folder, capsys):
+    """Also those of stiff bodies, which a run by itself makes implicit."""
+    words = ("sweep", "box", "--vary", "young=500,30MPa", "--duration", "0.05", "--device", "cpu")
+    assert run(*words, "-o", "results", "--workers", "1") == 0
+    with open("results/table.csv", newline="") as file:
+        soft, stiff = csv.DictReader(file)
+    assert int(float(stiff["steps"])) > 100 * int(float(soft["steps"]))
+
+
 def test_the_command_sweeps(folder, capsys):
     words = ("sweep", "box", "--vary", "young=500,1kPa", "--duration", "0.1", "--probe", "z == zmax", "--device", "cpu")
     assert run(*words, "-o", "results", "--workers", "1") == 0

@@ -80,8 +80,8 @@ def may_choose(bodies: Sequence[Body]) -> bool:
 
 
 def _stable_step(body: Body) -> float:
-    """An estimate of the largest stable step at rest [s], within some 10 %: the smallest height of an element over the
-    speed of sound."""
+    """An estimate of the largest stable step at rest [s]: the smallest height of an element over the speed of sound. It
+    was within 10 % for four uniform organs and a box, and is within 25 % where stiffness jumps."""
     mesh, material = body.soft.mesh, body.soft.discretization
     x = mesh.points[mesh.tets].astype(float)
     faces = np.array([(1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2)])

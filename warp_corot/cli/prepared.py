@@ -54,16 +54,19 @@ class Run:
     touched: Touched
 
 
-def prepared(options: Sequence[argparse.Namespace], others: Others | None = None, *, touches: bool = False) -> Run:
+def prepared(
+    options: Sequence[argparse.Namespace], others: Others | None = None, *, touches: bool = False, chooses: bool = True
+) -> Run:
     """Read and mesh the bodies, set up their simulation, and print their notes, and then warnings.
 
     Args:
         options: Options of each input.
         others: The ranks that get parts of the bodies, if there are any.
         touches: Whether something may come that the bodies touch.
+        chooses: Whether steps may be implicit if the user does not say; otherwise all runs of a kind are explicit.
     """
     with warnings.catch_warnings(record=True) as heard:
-        ready = _made_ready(options, others, touches)
+        ready = _made_ready(options, others, touches, chooses)
     for body in ready.bodies:
         name = f"{body.subject.name}: " if len(ready.bodies) > 1 else ""
         for note in body.subject.notes:
@@ -73,7 +76,7 @@ def prepared(options: Sequence[argparse.Namespace], others: Others | None = None
     return ready
 
 
-def _made_ready(options: Sequence[argparse.Namespace], others: Others | None, touches: bool) -> Run:
+def _made_ready(options: Sequence[argparse.Namespace], others: Others | None, touches: bool, chooses: bool) -> Run:
     shared = options[0]
     device = checked_device(shared.device)
     touched = touched_by(options)
@@ -83,7 +86,7 @@ def _made_ready(options: Sequence[argparse.Namespace], others: Others | None, to
             inputs.append(asked_bodies(each))
     bodies = [body for found in inputs for body in found]
     with compiling_said(device):
-        begin_loading(_modules(bodies, touches or touched.contact is not None, device), device)
+        begin_loading(_modules(bodies, touches or touched.contact is not None, chooses, device), device)
         for body in bodies:
             with waiting(f"meshing {body.args.input}"):
                 body.subject = find_body(body)
@@ -94,7 +97,8 @@ def _made_ready(options: Sequence[argparse.Namespace], others: Others | None, to
         for body in bodies:
             make_body(body, duration, alone=len(bodies) == 1)
         place_ground(touched, shared, bodies, gravity_of(shared, bodies[0].subject))
-        choose_steps(shared, bodies, touched, device)
+        if chooses:
+            choose_steps(shared, bodies, touched, device)
         with waiting("preparing the simulation"):
             sim = make_simulation(shared, bodies, touched, others)
             say_overlaps(touched, bodies, sim)
@@ -109,7 +113,7 @@ def _made_ready(options: Sequence[argparse.Namespace], others: Others | None, to
     return Run(bodies, sim, probes, duration, count, touched)
 
 
-def _modules(bodies: Sequence[Body], touches: bool, device: wp.Device) -> list[str]:
+def _modules(bodies: Sequence[Body], touches: bool, chooses: bool, device: wp.Device) -> list[str]:
     """Modules of kernels that the run is known to launch, in the order in which it needs them."""
     meshed = any(body.opened.kind in ("surface", "scan") for body in bodies)
     names = [*SURFACES, *MESHING] if meshed else []
@@ -117,7 +121,7 @@ def _modules(bodies: Sequence[Body], touches: bool, device: wp.Device) -> list[s
         return [*names, *BODY, *STEPS]
     explicit = not INTEGRATORS[integrator_name(bodies[0].args)].is_implicit
     names += [*(CONTACT if touches and explicit else ()), *BODY, *STEPS_ON_CPU]
-    return [*names, *(IMPLICIT if meshed and not touches and may_choose(bodies) else ())]
+    return [*names, *(IMPLICIT if meshed and not touches and chooses and may_choose(bodies) else ())]
 
 
 def _frames(args: argparse.Namespace, bodies: Sequence[Body], touched: Touched) -> tuple[float, int]:

@@ -89,7 +89,8 @@ def simulated(args: argparse.Namespace) -> Recording:
     options = bodies_of(args)
     shared = options[0]
     _check_output(args, shared)
-    ready = prepared(options)
+    # Runs that are compared have the same kind of steps.
+    ready = prepared(options, chooses=False)
     done = Recording(shared.output)
     table = Table(shared.csv, ready.sim, ready.probes, ready.touched.obstacles) if shared.csv else None
     rest(shared, ready.sim)

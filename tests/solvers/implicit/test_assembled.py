@@ -254,6 +254,16 @@ def test_the_choice_and_resumed_runs(young, length, ends_assembled, device, tmp_
         np.testing.assert_array_equal(later.kept["setup.0.choice"].numpy(), sim.kept["setup.0.choice"].numpy())
 
 
+def test_a_resumed_run_keeps_its_choice_although_a_new_one_would_begin_otherwise(device, monkeypatch, tmp_path):
+    sim = swinging(device)
+    sim.save(tmp_path / "state.npz")
+    monkeypatch.setattr("warp_corot.solvers.implicit.chosen.STIFF", 0.0)
+    later = wc.Simulation.load(tmp_path / "state.npz")
+    later.step()
+    assert is_assembled(later)
+    assert not is_assembled(swinging(device, steps=1))
+
+
 def test_a_beam_that_takes_too_many_iterations_is_solved_for_with_multigrid(device, monkeypatch):
     """Its first step is unfinished, and no other one, if its stiffness is not known before."""
     monkeypatch.setattr("warp_corot.solvers.implicit.chosen.STIFF", np.inf)

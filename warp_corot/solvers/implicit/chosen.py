@@ -62,7 +62,9 @@ class ChosenSolve:
         """Follow the mesh; not while launches are recorded. Launches must be recorded again after this."""
         self.assembled.follow()
         self.lagged.prepare()
-        if not self._is_prepared and self._dt * self.assembled.largest_frequency() > STIFF:
+        # A resumed run goes on with its choice.
+        is_new = not self._is_prepared and not self._counts.numpy().any()
+        if is_new and self._dt * self.assembled.largest_frequency() > STIFF:
             self._is_assembled.zero_()
             self._counts[int(kernels.ASSEMBLED) : int(kernels.ASSEMBLED) + 1].fill_(int(kernels.DEAR))
         self._is_prepared = True

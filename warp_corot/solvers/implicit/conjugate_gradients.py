@@ -46,7 +46,7 @@ class Assembled(Protocol):
 
 def assembled_in(preconditioner: Preconditioner) -> Assembled | None:
     """The assembled matrix that is or is in a preconditioner, if there is one."""
-    found: Any = getattr(preconditioner, "matrix", preconditioner)
+    found: Any = getattr(preconditioner, "plain", preconditioner)
     return found if hasattr(found, "iterate") else None
 
 

@@ -178,30 +178,29 @@ class FreePreconditioner:
     """S T B T S of a preconditioner B, where T takes the stiffness of friction into account; ``update`` is B's."""
 
     def __init__(self, preconditioner: Preconditioner, held: Held, like: wp.array):
-        self._preconditioner, self._held, self._r = preconditioner, held, wp.zeros_like(like)
-        self.matrix = preconditioner
+        self.plain, self._held, self._r = preconditioner, held, wp.zeros_like(like)
 
     def update(self, operator: LinearOperator) -> None:
-        self._preconditioner.update(operator)
+        self.plain.update(operator)
 
     def take_springs(self) -> None:
         """Launch the exchange of the springs in B for the present ones."""
-        if isinstance(self.matrix, ChosenSolve):
-            self.matrix.take_contact(self._held)
+        if isinstance(self.plain, ChosenSolve):
+            self.plain.take_contact(self._held)
             return
         springs = self._held.springs
-        if springs is not None and hasattr(self._preconditioner, "take_springs"):
+        if springs is not None and hasattr(self.plain, "take_springs"):
             springs.update()
-            self._preconditioner.take_springs()
+            self.plain.take_springs()
 
     def apply(self, r: wp.array, z: wp.array) -> None:
         nodes = self._held.nodes
         if nodes is None:
-            self._preconditioner.apply(r, z)
+            self.plain.apply(r, z)
             return
         wp.copy(self._r, r)
         nodes.launch_yielding(self._r)
-        self._preconditioner.apply(self._r, z)
+        self.plain.apply(self._r, z)
         nodes.launch_yielding(z)
 
 
@@ -235,11 +234,15 @@ class TouchingSolve:
         """Launch the solve for ``newton.step``, from a guess; the residual must be known."""
         self.newton.linearise()
         self.iterations.zero_()
-        solver = self.newton.preconditioner
-        blocks = solver.diagonal if isinstance(solver, ChosenSolve) else self._operator.diagonal_blocks()
-        self.held.launch_begin(self.newton.body.state.displacements, self.newton.step, blocks)
+        self.held.launch_begin(self.newton.body.state.displacements, self.newton.step, self.diagonal_blocks())
         self.launch_rounds()
         self.held.launch_end(self.newton.step)
+
+    def diagonal_blocks(self) -> wp.array:
+        """Launch the blocks on the diagonal of the matrix without contact, unless the last linearisation has found
+        them; mat33 [worlds * nodes] or longer."""
+        solver = self.newton.preconditioner
+        return solver.diagonal if isinstance(solver, ChosenSolve) else self._operator.diagonal_blocks()
 
     def launch_rounds(self) -> None:
         """Launch the linear solves, until contact no longer changes."""

@@ -46,7 +46,7 @@ class TouchingNewton:
         self.linear_iterations.zero_()
         newton.launch_residual()
         newton.linearise()
-        blocks = self._operator.diagonal_blocks()
+        blocks = self._touching.diagonal_blocks()
         newton.move_held(to_end=True)
         held.launch_begin(newton.body.state.displacements, newton.step, blocks)
         newton.move_held(to_end=False)
