@@ -37,14 +37,15 @@ def test_steps_load_no_kernels():
 
 
 def test_progress_counts_the_modules_that_are_being_loaded(monkeypatch):
-    """It counts from the last time when nothing was left, and estimates the time left by the time so far."""
+    """It estimates the time left by the time so far, and not before a quarter are loaded."""
     ended, waits = Future(), Future()
     ended.set_result(None)
-    begun = {("earlier", "cpu"): ended, ("first", "cpu"): ended, ("second", "cpu"): waits, ("third", "cpu"): waits}
-    monkeypatch.setattr(loading, "_begun", begun)
-    monkeypatch.setattr(loading, "_since", [(time.monotonic() - 3.0, 1)])
+    monkeypatch.setattr(loading, "_begun", {("first", "cpu"): ended, **{(k, "cpu"): waits for k in range(4)}})
+    monkeypatch.setattr(loading, "_since", [time.monotonic() - 3.0])
+    assert loading.progress() == (1, 5, None)
+    del loading._begun[3, "cpu"]
     done, count, left = loading.progress()
-    assert (done, count) == (1, 3)
-    assert 6.0 <= left < 60.0
+    assert (done, count) == (1, 4)
+    assert 9.0 <= left < 90.0
     waits.set_result(None)
     assert loading.progress() is None

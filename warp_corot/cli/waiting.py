@@ -49,4 +49,5 @@ def _left_to_compile() -> str:
     if found is None:
         return ""
     done, count, left = found
-    return f", compiling {done + 1} of {count} modules, about {left:.0f} s left"
+    words = f", compiling {done + 1} of {count} modules"
+    return words if left is None else f"{words}, about {max(left, 1.0):.0f} s left"

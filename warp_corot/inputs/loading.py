@@ -43,8 +43,8 @@ CONTACT = (
 
 #: What was begun: modules by device.
 _begun: dict[tuple[wp.Module, str], Future] = {}
-#: When loading last began [s], and how many modules were loaded then.
-_since = [(0.0, 0)]
+#: When loading began [s].
+_since: list[float] = []
 
 
 def begin_loading(names: Iterable[str], device: wp.Device, kernels: Iterable[wp.Kernel] = ()) -> list[Future]:
@@ -54,21 +54,20 @@ def begin_loading(names: Iterable[str], device: wp.Device, kernels: Iterable[wp.
     for module in (*modules, *(kernel.module for kernel in kernels)):
         key = (module, str(device))
         if key not in _begun:
-            if all(each.done() for each in _begun.values()):
-                _since[0] = time.monotonic(), len(_begun)
+            _since[:] = _since or [time.monotonic()]
             _begun[key] = _threads().submit(wp.load_module, module, device)
         found.append(_begun[key])
     return found
 
 
-def progress() -> tuple[int, int, float] | None:
-    """The number of modules that have been loaded since loading last began, and of all that are asked for so far, and
-    an estimate of the time left [s]; None if all are loaded."""
-    began, before = _since[0]
-    done, count = sum(each.done() for each in _begun.values()) - before, len(_begun) - before
-    if done >= count:
+def progress() -> tuple[int, int, float | None] | None:
+    """The number of modules that have been loaded, that of all that are asked for so far, and an estimate of the time
+    left [s], once a quarter are loaded, since the slowest come first; None if all are loaded."""
+    done, count = sum(each.done() for each in _begun.values()), len(_begun)
+    if done == count:
         return None
-    return done, count, (time.monotonic() - began) * (count - done) / max(done, 1)
+    left = (time.monotonic() - _since[0]) * (count - done) / max(done, 1)
+    return done, count, left if 4 * done >= count else None
 
 
 def load(names: Iterable[str], device: wp.Device, kernels: Iterable[wp.Kernel] = ()) -> None:
