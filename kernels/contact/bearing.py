@@ -4,8 +4,6 @@ A place moves as the weighted mean of its bearers, and they divide its force in 
 torques and work are those of the place. Places that share a bearer move together: each force moves all of them.
 """
 
-from typing import Any
-
 import warp as wp
 
 from .motion import Foreseen, Surface
@@ -26,14 +24,7 @@ def loose_share(s: int, surface: Surface):
     """The share of a place's weights that free nodes have."""
     if is_borne(s, surface):
         return surface.bearing.loose[s]
-    return 1.0
-
-
-@wp.func
-def forget_forces(s: int, surface: Surface):
-    """Nothing has been gathered at a place."""
-    if is_borne(s, surface):
-        surface.bearing.gathered[s] = wp.vec3()
+    return wp.where(surface.yielding[s] > 0.0, 1.0, 0.0)
 
 
 @wp.func
@@ -50,44 +41,6 @@ def share_bearers(s: int, r: int, surface: Surface):
             if b[k] == c[m] and v[k] != 0.0 and w[m] != 0.0:
                 return True
     return False
-
-
-@wp.func
-def ease(s: int, crowd: wp.array[Any], yielding: wp.array[wp.float32], surface: Surface):
-    """How far a place moves for each unit of force if all places around it are pushed in proportion to ``crowd``
-    [m/N].
-
-    Args:
-        crowd: The sum of the weights of contacts that push at each place.
-        yielding: As in ``Surface``, also for nodes that another process moves.
-    """
-    if not is_borne(s, surface):
-        return float(crowd[s]) * yielding[s]
-    b = surface.bearing.bearers[s]
-    w = surface.bearing.weights[s]
-    total = float(0.0)
-    for k in range(4):
-        if w[k] != 0.0:
-            pushed = float(0.0)
-            for m in range(surface.bearing.starts[b[k]], surface.bearing.starts[b[k] + 1]):
-                pushed += wp.abs(surface.bearing.shares[m]) * float(crowd[surface.bearing.places[m]])
-            total += wp.abs(w[k]) * surface.bearing.yielding[b[k]] * pushed
-    return total
-
-
-@wp.func
-def give_way(s: int, surface: Surface):
-    """Move a borne place by the forces at all places that were gathered since the last time."""
-    b = surface.bearing.bearers[s]
-    w = surface.bearing.weights[s]
-    d = wp.vec3()
-    for k in range(4):
-        if w[k] != 0.0:
-            force = wp.vec3()
-            for m in range(surface.bearing.starts[b[k]], surface.bearing.starts[b[k] + 1]):
-                force += surface.bearing.shares[m] * surface.bearing.gathered[surface.bearing.places[m]]
-            d += (w[k] * surface.bearing.yielding[b[k]]) * force
-    surface.d[s] = surface.d[s] + d
 
 
 @wp.func

@@ -115,11 +115,11 @@ def begin_step(
             b = surface.bearing.bearers[s]
             w = surface.bearing.weights[s]
             place = Foreseen()
+            # Without branches, so that CUDA loads all at once.
             for m in range(4):
-                if w[m] != 0.0:
-                    i = bearers.node[b[m]]
-                    own = foreseen(i, damping, gravity, inverse_mass, has_load, load, pace, offset, rest, f, u, v)
-                    place = place_among(place, w[m], own)
+                i = bearers.node[b[m]]
+                own = foreseen(i, damping, gravity, inverse_mass, has_load, load, pace, offset, rest, f, u, v)
+                place = place_among(place, w[m], own)
             surface.rest[s] = place.rest
             surface.x[s] = place.x
             surface.d[s] = place.d

@@ -24,13 +24,11 @@ def find_nodes_beside(
     # Out
     near: Near,
     rigid: Rigid,
-    crowd: wp.array[wp.float32],
 ):
     """Mark nodes that may touch an obstacle before the next search. Obstacles exert no forces on other nodes."""
     s = wp.tid()
     if watch.due[0] == 0:
         return
-    crowd[s] = 0.0
     if rigid.surface.node[s] >= 0:
         world = rigid.surface.world[s]
         for o in range(rigid.forces.shape[0]):

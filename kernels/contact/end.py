@@ -9,7 +9,7 @@ from warp_corot.kernels.stepping.integrate import by_vectors
 from warp_corot.kernels.stepping.pace import Pace
 from warp_corot.kernels.stepping.work import count_constraint
 
-from .bearing import borne_force
+from .mass_split import Sums, force_of
 from .motion import Surface
 from .watch import Watch, follow_node
 
@@ -23,7 +23,9 @@ def end_contact(
     count: int,
     place_start: int,
     places: int,
-    are_borne: int,
+    first: int,
+    buffer: int,
+    grain: float,
     nodes: Surface,
     surface: Surface,
     counts: int,
@@ -36,17 +38,19 @@ def end_contact(
     offset: int,
     v: wp.array[wp.vec4],
     # In and out
+    sums: Sums,
     watch: Watch,
     f: wp.array[wp.vec4],
     account: wp.array2d[wp.float64],
     # Out
     contact_forces: wp.array[wp.vec4],
 ):
-    """Add the contact forces to a body's forces; follow its places.
+    """Add the contact forces to a body's forces, and clear their sums; follow the body's places.
 
     Args:
         start, count: The first of the ``nodes``, which are places or bear them, and how many there are.
         place_start, places: The first place, and how many of them to follow.
+        first, buffer: The number of the first of the nodes in the sums, and the buffer of these.
         counts: Whether the work of contact is counted here.
     """
     k = wp.tid()
@@ -55,11 +59,12 @@ def end_contact(
         i = nodes.node[s]
         if i >= 0:
             force = wp.vec3()
-            if are_borne != 0:
-                force = borne_force(s, surface)
-                nodes.f[s] = force
-            else:
-                force = nodes.f[s]
+            if sums.touched[first + k] != 0:
+                force = force_of(sums.forces[buffer, first + k], grain)
+                sums.touched[first + k] = 0
+                for other in range(2):
+                    sums.weights[other, first + k] = 0
+                    sums.forces[other, first + k] = wp.vec3l()
             store_node(contact_forces, i, force)
             if wp.dot(force, force) > 0.0:
                 total = load_node(f, i) + force

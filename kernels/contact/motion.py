@@ -19,10 +19,8 @@ class Bearing:
     weights: wp.array[wp.vec4]  # [S] their weights
     loose: wp.array[wp.float32]  # [S] the share of the weights that free nodes have
     held: wp.array[wp.vec3]  # [S] the part of the displacement that comes from held nodes [m]
-    gathered: wp.array[wp.vec3]  # [S] forces that have not moved the places yet [N]
+    d: wp.array[wp.vec3]  # [B] motion in this step without contact [m]
     yielding: wp.array[wp.float32]  # [B] additional motion per force [m/N]
-    crowd: wp.array[wp.int32]  # [B] the sum of the weights of contacts that push, in multiples; see ``together``
-    pushed: wp.array2d[wp.vec3l]  # [2, B] forces that move the places, by turns, in grains
     starts: wp.array[wp.int32]  # [B + 1] the places that a node bears, from one start to the next
     places: wp.array[wp.int32]
     shares: wp.array[wp.float32]  # its weights there
@@ -36,7 +34,7 @@ class Surface:
     world: wp.array[wp.int32]  # [S]
     rest: wp.array[wp.vec3]  # [S] rest position [m]
     x: wp.array[wp.vec3]  # [S] where it is [m]
-    d: wp.array[wp.vec3]  # [S] its motion in this step [m]
+    d: wp.array[wp.vec3]  # [S] its motion in this step [m]; after an explicit step that with contact, near things
     yielding: wp.array[wp.float32]  # [S] additional motion per force [m/N]; zero for held nodes
     f: wp.array[wp.vec3]  # [S] contact force [N]
     bearing: Bearing

@@ -2,7 +2,6 @@
 
 import warp as wp
 
-from .bearing import forget_forces
 from .motion import Motions, Surface
 from .watch import ALONE, ASKED, FARTHEST, PARTS, Watch, common_motion, reserve_node, reserve_obstacle
 
@@ -74,7 +73,6 @@ def reserve(surface: Surface, motions: Motions, obstacles: int, watch: Watch, ne
         if obstacles == 0 and (near.flags[s] & SOMETHING) == 0:
             farther = ALONE
         reserve_node(s, farther, surface, watch)
-        forget_forces(s, surface)
         near.flags[s] = 0
     if s == 0:
         # Where something was near at the last search, no room is looked for.

@@ -52,13 +52,9 @@ class Rows:
     shares: wp.array[wp.vec4]
     normal: wp.array[wp.vec3]  # from the second to the first
     gap: wp.array[wp.float32]
-    acts: wp.array[wp.int32]
+    acts: wp.array[wp.int32]  # see ``mass_split``
     force: wp.array[wp.vec3]  # on the first [N]
-    more: wp.array[wp.vec3]
-    live: wp.array[wp.int32]  # those that may push in this step
-    live_count: wp.array[wp.int32]  # [1]
-    exact: int  # whether forces on places are summed as integers, so that the order of threads does not matter
-    summed: wp.array[wp.vec4]  # [S] these sums, if not
+    more: wp.array[wp.vec3]  # its change in the last iteration
 
 
 @wp.func

@@ -79,17 +79,6 @@ def left_overlap(gap: float, loose: float, beyond: float):
 
 
 @wp.func
-def left_at_place(s: int, gap: float, n: wp.vec3, surface: Surface):
-    """How deep a place may stay in an obstacle with the normal n [m]."""
-    if not is_borne(s, surface):
-        return 0.0
-    loose = loose_share(s, surface)
-    if loose >= MOSTLY:
-        return 0.0
-    return left_overlap(gap, loose, wp.dot(n, strayed(add_support(Support(), s, 1.0, surface.yielding, surface))))
-
-
-@wp.func
 def loose_at_triangle(w: wp.vec3, corners: wp.vec3i, yielding: wp.array[wp.float32], surface: Surface):
     """The share of free nodes at a triangle's point. ``yielding``: see ``add_support``."""
     loose = float(0.0)
@@ -126,11 +115,10 @@ def left_at_triangle(
 
 
 @wp.func
-def left_at_pair(p: wp.vec4i, w: wp.vec4, gap: float, n: wp.vec3, surface: Surface):
-    """How deep two sides may stay in each other, with positive and negative shares w at the places p [m]."""
-    loose = loose_at_pair(p, w, surface)
-    if loose >= MOSTLY:
-        return 0.0
+def left_between(p: wp.vec4i, w: wp.vec4, gap: float, loose: float, n: wp.vec3, surface: Surface):
+    """How deep two sides may stay in each other, with positive and negative shares w at the places p [m]; or one side
+    in an obstacle. ``loose``: see ``left_overlap``; less than ``MOSTLY``.
+    """
     first = Support()
     second = Support()
     for k in range(4):
@@ -139,3 +127,12 @@ def left_at_pair(p: wp.vec4i, w: wp.vec4, gap: float, n: wp.vec3, surface: Surfa
         elif w[k] < 0.0:
             second = add_support(second, p[k], -w[k], surface.yielding, surface)
     return left_overlap(gap, loose, wp.dot(n, strayed(first) - strayed(second)))
+
+
+@wp.func
+def left_at_pair(p: wp.vec4i, w: wp.vec4, gap: float, n: wp.vec3, surface: Surface):
+    """The same for a pair, whatever its share of free nodes is."""
+    loose = loose_at_pair(p, w, surface)
+    if loose >= MOSTLY:
+        return 0.0
+    return left_between(p, w, gap, loose, n, surface)

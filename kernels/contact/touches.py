@@ -2,11 +2,11 @@
 
 import warp as wp
 
+from .bearing import is_borne
 from .closest import deepest_on_triangle, on_triangle, point_of, segment_to_triangle
 from .law import LOST, allowed, held_back
-from .near import Near
 from .shapes import CAPSULE, SPHERE, Shapes, carried, distance_to
-from .vertices import Rigid, across
+from .vertices import FORESEEN, Rigid, across
 
 wp.set_module_options({"enable_backward": False})
 
@@ -30,10 +30,10 @@ class Touches:
     gap: wp.array2d[wp.float32]
     friction: wp.array2d[wp.float32]
     moved: wp.array2d[wp.vec3]  # motion of the obstacle's point in this step [m]
-    acts: wp.array2d[wp.int32]
+    acts: wp.array2d[wp.int32]  # see ``mass_split``
     force: wp.array2d[wp.vec3]  # on the triangle [N]
-    more: wp.array2d[wp.vec3]  # its change in this round
-    warmth: wp.array[wp.float32]  # [T] fraction of the last step's normal force with which the rounds begin
+    more: wp.array2d[wp.vec3]  # its change in the last iteration
+    warmth: wp.array[wp.float32]  # [T] fraction of the last step's normal force that is left beside corners that touch
     allowance: wp.array2d[wp.float32]  # how deep the triangle may be [m]; see ``law.allowed``
 
 
@@ -64,10 +64,14 @@ def nearest(shapes: Shapes, o: int, pose: wp.transform, most: float, a: wp.vec3,
 
 @wp.func
 def find_touch(o: int, t: int, rigid: Rigid, triangles: wp.array[wp.vec3i], touches: Touches):
+    """Find the point where an obstacle comes close to a triangle but not to its corners, and the force with which the
+    step begins. Returns whether there is one.
+    """
     was = touches.force[o, t]
     side = touches.normal[o, t]
     touches.shares[o, t] = wp.vec3()
     touches.force[o, t] = wp.vec3()
+    touches.more[o, t] = wp.vec3()
     touches.acts[o, t] = 0
     corners = triangles[t]
     pose = rigid.motions.now[rigid.surface.world[corners[0]], o]
@@ -81,24 +85,24 @@ def find_touch(o: int, t: int, rigid: Rigid, triangles: wp.array[wp.vec3i], touc
         wp.length(rigid.surface.d[corners[0]]),
         wp.max(wp.length(rigid.surface.d[corners[1]]), wp.length(rigid.surface.d[corners[2]])),
     )
-    far += wp.length(carried(pose, later, middle)) + rigid.law.tolerance
+    far = FORESEEN * (far + wp.length(carried(pose, later, middle))) + rigid.law.tolerance
     distance, _away = distance_to(rigid.shapes, o, pose, middle, size + far)
     if distance > size + far:
-        return
+        return False
     w, gap, n = nearest(rigid.shapes, o, pose, size + far, a, b, c)
     if wp.dot(was, was) > 0.0 and wp.dot(n, side) < 0.0 and rigid.shapes.kind[o] == CAPSULE:
         # The axis has passed through since the last step.
         n = -n
         gap = -2.0 * rigid.shapes.size[o][0] - gap
     if gap > far or wp.max(w) > CORNER:
-        return
+        return False
     allowance = touches.allowance[o, t]
     if allowance != 0.0:
         allowance = allowed(allowance, gap)
         touches.allowance[o, t] = (1.0 - LOST) * allowance
         gap += allowance
         if gap > far:
-            return
+            return False
     friction = wp.where(gap < -SKEWERED * rigid.shapes.thickness[o], 0.0, rigid.shapes.friction[o])
     touches.shares[o, t] = w
     touches.normal[o, t] = n
@@ -106,31 +110,12 @@ def find_touch(o: int, t: int, rigid: Rigid, triangles: wp.array[wp.vec3i], touc
     touches.friction[o, t] = friction
     touches.moved[o, t] = carried(pose, later, point_of(w, a, b, c))
     was_push = wp.max(wp.dot(was, n), 0.0)
-    push = touches.warmth[t] * was_push
+    push = was_push
+    # Beside corners that touch, too, it would hold these off; and where nodes bear places, other places.
+    for k in range(3):
+        if rigid.anchors[o, corners[k]][3] > 0.0 or is_borne(corners[k], rigid.surface):
+            push = touches.warmth[t] * was_push
     # Friction begins with all of it, because the slip that restores a part would accumulate.
     if push > 0.0:
-        touches.acts[o, t] = 1
-        force = push * n + held_back(across(was, n), was_push, friction)
-        touches.force[o, t] = force
-        touches.more[o, t] = force
-
-
-@wp.kernel(enable_backward=False)
-def find_touches(
-    # In
-    threads: int,
-    near: Near,
-    rigid: Rigid,
-    triangles: wp.array[wp.vec3i],
-    # In and out
-    touches: Touches,
-):
-    """Find the points where obstacles come close to triangles but not to their corners."""
-    k = wp.tid()
-    count = near.touch_count[0]
-    all_triangles = triangles.shape[0]
-    while k < count:
-        o = near.touches[k] // all_triangles
-        t = near.touches[k] % all_triangles
-        k += threads
-        find_touch(o, t, rigid, triangles, touches)
+        touches.force[o, t] = push * n + held_back(across(was, n), was_push, friction)
+    return True

@@ -1,17 +1,15 @@
-"""Contact of surface nodes with obstacles. Every node has its own mass, so its forces follow directly."""
+"""Contact of places with obstacles."""
 
 import warp as wp
 
-from .bearing import loose_share
-from .law import LOST, Law, allowed, held_back, least_motion, left_to_held, settled
+from .law import LOST, Law, allowed, held_back, settled
 from .motion import Motions, Surface
-from .shapes import MESH, Shapes, carried, distance_to
-from .supports import left_at_place
+from .shapes import Shapes, carried, distance_to
 
 wp.set_module_options({"enable_backward": False})
 
-#: Number of rounds over the obstacles for a node that touches more than one.
-ROUNDS = wp.constant(8)
+#: Gaps of more than so many times the motion of their places and obstacles do not close in a step.
+FORESEEN = wp.constant(4.0)
 
 
 @wp.struct
@@ -25,7 +23,10 @@ class Rigid:
     forces: wp.array2d[wp.vec3]  # of obstacles on places [N]
     anchors: wp.array2d[wp.vec4]  # in the obstacle's frame; the fourth number is 1 if the place sticks
     away: wp.array2d[wp.vec4]  # the direction out of the obstacle, and the gap [m]
-    moved: wp.array2d[wp.vec3]  # motion of the obstacle's point in this step [m]
+    # motion of the obstacle's point in this step, and of that back to the anchor [m]
+    moved: wp.array2d[wp.vec3]
+    more: wp.array2d[wp.vec3]  # changes of forces in the last iteration [N]
+    acts: wp.array2d[wp.int32]  # see ``mass_split``
     allowance: wp.array2d[wp.float32]  # how deep the place may be [m]; see ``law.allowed``
 
 
@@ -35,142 +36,42 @@ def across(a: wp.vec3, normal: wp.vec3):
 
 
 @wp.func
-def find_beside(s: int, o: int, far: float, rigid: Rigid):
-    """Find where an obstacle is in this step; ``far`` is how far the place goes [m]."""
+def begin_place(s: int, o: int, dt: float, rigid: Rigid):
+    """Find where an obstacle is in this step, and the force with which it begins: that of the last step.
+
+    A sticking place is held at an anchor, a point in the obstacle's frame whose fourth number is 1. Returns whether
+    there may be a force.
+    """
+    was = rigid.forces[o, s]
+    rigid.forces[o, s] = wp.vec3()
+    rigid.more[o, s] = wp.vec3()
+    rigid.acts[o, s] = 0
+    if rigid.surface.yielding[s] == 0.0:
+        return False
     world = rigid.surface.world[s]
     now = rigid.motions.now[world, o]
     x = rigid.surface.x[s]
     moved = carried(now, rigid.motions.later[world, o], x)
-    gap, n = distance_to(rigid.shapes, o, now, x, far + rigid.law.tolerance + wp.length(moved))
+    far = FORESEEN * (wp.length(rigid.surface.d[s]) + wp.length(moved)) + rigid.law.tolerance
+    pushed = wp.dot(was, was) > 0.0
+    gap, n = distance_to(rigid.shapes, o, now, x, wp.where(pushed, 1.0, far))
     allowance = rigid.allowance[o, s]
     if allowance != 0.0:
         allowance = allowed(allowance, gap)
         rigid.allowance[o, s] = allowance
         gap += allowance
+    if gap > far and not pushed:
+        return False
+    anchor = rigid.anchors[o, s]
+    if anchor[3] > 0.0:
+        held = wp.transform_point(now, wp.vec3(anchor[0], anchor[1], anchor[2]))
+        moved -= settled(rigid.law, dt) * across(x - held, n)
     rigid.away[o, s] = wp.vec4(n[0], n[1], n[2], gap)
     rigid.moved[o, s] = moved
-
-
-@wp.func
-def touch(s: int, is_first: bool, dt: float, rigid: Rigid):
-    """Find the forces of all obstacles on a node.
-
-    A sticking node is held at an anchor, a point in the obstacle's frame whose fourth number is 1.
-    """
-    count = rigid.forces.shape[0]
-    total = wp.vec3()
-    for o in range(count):
-        if is_first:
-            rigid.forces[o, s] = wp.vec3()
-        total -= rigid.forces[o, s]
-    yielding = rigid.surface.yielding[s]
-    if yielding == 0.0:
-        return
-    world = rigid.surface.world[s]
-    x = rigid.surface.x[s]
-    d = rigid.surface.d[s]
-    going = int(ROUNDS)
-    while going > 0:
-        touched = int(0)
-        for o in range(count):
-            far = wp.length(d)
-            # Meshes look for points no farther away than asked.
-            if (is_first and going == ROUNDS) or rigid.shapes.kind[o] == MESH:
-                find_beside(s, o, far, rigid)
-            now = rigid.motions.now[world, o]
-            moved = rigid.moved[o, s]
-            found = rigid.away[o, s]
-            n = wp.vec3(found[0], found[1], found[2])
-            gap = found[3]
-            far += rigid.law.tolerance + wp.length(moved)
-            before = rigid.forces[o, s]
-            if gap <= far or wp.dot(before, before) > 0.0:
-                relative = d - moved
-                normal_force = wp.max(
-                    wp.dot(before, n) + (least_motion(gap, rigid.law, dt) - wp.dot(relative, n)) / yielding, 0.0
-                )
-                sideways = wp.vec3()
-                if normal_force > 0.0:
-                    touched += 1
-                    slip = across(relative, n)
-                    anchor = rigid.anchors[o, s]
-                    if anchor[3] > 0.0:
-                        held = wp.transform_point(now, wp.vec3(anchor[0], anchor[1], anchor[2]))
-                        slip += settled(rigid.law, dt) * across(x - held, n)
-                    sideways = held_back(across(before, n) - slip / yielding, normal_force, rigid.shapes.friction[o])
-                force = normal_force * n + sideways
-                d += yielding * (force - before)
-                rigid.forces[o, s] = force
-        going -= 1
-        if touched < 2:
-            going = 0
-    for o in range(count):
-        total += rigid.forces[o, s]
-    rigid.surface.d[s] = d
-    rigid.surface.f[s] = rigid.surface.f[s] + total
-
-
-@wp.func
-def begin_borne(s: int, rigid: Rigid):
-    """Begin a step at a borne place with the forces of the last one; returns their sum."""
-    total = wp.vec3()
-    for o in range(rigid.forces.shape[0]):
-        was = rigid.forces[o, s]
-        far = wp.length(rigid.surface.d[s])
-        if wp.dot(was, was) > 0.0:
-            far = 1.0
-        find_beside(s, o, far, rigid)
-        if wp.dot(was, was) > 0.0:
-            found = rigid.away[o, s]
-            n = wp.vec3(found[0], found[1], found[2])
-            push = wp.max(wp.dot(was, n), 0.0)
-            force = push * n + held_back(across(was, n), push, rigid.shapes.friction[o])
-            rigid.forces[o, s] = force
-            total += force
-    return total
-
-
-@wp.func
-def push_borne(s: int, yielding: float, dt: float, rigid: Rigid):
-    """Correct the forces of obstacles on a borne place, if its ``yielding`` is positive.
-
-    Returns:
-        The change of their sum, and the number of obstacles that push.
-    """
-    world = rigid.surface.world[s]
-    x = rigid.surface.x[s]
-    d = rigid.surface.d[s]
-    more = wp.vec3()
-    count = float(0.0)
-    for o in range(rigid.forces.shape[0]):
-        far = wp.length(d)
-        if rigid.shapes.kind[o] == MESH:
-            find_beside(s, o, far, rigid)
-        now = rigid.motions.now[world, o]
-        moved = rigid.moved[o, s]
-        found = rigid.away[o, s]
-        n = wp.vec3(found[0], found[1], found[2])
-        gap = found[3]
-        far += rigid.law.tolerance + wp.length(moved)
-        before = rigid.forces[o, s]
-        if gap <= far or wp.dot(before, before) > 0.0:
-            relative = d - moved
-            wanted = least_motion(gap + left_at_place(s, gap, n, rigid.surface), rigid.law, dt) - wp.dot(relative, n)
-            wanted -= left_to_held(wanted + wp.dot(d, n), loose_share(s, rigid.surface))
-            if wanted > 0.0 or wp.dot(before, n) > 0.0:
-                count += 1.0
-                if yielding > 0.0:
-                    normal_force = wp.max(wp.dot(before, n) + wanted / yielding, 0.0)
-                    slip = across(relative, n)
-                    anchor = rigid.anchors[o, s]
-                    if anchor[3] > 0.0:
-                        held = wp.transform_point(now, wp.vec3(anchor[0], anchor[1], anchor[2]))
-                        slip += settled(rigid.law, dt) * across(x - held, n)
-                    sideways = held_back(across(before, n) - slip / yielding, normal_force, rigid.shapes.friction[o])
-                    force = normal_force * n + sideways
-                    rigid.forces[o, s] = force
-                    more += force - before
-    return more, count
+    push = wp.max(wp.dot(was, n), 0.0)
+    if push > 0.0:
+        rigid.forces[o, s] = push * n + held_back(across(was, n), push, rigid.shapes.friction[o])
+    return True
 
 
 @wp.func
@@ -180,8 +81,7 @@ def anchor(s: int, rigid: Rigid):
     if rigid.surface.yielding[s] == 0.0:
         return
     world = rigid.surface.world[s]
-    x = rigid.surface.x[s]
-    end = x + rigid.surface.d[s]
+    end = rigid.surface.x[s] + rigid.surface.d[s]
     for o in range(rigid.forces.shape[0]):
         if rigid.allowance[o, s] > 0.0:
             rigid.allowance[o, s] = (1.0 - LOST) * rigid.allowance[o, s]
@@ -192,8 +92,6 @@ def anchor(s: int, rigid: Rigid):
             pose = rigid.motions.later[world, o]
             found = rigid.away[o, s]
             n = wp.vec3(found[0], found[1], found[2])
-            if rigid.shapes.kind[o] == MESH:
-                _gap, n = distance_to(rigid.shapes, o, rigid.motions.now[world, o], x, 1.0)
             normal_force = wp.dot(force, n)
             slips = wp.length(across(force, n)) >= 0.9999 * rigid.shapes.friction[o] * normal_force
             if slips or rigid.anchors[o, s][3] == 0.0:

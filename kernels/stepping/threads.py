@@ -23,6 +23,26 @@ def synchronize_any(flag: int) -> int:
     ...
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __syncthreads();
+    if (gridDim.x == 1) return;
+    if (threadIdx.x == 0) {
+        unsigned long long* count = reinterpret_cast<unsigned long long*>(arrived.data);
+        __threadfence();
+        const unsigned long long goal = (atomicAdd(count, 1ull) / gridDim.x + 1ull) * gridDim.x;
+        while (*reinterpret_cast<volatile unsigned long long*>(count) < goal) {}
+        __threadfence();
+    }
+    __syncthreads();
+#endif
+""")
+def synchronize_grid(arrived: wp.array[wp.uint64]):
+    """Wait for all threads of the launch, whose blocks must all be resident. ``arrived`` [1] counts blocks, ever; a
+    launch with another number of blocks has another one."""
+    ...
+
+
 @wp.func
 def number_in(word: wp.uint64, k: int):
     """The k-th of the four 16-bit numbers in a word."""

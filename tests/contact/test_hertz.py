@@ -7,8 +7,9 @@ from half_balls import CONTACT, DEPTH, FORCE, HALF, POISSON, RADIUS, YOUNG, bord
 import warp_corot as wc
 
 
-@pytest.mark.parametrize("finest", [12, pytest.param(15, marks=pytest.mark.slow)])
-def test_a_ball_sinks_in_as_hertz_says(device, finest):
+@pytest.mark.parametrize(("finest", "error"), [(12, 0.035), pytest.param(15, 0.02, marks=pytest.mark.slow)])
+def test_a_ball_sinks_in_as_hertz_says(device, finest, error):
+    """The error is that of the mesh: 16, 3.2 and 1.9 % at levels 9, 12 and 15."""
     mesh = refined_block(finest)
     body = wc.SoftBody(mesh, wc.Isotropic(YOUNG, POISSON, 1000.0), device=device)
     x = mesh.points
@@ -24,7 +25,7 @@ def test_a_ball_sinks_in_as_hertz_says(device, finest):
         contact=wc.Contact(friction=0.0),
     )
     sim.advance(0.3)
-    assert ball.wrench.numpy()[0, 2] == pytest.approx(FORCE, rel=0.03)
+    assert ball.wrench.numpy()[0, 2] == pytest.approx(FORCE, rel=error)
     moved = body.positions.numpy().astype(float) - (0.0, 0.0, RADIUS - DEPTH)
     assert np.linalg.norm(moved, axis=1).min() > RADIUS - 1e-6
 

@@ -19,6 +19,7 @@ from .active_set import ActiveSet
 from .borne_set import BorneSet
 from .carried import CarriedForces
 from .joined_rows import JoinedRows
+from .mass_split import MassSplit
 from .obstacles import Obstacles
 from .options import SURFACE, Contact
 from .pairs import Pairs, smallest_size
@@ -43,8 +44,6 @@ SLACK, FINE = 0.0005, 0.2
 #: Gaps of more than this fraction of the smallest element besides their own motion do not close in an explicit step:
 #: nothing moves by more than a tenth of it.
 CLOSING = 0.25
-#: Number of rounds for obstacles between the nodes, and with places that nodes bear.
-ROUNDS, ROUNDS_OF_BORNE = 3, 4
 #: Number of grains in the force that moves the heaviest node across the smallest element in a step; the maximum is
 #: 2^63.
 GRAINS = 2.0**48
@@ -99,12 +98,14 @@ class Contacts:
         self.law = self._law(stable_dt)
         self.search = Search(self.surface, self.obstacles, self.smallest, branches=system.ranks.is_alone)
         #: Contact between soft surfaces; None if they cannot touch one another.
-        exact = self.device.is_cpu or not system.ranks.is_alone or any(field.deterministic for field in system.fields)
-        self.pairs = Pairs(self.surface, self.search, options, system.ranks, exact=exact) if meets else None
+        self.pairs = Pairs(self.surface, self.search, options, system.ranks) if meets else None
         self.rigid: RigidForces | None = None
         if self.obstacles.count:
-            given = (self.surface, self.obstacles, self.search, self.law, system.pace.arrays, self._ranks, self.pairs)
-            self.rigid = RigidForces(*given)
+            self.rigid = RigidForces(self.surface, self.obstacles, self.search, self.law)
+        given = (self.surface, self.search, self.law, system.pace.arrays, self._ranks, self.rigid, self.pairs)
+        #: The forces of explicit steps.
+        self.split = MassSplit(*given)
+        self._is_explicit = False
         #: Steps while nothing is near; None where the device cannot leave anything out.
         self.sleep = Sleep(system, made, self.obstacles, self.search) if self.search.can_sleep else None
         self._revision = 0
@@ -116,8 +117,7 @@ class Contacts:
     @property
     def launch_revision(self) -> int:
         pairs = 0 if self.pairs is None else self.pairs.revision
-        rigid = 0 if self.rigid is None else self.rigid.revision
-        return self._revision + self.surface.revision + self.obstacles.revision + pairs + rigid
+        return self._revision + self.surface.revision + self.obstacles.revision + pairs
 
     @property
     def state(self) -> dict[str, wp.array]:
@@ -132,12 +132,11 @@ class Contacts:
             self.surface.follow()
             self._follow(before)
             carried.give_back()
-        if self.rigid is not None:
-            self.rigid.prepare()
         if self.pairs is not None:
             if not self.pairs.is_planted:
                 self._predict(0, 0.0)
             self.pairs.prepare()
+        self.split.follow()
 
     @property
     def is_full(self) -> bool:
@@ -192,8 +191,8 @@ class Contacts:
         system, surface = self.system, self.surface
         self._predict(offset, damping, begins=True, moves=moves)
         self.search.launch(offset, follows=True, sleeps=self.sleep is not None)
-        self._solve()
-        self._ranks.clear_surface(surface.arrays.f)
+        self.split.launch()
+        self._is_explicit = True
         follows = bool(self.search.finders) and not surface.is_whole
         for k, (body, part) in enumerate(zip(system.bodies, surface.parts, strict=True)):
             state, conditions, accounts = body.state, body.conditions, system.constraint_accounts(k)
@@ -203,12 +202,20 @@ class Contacts:
                 state.contact_forces.zero_()
             start, count, arrays = self.surface.nodes_of(k)
             places = self._count(k) if follows else 0
-            inputs = [start, count, part.start, places, int(part.bearers > 0), arrays, surface.arrays]
+            inputs = [start, count, part.start, places, self.split.first(k), self.split.buffer, self.law.grain]
+            inputs += [arrays, surface.arrays]
             inputs += [int(counts), damping, system.gravity, conditions.inverse_mass, int(conditions.has_loads)]
             inputs += [conditions.loads, system.pace.arrays, offset, state.velocities]
-            outputs = [self.search.watch, state.forces, accounts[0] if counts else None, state.contact_forces]
+            outputs = [
+                self.split.sums,
+                self.search.watch,
+                state.forces,
+                accounts[0] if counts else None,
+                state.contact_forces,
+            ]
             self._launch(END_CONTACT[conditions.loads.dtype], max(count, places), inputs, outputs)
         if surface.is_whole:
+            self.split.launch_clear()
             self.search.launch_after()
 
     @property
@@ -247,6 +254,7 @@ class Contacts:
         surface, obstacles = self.surface, self.obstacles
         if self.sleep is not None:
             self.sleep.launch_check()
+        forces = None
         if self.rigid is not None:
             forces = self.rigid.launch_totals()
             for number in range(obstacles.count if self.rigid.have_edges else 0):
@@ -262,6 +270,8 @@ class Contacts:
                 sums.fold_wrenches, obstacles.wrenches.shape, [self._parts], [obstacles.wrenches], device=self.device
             )
         self.search.launch_report()
+        if self._is_explicit:
+            self.split.launch_place_forces(forces)
         inputs = [surface.arrays, surface.triangles, surface.corner_starts, surface.corners]
         self._launch(sums.node_pressures, surface.count, inputs, [self._pressures])
         self._ranks.complete_surface(self._pressures)
@@ -363,19 +373,6 @@ class Contacts:
         for k, part in enumerate(surface.parts):
             if part.bearers and not finds_borne:
                 self._launch(bearing.place_borne, self._count(k), [part.start, surface.bearers, surface.arrays], [])
-
-    def _solve(self) -> None:
-        """Launch the forces in turn: of obstacles on nodes, of obstacles between these, and of soft surfaces."""
-        rigid, pairs = self.rigid, self.pairs
-        rounds = ROUNDS if self.obstacles.have_edges or pairs is not None else 0
-        if self.surface.is_borne:
-            rounds = ROUNDS_OF_BORNE
-        if rigid is not None:
-            rigid.launch(rounds)
-        elif pairs is not None:
-            pairs.launch_begin(self.law)
-            for _ in range(rounds):
-                pairs.launch_round(self.law, self.system.pace.arrays)
 
     def _make_arrays(self) -> None:
         surface, device = self.surface, self.device

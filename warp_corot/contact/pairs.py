@@ -7,12 +7,9 @@ import warp as wp
 
 from warp_corot.errors import UnstableError
 from warp_corot.kernels.contact import boxes
-from warp_corot.kernels.contact import pairs as kernels
 from warp_corot.kernels.contact import search as search_kernels
 from warp_corot.kernels.contact.crushed import mark_crushed
-from warp_corot.kernels.contact.law import Law
 from warp_corot.kernels.contact.rows import Meeting, Rows
-from warp_corot.kernels.stepping.pace import Pace
 from warp_corot.solvers.ranks import ALONE, Ranks
 
 from .options import Contact
@@ -41,7 +38,6 @@ class Pairs:
         search: The search for nearby surfaces.
         options: The options of contact.
         ranks: The processes that compute other elements.
-        exact: Whether sums of forces do not depend on the order of threads.
 
     Attributes:
         rows: The pairs, as a struct for kernels.
@@ -55,14 +51,11 @@ class Pairs:
         search: Search,
         options: Contact,
         ranks: Ranks = ALONE,
-        *,
-        exact: bool = True,
     ):
         self._ranks = ranks
         self.surface, self.search, self.device = surface, search, surface.device
         self.friction, self.meets_itself, self._flat_edges = options.friction, options.self_contact, options.flat_edges
         self.revision, self._room, self._taken, self._built = 0, 0, -1, 0
-        self.exact = exact
         search.watch.most_calm = CALM_ITSELF if self.meets_itself else CALM
         if self.meets_itself:
             search.watch.most_alone = 1.0
@@ -95,9 +88,6 @@ class Pairs:
         roots = (2, surface.worlds * meeting.groups)
         meeting.roots = wp.zeros(roots, dtype=wp.int32, device=device)
         self.meeting = meeting
-        self._crowd = wp.zeros(count, dtype=wp.int32, device=device)
-        self._added = wp.zeros(count, dtype=wp.vec3l, device=device)
-        self._summed = wp.zeros(1 if self.exact else count, dtype=wp.vec4, device=device)
         self._boxes = [
             tuple(wp.zeros(max(number, 1), dtype=wp.vec3, device=device) for _ in range(2))
             for number in (surface.triangle_count, edges)
@@ -125,18 +115,16 @@ class Pairs:
     def _rows_for(self, room: int) -> tuple[Rows, search_kernels.OldRows]:
         device, owners = self.device, self.surface.count + self.surface.edge_count
         rows, old = Rows(), search_kernels.OldRows()
-        rows.total, rows.live_count = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
+        rows.total = wp.zeros(1, dtype=wp.int32, device=device)
         for kept in (rows, old):
             kept.starts, kept.counts = (wp.zeros(owners, dtype=wp.int32, device=device) for _ in range(2))
             kept.other = wp.zeros(room, dtype=wp.int32, device=device)
             kept.force = wp.zeros(room, dtype=wp.vec3, device=device)
-        rows.owner, rows.acts, rows.live = (wp.zeros(room, dtype=wp.int32, device=device) for _ in range(3))
-        rows.normal = wp.zeros(room, dtype=wp.vec3, device=device)
+        rows.owner, rows.acts = (wp.zeros(room, dtype=wp.int32, device=device) for _ in range(2))
+        rows.normal, rows.more = (wp.zeros(room, dtype=wp.vec3, device=device) for _ in range(2))
         rows.places = wp.zeros(room, dtype=wp.vec4i, device=device)
         rows.shares = wp.zeros(room, dtype=wp.vec4, device=device)
         rows.gap = wp.zeros(room, dtype=wp.float32, device=device)
-        rows.exact = int(self.exact)
-        rows.summed = self._summed
         return rows, old
 
     @property
@@ -195,19 +183,6 @@ class Pairs:
 
     # --- launches --------------------------------------------------------------------------------------------------
 
-    def launch_begin(self, law: Law) -> None:
-        """Launch the places of all pairs."""
-        self.rows.live_count.zero_()
-        self._on_rows(kernels.locate_rows, [law, self.surface.arrays, self.meeting, self.rows, self._added])
-        self._apply(law)
-
-    def launch_round(self, law: Law, pace: Pace) -> None:
-        """Launch one round of the forces between pairs."""
-        arrays = self.surface.arrays
-        self._on_rows(kernels.judge_rows, [law, pace, arrays, self.rows, self._crowd])
-        self._on_rows(kernels.solve_rows, [law, pace, arrays, self.friction, self._crowd, self.rows, self._added])
-        self._apply(law)
-
     def _box(self) -> None:
         inputs = [self.surface.arrays, self.meeting]
         boxed = (boxes.box_triangles, boxes.box_edges)
@@ -262,20 +237,6 @@ class Pairs:
             inputs = [watch, elements, body.state.displacements, places, int(part.bearers > 0), surface.arrays]
             wp.launch(kernel, body.sizes.launch_elements, inputs, [near], device=self.device)
         self._ranks.take_most(near.flags)
-
-    def _on_rows(self, kernel: wp.Kernel, inputs: list) -> None:
-        threads = self.search.threads(self._room)
-        if not self.device.is_cpu:
-            threads = -(-threads // kernels.LANES) * kernels.LANES
-        wp.launch(kernel, threads, [threads, *inputs], device=self.device)
-
-    def _apply(self, law: Law) -> None:
-        """Launch the addition of these forces to the nodes."""
-        among = self.search.at_nodes
-        inputs = [*among, law, self.surface.arrays, self.rows, self._added, self._crowd]
-        wp.launch(kernels.apply_added, among[0], inputs, device=self.device)
-        if self.surface.is_borne:
-            wp.launch(kernels.settle_pairs, among[0], [*among, self.surface.arrays], device=self.device)
 
 
 def smallest_size(volumes: list[float]) -> float:

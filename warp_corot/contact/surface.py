@@ -22,9 +22,11 @@ if TYPE_CHECKING:
 #: Room for a body whose mesh changes, over the size of its surface when the room is reserved.
 ROOM = 1.5
 NO_NODE = -1
-#: Steps begin with this fraction of the last step's forces of obstacles on triangles: with more, triangles hold off the
-#: nodes around an obstacle, and bodies seem stiffer. Where nodes bear both sides of a thin wall they begin with all:
-#: the rounds of a step do not make up for the rest there.
+#: Smaller weights of the nodes around a place are rounding errors.
+LEAST_WEIGHT = 1e-6
+#: Beside corners that touch, too, and where nodes bear places, a step begins with this fraction of the last step's
+#: forces of obstacles on triangles: with more, triangles hold off places around, and bodies seem stiffer. Where nodes
+#: bear both sides of a thin wall it begins with all: the iterations of a step do not make up for the rest there.
 WARMTH = 0.5
 
 Ints = npt.NDArray[np.int32]
@@ -262,10 +264,7 @@ class ContactSurface:
         bearing.bearers = wp.empty(borne, dtype=wp.vec4i, device=device)
         bearing.loose = wp.zeros(borne, dtype=wp.float32, device=device)
         bearing.held = wp.zeros(borne, dtype=wp.vec3, device=device)
-        bearing.gathered = wp.zeros(borne, dtype=wp.vec3, device=device)
-        bearing.yielding = self.bearers.yielding
-        bearing.crowd = wp.zeros(bearers, dtype=wp.int32, device=device)
-        bearing.pushed = wp.zeros((2, bearers), dtype=wp.vec3l, device=device)
+        bearing.d, bearing.yielding = self.bearers.d, self.bearers.yielding
         bearing.starts = wp.zeros(bearers + 1, dtype=wp.int32, device=device)
         bearing.weights = wp.zeros(borne, dtype=wp.vec4, device=device)
         bearing.places = wp.zeros(4 * borne, dtype=wp.int32, device=device)
@@ -289,6 +288,8 @@ class ContactSurface:
                 world[start : start + part.bearers] = w
                 bearers[first : first + len(at)] = at + start
                 weights[first : first + len(at)] = part.skin.own.weights
+        # Nodes with a share that comes from rounding would have to move places by far.
+        weights[np.abs(weights) < LEAST_WEIGHT] = 0.0
         places, which = np.nonzero(weights)
         order = np.argsort(bearers[places, which], kind="stable")
         places, which = places[order], which[order]

@@ -37,7 +37,7 @@ IMPLICIT = (
 )
 #: Modules for explicit contact with obstacles on the CPU.
 CONTACT = (
-    *("contact.together", "contact.begin", "contact.sums", "contact.beside", "contact.sleep", "contact.overlaps"),
+    *("contact.mass_split", "contact.begin", "contact.sums", "contact.beside", "contact.sleep", "contact.overlaps"),
     *("contact.watch", "contact.near", "contact.end", "contact.bearing"),
 )
 

@@ -166,10 +166,9 @@ class RecordedSteps:
             self._asked.add(segment)
         if self.in_blocks:
             pieces = segment.pieces(BLOCK_STEPS)
-        elif self._pace.device.is_cpu:
-            pieces = segment.pieces(min(CPU_GRAPH_STEPS, self._stepper.graph_steps), edges=True)
         else:
-            pieces = segment.pieces(self._stepper.graph_steps)
+            longest = CPU_GRAPH_STEPS if self._pace.device.is_cpu else self._stepper.graph_steps
+            pieces = segment.pieces(min(longest, self._stepper.graph_steps), edges=True)
         for piece in pieces:
             self._replay_recording(piece)
 

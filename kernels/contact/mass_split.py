@@ -1,0 +1,431 @@
+"""Contact forces of an explicit step: projected Jacobi iterations over all contacts, with split masses.
+
+A contact is a place and an obstacle, a triangle and an obstacle, or a pair of soft surfaces. Contacts that push one
+node divide its mass in proportion to their weights there. Then the iterations converge and add no energy for any number of
+contacts (mass splitting; the bound is the sum of each row of J M^-1 J^T; Tonge, Benevolenski and Voroshilov 2012).
+
+Forces are summed at nodes as integers, so that the order of threads does not matter. An iteration reads the sums of one
+buffer and writes those of the other: so it ends with one barrier. On CUDA resident blocks of threads make all
+iterations of a step in one launch.
+"""
+
+import warp as wp
+
+from warp_corot.kernels.stepping.pace import DT, Pace
+from warp_corot.kernels.stepping.threads import synchronize_grid
+
+from .bearing import is_borne, loose_share
+from .law import Law, held_back, least_motion, left_to_held
+from .motion import Surface
+from .near import BESIDE, Near
+from .pairs import list_by_warp, locate_row
+from .rows import Meeting, Rows, row_count
+from .supports import MOSTLY, left_between
+from .touches import Touches, find_touch
+from .vertices import Rigid, across, anchor, begin_place
+
+wp.set_module_options({"enable_backward": False})
+
+#: Number of threads of a block on CUDA.
+BLOCK = 256
+#: Weights are summed in multiples of one over this.
+SHARES = wp.constant(1048576.0)
+#: Whether a contact acts: no; yes, since the last iteration, so that its weight is in the sums of one buffer only; yes;
+#: no, since the last iteration.
+WAITS, BEGINS, ACTS, ENDS = (wp.constant(k) for k in range(4))
+#: The first phase of a step. Iterations follow, and then the end.
+LOCATE = wp.constant(0)
+#: Threads of a warp.
+WARP = wp.constant(32)
+
+
+@wp.struct
+class Sums:
+    """What contacts add up at places that are nodes, [S], and after these at bearers, [B]; zero between steps."""
+
+    touched: wp.array[wp.int32]  # [S + B] whether anything was added
+    weights: wp.array2d[wp.int32]  # [2, S + B] of the contacts that act, in multiples of one over SHARES
+    forces: wp.array2d[wp.vec3l]  # [2, S + B] in multiples of ``Law.grain``
+    live: wp.array[wp.int32]  # contacts that may act in this step, by their numbers
+    live_count: wp.array[wp.int32]  # [2] how many in this step while forces are found, and in the last one
+    arrived: wp.array[wp.uint64]  # [1] blocks at the barrier, ever
+
+
+@wp.struct
+class Contact:
+    """A contact: up to four places with weights, whose weighted motion opens it."""
+
+    places: wp.vec4i  # -1 for none
+    weights: wp.vec4
+    normal: wp.vec3
+    gap: float  # [m]
+    moved: wp.vec3  # motion of the obstacle's point in this step [m]
+    friction: float
+    force: wp.vec3  # on the side with positive weights [N]
+    more: wp.vec3  # its change in the last iteration [N]
+    acts: int
+
+
+@wp.struct
+class Contacts:
+    """All that there may be. Numbers: S for each obstacle, then T for each obstacle, and then the pairs."""
+
+    rigid: Rigid
+    triangles: wp.array[wp.vec3i]
+    touches: Touches
+    meeting: Meeting
+    rows: Rows
+
+
+@wp.func
+def contact_of(number: int, all: Contacts):
+    """The contact with a number, which has been located in this step."""
+    found = Contact()
+    places = all.rigid.surface.node.shape[0]
+    at_places = places * all.rigid.forces.shape[0]
+    at_triangles = at_places + all.touches.force.shape[0] * all.touches.force.shape[1]
+    if number < at_places:
+        o = number // places
+        s = number % places
+        away = all.rigid.away[o, s]
+        found.places = wp.vec4i(s, -1, -1, -1)
+        found.weights = wp.vec4(1.0, 0.0, 0.0, 0.0)
+        found.normal = wp.vec3(away[0], away[1], away[2])
+        found.gap = away[3]
+        found.moved = all.rigid.moved[o, s]
+        found.friction = all.rigid.shapes.friction[o]
+        found.force = all.rigid.forces[o, s]
+        found.more = all.rigid.more[o, s]
+        found.acts = all.rigid.acts[o, s]
+    elif number < at_triangles:
+        o = (number - at_places) // all.triangles.shape[0]
+        t = (number - at_places) % all.triangles.shape[0]
+        c = all.triangles[t]
+        w = all.touches.shares[o, t]
+        found.places = wp.vec4i(c[0], c[1], c[2], -1)
+        found.weights = wp.vec4(w[0], w[1], w[2], 0.0)
+        found.normal = all.touches.normal[o, t]
+        found.gap = all.touches.gap[o, t]
+        found.moved = all.touches.moved[o, t]
+        found.friction = all.touches.friction[o, t]
+        found.force = all.touches.force[o, t]
+        found.more = all.touches.more[o, t]
+        found.acts = all.touches.acts[o, t]
+    else:
+        row = number - at_triangles
+        found.places = all.rows.places[row]
+        found.weights = all.rows.shares[row]
+        found.normal = all.rows.normal[row]
+        found.gap = all.rows.gap[row]
+        found.friction = all.meeting.friction
+        found.force = all.rows.force[row]
+        found.more = all.rows.more[row]
+        found.acts = all.rows.acts[row]
+    return found
+
+
+@wp.func
+def keep(number: int, contact: Contact, all: Contacts):
+    """Store what an iteration changes."""
+    places = all.rigid.surface.node.shape[0]
+    at_places = places * all.rigid.forces.shape[0]
+    at_triangles = at_places + all.touches.force.shape[0] * all.touches.force.shape[1]
+    if number < at_places:
+        o = number // places
+        s = number % places
+        all.rigid.forces[o, s] = contact.force
+        all.rigid.more[o, s] = contact.more
+        all.rigid.acts[o, s] = contact.acts
+    elif number < at_triangles:
+        o = (number - at_places) // all.triangles.shape[0]
+        t = (number - at_places) % all.triangles.shape[0]
+        all.touches.force[o, t] = contact.force
+        all.touches.more[o, t] = contact.more
+        all.touches.acts[o, t] = contact.acts
+    else:
+        row = number - at_triangles
+        all.rows.force[row] = contact.force
+        all.rows.more[row] = contact.more
+        all.rows.acts[row] = contact.acts
+
+
+# --- sums at nodes ---------------------------------------------------------------------------------------------------
+
+
+@wp.func
+def grains_of(force: wp.vec3, grain: float):
+    g = force / grain
+    return wp.vec3l(wp.int64(g[0]), wp.int64(g[1]), wp.int64(g[2]))
+
+
+@wp.func
+def force_of(grains: wp.vec3l, grain: float):
+    return grain * wp.vec3(float(grains[0]), float(grains[1]), float(grains[2]))
+
+
+@wp.func
+def share_of(weight: float):
+    """A weight in multiples of one over ``SHARES``."""
+    return wp.max(int(SHARES * wp.abs(weight)), 1)
+
+
+@wp.func
+def add_weights(contact: Contact, times: int, buffer: int, surface: Surface, sums: Sums):
+    """Count a contact that acts at the nodes of its places, so many times: 1, or -1 if it does not any more."""
+    nodes = surface.node.shape[0]
+    for k in range(4):
+        weight = contact.weights[k]
+        if weight != 0.0:
+            s = contact.places[k]
+            if is_borne(s, surface):
+                b = surface.bearing.bearers[s]
+                w = surface.bearing.weights[s]
+                for m in range(4):
+                    if w[m] != 0.0:
+                        sums.touched[nodes + b[m]] = 1
+                        wp.atomic_add(sums.weights, buffer, nodes + b[m], times * share_of(weight * w[m]))
+            else:
+                sums.touched[s] = 1
+                wp.atomic_add(sums.weights, buffer, s, times * share_of(weight))
+
+
+@wp.func
+def add_force(contact: Contact, force: wp.vec3, buffer: int, grain: float, surface: Surface, sums: Sums):
+    """Add a force to the nodes of a contact's places."""
+    nodes = surface.node.shape[0]
+    for k in range(4):
+        weight = contact.weights[k]
+        if weight != 0.0:
+            s = contact.places[k]
+            if is_borne(s, surface):
+                b = surface.bearing.bearers[s]
+                w = surface.bearing.weights[s]
+                for m in range(4):
+                    if w[m] != 0.0:
+                        wp.atomic_add(sums.forces, buffer, nodes + b[m], grains_of((weight * w[m]) * force, grain))
+            else:
+                wp.atomic_add(sums.forces, buffer, s, grains_of(weight * force, grain))
+
+
+@wp.func
+def motion_of(s: int, buffer: int, grain: float, surface: Surface, sums: Sums):
+    """The motion of a place in this step with the forces of a buffer [m]; and how far it moves for each unit of force
+    if all contacts at its nodes push in proportion to their weights [m/N].
+    """
+    if not is_borne(s, surface):
+        mobility = surface.yielding[s]
+        d = surface.d[s] + mobility * force_of(sums.forces[buffer, s], grain)
+        return d, mobility * float(sums.weights[buffer, s]) / SHARES
+    nodes = surface.node.shape[0]
+    b = surface.bearing.bearers[s]
+    w = surface.bearing.weights[s]
+    d = wp.vec3()
+    compliance = float(0.0)
+    # Without branches, so that CUDA loads all at once.
+    for k in range(4):
+        mobility = surface.bearing.yielding[b[k]]
+        force = force_of(sums.forces[buffer, nodes + b[k]], grain)
+        d += w[k] * (surface.bearing.d[b[k]] + mobility * force)
+        compliance += wp.abs(w[k]) * mobility * float(sums.weights[buffer, nodes + b[k]])
+    return d, compliance / SHARES
+
+
+# --- the phases of a step --------------------------------------------------------------------------------------------
+
+
+@wp.func
+def required_opening(contact: Contact, opens: wp.vec3, loose: float, law: Law, dt: float, surface: Surface):
+    """How much more a contact must open than it does [m]; ``opens``: its motion in this step; ``loose``: the sum of its
+    places' shares of free nodes.
+    """
+    gap = contact.gap
+    if loose < MOSTLY:
+        gap += left_between(contact.places, contact.weights, contact.gap, loose, contact.normal, surface)
+    return least_motion(gap, law, dt) - wp.dot(opens, contact.normal)
+
+
+@wp.func
+def locate(number: int, dt: float, all: Contacts, sums: Sums):
+    """Find a contact in this step, with the force with which it begins. Returns whether it may act."""
+    surface = all.rigid.surface
+    law = all.rigid.law
+    places = surface.node.shape[0]
+    at_places = places * all.rigid.forces.shape[0]
+    at_triangles = at_places + all.touches.force.shape[0] * all.touches.force.shape[1]
+    is_near = bool(False)
+    if number < at_places:
+        is_near = begin_place(number % places, number // places, dt, all.rigid)
+    elif number < at_triangles:
+        pair = number - at_places
+        is_near = find_touch(
+            pair // all.triangles.shape[0], pair % all.triangles.shape[0], all.rigid, all.triangles, all.touches
+        )
+    else:
+        is_near = locate_row(number - at_triangles, law, surface, all.meeting, all.rows)
+    if not is_near:
+        return 0
+    contact = contact_of(number, all)
+    opens = -contact.moved
+    loose = float(0.0)
+    for k in range(4):
+        if contact.weights[k] != 0.0:
+            s = contact.places[k]
+            opens += contact.weights[k] * surface.d[s]
+            loose += wp.abs(contact.weights[k]) * loose_share(s, surface)
+    pushes = wp.dot(contact.force, contact.force) > 0.0
+    if pushes or required_opening(contact, opens, loose, law, dt, surface) > 0.0:
+        contact.acts = ACTS
+        for buffer in range(2):
+            add_weights(contact, 1, buffer, surface, sums)
+            if pushes:
+                add_force(contact, contact.force, buffer, law.grain, surface, sums)
+        keep(number, contact, all)
+    return 1
+
+
+@wp.func
+def iterate(number: int, before: int, dt: float, all: Contacts, sums: Sums):
+    """Correct the force of a contact, with the sums of the buffer ``before`` and into the other one."""
+    surface = all.rigid.surface
+    law = all.rigid.law
+    contact = contact_of(number, all)
+    opens = -contact.moved
+    compliance = float(0.0)
+    loose = float(0.0)
+    free = wp.vec3()
+    for k in range(4):
+        if contact.weights[k] != 0.0:
+            s = contact.places[k]
+            weight = wp.abs(contact.weights[k])
+            share = loose_share(s, surface)
+            motion, own = motion_of(s, before, law.grain, surface, sums)
+            opens += contact.weights[k] * motion
+            loose += weight * share
+            if share > 0.0:
+                compliance += weight * own
+                free += contact.weights[k] * motion
+    wanted = required_opening(contact, opens, loose, law, dt, surface)
+    # The other buffer has not got the last changes yet.
+    added = contact.more
+    contact.more = wp.vec3()
+    counted = int(0)
+    if contact.acts == BEGINS:
+        counted += 1
+        contact.acts = ACTS
+    elif contact.acts == ENDS:
+        counted -= 1
+        contact.acts = WAITS
+    if contact.acts == ACTS:
+        force = wp.vec3()
+        if compliance > 0.0:
+            n = contact.normal
+            wanted -= left_to_held(wanted + wp.dot(free, n), loose)
+            normal_force = wp.max(wp.dot(contact.force, n) + wanted / compliance, 0.0)
+            sideways = across(contact.force, n) - across(opens, n) / compliance
+            force = normal_force * n + held_back(sideways, normal_force, contact.friction)
+        contact.more = force - contact.force
+        contact.force = force
+        added += contact.more
+        if wp.dot(force, force) == 0.0:
+            counted -= 1
+            contact.acts = ENDS
+    elif wanted > 0.0:
+        counted += 1
+        contact.acts = BEGINS
+    if counted != 0:
+        add_weights(contact, counted, 1 - before, surface, sums)
+    if wp.dot(added, added) > 0.0:
+        add_force(contact, added, 1 - before, law.grain, surface, sums)
+    keep(number, contact, all)
+
+
+@wp.kernel(enable_backward=False, grid_stride=False, launch_bounds=(BLOCK, 2))
+def solve_contacts(
+    # In
+    threads: int,
+    first: int,
+    last: int,
+    iterations: int,
+    near: Near,
+    pace: Pace,
+    # In and out
+    all: Contacts,
+    sums: Sums,
+):
+    """Make some phases of a step: the first one finds all contacts, then there are the iterations, and the last one
+    finds where places go and updates anchors.
+
+    Args:
+        threads: The number of threads, of blocks that are all resident on CUDA.
+        first, last: The phases, from 0 to ``iterations`` + 1.
+    """
+    thread = wp.tid()
+    dt = float(pace.seconds[DT])
+    obstacles = all.rigid.forces.shape[0]
+    phase = int(first)
+    while phase <= last:
+        if phase > first:
+            synchronize_grid(sums.arrived)
+        k = int(thread)
+        if phase == LOCATE:
+            beside = near.count[0] * obstacles
+            touches = beside + near.touch_count[0]
+            count = touches + row_count(all.rows)
+            places = all.rigid.surface.node.shape[0]
+            # Warps stay together.
+            beyond = count + wp.where(threads > 1, thread % WARP, 0)
+            while k < beyond:
+                number = int(-1)
+                if k < beside:
+                    s = near.nodes[k // obstacles]
+                    if (near.flags[s] & BESIDE) != 0:
+                        number = (k % obstacles) * places + s
+                elif k < touches:
+                    number = places * obstacles + near.touches[k - beside]
+                elif k < count:
+                    number = places * obstacles + all.touches.force.shape[0] * all.touches.force.shape[1] + k - touches
+                may_act = int(0)
+                if number >= 0:
+                    may_act = locate(number, dt, all, sums)
+                list_by_warp(sums.live, sums.live_count, number, may_act)
+                k += threads
+        elif phase <= iterations:
+            while k < sums.live_count[0]:
+                iterate(sums.live[k], (phase - 1) % 2, dt, all, sums)
+                k += threads
+        else:
+            if thread == 0:
+                sums.live_count[1] = sums.live_count[0]
+                sums.live_count[0] = 0
+            while k < near.count[0]:
+                s = near.nodes[k]
+                d, _compliance = motion_of(s, iterations % 2, all.rigid.law.grain, all.rigid.surface, sums)
+                all.rigid.surface.d[s] = d
+                if (near.flags[s] & BESIDE) != 0:
+                    anchor(s, all.rigid)
+                k += threads
+        phase += 1
+
+
+# --- results ---------------------------------------------------------------------------------------------------------
+
+
+@wp.kernel(enable_backward=False)
+def add_pairs(grain: float, rows: Rows, forces: wp.array[wp.vec3l]):
+    """Add the forces of pairs to their places."""
+    row = wp.tid()
+    if row < row_count(rows) and rows.acts[row] != 0:
+        for k in range(4):
+            if rows.shares[row][k] != 0.0:
+                wp.atomic_add(forces, rows.places[row][k], grains_of(rows.shares[row][k] * rows.force[row], grain))
+
+
+@wp.kernel(enable_backward=False)
+def place_forces(grain: float, totals: wp.array2d[wp.vec3], forces: wp.array[wp.vec3l], surface: Surface):
+    """Find the force at each place: those of pairs, which become zero, and those of obstacles."""
+    s = wp.tid()
+    force = force_of(forces[s], grain)
+    forces[s] = wp.vec3l()
+    for o in range(totals.shape[0]):
+        force += totals[o, s]
+    surface.f[s] = force

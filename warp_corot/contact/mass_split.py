@@ -1,0 +1,141 @@
+"""The contact forces of an explicit step; see ``kernels.contact.mass_split``."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from warp_corot.kernels.contact import mass_split as kernels
+from warp_corot.kernels.contact.law import Law
+from warp_corot.kernels.contact.rows import Meeting, Rows
+from warp_corot.kernels.contact.touches import Touches
+from warp_corot.kernels.contact.vertices import Rigid
+from warp_corot.kernels.stepping.pace import Pace
+from warp_corot.solvers.ranks import Ranks
+
+from .pairs import Pairs
+from .rigid_forces import RigidForces
+from .search import Search
+from .surface import ContactSurface
+
+#: Number of iterations if contacts share nodes, and otherwise: then the first one is exact.
+ITERATIONS, EXACT = 4, 1
+
+
+class MassSplit:
+    """Projected Jacobi iterations over the contacts of a step.
+
+    Args:
+        surface: The bodies' surfaces.
+        search: The search for nearby surfaces.
+        law: The law of contact.
+        pace: The clock.
+        ranks: The processes that move the other nodes of the triangles here.
+        rigid: Contact with obstacles; None without.
+        pairs: Contact between soft surfaces; None if they cannot touch.
+
+    Attributes:
+        sums: What contacts add up at nodes, as a struct for kernels.
+        iterations: Number of iterations of a step.
+    """
+
+    def __init__(
+        self,
+        surface: ContactSurface,
+        search: Search,
+        law: Law,
+        pace: Pace,
+        ranks: Ranks,
+        rigid: RigidForces | None,
+        pairs: Pairs | None,
+    ):
+        self.surface, self.device = surface, surface.device
+        self._search, self._law, self._pace, self._ranks = search, law, pace, ranks
+        self._rigid, self._pairs, self._taken = rigid, pairs, (-1, -1)
+        alone = pairs is None and not surface.is_borne and (rigid is None or rigid.is_separate)
+        self.iterations = EXACT if alone else ITERATIONS
+        self.follow()
+
+    def follow(self) -> None:
+        """Update to the present surfaces and the room for pairs."""
+        room = 0 if self._pairs is None else self._pairs.room
+        if (self.surface.revision, room) == self._taken:
+            return
+        self._taken, device = (self.surface.revision, room), self.device
+        count = self.surface.count + self.surface.bearer_count
+        self.sums = kernels.Sums()
+        self.sums.touched = wp.zeros(count, dtype=wp.int32, device=device)
+        self.sums.weights = wp.zeros((2, count), dtype=wp.int32, device=device)
+        self.sums.forces = wp.zeros((2, count), dtype=wp.vec3l, device=device)
+        contacts = room
+        if self._rigid is not None:
+            contacts += self._rigid.forces.size + self._rigid.touches.force.size
+        self.sums.live = wp.zeros(contacts, dtype=wp.int32, device=device)
+        self.sums.live_count = wp.zeros(2, dtype=wp.int32, device=device)
+        self.sums.arrived = wp.zeros(1, dtype=wp.uint64, device=device)
+        self._threads: int = 1
+        if device.is_cuda:
+            self._threads = kernels.BLOCK * max(min(-(-contacts // kernels.BLOCK), device.sm_count), 1)
+
+    @property
+    def buffer(self) -> int:
+        """The buffer of the sums that has the forces at the end of a step."""
+        return self.iterations % 2
+
+    def first(self, k: int) -> int:
+        """The number in the sums of the first node that carries a body's surface."""
+        part = self.surface.parts[k]
+        return self.surface.count + part.bearer_start if part.bearers else part.start
+
+    def launch(self) -> None:
+        """Launch all phases of a step."""
+        last = self.iterations + 1
+        if self._ranks.is_alone:
+            self._launch(0, last)
+            return
+        self._ranks.complete_surface(self.surface.arrays.yielding)
+        for phase in range(last + 1):
+            self._launch(phase, phase)
+            for buffer in (0, 1) if phase == 0 else (phase % 2,):
+                self._ranks.complete_surface(self.sums.weights[buffer])
+                self._ranks.complete_surface(self.sums.forces[buffer])
+        self._ranks.clear_surface(self.sums.forces[self.buffer])
+
+    def launch_clear(self) -> None:
+        """Launch the reset of all sums, which the end of a step does for nodes that this process moves only."""
+        self.sums.touched.zero_()
+        self.sums.weights.zero_()
+        self.sums.forces.zero_()
+
+    def launch_place_forces(self, totals: wp.array | None) -> None:
+        """Launch the sums of the last step's forces at each place.
+
+        Args:
+            totals: The forces of obstacles, vec3 [O, S]; None without.
+        """
+        forces, arrays = self.sums.forces[0], self.surface.arrays
+        if self._pairs is not None:
+            inputs = [self._law.grain, self._pairs.rows]
+            wp.launch(kernels.add_pairs, self._pairs.room, inputs, [forces], device=self.device)
+        inputs = [self._law.grain, totals, forces]
+        wp.launch(kernels.place_forces, self.surface.count, inputs, [arrays], device=self.device)
+
+    def _launch(self, first: int, last: int) -> None:
+        contacts = kernels.Contacts()
+        contacts.triangles, contacts.touches = self.surface.triangles, Touches()
+        if self._rigid is not None:
+            contacts.rigid, contacts.touches = self._rigid.arrays, self._rigid.touches
+        else:
+            contacts.rigid = Rigid()
+            contacts.rigid.surface, contacts.rigid.law = self.surface.arrays, self._law
+        contacts.meeting, contacts.rows = Meeting(), Rows()
+        if self._pairs is not None:
+            contacts.meeting, contacts.rows = self._pairs.meeting, self._pairs.rows
+        inputs = [self._threads, first, last, self.iterations, self._search.near, self._pace]
+        wp.launch(
+            kernels.solve_contacts,
+            self._threads,
+            inputs,
+            [contacts, self.sums],
+            device=self.device,
+            block_dim=min(self._threads, kernels.BLOCK),
+        )
