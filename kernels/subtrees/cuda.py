@@ -6,9 +6,8 @@ Sums go to global memory as 16-byte vector reductions if the card has them. The 
 polynomial (``corotated.algebraic``), in the same way for small strains and large ones.
 
 A leaf that is flat, inverted or strained far beyond order one adds nothing. Its bit is set in its subtree's byte, and
-the subtree is put on a list; ``repair`` computes those leaves. If most leaves of a warp were left out in the last
-evaluation, the warp computes all of them one by one instead, and sets their bits again. A body whose subtrees are all
-of one type has a kernel for that type; any other body is one launch, in which each thread block looks up its work.
+the subtree is put on a list; ``repair`` computes those leaves. A body whose subtrees are all of one type has a kernel
+for that type; any other body is one launch, in which each thread block looks up its work.
 """
 
 import functools
@@ -29,10 +28,8 @@ from warp_corot.kernels.elements.merging import add_four_forces
 from warp_corot.kernels.modules import unique_kernel
 
 from .forces import leaf_stress, mat10, own_forces, shared_forces
-from .in_warps import is_mostly_left_out, scatter_one_by_one
-from .left_out import WARP, LeftOut, append, list_of, reserve
+from .left_out import LeftOut, append, list_of, reserve
 from .memory import BLOCK, add_single, group_memory, load_single, memory_of
-from .pooled import scatter_in_block
 
 wp.set_module_options({"enable_backward": False})
 
@@ -58,40 +55,26 @@ class Stretch:
 def scatter_subtrees_own(shape: int, grouped: bool, uniform: bool, listed: bool) -> wp.Kernel:
     """Corotated forces of subtrees of one type, every leaf with its own rotation. Launch with block_dim BLOCK.
 
-    If ``listed``, subtrees with left-out leaves are put on a list, and a warp whose former bits in ``flagged`` say that
-    most of its leaves were left out computes them one by one.
+    If ``listed``, subtrees with left-out leaves are put on a list.
     """
     load, add = memory_of(shape, grouped)
     forces = own_forces(shape, uniform)
     resident = RESIDENT[shape] if uniform else min(RESIDENT)
 
-    @unique_kernel(
-        grid_stride=False,
-        launch_bounds=(BLOCK, resident),
-    )
+    @unique_kernel(grid_stride=False, launch_bounds=(BLOCK, resident))
     def scatter_subtrees_own(
         # In
-        elements: ForestElements,
         subtrees: Subtrees,
         material: IsotropicMaterial,
         u: wp.array[wp.vec4],
-        # In and out
+        # Out
         f: wp.array[wp.vec4],
         flagged: wp.array[wp.uint8],
         left_out: LeftOut,
     ):
         s = wp.tid()
-        before = int(0)
-        if wp.static(listed):
-            before = int(flagged[s])
         h, q, mirror = root_of(subtrees, s)
         x = load(subtrees, s, u)
-        # The test stands here so that the bits and the displacements are loaded at the same time.
-        if wp.static(listed):  # noqa: SIM102 (what is static decides what is generated)
-            if is_mostly_left_out(before):
-                mask = scatter_one_by_one(elements, subtrees.first[s], s % WARP, material, u, f)
-                flagged[s] = wp.uint8(mask)
-                return
         leaf = wp.where(wp.static(uniform), 0, subtrees.first[s])
         g, mask = forces(x, q, h, mirror, material.mu, material.lam, leaf)
         flagged[s] = wp.uint8(mask)
@@ -103,49 +86,6 @@ def scatter_subtrees_own(shape: int, grouped: bool, uniform: bool, listed: bool)
             append(left_out, list_of(s // BLOCK), reserved, subtrees.first[s], mask, subtrees.code.shape[0] - s)
 
     return scatter_subtrees_own
-
-
-@functools.cache
-def scatter_subtrees_in_blocks(shape: int, grouped: bool, uniform: bool) -> wp.Kernel:
-    """The same as ``scatter_subtrees_own``, but each block also computes the leaves that it left out, a thread a leaf.
-
-    That saves a launch and the list, and is faster for bodies of up to some millions of elements. Launch with block_dim
-    BLOCK.
-    """
-    load, add = memory_of(shape, grouped)
-    forces = own_forces(shape, uniform)
-    resident = RESIDENT[shape] if uniform else min(RESIDENT)
-
-    @unique_kernel(
-        grid_stride=False,
-        launch_bounds=(BLOCK, resident),
-    )
-    def scatter_subtrees_in_blocks(
-        # In
-        elements: ForestElements,
-        subtrees: Subtrees,
-        material: IsotropicMaterial,
-        u: wp.array[wp.vec4],
-        # In and out
-        f: wp.array[wp.vec4],
-        flagged: wp.array[wp.uint8],
-    ):
-        s = wp.tid()
-        before = int(flagged[s])
-        h, q, mirror = root_of(subtrees, s)
-        x = load(subtrees, s, u)
-        # The test stands here so that the bits and the displacements are loaded at the same time.
-        mostly = is_mostly_left_out(before)
-        mask = int(255)
-        if not mostly:
-            leaf = wp.where(wp.static(uniform), 0, subtrees.first[s])
-            g, mask = forces(x, q, h, mirror, material.mu, material.lam, leaf)
-            add(subtrees, s, g, f)
-        to_come = subtrees.code.shape[0] - s
-        mask = scatter_in_block(elements, subtrees.first[s], mask, mostly, to_come, material, u, f)
-        flagged[s] = wp.uint8(mask)
-
-    return scatter_subtrees_in_blocks
 
 
 @functools.cache

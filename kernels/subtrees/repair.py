@@ -50,8 +50,7 @@ def scatter_turned(
 
 @wp.func
 def own_stress(elements: ForestElements, t: int, material: IsotropicMaterial, u: wp.array[wp.vec4]):
-    """First Piola-Kirchhoff stress of element t with its own rotation, times Q, for any F, and whether the subtree
-    kernels could have found it."""
+    """First Piola-Kirchhoff stress of element t with its own rotation, times Q, for any F."""
     q = frame(elements, t)
     w = wp.transpose(q) * local_gradient(elements, t, u)
     m = material.mu[t * material.stride]
@@ -62,7 +61,7 @@ def own_stress(elements: ForestElements, t: int, material: IsotropicMaterial, u:
         p, trusted = stretch_stress(w, m, k)
     if not trusted:
         p = turned_stress(identity3() + w, m, k)
-    return q * p, trusted
+    return q * p
 
 
 @wp.func
@@ -115,7 +114,7 @@ def repair_listed_own(
                 if k < total:
                     t = leaves_of_entries(listed, 0, 0, k)
                     targets = elements.targets[t]
-                    p, _trusted = own_stress(elements, t, material, u)
+                    p = own_stress(elements, t, material, u)
                 f0, f1, f2, f3 = nodal_forces(elements, t, p)
                 add_pairs(f, targets, f0, f1, f2, f3)
                 k += lanes
@@ -181,7 +180,7 @@ def repair_own(
     while leaf < SUBTREES * LEAVES:
         if is_left_out(flags, leaf):
             t = first[SUBTREES * i + leaf // LEAVES] + leaf % LEAVES
-            p, _trusted = own_stress(elements, t, material, u)
+            p = own_stress(elements, t, material, u)
             scatter_stress(elements, t, p, f)
         leaf += 1
 

@@ -15,9 +15,7 @@ import warp_corot as wc
 from warp_corot.discretization.planning.fixed import ForcePlan
 from warp_corot.elasticity.corotated.left_out import LeftOutLeaves
 from warp_corot.elasticity.structs import isotropic_material
-from warp_corot.kernels.subtrees.cuda import scatter_subtrees_in_blocks
 from warp_corot.kernels.subtrees.left_out import COUNT_STRIDE, LISTS
-from warp_corot.kernels.subtrees.memory import BLOCK
 
 TOLERANCE = 1e-5  # of the largest force, as in test_miscompile
 
@@ -60,7 +58,7 @@ def test_listed_leaves_get_their_forces(share, uniform, device, rng):
 def test_whole_subtrees_get_their_forces(device, rng):
     """An inverted body, compressed so that it has definite rotations: every subtree is left out whole.
 
-    On CUDA the second evaluation knows that from the first. Then half of the body, and later all of it, recovers.
+    Then half of the body, and later all of it, recovers.
     """
     forest = wc.TetForest.box((2, 1, 1), 0.1, 9)
     body = wc.SoftBody(forest, wc.Isotropic(1e4, 0.4, 1000.0), device=device)
@@ -102,31 +100,6 @@ def test_one_bad_leaf_is_left_out_alone(device, rng):
     assert 0 < left_out.sum() < 8
 
 
-@pytest.mark.parametrize("share", [0.1, 1.0])
-def test_leaves_that_a_block_computes_itself(share, device, rng):
-    """A body with one type of subtree, in two evaluations: the second one knows what the first one left out."""
-    forest = wc.TetForest.box((2, 1, 1), 0.1, 9)
-    body = wc.SoftBody(forest, wc.Isotropic(1e4, 0.4, 1000.0), device=device)
-    far = rng.random((len(forest.points), 1)) < share
-    u = np.where(far, 1.0, 0.08) * edge_scale(forest) * rng.uniform(-1, 1, forest.points.shape)
-    body.displacements = u
-    plan = ForcePlan.of_forest(forest, None, body.device, grouped=False)
-    (batch,) = plan.batches
-    if body.device.is_cpu:
-        nodes = np.ascontiguousarray(batch.subtrees.nodes.numpy().T)
-        batch.subtrees.nodes = batch.subtrees.targets = wp.array(nodes, dtype=wp.int32, device=body.device)
-    own = body.discretization
-    material = isotropic_material([own.mu, own.lam, own.material_stride])
-    forces, sound = expected(forest, u, 1e4)
-    for _ in range(2):
-        f = wp.zeros_like(body.state.displacements)
-        inputs = [own.elements, batch.subtrees, material, body.state.displacements]
-        kernel = scatter_subtrees_in_blocks(batch.shape, False, True)
-        wp.launch(kernel, batch.count, inputs, [f, batch.flagged], device=body.device, block_dim=BLOCK)
-        assert np.abs(f.numpy()[:, :3] - forces)[sound].max() < TOLERANCE * np.abs(forces).max()
-        assert (batch.flagged.numpy()[: batch.count] != 0).mean() > 0.5 * share
-
-
 @pytest.mark.parametrize("share", [0.0, 0.1, 1.0])
 def test_every_leaf_may_be_listed(share, device, rng):
     """Leaves may be listed unnecessarily: the forces of a body with all subtrees on the lists are right."""
@@ -157,32 +130,3 @@ def test_every_leaf_may_be_listed(share, device, rng):
     forces, sound = expected(forest, u, young)
     assert np.abs(f.numpy()[:, :3] - forces)[sound].max() < TOLERANCE * np.abs(forces).max()
     assert (listed.own.counts.numpy()[: LISTS * COUNT_STRIDE] == 0).all()
-
-
-@pytest.mark.skipif(not wp.get_cuda_devices(), reason="on the CPU what is left out is done in order")
-@pytest.mark.parametrize("turned", [1.0, 0.4])
-def test_what_was_left_out_before_changes_nothing(turned, rng):
-    """A body is inverted, all or a part: the first evaluation does not know that, the next ones do."""
-    device = wp.get_cuda_devices()[0]
-    forest = wc.TetForest.box((1, 1, 1), 0.1, 17)
-    body = wc.SoftBody(forest, wc.Isotropic(1e4, 0.4, 1000.0), device=device)
-    x = forest.points
-    body.displacements = (
-        0.02 * edge_scale(forest) * rng.uniform(-1, 1, x.shape)
-        - np.where(x[:, 2:] < turned * 0.1, 1.6, 0.0) * [0, 0, 1] * x
-    )
-    fast, leaf = (wc.Corotated(subtrees=subtrees).bind(body) for subtrees in (True, False))
-    found, flags = [], []
-    for field in (fast, fast, leaf, *([fast] * 20)):
-        f = wp.zeros_like(body.state.displacements)
-        field.scatter_forces(body.state.displacements, f)
-        found.append(f.numpy()[:, :3])
-        flags.append(fast.plan.batches[0].flagged.numpy())
-    assert (flags[0] == 255).mean() > 0.9 * turned
-    for other in found:
-        assert np.abs(other - found[2]).max() < TOLERANCE * np.abs(found[2]).max()
-    # The recovery of the original orientation is detected.
-    body.displacements = np.zeros_like(x)
-    for _ in range(40):
-        fast.scatter_forces(body.state.displacements, f)
-    assert (fast.plan.batches[0].flagged.numpy() == 0).all()

@@ -38,11 +38,10 @@ class LeftOutLeaves:
         self._device = device
 
     @classmethod
-    def of(cls, plan: Plan, device: wp.Device, *, in_blocks: bool = False) -> LeftOutLeaves:
-        """The lists of a plan; leaves with own rotations have none if warps compute them at once."""
+    def of(cls, plan: Plan, device: wp.Device) -> LeftOutLeaves:
+        """The lists of a plan."""
         own = [batch.count for batch in plan.batches if batch.sharing is Sharing.OWN]
-        own = [] if in_blocks else [*own, len(plan.flat)]
-        return cls(own, [batch for batch in plan.batches if batch.sharing is Sharing.ROOT], device)
+        return cls([*own, len(plan.flat)], [batch for batch in plan.batches if batch.sharing is Sharing.ROOT], device)
 
     @staticmethod
     def load(device: wp.Device) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import nullcontext
 
 import warp as wp
@@ -14,30 +14,13 @@ from warp_corot.elasticity.paths.clusters import ChangingClusterScatter, Cluster
 from warp_corot.kernels.clusters.laws import isotropic_law
 from warp_corot.kernels.corotated.algebraic import corotated_stress
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
-from warp_corot.kernels.subtrees.cuda import (
-    FLAT,
-    Stretch,
-    scatter_stretches,
-    scatter_subtrees_in_blocks,
-    scatter_subtrees_own,
-)
+from warp_corot.kernels.subtrees.cuda import FLAT, Stretch, scatter_stretches, scatter_subtrees_own
 from warp_corot.kernels.subtrees.left_out import LeftOut
 from warp_corot.kernels.subtrees.memory import BLOCK
 
 #: Number of leaves of a uniform forest from which subtrees have a launch: clusters are faster for fewer leaves, above
 #: all if some are inverted (H200: 73,728 take 6.0 us at rest and 6.3 under their weight; by subtrees 9.6 and 14.4).
 UNIFORM_LEAVES = 1 << 18
-
-
-#: Number of leaves in subtrees below which each block computes the leaves that it leaves out. H200, without inverted
-#: leaves, with one, and with some in a twentieth of the subtrees: 26.5, 26.6 and 38.7 us for 1.57 million leaves, by a
-#: list 28.8, 33.5 and 39.7; 166, 166 and 270 for 12.6 million, by a list 162, 168 and 210.
-IN_BLOCKS_LEAVES = 1 << 22
-
-
-def does_in_blocks(batches: Sequence[Batch]) -> bool:
-    """Whether blocks compute the leaves that they leave out of these batches."""
-    return 8 * sum(batch.count for batch in batches) < IN_BLOCKS_LEAVES
 
 
 class OwnLaunches:
@@ -64,7 +47,6 @@ class OwnLaunches:
         changing: ChangingClusterScatter | None = None,
         awaited: Awaited | None = None,
     ):
-        self._elements = plan.elements
         self._device = plan.elements.nodes.device
         self._material = material
         batches, self._flat = list(plan.batches), plan.flat
@@ -87,11 +69,8 @@ class OwnLaunches:
         flat = None if self._clusters is not None else plan.flat
         self._rows, self._blocks = ([], 0) if self._is_single else _stretches(batches, flat)
         self._stretches = wp.array(self._rows, dtype=Stretch, device=self._device) if self._rows else None
-        self._in_blocks = self._is_single and does_in_blocks(batches)
         #: Numbers of subtrees and single leaves of each launch that may leave some out, with gaps.
         self.places = [batch.count for batch in batches] if self._is_single else [self._blocks * BLOCK]
-        if self._in_blocks:
-            self.places = []
 
     @property
     def in_clusters(self) -> tuple[ClusterScatter, tuple[Batch, ...]] | None:
@@ -139,13 +118,8 @@ class OwnLaunches:
 
     def _launch(self, batch: Batch, u: wp.array, f: wp.array, left_out: LeftOut) -> None:
         material = self._material
-        uniform = material.stride == 0
-        inputs, outputs = [self._elements, batch.subtrees, material, u], [f, batch.flagged]
-        if self._in_blocks:
-            kernel = scatter_subtrees_in_blocks(batch.shape, True, uniform)
-        else:
-            kernel = scatter_subtrees_own(batch.shape, True, uniform, True)
-            outputs.append(left_out)
+        kernel = scatter_subtrees_own(batch.shape, True, material.stride == 0, True)
+        inputs, outputs = [batch.subtrees, material, u], [f, batch.flagged, left_out]
         wp.launch(kernel, batch.count, inputs=inputs, outputs=outputs, device=self._device, block_dim=BLOCK)
 
 

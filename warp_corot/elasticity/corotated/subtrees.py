@@ -39,7 +39,7 @@ from .elements import (
     rotated_material,
 )
 from .left_out import LeftOutLeaves
-from .own_launches import OwnLaunches, does_in_blocks
+from .own_launches import OwnLaunches
 from .subtree_tangent import FEWEST, SubtreeTangent, subtrees_of
 
 if TYPE_CHECKING:
@@ -131,8 +131,6 @@ class SubtreeField(CorotatedField):
     def follow(self) -> None:
         super().follow()
         plan = self.plan
-        #: Whether warps compute the leaves that they leave out.
-        self._in_blocks = self._listed and plan.counts is None and does_in_blocks(plan.batches)
         self._rotations = wp.empty(0, dtype=wp.mat33, device=self.device)
         self._no_unit = wp.empty(0, dtype=wp.int32, device=self.device)
         if plan.units is not None:
@@ -148,7 +146,7 @@ class SubtreeField(CorotatedField):
                 self._own_launches = OwnLaunches(plan, *given)
                 self._left_out = LeftOutLeaves(self._own_launches.places, [], self.device)
                 return
-            self._left_out = LeftOutLeaves.of(plan, self.device, in_blocks=self._in_blocks)
+            self._left_out = LeftOutLeaves.of(plan, self.device)
         self._kernels = [self._kernel(batch.shape, batch.grouped, batch.sharing) for batch in plan.batches]
         self._materials = [self._material(batch) for batch in plan.batches]
         self._flat_rotated = Kept(rotated_material)
@@ -211,8 +209,6 @@ class SubtreeField(CorotatedField):
     def _kernel(self, shape: int, grouped: bool, sharing: Sharing) -> wp.Kernel:
         given = sharing is Sharing.ABOVE
         if self.device.is_cuda:
-            if sharing is Sharing.OWN and self._in_blocks:
-                return subtree_cuda.scatter_subtrees_in_blocks(shape, grouped, self._uniform)
             if sharing is Sharing.OWN:
                 return subtree_cuda.scatter_subtrees_own(shape, grouped, self._uniform, self._listed)
             return subtree_cuda.scatter_subtrees_shared(shape, grouped, self._uniform, given, self._listed)
@@ -245,12 +241,11 @@ class SubtreeField(CorotatedField):
         if self.device.is_cuda:
             threads = batch.count
             if own:
-                inputs = [self.elements, batch.subtrees, self.isotropic, u]
+                inputs = [batch.subtrees, self.isotropic, u]
             else:
                 unit = self._no_unit if batch.unit is None else batch.unit
                 inputs = [batch.subtrees, discretization.mu, discretization.lam, u, self._rotations, unit]
-            if not (own and self._in_blocks):
-                outputs.append(LeftOutLeaves.NONE if self._left_out is None else self._left_out.list_of(batch))
+            outputs.append(LeftOutLeaves.NONE if self._left_out is None else self._left_out.list_of(batch))
         else:
             threads = -(-batch.count // LANES)
             inputs = [batch.subtrees, batch.count, material(), u]
