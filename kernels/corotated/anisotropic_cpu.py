@@ -13,25 +13,20 @@ import warp as wp
 
 from warp_corot.kernels.elements.elements import ForestElements, GeneralElements, frame, rest_volume
 from warp_corot.kernels.elements.general_cpu import rest_inverse_of
-from warp_corot.kernels.elements.lanes import ELEMENTS, constants, native, scatter_lanes
-from warp_corot.kernels.elements.law_lanes import ROTATION
+from warp_corot.kernels.elements.lanes import headers, scatter_lanes
 from warp_corot.kernels.modules import unique_kernel
 
 from .anisotropic import FibreMaterial, OrthotropicMaterial, axes_of, filled
 
 wp.set_module_options({"enable_backward": False})
 
-#: Of det(tr(S) I - S) over |S|^3, where leaves of no definite rotation begin.
-NEARLY_INDEFINITE = 0.41
-
 #: Corotated forces of orthotropic elements, whose inverse rest matrix is Dm^-1 M, and forces of their active stress.
 scatter_anisotropic_lanes = scatter_lanes(
-    constants(NEARLY_INDEFINITE=(2 * NEARLY_INDEFINITE) ** 2)
-    + ROTATION
-    + native(*ELEMENTS, "orthotropic", "element_forces", "left_out_elements"),
+    "corot::scatter_orthotropic(units, block, count, material, u, f, missed)",
     GeneralElements,
     FibreMaterial,
     wp.int32,
+    headers("law_orthotropic"),
 )
 
 

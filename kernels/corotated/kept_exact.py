@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_corot.kernels.elements.constitutive import corotated_strain
 from warp_corot.kernels.elements.elements import GeneralElements, local_gradient
-from warp_corot.kernels.elements.lanes import ISOTROPIC_PART, constants, native, scatter_lanes
+from warp_corot.kernels.elements.lanes import headers, scatter_lanes
 from warp_corot.kernels.math.matrices import identity3
 from warp_corot.kernels.modules import unique_kernel
 
@@ -68,6 +68,5 @@ def keep_elements(rotation: wp.Function) -> wp.Kernel:
 @functools.cache
 def add_exact_product() -> wp.Kernel:
     """y += K p; a thread is eight elements."""
-    code = constants(PLACES=PLACES) + ISOTROPIC_PART
-    code += native("eights", "side_by_side", "kept_elements", "elements", "exact_elements", "element_forces")
-    return scatter_lanes(code, GeneralElements, KeptGradients, wp.int32)
+    call = "corot::add_exact_product(units, block, count, material, u, f)"
+    return scatter_lanes(call, GeneralElements, KeptGradients, wp.int32, headers("tangents8"))

@@ -11,8 +11,7 @@ import warp as wp
 
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.elements import GeneralElements, local_gradient
-from warp_corot.kernels.elements.lanes import ELEMENTS, ISOTROPIC_PART, constants, native, scatter_lanes
-from warp_corot.kernels.elements.law_lanes import LAWS, ROTATION
+from warp_corot.kernels.elements.lanes import headers, scatter_lanes
 from warp_corot.kernels.math.matrices import identity3
 from warp_corot.kernels.math.rotation import quick_rotation
 
@@ -33,16 +32,15 @@ class KeptGradients:
 @functools.cache
 def turn_gradients() -> wp.Kernel:
     """Write the gradients; a thread is eight elements. Those without a good rotation are listed."""
-    code = ROTATION + native(*ELEMENTS, "turned_gradients", "left_out_elements")
-    return scatter_lanes(code, GeneralElements, IsotropicMaterial, wp.int32)
+    call = "corot::turn_gradients(units, block, count, u, f, missed)"
+    return scatter_lanes(call, GeneralElements, IsotropicMaterial, wp.int32, headers("tangents8"))
 
 
 @functools.cache
 def add_kept_product() -> wp.Kernel:
     """y += K p; a thread is eight elements."""
-    code = constants(PLACES=PLACES) + LAWS["linear"] + ISOTROPIC_PART
-    code += native("eights", "side_by_side", "kept_elements", "elements", "isotropic_elements", "element_forces")
-    return scatter_lanes(code, GeneralElements, KeptGradients, wp.int32)
+    call = "corot::add_kept_product(units, block, count, material, u, f)"
+    return scatter_lanes(call, GeneralElements, KeptGradients, wp.int32, headers("tangents8"))
 
 
 @wp.kernel(enable_backward=False)

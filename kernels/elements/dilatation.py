@@ -48,14 +48,14 @@ class Dilatation(NamedTuple):
     """The functions (device code) that stand for lambda times half the square of a trace in a law.
 
     Attributes:
-        lanes: The native code for lanes, files of ``native``.
+        lanes: The struct of ``native/dilatation.h`` that has them for lanes.
         measure: theta and d theta / dF of A.
         turning: The differential of d theta / dF at A in a direction dA.
         energy, slope, curvature: w and its derivatives, of theta.
         holding: h and its derivatives, of theta_e.
     """
 
-    lanes: tuple[str, ...]
+    lanes: str
     measure: wp.Function
     turning: wp.Function
     energy: wp.Function
@@ -144,11 +144,11 @@ def not_held(theta: float):
 
 _SQUARE = (square_energy, square_slope, square_curvature)
 #: tr e of linear elasticity, tr E of St. Venant-Kirchhoff, J - 1 of corotated and, in the logarithm, of neo-Hookean.
-SMALL = Dilatation(("dilatation_small",), small_dilatation, small_turning, *_SQUARE, not_held)
-GREEN = Dilatation(("dilatation_green",), green_dilatation, green_turning, *_SQUARE, not_held)
-VOLUME = Dilatation(("dilatation_of_volume", "dilatation_volume"), volume_dilatation, volume_turning, *_SQUARE, held)
+SMALL = Dilatation("SmallDilatation", small_dilatation, small_turning, *_SQUARE, not_held)
+GREEN = Dilatation("GreenDilatation", green_dilatation, green_turning, *_SQUARE, not_held)
+VOLUME = Dilatation("VolumeDilatation", volume_dilatation, volume_turning, *_SQUARE, held)
 LOG_VOLUME = Dilatation(
-    ("log", "dilatation_of_volume", "dilatation_log_volume"),
+    "LogVolumeDilatation",
     volume_dilatation,
     volume_turning,
     log_energy,

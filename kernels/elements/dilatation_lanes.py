@@ -11,32 +11,22 @@ import warp as wp
 
 from warp_corot.kernels.modules import unique_kernel
 
-from .constitutive import CONTINUED_BELOW, IsotropicMaterial
-from .dilatation import FREE, MOST, RAMP, Dilatation
+from .constitutive import IsotropicMaterial
+from .dilatation import MOST, Dilatation
 from .elements import GeneralElements, frame, rest_volume
 from .general_cpu import rest_inverse_of
-from .lanes import ELEMENTS, ISOTROPIC, ISOTROPIC_PART, constants, native, on_cpu, scatter_lanes
-from .law_lanes import LawInLanes, code_of, has_log
+from .lanes import headers, on_cpu, scatter_lanes
+from .law_lanes import LawInLanes, elastic
 
 wp.set_module_options({"enable_backward": False})
-
-
-def law_of(of: Dilatation, has_log: bool = False) -> str:
-    """The native code of a law's dilatation; ``has_log``: it follows the code of neo-Hookean, which has the logarithm
-    already.
-    """
-    free = constants(FREE=float(FREE), RAMP=float(RAMP))
-    if has_log:
-        return free + native(*(name for name in of.lanes if name != "log"))
-    return free + constants(CONTINUED_BELOW=CONTINUED_BELOW) + native(*of.lanes)
 
 
 @functools.cache
 def measure_in_lanes(of: Dilatation) -> wp.Kernel:
     """``measure_elements`` without a direction; a thread is eight elements."""
-    code = on_cpu(law_of(of) + native(*ELEMENTS, "element_dilatation", "store_dilatation"))
+    call = f"corot::measure_eight<corot::{of.lanes}>(units, block, count, places, live, u, shared);"
 
-    @wp.func_native(code)
+    @wp.func_native(on_cpu(call))
     def measure_eight(
         units: GeneralElements,
         block: int,
@@ -47,7 +37,7 @@ def measure_in_lanes(of: Dilatation) -> wp.Kernel:
         shared: wp.array[wp.vec4],
     ): ...
 
-    @unique_kernel()
+    @unique_kernel(native=headers("elements8"))
     def measure_in_lanes(
         # In
         units: GeneralElements,
@@ -66,9 +56,10 @@ def measure_in_lanes(of: Dilatation) -> wp.Kernel:
 @functools.cache
 def scatter_in_lanes(of: Dilatation) -> wp.Kernel:
     """``scatter_pressures``; a thread is eight elements."""
-    passes = native(*ELEMENTS, "element_dilatation", "dilatation_stresses", "element_forces")
+    call = f"""corot::scatter_pressures<corot::{of.lanes}>(
+        units, block, count, places, live, material.lam, material.stride, u, shared, f);"""
 
-    @wp.func_native(on_cpu(law_of(of) + ISOTROPIC + passes))
+    @wp.func_native(on_cpu(call))
     def scatter_eight(
         units: GeneralElements,
         block: int,
@@ -81,7 +72,7 @@ def scatter_in_lanes(of: Dilatation) -> wp.Kernel:
         f: wp.array[wp.vec4],
     ): ...
 
-    @unique_kernel()
+    @unique_kernel(native=headers("elements8"))
     def scatter_in_lanes(
         # In
         units: GeneralElements,
@@ -121,12 +112,9 @@ def scatter_grouped_elements(law: LawInLanes, of: Dilatation) -> wp.Kernel:
 
     The corotated law lists what it leaves out.
     """
-    leaves_out = ["left_out_elements"] if law == "corotated" else []
-    code = code_of(law) + law_of(of, has_log=has_log(law)) + ISOTROPIC_PART
-    rest = native("side_by_side", "rest_elements")
-    code += constants(GROUPS=GROUPS, MOST=MOST) + native("group_dilatations") + rest + native("elements")
-    code += native("group_pressures") + rest + native("grouped_elements", "element_forces", *leaves_out) + "}\n"
-    return scatter_lanes(code, GeneralElements, GroupedMaterial, wp.int32)
+    of_law, kind = elastic(law, "material.isotropic"), f"corot::{of.lanes}, {GROUPS}, {MOST}"
+    call = f"corot::scatter_groups<{kind}>({of_law.code}, units, block, count, material, u, f, missed)"
+    return scatter_lanes(call, GeneralElements, GroupedMaterial, wp.int32, headers("groups8", of_law.header))
 
 
 @functools.cache

@@ -1,9 +1,7 @@
 """Forces of tetrahedra one by one on the CPU, eight to the lanes of vector registers; see ``lanes``.
 
-General tetrahedra, and those of a forest that are in no complete subtree, for which a rest matrix is worked out once.
-
-An element of which the corotated law finds no rotation adds nothing and is put on a list, which
-``forces.repair_forces`` goes through.
+For tetrahedra of a forest that are in no complete subtree, a rest matrix is worked out once. An element of which a law
+finds no rotation adds nothing and is put on a list, which ``forces.repair_forces`` goes through.
 """
 
 import functools
@@ -13,18 +11,23 @@ import warp as wp
 
 from .constitutive import IsotropicMaterial
 from .elements import ForestElements, GeneralElements, frame, gradient_of, rest_volume
-from .lanes import ELEMENTS, ISOTROPIC, native, scatter_lanes
-from .law_lanes import LawInLanes, code_of
+from .lanes import headers, scatter_lanes
+from .law_lanes import LawInLanes, NativeLaw, elastic
 
 wp.set_module_options({"enable_backward": False})
 
 
 @functools.cache
+def scatter_elements(Elements: type, Material: type, law: NativeLaw) -> wp.Kernel:
+    """Forces of elements of either kind under a law; a thread is eight of them. Elements left out are listed."""
+    traversal = "scatter_forest" if Elements is ForestElements else "scatter_general"
+    call = f"corot::{traversal}({law.code}, units, block, count, u, f, missed)"
+    return scatter_lanes(call, Elements, Material, wp.int32, headers("elements8", law.header))
+
+
 def scatter_law_elements(law: LawInLanes) -> wp.Kernel:
-    """Forces of a law of ``law_lanes``; a thread is eight elements. The corotated law lists what it leaves out."""
-    leaves_out = ["left_out_elements"] if law == "corotated" else []
-    forces = native(*ELEMENTS, "isotropic_elements", "element_forces", *leaves_out)
-    return scatter_lanes(code_of(law) + ISOTROPIC + forces, GeneralElements, IsotropicMaterial, wp.int32)
+    """The same of general elements under an isotropic law."""
+    return scatter_elements(GeneralElements, IsotropicMaterial, elastic(law))
 
 
 @wp.func

@@ -7,17 +7,15 @@ the nodes is that of P = R (s + [a]x), with (tr(U) I - U) a the axial vector of 
 power and has no torque.
 """
 
-import functools
 from typing import Any
 
 import warp as wp
 
 from warp_corot.kernels.math.matrices import axial
 from warp_corot.kernels.math.rotation import byers_xu, identity3
-from warp_corot.kernels.modules import unique_kernel
 
 from .constitutive import IsotropicMaterial, corotated_strain, hooke, symmetric
-from .elements import frame, local_gradient, scatter_stress
+from .elements import frame, local_gradient
 
 wp.set_module_options({"enable_backward": False})
 
@@ -49,14 +47,9 @@ def viscous_stress(u: wp.mat33, a: wp.mat33, mu: float, lam: float):
 
 
 @wp.func
-def add_viscous_forces(
-    elements: Any,
-    t: int,
-    material: ViscousMaterial,
-    u: wp.array[wp.vec4],
-    f: wp.array[wp.vec4],
-):
-    """Add the viscous nodal forces of element t to f: the stiffness times seconds, for small motions."""
+def viscosity_stress(elements: Any, t: int, material: ViscousMaterial, u: wp.array[wp.vec4]):
+    """The viscous stress of element t for the kernels of ``forces``; forces are the stiffness times seconds times
+    velocities, for small motions."""
     g = local_gradient(elements, t, u)
     q = frame(elements, t)
     r = byers_xu(q + g)
@@ -64,23 +57,4 @@ def add_viscous_forces(
     rate = wp.transpose(r) * local_gradient(elements, t, material.velocities)
     eta = material.seconds
     i = t * material.isotropic.stride
-    p = r * viscous_stress(stretch, rate, eta * material.isotropic.mu[i], eta * material.isotropic.lam[i])
-    scatter_stress(elements, t, p, f)
-
-
-@functools.cache
-def scatter_viscous(Elements: type) -> wp.Kernel:
-    """Add viscous nodal forces to f; a thread is an element."""
-
-    @unique_kernel()
-    def scatter_viscous(
-        # In
-        elements: Elements,
-        material: ViscousMaterial,
-        u: wp.array[wp.vec4],
-        # Out
-        f: wp.array[wp.vec4],
-    ):
-        add_viscous_forces(elements, wp.tid(), material, u, f)
-
-    return scatter_viscous
+    return r * viscous_stress(stretch, rate, eta * material.isotropic.mu[i], eta * material.isotropic.lam[i])

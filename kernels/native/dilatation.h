@@ -1,10 +1,143 @@
-// Forces of what joins leaves alone. In: ``join``. Out: g.
-#pragma clang loop unroll(disable)
-for (int leaf = 0; leaf < 8; ++leaf) {
-    triple a[3], p[3] = {nothing, nothing, nothing};
-    columns(x, nodes_of[leaf], a);
-    const int* c = axes_of[leaf];
-    const triple q[3] = {leaf_axes[c[0]], leaf_axes[c[1]], leaf_axes[c[2]]};
-    join(leaf, a, q, p);
-    add_leaf(g, nodes_of[leaf], p);
+// The dilatation that elements share; see elements/dilatation.py. A kind of it has ``theta`` of an element, the columns p
+// of d theta / dF, w' of a mean theta (``pressure``) and h' of an element's own (``holding``).
+#pragma once
+
+#include "laws.h"
+
+namespace corot {
+
+template <class S> COROT_INLINE void columns_of(const Frame<S>& frame, triple<S>* q) {
+    for (int j = 0; j < 3; ++j) q[j] = frame.q[j];
 }
+
+template <class S> COROT_INLINE void columns_of(const RestAxes<S>&, triple<S>* q) {
+    for (int j = 0; j < 3; ++j) q[j] = nothing<S>();
+    q[0].x = q[1].y = q[2].z = spread<S>(1.0f);
+}
+
+template <class S> COROT_INLINE S trace_of(const triple<S>* a, const triple<S>* q) {
+    return dot(a[0], q[0]) + dot(a[1], q[1]) + dot(a[2], q[2]);
+}
+
+struct SquareEnergy {
+    template <class S> static COROT_INLINE S pressure(const S& theta) { return theta; }
+};
+
+struct NotHeld {
+    template <class S> static COROT_INLINE S holding(const S&) { return spread<S>(0.0f); }
+};
+
+// Linear elasticity: theta = tr e.
+struct SmallDilatation : SquareEnergy, NotHeld {
+    template <class S, class Axes> static COROT_INLINE S theta(const triple<S>* a, const Axes& axes) {
+        triple<S> q[3];
+        columns_of(axes, q);
+        return trace_of(a, q);
+    }
+    template <class S, class Axes> static COROT_INLINE void slopes(const triple<S>*, const Axes& axes, triple<S>* p) {
+        columns_of(axes, p);
+    }
+};
+
+// St. Venant-Kirchhoff: theta = tr E.
+struct GreenDilatation : SquareEnergy, NotHeld {
+    template <class S, class Axes> static COROT_INLINE S theta(const triple<S>* a, const Axes& axes) {
+        triple<S> q[3];
+        columns_of(axes, q);
+        return trace_of(a, q) + 0.5f * (dot(a[0], a[0]) + dot(a[1], a[1]) + dot(a[2], a[2]));
+    }
+    template <class S, class Axes> static COROT_INLINE void slopes(const triple<S>* a, const Axes& axes, triple<S>* p) {
+        columns_of(axes, p);
+        for (int j = 0; j < 3; ++j) p[j] = p[j] + a[j];
+    }
+};
+
+// |J - 1| up to which an element is free to differ from its group, and the range over which its stiffness grows from there.
+constexpr float FREE = 0.25f, RAMP = 0.5f;
+
+// theta = J - 1, with the digits of small strains.
+struct VolumeChange {
+    template <class S, class Axes> static COROT_INLINE S theta(const triple<S>* a, const Axes& axes) {
+        triple<S> q[3];
+        columns_of(axes, q);
+        const triple<S> crossed = cross(a[0], q[1]) + cross(q[0], a[1]);
+        return trace_of(a, q)
+            + handedness_of(axes) * (dot(a[2], crossed) + dot(cross(a[0], a[1]), q[2] + a[2]));
+    }
+    template <class S, class Axes> static COROT_INLINE void slopes(const triple<S>* a, const Axes& axes, triple<S>* p) {
+        triple<S> f[3];
+        columns_of(axes, f);
+        for (int j = 0; j < 3; ++j) f[j] = f[j] + a[j];
+        const S handedness = handedness_of(axes);
+        p[0] = cross(f[1], f[2]) * handedness;
+        p[1] = cross(f[2], f[0]) * handedness;
+        p[2] = cross(f[0], f[1]) * handedness;
+    }
+    template <class S> static COROT_INLINE S holding(const S& theta) {
+        const S size = theta < 0.0f ? -theta : theta, beyond = size > FREE ? size - FREE : spread<S>(0.0f);
+        const S near = beyond < RAMP ? beyond : spread<S>(RAMP), slope = (0.5f / RAMP) * near * near + (beyond - near);
+        return theta < 0.0f ? -slope : slope;
+    }
+};
+
+// Corotated: w = theta^2 / 2.
+struct VolumeDilatation : VolumeChange, SquareEnergy {};
+
+// Neo-Hookean: w = (ln J)^2 / 2, continued below J0 = CONTINUED_BELOW.
+struct LogVolumeDilatation : VolumeChange {
+    template <class S> static COROT_INLINE S pressure(const S& theta) {
+        const float j0 = CONTINUED_BELOW, log0 = LOG_CONTINUED;
+        const mask_of<S> crushed = theta < j0 - 1.0f;
+        const S safe = crushed ? spread<S>(0.0f) : theta;
+        const S line = spread<S>(log0 / j0) + (1.0f - log0) / (j0 * j0) * (theta + (1.0f - j0));
+        return crushed ? line : log_of(safe) / (1.0f + safe);
+    }
+};
+
+// Adds a weight times the stress of an element's dilatation theta and a shared one whose w' is ``pressure``.
+template <class Of, class D, class S = typename D::S>
+COROT_INLINE void add_pressure(const D& d, const S& theta, const S& pressure, const S& weight, triple<S>* p) {
+    triple<S> slopes[3];
+    Of::slopes(d.a, d.frame, slopes);
+    const S w = weight * (pressure + Of::holding(theta));
+    for (int j = 0; j < 3; ++j) p[j] = added(p[j], w, slopes[j]);
+}
+
+// A law whose elements share a dilatation: all those that a traversal of subtrees gathers in a lane. The law's own lambda is
+// zero; this one is in ``lam``.
+template <class Of, class Law, class Values> struct Dilating {
+    Law law;
+    const Values& lam;
+    const int stride;
+    lanes8 pressure;
+    template <class Nodes> COROT_INLINE void begin(const Nodes& nodes) {
+        law.begin(nodes);
+        lanes8 sum = spread<lanes8>(0.0f), weight = spread<lanes8>(0.0f);
+#if defined(__clang__)
+#pragma clang loop unroll(disable)
+#endif
+        for (int leaf = 0; leaf < nodes.LEAVES; ++leaf) {
+            const auto at = nodes.leaf(leaf);
+            const lanes8 share = at.value(lam, stride);
+            triple<lanes8> a[3];
+            at.columns(nodes.x, a);
+            sum += share * Of::theta(a, at.frame);
+            weight += share;
+        }
+        const masks8 weighted = weight != 0.0f;
+        pressure = Of::pressure(weighted ? sum / weight : spread<lanes8>(0.0f));
+    }
+    template <class D, class At>
+    COROT_INLINE masks8 stress(const D& d, const At& at, triple<lanes8>* p) const {
+        const masks8 sound = law.stress(d, at, p);
+        add_pressure<Of>(d, Of::theta(d.a, d.frame), pressure, at.weight() * at.value(lam, stride), p);
+        return sound;
+    }
+};
+
+template <class Of, class Law, class Values>
+COROT_INLINE Dilating<Of, Law, Values> dilating(const Law& law, const Values& lam, int stride) {
+    return {law, lam, stride, spread<lanes8>(0.0f)};
+}
+
+}  // namespace corot

@@ -18,8 +18,8 @@ from warp_corot.kernels.elements.general_cuda import (
     load_four,
     rest_inverse_of,
 )
-from warp_corot.kernels.elements.lanes import ELEMENTS, ISOTROPIC, native, scatter_lanes
-from warp_corot.kernels.elements.law_lanes import LAWS
+from warp_corot.kernels.elements.lanes import headers, scatter_lanes
+from warp_corot.kernels.elements.law_lanes import elastic
 from warp_corot.kernels.math.rotation import byers_xu, cofactor, identity3
 from warp_corot.kernels.modules import unique_kernel
 
@@ -123,10 +123,11 @@ def scatter_posed(rotation: wp.Function, damped: bool, rounds: int = 1) -> wp.Ke
 
 #: Corotated forces, each element with its own rotation.
 scatter_posed_lanes = scatter_lanes(
-    LAWS["corotated"] + ISOTROPIC + native(*ELEMENTS, "posed_elements", "element_forces", "left_out_elements"),
+    f"corot::scatter_posed({elastic('corotated').code}, units, block, count, u, f, missed)",
     GeneralElements,
     IsotropicMaterial,
     wp.int32,
+    headers("elements8"),
 )
 
 

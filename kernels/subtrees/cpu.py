@@ -1,10 +1,8 @@
 """Forces of complete subtrees on the CPU: eight subtrees side by side in the lanes of vector registers.
 
 A CPU core is fast only with vector instructions. So the ten nodes of eight subtrees of one type are gathered into
-arrays of lanes, a loop computes the eight leaves, and forces are scattered once at the end. The laws are those of
-``elements.law_lanes``. A bit flags each leaf or subtree that the corotated law leaves out.
-
-``elements.lanes`` says why this is native code; ``lanes`` generates a part of it.
+arrays of lanes, a loop computes the eight leaves, and forces are scattered once at the end (``native/subtrees8.h``).
+The laws are those of ``elements.law_lanes``. A bit flags each leaf or subtree that the corotated law leaves out.
 """
 
 import functools
@@ -14,12 +12,11 @@ import warp as wp
 from warp_corot.kernels.corotated.tangent import RotatedMaterial
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import Dilatation
-from warp_corot.kernels.elements.dilatation_lanes import law_of
 from warp_corot.kernels.elements.elements import Subtrees
-from warp_corot.kernels.elements.lanes import ISOTROPIC, ISOTROPIC_PART, native, scatter_lanes
-from warp_corot.kernels.elements.law_lanes import LAWS, ROTATION, LawInLanes, code_of, has_log
+from warp_corot.kernels.elements.lanes import headers, scatter_lanes
+from warp_corot.kernels.elements.law_lanes import LawInLanes, NativeLaw, elastic
 
-from .lanes import begin, near_test, product
+from .lanes import subtree_type
 
 wp.set_module_options({"enable_backward": False})
 
@@ -44,33 +41,34 @@ class DilatingMaterial:
     lam: wp.array[wp.float32]
 
 
-def joining(law: LawInLanes, shared: Dilatation | None) -> str:
-    """Native code that adds the shared dilatation to a law, or the law alone if there is none."""
-    if shared is None:
-        return native("own_leaves")
-    return law_of(shared, has_log=has_log(law)) + "const auto& dilating = material.lam;\n" + native("shared_dilatation")
+#: The arguments of all traversals, and how laws with a shared dilatation begin.
+_UNITS = "units, block, count"
+_DILATING = "corot::dilating<corot::{}>({}, material.lam, material.isotropic.stride)"
 
 
 @functools.cache
-def scatter_law_subtrees(shape: int, law: LawInLanes = "corotated", shared: Dilatation | None = None) -> wp.Kernel:
-    """Forces of subtrees under a law of ``elements.law_lanes``, each leaf on its own; a thread is eight subtrees.
+def scatter_subtrees(shape: int, Material: type, law: NativeLaw) -> wp.Kernel:
+    """Forces of subtrees under a law, each leaf on its own; a thread is eight subtrees."""
+    flags = "true" if law.leaves_out else "false"
+    call = f"corot::scatter_subtrees<corot::Type, {flags}>({law.code}, {_UNITS}, u, f, missed)"
+    native = headers("subtrees8", law.header, types=subtree_type(shape))
+    return scatter_lanes(call, Subtrees, Material, wp.uint8, native)
 
-    With a shared dilatation the material is a ``DilatingMaterial``.
-    """
-    flags = ["left_out_leaves"] if law == "corotated" else []
-    leaves = joining(law, shared) + "const masks8 done = {};\n" + native("leaves", "subtree_forces", *flags)
+
+def scatter_law_subtrees(shape: int, law: LawInLanes = "corotated", shared: Dilatation | None = None) -> wp.Kernel:
+    """The same under an isotropic law; with a shared dilatation the material is a ``DilatingMaterial``."""
     if shared is None:
-        return scatter_lanes(code_of(law) + ISOTROPIC + begin(shape) + leaves, Subtrees, IsotropicMaterial, wp.uint8)
-    return scatter_lanes(code_of(law) + ISOTROPIC_PART + begin(shape) + leaves, Subtrees, DilatingMaterial, wp.uint8)
+        return scatter_subtrees(shape, IsotropicMaterial, elastic(law))
+    inner = elastic(law, "material.isotropic")
+    return scatter_subtrees(shape, DilatingMaterial, inner._replace(code=_DILATING.format(shared.lanes, inner.code)))
 
 
 @functools.cache
 def scatter_subtrees_shared(shape: int, given: bool) -> wp.Kernel:
     """Corotated forces of subtrees with their root's rotation or a given one; a thread is eight subtrees."""
-    rotation = "given_rotation" if given else "root_rotation"
-    forces = native("shared_rotation", rotation, "shared_leaves", "subtree_forces", "left_out_leaves")
-    code = ROTATION + ISOTROPIC_PART + begin(shape) + product(shape) + forces
-    return scatter_lanes(code, Subtrees, RotatedMaterial, wp.uint8)
+    kind = f"corot::Type, {'true' if given else 'false'}"
+    call = f"corot::scatter_subtrees_shared<{kind}>({_UNITS}, material, u, f, missed)"
+    return scatter_lanes(call, Subtrees, RotatedMaterial, wp.uint8, headers("subtrees8", types=subtree_type(shape)))
 
 
 @functools.cache
@@ -84,12 +82,21 @@ def scatter_subtrees_near(shape: int, shared: Dilatation | None = None) -> wp.Ke
     Otherwise every leaf has its own rotation, and the forces are bit for bit those of ``scatter_law_subtrees``. With a
     shared dilatation the material is a ``DilatingMaterial``.
     """
-    code = LAWS["corotated"] + native("rotation") + ISOTROPIC_PART + begin(shape) + product(shape) + near_test(shape)
-    code += (
-        joining("corotated", shared)
-        + native("shared_rotation", "near_leaves")
-        + f"if (any(~done)) {{\n{native('leaves')}}}"
+    law, rest = elastic("corotated", "material.isotropic").code, "corot::Stressless{}"
+    if shared is not None:
+        law, rest = (_DILATING.format(shared.lanes, code) for code in (law, rest))
+    kind = f"corot::Type, {'false' if shared is None else 'true'}"
+    material = "material.isotropic, material.tolerance"
+    call = f"corot::scatter_subtrees_near<{kind}>({law}, {rest}, {_UNITS}, {material}, u, f, missed)"
+    Material, native = (
+        NearMaterial if shared is None else DilatingMaterial,
+        headers("subtrees8", types=subtree_type(shape)),
     )
-    code += "\n" if shared is None else f" else {{\n{native('dilatation')}}}\n"
-    material = NearMaterial if shared is None else DilatingMaterial
-    return scatter_lanes(code + native("subtree_forces", "left_out_leaves"), Subtrees, material, wp.uint8)
+    return scatter_lanes(call, Subtrees, Material, wp.uint8, native)
+
+
+@functools.cache
+def scatter_dilatation_lanes(shape: int, of: Dilatation) -> wp.Kernel:
+    """Forces of the shared dilatation of subtrees alone; a thread is eight subtrees."""
+    code = f"corot::dilating<corot::{of.lanes}>(corot::Stressless{{}}, material.lam, material.stride)"
+    return scatter_subtrees(shape, IsotropicMaterial, NativeLaw(code))

@@ -1,8 +1,7 @@
 """The dilatation that the eight leaves of a complete subtree share; see ``elements.dilatation``.
 
-There are two fast kernels for its forces. On CUDA a thread takes a subtree, with ten displacements in and ten forces
-out; on the CPU the lanes of vector registers take eight subtrees. ``elements.shared_dilatation`` computes everything
-else leaf by leaf.
+This is the fast kernel for its forces on CUDA, where a thread takes a subtree, with ten displacements in and ten
+forces out; ``cpu`` has that for the CPU. ``elements.shared_dilatation`` computes everything else leaf by leaf.
 """
 
 import functools
@@ -10,12 +9,9 @@ import functools
 import warp as wp
 
 from warp_corot.kernels.corotated.algebraic import stretch_stress
-from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import VOLUME as VOLUME_CHANGE
 from warp_corot.kernels.elements.dilatation import Dilatation, mean_of, pressure_stress_of
-from warp_corot.kernels.elements.dilatation_lanes import law_of
 from warp_corot.kernels.elements.elements import Subtrees, root_of
-from warp_corot.kernels.elements.lanes import ISOTROPIC, native, scatter_lanes
 from warp_corot.kernels.elements.shapes import columns_of, leaf_forces_of
 from warp_corot.kernels.math.rotation import column
 from warp_corot.kernels.modules import unique_kernel
@@ -23,19 +19,10 @@ from warp_corot.kernels.tables.shapes import VOLUME, fingerprint
 from warp_corot.kernels.tables.subtree import LEAVES
 
 from .forces import mat10, turns_of
-from .lanes import begin
 from .laws import turn_in, turn_out
 from .memory import memory_of
 
 wp.set_module_options({"enable_backward": False})
-
-
-@functools.cache
-def scatter_in_lanes(shape: int, of: Dilatation) -> wp.Kernel:
-    """Forces of the shared dilatation of subtrees on the CPU; a thread is eight subtrees."""
-    code = ISOTROPIC + begin(shape) + law_of(of) + "const auto& dilating = isotropic.lam;\n"
-    code += native("shared_dilatation", "dilatation", "subtree_forces")
-    return scatter_lanes(code, Subtrees, IsotropicMaterial, wp.uint8)
 
 
 @functools.cache

@@ -6,8 +6,9 @@ import warp as wp
 
 import warp_corot as wc
 from warp_corot.elasticity.viscosity import Viscosity
+from warp_corot.kernels.elements.forces import scatter_forces
 from warp_corot.kernels.elements.lanes import LANES
-from warp_corot.kernels.elements.viscosity import ViscousMaterial, scatter_viscous
+from warp_corot.kernels.elements.viscosity import ViscousMaterial, viscosity_stress
 
 BOX = wc.TetForest.box((1, 1, 2), 0.1, 3)
 GENERAL = wc.TetMesh(BOX.points, BOX.tets)
@@ -190,7 +191,8 @@ def test_elements_side_by_side_do_what_each_does_alone(mesh, amount, rng):
     material = ViscousMaterial()
     material.isotropic, material.seconds, material.velocities = field.isotropic, 0.1, state.velocities
     inputs = [field.elements, material, state.displacements]
-    wp.launch(scatter_viscous(body.discretization.element_kind), count, inputs, [expected], device="cpu")
+    alone = scatter_forces(body.discretization.element_kind, ViscousMaterial, viscosity_stress)
+    wp.launch(alone, count, inputs, [expected], device="cpu")
     atol = 2e-5 * np.abs(expected.numpy()).max()
     np.testing.assert_allclose(state.forces.numpy(), expected.numpy(), rtol=0, atol=atol)
     rest, now = (np.linalg.det(np.diff(x[mesh.tets], axis=1)) for x in (mesh.points, body.positions.numpy()))

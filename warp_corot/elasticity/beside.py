@@ -13,10 +13,11 @@ from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.elements import Elements
 from warp_corot.discretization.members import Members
 from warp_corot.discretization.plan import Plan
-from warp_corot.kernels.elements.forces import add_energies, scatter_forces
+from warp_corot.kernels.elements.forces import add_energies
+from warp_corot.kernels.elements.law_lanes import NativeLaw
 
 from .model import ForceField, SmallForces
-from .paths.elements import ByElements, Factory
+from .paths.elements import ByElements
 from .stiffness import ElementMaterial, ElementStiffness
 from .tangent import Tangent
 
@@ -33,8 +34,7 @@ class BesideField(ForceField):
         Material: The struct that the other stress reads.
         stress, differential, density: The other stress, its differential, and its energy density, as
             ``kernels.elements.forces`` and ``kernels.elements.stiffness_products`` take them.
-        eights: A function that makes the kernel that adds the other forces on the CPU, of eight elements in a thread,
-            for a kind of elements; None: that of ``stress``.
+        lanes: The other stress in C++, for the CPU, if it is there.
 
     Attributes:
         law: The same.
@@ -50,12 +50,12 @@ class BesideField(ForceField):
         stress: wp.Function,
         differential: wp.Function,
         density: wp.Function,
-        eights: Factory | None = None,
+        lanes: NativeLaw | None = None,
     ):
         self.law = law
         super().__init__(discretization, law.deterministic)
         kind = discretization.element_kind
-        self._forces = ByElements(discretization, lambda kind: scatter_forces(kind, Material, stress), eights)
+        self._forces = ByElements(discretization, Material, stress, lanes)
         self._energies = add_energies(kind, Material, density)
         self._stiffness = ElementStiffness(discretization, differential, Material)
         #: Separate places for each element's forces, if sums must be reproducible.
@@ -87,7 +87,7 @@ class BesideField(ForceField):
         slots.gather(f)
 
     def _scatter_own(self, elements: Elements, u: wp.array, f: wp.array) -> None:
-        self._forces(elements, self.element_count, [self.material, u], [f])
+        self._forces(elements, self.element_count, self.material, u, f)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         raise NotImplementedError("add_forces does all")

@@ -21,8 +21,8 @@ from warp_corot.kernels.elements.fibres import (
     reinforced_differential,
     reinforced_stress,
 )
-from warp_corot.kernels.elements.fibres_cpu import scatter_reinforced_eights
-from warp_corot.kernels.elements.forces import element_energies, element_von_mises, scatter_forces
+from warp_corot.kernels.elements.forces import element_energies, element_von_mises
+from warp_corot.kernels.elements.law_lanes import FIBRES
 from warp_corot.materials.reinforced import FibreReinforced
 
 from .corotated.anisotropic import fibre_material
@@ -70,11 +70,7 @@ class ReinforcedField(ForceField):
     def __init__(self, discretization: Discretization, deterministic: bool):
         super().__init__(discretization, deterministic)
         kind = discretization.element_kind
-        self._forces = ByElements(
-            discretization,
-            lambda kind: scatter_forces(kind, ReinforcedMaterial, reinforced_stress),
-            scatter_reinforced_eights,
-        )
+        self._forces = ByElements(discretization, ReinforcedMaterial, reinforced_stress, FIBRES)
         self._energies = element_energies(kind, ReinforcedMaterial, reinforced_density)
         self._von_mises = element_von_mises(kind, ReinforcedMaterial, reinforced_cauchy)
         self._stiffness = ElementStiffness(discretization, reinforced_differential, ReinforcedMaterial)
@@ -82,7 +78,7 @@ class ReinforcedField(ForceField):
         self._made, self._active = Kept(_material), Kept(fibre_material)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        self._forces(self.elements, self.element_count, [self.material, u], [f])
+        self._forces(self.elements, self.element_count, self.material, u, f)
 
     def add_stiffness(self, u: wp.array, p: wp.array, y: wp.array) -> None:
         self._stiffness.add_product(self.elements, self.material, u, p, y)

@@ -15,12 +15,13 @@ from warp_corot.discretization.discretization import Discretization, discretizat
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, shown
 from warp_corot.kernels.elements import prony as kernels
-from warp_corot.kernels.elements.prony_cpu import relax_eights, scatter_prony_eights
+from warp_corot.kernels.elements.lanes import LANES
+from warp_corot.kernels.elements.law_lanes import PRONY
+from warp_corot.kernels.elements.prony_cpu import relax_eights
 
 from .beside import BesideField
 from .corotated.model import Corotated
 from .model import ForceField, Model
-from .paths.elements import ByElements
 
 if TYPE_CHECKING:
     from warp_corot.discretization.changing.plan import DevicePlan
@@ -102,7 +103,7 @@ class PronyField(BesideField):
 
     def __init__(self, discretization: Discretization, model: Prony, law: ForceField):
         functions = (kernels.prony_stress, kernels.prony_differential, kernels.prony_density)
-        super().__init__(discretization, law, kernels.PronyMaterial, *functions, eights=scatter_prony_eights)
+        super().__init__(discretization, law, kernels.PronyMaterial, *functions, lanes=PRONY)
         g, tau = (np.array(values, np.float32) for values in model.terms)
         self._carried, counts = model.carried, self.plan.counts
         #: The number of elements may grow if the mesh changes.
@@ -110,7 +111,8 @@ class PronyField(BesideField):
         self._g, self._tau = (wp.array(v, dtype=wp.float32, device=self.device) for v in (g, tau))
         self._elapsed = wp.zeros(1, dtype=wp.float32, device=self.device)
         self._known = wp.zeros(len(self._carried) * self._count, dtype=wp.float32, device=self.device)
-        self._relax = ByElements(discretization, kernels.relax, relax_eights)
+        relax = relax_eights if self.device.is_cpu else kernels.relax
+        self._relax = relax(discretization.element_kind)
 
     @property
     def material(self) -> kernels.PronyMaterial:
@@ -125,7 +127,11 @@ class PronyField(BesideField):
 
     def complete_step(self, u: wp.array, pace: Pace) -> None:
         self.law.complete_step(u, pace)
-        self._relax(self.elements, self.element_count, [u, pace, self.material], [])
+        if self.device.is_cpu:
+            inputs = [self.elements, self.element_count, u, pace, self.material]
+            self.launch(self._relax, -(-self.element_count // LANES), inputs, [])
+        else:
+            self.launch(self._relax, self.element_count, [self.elements, u, pace, self.material], [])
 
     def relax_fully(self) -> None:
         self._elapsed.fill_(math.inf)

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from warp_corot.kernels.elements.viscosity import ViscousMaterial, scatter_viscous
-from warp_corot.kernels.elements.viscosity_cpu import scatter_viscous_eights
+from warp_corot.kernels.elements.law_lanes import VISCOUS
+from warp_corot.kernels.elements.viscosity import ViscousMaterial, viscosity_stress
 
 from .paths.elements import ByElements
 
@@ -39,7 +39,7 @@ class Viscosity:
         complete: Callable[[wp.array], wp.array] | None = None,
     ):
         self.body, self.field, self.seconds, self._complete = body, field, seconds, complete
-        self._scatter = ByElements(body.discretization, scatter_viscous, scatter_viscous_eights)
+        self._scatter = ByElements(body.discretization, ViscousMaterial, viscosity_stress, VISCOUS)
         #: Separate places for each element's forces, if sums must be reproducible.
         self._slotted = body.discretization.plan(subtrees=False, deterministic=True) if field.deterministic else None
 
@@ -63,4 +63,4 @@ class Viscosity:
     def _launch(self, elements: object, u: wp.array, v: wp.array, f: wp.array) -> None:
         material = ViscousMaterial()
         material.isotropic, material.seconds, material.velocities = self.field.isotropic, self.seconds, v
-        self._scatter(elements, self.field.element_count, [material, u], [f])
+        self._scatter(elements, self.field.element_count, material, u, f)

@@ -24,6 +24,7 @@ from warp_corot.kernels.elements import shared_dilatation as kernels
 from warp_corot.kernels.elements.dilatation import VOLUME, Dilatation
 from warp_corot.kernels.elements.lanes import LANES
 from warp_corot.kernels.subtrees import dilatation as subtrees
+from warp_corot.kernels.subtrees.cpu import scatter_dilatation_lanes
 from warp_corot.kernels.subtrees.memory import BLOCK
 from warp_corot.mesh import TetForest
 
@@ -177,7 +178,7 @@ class DilatationField(ForceField):
     def _kernel(self, shape: int, grouped: bool) -> wp.Kernel:
         if self.device.is_cuda:
             return subtrees.scatter_dilatation(shape, grouped, self.discretization.material_stride == 0, self.of)
-        return subtrees.scatter_in_lanes(shape, self.of)
+        return scatter_dilatation_lanes(shape, self.of)
 
     @property
     def _block(self) -> int:

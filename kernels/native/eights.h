@@ -1,2 +1,0 @@
-// Elements in eights. In: block. Out: the first of eight.
-const int first_element = 8 * block;

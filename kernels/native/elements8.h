@@ -1,0 +1,231 @@
+// Eight elements, one after the other in memory, in the lanes of vector registers: what laws need of them, and their
+// forces. A place ``at`` has, for laws, the ``frame``, the ``weight`` of stresses, the ``value`` of an array that has a number
+// for each element (or one for all), and the ``columns`` of the gradient of nodal vectors.
+#pragma once
+
+#include "dilatation.h"
+
+namespace corot {
+
+// The columns of the gradient of nodal vectors times the edge length, and the forces at the four nodes of columns of a
+// stress times V / h, by the three shapes of the forest: sums and differences as tables/shapes.py has them.
+template <int SHAPE, class S>
+COROT_INLINE void shape_columns(const triple<S>& x0, const triple<S>& x1, const triple<S>& x2, const triple<S>& x3, triple<S>* a) {
+    const float root2 = 1.4142135623730951f;
+    a[0] = SHAPE == 2 ? (x0 - x2) * root2 : x1 - x0;
+    a[1] = SHAPE == 2 ? (x1 - x2) * root2 : x2 - x1;
+    a[2] = SHAPE == 2 ? (x3 - x2) * 2.0f : SHAPE == 1 ? (x3 - x2) + (x3 - x0) : x3 - x2;
+}
+
+template <int SHAPE, class S> COROT_INLINE void shape_forces(const triple<S>* p, triple<S>* force) {
+    const float root2 = 1.4142135623730951f;
+    if (SHAPE == 2) {
+        const triple<S> p0 = p[0] * root2, p1 = p[1] * root2, p2 = p[2] * 2.0f;
+        force[0] = -p0, force[1] = -p1, force[2] = p0 + p1 + p2, force[3] = -p2;
+    } else {
+        force[0] = SHAPE == 1 ? p[0] + p[2] : p[0];
+        force[1] = p[1] - p[0], force[2] = p[2] - p[1], force[3] = SHAPE == 1 ? p[2] * -2.0f : -p[2];
+    }
+}
+
+// The volume of a shape over its edge cubed, and how elements and subtrees code their shape: a level, whether they are
+// mirrored, and the number of their frame.
+constexpr float VOLUME[3] = {1.0f / 6, 1.0f / 12, 1.0f / 24};
+constexpr int LEVEL_MASK = 63, MIRROR_BIT = 6, FRAME_SHIFT = 7;
+constexpr float SIGNS[2] = {1.0f, -1.0f};
+
+COROT_INLINE int least_of(int a, int b) { return a < b ? a : b; }
+
+// The frame of the shape code of each lane, whose last column has the sign of its handedness.
+template <class Units, class Code> COROT_INLINE Frame<lanes8> frame_of(const Units& units, const Code& code) {
+    lanes8 axes[9];
+    Frame<lanes8> frame;
+    gather_matrix([&](int lane) { return units.frames.data[code(lane) >> FRAME_SHIFT].data[0]; }, axes);
+    frame.handedness = gather_one([&](int lane) { return SIGNS + ((code(lane) >> MIRROR_BIT) & 1); });
+    for (int j = 0; j < 3; ++j) frame.q[j] = {axes[j], axes[3 + j], axes[6 + j]};
+    frame.q[2] = frame.q[2] * frame.handedness;
+    return frame;
+}
+
+template <class Units, class Code> COROT_INLINE lanes8 edge_of(const Units& units, const Code& code) {
+    return gather_one([&](int lane) { return &units.size.data[(code(lane) & LEVEL_MASK) / 3]; });
+}
+
+// Eight elements from ``first`` on; those past the last of ``count`` are the last one again.
+template <class Units_> struct Eight {
+    const Units_& units;
+    const int first, count, end;
+    COROT_INLINE Eight(const Units_& units, int first, int count)
+        : units(units), first(first), count(count), end(least_of(8, count - first)) {}
+    COROT_INLINE int element(int lane) const { return least_of(first + lane, count - 1); }
+    COROT_INLINE lanes8 values_of(const float* values) const {
+        return end == 8 ? load8(values + first) : gather_one([&](int lane) { return values + element(lane); });
+    }
+    template <class Values> COROT_INLINE lanes8 value(const Values& values, int stride) const {
+        return stride ? values_of(values.data) : spread<lanes8>(values.data[0]);
+    }
+    COROT_INLINE masks8 done() const { return masks8{}; }
+    // Vectors of the four nodes.
+    template <class Vectors> COROT_INLINE void gather_nodes(const Vectors& vectors, triple<lanes8>* x) const {
+        for (int n = 0; n < 4; ++n)
+            x[n] = gather_vector([&](int lane) { return &vectors.data[units.nodes.data[element(lane)][n]][0]; });
+    }
+    // Adds forces at the four nodes, one element after the other.
+    template <class Vectors> COROT_INLINE void add_forces(const triple<lanes8>* force, const Vectors& f) const {
+        packed4 parts[8][4];
+        for (int n = 0; n < 4; ++n) part(force[n], &parts[0][n], 4);
+        for (int lane = 0; lane < end; ++lane) {
+            const auto& to = units.nodes.data[first + lane];
+            for (int n = 0; n < 4; ++n) add4(&f.data[to[n]][0], parts[lane][n]);
+        }
+    }
+    // Puts elements that are not ``sound`` on a list: how many, then which.
+    template <class List> COROT_INLINE void list_others(const masks8& sound, const List& list) const {
+        if (!any(inverted(sound))) return;
+        for (int lane = 0; lane < end; ++lane)
+            if (!sound[lane]) list.data[++list.data[0]] = first + lane;
+    }
+};
+
+// General elements, by their rest matrices b.
+template <class Units> struct GeneralEight : Eight<Units> {
+    RestAxes<lanes8> frame;
+    lanes8 b[9], volume;
+    COROT_INLINE GeneralEight(const Units& units, int first, int count) : Eight<Units>(units, first, count) {
+        gather_matrix([&](int lane) { return units.rest_inverse.data[this->element(lane)].data[0]; }, b);
+        volume = this->values_of(units.volume.data);
+    }
+    COROT_INLINE lanes8 weight() const { return -volume; }
+    COROT_INLINE void columns(const triple<lanes8>* x, triple<lanes8>* a) const {
+        const triple<lanes8> d1 = x[1] - x[0], d2 = x[2] - x[0], d3 = x[3] - x[0];
+        for (int j = 0; j < 3; ++j) a[j] = combined(b[j], d1, b[3 + j], d2, b[6 + j], d3);
+    }
+    COROT_INLINE void forces_of(const triple<lanes8>* p, triple<lanes8>* force) const {
+        for (int n = 0; n < 3; ++n) force[n + 1] = combined(b[3 * n], p[0], b[3 * n + 1], p[1], b[3 * n + 2], p[2]);
+        force[0] = -(force[1] + force[2] + force[3]);
+    }
+};
+
+// Elements of a forest.
+template <class Units> struct ForestEight : Eight<Units> {
+    Frame<lanes8> frame;
+    lanes8 h;
+    masks8 is_1, is_2;
+    COROT_INLINE ForestEight(const Units& units, int first, int count) : Eight<Units>(units, first, count) {
+        const auto code = [&](int lane) { return units.code.data[this->element(lane)]; };
+        frame = frame_of(units, code);
+        h = edge_of(units, code);
+        masks8 shape;
+        for (int lane = 0; lane < 8; ++lane) shape[lane] = (code(lane) & LEVEL_MASK) % 3;
+        is_1 = shape == 1, is_2 = shape == 2;
+    }
+    COROT_INLINE lanes8 weight() const {
+        return h * h * (is_2 ? spread<lanes8>(VOLUME[2]) : is_1 ? spread<lanes8>(VOLUME[1]) : spread<lanes8>(VOLUME[0]));
+    }
+    COROT_INLINE void columns(const triple<lanes8>* x, triple<lanes8>* a) const {
+        triple<lanes8> a1[3], a2[3];
+        shape_columns<0>(x[0], x[1], x[2], x[3], a);
+        shape_columns<1>(x[0], x[1], x[2], x[3], a1);
+        shape_columns<2>(x[0], x[1], x[2], x[3], a2);
+        const lanes8 inverse = 1.0f / h;
+        for (int j = 0; j < 3; ++j) a[j] = chosen(is_2, a2[j], chosen(is_1, a1[j], a[j])) * inverse;
+    }
+    COROT_INLINE void forces_of(const triple<lanes8>* p, triple<lanes8>* force) const {
+        triple<lanes8> of1[4], of2[4];
+        shape_forces<0>(p, force);
+        shape_forces<1>(p, of1);
+        shape_forces<2>(p, of2);
+        for (int n = 0; n < 4; ++n) force[n] = chosen(is_2, of2[n], chosen(is_1, of1[n], force[n]));
+    }
+};
+
+// The columns of the gradient of nodal vectors, times the frame.
+template <class At, class Vectors> COROT_INLINE void gradient_of(const At& at, const Vectors& vectors, triple<lanes8>* a) {
+    triple<lanes8> x[4];
+    at.gather_nodes(vectors, x);
+    at.columns(x, a);
+}
+
+// Adds the forces of eight elements under a law, and lists those where its stress may not be trusted.
+template <class At, class Law, class Vectors, class List>
+COROT_INLINE void scatter_eight(const At& at, Law law, const Vectors& u, const Vectors& f, const List& missed) {
+    triple<lanes8> a[3], p[3], force[4];
+    law.begin(at);
+    gradient_of(at, u, a);
+    const masks8 sound = law.stress(deformation_of(a, at.frame), at, p);
+    at.forces_of(p, force);
+    at.add_forces(force, f);
+    at.list_others(sound, missed);
+}
+
+template <class Units, class Law, class Vectors, class List>
+COROT_INLINE void scatter_general(const Law& law, const Units& units, int block, int count, const Vectors& u, const Vectors& f,
+        const List& missed) {
+    scatter_eight(GeneralEight<Units>(units, 8 * block, count), law, u, f, missed);
+}
+
+template <class Units, class Law, class Vectors, class List>
+COROT_INLINE void scatter_forest(const Law& law, const Units& units, int block, int count, const Vectors& u, const Vectors& f,
+        const List& missed) {
+    scatter_eight(ForestEight<Units>(units, 8 * block, count), law, u, f, missed);
+}
+
+// The same where nodes have positions x in the place of displacements.
+template <class Units, class Law, class Vectors, class List>
+COROT_INLINE void scatter_posed(const Law& law, const Units& units, int block, int count, const Vectors& x, const Vectors& f,
+        const List& missed) {
+    const GeneralEight<Units> at(units, 8 * block, count);
+    triple<lanes8> a[3], p[3], force[4];
+    gradient_of(at, x, a);
+    a[0].x -= 1.0f; a[1].y -= 1.0f; a[2].z -= 1.0f;
+    const masks8 sound = law.stress(deformation_of(a, at.frame), at, p);
+    at.forces_of(p, force);
+    at.add_forces(force, f);
+    at.list_others(sound, missed);
+}
+
+// --- a shared dilatation by itself, in passes -------------------------------------------------------------------------
+
+// The place of an element among a mesh's, and how many of eight are in the mesh.
+template <class At, class Numbers> COROT_INLINE int place_of(const At& at, const Numbers& places, int lane) {
+    return places.shape[0] ? places.data[at.element(lane)] : at.element(lane);
+}
+
+template <class At, class Numbers> COROT_INLINE int present(const At& at, const Numbers& live) {
+    return live.shape[0] ? least_of(at.end, live.data[0] - at.first) : at.end;
+}
+
+// Writes theta of eight elements at their places.
+template <class Of, class Units, class Numbers, class Vectors>
+COROT_INLINE void measure_eight(const Units& units, int block, int count, const Numbers& places, const Numbers& live,
+        const Vectors& u, const Vectors& shared) {
+    const GeneralEight<Units> at(units, 8 * block, count);
+    triple<lanes8> a[3];
+    gradient_of(at, u, a);
+    const lanes8 theta = Of::theta(a, at.frame);
+    const int there = present(at, live);
+    for (int lane = 0; lane < there; ++lane) {
+        auto& to = shared.data[place_of(at, places, lane)];
+        to[0] = theta[lane];
+        to[1] = to[2] = to[3] = 0.0f;
+    }
+}
+
+// Adds the forces of a dilatation whose w' is the second number in ``shared``.
+template <class Of, class Units, class Numbers, class Values, class Vectors>
+COROT_INLINE void scatter_pressures(const Units& units, int block, int count, const Numbers& places, const Numbers& live,
+        const Values& lam, int stride, const Vectors& u, const Vectors& shared, const Vectors& f) {
+    const GeneralEight<Units> at(units, 8 * block, count);
+    triple<lanes8> a[3], p[3] = {nothing<lanes8>(), nothing<lanes8>(), nothing<lanes8>()}, force[4];
+    gradient_of(at, u, a);
+    const lanes8 k = stride ? gather_one([&](int lane) { return lam.data + place_of(at, places, lane); })
+        : spread<lanes8>(lam.data[0]);
+    const lanes8 slope = gather_one([&](int lane) { return &shared.data[place_of(at, places, lane)][1]; });
+    const lanes8 numbers = {0.0f, 1.0f, 2.0f, 3.0f, 4.0f, 5.0f, 6.0f, 7.0f};
+    const lanes8 weight = numbers < 1.0f * present(at, live) ? k * at.weight() : spread<lanes8>(0.0f);
+    add_pressure<Of>(deformation_of(a, at.frame), Of::theta(a, at.frame), slope, weight, p);
+    at.forces_of(p, force);
+    at.add_forces(force, f);
+}
+
+}  // namespace corot

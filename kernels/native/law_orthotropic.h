@@ -1,0 +1,84 @@
+// The corotated law of orthotropic materials, and active stress; see corotated/anisotropic.py and its neighbours.
+#pragma once
+
+#include "elements8.h"
+
+namespace corot {
+
+// (det(tr(S) I - S) / |S|^3)^2 times four, where leaves of no definite rotation begin: twice 0.41, squared.
+constexpr float NEARLY_INDEFINITE = 0.82f * 0.82f;
+
+// Forces of eight elements whose rest matrices are multiplied by the material's axes M, under a ``FibreMaterial``. Lists
+// those that have no definite rotation.
+template <class Units, class Material, class Vectors, class List>
+COROT_INLINE void scatter_orthotropic(const Units& units, int block, int count, const Material& material, const Vectors& u,
+        const Vectors& f, const List& missed) {
+    const GeneralEight<Units> at(units, 8 * block, count);
+    const auto& passive = material.passive;
+    lanes8 m[9], k[9];
+    gather_numbers<9>(at, [&](int t) { return passive.axes.data[t].data[0]; }, passive.axes_stride, m);
+    gather_numbers<9>(at, [&](int t) { return &passive.stiffness.data[t][0]; }, passive.stride, k);
+    const lanes8 active = material.is_active ? at.values_of(material.activation.data) : spread<lanes8>(0.0f);
+    // Columns of M, of G M and of F M, and E in the material's axes.
+    triple<lanes8> a[3], r[3], p[3], force[4];
+    gradient_of(at, u, a);
+    const Frame<lanes8> axes = {{{m[0], m[3], m[6]}, {m[1], m[4], m[7]}, {m[2], m[5], m[8]}}, spread<lanes8>(1.0f)};
+    const auto d = deformation_of(a, axes);
+    const triple<lanes8>* c = d.f;
+    const lanes8* e = d.e;
+    // Where E is small, S - I is a polynomial of it, with its digits, and R = F (I - (I - S^-1)); elsewhere R^T F - I.
+    const Stretch<lanes8> s = stretch_of(e, dot(c[0], cross(c[1], c[2])));
+    const masks8 small = s.of.small;
+    const lanes8 &ia = s.of.a, &ib = s.of.b, &ic = s.of.c, &ij = s.of.j, &it = s.t;
+    const lanes8 y = (2.0f * it - 6.0f * ij) / (1.0f + ij), over_q = 1.0f / s.q;
+    const lanes8 n0 = over_q * (it * (18.0f + it * (8.0f + it)) - ia * (10.0f + it) - 2.0f * ij - y * (1.0f + ia));
+    const lanes8 n1 = over_q * (8.0f + y), n2 = -over_q * (6.0f + y);
+    lanes8 sigma[6], strain[6];
+    for (int i = 0; i < 6; ++i) {
+        sigma[i] = -n1 * e[i] - n2 * s.of.adjugate[i];
+        strain[i] = (1.0f - n1 - n0 - n1 * ia) * e[i] - (n1 + n2) * s.of.adjugate[i];
+    }
+    for (int i = 0; i < 3; ++i) { sigma[i] += 1.0f - n0; strain[i] += n1 * ib - n2 * ic - n0; }
+    times(c, sigma, r);
+    const masks8 sound = s.sound & (s.q * s.q > NEARLY_INDEFINITE * (3.0f + ia) * (3.0f + ia) * (3.0f + ia));
+    if (any(~small)) {
+        triple<lanes8> other[3];
+        rotation_of(d, other);
+        for (int j = 0; j < 3; ++j) {
+            r[j] = chosen(small, r[j], other[j]);
+            strain[j] = small ? strain[j] : dot(other[j], c[j]) - 1.0f;
+        }
+        strain[3] = small ? strain[3] : 0.5f * (dot(other[0], c[1]) + dot(other[1], c[0]));
+        strain[4] = small ? strain[4] : 0.5f * (dot(other[0], c[2]) + dot(other[2], c[0]));
+        strain[5] = small ? strain[5] : 0.5f * (dot(other[1], c[2]) + dot(other[2], c[1]));
+    }
+    const lanes8 &e0 = strain[0], &e1 = strain[1], &e2 = strain[2];
+    const lanes8 &e01 = strain[3], &e02 = strain[4], &e12 = strain[5];
+    const lanes8 s0 = k[0] * e0 + k[3] * e1 + k[4] * e2;
+    const lanes8 s1 = k[3] * e0 + k[1] * e1 + k[5] * e2;
+    const lanes8 s2 = k[4] * e0 + k[5] * e1 + k[2] * e2;
+    const lanes8 s01 = 2.0f * k[6] * e01, s02 = 2.0f * k[7] * e02, s12 = 2.0f * k[8] * e12;
+    // tr(S) I - S has the diagonal h and the other entries -e; its adjugate and determinant.
+    const lanes8 h0 = 2.0f + e1 + e2, h1 = 2.0f + e0 + e2, h2 = 2.0f + e0 + e1;
+    const lanes8 a0 = h1 * h2 - e12 * e12, a1 = h0 * h2 - e02 * e02, a2 = h0 * h1 - e01 * e01;
+    const lanes8 a01 = e02 * e12 + e01 * h2, a02 = e01 * e12 + e02 * h1, a12 = e01 * e02 + h0 * e12;
+    const lanes8 det = h0 * a0 - e01 * a01 - e02 * a02;
+    // Axial vector of e s - s e.
+    const lanes8 w0 = e02 * s01 + e12 * s1 + e2 * s12 - (e01 * s02 + e1 * s12 + e12 * s2);
+    const lanes8 w1 = e0 * s02 + e01 * s12 + e02 * s2 - (e02 * s0 + e12 * s01 + e2 * s02);
+    const lanes8 w2 = e01 * s0 + e1 * s01 + e12 * s02 - (e0 * s01 + e01 * s1 + e02 * s12);
+    const lanes8 over = 1.0f / det;
+    const lanes8 t0 = over * (a0 * w0 + a01 * w1 + a02 * w2);
+    const lanes8 t1 = over * (a01 * w0 + a1 * w1 + a12 * w2);
+    const lanes8 t2 = over * (a02 * w0 + a12 * w1 + a2 * w2);
+    p[0] = r[0] * s0 + (r[1] * (s01 + t2) + r[2] * (s02 - t1));
+    p[1] = r[0] * (s01 - t2) + (r[1] * s1 + r[2] * (s12 + t0));
+    p[2] = r[0] * (s02 + t1) + (r[1] * (s12 - t0) + r[2] * s2);
+    p[0] = p[0] + c[0] * active;
+    for (int j = 0; j < 3; ++j) p[j] = chosen(sound, p[j] * at.weight(), nothing<lanes8>());
+    at.forces_of(p, force);
+    at.add_forces(force, f);
+    at.list_others(sound, missed);
+}
+
+}  // namespace corot

@@ -1,0 +1,169 @@
+// Isotropic laws as functions of a ``Deformation``: ``stress`` writes the columns p of the first Piola-Kirchhoff stress
+// times the frame and returns where they may be trusted. mu and lambda are already multiplied by the weight of P. All is
+// computed from E, which keeps its digits however small it is, so P keeps them, too.
+#pragma once
+
+#include "deformation.h"
+
+namespace corot {
+
+// P = sigma(e) of the small strain e.
+struct Linear {
+    template <class D, class S = typename D::S>
+    static COROT_INLINE mask_of<S> stress(const D& d, const S& m, const S& k, triple<S>* p) {
+        S e[6], sigma[6];
+        small_strain(d.a, d.frame, e);
+        const S pressure = k * (e[0] + e[1] + e[2]);
+        for (int i = 0; i < 6; ++i) sigma[i] = 2.0f * m * e[i];
+        for (int i = 0; i < 3; ++i) sigma[i] += pressure;
+        frame_times(d.frame, sigma, p);
+        return every<S>();
+    }
+};
+
+// P = F (mu E + lambda / 2 tr E).
+struct StVenantKirchhoff {
+    template <class D, class S = typename D::S>
+    static COROT_INLINE mask_of<S> stress(const D& d, const S& m, const S& k, triple<S>* p) {
+        S sigma[6];
+        const S pressure = 0.5f * k * (d.e[0] + d.e[1] + d.e[2]);
+        for (int i = 0; i < 6; ++i) sigma[i] = m * d.e[i];
+        for (int i = 0; i < 3; ++i) sigma[i] += pressure;
+        times(d.f, sigma, p);
+        return every<S>();
+    }
+};
+
+// With t, j and q of ``Stretch``, I - S^-1 = (n0 I + (8 + y) E - (6 + y) adj E) / q, y = (2t - 6j) / J, n0 = t (18 + t (8 +
+// t)) - a (10 + t) - 2j - y (1 + a), and P = F (2 mu (I - S^-1) + lambda t S^-1), where E is small; elsewhere by R. P is
+// zero where it is not trusted.
+struct Corotated {
+    template <class D, class S = typename D::S>
+    static COROT_INLINE mask_of<S> stress(const D& d, const S& m, const S& k, triple<S>* p) {
+        const triple<S>* f = d.f;
+        const triple<S> last = cross(f[0], f[1]);
+        const S handedness = handedness_of(d.frame);
+        const Stretch<S> s = stretch_of(d.e, handedness * dot(f[2], last));
+        const S &a = s.of.a, &j = s.of.j, &t = s.t;
+        const S kt = k * t;
+        const S w = (2.0f * m - kt) / s.q;
+        const S y = (2.0f * t - 6.0f * j) / (1.0f + j);
+        S s0 = kt + w * (t * (18.0f + t * (8.0f + t)) - a * (10.0f + t) - 2.0f * j - y * (1.0f + a));
+        S s1 = w * (8.0f + y), s2 = -w * (6.0f + y);
+        const bool mixed = any(inverted(s.of.small));
+        if (mixed) {
+            s0 = s.of.small ? s0 : 2.0f * m - w * (10.0f + t * (6.0f + t) + a);
+            s1 = s.of.small ? s1 : 2.0f * w;
+            s2 = s.of.small ? s2 : spread<S>(0.0f);
+        }
+        S sigma[6];
+        for (int i = 0; i < 6; ++i) sigma[i] = s1 * d.e[i] + s2 * s.of.adjugate[i];
+        for (int i = 0; i < 3; ++i) sigma[i] += s0;
+        times(f, sigma, p);
+        if (mixed) {
+            const S v = s.of.small ? spread<S>(0.0f) : -2.0f * (3.0f + t) * w * handedness;
+            p[0] = added(p[0], v, cross(f[1], f[2]));
+            p[1] = added(p[1], v, cross(f[2], f[0]));
+            p[2] = added(p[2], v, last);
+            for (int i = 0; i < 3; ++i) p[i] = chosen(s.sound, p[i], nothing<S>());
+        }
+        return s.sound;
+    }
+};
+
+// J below which the volumetric energy is its own Taylor polynomial of second order about this J, and its logarithm.
+constexpr float CONTINUED_BELOW = 0.5f, LOG_CONTINUED = -0.6931472f;
+
+// P = cof F (mu E + lambda ln J) / J; below J0 = CONTINUED_BELOW mu F + U'(J) cof F, with U' continued linearly.
+struct NeoHookean {
+    template <class D, class S = typename D::S>
+    static COROT_INLINE mask_of<S> stress(const D& d, const S& m, const S& k, triple<S>* p) {
+        const triple<S>* f = d.f;
+        const S handedness = handedness_of(d.frame);
+        const triple<S> cofactor[3] = {cross(f[1], f[2]), cross(f[2], f[0]), cross(f[0], f[1])};
+        const S j = invariants_of(d.e, handedness * dot(f[0], cofactor[0])).j;
+        const mask_of<S> crushed = j < CONTINUED_BELOW - 1.0f;
+        const S safe = crushed ? spread<S>(0.0f) : j;
+        const S w = handedness / (1.0f + safe);
+        const S pressure = w * k * log_of(safe), mw = m * w;
+        S sigma[6];
+        for (int i = 0; i < 6; ++i) sigma[i] = mw * d.e[i];
+        for (int i = 0; i < 3; ++i) sigma[i] += pressure;
+        times(cofactor, sigma, p);
+        if (any(crushed)) {
+            const float j0 = CONTINUED_BELOW;
+            const S slope = handedness * ((k * LOG_CONTINUED - m) / j0
+                + (m + k * (1.0f - LOG_CONTINUED)) / (j0 * j0) * (j + (1.0f - j0)));
+            for (int i = 0; i < 3; ++i) p[i] = chosen(crushed, added(f[i] * m, slope, cofactor[i]), p[i]);
+        }
+        return every<S>();
+    }
+};
+
+// --- laws with their material, as traversals take them ---------------------------------------------------------------
+//
+// ``begin`` is called once with the nodes that a traversal has gathered; then ``stress`` for each element, with the place
+// ``at``: see elements8.h and subtrees8.h. The stress is nothing in lanes that are ``done``.
+
+// ``COUNT`` numbers of each lane's element, from arrays of one entry (stride 0) or one for each element.
+template <int COUNT, class Entry, class At> COROT_INLINE void gather_numbers(const At& at, const Entry& entry, int stride, lanes8* to) {
+    if (!stride) {
+        for (int i = 0; i < COUNT; ++i) to[i] = spread<lanes8>(entry(0)[i]);
+        return;
+    }
+    for (int i = 0; i + 4 <= COUNT; i += 4) gather([&](int lane) { return entry(at.element(lane)) + i; }, to + i);
+    if (COUNT % 4) to[COUNT - 1] = gather_one([&](int lane) { return entry(at.element(lane)) + COUNT - 1; });
+}
+
+// A law with Lame's parameters of a Warp struct that has mu, lam and stride.
+template <class Law, class Material> struct Elastic {
+    const Law law;
+    const Material& material;
+    template <class Nodes> COROT_INLINE void begin(const Nodes&) {}
+    template <class D, class At, class S = typename D::S>
+    COROT_INLINE mask_of<S> stress(const D& d, const At& at, triple<S>* p) const {
+        const S weight = at.weight();
+        const mask_of<S> sound = law.stress(d, weight * at.value(material.mu, material.stride),
+            weight * at.value(material.lam, material.stride), p);
+        for (int j = 0; j < 3; ++j) p[j] = chosen(at.done(), nothing<S>(), p[j]);
+        return sound;
+    }
+};
+
+template <class Law, class Material> COROT_INLINE Elastic<Law, Material> elastic(const Law& law, const Material& material) {
+    return {law, material};
+}
+
+// No law.
+struct Stressless {
+    template <class Nodes> COROT_INLINE void begin(const Nodes&) {}
+    template <class D, class At, class S = typename D::S>
+    COROT_INLINE mask_of<S> stress(const D&, const At&, triple<S>* p) const {
+        for (int j = 0; j < 3; ++j) p[j] = nothing<S>();
+        return every<S>();
+    }
+};
+
+// Two laws side by side.
+template <class First, class Second> struct Sum {
+    First first;
+    Second second;
+    template <class Nodes> COROT_INLINE void begin(const Nodes& nodes) {
+        first.begin(nodes);
+        second.begin(nodes);
+    }
+    template <class D, class At, class S = typename D::S>
+    COROT_INLINE mask_of<S> stress(const D& d, const At& at, triple<S>* p) const {
+        triple<S> more[3];
+        mask_of<S> sound = first.stress(d, at, p);
+        sound &= second.stress(d, at, more);
+        for (int j = 0; j < 3; ++j) p[j] = p[j] + more[j];
+        return sound;
+    }
+};
+
+template <class First, class Second> COROT_INLINE Sum<First, Second> sum(const First& first, const Second& second) {
+    return {first, second};
+}
+
+}  // namespace corot

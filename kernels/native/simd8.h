@@ -1,0 +1,199 @@
+// Scalars of laws: float, double, or ``lanes8``, eight floats in a CPU's vector registers; triples of these; and how lanes
+// are read and written.
+#pragma once
+
+#if defined(__clang__)
+#pragma clang fp contract(fast)
+#endif
+// Functions that are called more than once must not pass vectors through memory.
+#define COROT_INLINE inline __attribute__((always_inline))
+
+namespace corot {
+
+typedef float lanes8 __attribute__((vector_size(32)));
+typedef int masks8 __attribute__((vector_size(32)));
+// As they stand in memory, where nothing is aligned.
+typedef float packed8 __attribute__((vector_size(32), aligned(4)));
+typedef float packed4 __attribute__((vector_size(16), aligned(4)));
+
+// --- scalars --------------------------------------------------------------------------------------------------------
+
+// What a comparison of scalars gives.
+template <class S> struct mask { typedef bool type; };
+template <> struct mask<lanes8> { typedef masks8 type; };
+template <class S> using mask_of = typename mask<S>::type;
+
+template <class A, class B> struct same { static constexpr bool value = false; };
+template <class A> struct same<A, A> { static constexpr bool value = true; };
+
+template <class S> struct constant { static COROT_INLINE S of(float a) { return a; } };
+template <> struct constant<lanes8> {
+    static COROT_INLINE lanes8 of(float a) { return lanes8{a, a, a, a, a, a, a, a}; }
+};
+template <class S> COROT_INLINE S spread(float a) { return constant<S>::of(a); }
+template <class S> COROT_INLINE mask_of<S> every() { return spread<S>(0.0f) == spread<S>(0.0f); }
+
+COROT_INLINE bool any(bool a) { return a; }
+COROT_INLINE bool any(const masks8& a) {
+#if defined(__clang__)
+    return __builtin_reduce_or(a) != 0;
+#else
+    int found = 0;
+    for (int lane = 0; lane < 8; ++lane) found |= a[lane];
+    return found != 0;
+#endif
+}
+COROT_INLINE bool inverted(bool a) { return !a; }
+COROT_INLINE masks8 inverted(const masks8& a) { return ~a; }
+
+COROT_INLINE float root(float a) { return __builtin_sqrtf(a); }
+COROT_INLINE double root(double a) { return __builtin_sqrt(a); }
+COROT_INLINE lanes8 root(const lanes8& a) {
+#if defined(__clang__)
+    return __builtin_elementwise_sqrt(a);
+#else
+    lanes8 b;
+    for (int lane = 0; lane < 8; ++lane) b[lane] = __builtin_sqrtf(a[lane]);
+    return b;
+#endif
+}
+
+// ln(1 + j) of positive 1 + j, to all its digits: for lanes twice the artanh of j / (2 + j), of what powers of two leave
+// within sqrt(2).
+COROT_INLINE float log_of(float j) { return __builtin_log1pf(j); }
+COROT_INLINE double log_of(double j) { return __builtin_log1p(j); }
+COROT_INLINE lanes8 log_of(const lanes8& j) {
+    const lanes8 whole = 1.0f + j;
+    const masks8 bits = reinterpret_cast<const masks8&>(whole);
+    const masks8 power = (bits - 0x3f3504f3) >> 23;
+    const masks8 reduced = bits - (power << 23);
+    const lanes8 rest = power == 0 ? j : reinterpret_cast<const lanes8&>(reduced) - 1.0f;
+    const lanes8 z = rest / (2.0f + rest), zz = z * z;
+    const lanes8 series = 1.0f + zz * (1.0f / 3 + zz * (0.2f + zz * (1.0f / 7 + zz * (1.0f / 9))));
+    return 0.6931472f * __builtin_convertvector(power, lanes8) + 2.0f * z * series;
+}
+
+// exp(x) - 1 to all its digits; for lanes with x up to 80: powers of two, and a series of what they leave within
+// ln(2) / 2.
+COROT_INLINE float power_excess(float x) { return __builtin_expm1f(x); }
+COROT_INLINE double power_excess(double x) { return __builtin_expm1(x); }
+COROT_INLINE lanes8 power_excess(const lanes8& x) {
+    const lanes8 bounded = x < -80.0f ? spread<lanes8>(-80.0f) : x;
+    const lanes8 near = 1.4426950f * bounded + (bounded < 0.0f ? spread<lanes8>(-0.5f) : spread<lanes8>(0.5f));
+    const masks8 power = __builtin_convertvector(near, masks8);
+    const lanes8 whole = __builtin_convertvector(power, lanes8);
+    const lanes8 r = (bounded - 0.693359375f * whole) + 2.1219444e-4f * whole;
+    const lanes8 series = r + r * r * (0.5f + r * (1.0f / 6 + r * (1.0f / 24 + r * (1.0f / 120 + r * (1.0f / 720
+        + r * (1.0f / 5040))))));
+    const masks8 bits = (power + 127) << 23;
+    const lanes8 scale = reinterpret_cast<const lanes8&>(bits);
+    return scale * series + (scale - 1.0f);
+}
+
+// --- triples --------------------------------------------------------------------------------------------------------
+
+template <class S> struct triple {
+    S x, y, z;
+    COROT_INLINE triple operator+(const triple& b) const { return {x + b.x, y + b.y, z + b.z}; }
+    COROT_INLINE triple operator-(const triple& b) const { return {x - b.x, y - b.y, z - b.z}; }
+    COROT_INLINE triple operator-() const { return {-x, -y, -z}; }
+    template <class W> COROT_INLINE triple operator*(const W& w) const { return {w * x, w * y, w * z}; }
+};
+
+// a + w b
+template <class S> COROT_INLINE triple<S> added(const triple<S>& a, const S& w, const triple<S>& b) {
+    return {a.x + w * b.x, a.y + w * b.y, a.z + w * b.z};
+}
+
+// u a + v b + w c
+template <class S> COROT_INLINE triple<S> combined(const S& u, const triple<S>& a, const S& v, const triple<S>& b, const S& w,
+        const triple<S>& c) {
+    return {u * a.x + v * b.x + w * c.x, u * a.y + v * b.y + w * c.y, u * a.z + v * b.z + w * c.z};
+}
+
+template <class S> COROT_INLINE S dot(const triple<S>& a, const triple<S>& b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+
+template <class S> COROT_INLINE triple<S> cross(const triple<S>& a, const triple<S>& b) {
+    return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+}
+
+template <class S> COROT_INLINE triple<S> chosen(const mask_of<S>& which, const triple<S>& a, const triple<S>& b) {
+    return {which ? a.x : b.x, which ? a.y : b.y, which ? a.z : b.z};
+}
+
+template <class S> COROT_INLINE triple<S> nothing() { return {spread<S>(0.0f), spread<S>(0.0f), spread<S>(0.0f)}; }
+
+// P = F S of a symmetric S: 00, 11, 22, 01, 02, 12, as all symmetric tensors here.
+template <class S> COROT_INLINE void times(const triple<S>* f, const S* s, triple<S>* p) {
+    p[0] = combined(s[0], f[0], s[3], f[1], s[4], f[2]);
+    p[1] = combined(s[3], f[0], s[1], f[1], s[5], f[2]);
+    p[2] = combined(s[4], f[0], s[5], f[1], s[2], f[2]);
+}
+
+// --- memory ---------------------------------------------------------------------------------------------------------
+//
+// Memory is read and written four floats of a lane at a time and transposed in registers: written float by float, lanes
+// would be read before the stores have arrived. ``at`` gives the address of a lane.
+
+COROT_INLINE packed4 load4(const float* at) { return *reinterpret_cast<const packed4*>(at); }
+COROT_INLINE lanes8 load8(const float* at) { return *reinterpret_cast<const packed8*>(at); }
+COROT_INLINE void store8(float* at, const lanes8& a) { *reinterpret_cast<packed8*>(at) = a; }
+
+COROT_INLINE lanes8 halves(const float* low, const float* high) {
+    const packed4 a = load4(low), b = load4(high);
+    return __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7);
+}
+
+// One float in each lane.
+template <class At> COROT_INLINE lanes8 gather_one(const At& at) {
+    return lanes8{*at(0), *at(1), *at(2), *at(3), *at(4), *at(5), *at(6), *at(7)};
+}
+
+// Four floats in each lane.
+template <class At> COROT_INLINE void gather(const At& at, lanes8* to) {
+    const lanes8 r0 = halves(at(0), at(4)), r1 = halves(at(1), at(5));
+    const lanes8 r2 = halves(at(2), at(6)), r3 = halves(at(3), at(7));
+    const lanes8 a = __builtin_shufflevector(r0, r1, 0, 8, 1, 9, 4, 12, 5, 13);
+    const lanes8 b = __builtin_shufflevector(r2, r3, 0, 8, 1, 9, 4, 12, 5, 13);
+    const lanes8 c = __builtin_shufflevector(r0, r1, 2, 10, 3, 11, 6, 14, 7, 15);
+    const lanes8 d = __builtin_shufflevector(r2, r3, 2, 10, 3, 11, 6, 14, 7, 15);
+    to[0] = __builtin_shufflevector(a, b, 0, 1, 8, 9, 4, 5, 12, 13);
+    to[1] = __builtin_shufflevector(a, b, 2, 3, 10, 11, 6, 7, 14, 15);
+    to[2] = __builtin_shufflevector(c, d, 0, 1, 8, 9, 4, 5, 12, 13);
+    to[3] = __builtin_shufflevector(c, d, 2, 3, 10, 11, 6, 7, 14, 15);
+}
+
+// A vector of a node in each lane.
+template <class At> COROT_INLINE triple<lanes8> gather_vector(const At& at) {
+    lanes8 four[4];
+    gather(at, four);
+    return {four[0], four[1], four[2]};
+}
+
+// The nine entries of a matrix in each lane, row by row.
+template <class At> COROT_INLINE void gather_matrix(const At& at, lanes8* to) {
+    gather(at, to);
+    gather([&](int lane) { return at(lane) + 4; }, to + 4);
+    to[8] = gather_one([&](int lane) { return at(lane) + 8; });
+}
+
+// The triple of each lane as four floats, lanes ``stride`` apart.
+COROT_INLINE void part(const triple<lanes8>& a, packed4* to, int stride) {
+    const lanes8 zero = spread<lanes8>(0.0f);
+    const lanes8 xy = __builtin_shufflevector(a.x, a.y, 0, 8, 1, 9, 4, 12, 5, 13);
+    const lanes8 z0 = __builtin_shufflevector(a.z, zero, 0, 8, 1, 9, 4, 12, 5, 13);
+    const lanes8 xy_ = __builtin_shufflevector(a.x, a.y, 2, 10, 3, 11, 6, 14, 7, 15);
+    const lanes8 z0_ = __builtin_shufflevector(a.z, zero, 2, 10, 3, 11, 6, 14, 7, 15);
+    to[0] = __builtin_shufflevector(xy, z0, 0, 1, 8, 9);
+    to[stride] = __builtin_shufflevector(xy, z0, 2, 3, 10, 11);
+    to[2 * stride] = __builtin_shufflevector(xy_, z0_, 0, 1, 8, 9);
+    to[3 * stride] = __builtin_shufflevector(xy_, z0_, 2, 3, 10, 11);
+    to[4 * stride] = __builtin_shufflevector(xy, z0, 4, 5, 12, 13);
+    to[5 * stride] = __builtin_shufflevector(xy, z0, 6, 7, 14, 15);
+    to[6 * stride] = __builtin_shufflevector(xy_, z0_, 4, 5, 12, 13);
+    to[7 * stride] = __builtin_shufflevector(xy_, z0_, 6, 7, 14, 15);
+}
+
+COROT_INLINE void add4(float* to, const packed4& a) { *reinterpret_cast<packed4*>(to) += a; }
+
+}  // namespace corot
