@@ -14,6 +14,7 @@ from warp_corot.kernels.corotated.anisotropic import (
 )
 from warp_corot.kernels.corotated.definite import definite_law, definite_strain, is_definite, load_axes
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
+from warp_corot.kernels.elements.fibres import ReinforcedMaterial, stress_in_axes
 from warp_corot.kernels.math.rotation import ITERATIONS, byers_xu, column, identity3, newton_rotation
 
 from .elements import number_of
@@ -87,3 +88,11 @@ def anisotropic_law(transverse: bool) -> wp.Function:
         return p
 
     return anisotropic_law
+
+
+@wp.func
+def reinforced_law(material: ReinforcedMaterial, listed: wp.array[wp.int32], i: int, scale: float, w: wp.mat33):
+    """The law of Holzapfel, Gasser and Ogden, for elements whose axes are the axes of rest space."""
+    t = number_of(listed, i)
+    m = axes_of(material.fibres, t)
+    return scale * (m * stress_in_axes(wp.transpose(m) * w * m, material, t) * wp.transpose(m))

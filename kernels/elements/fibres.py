@@ -126,15 +126,19 @@ def active_stress(material: ReinforcedMaterial, t: int, f: wp.mat33):
 
 
 @wp.func
-def reinforced_stress(elements: Any, t: int, material: ReinforcedMaterial, u: wp.array[wp.vec4]):
-    m = axes_of(material.fibres, t)
-    g, turn = material_gradient(elements, t, m, u)
-    a = wp.transpose(m) * g
+def stress_in_axes(a: wp.mat33, material: ReinforcedMaterial, t: int):
+    """P of the displacement gradient A of element t, both in the material's axes."""
     f = identity3() + a
     i = t * material.matrix.stride
     own = f * fibre_stress(material.fibres, t, green_strain(a)) + active_stress(material, t, f)
-    p = neo_hookean_stress(a, material.matrix.mu[i], material.matrix.lam[i]) + filled(material.fibres, t) * own
-    return m * p * wp.transpose(turn)
+    return neo_hookean_stress(a, material.matrix.mu[i], material.matrix.lam[i]) + filled(material.fibres, t) * own
+
+
+@wp.func
+def reinforced_stress(elements: Any, t: int, material: ReinforcedMaterial, u: wp.array[wp.vec4]):
+    m = axes_of(material.fibres, t)
+    g, turn = material_gradient(elements, t, m, u)
+    return m * stress_in_axes(wp.transpose(m) * g, material, t) * wp.transpose(turn)
 
 
 @wp.func

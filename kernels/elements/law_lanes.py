@@ -22,7 +22,7 @@ class NativeLaw(NamedTuple):
 
 FIBRES = NativeLaw("corot::fibres(material)", "law_fibres")
 PRONY = NativeLaw("corot::prony(material)", "rates")
-VISCOUS = NativeLaw("corot::viscous<4>(material)", "rates", True)
+VISCOUS = NativeLaw("corot::viscous(material)", "rates", True)
 
 #: The structs of isotropic laws by their names.
 LAWS = {"corotated": "Corotated", "linear": "Linear", "stvk": "StVenantKirchhoff", "neo-hookean": "NeoHookean"}

@@ -15,8 +15,8 @@ import functools
 
 import warp as wp
 
-from warp_corot.kernels.math.eigen import symmetric_eigen
-from warp_corot.kernels.math.matrices import identity3
+from warp_corot.kernels.math.eigen import eigenvalue_nodes, symmetric_eigen
+from warp_corot.kernels.math.matrices import identity3, reciprocal
 
 from .constitutive import (
     green_strain,
@@ -127,11 +127,17 @@ def ogden(terms: tuple[tuple[float, float], ...]) -> dict[str, wp.Function]:
 
     @wp.func
     def stress(a: wp.mat33, mu: float, lam: float):
-        e, n = symmetric_eigen(green_strain(a))
-        s0, _c0, _w0 = of_square(e[0])
-        s1, _c1, _w1 = of_square(e[1])
-        s2, _c2, _w2 = of_square(e[2])
-        own = n * wp.diag(wp.vec3(s0, s1, s2)) * wp.transpose(n)
+        e = green_strain(a)
+        n = eigenvalue_nodes(e)
+        s0, _c0, _w0 = of_square(n[0])
+        s1, _c1, _w1 = of_square(n[1])
+        s2, _c2, _w2 = of_square(n[2])
+        # Newton's polynomial: s0 + first (E - n0) + curvature (E - n0) (E - n1).
+        first = (s0 - s1) * reciprocal(n[0] - n[1])
+        curvature = (first - (s1 - s2) * reciprocal(n[1] - n[2])) * reciprocal(n[0] - n[2])
+        linear = first - curvature * (n[0] + n[1])
+        constant = s0 - first * n[0] + curvature * n[0] * n[1]
+        own = constant * identity3() + linear * e + curvature * (e * e)
         return neo_hookean_stress(a, v * mu, lam) + mu * ((identity3() + a) * own)
 
     @wp.func

@@ -19,7 +19,7 @@ def relax_eights(Elements: type) -> wp.Kernel:
     """Make the state at displacements u, after a step of the clock's length, the known one; a thread is eight
     elements."""
 
-    traversal = "ForestEight" if Elements is ForestElements else "GeneralEight"
+    traversal = "ForestEight" if Elements is ForestElements else "ListableGeneralEight"
 
     @wp.func_native(on_cpu(f"corot::relax_eight<corot::{traversal}>(material, units, block, count, u, time);"))
     def eight_elements(

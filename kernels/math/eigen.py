@@ -1,6 +1,8 @@
-"""Eigenvalues and eigenvectors of symmetric 3x3 matrices, by Jacobi's method."""
+"""Eigenvalues and eigenvectors of symmetric 3x3 matrices: both by Jacobi's method, or near the first in closed form."""
 
 import warp as wp
+
+from .matrices import identity3, reciprocal, square_root
 
 wp.set_module_options({"enable_backward": False})
 
@@ -55,3 +57,32 @@ def symmetric_eigen(a: wp.mat33):
         a12 = 0.0
         sweep += 1
     return wp.vec3(d0, d1, d2), wp.matrix_from_cols(v0, v1, v2)
+
+
+@wp.func
+def third_cosine(x: float):
+    """cos(acos(r) / 3) of x = cos(acos(r) / 2), to 1.2e-6."""
+    inner = 0.04779688 + x * (-0.01930408 + x * 0.00419271)
+    return 0.50000121 + x * (0.5772581 + x * (-0.10994389 + x * inner))
+
+
+@wp.func
+def eigenvalue_nodes(e: wp.mat33):
+    """Three numbers, from the largest to the smallest, that stand for a symmetric matrix's eigenvalues in polynomials.
+
+    They are some 1e-3 of the eigenvalues' differences away from these, and never nearer to one another than that. A
+    polynomial that has a smooth function's values there has those of the function at the eigenvalues up to the product
+    of all three distances. ``native/law_ogden.h`` has the same.
+    """
+    mean = wp.trace(e) / 3.0
+    d = e - mean * identity3()
+    squared = wp.ddot(d, d) / 6.0
+    least = 1.0e-6 * mean * mean
+    r = float(0.0)
+    p = square_root(least + 1.0e-30)
+    if squared > least and squared > 1.0e-30:
+        p = square_root(squared)
+        r = wp.clamp(0.5 * wp.determinant(d * reciprocal(p)), -0.9999997, 0.9999997)
+    above = 2.0 * p * third_cosine(square_root(0.5 + 0.5 * r))
+    below = 2.0 * p * third_cosine(square_root(0.5 - 0.5 * r))
+    return wp.vec3(mean + above, mean - (above - below), mean - below)

@@ -51,15 +51,23 @@ template <class Units, class Code> COROT_INLINE lanes8 edge_of(const Units& unit
     return gather_one([&](int lane) { return &units.size.data[(code(lane) & LEVEL_MASK) / 3]; });
 }
 
-// Eight elements from ``first`` on; those past the last of ``count`` are the last one again.
-template <class Units_> struct Eight {
+// Eight elements from ``first`` on, or, if LISTABLE, of a list of them; those past the last of ``count`` are the last one
+// again.
+template <class Units_, bool LISTABLE> struct Eight {
     const Units_& units;
-    const int first, count, end;
-    COROT_INLINE Eight(const Units_& units, int first, int count)
-        : units(units), first(first), count(count), end(least_of(8, count - first)) {}
-    COROT_INLINE int element(int lane) const { return least_of(first + lane, count - 1); }
+    const int first, last, end;
+    const bool is_row;
+    int numbers[8];
+    COROT_INLINE Eight(const Units_& units, int first, int count, const int* listed)
+        : units(units), first(first), last(count - 1), end(least_of(8, count - first)), is_row(end == 8 && !listed) {
+        for (int lane = 0; LISTABLE && lane < 8; ++lane) {
+            const int k = least_of(first + lane, last);
+            numbers[lane] = listed ? listed[k] : k;
+        }
+    }
+    COROT_INLINE int element(int lane) const { return LISTABLE ? numbers[lane] : least_of(first + lane, last); }
     COROT_INLINE lanes8 values_of(const float* values) const {
-        return end == 8 ? load8(values + first) : gather_one([&](int lane) { return values + element(lane); });
+        return is_row ? load8(values + first) : gather_one([&](int lane) { return values + element(lane); });
     }
     template <class Values> COROT_INLINE lanes8 value(const Values& values, int stride) const {
         return stride ? values_of(values.data) : spread<lanes8>(values.data[0]);
@@ -75,7 +83,7 @@ template <class Units_> struct Eight {
         packed4 parts[8][4];
         for (int n = 0; n < 4; ++n) part(force[n], &parts[0][n], 4);
         for (int lane = 0; lane < end; ++lane) {
-            const auto& to = units.nodes.data[first + lane];
+            const auto& to = units.nodes.data[element(lane)];
             for (int n = 0; n < 4; ++n) add4(&f.data[to[n]][0], parts[lane][n]);
         }
     }
@@ -83,15 +91,16 @@ template <class Units_> struct Eight {
     template <class List> COROT_INLINE void list_others(const masks8& sound, const List& list) const {
         if (!any(inverted(sound))) return;
         for (int lane = 0; lane < end; ++lane)
-            if (!sound[lane]) list.data[++list.data[0]] = first + lane;
+            if (!sound[lane]) list.data[++list.data[0]] = element(lane);
     }
 };
 
 // General elements, by their rest matrices b.
-template <class Units> struct GeneralEight : Eight<Units> {
+template <class Units, bool LISTABLE = false> struct GeneralEight : Eight<Units, LISTABLE> {
     RestAxes<lanes8> frame;
     lanes8 b[9], volume;
-    COROT_INLINE GeneralEight(const Units& units, int first, int count) : Eight<Units>(units, first, count) {
+    COROT_INLINE GeneralEight(const Units& units, int first, int count, const int* listed = nullptr)
+        : Eight<Units, LISTABLE>(units, first, count, listed) {
         gather_matrix([&](int lane) { return units.rest_inverse.data[this->element(lane)].data[0]; }, b);
         volume = this->values_of(units.volume.data);
     }
@@ -106,12 +115,15 @@ template <class Units> struct GeneralEight : Eight<Units> {
     }
 };
 
+template <class Units> using ListableGeneralEight = GeneralEight<Units, true>;
+
 // Elements of a forest.
-template <class Units> struct ForestEight : Eight<Units> {
+template <class Units> struct ForestEight : Eight<Units, true> {
     Frame<lanes8> frame;
     lanes8 h;
     masks8 is_1, is_2;
-    COROT_INLINE ForestEight(const Units& units, int first, int count) : Eight<Units>(units, first, count) {
+    COROT_INLINE ForestEight(const Units& units, int first, int count, const int* listed = nullptr)
+        : Eight<Units, true>(units, first, count, listed) {
         const auto code = [&](int lane) { return units.code.data[this->element(lane)]; };
         frame = frame_of(units, code);
         h = edge_of(units, code);
@@ -164,10 +176,12 @@ COROT_INLINE void scatter_general(const Law& law, const Units& units, int block,
     scatter_eight(GeneralEight<Units>(units, 8 * block, count), law, u, f, missed);
 }
 
-template <class Units, class Law, class Vectors, class List>
-COROT_INLINE void scatter_forest(const Law& law, const Units& units, int block, int count, const Vectors& u, const Vectors& f,
-        const List& missed) {
-    scatter_eight(ForestEight<Units>(units, 8 * block, count), law, u, f, missed);
+// The same of either kind of elements, or of those on a list if it is not empty.
+template <template <class> class Traversal, class Units, class Law, class List, class Vectors>
+COROT_INLINE void scatter_listed(const Law& law, const Units& units, int block, int count, const List& listed, const Vectors& u,
+        const Vectors& f, const List& missed) {
+    const int* const chosen = listed.shape[0] ? listed.data : nullptr;
+    scatter_eight(Traversal<Units>(units, 8 * block, count, chosen), law, u, f, missed);
 }
 
 // The same where nodes have positions x in the place of displacements.

@@ -44,10 +44,10 @@ COROT_INLINE void viscous_stress(const triple<S>* f, const triple<S>* r, const t
     for (int j = 0; j < 3; ++j) p[j] = combined(s[j].x, r[0], s[j].y, r[1], s[j].z, r[2]);
 }
 
-// The viscous stress of a ``ViscousMaterial``, in a traversal that gathers NODES nodes.
-template <int NODES, class Material> struct Viscous {
+// The viscous stress of a ``ViscousMaterial``.
+template <class Material> struct Viscous {
     const Material& material;
-    triple<lanes8> velocities[NODES];
+    triple<lanes8> velocities[10];  // of four or ten nodes
     template <class Nodes> COROT_INLINE void begin(const Nodes& nodes) { nodes.gather_nodes(material.velocities, velocities); }
     template <class D, class At> COROT_INLINE masks8 stress(const D& d, const At& at, triple<lanes8>* p) const {
         const auto& isotropic = material.isotropic;
@@ -62,9 +62,7 @@ template <int NODES, class Material> struct Viscous {
     }
 };
 
-template <int NODES, class Material> COROT_INLINE Viscous<NODES, Material> viscous(const Material& material) {
-    return {material, {}};
-}
+template <class Material> COROT_INLINE Viscous<Material> viscous(const Material& material) { return {material, {}}; }
 
 // The Maxwell elements of a ``PronyMaterial``.
 template <class Material> struct Prony {

@@ -81,6 +81,13 @@ template <class Type, class Units_> struct EightSubtrees {
             for (int k = 0; k < 10; ++k) add4(&f.data[node[k]][0], parts[lane][k]);
         }
     }
+    // Puts leaves that were left out on a list: how many, then which.
+    template <class List> COROT_INLINE void list_others(const masks8& left_out, const List& list) const {
+        if (!any(left_out)) return;
+        for (int lane = 0; lane < end; ++lane)
+            for (int number = 0; number < 8; ++number)
+                if (left_out[lane] >> number & 1) list.data[++list.data[0]] = units.first.data[first + lane] + number;
+    }
     // Says which leaves were left out, a byte a subtree.
     template <class Bytes> COROT_INLINE void flag(const masks8& left_out, const Bytes& flags) const {
         for (int lane = 0; lane < end; ++lane) flags.data[first + lane] = static_cast<unsigned char>(left_out[lane]);
@@ -104,10 +111,10 @@ COROT_INLINE void add_leaves(const Subtrees& subtrees, const Law& law, const mas
     }
 }
 
-// Forces of eight subtrees under a law; ``FLAGS``: it may leave leaves out.
-template <class Type, bool FLAGS, class Law, class Units, class Vectors, class Bytes>
+// Forces of eight subtrees under a law; leaves that are left out are flagged or LISTED, if the law leaves any out (SOME).
+template <class Type, bool SOME, bool LISTED, class Law, class Units, class Vectors, class Missed>
 COROT_INLINE void scatter_subtrees(Law law, const Units& units, int block, int count, const Vectors& u, const Vectors& f,
-        const Bytes& flags) {
+        const Missed& missed) {
     const EightSubtrees<Type, Units> subtrees(units, block, count, u);
     triple<lanes8> g[10];
     for (int k = 0; k < 10; ++k) g[k] = nothing<lanes8>();
@@ -115,7 +122,8 @@ COROT_INLINE void scatter_subtrees(Law law, const Units& units, int block, int c
     law.begin(subtrees);
     add_leaves(subtrees, law, masks8{}, g, left_out);
     subtrees.add_forces(g, f);
-    if (FLAGS) subtrees.flag(left_out, flags);
+    if constexpr (SOME && LISTED) subtrees.list_others(left_out, missed);
+    if constexpr (SOME && !LISTED) subtrees.flag(left_out, missed);
 }
 
 // --- corotated forces of all leaves with one rotation -----------------------------------------------------------------

@@ -47,12 +47,14 @@ _DILATING = "corot::dilating<corot::{}>({}, material.lam, material.isotropic.str
 
 
 @functools.cache
-def scatter_subtrees(shape: int, Material: type, law: NativeLaw) -> wp.Kernel:
-    """Forces of subtrees under a law, each leaf on its own; a thread is eight subtrees."""
-    flags = "true" if law.leaves_out else "false"
-    call = f"corot::scatter_subtrees<corot::Type, {flags}>({law.code}, {_UNITS}, u, f, missed)"
+def scatter_subtrees(shape: int, Material: type, law: NativeLaw, missed_type: type = wp.uint8) -> wp.Kernel:
+    """Forces of subtrees under a law, each leaf on its own; a thread is eight subtrees. Leaves that are left out are
+    flagged, or listed by their numbers in the mesh (int32)."""
+    listed = missed_type is wp.int32
+    kind = f"corot::Type, {int(law.leaves_out)}, {int(listed)}"
+    call = f"corot::scatter_subtrees<{kind}>({law.code}, {_UNITS}, u, f, missed)"
     native = headers("subtrees8", law.header, types=subtree_type(shape))
-    return scatter_lanes(call, Subtrees, Material, wp.uint8, native)
+    return scatter_lanes(call, Subtrees, Material, missed_type, native)
 
 
 def scatter_law_subtrees(shape: int, law: LawInLanes = "corotated", shared: Dilatation | None = None) -> wp.Kernel:
@@ -66,7 +68,7 @@ def scatter_law_subtrees(shape: int, law: LawInLanes = "corotated", shared: Dila
 @functools.cache
 def scatter_subtrees_shared(shape: int, given: bool) -> wp.Kernel:
     """Corotated forces of subtrees with their root's rotation or a given one; a thread is eight subtrees."""
-    kind = f"corot::Type, {'true' if given else 'false'}"
+    kind = f"corot::Type, {int(given)}"
     call = f"corot::scatter_subtrees_shared<{kind}>({_UNITS}, material, u, f, missed)"
     return scatter_lanes(call, Subtrees, RotatedMaterial, wp.uint8, headers("subtrees8", types=subtree_type(shape)))
 
@@ -85,7 +87,7 @@ def scatter_subtrees_near(shape: int, shared: Dilatation | None = None) -> wp.Ke
     law, rest = elastic("corotated", "material.isotropic").code, "corot::Stressless{}"
     if shared is not None:
         law, rest = (_DILATING.format(shared.lanes, code) for code in (law, rest))
-    kind = f"corot::Type, {'false' if shared is None else 'true'}"
+    kind = f"corot::Type, {int(shared is not None)}"
     material = "material.isotropic, material.tolerance"
     call = f"corot::scatter_subtrees_near<{kind}>({law}, {rest}, {_UNITS}, {material}, u, f, missed)"
     Material, native = (

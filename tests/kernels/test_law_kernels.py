@@ -20,12 +20,15 @@ from warp_corot.elasticity.corotated.anisotropic_general import GeneralAnisotrop
 from warp_corot.elasticity.corotated.anisotropic_subtrees import as_bytes
 from warp_corot.elasticity.paths.clusters import ClusterScatter
 from warp_corot.elasticity.structs import isotropic_material
-from warp_corot.kernels.clusters.laws import isotropic_law
+from warp_corot.kernels.clusters.laws import isotropic_law, reinforced_law
 from warp_corot.kernels.corotated.anisotropic import FibreMaterial, fibre_stress
 from warp_corot.kernels.corotated.definite import quaternions_of
 from warp_corot.kernels.elements import constitutive
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial
+from warp_corot.kernels.elements.fibres import ReinforcedMaterial
 from warp_corot.kernels.elements.forces import scatter_forces
 from warp_corot.kernels.elements.general_cuda import corotated_law
+from warp_corot.kernels.elements.ogden import ogden
 from warp_corot.kernels.math.rotation import byers_xu, quick_rotation
 from warp_corot.kernels.subtrees.anisotropic import repair_leaves, scatter_anisotropic_subtrees, scatter_flat
 from warp_corot.kernels.subtrees.laws import scatter_subtrees
@@ -148,6 +151,31 @@ def test_anisotropic_subtrees_one_by_one(name, kind, device, rng):
     assert flags < 0.3 * len(mesh.tets)
     assert flags > 0 or name == "mixed levels"
     assert_right(f.numpy()[:, :3], leaf_by_leaf(whole, active, on_device))
+
+
+OGDEN = wc.Ogden((0.6, 0.4), (8.0, -4.0), dilatation="element")
+
+
+@pytest.mark.parametrize("name", ["type 2", "general"])
+@pytest.mark.parametrize("model", [OGDEN, wc.HolzapfelGasserOgden("element")], ids=["ogden", "fibres"])
+def test_laws_in_clusters_are_those_leaf_by_leaf(model, name, device, rng):
+    """Deterministic sums on CUDA are leaf by leaf; on the CPU eight leaves at a time."""
+    mesh = meshed(name)
+    given, _ = materials(len(mesh.tets), False, rng)
+    law, Material, material = reinforced_law, ReinforcedMaterial, wc.Isotropic(**given)
+    if model is OGDEN:
+        law, Material = isotropic_law(ogden(model.terms)["stress"]), IsotropicMaterial
+    else:
+        along, across, _ = random_axes(rng)
+        material = wc.FibreReinforced(k1=1e4, k2=5.0, direction=along, across=across, angle=0.5, kappa=0.1, **given)
+    body = wc.SoftBody(mesh, material, device=device)
+    on_device = wp.array(state(mesh, "corotated", rng)[0], dtype=wp.vec4, device=device)
+    found, expected = wp.zeros_like(on_device), wp.zeros_like(on_device)
+    field = model.bind(body, deterministic=True)
+    field.add_forces(on_device, expected)
+    values = field.isotropic if model is OGDEN else field.material
+    add_forces(ClusterScatter(body.discretization.elements, law, Material), values, on_device, found)
+    assert_right(found.numpy()[:, :3], expected.numpy()[:, :3])
 
 
 @pytest.mark.parametrize("kind", ["muscle", "wood field", "stiffness field"])

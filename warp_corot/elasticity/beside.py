@@ -55,7 +55,7 @@ class BesideField(ForceField):
         self.law = law
         super().__init__(discretization, law.deterministic)
         kind = discretization.element_kind
-        self._forces = ByElements(discretization, Material, stress, lanes)
+        self._forces = ByElements(discretization, self.plan, Material, stress, lanes)
         self._energies = add_energies(kind, Material, density)
         self._stiffness = ElementStiffness(discretization, differential, Material)
         #: Separate places for each element's forces, if sums must be reproducible.

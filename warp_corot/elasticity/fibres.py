@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, ClassVar
 import warp as wp
 
 from warp_corot.discretization.discretization import Discretization, discretization_of
+from warp_corot.discretization.plan import Plan
 from warp_corot.elasticity.stiffness import ElementStiffness
 from warp_corot.elasticity.structs import Kept
 from warp_corot.errors import InputError
+from warp_corot.kernels.clusters.laws import reinforced_law
 from warp_corot.kernels.corotated.anisotropic import OrthotropicMaterial, add_active_energies
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import LOG_VOLUME
@@ -28,7 +30,9 @@ from warp_corot.materials.reinforced import FibreReinforced
 from .corotated.anisotropic import fibre_material
 from .dilatation import AUTO, bind_law, check_dilatation
 from .model import ForceField, Model
+from .paths.clusters import ClusterScatter
 from .paths.elements import ByElements
+from .paths.general import clustered
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretized
@@ -63,22 +67,33 @@ class HolzapfelGasserOgden(Model):
 
 
 class ReinforcedField(ForceField):
-    """The forces of ``HolzapfelGasserOgden``, element by element, or eight side by side on the CPU."""
+    """The forces of ``HolzapfelGasserOgden``; on the CPU of eight subtrees or elements at a time."""
 
     takes_anisotropic: ClassVar[bool] = True
 
     def __init__(self, discretization: Discretization, deterministic: bool):
         super().__init__(discretization, deterministic)
         kind = discretization.element_kind
-        self._forces = ByElements(discretization, ReinforcedMaterial, reinforced_stress, FIBRES)
+        #: On CUDA the elements of a mesh that never changes, if their forces may be summed in any order.
+        self._clusters: ClusterScatter | None = None
+        if self.device.is_cuda and self.plan.counts is None and not deterministic:
+            chosen = clustered(discretization)
+            self._clusters = ClusterScatter(self.elements, reinforced_law, ReinforcedMaterial, chosen=chosen)
+        self._forces = ByElements(discretization, self.plan, ReinforcedMaterial, reinforced_stress, FIBRES)
         self._energies = element_energies(kind, ReinforcedMaterial, reinforced_density)
         self._von_mises = element_von_mises(kind, ReinforcedMaterial, reinforced_cauchy)
         self._stiffness = ElementStiffness(discretization, reinforced_differential, ReinforcedMaterial)
         self._fibres = discretization.anisotropic_material()
         self._made, self._active = Kept(_material), Kept(fibre_material)
 
+    def plan_of(self, discretization: Discretization) -> Plan:
+        return discretization.plan(subtrees=self.device.is_cpu, deterministic=self.deterministic)
+
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        self._forces(self.elements, self.element_count, self.material, u, f)
+        if self._clusters is not None:
+            self._clusters(self.material, u, f)
+        else:
+            self._forces(self.elements, self.element_count, self.material, u, f)
 
     def add_stiffness(self, u: wp.array, p: wp.array, y: wp.array) -> None:
         self._stiffness.add_product(self.elements, self.material, u, p, y)

@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from warp_corot.discretization.discretization import Discretization
-from warp_corot.elasticity.model import LawField
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, shown
 from warp_corot.kernels.elements import ogden as kernels
@@ -16,10 +15,10 @@ from warp_corot.kernels.elements.dilatation import LOG_VOLUME
 
 from .dilatation import AUTO, bind_law, check_dilatation
 from .model import ForceField, Model
-from .paths.law_lanes import LawLanesField
+from .paths.laws import Law, law_field
 
 if TYPE_CHECKING:
-    from warp_corot.discretization.discretization import Discretized
+    from warp_corot.discretization.discretization import Discretization, Discretized
 
 #: With larger exponents, powers of stretches would exceed the range of float32.
 LARGEST_EXPONENT = 60.0
@@ -36,8 +35,7 @@ class Ogden(Model):
 
     The law holds for J >= 0.5 and principal stretches within ``stretch_limits``, at which a term is a thousand times as
     stiff as at rest. Beyond, the energy continues as a parabola, in J as for ``NeoHookean`` and in squared stretches:
-    energy, force and stiffness are continuous and exist for every F, and inverted elements are pushed back. On CUDA,
-    elements are computed one by one, which is slower than the subtrees of ``NeoHookean``.
+    energy, force and stiffness are continuous and exist for every F, and inverted elements are pushed back.
 
     Attributes:
         mu: The shear moduli mu_p > 0 of the terms, in any unit; only their ratios count.
@@ -82,14 +80,8 @@ class Ogden(Model):
         return max(low), min(high)
 
     def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:
-        functions = kernels.ogden(self.terms)
-
-        def bind(discretization: Discretization, deterministic: bool) -> LawField:
-            if discretization.device.is_cpu:
-                return LawLanesField(discretization, law=self.terms, **functions, deterministic=deterministic)
-            return LawField(discretization, **functions, deterministic=deterministic)
-
-        return bind_law(bind, LOG_VOLUME, self.dilatation, body, deterministic)
+        law = Law(self.terms, **kernels.ogden(self.terms))
+        return bind_law(partial(law_field, law), LOG_VOLUME, self.dilatation, body, deterministic)
 
 
 def _numbers(given: Any, name: str) -> tuple[float, ...]:

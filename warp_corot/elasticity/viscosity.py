@@ -39,7 +39,7 @@ class Viscosity:
         complete: Callable[[wp.array], wp.array] | None = None,
     ):
         self.body, self.field, self.seconds, self._complete = body, field, seconds, complete
-        self._scatter = ByElements(body.discretization, ViscousMaterial, viscosity_stress, VISCOUS)
+        self._scatter = ByElements(body.discretization, field.plan, ViscousMaterial, viscosity_stress, VISCOUS)
         #: Separate places for each element's forces, if sums must be reproducible.
         self._slotted = body.discretization.plan(subtrees=False, deterministic=True) if field.deterministic else None
 

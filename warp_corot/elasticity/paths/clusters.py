@@ -22,6 +22,7 @@ from warp_corot.kernels.clusters.pairs import scatter_pairs
 from warp_corot.kernels.clusters.single import scatter_clusters
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.elements import ForestElements, GeneralElements
+from warp_corot.kernels.elements.fibres import ReinforcedMaterial
 from warp_corot.kernels.elements.general_cpu import rest_matrices
 from warp_corot.kernels.tables.cluster_layout import (
     AHEAD,
@@ -127,7 +128,9 @@ class ClusterScatter:
         self.layout = replace(self.layout, resident=self.layout.resident - 1)
         self._kernel, self._wrapped = scatter_pairs(self.Pairs, Material, law, self.layout, given), wrapped
 
-    def __call__(self, material: IsotropicMaterial | ActiveMaterial, u: wp.array, f: wp.array) -> None:
+    def __call__(
+        self, material: IsotropicMaterial | ActiveMaterial | ReinforcedMaterial, u: wp.array, f: wp.array
+    ) -> None:
         """Add the forces [N] of displacements u to f, both vec4 [N]; ``material`` is what the law takes."""
         threads = self.layout.threads
         wp.launch(

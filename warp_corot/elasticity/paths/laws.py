@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import warp as wp
 
 from warp_corot.elasticity.model import LawField
+from warp_corot.kernels.elements.law_lanes import LawInLanes
 from warp_corot.mesh import TetForest
 
 from .general import LawGeneralField
@@ -21,11 +22,11 @@ class Law(NamedTuple):
     """A constitutive law of the package.
 
     Attributes:
-        lanes: Its name among the laws that run in lanes on the CPU, a key of ``kernels.elements.law_lanes.LAWS``.
+        lanes: The law of ``kernels.elements.law_lanes`` that runs in lanes on the CPU.
         stress, differential, energy, cauchy: Functions of ``kernels.elements.constitutive``.
     """
 
-    lanes: str
+    lanes: LawInLanes
     stress: wp.Function
     differential: wp.Function
     energy: wp.Function
