@@ -73,10 +73,37 @@ def power_excess(x: float):
 
 
 @functools.cache
+def whole_power(power: int) -> wp.Function:
+    """(1 + x)^|power| - 1 of x and ln(1 + x), without the logarithm."""
+
+    @wp.func
+    def whole_power(x: float, log: float):
+        excess = float(0.0)
+        for _ in range(wp.static(abs(power))):
+            excess += x + excess * x
+        return excess
+
+    return whole_power
+
+
+@functools.cache
+def any_power(power: float) -> wp.Function:
+    """The same for c^power - 1, of x and ln c."""
+
+    @wp.func
+    def any_power(x: float, log: float):
+        excess, _second = power_excess(power * log)
+        return excess
+
+    return any_power
+
+
+@functools.cache
 def ogden_term(share: float, alpha: float) -> wp.Function:
     """2 G', 2 G'' and G of one term at an eigenvalue e of Green's strain."""
     m, v = 2.0 * share / alpha, part_of_volume(share, alpha)
     rest, half = m - v, 0.5 * alpha
+    power_of = whole_power(int(half - 1.0)) if half == int(half) and abs(half - 1.0) < 6.0 else any_power(half - 1.0)
     over = m / alpha
     low, high = ((stretch**2 - 1.0) / 2.0 for stretch in stretch_limits(alpha))
 
@@ -84,9 +111,9 @@ def ogden_term(share: float, alpha: float) -> wp.Function:
     def term(e: float):
         inside = wp.clamp(e, low, high)
         log = log_of_square(inside)
-        of_power, _second = power_excess((half - 1.0) * log)
-        of_inverse, _second_inverse = power_excess(-log)
-        inverse = 1.0 + of_inverse
+        inverse = reciprocal(1.0 + 2.0 * inside)
+        of_inverse = -2.0 * inside * inverse
+        of_power = power_of(wp.where(half >= 1.0, 2.0 * inside, of_inverse), log)
         slope = m * of_power - rest * of_inverse
         curvature = (m * (half - 1.0) * (1.0 + of_power) + rest * inverse) * inverse
         _first, whole = power_excess(half * log)
