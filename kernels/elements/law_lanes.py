@@ -21,8 +21,9 @@ class NativeLaw(NamedTuple):
 
 
 FIBRES = NativeLaw("corot::fibres(material)", "law_fibres")
-PRONY = NativeLaw("corot::prony(material)", "rates")
-VISCOUS = NativeLaw("corot::viscous(material)", "rates", True)
+PRONY = NativeLaw("corot::prony(material)", "added")
+PRESTRESS = NativeLaw("corot::prestressed(material)", "added")
+VISCOUS = NativeLaw("corot::viscous(material)", "added", True)
 
 #: The structs of isotropic laws by their names.
 LAWS = {"corotated": "Corotated", "linear": "Linear", "stvk": "StVenantKirchhoff", "neo-hookean": "NeoHookean"}

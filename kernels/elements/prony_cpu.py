@@ -26,7 +26,7 @@ def relax_eights(Elements: type) -> wp.Kernel:
         units: Elements, block: int, count: int, u: wp.array[wp.vec4], time: float, material: PronyMaterial
     ): ...
 
-    @unique_kernel(native=headers("elements8", "rates"))
+    @unique_kernel(native=headers("elements8", "added"))
     def relax_eights(
         # In
         elements: Elements,

@@ -13,6 +13,7 @@ from warp_corot.discretization.discretization import Discretization, discretizat
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_numbers, shown
 from warp_corot.kernels.elements import prestress as kernels
+from warp_corot.kernels.elements.law_lanes import PRESTRESS
 
 from .beside import BesideField
 from .corotated.model import Corotated
@@ -78,7 +79,7 @@ class PrestressedField(BesideField):
 
     def __init__(self, discretization: Discretization, model: Prestressed, law: ForceField):
         functions = (kernels.prestress_stress, kernels.prestress_differential, kernels.prestress_density)
-        super().__init__(discretization, law, kernels.Prestress, *functions)
+        super().__init__(discretization, law, kernels.Prestress, *functions, lanes=PRESTRESS)
         stress, count = np.array(model.stress), len(discretization.mesh.tets)
         if stress.ndim == 3 and len(stress) != count:
             raise InputError(f"stress has {len(stress)} tensors; the mesh has {count} elements")

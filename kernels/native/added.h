@@ -1,5 +1,5 @@
-// Stresses that depend on time: viscosity (elements/viscosity.py), and the Maxwell elements of a Prony series
-// (elements/prony.py).
+// Stresses beside a law: viscosity (elements/viscosity.py), the Maxwell elements of a Prony series (elements/prony.py), and
+// one that a body has at rest (elements/prestress.py).
 #pragma once
 
 #include "elements8.h"
@@ -123,6 +123,23 @@ template <class Material> struct Prony {
         for (int i = 0; i < 6; ++i) keep(0, i, strain[i]);
     }
 };
+
+// The stress F S of a ``Prestress`` S, in the axes of rest space.
+template <class Material> struct Prestressed {
+    const Material& material;
+    template <class Nodes> COROT_INLINE void begin(const Nodes&) {}
+    template <class D, class At> COROT_INLINE masks8 stress(const D& d, const At& at, triple<lanes8>* p) const {
+        lanes8 s[9], turned[6];
+        gather_numbers<9>(at, [&](int t) { return material.stress.data[t].data[0]; }, material.stride, s);
+        const lanes8 six[6] = {s[0], s[4], s[8], s[1], s[2], s[5]};
+        into_frame(d.frame, six, turned);
+        for (int i = 0; i < 6; ++i) turned[i] *= at.weight();
+        times(d.f, turned, p);
+        return every<lanes8>();
+    }
+};
+
+template <class Material> COROT_INLINE Prestressed<Material> prestressed(const Material& material) { return {material}; }
 
 template <class Material> COROT_INLINE Prony<Material> prony(const Material& material) { return {material}; }
 
