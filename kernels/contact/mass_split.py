@@ -1,8 +1,9 @@
 """Contact forces of an explicit step: projected Jacobi iterations over all contacts, with split masses.
 
 A contact is a place and an obstacle, a triangle and an obstacle, or a pair of soft surfaces. Contacts that push one
-node divide its mass in proportion to their weights there. Then the iterations converge and add no energy for any number of
-contacts (mass splitting; the bound is the sum of each row of J M^-1 J^T; Tonge, Benevolenski and Voroshilov 2012).
+node divide its mass in proportion to their weights there. Then the iterations converge and add no energy for any
+number of contacts (mass splitting; the bound is the sum of each row of J M^-1 J^T; Tonge, Benevolenski and Voroshilov
+2012).
 
 Forces are summed at nodes as integers, so that the order of threads does not matter. An iteration reads the sums of one
 buffer and writes those of the other: so it ends with one barrier. On CUDA resident blocks of threads make all
