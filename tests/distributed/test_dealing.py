@@ -15,13 +15,13 @@ from warp_corot.discretization.awaited import Awaited
 from warp_corot.discretization.groups import group_numbers
 from warp_corot.discretization.planning.fixed import ForcePlan
 from warp_corot.distributed.directions import normal_numbers
-from warp_corot.distributed.dividing import dealt, pieces_of
 from warp_corot.distributed.partition import Partition
 from warp_corot.distributed.parts import Part, numbered_part, part_of_mesh
 from warp_corot.distributed.places import Places
-from warp_corot.distributed.refusals import check_supported
 from warp_corot.distributed.rejoining import pack_part, rejoined
-from warp_corot.distributed.settled import settled_sums
+from warp_corot.distributed.reproducible_sums import reproducible_sums
+from warp_corot.distributed.scatter_mesh import dealt, pieces_of
+from warp_corot.distributed.unsupported import check_supported
 
 
 class Others:
@@ -212,12 +212,12 @@ def test_values_go_to_the_part_and_back(direct):
 
 def test_sums_are_the_same_in_any_order(rng):
     addends = rng.normal(size=(5000, 2)) * 10.0 ** rng.uniform(-12, 12, (5000, 2))
-    first = settled_sums(addends, Others())
+    first = reproducible_sums(addends, Others())
     for _ in range(3):
-        np.testing.assert_array_equal(settled_sums(rng.permutation(addends), Others()), first)
+        np.testing.assert_array_equal(reproducible_sums(rng.permutation(addends), Others()), first)
     np.testing.assert_allclose(first, [math.fsum(column) for column in addends.T], rtol=1e-15)
-    assert np.isnan(settled_sums(np.array([[1.0], [np.inf]]), Others())).all()
-    np.testing.assert_array_equal(settled_sums(np.zeros((3, 1)), Others()), [0.0])
+    assert np.isnan(reproducible_sums(np.array([[1.0], [np.inf]]), Others())).all()
+    np.testing.assert_array_equal(reproducible_sums(np.zeros((3, 1)), Others()), [0.0])
 
 
 def test_directions_depend_only_on_a_nodes_number():

@@ -18,8 +18,8 @@ wp.config.enable_backward = False
 import grown_parts  # noqa: E402
 
 import warp_corot as wc  # noqa: E402
-from warp_corot.distributed import front, mpi, simulation  # noqa: E402
-from warp_corot.distributed.patience import Patient, patience  # noqa: E402
+from warp_corot.distributed import mpi, root_facade, simulation  # noqa: E402
+from warp_corot.distributed.timeout import TimedCommunicator, patience  # noqa: E402
 from warp_corot.mesh.surfaces.boundary import boundary_faces  # noqa: E402
 
 
@@ -366,10 +366,10 @@ def led() -> np.ndarray | None:
     """The run "forest" of a body that only rank 0 has whole; other ranks get parts."""
     everybody = mpi.world()
     if everybody.rank > 0:
-        front.Crew.joined("cpu").serve()
+        root_facade.Workers.joined("cpu").serve()
         return None
     body = body_of(graded(), 0.49)
-    sim = front.LedSimulation(body, in_parts=True, deterministic=True)
+    sim = root_facade.RootSimulation(body, in_parts=True, deterministic=True)
     moved(sim, body)
     positions, called = body.positions.numpy().copy(), []
     sim.on_step(lambda sim: called.append(sim.time), every=1)
@@ -472,7 +472,7 @@ def main() -> None:
         return
     # One rank, which compiles all kernels, then two, and then all three.
     alone = everybody.rank == 2
-    some = Patient(mpi.library().COMM_WORLD.Split(int(alone)), patience())
+    some = TimedCommunicator(mpi.library().COMM_WORLD.Split(int(alone)), patience())
     mpi.world = lambda: some  # type: ignore[assignment]
     simulation.compile_once = lambda *_, **__: None
     if alone:

@@ -203,10 +203,10 @@ class _Table:
 def _summary(
     args: argparse.Namespace, sim: Simulation, loads: Sequence[Load], subject: Subject, done: Recording
 ) -> str:
-    from warp_corot.distributed.part_meshes import ForestPart
+    from warp_corot.distributed.divided_mesh import DividedForest
 
     mesh = sim.body.mesh
-    assert isinstance(mesh, ForestPart)
+    assert isinstance(mesh, DividedForest)
     nodes = sim.following[0].part.numbers.node_count
     held = " or ".join(args.fix or [str(subject.fix)])
     shortest, longest = sim.dt_range

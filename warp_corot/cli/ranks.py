@@ -103,19 +103,19 @@ class Others:
 
     def simulation(self, **options: Any) -> Any:
         """The simulation of the bodies, whose parts these ranks get."""
-        from warp_corot.distributed.front import LedSimulation
+        from warp_corot.distributed.root_facade import RootSimulation
 
         self._are_waiting = False
-        self._sim = LedSimulation(in_parts=True, **options)
+        self._sim = RootSimulation(in_parts=True, **options)
         return self._sim
 
     def dismiss(self, error: InputError) -> None:
         """End these ranks, because of an error before the first step."""
-        from warp_corot.distributed import dividing, mpi
+        from warp_corot.distributed import mpi, scatter_mesh
 
         if self._are_waiting:
             self._are_waiting = False
-            dividing.dismiss(error, mpi.world())
+            scatter_mesh.dismiss(error, mpi.world())
         elif self._sim is not None:
             self._sim.end()
 
@@ -126,13 +126,13 @@ def serve(device: str | None) -> None:
     Raises:
         InputError, UnstableError: As on rank 0.
     """
-    from warp_corot.distributed.front import Crew
+    from warp_corot.distributed.root_facade import Workers
 
-    Crew.joined(device).serve()
+    Workers.joined(device).serve()
 
 
 def led_simulation(**options: Any) -> Any:
     """The simulation of all ranks, each of which has the whole bodies."""
-    from warp_corot.distributed.front import LedSimulation
+    from warp_corot.distributed.root_facade import RootSimulation
 
-    return LedSimulation(**options)
+    return RootSimulation(**options)

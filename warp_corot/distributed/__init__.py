@@ -6,11 +6,11 @@
 
 from . import mpi
 from .boxes import box
-from .dividing import divided
 from .gathering import gather
-from .grown import from_domain
+from .parallel_growth import from_domain
 from .reading import load
 from .recording import record
+from .scatter_mesh import divided
 from .simulation import Simulation
 from .sweeping import sweep
 

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from warp_corot.mesh.surfaces.boundary import boundary_faces, signed_volumes
 
-from .part_meshes import MeshPart, Numbers
+from .divided_mesh import DividedTetMesh, Numbers
 from .partition import along_curve
 
 Longs = npt.NDArray[np.int64]
@@ -116,7 +116,7 @@ def assembled(
     comm: Any,
     described: Callable[[Longs, Longs], dict[str, Any]],
     **options: Any,
-) -> MeshPart:
+) -> DividedTetMesh:
     """This rank's part of a mesh, from the elements that it counts; all ranks must call this.
 
     Args:
@@ -155,7 +155,7 @@ def assembled(
         node_count,
         *(np.arange(count, dtype=np.int32) for count in (len(here), len(places))),
     )
-    return MeshPart(
+    return DividedTetMesh(
         points,
         places,
         numbers=numbers,

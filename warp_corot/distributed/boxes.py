@@ -15,7 +15,7 @@ from warp_corot.mesh.uniform_part import SUBTREE_DEPTH
 
 from . import mpi
 from .cutting import Cut, cut_box
-from .part_meshes import ForestPart, Numbers
+from .divided_mesh import DividedForest, Numbers
 
 Longs = npt.NDArray[np.int64]
 
@@ -31,7 +31,7 @@ def box(
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
     up_axis: str = "Y",
     costs: npt.ArrayLike | None = None,
-) -> ForestPart:
+) -> DividedForest:
     """This rank's part of the mesh that ``TetForest.box`` makes; all ranks must call this.
 
     A rank makes only the leaves that it computes: its share along the order of the tree, and the leaves around the
@@ -61,7 +61,7 @@ def box(
     here = tuple(np.arange(n, dtype=np.int32) for n in (len(nodes), len(cut.elements)))
     numbers = Numbers(nodes, cut.elements, cut.owner, cut.counted, node_count, *here)
     highest = (np.array(cells) << LATTICE_BITS) * (cell_size / 2**LATTICE_BITS)
-    return ForestPart(
+    return DividedForest(
         cells,
         cell_size,
         origin,

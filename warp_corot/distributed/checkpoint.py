@@ -15,8 +15,8 @@ from warp_corot.body.soft_body import SoftBody
 from warp_corot.errors import InputError
 from warp_corot.io.checkpoint.archive import save_checkpoint
 
-from .following import Following
-from .of_parts import SimulationOfParts
+from .part_simulation import PartSimulation
+from .part_sync import PartSync
 from .touch_checkpoint import gathered_contact, resume_contact
 
 if TYPE_CHECKING:
@@ -39,8 +39,8 @@ class Values:
 def save(
     path: str | PathLike[str],
     bodies: tuple[SoftBody, ...],
-    parts: SimulationOfParts,
-    following: list[Following],
+    parts: PartSimulation,
+    following: list[PartSync],
     comm: Any,
 ) -> None:
     """Write a checkpoint on rank 0; all ranks must call this, with bodies in which all nodes are up to date.
@@ -49,7 +49,7 @@ def save(
         path: The file.
         bodies: The whole bodies.
         parts: This rank's simulation of parts.
-        following: The ``Following`` of each body.
+        following: The ``PartSync`` of each body.
         comm: The ranks.
 
     Raises:
@@ -100,13 +100,13 @@ def body_of(name: str, parts: Simulation) -> int | None:
     return None
 
 
-def resume(loaded: Simulation | SimpleNamespace, parts: SimulationOfParts, following: list[Following]) -> None:
+def resume(loaded: Simulation | SimpleNamespace, parts: PartSimulation, following: list[PartSync]) -> None:
     """Resume a simulation of parts from a saved one.
 
     Args:
         loaded: The simulation that one process loads from the checkpoint.
         parts: This rank's simulation of parts of the same bodies.
-        following: The ``Following`` of each body.
+        following: The ``PartSync`` of each body.
     """
     for name, array in parts.kept.items():
         values = loaded.kept[name].numpy()

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from warp_corot.mesh.surfaces.boundary import boundary_faces
 
-from .territory import Territory, places_of
+from .root_cube_partition import RootCubePartition, places_of
 
 Ints = npt.NDArray[np.int32]
 Longs = npt.NDArray[np.int64]
@@ -30,7 +30,7 @@ class Faces:
     others: Longs
 
 
-def faces_of(tets: Ints, lattice: Ints, first: int, territory: Territory) -> Faces:
+def faces_of(tets: Ints, lattice: Ints, first: int, territory: RootCubePartition) -> Faces:
     """Find out which faces of ranks' elements are the same; all ranks must call this.
 
     Args:

@@ -12,18 +12,18 @@ import warp as wp
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import shown
 
-from .following import Following
+from .part_sync import PartSync
 
-_all: weakref.WeakSet[Following] = weakref.WeakSet()
+_all: weakref.WeakSet[PartSync] = weakref.WeakSet()
 
 
-def register(following: Iterable[Following]) -> None:
+def register(following: Iterable[PartSync]) -> None:
     """Register bodies and their parts for ``gather``."""
     for each in following:
         _all.add(each)
 
 
-def forget(following: Iterable[Following]) -> None:
+def forget(following: Iterable[PartSync]) -> None:
     """Forget bodies and their former parts."""
     for each in following:
         _all.discard(each)

@@ -14,7 +14,7 @@ import warp as wp
 from warp_corot.errors import InputError
 from warp_corot.inputs.processes import process_count
 
-from .patience import Patient, patience
+from .timeout import TimedCommunicator, patience
 
 #: Time for which a waiting rank sleeps between two checks [s].
 REST = 0.01
@@ -37,7 +37,7 @@ def library() -> Any:
 
 
 @functools.cache
-def world() -> Patient:
+def world() -> TimedCommunicator:
     """The program's own communicator of all ranks.
 
     An uncaught error on one rank ends all of them with one line; otherwise the others would wait for ever. So does a
@@ -46,7 +46,7 @@ def world() -> Patient:
     Raises:
         InputError: MPI is not installed, or ``WARP_COROT_PATIENCE`` is not a positive number.
     """
-    comm = Patient(library().COMM_WORLD.Dup(), patience())
+    comm = TimedCommunicator(library().COMM_WORLD.Dup(), patience())
     if comm.size > 1:
         sys.excepthook = functools.partial(_end_all, comm)
     return comm

@@ -25,8 +25,8 @@ from warp_corot.solvers.implicit.multigrid.level import Level, SmoothedLevel
 from warp_corot.solvers.implicit.multigrid.multigrid import MOST_DENSE
 from warp_corot.solvers.implicit.operator import LinearOperator
 
+from .divided_mesh import DividedMesh
 from .halo import Halo
-from .part_meshes import InParts
 from .partition import sharing_groups
 from .parts import Part
 from .places import Places
@@ -269,7 +269,7 @@ def has_multigrid(whole: SoftBody, part: Part) -> bool:
     """Whether multigrid can precondition the solves of a body, given this rank's part of it: every rank holds the whole
     forest on the same device, and it has enough nodes for two levels."""
     mesh = whole.mesh
-    is_whole = isinstance(mesh, TetForest) and not isinstance(mesh, InParts)
+    is_whole = isinstance(mesh, TetForest) and not isinstance(mesh, DividedMesh)
     return is_whole and whole.device == part.device and whole.world_node_count > MOST_DENSE
 
 

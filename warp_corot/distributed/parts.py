@@ -18,7 +18,7 @@ from warp_corot.mesh import TetForest, TetMesh
 from warp_corot.mesh.numbering import in_order_of_leaves, live_or_void, pruned, renumbered, with_virtual
 from warp_corot.mesh.tree import VOID
 
-from .part_meshes import InParts, Numbers
+from .divided_mesh import DividedMesh, Numbers
 from .partition import Partition
 
 Ints = npt.NDArray[np.int32]
@@ -38,7 +38,7 @@ class Part(SoftBody):
     def __init__(self, whole: SoftBody, partition: Partition | None, rank: int, device: wp.Device | None = None):
         self._whole = whole
         mesh, material = whole.mesh, whole.material
-        if isinstance(mesh, InParts):
+        if isinstance(mesh, DividedMesh):
             self.numbers = mesh.numbers
         else:
             assert partition is not None
@@ -48,7 +48,7 @@ class Part(SoftBody):
             material = part_of_material(material, elements, count)
         self.is_own = np.tile(self.numbers.owner == rank, whole.worlds)
         super().__init__(mesh, material, worlds=whole.worlds, device=device or whole.device)
-        of_whole = whole.mesh if isinstance(whole.mesh, InParts) else whole.discretization
+        of_whole = whole.mesh if isinstance(whole.mesh, DividedMesh) else whole.discretization
         self.discretization.smallest_volume = of_whole.smallest_volume
 
     def _discretized(self, mesh: Mesh, material: Material) -> Discretization:
@@ -58,7 +58,7 @@ class Part(SoftBody):
     @property
     def masses(self) -> npt.NDArray[np.float64]:
         """Lumped masses of the nodes that this rank moves [kg], float64 [worlds * n]; zero for ghosts."""
-        if isinstance(self._whole.mesh, InParts):
+        if isinstance(self._whole.mesh, DividedMesh):
             return np.where(self.is_own, super().masses, 0.0)
         # Nodes of a remeshed body have what they carry.
         return np.where(self.is_own, self._whole.masses[self.numbers.in_worlds(self._whole.worlds)], 0.0)

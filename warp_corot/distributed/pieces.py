@@ -11,8 +11,8 @@ import warp as wp
 from warp_corot.io.write.skins import Skin
 from warp_corot.mesh.surfaces.bound import SurfaceMesh
 
-from .following import Following
-from .part_meshes import InParts
+from .divided_mesh import DividedMesh
+from .part_sync import PartSync
 
 Ints = npt.NDArray[np.int32]
 
@@ -31,7 +31,7 @@ class Piece:
         skin: The faces on the bodies' surface.
     """
 
-    def __init__(self, following: Sequence[Following], world: int):
+    def __init__(self, following: Sequence[PartSync], world: int):
         self._following, self._world = following, world
         self.up_axis = following[0].whole.mesh.up_axis
         #: The elements of each body that this rank counts, among those of its part; and the nodes of these.
@@ -95,16 +95,16 @@ class Piece:
         return float(joined[0]) if (joined == joined[0]).all() and not varies else joined
 
 
-def _changes(following: Following) -> bool:
+def _changes(following: PartSync) -> bool:
     return following.whole.changing is not None
 
 
-def _outer_faces(following: Following) -> Ints:
+def _outer_faces(following: PartSync) -> Ints:
     """The triangles of the whole body's surface that are faces of elements that this rank counts, by the part's
     nodes."""
     whole, numbers = following.whole, following.part.numbers
     triangles, parents = whole.surface_faces
-    if isinstance(whole.mesh, InParts):
+    if isinstance(whole.mesh, DividedMesh):
         own = numbers.counted[parents] & whole.mesh.are_outer(triangles)
         return triangles[own]
     is_own = np.zeros(whole.world_element_count, bool)

@@ -21,12 +21,12 @@ from warp_corot.solvers.ranks import Floats, Ints, Ranks
 
 from .cards import CardExchange, add_up, take_most
 from .directions import normal_numbers
+from .divided_mesh import DividedMesh
 from .graphs import keep_priorities
 from .halo import Halo, HostExchange
 from .multigrid import MultigridOfParts, has_multigrid
-from .part_meshes import InParts
 from .parts import Part
-from .settled import settled_sums
+from .reproducible_sums import reproducible_sums
 from .surfaces import SurfacePlaces
 
 #: Number of times that a row of exchanges is timed.
@@ -149,7 +149,7 @@ class MpiRanks(Ranks):
 
     def add_up(self, parts: wp.array, sums: wp.array) -> None:
         if self.is_settled:
-            total = settled_sums(parts.numpy().reshape(-1, 1), self.comm)[0]
+            total = reproducible_sums(parts.numpy().reshape(-1, 1), self.comm)[0]
         else:
             total = float(np.sum(self.comm.allgather(float(sums.numpy().sum()))))
         found = np.zeros(len(sums))
@@ -166,7 +166,7 @@ class MpiRanks(Ranks):
             total = np.max(self.comm.allgather(own.max(axis=1)), axis=0)
         elif self.is_settled:
             addends = np.moveaxis(own, 0, 1).reshape(own.shape[1], -1)
-            total = settled_sums(addends, self.comm).reshape(len(own), -1)
+            total = reproducible_sums(addends, self.comm).reshape(len(own), -1)
         else:
             total = np.sum(self.comm.allgather(own.sum(axis=1)), axis=0)
         values[:, :, chosen] = 0.0
@@ -254,7 +254,7 @@ class MpiRanks(Ranks):
         if addends is not None:
             worlds, _, columns = addends.shape
             by_world = np.moveaxis(addends, 0, 1).reshape(-1, worlds * columns)
-            found = settled_sums(by_world, self.comm).reshape(worlds, columns)
+            found = reproducible_sums(by_world, self.comm).reshape(worlds, columns)
         found[:, reach] = everybody[..., reach].max(axis=0)
         return found
 
@@ -286,7 +286,7 @@ class MpiRanks(Ranks):
 
     def bounds(self, body: SoftBody) -> Floats:
         mesh = self.whole(body).mesh
-        return mesh.bounds if isinstance(mesh, InParts) else super().bounds(self.whole(body))
+        return mesh.bounds if isinstance(mesh, DividedMesh) else super().bounds(self.whole(body))
 
     def bulk(self, body: SoftBody) -> tuple[float, float]:
         return self._bulks[body]
@@ -294,7 +294,7 @@ class MpiRanks(Ranks):
     def _bulk(self, part: Part) -> tuple[float, float]:
         """See ``bulk``; all ranks must call."""
         mesh = self._wholes[part].mesh
-        if not isinstance(mesh, InParts):
+        if not isinstance(mesh, DividedMesh):
             return super().bulk(self._wholes[part])
         own = part.numbers.counted
         moduli = (2.0 * part.discretization.mu.numpy() + part.discretization.lam.numpy()).astype(np.float64)

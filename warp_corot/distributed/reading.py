@@ -21,8 +21,8 @@ from warp_corot.mesh import TetMesh
 
 from . import mpi
 from .assembling import Homes, assembled, fetched, moved_along_curve
-from .dividing import divided
-from .part_meshes import ForestPart, MeshPart
+from .divided_mesh import DividedForest, DividedTetMesh
+from .scatter_mesh import divided
 
 Longs = npt.NDArray[np.int64]
 
@@ -39,7 +39,7 @@ def load(
     unit: str | float | None = None,
     up_axis: str | None = None,
     regions: str | None = None,
-) -> ForestPart | MeshPart:
+) -> DividedForest | DividedTetMesh:
     """This rank's part of a file's tetrahedra, as of ``TetMesh.load``; all ranks must call this.
 
     Of a ``.vtkhdf`` file with nothing but tetrahedra, each rank reads a piece of the arrays. Ranks then exchange

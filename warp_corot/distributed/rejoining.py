@@ -11,12 +11,12 @@ import numpy.typing as npt
 from warp_corot.mesh import TetForest, TetMesh, Tree
 from warp_corot.mesh.tree import LIVE, VOID
 
-from .part_meshes import ForestPart, MeshPart
+from .divided_mesh import DividedForest, DividedTetMesh
 
 Arrays = dict[str, npt.NDArray[Any]]
 
 
-def pack_part(mesh: ForestPart | MeshPart, prefix: str, arrays: Arrays) -> dict[str, Any]:
+def pack_part(mesh: DividedForest | DividedTetMesh, prefix: str, arrays: Arrays) -> dict[str, Any]:
     """Put a rank's part of a divided mesh into arrays whose names begin with ``prefix``; returns what is the same on
     all ranks."""
     numbers = mesh.numbers
@@ -26,7 +26,7 @@ def pack_part(mesh: ForestPart | MeshPart, prefix: str, arrays: Arrays) -> dict[
     described |= {"element_count": mesh.element_count, "node_count": numbers.node_count}
     if mesh.labels is not None:
         found["labels"] = mesh.labels[counted]
-    if isinstance(mesh, ForestPart):
+    if isinstance(mesh, DividedForest):
         assert numbers.tree is not None
         assert numbers.lattice is not None
         tree, points = mesh.tree, numbers.lattice

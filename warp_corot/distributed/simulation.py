@@ -31,14 +31,14 @@ from warp_corot.simulation.parts import (
 from warp_corot.simulation.solves import Solves
 from warp_corot.solvers import Integrator, SymplecticEuler
 
-from . import checkpoint, in_pieces, mpi
-from .following import Following
+from . import checkpoint, mpi, parallel_checkpoint
 from .gathering import forget, register
-from .of_parts import SimulationOfParts, compile_once, of_their_own, part_of, settled_model
+from .part_simulation import PartSimulation, compile_once, of_their_own, part_of, settled_model
+from .part_sync import PartSync
 from .parts import Part
 from .passes import Passes
 from .ranks import MpiRanks, Together
-from .refusals import check_supported
+from .unsupported import check_supported
 
 
 class Simulation:
@@ -109,18 +109,18 @@ class Simulation:
         parts = [part_of(body, m, comm, costs, here) for body, m in zip(self.bodies, models, strict=True)]
         for part in parts:
             part.discretization.sums_by_subtrees = bool(deterministic)
-        self._following = [Following(body, part, comm) for body, part in zip(self.bodies, parts, strict=True)]
+        self._following = [PartSync(body, part, comm) for body, part in zip(self.bodies, parts, strict=True)]
         for each in self._following:
             each.take_over()
         return parts
 
-    def _made(self, parts: list[Part]) -> SimulationOfParts:
+    def _made(self, parts: list[Part]) -> PartSimulation:
         """The simulation of these parts."""
         for each in self._following:
             each.take_over()
         settled, records = bool(self._options["deterministic"]), not self._options["integrator"].is_implicit
         ranks = MpiRanks(self._comm, self.bodies, parts, settled=settled, records=records)
-        return SimulationOfParts(ranks, parts, **self._options)
+        return PartSimulation(ranks, parts, **self._options)
 
     def _remesh(self) -> None:
         """Make the passes that are due over the whole bodies, on all ranks alike, and divide the new meshes."""
@@ -328,7 +328,7 @@ class Simulation:
         return self._parts.ranks.completed(k, getattr(self._following[k].part.state, name))
 
     @property
-    def following(self) -> list[Following]:
+    def following(self) -> list[PartSync]:
         """The bodies, each with this rank's part of it."""
         return self._following
 
@@ -372,7 +372,7 @@ class Simulation:
         """
         self._take_over()
         if any(each.is_in_parts for each in self._following):
-            in_pieces.save(path, self._parts, self._following, self._comm)
+            parallel_checkpoint.save(path, self._parts, self._following, self._comm)
             return
         self.collect()
         checkpoint.save(path, self.bodies, self._parts, self._following, self._comm)
@@ -398,7 +398,7 @@ class Simulation:
         Raises:
             InputError: As for ``warp_corot.Simulation.load``, or a run that does not work on several ranks.
         """
-        in_parts = in_pieces.load(path, device)
+        in_parts = parallel_checkpoint.load(path, device)
         if in_parts is not None:
             options = {name: getattr(in_parts, name) for name in ("integrator", "gravity", "deterministic")}
             made = cls(in_parts.bodies, model=in_parts.models, **options, **in_parts.touching)

@@ -15,8 +15,8 @@ from warp_corot.contact.contacts import Contacts
 from warp_corot.contact.keeping import keep_again, kept_arrays
 from warp_corot.solvers.system import System
 
-from .following import Following
-from .of_parts import SimulationOfParts, of_their_own
+from .part_simulation import PartSimulation, of_their_own
+from .part_sync import PartSync
 
 Ints = npt.NDArray[np.intp]
 
@@ -24,12 +24,12 @@ Ints = npt.NDArray[np.intp]
 NODAL = ("anchors", "kinds", "forces")
 
 
-def gathered_contact(parts: SimulationOfParts, everything: Sequence[Following], comm: Any) -> Contacts | None:
+def gathered_contact(parts: PartSimulation, everything: Sequence[PartSync], comm: Any) -> Contacts | None:
     """The state from which contact of the whole body continues, on rank 0; None elsewhere. All ranks must call this.
 
     Args:
         parts: This rank's simulation of its parts.
-        everything: The ``Following`` of each body; the whole bodies have contact forces of all nodes.
+        everything: The ``PartSync`` of each body; the whole bodies have contact forces of all nodes.
         comm: The ranks.
     """
     here = parts.contact
@@ -72,13 +72,13 @@ def gathered_contact(parts: SimulationOfParts, everything: Sequence[Following], 
     return whole
 
 
-def resume_contact(loaded: Contacts, parts: SimulationOfParts, everything: Sequence[Following]) -> None:
+def resume_contact(loaded: Contacts, parts: PartSimulation, everything: Sequence[PartSync]) -> None:
     """Continue from the contact of the whole body.
 
     Args:
         loaded: That contact.
         parts: This rank's simulation of its parts.
-        everything: The ``Following`` of each body.
+        everything: The ``PartSync`` of each body.
     """
     here, following = parts.contact, everything[0]
     assert here is not None
@@ -108,7 +108,7 @@ def resume_contact(loaded: Contacts, parts: SimulationOfParts, everything: Seque
     here.search.forget()
 
 
-def _places(here: Contacts, following: Following) -> tuple[npt.NDArray[np.bool_], Ints, Ints]:
+def _places(here: Contacts, following: PartSync) -> tuple[npt.NDArray[np.bool_], Ints, Ints]:
     """Which places of this rank's surface have nodes that it moves; the place of each in the whole body's surface, -1
     if there is none; and the places of its triangles there, world after world."""
     whole, numbers, skin = following.whole, following.part.numbers, here.surface.parts[0]

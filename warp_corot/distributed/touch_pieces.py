@@ -11,8 +11,8 @@ import numpy.typing as npt
 from warp_corot.contact.contacts import Contacts
 from warp_corot.io.checkpoint.contact import obstacles_of, pack_obstacles
 
-from .following import Following
-from .of_parts import SimulationOfParts
+from .part_simulation import PartSimulation
+from .part_sync import PartSync
 from .touch_checkpoint import NODAL
 
 Arrays = dict[str, npt.NDArray[Any]]
@@ -22,12 +22,12 @@ COMMON = ("now", "later", "target")
 OF_TRIANGLES = ("normal", "force")
 
 
-def pack_touch(here: Contacts, following: Following, piece: Arrays) -> dict[str, Any]:
+def pack_touch(here: Contacts, following: PartSync, piece: Arrays) -> dict[str, Any]:
     """Put this rank's contact into its piece; returns what is the same on all ranks.
 
     Args:
         here: Contact of this rank's part.
-        following: The ``Following`` of the body.
+        following: The ``PartSync`` of the body.
         piece: The piece.
     """
     assert here.rigid is not None
@@ -61,7 +61,7 @@ def obstacles_in(described: dict[str, Any] | None, arrays: Arrays) -> dict[str, 
 
 
 def resume_touch(
-    described: dict[str, Any], arrays: Arrays, pieces: Sequence[Arrays], parts: SimulationOfParts, following: Following
+    described: dict[str, Any], arrays: Arrays, pieces: Sequence[Arrays], parts: PartSimulation, following: PartSync
 ) -> None:
     """Continue from the contact of a checkpoint.
 
@@ -70,7 +70,7 @@ def resume_touch(
         arrays: Arrays of the nodes of this rank's part, and those that are the same on all ranks.
         pieces: The arrays of triangles of all pieces.
         parts: This rank's simulation of its part.
-        following: The ``Following`` of the body.
+        following: The ``PartSync`` of the body.
     """
     here = parts.contact
     assert here is not None
@@ -95,7 +95,7 @@ def resume_touch(
     here.search.forget()
 
 
-def _resume_triangles(here: Contacts, pieces: Sequence[Arrays], following: Following) -> None:
+def _resume_triangles(here: Contacts, pieces: Sequence[Arrays], following: PartSync) -> None:
     assert here.rigid is not None
     mine, worlds = _triangles(following), following.part.worlds
     given = np.concatenate([mine, *(piece["touched/triangles"] for piece in pieces)])
@@ -119,7 +119,7 @@ def _nodes(here: Contacts, own: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.i
     return node, (node >= 0) & own[node]
 
 
-def _triangles(following: Following) -> npt.NDArray[np.int64]:
+def _triangles(following: PartSync) -> npt.NDArray[np.int64]:
     """The triangles around the nodes that this rank moves, by the nodes' numbers in the whole mesh, int64 [f, 3]."""
     faces, _ = following.part.surface_faces
     return np.sort(following.part.numbers.nodes[faces], axis=1).astype(np.int64)

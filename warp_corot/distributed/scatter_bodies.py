@@ -14,8 +14,8 @@ from warp_corot.body.soft_body import SoftBody
 from warp_corot.errors import InputError
 from warp_corot.materials.isotropic import Material
 
-from .dividing import Piece, dealt, handed_out, pieces_of
 from .parts import part_of_material
+from .scatter_mesh import Piece, dealt, handed_out, pieces_of
 
 Vectors = npt.NDArray[Any]
 

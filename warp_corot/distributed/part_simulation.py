@@ -29,7 +29,7 @@ from warp_corot.simulation.energy import WorldEnergies
 from warp_corot.solvers.ranks import Ranks
 
 from . import mpi
-from .part_meshes import ForestPart, InParts, MeshPart
+from .divided_mesh import DividedForest, DividedMesh, DividedTetMesh
 from .partition import Partition
 from .parts import Part
 from .ranks import MpiRanks
@@ -45,7 +45,7 @@ FEW_ELEMENTS = 200_000
 TRIED_STEPS = 10
 
 
-class SimulationOfParts(on_one.Simulation):
+class PartSimulation(on_one.Simulation):
     """A rank's own simulation of parts, which exchanges data with other ranks."""
 
     def __init__(self, ranks: MpiRanks, parts: Sequence[Part], **options: Any):
@@ -69,7 +69,7 @@ class SimulationOfParts(on_one.Simulation):
         self.stable_steps = super()._find_stable_steps()
         return self.stable_steps
 
-    def become(self, other: SimulationOfParts) -> None:
+    def become(self, other: PartSimulation) -> None:
         """Go on with the parts of another simulation, at the same time and with the same hooks."""
         self.guard.forget()
         if self.contact is not None:
@@ -124,8 +124,8 @@ def part_of(body: SoftBody, model: Model, comm: Any, costs: npt.ArrayLike | None
             elements of several ranks.
     """
     level = getattr(model, "level", None)
-    if isinstance(body.mesh, InParts):
-        ungrouped = isinstance(body.mesh, MeshPart) and body.mesh.element_groups is None
+    if isinstance(body.mesh, DividedMesh):
+        ungrouped = isinstance(body.mesh, DividedTetMesh) and body.mesh.element_groups is None
         if ungrouped and getattr(model, "dilatation", ELEMENT) == SHARED:
             raise InputError(
                 "the mesh was read in parts, so its elements cannot share their dilatation; dilatation must be "
@@ -135,7 +135,7 @@ def part_of(body: SoftBody, model: Model, comm: Any, costs: npt.ArrayLike | None
             raise InputError("the mesh is divided already; give costs to warp_corot.distributed.box or divided")
         if level is not None and not body.mesh.is_box:
             raise InputError(f"rotation_level is {level}; of a divided mesh it must be a tolerance or None")
-        if level is not None and isinstance(body.mesh, ForestPart):
+        if level is not None and isinstance(body.mesh, DividedForest):
             least = int(body.mesh.tree.leaf_levels[0]) - SUBTREE_DEPTH
             if level < least:
                 raise InputError(

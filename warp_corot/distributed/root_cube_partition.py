@@ -19,7 +19,7 @@ Longs = npt.NDArray[np.int64]
 KEY_BITS = 63
 
 
-class Territory:
+class RootCubePartition:
     """The root cubes of each rank, a range in their order, z fastest.
 
     Attributes:

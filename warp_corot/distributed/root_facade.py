@@ -17,12 +17,12 @@ from warp_corot.simulation.simulation import Simulation as OnOne
 from warp_corot.simulation.solves import Solves
 
 from . import mpi
-from .following import STATE
-from .handing import handed_bodies
+from .part_sync import STATE
+from .scatter_bodies import handed_bodies
 from .simulation import Simulation
 
 
-class Crew:
+class Workers:
     """The simulation of all ranks, which rank 0 leads; the others call ``serve``.
 
     Args:
@@ -46,7 +46,7 @@ class Crew:
         self._served = False
 
     @classmethod
-    def joined(cls, device: str | wp.Device | None) -> Crew:
+    def joined(cls, device: str | wp.Device | None) -> Workers:
         """On ranks other than 0: the simulation of parts of the bodies that rank 0 hands out.
 
         Raises:
@@ -138,7 +138,7 @@ class Crew:
                 self.collect()
 
 
-class LedSimulation(OnOne):
+class RootSimulation(OnOne):
     """A simulation of whole bodies, for writers and tables; rank 0 leads it.
 
     Rank 0 uses it like any other simulation. The other ranks call ``serve``, which makes the steps that rank 0 asks
@@ -147,7 +147,7 @@ class LedSimulation(OnOne):
     Args:
         bodies, options: As for ``warp_corot.Simulation``.
         in_parts: Whether only rank 0 makes this, and hands out parts of the bodies to the others, which call
-            ``Crew.joined``; otherwise every rank makes this with the whole bodies.
+            ``Workers.joined``; otherwise every rank makes this with the whole bodies.
 
     Raises:
         InputError: As for ``warp_corot.distributed.Simulation``.
@@ -163,9 +163,9 @@ class LedSimulation(OnOne):
         if in_parts:
             wholes = [bodies] if isinstance(bodies, SoftBody) else list(bodies)
             parts, _, nodes = handed_bodies(wholes, options, wholes[0].device, mpi.world())
-            self._crew = Crew(Simulation(parts, **options), wholes, nodes)
+            self._crew = Workers(Simulation(parts, **options), wholes, nodes)
         else:
-            self._crew = Crew(Simulation(bodies, **options))
+            self._crew = Workers(Simulation(bodies, **options))
         if (remeshing := self._crew.on_all.remeshing) is not None:
             self.remeshing, self.fields = remeshing
         self.serve, self.end = self._crew.serve, self._crew.end

@@ -45,7 +45,7 @@ class Numbers:
         return (self.nodes + self.node_count * np.arange(worlds, dtype=np.int64)[:, None]).ravel()
 
 
-class InParts:
+class DividedMesh:
     """A rank's part of a mesh: the elements around the nodes that the rank moves.
 
     Elements and nodes are those of this part; some are copies of other ranks' elements, and the nodes of these.
@@ -116,7 +116,7 @@ class InParts:
             raise InputError("nearest needs the whole mesh, and this rank holds a part; use sphere or box")
 
 
-class ForestPart(InParts, TetForest):
+class DividedForest(DividedMesh, TetForest):
     """A rank's part of a forest."""
 
     def __init__(
@@ -151,7 +151,7 @@ class ForestPart(InParts, TetForest):
         return np.any([(corners == end).all(axis=1).any(axis=1) for end in ends], axis=0)
 
 
-class MeshPart(InParts, TetMesh):
+class DividedTetMesh(DividedMesh, TetMesh):
     """A rank's part of a general mesh."""
 
     def __init__(

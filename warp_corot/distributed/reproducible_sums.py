@@ -18,7 +18,7 @@ Floats = npt.NDArray[np.float64]
 BITS, ROUNDS = 30, 3
 
 
-def settled_sums(addends: Floats, comm: Any) -> Floats:
+def reproducible_sums(addends: Floats, comm: Any) -> Floats:
     """The sums of all ranks' addends, [n, columns] -> [columns]; NaN where any addend is not finite."""
     columns = addends.shape[1]
     sizes = np.abs(addends).max(axis=0, initial=0.0)

@@ -37,7 +37,7 @@ def patience() -> float:
     return found
 
 
-class Patient:
+class TimedCommunicator:
     """A communicator of MPI with limited waits: after that time it ends all ranks.
 
     Args:

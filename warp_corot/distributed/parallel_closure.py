@@ -11,7 +11,7 @@ import warp as wp
 from warp_corot.mesh.growing.adapt import Growing
 from warp_corot.mesh.growing.judging import Wishes
 
-from .territory import Territory, places_of
+from .root_cube_partition import RootCubePartition, places_of
 
 if TYPE_CHECKING:
     from warp_corot.domain import Domain
@@ -31,7 +31,9 @@ class GrowingTogether(Growing):
         territory: The cubes of each rank.
     """
 
-    def __init__(self, domain: Domain, cell_size: float, wishes: Wishes, device: wp.Device, territory: Territory):
+    def __init__(
+        self, domain: Domain, cell_size: float, wishes: Wishes, device: wp.Device, territory: RootCubePartition
+    ):
         super().__init__(domain, cell_size, wishes, device, territory.own)
         self._territory = territory
         self._known = np.zeros(0, bool)

@@ -24,13 +24,13 @@ from warp_corot.mesh.numbering import by_levels, in_order_of_leaves, live_or_voi
 from warp_corot.mesh.tree import LIVE, VOID
 
 from . import mpi
-from .closing import GrowingTogether
+from .divided_mesh import DividedForest
 from .faces import faces_of
-from .filling import Elements, without_slivers
-from .joining import joined
-from .part_meshes import ForestPart
+from .ghost_layer import joined
+from .parallel_closure import GrowingTogether
+from .parallel_slivers import Elements, without_slivers
 from .partition import checked_shares
-from .territory import Territory, key_room
+from .root_cube_partition import RootCubePartition, key_room
 
 if TYPE_CHECKING:
     from warp_corot.domain import Domain
@@ -57,7 +57,7 @@ def from_domain(
     sliver: float = 0.02,
     costs: npt.ArrayLike | None = None,
     device: str | wp.Device | None = None,
-) -> ForestPart:
+) -> DividedForest:
     """This rank's part of the mesh that ``TetForest.from_domain`` makes; all ranks must call this.
 
     Every rank has the domain and grows the root cubes of its part, a range of them; so there must be more cubes than
@@ -93,7 +93,7 @@ def from_domain(
     cells, _ = grid_around(domain.bounds, size)
     key_room(cells, wishes.max_level)
     starts = _starts(domain, size, wishes, where, checked_shares(comm.size, costs))
-    territory = Territory(cells, wishes.max_level, starts, comm)
+    territory = RootCubePartition(cells, wishes.max_level, starts, comm)
     growing = GrowingTogether(domain, size, wishes, where, territory)
     growing.run()
     resolved = Resolved(growing.grown(), size)
@@ -136,7 +136,7 @@ def _starts(
     return np.concatenate([[0], used[first], [len(of_cube)]]).astype(np.int64)
 
 
-def _finished(resolved: Resolved, domain: Domain, sliver: float, territory: Territory) -> tuple[TetForest, str]:
+def _finished(resolved: Resolved, domain: Domain, sliver: float, territory: RootCubePartition) -> tuple[TetForest, str]:
     """This rank's leaves, without empty and nearly empty ones, and what else is left out; as of a whole mesh.
 
     Raises:

@@ -11,7 +11,7 @@ from warp_corot.elasticity import Corotated, Linear, Model, NeoHookean, StVenant
 from warp_corot.errors import InputError
 from warp_corot.solvers import Integrator
 
-from .part_meshes import InParts
+from .divided_mesh import DividedMesh
 from .passes import Passes
 
 #: Models whose forces need only the elements around a node.
@@ -34,7 +34,7 @@ def check_supported(
     Raises:
         InputError: It cannot.
     """
-    in_parts = any(isinstance(body.mesh, InParts) for body in bodies)
+    in_parts = any(isinstance(body.mesh, DividedMesh) for body in bodies)
     if others.get("remesh") and in_parts:
         raise InputError(
             "remeshing of meshes that no rank holds whole does not work yet; leave remesh out, let every rank make the "
@@ -48,7 +48,7 @@ def check_supported(
             "rank holds whole; use one body without self_contact, or explicit steps of whole meshes, or one process"
         )
     touches = bool(contact or others.get("obstacles"))
-    embedded = any(isinstance(body.mesh, InParts) and body.mesh.is_embedded for body in bodies)
+    embedded = any(isinstance(body.mesh, DividedMesh) and body.mesh.is_embedded for body in bodies)
     if touches and embedded and not integrator.is_implicit and getattr(contact, "on", SURFACE) == SURFACE:
         raise InputError(
             f"no rank has the surface of a divided mesh; contact must be Contact(on={TETRAHEDRA!r}), which touches the "

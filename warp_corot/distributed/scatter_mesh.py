@@ -16,7 +16,7 @@ from warp_corot.mesh import TetForest, TetMesh
 from warp_corot.mesh.surfaces.boundary import boundary_faces, signed_volumes
 
 from . import mpi
-from .part_meshes import ForestPart, MeshPart
+from .divided_mesh import DividedForest, DividedTetMesh
 from .partition import Partition
 from .parts import numbered_part
 
@@ -27,7 +27,7 @@ TAG = 77
 Piece = tuple[type, tuple[Any, ...], dict[str, Any]]
 
 
-def divided(make: Callable[[], Mesh], *, costs: npt.ArrayLike | None = None) -> ForestPart | MeshPart:
+def divided(make: Callable[[], Mesh], *, costs: npt.ArrayLike | None = None) -> DividedForest | DividedTetMesh:
     """This rank's part of a mesh that rank 0 makes; all ranks must call this.
 
     Only rank 0 calls ``make``, and afterwards it keeps only its part. So one machine holds the whole mesh once, not
@@ -53,7 +53,7 @@ def divided(make: Callable[[], Mesh], *, costs: npt.ArrayLike | None = None) -> 
         return pieces_of(mesh, dealt(mesh, comm.size, costs))
 
     kind, place, options = handed_out(pieces, comm)
-    made: ForestPart | MeshPart = kind(*place, **options)
+    made: DividedForest | DividedTetMesh = kind(*place, **options)
     return made
 
 
@@ -119,12 +119,12 @@ def pieces_of(mesh: Mesh, division: Partition) -> Iterator[Piece]:
         if isinstance(part, TetForest):
             place: tuple[Any, ...] = (part.cells, part.cell_size, part.origin, part.lattice, part.node_ends, part.tree)
             given |= {"fill": part.fill, "leaf_groups": part.leaf_groups, "is_embedded": has_own_surface(mesh)}
-            yield ForestPart, place, whole | given
+            yield DividedForest, place, whole | given
         else:
             assert isinstance(mesh, TetMesh)
             sets = {name: mask[numbers.nodes] for name, mask in mesh.node_sets.items()}
             given |= {"element_groups": part.element_groups, "node_sets": sets}
-            yield MeshPart, (part.points, part.tets), whole | given
+            yield DividedTetMesh, (part.points, part.tets), whole | given
 
 
 def _here(faces: npt.NDArray[np.int32], nodes: npt.NDArray[np.integer], count: int) -> npt.NDArray[np.int32]:

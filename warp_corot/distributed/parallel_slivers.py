@@ -13,7 +13,7 @@ from warp_corot.mesh.growing.slivers import FEW_ELEMENTS, Filling, LumpedError, 
 from warp_corot.mesh.growing.strays import strays_among
 
 from .faces import Faces
-from .territory import Territory, places_of
+from .root_cube_partition import RootCubePartition, places_of
 
 if TYPE_CHECKING:
     from warp_corot.domain import Domain
@@ -45,7 +45,7 @@ class Elements:
 
 
 def without_slivers(
-    elements: Elements, sliver: float, domain: Domain, territory: Territory
+    elements: Elements, sliver: float, domain: Domain, territory: RootCubePartition
 ) -> tuple[Floats, Bools, str]:
     """What ``from_domain`` gives up of a whole mesh; all ranks must call this.
 
@@ -81,7 +81,7 @@ class _MissingError(Exception):
 class _Graph:
     """The elements that stand for themselves, and connected groups of the others."""
 
-    def __init__(self, elements: Elements, sliver: float, territory: Territory):
+    def __init__(self, elements: Elements, sliver: float, territory: RootCubePartition):
         comm = territory.comm
         self._elements, self._comm = elements, comm
         self._first = int(elements.firsts[comm.rank])

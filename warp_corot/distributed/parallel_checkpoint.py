@@ -34,11 +34,11 @@ from warp_corot.solvers import INTEGRATORS
 
 from .boxes import box
 from .checkpoint import Values, body_of
-from .dividing import divided
-from .following import Following
-from .of_parts import SimulationOfParts
-from .part_meshes import ForestPart, MeshPart
+from .divided_mesh import DividedForest, DividedTetMesh
+from .part_simulation import PartSimulation
+from .part_sync import PartSync
 from .rejoining import pack_part, rejoined
+from .scatter_mesh import divided
 from .touch_pieces import obstacles_in, pack_touch, resume_touch
 
 Arrays = dict[str, npt.NDArray[Any]]
@@ -49,7 +49,7 @@ NODAL = ("displacements", "velocities", "reactions", "constrained", "loads")
 MOTION = ("world", "nodes", "times", "to")
 
 
-def save(path: str | PathLike[str], parts: SimulationOfParts, following: list[Following], comm: Any) -> None:
+def save(path: str | PathLike[str], parts: PartSimulation, following: list[PartSync], comm: Any) -> None:
     """Write a checkpoint; all ranks must call.
 
     ``run.npz`` names the files ``run.ranks/step-…-rank-0000.npz`` and so on, each with the nodes that a rank moves.
@@ -123,7 +123,7 @@ def load(path: str | PathLike[str], device: str | wp.Device | None) -> SimpleNam
         raise InputError(f"{target} is not a complete checkpoint of bodies in parts: {error}") from error
 
 
-def _header(parts: SimulationOfParts) -> dict[str, Any]:
+def _header(parts: PartSimulation) -> dict[str, Any]:
     plain = ("stable_dt", "steps_before_reset", "time_before_reset", "gravity", "deterministic", "worlds")
     return {name: getattr(parts, name) for name in plain} | {
         "format": FORMAT_IN_PARTS,
@@ -134,11 +134,11 @@ def _header(parts: SimulationOfParts) -> dict[str, Any]:
     }
 
 
-def _pack(each: Following, model: Model, field: ForceField, k: int, piece: Arrays) -> dict[str, Any]:
+def _pack(each: PartSync, model: Model, field: ForceField, k: int, piece: Arrays) -> dict[str, Any]:
     """Put this rank's part of the k-th body into its piece; returns what is the same on all ranks."""
     body, numbers, prefix = each.whole, each.part.numbers, f"body{k}."
     mesh, arrays = body.mesh, Arrays()
-    assert isinstance(mesh, ForestPart | MeshPart)
+    assert isinstance(mesh, DividedForest | DividedTetMesh)
     described = pack_body(body, model, field, None, prefix, arrays, with_mesh=False)
     described.pop("trajectories")
     owned, counted = each.part.is_own, np.flatnonzero(numbers.counted)
@@ -166,7 +166,7 @@ def _pack(each: Following, model: Model, field: ForceField, k: int, piece: Array
             piece[f"motion{k}/{number}.{what}"] = values
     if not mesh.is_box:
         return described | {"divided": pack_part(mesh, f"mesh{k}/", piece)}
-    assert isinstance(mesh, ForestPart)
+    assert isinstance(mesh, DividedForest)
     place = {"cells": mesh.cells, "cell_size": mesh.cell_size, "origin": mesh.origin, "up_axis": mesh.up_axis}
     return described | {"box": place | {"level": int(mesh.tree.leaf_levels[0])}}
 
@@ -212,7 +212,7 @@ def _rebuilt_run(
     )
 
 
-def _rebuilt_mesh(described: dict[str, Any], k: int, files: Sequence[Path]) -> ForestPart | MeshPart:
+def _rebuilt_mesh(described: dict[str, Any], k: int, files: Sequence[Path]) -> DividedForest | DividedTetMesh:
     """This rank's part of the k-th body's mesh; rank 0 makes a divided one whole again, and divides it."""
     if "box" in described:
         return box(**described["box"] | {"cells": tuple(described["box"]["cells"])})
@@ -234,7 +234,7 @@ def _rebuilt_mesh(described: dict[str, Any], k: int, files: Sequence[Path]) -> F
     return divided(whole)
 
 
-def _take(piece: Arrays, mesh: ForestPart | MeshPart, k: int, worlds: int, arrays: Arrays) -> None:
+def _take(piece: Arrays, mesh: DividedForest | DividedTetMesh, k: int, worlds: int, arrays: Arrays) -> None:
     """Copy a piece's values to the arrays of this rank's part of the k-th body."""
     for kind, numbers, copies in (("nodes", mesh.numbers.nodes, worlds), ("elements", mesh.numbers.elements, 1)):
         prefix = f"{kind}{k}/"
@@ -249,7 +249,7 @@ def _take(piece: Arrays, mesh: ForestPart | MeshPart, k: int, worlds: int, array
             by_world[:, here] = values.reshape(copies, len(given), *values.shape[1:])[:, there]
 
 
-def _take_motions(piece: Arrays, mesh: ForestPart | MeshPart, k: int, first: int, arrays: Arrays) -> int:
+def _take_motions(piece: Arrays, mesh: DividedForest | DividedTetMesh, k: int, first: int, arrays: Arrays) -> int:
     """Copy prescribed motions of nodes of this rank's part of the k-th body; returns how many there are."""
     count, nodes = 0, mesh.numbers.nodes
     order = np.argsort(nodes)

@@ -13,10 +13,10 @@ from warp_corot.discretization.groups import group_numbers
 from warp_corot.mesh import TetForest, Tree
 from warp_corot.mesh.numbering import in_order_of_leaves, renumbered, with_virtual
 
+from .divided_mesh import DividedForest, Numbers
 from .faces import faces_of
-from .part_meshes import ForestPart, Numbers
 from .parts import part_of_forest
-from .territory import Territory, places_of
+from .root_cube_partition import RootCubePartition, places_of
 
 Ints = npt.NDArray[np.int32]
 Longs = npt.NDArray[np.int64]
@@ -45,7 +45,7 @@ class Branch:
     outer: Ints
 
 
-def joined(own: TetForest, territory: Territory) -> ForestPart:
+def joined(own: TetForest, territory: RootCubePartition) -> DividedForest:
     """This rank's part of the mesh that all ranks' leaves make together; all ranks must call this.
 
     Args:
@@ -97,7 +97,7 @@ def joined(own: TetForest, territory: Territory) -> ForestPart:
     )
 
 
-def _owners(own: TetForest, keys: Longs, territory: Territory) -> Ints:
+def _owners(own: TetForest, keys: Longs, territory: RootCubePartition) -> Ints:
     """The rank that moves each lattice point, the first with a leaf around it; if no leaf has it, the first rank that
     has it, plus the number of ranks; int32."""
     comm = territory.comm
@@ -135,7 +135,7 @@ def _numbers(owner: Ints, node_count: int, keys: Longs, comm: Any) -> tuple[Long
     return found, total
 
 
-def _together(branches: list[Branch], rank: int, *, node_count: int, **whole: Any) -> ForestPart:
+def _together(branches: list[Branch], rank: int, *, node_count: int, **whole: Any) -> DividedForest:
     """The part that branches of different ranks make, in the order of the ranks, the rank's own first."""
     forests = [each.forest for each in branches]
     keys, place, inverse = np.unique(
@@ -176,7 +176,7 @@ def _together(branches: list[Branch], rank: int, *, node_count: int, **whole: An
         lattice=numbers[order],
     )
     one = forests[0]
-    return ForestPart(
+    return DividedForest(
         one.cells,
         one.cell_size,
         one.origin,

@@ -13,7 +13,7 @@ from warp_corot.body.soft_body import SoftBody
 from warp_corot.body.trajectory import NodeKeyframes, Trajectory
 from warp_corot.errors import InputError
 
-from .part_meshes import InParts
+from .divided_mesh import DividedMesh
 from .parts import Part
 from .places import Places
 
@@ -21,7 +21,7 @@ from .places import Places
 STATE = ("displacements", "velocities", "reactions")
 
 
-class Following:
+class PartSync:
     """Copies users' changes of a whole body to its part, and the results of the part back.
 
     On each rank the whole body has the present state only of the nodes that this rank moves. Users must make every
@@ -58,7 +58,7 @@ class Following:
     @property
     def is_in_parts(self) -> bool:
         """Whether no rank holds the whole mesh."""
-        return isinstance(self.whole.mesh, InParts)
+        return isinstance(self.whole.mesh, DividedMesh)
 
     def take_ghosts(self, completed: Callable[[str], wp.array]) -> None:
         """Copy the state of all nodes of the part, with those that other ranks move, to the body.
