@@ -22,7 +22,7 @@ def scatter_values(places: wp.array[wp.int32], source: wp.array[Any], found: wp.
 
 
 #: The types of values that GPUs exchange, and the kernels for each.
-EXCHANGED = (wp.float32, wp.vec3, wp.vec4)
+EXCHANGED = (wp.float32, wp.int32, wp.vec3, wp.vec4, wp.vec3l)
 GATHER, SCATTER = (
     {kind: wp.overload(kernel, [wp.array[wp.int32], wp.array[kind], wp.array[kind]]) for kind in EXCHANGED}
     for kernel in (gather_values, scatter_values)
@@ -48,9 +48,14 @@ def clear_energies(places: wp.array[wp.int32], energies: wp.array[wp.float64]):
 
 
 @wp.kernel(enable_backward=False)
-def clear_forces(places: wp.array[wp.int32], forces: wp.array[wp.vec3]):
+def clear_forces(places: wp.array[wp.int32], forces: wp.array[Any]):
     """Set forces at some places to zero."""
-    forces[places[wp.tid()]] = wp.vec3()
+    i = places[wp.tid()]
+    forces[i] = forces[i] - forces[i]
+
+
+for _kind in (wp.vec3, wp.vec3l):
+    wp.overload(clear_forces, [wp.array[wp.int32], wp.array[_kind]])
 
 
 @wp.kernel(enable_backward=False)

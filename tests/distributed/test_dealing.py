@@ -14,7 +14,6 @@ import warp_corot as wc
 from warp_corot.discretization.awaited import Awaited
 from warp_corot.discretization.groups import group_numbers
 from warp_corot.discretization.planning.fixed import ForcePlan
-from warp_corot.distributed.directions import normal_numbers
 from warp_corot.distributed.partition import Partition
 from warp_corot.distributed.parts import Part, numbered_part, part_of_mesh
 from warp_corot.distributed.places import Places
@@ -22,6 +21,7 @@ from warp_corot.distributed.rejoining import pack_part, rejoined
 from warp_corot.distributed.reproducible_sums import reproducible_sums
 from warp_corot.distributed.scatter_mesh import dealt, pieces_of
 from warp_corot.distributed.unsupported import check_supported
+from warp_corot.mesh.scattered import normal_numbers
 
 
 class Others:

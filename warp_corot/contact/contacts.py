@@ -12,7 +12,7 @@ from warp_corot.kernels.contact import bearing, motion, sums
 from warp_corot.kernels.contact.begin import BEGIN_STEP
 from warp_corot.kernels.contact.end import END_CONTACT
 from warp_corot.kernels.contact.law import SETTLING, Law
-from warp_corot.solvers.ranks import ALONE, Ranks
+from warp_corot.solvers.halo import ALONE
 from warp_corot.solvers.system import System
 
 from .active_set import ActiveSet
@@ -28,6 +28,7 @@ from .search import Search
 from .skin import has_own_surface
 from .sleep import Sleep
 from .surface import ContactSurface
+from .surface_halo import SurfaceHalo
 from .tool import Obstacle
 from .warned import OVERLAP, warn_of_crushed, warn_of_overlaps
 from .whole_surface import WholeSurface
@@ -87,14 +88,12 @@ class Contacts:
         self.obstacles = Obstacles(obstacles, options.friction, system, dt)
         meets = len(system.bodies) > 1 or options.self_contact
         are_own = on_surfaces and options.on == SURFACE
-        have_own = are_own and any(has_own_surface(system.ranks.whole(body).mesh) for body in system.bodies)
+        have_own = are_own and any(has_own_surface(system.ranks.owned(body).whole.mesh) for body in system.bodies)
         is_whole = (meets or have_own) and not system.ranks.is_alone
         made = WholeSurface(system, are_own=are_own) if is_whole else ContactSurface(system.bodies, are_own=are_own)
         self.surface: ContactSurface = made
-        #: The ranks with other places of the surface.
-        self._ranks: Ranks = ALONE if is_whole else system.ranks
-        own = [self.surface.places_of(k) for k in range(len(system.bodies))]
-        self._ranks.take_surface(self.surface.arrays.node, own)
+        #: The exchange with ranks that have other places of the surface.
+        self._shared = SurfaceHalo(ALONE if is_whole else system.ranks, self.surface)
         self.law = self._law(stable_dt)
         self.search = Search(self.surface, self.obstacles, self.smallest, branches=system.ranks.is_alone)
         #: Contact between soft surfaces; None if they cannot touch one another.
@@ -102,7 +101,7 @@ class Contacts:
         self.rigid: RigidForces | None = None
         if self.obstacles.count:
             self.rigid = RigidForces(self.surface, self.obstacles, self.search, self.law)
-        given = (self.surface, self.search, self.law, system.pace.arrays, self._ranks, self.rigid, self.pairs)
+        given = (self.surface, self.search, self.law, system.pace.arrays, self._shared, self.rigid, self.pairs)
         #: The forces of explicit steps.
         self.split = MassSplit(*given)
         self._is_explicit = False
@@ -258,14 +257,14 @@ class Contacts:
         if self.rigid is not None:
             forces = self.rigid.launch_totals()
             for number in range(obstacles.count if self.rigid.have_edges else 0):
-                self._ranks.clear_surface(forces[number])
+                self._shared.clear(forces[number])
             threads = self._parts.shape[2] * self._lanes
             for part in surface.parts:
                 inputs = [part.start, part.nodes, self._lanes, threads, surface.arrays, obstacles.motions, forces]
                 wp.launch(
                     sums.sum_wrenches, (*obstacles.wrenches.shape, threads), inputs, [self._parts], device=self.device
                 )
-            self._ranks.add_up_wrenches(self._parts)
+            self._shared.ranks.sum(self._parts)
             wp.launch(
                 sums.fold_wrenches, obstacles.wrenches.shape, [self._parts], [obstacles.wrenches], device=self.device
             )
@@ -274,7 +273,7 @@ class Contacts:
             self.split.launch_place_forces(forces)
         inputs = [surface.arrays, surface.triangles, surface.corner_starts, surface.corners]
         self._launch(sums.node_pressures, surface.count, inputs, [self._pressures])
-        self._ranks.complete_surface(self._pressures)
+        self._shared.exchange(self._pressures)
         for k, part in enumerate(surface.parts):
             inputs = [part.triangle_start, surface.arrays, surface.triangles, self._pressures]
             outputs = [self._triangle_pressures[k]]
@@ -330,12 +329,12 @@ class Contacts:
         return smallest_size([body.discretization.smallest_volume for body in self.system.bodies])
 
     def _law(self, stable_dt: float) -> Law:
-        points = [np.abs(self.system.ranks.bounds(body)).max() for body in self.system.bodies]
+        points = [np.abs(self.system.ranks.owned(body).bounds).max() for body in self.system.bodies]
         law = Law()
         law.settling, law.whole = float(SETTLING), WHOLE * stable_dt if np.isfinite(stable_dt) else 0.0
         law.tolerance = ROUNDINGS * 2.0**-24 * max(*points, 1e-3)
         law.recovery = RECOVERY * self.smallest / stable_dt if np.isfinite(stable_dt) else 0.1
-        heaviest = self.system.ranks.most(max(float(body.masses.max()) for body in self.system.bodies))
+        heaviest = self.system.ranks.max(max(float(body.masses.max()) for body in self.system.bodies))
         step = stable_dt if np.isfinite(stable_dt) else 1.0
         law.slack = SLACK * self.smallest if self.surface.is_borne else 0.0
         law.closing = CLOSING * self.smallest
@@ -369,7 +368,7 @@ class Contacts:
         if isinstance(surface, WholeSurface):
             surface.complete()
         elif self.rigid is not None and self.rigid.have_edges:
-            system.ranks.complete_surface(surface.arrays.d)
+            self._shared.exchange(surface.arrays.d)
         for k, part in enumerate(surface.parts):
             if part.bearers and not finds_borne:
                 self._launch(bearing.place_borne, self._count(k), [part.start, surface.bearers, surface.arrays], [])
@@ -378,8 +377,8 @@ class Contacts:
         surface, device = self.surface, self.device
         count, obstacles = surface.count, self.obstacles.count
         self._lanes = 1 if device.is_cpu else WARP
-        # Ranks add these arrays up, so they must be of one size.
-        most = int(self._ranks.most(float(max(part.nodes for part in surface.parts))))
+        # Halo add these arrays up, so they must be of one size.
+        most = int(self._shared.ranks.max(float(max(part.nodes for part in surface.parts))))
         warps = 1 if device.is_cpu else max(min(most // WARP, MOST_WARPS), 1)
         self._parts = wp.zeros((obstacles, self.system.worlds, warps), dtype=wp.spatial_vectord, device=device)
         self._pressures = wp.zeros(count, dtype=wp.vec3, device=device)

@@ -92,7 +92,7 @@ class JoinedRows:
 
     def reserve(self, motion: float) -> None:
         """Search for pairs with a larger margin, if anything may begin to move so far in a step [m]."""
-        bounds = [self._system.ranks.bounds(body) for body in self._system.bodies]
+        bounds = [self._system.ranks.owned(body).bounds for body in self._system.bodies]
         self._pairs.search.serve_implicit(motion, max(float(np.linalg.norm(high - low)) for low, high in bounds))
 
     # --- launches ----------------------------------------------------------------------------------------------------

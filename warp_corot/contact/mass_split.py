@@ -10,12 +10,12 @@ from warp_corot.kernels.contact.rows import Meeting, Rows
 from warp_corot.kernels.contact.touches import Touches
 from warp_corot.kernels.contact.vertices import Rigid
 from warp_corot.kernels.stepping.pace import Pace
-from warp_corot.solvers.ranks import Ranks
 
 from .pairs import Pairs
 from .rigid_forces import RigidForces
 from .search import Search
 from .surface import ContactSurface
+from .surface_halo import SurfaceHalo
 
 #: Number of iterations if contacts share nodes, and otherwise: then the first one is exact.
 ITERATIONS, EXACT = 4, 1
@@ -29,7 +29,7 @@ class MassSplit:
         search: The search for nearby surfaces.
         law: The law of contact.
         pace: The clock.
-        ranks: The processes that move the other nodes of the triangles here.
+        shared: The exchange with ranks that move the other nodes of the triangles here.
         rigid: Contact with obstacles; None without.
         pairs: Contact between soft surfaces; None if they cannot touch.
 
@@ -44,12 +44,12 @@ class MassSplit:
         search: Search,
         law: Law,
         pace: Pace,
-        ranks: Ranks,
+        shared: SurfaceHalo,
         rigid: RigidForces | None,
         pairs: Pairs | None,
     ):
         self.surface, self.device = surface, surface.device
-        self._search, self._law, self._pace, self._ranks = search, law, pace, ranks
+        self._search, self._law, self._pace, self._shared = search, law, pace, shared
         self._rigid, self._pairs, self._taken = rigid, pairs, (-1, -1)
         alone = pairs is None and not surface.is_borne and (rigid is None or rigid.is_separate)
         self.iterations = EXACT if alone else ITERATIONS
@@ -89,16 +89,16 @@ class MassSplit:
     def launch(self) -> None:
         """Launch all phases of a step."""
         last = self.iterations + 1
-        if self._ranks.is_alone:
+        if self._shared.ranks.is_alone:
             self._launch(0, last)
             return
-        self._ranks.complete_surface(self.surface.arrays.yielding)
+        self._shared.exchange(self.surface.arrays.yielding)
         for phase in range(last + 1):
             self._launch(phase, phase)
             for buffer in (0, 1) if phase == 0 else (phase % 2,):
-                self._ranks.complete_surface(self.sums.weights[buffer])
-                self._ranks.complete_surface(self.sums.forces[buffer])
-        self._ranks.clear_surface(self.sums.forces[self.buffer])
+                self._shared.exchange(self.sums.weights[buffer])
+                self._shared.exchange(self.sums.forces[buffer])
+        self._shared.clear(self.sums.forces[self.buffer])
 
     def launch_clear(self) -> None:
         """Launch the reset of all sums, which the end of a step does for nodes that this process moves only."""

@@ -10,7 +10,7 @@ from warp_corot.kernels.contact import boxes
 from warp_corot.kernels.contact import search as search_kernels
 from warp_corot.kernels.contact.crushed import mark_crushed
 from warp_corot.kernels.contact.rows import Meeting, Rows
-from warp_corot.solvers.ranks import ALONE, Ranks
+from warp_corot.solvers.halo import ALONE, Halo
 
 from .options import Contact
 from .search import Search
@@ -50,7 +50,7 @@ class Pairs:
         surface: ContactSurface,
         search: Search,
         options: Contact,
-        ranks: Ranks = ALONE,
+        ranks: Halo = ALONE,
     ):
         self._ranks = ranks
         self.surface, self.search, self.device = surface, search, surface.device
@@ -236,7 +236,7 @@ class Pairs:
             kernel, elements = mark_crushed(body.discretization.element_kind), body.discretization.elements
             inputs = [watch, elements, body.state.displacements, places, int(part.bearers > 0), surface.arrays]
             wp.launch(kernel, body.sizes.launch_elements, inputs, [near], device=self.device)
-        self._ranks.take_most(near.flags)
+        self._ranks.max(near.flags)
 
 
 def smallest_size(volumes: list[float]) -> float:

@@ -16,7 +16,7 @@ from warp_corot.kernels.contact import sums
 from warp_corot.kernels.contact.crushed import count_crushed
 from warp_corot.kernels.contact.motion import Motions
 from warp_corot.kernels.contact.overlaps import find_gaps
-from warp_corot.solvers.ranks import ALONE
+from warp_corot.solvers.halo import ALONE
 
 from .sampled import SignedDistance, TriangleMesh
 from .shapes import Capsule, Cylinder, Ground
@@ -49,7 +49,7 @@ def warn_of_overlaps(contacts: Contacts, least: float) -> None:
         inputs = [contacts.obstacles.shapes, contacts.obstacles.motions, contacts.surface.arrays]
         wp.launch(sums.find_depths, contacts.surface.count, inputs, [depths], device=contacts.device)
         deep, ranks = depths.numpy(), ALONE if contacts.surface.is_whole else contacts.system.ranks
-        count, deepest = int(ranks.together(int((deep > least).sum()))), ranks.most(float(deep.max(initial=0.0)))
+        count, deepest = int(ranks.sum(int((deep > least).sum()))), ranks.max(float(deep.max(initial=0.0)))
         if count:
             _warn(f"{count} surface nodes begin inside obstacles, by up to {1e3 * deepest:.3g} mm; they are {speed}")
     axes = [(tool, _axis(tool, contacts.obstacles.poses()[0, k])) for k, tool in enumerate(contacts.obstacles.tools)]
@@ -62,7 +62,7 @@ def _own_surfaces(contacts: Contacts) -> Iterator[tuple[Floats, npt.NDArray[np.i
     """Where the surface nodes of each body are in its first world [m], and its triangles."""
     places = contacts.surface.arrays.x.numpy().astype(float)
     for body, part in zip(contacts.system.bodies, contacts.surface.parts, strict=True):
-        whole = contacts.system.ranks.whole(body)
+        whole = contacts.system.ranks.owned(body).whole
         if whole is body or contacts.surface.is_whole:
             yield places[part.start : part.start + len(part.skin.nodes)], part.skin.triangles
         else:
@@ -79,13 +79,11 @@ def warn_of_crushed(contacts: Contacts) -> bool:
     """
     system = contacts.system
     count = wp.zeros(1, dtype=wp.int32, device=contacts.device)
-    for k, body in enumerate(system.bodies):
+    for body in system.bodies:
         kernel = count_crushed(body.discretization.element_kind)
-        counted = system.ranks.counted(k)
-        counted = wp.empty(0, dtype=wp.int32, device=contacts.device) if counted is None else counted
-        inputs = [body.discretization.elements, body.state.displacements, counted]
+        inputs = [body.discretization.elements, body.state.displacements, system.ranks.owned(body).counted]
         wp.launch(kernel, body.sizes.launch_elements, inputs, [count], device=contacts.device)
-    crushed = int(system.ranks.together(int(count.numpy()[0])))
+    crushed = int(system.ranks.sum(int(count.numpy()[0])))
     if crushed:
         _warn(
             f"{crushed} elements are turned inside out at t = {system.pace.time:.4g} s: something presses harder than "

@@ -34,7 +34,7 @@ class WholeSurface(ContactSurface):
 
     def __init__(self, system: System, *, are_own: bool = False):
         self._system = system
-        wholes = [system.ranks.whole(body) for body in system.bodies]
+        wholes = [system.ranks.owned(body).whole for body in system.bodies]
         super().__init__(wholes, are_own=are_own, device=system.device)
 
     @property
@@ -51,16 +51,18 @@ class WholeSurface(ContactSurface):
 
     def complete(self) -> None:
         """Launch the exchange after which every rank has the motion of all places at nodes, and of all bearers."""
-        self._system.ranks.complete_whole_surface(
-            [getattr(self.arrays, name) for name in EXCHANGED], [getattr(self.bearers, name) for name in EXCHANGED]
-        )
+        for exchange, arrays in zip(self._exchanges, (self.arrays, self.bearers), strict=True):
+            for values in (getattr(arrays, name) for name in EXCHANGED):
+                if len(values):
+                    exchange(values)
 
     def _fill(self) -> None:
         super()._fill()
         ranks, self._solids = self._system.ranks, []
         at_places, at_bearers = (_Held(each) for each in (self.arrays, self.bearers))
         for k, (part, whole) in enumerate(zip(self._system.bodies, self.bodies, strict=True)):
-            numbers, is_own = ranks.numbers(k)
+            owned = ranks.owned(part)
+            numbers, is_own = owned.places, owned.nodes
             number = np.full(whole.node_count, NO_NODE, np.int32)
             number[numbers[is_own]] = np.flatnonzero(is_own)
             rest = whole.state.rest.numpy()[:, :3]
@@ -73,7 +75,7 @@ class WholeSurface(ContactSurface):
             of_nodes[: len(numbers)] = self.places[k].numpy()[numbers]
             self._solids.append((part, wp.array(of_nodes, dtype=wp.int32, device=self.device)))
         self._own, self._own_bearers = at_places.own(self.device), at_bearers.own(self.device)
-        ranks.take_whole_surface(at_places.moved, at_bearers.moved)
+        self._exchanges = [ranks.connect(np.arange(len(own)), own) for own in (at_places.moved, at_bearers.moved)]
 
 
 class _Held:
@@ -101,9 +103,9 @@ class _Held:
         self._rest[used] = rest[self._node[used]]
 
     @property
-    def moved(self) -> npt.NDArray[np.int32]:
-        """Those that this rank moves, int32."""
-        return np.flatnonzero(self._found >= 0).astype(np.int32)
+    def moved(self) -> npt.NDArray[np.bool_]:
+        """Which of them this rank moves, bool."""
+        return self._found >= 0
 
     def own(self, device: wp.Device) -> Surface:
         """The same arrays with only the nodes that this rank moves, by their numbers in its parts."""

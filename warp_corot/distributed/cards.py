@@ -17,7 +17,7 @@ from warp_corot.errors import InputError
 from warp_corot.kernels.distributed import exchange as kernels
 
 from . import mpi
-from .halo import Halo
+from .exchange import ExchangeLists
 
 
 @functools.cache
@@ -47,7 +47,7 @@ class CardExchange:
         kinds: The types of values that it exchanges.
     """
 
-    def __init__(self, halo: Halo, device: wp.Device, kinds: Sequence[Any] = kernels.EXCHANGED):
+    def __init__(self, halo: ExchangeLists, device: wp.Device, kinds: Sequence[Any] = kernels.EXCHANGED):
         self._nccl, self._device = nccl_of(device.alias), device
         self._sent, self._received = (_joined(lists, device) for lists in (halo.sent, halo.received))
         #: The stream on which it runs beside other launches, with a higher priority.
@@ -56,7 +56,7 @@ class CardExchange:
         self._rooms = {kind: self._room_for(kind) for kind in kinds}
 
     def launch(self, nodal: wp.array) -> None:
-        """Launch the exchange that gives ghosts their values, in a nodal array of float32, vec3 or vec4; may be
+        """Launch the exchange that gives ghosts their values, in a nodal array of one of the kinds; may be
         recorded."""
         import nccl.core as nccl
 
@@ -122,4 +122,6 @@ def _joined(lists: dict[int, Any], device: wp.Device) -> tuple[wp.array, list[tu
 
 
 def _floats(vectors: wp.array, start: int, end: int) -> wp.array:
-    return vectors[start:end].view(wp.float32).flatten()
+    part = vectors[start:end]
+    words = part.size * wp.types.type_size_in_bytes(part.dtype) // 4
+    return wp.array(ptr=part.ptr, dtype=wp.float32, shape=(words,), device=part.device)

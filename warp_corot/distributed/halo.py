@@ -1,118 +1,213 @@
-"""Lists of the nodes whose values are sent to each neighbour, and the exchange through the host's memory."""
+"""The halo of a run on several processes (``solvers.halo.Halo``)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import functools
+import time
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-Ints = npt.NDArray[np.int32]
-#: A buffer for each neighbour.
-Room = dict[int, npt.NDArray[Any]]
+from warp_corot.body.soft_body import SoftBody
+from warp_corot.discretization.awaited import Awaited
+from warp_corot.kernels.distributed import exchange as kernels
+from warp_corot.solvers.halo import Floats, Halo, Owned, V
+
+from .cards import CardExchange, add_up, take_most
+from .divided_mesh import DividedMesh
+from .exchange import ExchangeLists, HostExchange
+from .multigrid import MultigridOfParts, has_multigrid
+from .parts import Part
+from .reproducible_sums import reproducible_sums
+
+#: Number of times that a row of exchanges is timed.
+TIMED = 5
 
 
-@dataclass(frozen=True, eq=False)
-class Halo:
-    """The values that a part sends and receives, neighbour by neighbour in ascending order of ranks.
-
-    Attributes:
-        sent: Neighbours, and the nodes whose values each gets, as numbers within the part, int32.
-        received: Neighbours, and the ghosts whose values each sends.
-    """
-
-    sent: dict[int, Ints]
-    received: dict[int, Ints]
-
-    @classmethod
-    def of(cls, nodes: npt.NDArray[np.integer], owner: Ints, worlds: int, comm: Any) -> Halo:
-        """Make the lists; all ranks must call this.
-
-        Args:
-            nodes: The numbers of the part's nodes in the whole mesh, [n].
-            owner: The rank that moves each of them, int32 [n].
-            worlds: Number of copies of the body.
-            comm: The ranks.
-        """
-        wanted: list[npt.NDArray[np.integer]] = []
-        received = {}
-        for rank in range(comm.size):
-            ghosts = np.flatnonzero(owner == rank).astype(np.int32)
-            # Both sides use the order of the numbers in the whole mesh.
-            ghosts = ghosts[np.argsort(nodes[ghosts])] if rank != comm.rank else ghosts[:0]
-            wanted.append(nodes[ghosts])
-            if len(ghosts):
-                received[rank] = _in_worlds(ghosts, worlds, len(nodes))
-        place = np.argsort(nodes)
-        sent = {}
-        for rank, asked in enumerate(comm.alltoall(wanted)):
-            if len(asked):
-                own = place[np.searchsorted(nodes[place], asked)].astype(np.int32)
-                sent[rank] = _in_worlds(own, worlds, len(nodes))
-        return cls(sent, received)
-
-    @classmethod
-    def to_all(cls, own: Ints, comm: Any) -> Halo:
-        """The lists with which every rank gets all values of an array whose places all ranks number alike.
-
-        All ranks must call this.
-
-        Args:
-            own: The places of this rank's values, int32.
-            comm: The ranks.
-        """
-        everybody = comm.allgather(own)
-        received = {r: places for r, places in enumerate(everybody) if r != comm.rank and len(places)}
-        sent = {r: own for r in range(comm.size) if r != comm.rank and len(own)}
-        return cls(sent, received)
-
-    @property
-    def sent_bytes(self) -> int:
-        """Bytes that one exchange of nodal vectors sends."""
-        return 16 * sum(map(len, self.sent.values()))
-
-
-class HostExchange:
-    """The exchange of a part's nodal values through MPI, on the CPU.
+class CommHalo(Halo):
+    """The processes of an MPI communicator before they have parts.
 
     Args:
-        halo: The lists of nodes to send and to receive.
-        comm: The ranks.
-        tag: The tag of its messages.
+        comm: The communicator.
     """
 
-    def __init__(self, halo: Halo, comm: Any, tag: int):
-        self._halo, self._comm, self._tag = halo, comm, tag
-        self._rooms: dict[tuple[Any, ...], tuple[Room, Room]] = {}
+    is_alone = False
 
-    def launch(self, nodal: wp.array) -> None:
-        """Give ghosts their values, in a nodal array of any numbers or vectors."""
-        comm, halo = self._comm, self._halo
-        values = nodal.numpy()
-        out, received = self._room_for(values)
-        asked = [comm.Irecv(buffer, rank, self._tag) for rank, buffer in received.items()]
-        for rank, nodes in halo.sent.items():
-            np.take(values, nodes, axis=0, out=out[rank])
-            asked.append(comm.Isend(out[rank], rank, self._tag))
-        with comm.waiting("an exchange"):
-            for request in asked:
-                request.Wait()
-        for rank, nodes in halo.received.items():
-            values[nodes] = received[rank]
+    def __init__(self, comm: Any):
+        self.comm = comm
 
-    def _room_for(self, values: npt.NDArray[Any]) -> tuple[Room, Room]:
-        """The buffers for sent and received values."""
-        kind = (values.dtype, *values.shape[1:])
-        if kind not in self._rooms:
-            out, received = (
-                {rank: np.zeros((len(nodes), *values.shape[1:]), values.dtype) for rank, nodes in lists.items()}
-                for lists in (self._halo.sent, self._halo.received)
-            )
-            self._rooms[kind] = out, received
-        return self._rooms[kind]
+    def max(self, value: V) -> V:
+        if isinstance(value, wp.array):
+            if value.device.is_cuda:
+                take_most(value)
+            else:
+                own = value.numpy()
+                own[...] = np.max(self.comm.allgather(own), axis=0)
+            return value
+        everybody = self.comm.allgather(value)
+        return np.max(everybody, axis=0) if isinstance(value, np.ndarray) else max(everybody)
+
+    def sum(self, value: V, addends: npt.NDArray[np.float64] | None = None) -> V:
+        if isinstance(value, wp.array):
+            if value.device.is_cuda:
+                add_up(value.view(wp.float64).flatten())
+            else:
+                own = value.numpy()
+                own[...] = np.sum(self.comm.allgather(own), axis=0)
+            return value
+        if addends is None:
+            everybody = self.comm.allgather(value)
+            return np.sum(everybody, axis=0) if isinstance(value, np.ndarray) else sum(everybody)
+        total = reproducible_sums(addends.reshape(len(addends), -1), self.comm)
+        return total.reshape(value.shape) if isinstance(value, np.ndarray) else type(value)(total[0])
 
 
-def _in_worlds(nodes: Ints, worlds: int, count: int) -> Ints:
-    return (nodes + count * np.arange(worlds, dtype=np.int32)[:, None]).ravel()
+class OwnedPart(Owned):
+    """What of a body a rank moves and counts.
+
+    Args:
+        whole, part: The body, and this rank's part of it.
+        ranks: The halo.
+        k: The body's number.
+    """
+
+    def __init__(self, whole: SoftBody, part: Part, ranks: MpiHalo, k: int):
+        self.whole, self._part = whole, part
+        worlds, own = part.worlds, part.numbers
+        self.numbers, self.node_count = own.in_worlds(worlds), worlds * own.node_count
+        shift = whole.world_node_count * np.arange(worlds, dtype=np.int32)[:, None]
+        self.places, self.nodes = (own.places + shift).ravel(), part.is_own
+        self._elements = np.tile(own.counted, worlds)
+        self._ghosts, self._copies = (
+            wp.array(np.flatnonzero(~each).astype(np.int32), dtype=wp.int32, device=part.device)
+            for each in (self.nodes, self._elements)
+        )
+        self.has_multigrid = has_multigrid(whole, part)
+        self.multigrid = lambda options: MultigridOfParts(ranks, k, part, **options)
+        self._bulk = self._found_bulk(ranks)
+
+    def clear_ghosts(self, vectors: wp.array) -> None:
+        inputs = [self._ghosts]
+        wp.launch(kernels.clear_vectors, len(self._ghosts), inputs, [vectors], device=vectors.device)
+
+    def clear_copies(self, energies: wp.array) -> None:
+        inputs = [self._copies]
+        wp.launch(kernels.clear_energies, len(self._copies), inputs, [energies], device=energies.device)
+
+    @property
+    def counted(self) -> wp.array:
+        return wp.array(self._elements.astype(np.int32), dtype=wp.int32, device=self._part.device)
+
+    @property
+    def bounds(self) -> Floats:
+        mesh = self.whole.mesh
+        return mesh.bounds if isinstance(mesh, DividedMesh) else super().bounds
+
+    @property
+    def bulk(self) -> tuple[float, float]:
+        return self._bulk
+
+    def _found_bulk(self, ranks: MpiHalo) -> tuple[float, float]:
+        """See ``bulk``; all ranks must call."""
+        mesh, part = self.whole.mesh, self._part
+        if not isinstance(mesh, DividedMesh):
+            return super().bulk
+        own = part.numbers.counted
+        moduli = (2.0 * part.discretization.mu.numpy() + part.discretization.lam.numpy()).astype(np.float64)
+        if part.discretization.material_stride:
+            moduli = moduli.reshape(part.worlds, -1)[:, own]
+        here = np.array([float(moduli.sum()), moduli.size, float(np.sum(mesh.volumes[own]))])
+        stiffness, count, volume = ranks.sum(here)
+        return float(stiffness / count), float(volume)
+
+
+class MpiHalo(CommHalo):
+    """All processes of an MPI communicator, each with its part of every body.
+
+    Args:
+        comm: The communicator.
+        wholes: The bodies.
+        parts: This rank's part of each.
+        reproducible: Whether sums are the same bit for bit for any number of ranks.
+        records: Whether steps are recorded on cards.
+    """
+
+    def __init__(
+        self, comm: Any, wholes: Sequence[SoftBody], parts: Sequence[Part], *, reproducible: bool, records: bool
+    ):
+        super().__init__(comm)
+        self.is_reproducible, self._records, self._parts = reproducible, records, parts
+        self.device = parts[0].device
+        self.lists = [ExchangeLists.of(p.numbers.nodes, p.numbers.owner, p.worlds, comm) for p in parts]
+        self._exchanges = [self.exchange_of(lists, k) for k, lists in enumerate(self.lists)]
+        self._connected = len(parts)
+        for part, exchange in zip(parts, self._exchanges, strict=True):
+            if isinstance(exchange, CardExchange) and comm.size > 1:
+                part.discretization.awaited = Awaited(~part.is_own, exchange.later)
+        self._copies = [wp.zeros_like(part.state.displacements) for part in parts]
+        bound = enumerate(zip(wholes, parts, strict=True))
+        self._owned: dict[SoftBody, OwnedPart] = {part: OwnedPart(whole, part, self, k) for k, (whole, part) in bound}
+
+    def exchange_of(
+        self, lists: ExchangeLists, tag: int, kinds: Sequence[Any] = kernels.EXCHANGED
+    ) -> HostExchange | CardExchange:
+        """The exchange for some lists of places on this rank's device, of values of these types."""
+        return CardExchange(lists, self.device, kinds) if self.device.is_cuda else HostExchange(lists, self.comm, tag)
+
+    def owned(self, body: SoftBody) -> Owned:
+        return self._owned[body]
+
+    def exchange(self, k: int, vectors: wp.array, *, copies: bool = False, overlaps: bool = False) -> wp.array:
+        if copies:
+            wp.copy(self._copies[k], vectors)
+            vectors = self._copies[k]
+        exchange, awaited = self._exchanges[k], self._parts[k].discretization.awaited
+        if overlaps and isinstance(exchange, CardExchange) and awaited is not None and awaited.is_used:
+            exchange.begin(vectors)
+        else:
+            exchange.launch(vectors)
+        return vectors
+
+    def wait(self) -> None:
+        for exchange in self._exchanges:
+            if isinstance(exchange, CardExchange):
+                exchange.end()
+
+    def connect(self, numbers: npt.NDArray[np.integer], own: npt.NDArray[np.bool_]) -> Callable[[wp.array], None]:
+        everybody = self.comm.allgather(numbers[own])
+        given = np.concatenate(everybody)
+        order = np.argsort(given, kind="stable")
+        giver = np.repeat(np.arange(self.comm.size), [len(each) for each in everybody])[order]
+        owner = np.full(len(numbers), self.comm.rank, np.int32)
+        taken = np.flatnonzero(~own & np.isin(numbers, given))
+        owner[taken] = giver[np.searchsorted(given[order], numbers[taken])]
+        self._connected += 1
+        return self.exchange_of(ExchangeLists.of(numbers, owner, 1, self.comm), self._connected).launch
+
+    def exchange_seconds(self, vectors: Sequence[wp.array], count: int) -> float:
+        """The mean time of an exchange of a nodal array of each body, over ``count`` of them in a row [s]; on cards
+        they are recorded."""
+
+        def exchange() -> None:
+            for _ in range(count):
+                for k, each in enumerate(vectors):
+                    self.exchange(k, each)
+
+        made = exchange
+        if self.device.is_cuda and self._records:
+            exchange()
+            with wp.ScopedCapture(device=self.device) as capture:
+                exchange()
+            made = functools.partial(wp.capture_launch, capture.graph)
+        times = []
+        for _ in range(TIMED):
+            wp.synchronize_device(self.device)
+            self.comm.Barrier()
+            began = time.perf_counter()
+            made()
+            wp.synchronize_device(self.device)
+            times.append(time.perf_counter() - began)
+        return sorted(times)[TIMED // 2] / count

@@ -26,13 +26,13 @@ from warp_corot.solvers.implicit.multigrid.multigrid import MOST_DENSE
 from warp_corot.solvers.implicit.operator import LinearOperator
 
 from .divided_mesh import DividedMesh
-from .halo import Halo
+from .exchange import ExchangeLists
 from .partition import sharing_groups
 from .parts import Part
 from .places import Places
 
 if TYPE_CHECKING:
-    from .ranks import MpiRanks
+    from .halo import MpiHalo
 
 Ints = npt.NDArray[np.int32]
 Complete = Callable[[wp.array], None]
@@ -149,7 +149,7 @@ class MultigridOfParts(Multigrid):
 
     def __init__(
         self,
-        ranks: MpiRanks,
+        ranks: MpiHalo,
         k: int,
         part: Part,
         *,
@@ -160,17 +160,17 @@ class MultigridOfParts(Multigrid):
         self._ranks, self._k, self._part = ranks, k, part
         self._options = options | {"degree": degree, "sweeps": 0, "members": members}
         everywhere = None if members is None else self._members_everywhere
-        super().__init__(ranks.whole(part), degree=degree, members=everywhere, **options)
+        super().__init__(ranks.owned(part).whole, degree=degree, members=everywhere, **options)
 
     def update_finest(self, operator: LinearOperator) -> None:
         ranks, k = self._ranks, self._k
         wp.copy(self._inverse_mass, operator.inverse_mass)
-        ranks.complete(k, self._inverse_mass)
+        ranks.exchange(k, self._inverse_mass)
         self._own_nodes.to_whole(self._inverse_mass, self._everywhere_mass)
         self._everywhere(self._everywhere_mass)
         inputs = [self.count, self.count, self._numbers, self._everywhere_mass]
         self.levels[0].launch(values.find_free, self.count, inputs, [self._free])
-        u = ranks.completed(k, operator.displacements)
+        u = ranks.exchange(k, operator.displacements, copies=True)
         self._here.update_finest(Seen(operator, self._inverse_mass, u))  # type: ignore[arg-type]
         self._finest.gather_blocks()
 
@@ -179,7 +179,7 @@ class MultigridOfParts(Multigrid):
 
     def hand_out(self, r: wp.array, z: wp.array) -> None:
         self._here.hand_out(r, z)
-        self._ranks.clear_ghosts(self._k, z)
+        self._ranks.owned(self._part).clear_ghosts(z)
 
     # --- pieces ------------------------------------------------------------------------------------------------------
 
@@ -191,7 +191,7 @@ class MultigridOfParts(Multigrid):
 
     def _members_everywhere(self, below: int) -> Members:
         """The groups of the whole mesh's elements that share their dilatation."""
-        whole, own = self._ranks.whole(self._part), self._options["members"]
+        whole, own = self._ranks.owned(self._part).whole, self._options["members"]
         numbers = sharing_groups(whole.mesh, True)
         order = np.argsort(numbers, kind="stable")
         sizes = np.unique(numbers, return_counts=True)[1]
@@ -208,7 +208,7 @@ class MultigridOfParts(Multigrid):
         rank[self._nodes.numpy()] = np.arange(self.count, dtype=np.int32)
         order = np.argsort(rank[part.numbers.nodes]).astype(np.int32)
         everywhere, owner = rank[part.numbers.nodes[order]], part.numbers.owner[order]
-        halo = Halo.of(everywhere, owner, part.worlds, ranks.comm)
+        halo = ExchangeLists.of(everywhere, owner, part.worlds, ranks.comm)
         self._here = FinestPart(part, order, ranks.exchange_of(halo, tag).launch, **self._options)
         own = np.flatnonzero(owner == ranks.comm.rank).astype(np.int32)
         self._connect(everywhere, own)
@@ -258,10 +258,10 @@ class MultigridOfParts(Multigrid):
         Args:
             own: The places of this rank's values in one world.
             length: The number of values of a world.
-            options: As for ``MpiRanks.exchange_of``.
+            options: As for ``MpiHalo.exchange_of``.
         """
         ranks = self._ranks
-        halo = Halo.to_all(_in_worlds(own, self._part.worlds, length), ranks.comm)
+        halo = ExchangeLists.to_all(_in_worlds(own, self._part.worlds, length), ranks.comm)
         return ranks.exchange_of(halo, TAGS + self._k, **options).launch
 
 

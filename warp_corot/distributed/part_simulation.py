@@ -26,13 +26,13 @@ from warp_corot.mesh.uniform_part import SUBTREE_DEPTH
 from warp_corot.remesh.remeshing import Remeshing
 from warp_corot.simulation import simulation as on_one
 from warp_corot.simulation.energy import WorldEnergies
-from warp_corot.solvers.ranks import Ranks
+from warp_corot.solvers.halo import Halo
 
 from . import mpi
 from .divided_mesh import DividedForest, DividedMesh, DividedTetMesh
+from .halo import MpiHalo
 from .partition import Partition
 from .parts import Part
-from .ranks import MpiRanks
 
 #: The attributes of a simulation that belong to its parts.
 CHANGED = (
@@ -48,8 +48,9 @@ TRIED_STEPS = 10
 class PartSimulation(on_one.Simulation):
     """A rank's own simulation of parts, which exchanges data with other ranks."""
 
-    def __init__(self, ranks: MpiRanks, parts: Sequence[Part], **options: Any):
-        self.ranks: MpiRanks = ranks
+    def __init__(self, ranks: MpiHalo, parts: Sequence[Part], **options: Any):
+        self.ranks: MpiHalo = ranks
+        self.is_root = ranks.comm.rank == 0
         super().__init__(parts, **options)
 
     def take_remeshing(self, remeshing: Remeshing, after: Callable[[], None]) -> None:
@@ -107,11 +108,11 @@ class PartSimulation(on_one.Simulation):
         """This rank's share of the energies."""
         found = super().world_energies()
         elastic = np.zeros(self.worlds)
-        for k, (part, field) in enumerate(zip(self.bodies, self.fields, strict=True)):
+        for part, field in zip(self.bodies, self.fields, strict=True):
             energies = wp.zeros(field.energy_count, dtype=wp.float64, device=self.device)
             with field.state_kept():
                 field.write_energies(part.state.displacements, energies)
-            self.ranks.leave_own(k, energies)
+            self.ranks.owned(part).clear_copies(energies)
             elastic += energies.numpy().reshape(self.worlds, -1).sum(axis=1)
         return found._replace(elastic=elastic)
 
@@ -159,7 +160,7 @@ def part_of(body: SoftBody, model: Model, comm: Any, costs: npt.ArrayLike | None
 class _Tried(on_one.Simulation):
     """A simulation of one rank's parts that exchanges nothing."""
 
-    ranks = Ranks()
+    ranks = Halo()
 
 
 def compile_once(comm: Any, parts: Sequence[Part], **options: Any) -> None:

@@ -33,11 +33,11 @@ from warp_corot.solvers import Integrator, SymplecticEuler
 
 from . import checkpoint, mpi, parallel_checkpoint
 from .gathering import forget, register
+from .halo import CommHalo, MpiHalo
 from .part_simulation import PartSimulation, compile_once, of_their_own, part_of, settled_model
 from .part_sync import PartSync
 from .parts import Part
 from .passes import Passes
-from .ranks import MpiRanks, Together
 from .unsupported import check_supported
 
 
@@ -82,7 +82,7 @@ class Simulation:
     ):
         self._comm = self.comm = comm = mpi.world()
         self.rank, self.size = comm.rank, comm.size
-        self.bodies = checked_bodies(bodies, Together(comm))
+        self.bodies = checked_bodies(bodies, CommHalo(comm))
         models = checked_models(Corotated() if model is None else model, len(self.bodies))
         integrator = checked_integrator(SymplecticEuler() if integrator is None else integrator)
         here = None if device is None else checked_device(device)
@@ -119,7 +119,7 @@ class Simulation:
         for each in self._following:
             each.take_over()
         settled, records = bool(self._options["deterministic"]), not self._options["integrator"].is_implicit
-        ranks = MpiRanks(self._comm, self.bodies, parts, settled=settled, records=records)
+        ranks = MpiHalo(self._comm, self.bodies, parts, reproducible=settled, records=records)
         return PartSimulation(ranks, parts, **self._options)
 
     def _remesh(self) -> None:
@@ -280,7 +280,7 @@ class Simulation:
     @property
     def sent_bytes(self) -> int:
         """The bytes that this rank sends in one exchange."""
-        return sum(each.sent_bytes for each in self._parts.ranks.halos)
+        return sum(each.sent_bytes for each in self._parts.ranks.lists)
 
     def exchange_seconds(self, count: int) -> float:
         """The mean time of one exchange alone, over ``count`` of them in a row [s]; all ranks must call this."""
@@ -325,7 +325,7 @@ class Simulation:
 
         It is valid until the next call. All ranks must call this.
         """
-        return self._parts.ranks.completed(k, getattr(self._following[k].part.state, name))
+        return self._parts.ranks.exchange(k, getattr(self._following[k].part.state, name), copies=True)
 
     @property
     def following(self) -> list[PartSync]:
@@ -429,7 +429,7 @@ class Simulation:
     def _take_over(self) -> None:
         for k, each in enumerate(self._following):
             each.take_over()
-            self._parts.ranks.complete(k, each.part.state.displacements)
+            self._parts.ranks.exchange(k, each.part.state.displacements)
             each.part.state.publish_positions()
 
     def _publish(self) -> None:

@@ -24,6 +24,27 @@ def uniform_numbers(numbers: npt.NDArray[np.integer], stream: int) -> npt.NDArra
     return ((state >> np.uint64(11)).astype(np.float64) + 1.0) * 2.0**-53
 
 
+def normal_numbers(numbers: npt.NDArray[np.int64], seed: int) -> npt.NDArray[np.float64]:
+    """Three normally distributed random numbers for each node, by Box and Muller's transform, float64 [n, 3].
+
+    Args:
+        numbers: Numbers of the nodes, int64 [n].
+        seed: The seed of the numbers.
+    """
+    found = np.empty((len(numbers), 3))
+    for axis in range(3):
+        first, second = (uniform_numbers(numbers, seed * 6 + 2 * axis + half) for half in range(2))
+        found[:, axis] = np.sqrt(-2.0 * np.log(first)) * np.cos(2.0 * np.pi * second)
+    return found
+
+
+def padded(vectors: npt.NDArray[np.float64], count: int) -> npt.NDArray[np.float32]:
+    """Vectors [n, 3] in the first of ``count`` rows of vec4, which are zero elsewhere, float32 [count, 4]."""
+    found = np.zeros((count, 4), np.float32)
+    found[: len(vectors), :3] = vectors
+    return found
+
+
 def weights_within(lattice: npt.NDArray[np.integer], count: int) -> npt.NDArray[np.float64]:
     """Barycentric coordinates of points that are evenly distributed over the eighths of tetrahedra, float64 [n, count,
     4].

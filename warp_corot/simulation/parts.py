@@ -19,11 +19,11 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, checked_things, shown
 from warp_corot.inputs.indices import checked_indices
 from warp_corot.solvers import Integrator, QuasiStatic, Stepper
-from warp_corot.solvers.ranks import ALONE, Ranks
+from warp_corot.solvers.halo import ALONE, Halo
 from warp_corot.solvers.system import System
 
 
-def checked_bodies(given: SoftBody | Sequence[SoftBody], ranks: Ranks = ALONE) -> tuple[SoftBody, ...]:
+def checked_bodies(given: SoftBody | Sequence[SoftBody], ranks: Halo = ALONE) -> tuple[SoftBody, ...]:
     """One or several bodies that can be stepped together.
 
     Raises:
@@ -43,7 +43,7 @@ def checked_bodies(given: SoftBody | Sequence[SoftBody], ranks: Ranks = ALONE) -
             raise InputError(f"bodies have {first.worlds} and {body.worlds} worlds; all must have the same number")
         if body.device != first.device:
             raise InputError(f"bodies are on {first.device} and {body.device}; they must be on one device")
-        if not ranks.most(float(body.conditions.inverse_mass.numpy().max(initial=0.0))) > 0.0:
+        if not ranks.max(float(body.conditions.inverse_mass.numpy().max(initial=0.0))) > 0.0:
             raise InputError(f"all {body.node_count} nodes of the body are held; at least one must be free to move")
     return bodies
 

@@ -122,7 +122,7 @@ class Running:
 
     def _bar(self, total: float, unit: str) -> AbstractContextManager[Callable[[float], None]]:
         """A bar for long waits; none where hooks may print lines of their own."""
-        silent = self._sim.hooks.intervals or not self._sim.ranks.speaks
+        silent = self._sim.hooks.intervals or not self._sim.is_root
         return nullcontext(lambda _: None) if silent else bar_of(total, unit)
 
     def look(self) -> None:
@@ -355,7 +355,7 @@ class Running:
                 constraint.grow()
             except UnstableError as error:
                 said = str(error)
-        if not self._sim.ranks.most(float(bool(said))):
+        if not self._sim.ranks.max(float(bool(said))):
             return None
         return Fault(said or "surfaces of another rank go too far in one step", np.arange(self._sim.worlds))
 

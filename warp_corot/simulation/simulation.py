@@ -30,7 +30,7 @@ from warp_corot.remesh.online import OnlineRemesh
 from warp_corot.remesh.remeshing import Remeshing
 from warp_corot.solvers import Integrator, SymplecticEuler, largest_frequency
 from warp_corot.solvers.guarding.guard import Guard
-from warp_corot.solvers.ranks import ALONE, Ranks
+from warp_corot.solvers.halo import ALONE, Halo
 from warp_corot.solvers.recorded import RecordedSteps, Segment
 from warp_corot.solvers.steps.pace import Pace
 from warp_corot.solvers.steps.safe_step import ANY_STEP, SafeStep
@@ -91,7 +91,9 @@ class Simulation(Clock):
         CapacityWarning: A mesh has no room left for refinement; once.
     """
 
-    ranks: Ranks = ALONE
+    ranks: Halo = ALONE
+    #: Whether this process prints and writes.
+    is_root = True
 
     def __init__(
         self,

@@ -20,6 +20,7 @@ from warp_corot.solvers.steps.safe_step import (
     SafeStep,
 )
 
+from .graph_priorities import keep_priorities
 from .integrator import Stepper
 from .subnormals import FlushedSubnormals
 from .system import System
@@ -188,7 +189,9 @@ class RecordedSteps:
         self._rewritten = self._system.rewritten
 
     def _replay_recording(self, segment: Segment) -> None:
-        if not self._system.ranks.can_record:
+        apart = not self._system.ranks.is_alone
+        # On several ranks, the number of iterations of implicit steps is not known.
+        if apart and (self._pace.device.is_cpu or self._system.is_implicit):
             self.launch(segment)
             self._pace.forget()
             return
@@ -197,7 +200,8 @@ class RecordedSteps:
                 self._graphs.clear()
             with wp.ScopedCapture(device=self._pace.device) as capture:
                 self.launch(segment)
-            self._system.ranks.take_graph(capture.graph)
+            if apart:
+                keep_priorities(capture.graph)
             self._graphs[segment] = capture.graph
         wp.capture_launch(self._graphs[segment])
         self._pace.forget()

@@ -13,7 +13,7 @@ from warp_corot.elasticity import ForceField
 from warp_corot.solvers.steps.pace import Pace
 
 from .forces_work import ForcesWork
-from .ranks import ALONE, Ranks
+from .halo import ALONE, Halo
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
@@ -130,7 +130,7 @@ class System:
         fields: Sequence[ForceField],
         pace: Pace,
         gravity: Sequence[float],
-        ranks: Ranks = ALONE,
+        ranks: Halo = ALONE,
     ):
         self.ranks = ranks
         self.bodies, self.fields, self.pace, self.gravity = tuple(bodies), tuple(fields), pace, wp.vec3(*gravity)

@@ -79,7 +79,8 @@ class SymplecticEulerStepper(Stepper):
         if viscosity:
             bound = enumerate(zip(system.bodies, system.fields, strict=True))
             system.forces += [
-                Viscosity(body, field, viscosity, partial(system.ranks.completed, k)) for k, (body, field) in bound
+                Viscosity(body, field, viscosity, partial(system.ranks.exchange, k, copies=True))
+                for k, (body, field) in bound
             ]
         self._many = [_steps_in_one_launch(system, k) for k in range(len(system.bodies))]
 
@@ -119,14 +120,14 @@ class SymplecticEulerStepper(Stepper):
             if offset > 0 or not forces_known:
                 for k in one_by_one:
                     self.system.add_elastic_forces(k, offset)
-                self.system.ranks.end_completion()
+                self.system.ranks.wait()
             self.system.add_other_forces(offset, self.damping, one_by_one)
             for k in one_by_one:
                 body = self.system.bodies[k]
                 self._move(body, offset)
-                self.system.ranks.begin_completion(k, body.state.displacements)
+                self.system.ranks.exchange(k, body.state.displacements, overlaps=True)
                 self.system.fields[k].complete_step(body.state.displacements, self.system.pace.arrays)
-        self.system.ranks.end_completion()
+        self.system.ranks.wait()
 
     def _move(self, body: SoftBody, offset: int) -> None:
         """Launch the motion of the ``offset``-th step since the clock was last advanced."""

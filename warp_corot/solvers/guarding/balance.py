@@ -91,12 +91,12 @@ class Balance:
         warps = 1 if self.device.is_cpu else max(min(wanted, WARPS // self.worlds), 1)
         self._threads = warps * self._lanes
         self._ranks = system.ranks
-        if self._ranks.is_settled:
+        if self._ranks.is_reproducible:
             # Every node and every element is an addend, because their sums are the same in any order.
             self._lanes, warps = 1, max(max(b.sizes.launch_nodes, b.sizes.launch_elements) for b in self.bodies)
             warps = self._threads = max(warps // self.worlds, 1)
         self._sums = wp.zeros((self.worlds, warps, kernels.COLUMNS), dtype=wp.float64, device=self.device)
-        self._addends = wp.zeros_like(self._sums) if self._ranks.is_settled else None
+        self._addends = wp.zeros_like(self._sums) if self._ranks.is_reproducible else None
         self._energies: list[wp.array] = [wp.empty(0, dtype=wp.float64, device=self.device) for _ in self.bodies]
         self._field_states: list[dict[str, wp.array]] = [{} for _ in self.bodies]
         self._mapped = Mapped(self.worlds * kernels.COLUMNS + kernels.NUMBERS, self.device)
@@ -168,7 +168,9 @@ class Balance:
         total = self._mapped.values[: self.worlds * kernels.COLUMNS].reshape(self.worlds, kernels.COLUMNS).copy()
         self.system.pace.saw(numbers)
         ranks = self._ranks
-        total = ranks.totals(total, None if self._addends is None else self._addends.numpy())
+        reach = ranks.max(total[:, int(kernels.REACH)])
+        total = ranks.sum(total, None if self._addends is None else np.moveaxis(self._addends.numpy(), 1, 0))
+        total[:, int(kernels.REACH)] = reach
         kinetic, ahead, elastic = (total[:, int(c)] for c in (kernels.KINETIC, kernels.AHEAD, kernels.ELASTIC))
         worked, worked_absolute = total[:, int(kernels.WORKED)], total[:, int(kernels.WORKED_ABSOLUTE)]
         done = numbers[int(kernels.WORK)] + total[:, int(kernels.SUPPORTS)].sum() + worked
@@ -185,7 +187,7 @@ class Balance:
             worked_absolute=worked_absolute,
             reach=total[:, int(kernels.REACH)],
         )
-        bad_step = ranks.least(min(int(numbers[int(kernels.BAD_STEP)]), NEVER))
+        bad_step = -ranks.max(-min(int(numbers[int(kernels.BAD_STEP)]), NEVER))
         return Report(
             energies=energies,
             has_changed=bool(numbers[int(kernels.CHANGED)]),
@@ -195,7 +197,7 @@ class Balance:
     def rounding(self) -> Floats:
         """Energies that float32 cannot distinguish from zero, for each world [J]: those of strains of about 4e-4."""
         found = np.zeros(self.worlds)
-        for stiffness, volume in map(self._ranks.bulk, self.bodies):
+        for stiffness, volume in (self._ranks.owned(body).bulk for body in self.bodies):
             found += 1e-7 * stiffness * volume
         return found
 
@@ -206,7 +208,7 @@ class Balance:
         for name, array in field.state.items():
             wp.copy(kept[name], array)
         field.write_energies(u, energies)
-        self._ranks.leave_own(k, energies)
+        self._ranks.owned(body).clear_copies(energies)
         field.add_forces(u, body.state.forces)
         for name, array in field.state.items():
             wp.copy(array, kept[name])

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import warp as wp
 
+from warp_corot.kernels.distributed.exchange import forget_length
 from warp_corot.kernels.stepping import balance as kernels
+from warp_corot.kernels.stepping import pace as clock
 from warp_corot.solvers.system import System
 
 
@@ -94,7 +96,10 @@ class Copies:
             kernel = kernels.TAKE_OVER[body.state.positions.dtype]
             wp.launch(kernel, body.sizes.launch_nodes, inputs, outputs, device=self.device)
         self._launch_words(beside=False)
-        self._system.ranks.agree_on_changes(self.changed, self._pace.arrays)
+        if not self._system.ranks.is_alone:
+            self._system.ranks.max(self.changed)
+            before = self._pace.arrays.seconds[int(clock.BEFORE) : int(clock.BEFORE) + 1]
+            wp.launch(forget_length, 1, [self.changed], [before], device=self.device)
 
     def launch_keep(self) -> None:
         """Launch the copies of the fields' state at the end of a run; nodes are copied as their energies are summed."""

@@ -77,7 +77,7 @@ class Guard:
     def __init__(self, system: System):
         self.system, self.bodies, self.worlds = system, system.bodies, system.worlds
         self._ranks = system.ranks
-        bounds = map(self._ranks.bounds, system.bodies)
+        bounds = (self._ranks.owned(body).bounds for body in system.bodies)
         self._size = max(float((high - low).max()) for low, high in bounds)
         self._copies = Copies(system)
         self._balance = Balance(system, self._copies)
@@ -173,7 +173,7 @@ class Guard:
         report = self._balance.wait()
         self.was_given = report.has_changed
         full = any(each.is_full for each in self.system.constraints)
-        if self.system.constraints and self._ranks.most(float(full)):
+        if self.system.constraints and self._ranks.max(float(full)):
             return Fault("more contacts than there is room for", np.arange(self.worlds), is_want_of_room=True)
         if report.has_changed:
             self._begin_before()
@@ -213,7 +213,7 @@ class Guard:
 
     def not_finite(self) -> Fault | None:
         """Whether the state is not finite: the cheapest check."""
-        return self._not_finite(self._ranks.least(int(self.system.bad_step.numpy()[0])))
+        return self._not_finite(-self._ranks.max(-int(self.system.bad_step.numpy()[0])))
 
     def beyond_reach(self) -> Fault | None:
         """Whether nodes are beyond reach: the only check of a state that users may write to."""
@@ -314,7 +314,7 @@ class Guard:
         for body in self.bodies:
             sizes = np.abs(body.state.displacements.numpy().astype(np.float64)).sum(axis=1)
             bad |= ~(sizes.reshape(self.worlds, -1) <= 3e38).all(axis=1)
-        return np.flatnonzero(self._ranks.anywhere(bad))
+        return np.flatnonzero(self._ranks.max(bad))
 
     def _beyond_reach(self, found: Energies) -> Fault | None:
         bad = np.flatnonzero(~(found.reach <= REACH * self._size))

@@ -15,7 +15,7 @@ from warp_corot.kernels.implicit import conjugate_gradients
 from warp_corot.kernels.implicit import newton as kernels_of_newton
 from warp_corot.kernels.implicit import steps as kernels
 from warp_corot.kernels.stepping.integrate import follow_trajectory
-from warp_corot.solvers.ranks import ALONE
+from warp_corot.solvers.halo import ALONE
 
 from .assembled import AssembledSolve, suits
 from .chosen import ChosenSolve
@@ -239,7 +239,7 @@ class BodySteps:
         if self.held is not None:
             # Velocities jump when nodes meet obstacles, so schemes of second order begin again.
             self.held.launch_meetings(self.met, self._begins)
-        self.system.ranks.take_most(self._begins)
+        self.system.ranks.max(self._begins)
 
     def launch_residual(self) -> None:
         """Launch the forces that are out of balance, if the step is solved for by itself."""
@@ -289,7 +289,7 @@ class BodySteps:
         if self.lagged is not None:
             self.lagged.judge(iterations, status)
         self._launch(kernels.take_step, [newton.step], [newton.increment, self.body.state.displacements])
-        self.system.ranks.complete(self.k, self.body.state.displacements)
+        self.system.ranks.exchange(self.k, self.body.state.displacements)
         self._counts, self._good = [self._one, iterations, status], int(conjugate_gradients.CONVERGED)
 
     def launch_end(self, offset: int, *, is_last: bool) -> None:
@@ -337,7 +337,7 @@ class BodySteps:
         outputs = [state.displacements, self.before, newton.base, newton.increment, newton.pull]
         outputs += [newton.step, self._drift]
         self._launch(kernels.begin_step, inputs, outputs)
-        system.ranks.complete(self.k, state.displacements)
+        system.ranks.exchange(self.k, state.displacements)
 
     def _add_others(self) -> None:
         """Launch forces other than elastic ones at the stage."""
@@ -345,7 +345,7 @@ class BodySteps:
         if self.viscosity is not None:
             inputs = [self.operator.scales, self.newton.increment, self._drift]
             self._launch(kernels.find_rates, inputs, [self._rates])
-            self.system.ranks.complete(self.k, self._rates)
+            self.system.ranks.exchange(self.k, self._rates)
             state, turned, frame = self.body.state, self.newton.turned, self.operator.frame
             there = state.displacements if turned is None else turned.displacements
             if frame is not None:
@@ -363,7 +363,7 @@ class BodySteps:
         outputs = [state.velocities, *self._h, state.displacements, *self._left, system.bad_step, self._moves]
         self._moves.zero_()
         self._launch(kernels.end_step, inputs, outputs)
-        system.ranks.complete(self.k, state.displacements)
+        system.ranks.exchange(self.k, state.displacements)
         self.field.complete_step(state.displacements, system.pace.arrays)
         if system.counted:
             self.shared.add_counted_forces()

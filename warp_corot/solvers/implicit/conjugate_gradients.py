@@ -10,7 +10,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.kernels.implicit import conjugate_gradients as kernels
-from warp_corot.solvers.ranks import ALONE, Ranks
+from warp_corot.solvers.halo import ALONE, Halo
 
 from .operator import LinearOperator, Preconditioner
 from .sums import WorldSums
@@ -70,7 +70,7 @@ class ConjugateGradients:
         status: How the last solve ended, see there, int32 [worlds] on the device.
     """
 
-    def __init__(self, operator: LinearOperator, length: int, *, most: int = 1000, ranks: Ranks = ALONE):
+    def __init__(self, operator: LinearOperator, length: int, *, most: int = 1000, ranks: Halo = ALONE):
         self.operator, self.device, self.worlds, self.most = operator, operator.device, operator.worlds, most
         self._count = operator.node_count
         self._r, self._z, self._p, self._q = (wp.zeros(length, dtype=wp.vec4, device=self.device) for _ in range(4))

@@ -7,7 +7,7 @@ from typing import Protocol
 import warp as wp
 
 from warp_corot.kernels.implicit import lagged as kernels
-from warp_corot.solvers.ranks import ALONE, Ranks
+from warp_corot.solvers.halo import ALONE, Halo
 
 from .operator import LinearOperator, Preconditioner, Springs
 
@@ -52,7 +52,7 @@ class Lagged:
         state: Arrays by name to be kept with the state of the body, so that a resumed run is the same.
     """
 
-    def __init__(self, preconditioner: CostlySetUp, operator: LinearOperator, ranks: Ranks = ALONE):
+    def __init__(self, preconditioner: CostlySetUp, operator: LinearOperator, ranks: Halo = ALONE):
         self._ranks = ranks
         self.preconditioner, self._operator, self.device = preconditioner, operator, operator.device
         self._counts = wp.zeros(kernels.COUNTS, dtype=wp.int32, device=self.device)
@@ -85,7 +85,7 @@ class Lagged:
             [operator.inverse_mass, self._held, self._due],
             device=self.device,
         )
-        self._ranks.take_most(self._due)
+        self._ranks.max(self._due)
         wp.capture_if(self._due, self._set_up)
 
     def follow_springs(self, springs: Springs) -> None:

@@ -7,9 +7,9 @@ from typing import Protocol
 import warp as wp
 
 from warp_corot.kernels.implicit import line_search as kernels
-from warp_corot.solvers.ranks import ALONE, Ranks
+from warp_corot.solvers.halo import ALONE, Halo
 
-from .sums import WorldSums
+from .sums import WorldSums, take_in
 
 
 class Contacts(Protocol):
@@ -46,7 +46,7 @@ class LineSearch:
         device: The device.
     """
 
-    _ranks: Ranks = ALONE
+    _ranks: Halo = ALONE
 
     def __init__(self, worlds: int, count: int, contacts: Contacts, device: wp.Device):
         self._worlds, self._count, self._contacts, self.device = worlds, count, contacts, device
@@ -92,7 +92,7 @@ class SharedLineSearch(LineSearch):
         ranks: The ranks with the other entries of each world.
     """
 
-    def __init__(self, worlds: int, count: int, contacts: ContactsApart, device: wp.Device, ranks: Ranks):
+    def __init__(self, worlds: int, count: int, contacts: ContactsApart, device: wp.Device, ranks: Halo):
         self._ranks, self._apart = ranks, contacts
         super().__init__(worlds, count, contacts, device)
         # The sums of worlds are in the first places.
@@ -102,4 +102,4 @@ class SharedLineSearch(LineSearch):
     def _add_slopes(self, d: wp.array, change: wp.array) -> None:
         self._addends.zero_()
         self._apart.add_slopes(d, change, self._search, self._addends.flatten(), apart=True)
-        self._ranks.take_in_parts(self._addends, [0], most=False)
+        take_in(self._addends, [0], self._ranks)

@@ -155,7 +155,7 @@ class Newton:
             self.field.add_forces(body.state.displacements, self.forces)
         else:
             self.turned.launch_forces(self.forces)
-        self.ranks.clear_ghosts(self.operator.number, self.forces)
+        self.ranks.owned(self.body).clear_ghosts(self.forces)
         if self._others is not None:
             self._others()
         inputs: list[Any] = [self.gravity, conditions.mass, conditions.inverse_mass, int(conditions.has_loads)]
@@ -185,7 +185,7 @@ class Newton:
     def _launch_energies(self) -> None:
         self._energies.zero_()
         self.field.write_potentials(self.body.state.displacements, self._energies)
-        self.ranks.leave_own(self.operator.number, self._energies)
+        self.ranks.owned(self.body).clear_copies(self._energies)
         sums = self._sums
         inputs = [self._energies, len(self._energies) // self.worlds, *sums.sizes[1:]]
         wp.launch(kernels.sum_energies, sums.shape, inputs, [sums.parts], device=self.device)
@@ -195,7 +195,7 @@ class Newton:
         inputs = [self._scalars, self.base, self.step, self._count, int(commits)]
         outputs = [self.increment, self.body.state.displacements]
         wp.launch(kernels.try_step, self.worlds * self._count, inputs, outputs, device=self.device)
-        self.ranks.complete(self.operator.number, self.body.state.displacements)
+        self.ranks.exchange(self.operator.number, self.body.state.displacements)
 
     def move_held(self, *, to_end: bool) -> None:
         """Launch the motion of held nodes from the stage to the end of the step, or back, if these are not the same."""

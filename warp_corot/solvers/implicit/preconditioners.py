@@ -49,9 +49,8 @@ def _multigrid(operator: TangentOperator, short_cycles: bool, few_digits: bool) 
         options = SWEPT
     is_turned = not operator.field.is_linear
     over_ranks = {"degree": SHORT_DEGREE if is_short else DEGREE, "is_turned": is_turned, **options}
-    found = operator.ranks.multigrid(operator.number, over_ranks | {"stiffening": stiffening, "members": members})
-    if found is not None:
-        return found
+    if (make := operator.ranks.owned(operator.body).multigrid) is not None:
+        return make(over_ranks | {"stiffening": stiffening, "members": members})
     if operator.device.is_cuda and operator.body.sizes.elements >= FEWEST_OVER_SUBTREES and options in ({}, IN_GROUPS):
         options = options | {"assembled": False}
     return Multigrid(operator.body, is_turned=is_turned, stiffening=stiffening, members=members, **options)
@@ -81,7 +80,7 @@ def preconditioner_of(
     check_preconditioner(name)
     if name is None:
         is_forest = operator.body.discretization.element_kind is ForestElements
-        name = "multigrid" if is_forest and operator.ranks.has_multigrid(operator.number) else "diagonal"
+        name = "multigrid" if is_forest and operator.ranks.owned(operator.body).has_multigrid else "diagonal"
     return PRECONDITIONERS[name](operator, short_cycles, few_digits)
 
 

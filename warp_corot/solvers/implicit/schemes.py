@@ -285,7 +285,7 @@ class QuasiStatic(ImplicitIntegrator):
 
     def bind(self, system: System) -> Stepper:
         for body in system.bodies:
-            held = system.ranks.whole(body).conditions.held_mask().reshape(body.worlds, -1)
-            if not system.ranks.anywhere(np.asarray(held.any(axis=1))).all():
+            held = system.ranks.owned(body).whole.conditions.held_mask().reshape(body.worlds, -1)
+            if not system.ranks.max(np.asarray(held.any(axis=1))).all():
                 raise InputError("no node of the body is held; QuasiStatic needs some in each world")
         return super().bind(system)

@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_corot.elasticity import ForceField
 from warp_corot.kernels.implicit.tangent import finish_blocks, finish_rows
-from warp_corot.solvers.ranks import ALONE, Ranks
+from warp_corot.solvers.halo import ALONE, Halo
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
@@ -43,7 +43,7 @@ class TangentOperator:
         viscosity: Viscosity | None = None,
         stiff_forces: Sequence[Any] = (),
         exact: bool = False,
-        ranks: Ranks = ALONE,
+        ranks: Halo = ALONE,
         number: int = 0,
     ):
         self.body, self.field, self.viscosity = body, field, viscosity
@@ -92,7 +92,7 @@ class TangentOperator:
 
     def apply(self, x: wp.array, y: wp.array) -> None:
         y.zero_()
-        everywhere = self.ranks.completed(self.number, x)
+        everywhere = self.ranks.exchange(self.number, x, copies=True)
         self.tangent.add_product(everywhere, y)
         for forces in self.stiff_forces:
             forces.add_stiffness(self.body, x, y)

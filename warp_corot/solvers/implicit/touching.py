@@ -266,7 +266,7 @@ class TouchingSolve:
         self._search.launch(self._rest, self._q, self._change, d)
         self._operator.apply(d, self._q)
         held.launch_judgement(b, self._q, d)
-        self._ranks.take_most(held.changed)
+        self._ranks.max(held.changed)
         inputs = [newton.solver.scalars, newton.solver.iterations, held.changed, SETTLED]
         wp.launch(judge_round, 1, inputs, [self._rounds, self.iterations, self._going], device=self.device)
         held.launch_going(newton.solver.scalars, NEAR, held.changed, self._rounds, held.rounds, self._going)

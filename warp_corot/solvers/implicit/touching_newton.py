@@ -76,8 +76,8 @@ class TouchingNewton:
         inputs = [self._count, body.conditions.inverse_mass, newton.base, newton.share, newton.step]
         outputs = [newton.increment, body.state.displacements, self._sizes]
         self._launch(kernels.take_increments, inputs, outputs)
-        newton.ranks.complete(newton.operator.number, body.state.displacements)
-        newton.ranks.take_most(self._sizes.flatten())
+        newton.ranks.exchange(newton.operator.number, body.state.displacements)
+        newton.ranks.max(self._sizes.flatten())
         self._going.zero_()
         inputs = [self._sizes, touching.iterations, newton.solver.status, self._tolerance, self._most]
         outputs = [self.iterations, self.linear_iterations, self.status, self._going]

@@ -9,7 +9,8 @@ import numpy as np
 import warp as wp
 
 from warp_corot.kernels.stepping import gauge as kernels
-from warp_corot.solvers.ranks import ALONE, Ranks
+from warp_corot.mesh.scattered import normal_numbers, padded
+from warp_corot.solvers.halo import ALONE, Halo
 
 from .pace import Pace
 from .repeated import repeat
@@ -34,14 +35,16 @@ class Gauge:
         ranks, number: The processes that have the other parts of the body, and its number there.
     """
 
-    def __init__(self, body: SoftBody, field: ForceField, found: wp.array, ranks: Ranks = ALONE, number: int = 0):
+    def __init__(self, body: SoftBody, field: ForceField, found: wp.array, ranks: Halo = ALONE, number: int = 0):
         self._ranks, self._number = ranks, number
         self.body = body
         self.field = field
         self.found = found
         places = body.state.displacements.shape
         self.directions = wp.zeros(places, dtype=wp.vec4, device=body.device)
-        ranks.number_directions(number, self.directions)
+        if (numbers := ranks.owned(body).numbers) is not None:
+            drawn = normal_numbers(numbers, 20130705)
+            self.directions.assign(padded(drawn / np.linalg.norm(drawn, axis=1, keepdims=True), len(self.directions)))
         self._probed, self._forces = (wp.zeros(places, dtype=wp.vec4, device=body.device) for _ in range(2))
         self._rest_directions = self.directions
         #: The size of the probing motion, float32 [1].
@@ -53,7 +56,7 @@ class Gauge:
     def rescale(self) -> None:
         """Scale the probing motion to the mesh: the lightest free node moves a share of the smallest element."""
         inverse = self.body.conditions.inverse_mass[: self.body.node_count].numpy()
-        lightest = self._ranks.most(float(inverse.max(initial=0.0)))
+        lightest = self._ranks.max(float(inverse.max(initial=0.0)))
         size = self.body.discretization.smallest_volume ** (1.0 / 3.0)
         self.scale.fill_(PROBE * size / np.sqrt(lightest) if lightest > 0 else 0.0)
 
@@ -78,7 +81,7 @@ class Gauge:
             inputs=[
                 body.discretization.elements,
                 body.state.displacements,
-                self._ranks.completed(self._number, body.state.velocities),
+                self._ranks.exchange(self._number, body.state.velocities, copies=True),
                 pace.arrays,
                 ahead,
                 turns,
@@ -94,7 +97,7 @@ class Gauge:
         with self.field.state_kept():
             self.field.add_forces(u, f)
             repeat(partial(self._find_afresh, u, f), REST_TURNS, self.body.device, self._ranks)
-            self._ranks.take_most(self.found)
+            self._ranks.max(self.found)
         self._rest_directions = wp.clone(self.directions)
         value = float(self.found.numpy()[0])
         self.found.zero_()
@@ -108,7 +111,7 @@ class Gauge:
         inverse_mass = self.body.conditions.inverse_mass
         outputs = [self.directions, self._probed, self._forces]
         self._launch(kernels.probe_directions, [self.scale, inverse_mass, u], outputs)
-        self._ranks.complete(self._number, self._probed)
+        self._ranks.exchange(self._number, self._probed)
         self.field.add_forces(self._probed, self._forces)
         inputs = [inverse_mass, u, self._probed, f, self._forces]
         self._launch(kernels.find_curvatures, inputs, [self.directions, self.found])

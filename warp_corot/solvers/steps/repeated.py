@@ -7,10 +7,10 @@ from collections.abc import Callable
 import warp as wp
 
 from warp_corot.inputs.turns import TURN
-from warp_corot.solvers.ranks import Ranks
+from warp_corot.solvers.halo import Halo
 
 
-def repeat(launch: Callable[[], None], times: int, device: wp.Device, ranks: Ranks) -> None:
+def repeat(launch: Callable[[], None], times: int, device: wp.Device, ranks: Halo) -> None:
     """Launch the same work so many times, with the same arguments each time.
 
     On the CPU Python takes longer to launch a small body's work than the work takes: the first launch compiles, and the

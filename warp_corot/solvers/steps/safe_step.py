@@ -141,9 +141,9 @@ class SafeStep:
             gauge.launch(self.pace, ahead)
         for each in self._system.constraints:
             each.measure()
-        self._system.ranks.take_most(self._found)
+        self._system.ranks.max(self._found)
         if self._system.constraints:
-            self._system.ranks.take_most(self._system.motion_rates)
+            self._system.ranks.max(self._system.motion_rates)
         inputs = [self._at_rest, self._found, self._system.motion_rates, self._control, self.pace.arrays]
         wp.launch(kernels.take_safe_step, dim=1, inputs=inputs, device=self.device)
 

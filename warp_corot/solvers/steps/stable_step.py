@@ -11,7 +11,8 @@ import warp as wp
 from warp_corot.elasticity.model import SmallForces
 from warp_corot.errors import InputError
 from warp_corot.kernels.stepping import lanczos
-from warp_corot.solvers.ranks import ALONE, Ranks
+from warp_corot.mesh.scattered import normal_numbers, padded
+from warp_corot.solvers.halo import ALONE, Halo
 
 from .repeated import repeat
 
@@ -26,7 +27,7 @@ LAST_STEPS = 8
 PROBE = 1e-3
 
 
-def largest_frequency(body: SoftBody, field: SmallForces, ranks: Ranks = ALONE, number: int = 0) -> float:
+def largest_frequency(body: SoftBody, field: SmallForces, ranks: Halo = ALONE, number: int = 0) -> float:
     """Largest angular frequency [rad/s] of small motions about rest; explicit central differences need dt < 2 / it.
 
     Zero if no node is free to move.
@@ -43,6 +44,7 @@ def largest_frequency(body: SoftBody, field: SmallForces, ranks: Ranks = ALONE, 
         body.sizes.launch_nodes,
         ranks,
         number,
+        ranks.owned(body).numbers,
     )
     return float(np.sqrt(largest))
 
@@ -53,8 +55,9 @@ def largest_eigenvalue(
     smallest_volume: float,
     nodes: int,
     launch_nodes: int | None = None,
-    ranks: Ranks = ALONE,
+    ranks: Halo = ALONE,
     number: int = 0,
+    numbers: npt.NDArray[np.int64] | None = None,
 ) -> float:
     """The largest eigenvalue of M^-1 K [1/s^2], where K gives the forces of small displacements from rest.
 
@@ -68,12 +71,13 @@ def largest_eigenvalue(
         nodes: Number of nodes.
         launch_nodes: Number of nodes that launches go through; None: ``nodes``.
         ranks, number: As for ``largest_frequency``.
+        numbers: The numbers of the nodes in the whole body, which set the first motion; None: they are those here.
     """
-    free = int(ranks.together(int((inverse_mass[:nodes].numpy() > 0).sum())))
+    free = int(ranks.sum(int((inverse_mass[:nodes].numpy() > 0).sum())))
     if not free:
         return 0.0
     probe = PROBE * smallest_volume ** (1.0 / 3.0)
-    iteration = _Lanczos(forces, inverse_mass, probe, launch_nodes or nodes, ranks, number)
+    iteration = _Lanczos(forces, inverse_mass, probe, launch_nodes or nodes, ranks, number, numbers)
     with forces.state_kept():
         iteration.find_rest_forces()
         iteration.launch(min(LANCZOS_STEPS, 3 * free))
@@ -101,7 +105,14 @@ class _Lanczos:
     """The iteration's vectors on the device, vec4, as long as launches: the present, the previous and the next one."""
 
     def __init__(
-        self, forces: SmallForces, inverse_mass: wp.array, probe: float, count: int, ranks: Ranks, number: int
+        self,
+        forces: SmallForces,
+        inverse_mass: wp.array,
+        probe: float,
+        count: int,
+        ranks: Halo,
+        number: int,
+        numbers: npt.NDArray[np.int64] | None,
     ):
         self._ranks, self._number = ranks, number
         self.forces, self.inverse_mass, self.probe, self.count = forces, inverse_mass, probe, count
@@ -109,7 +120,7 @@ class _Lanczos:
         self.q, self.before, self.next = (wp.empty(count, dtype=wp.vec4, device=self.device) for _ in range(3))
         places = len(inverse_mass)
         self.u, self.f, self._rest = (wp.zeros(places, dtype=wp.vec4, device=self.device) for _ in range(3))
-        parts = count if ranks.is_settled else min(count, lanczos.PARTS)
+        parts = count if ranks.is_reproducible else min(count, lanczos.PARTS)
         self._parts, self._sums, self._largest, self._diagonal, self._off = (
             wp.empty(size, dtype=wp.float64, device=self.device)
             for size in (parts, lanczos.FOLDED, lanczos.FOLDED, LANCZOS_STEPS, LANCZOS_STEPS + 1)
@@ -118,7 +129,10 @@ class _Lanczos:
         self._step = wp.zeros(1, dtype=wp.int32, device=self.device)
         self._steps = 0
         self._launch(lanczos.random_motion, [0, inverse_mass, self.q])
-        ranks.number_motion(number, inverse_mass, self.q)
+        if numbers is not None:
+            motion = padded(normal_numbers(numbers, 0), count)
+            motion[inverse_mass.numpy()[:count] == 0.0] = 0.0
+            self.q.assign(motion)
         self._sum(self.q, self.q, self._off, root=True)
         self._launch(lanczos.normalise, [self._off, self.q])
 
@@ -136,10 +150,10 @@ class _Lanczos:
         inverse_mass = self.inverse_mass
         self._launch(lanczos.largest_motions, [inverse_mass, self.q, self._parts], len(self._parts))
         self._launch(lanczos.fold, [self._parts, self._sums, self._largest], lanczos.FOLDED)
-        self._ranks.take_most(self._largest)
+        self._ranks.max(self._largest)
         self._launch(lanczos.take_scale, [self.probe, self._largest, self._scale], 1)
         self._launch(lanczos.probe_motion, [self._scale, inverse_mass, self.q, self.u])
-        self._ranks.complete(self._number, self.u)
+        self._ranks.exchange(self._number, self.u)
         wp.copy(self.f, self._rest, count=self.count)
         self.forces.add_forces(self.u, self.f)
         arguments = [self._scale, self._off, self._step, inverse_mass, self.f, self.before, self.next]
@@ -164,7 +178,9 @@ class _Lanczos:
         """Launch the step's entry of ``numbers``: a . b, or its square root with ``root``."""
         self._launch(lanczos.inner_products, [a, b, self._parts], len(self._parts))
         self._launch(lanczos.fold, [self._parts, self._sums, self._largest], lanczos.FOLDED)
-        self._ranks.add_up(self._parts, self._sums)
+        if not (ranks := self._ranks).is_alone:
+            total = ranks.sum(float(self._sums.numpy().sum()), self._parts.numpy() if ranks.is_reproducible else None)
+            self._sums.assign(np.array([total] + [0.0] * (len(self._sums) - 1)))
         self._launch(lanczos.take_sum, [self._sums, int(root), self._step, after, numbers], 1)
 
     def _launch(self, kernel: wp.Kernel, arguments: list, dim: int | None = None) -> None:
