@@ -168,5 +168,8 @@ def test_a_rank_that_ends_takes_the_others_along(how, monkeypatch):
     if how == "failed":
         said = [line for line in done.stderr.splitlines() if line.startswith("warp-corot:")]
         assert said == ["warp-corot: rank 1 of 2 ends all others: ValueError: rank 1 has had enough"]
+    if how == "killed":
+        said = [line for line in done.stderr.splitlines() if line.startswith("warp-corot:")]
+        assert said == ["warp-corot: rank 1 of 2 was killed, which ends all others"]
     if how == "hung":
         assert "rank 0 of 2 has waited 5 s for others (an exchange), and ends all" in done.stderr

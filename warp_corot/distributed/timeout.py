@@ -1,9 +1,12 @@
-"""Waits for other ranks: if one rank never comes, all ranks end with one line."""
+"""Waits for other ranks: if one rank never comes or was killed, all ranks end with one line."""
 
 from __future__ import annotations
 
 import math
 import os
+import select
+import signal
+import socket
 import sys
 import threading
 import time
@@ -19,6 +22,8 @@ VARIABLE, SECONDS = "WARP_COROT_PATIENCE", 600.0
 WATCHED = frozenset({"allgather", "allreduce", "alltoall", "Barrier", "bcast", "gather"})
 #: Time that MPI has to end all ranks before this one ends by itself [s].
 GRACE = 5.0
+#: Time for other ranks to see that this one still lives, before it ends with them [s].
+LAST_LOOK = 0.5
 
 
 def patience() -> float:
@@ -53,6 +58,16 @@ class TimedCommunicator:
         self.unwatched, self.rank, self.size, self._seconds = comm, comm.rank, comm.size, seconds
         self._wait: tuple[float, str] | None = None
         if comm.size > 1:
+            here = socket.gethostname()
+            everybody = comm.allgather((here, os.getpid()))
+            #: The processes of this machine, by their ranks.
+            self._beside = {rank: pid for rank, (where, pid) in enumerate(everybody) if where == here}
+            self._signals, told = os.pipe()
+            os.set_blocking(told, False)
+            if threading.current_thread() is threading.main_thread():
+                # Python would call a handler only after MPI's call, which waits for ever for a killed rank.
+                signal.signal(signal.SIGTERM, lambda *_: None)
+                signal.set_wakeup_fd(told, warn_on_full_buffer=False)
             threading.Thread(target=self._watch, daemon=True).start()
 
     def __getattr__(self, name: str) -> Any:
@@ -78,19 +93,45 @@ class TimedCommunicator:
 
     def _watch(self) -> None:
         while True:
-            time.sleep(min(1.0, 0.25 * self._seconds))
+            ready, _, _ = select.select([self._signals], [], [], min(1.0, 0.25 * self._seconds))
+            if ready and signal.SIGTERM in os.read(self._signals, 64):
+                self._follow_killed()
             wait = self._wait
             if wait is not None and time.monotonic() - wait[0] > self._seconds:
                 self._end(wait[1])
 
+    def _follow_killed(self) -> None:
+        """End this rank, as MPI's launcher asks all to do when one was killed; the first on each machine says so."""
+        living = [rank for rank, pid in self._beside.items() if _lives(pid)]
+        killed = [str(rank) for rank in self._beside if rank not in living]
+        if killed and self.rank == living[0]:
+            _say(f"rank {', '.join(killed)} of {self.size} was killed, which ends all others")
+        time.sleep(LAST_LOOK)
+        os._exit(128 + signal.SIGTERM)
+
     def _end(self, what: str) -> None:
-        stream = sys.__stderr__ or sys.stderr
-        stream.write(
-            f"warp-corot: rank {self.rank} of {self.size} has waited {self._seconds:g} s for others ({what}), and ends "
-            f"all; {VARIABLE} sets how long ranks wait\n"
+        _say(
+            f"rank {self.rank} of {self.size} has waited {self._seconds:g} s for others ({what}), and ends all; "
+            f"{VARIABLE} sets how long ranks wait"
         )
-        stream.flush()
         last = threading.Timer(GRACE, os._exit, [1])
         last.daemon = True
         last.start()
         self.unwatched.Abort(1)
+
+
+def _say(line: str) -> None:
+    stream = sys.__stderr__ or sys.stderr
+    stream.write(f"warp-corot: {line}\n")
+    stream.flush()
+
+
+def _lives(pid: int) -> bool:
+    """Whether a process of this machine has not ended."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        pass
+    return True
