@@ -13,7 +13,6 @@ from pxr import Tf, Usd, UsdGeom
 
 from warp_corot.errors import InputError
 
-from .isolated import read_isolated
 from .quiet import USD_MEMORY, bounded, quietly
 from .whole import check_output
 
@@ -41,13 +40,8 @@ def open_stage(path: Path) -> Any:
     """Open the stage of a file.
 
     Raises:
-        InputError: It is not a stage, or a binary one on which OpenUSD crashes or does not finish.
+        InputError: It is not a stage.
     """
-    if _is_binary(path):
-        about = path.stat()
-        reason = _trial(path, about.st_size, about.st_mtime_ns)
-        if reason:
-            raise InputError(f"{path}: is not a USD file that OpenUSD can open ({reason})")
     try:
         stage = Usd.Stage.Open(usd_name(path))
     except Tf.ErrorException as error:
@@ -92,18 +86,6 @@ def _is_of(value: Any, due: Any) -> bool:
         return found.ndim > 0
     rank = wanted.ndim + int(due.isArray)
     return found.ndim == rank and found.shape[rank - wanted.ndim :] == wanted.shape and found.dtype.kind in kinds
-
-
-def _is_binary(path: Path) -> bool:
-    """Whether a file is a crate or a package, judged by its first bytes."""
-    with path.open("rb") as file:
-        return file.read(8).startswith((b"PXR-USDC", b"PK"))
-
-
-@functools.lru_cache(maxsize=64)
-def _trial(path: Path, size: int, written: int) -> str | None:
-    """Why a stage must not be opened in this process, or None; the cache distinguishes files by size and time, too."""
-    return read_isolated(f"{__package__}.usd_trial", path)[1]
 
 
 P = ParamSpec("P")

@@ -1,9 +1,7 @@
-"""The content of a mesh file: points, blocks of cells, and numbers that distinguish regions."""
+"""The content of a file: points, blocks of cells, and numbers that distinguish regions; or voxels."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -87,36 +85,20 @@ class FileMesh:
         found = {block.kind for block in self.blocks if len(block.nodes)} | {k for k, n in self.ignored.items() if n}
         return ", ".join(sorted(found)) or "none"
 
-    def to_arrays(self) -> dict[str, NDArray[Any]]:
-        """All data as arrays of plain numbers, for transfer between processes."""
-        described = {
-            "kinds": [block.kind for block in self.blocks],
-            "names": {array: {str(n): name for n, name in names.items()} for array, names in self.names.items()},
-            "data": [list(block.data) for block in self.blocks],
-            "ignored": self.ignored,
-            "notes": self.notes,
-            "sets": list(self.node_sets),
-        }
-        arrays: dict[str, NDArray[Any]] = {"mesh": as_bytes(described), "points": self.points}
-        for place, block in enumerate(self.blocks):
-            arrays[f"nodes{place}"] = block.nodes
-            for index, values in enumerate(block.data.values()):
-                arrays[f"data{place}_{index}"] = values
-        for place, nodes in enumerate(self.node_sets.values()):
-            arrays[f"set{place}"] = nodes
-        return arrays
 
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> FileMesh:
-        """The mesh from the arrays of ``to_arrays``."""
-        described = from_bytes(arrays["mesh"])
-        blocks = [
-            Block(kind, arrays[f"nodes{place}"], {name: arrays[f"data{place}_{k}"] for k, name in enumerate(data)})
-            for place, (kind, data) in enumerate(zip(described["kinds"], described["data"], strict=True))
-        ]
-        names = {array: {int(n): name for n, name in of.items()} for array, of in described["names"].items()}
-        sets = {name: arrays[f"set{place}"] for place, name in enumerate(described["sets"])}
-        return cls(arrays["points"], blocks, names, described["ignored"], described["notes"], sets)
+@dataclass(frozen=True)
+class FileImage:
+    """The voxels of a file, see `warp_corot.io.read.volumes.LoadedVolume`.
+
+    Attributes:
+        values: [nx, ny, nz].
+        affine: From voxel indices to positions, float64 [4, 4].
+        notes: Notes for the user, one line each.
+    """
+
+    values: NDArray[Any]
+    affine: NDArray[np.float64]
+    notes: list[str]
 
 
 def sets_of_numbers(
@@ -169,16 +151,6 @@ def corners_note(kind: str, order: int | None = 2) -> str:
     """The note about cells of higher order, of which only the corners are used."""
     word = {2: "second-order", 3: "third-order"}.get(order or 0, "higher-order")
     return f"{word} cells ({kind}) are taken by their corners, with straight edges"
-
-
-def as_bytes(thing: Any) -> NDArray[np.uint8]:
-    """Lists, dictionaries, texts and numbers as an array of bytes."""
-    return np.frombuffer(json.dumps(thing).encode(), np.uint8)
-
-
-def from_bytes(array: NDArray[np.uint8]) -> Any:
-    """The object that was given to `as_bytes`."""
-    return json.loads(array.tobytes())
 
 
 def whole_numbers(values: Any) -> NDArray[np.int64] | None:

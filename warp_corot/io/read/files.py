@@ -5,15 +5,13 @@ from __future__ import annotations
 import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from warp_corot.errors import InputError
 from warp_corot.io.files.isolated import read_isolated
 
-from .filemesh import FileMesh
+from .filemesh import FileImage, FileMesh
 
 
 @dataclass(frozen=True)
@@ -94,7 +92,7 @@ def suffix_of(path: Path) -> str | None:
     return next((suffix for suffix in sorted(SUFFIXES, key=len, reverse=True) if name.endswith(suffix)), None)
 
 
-def read_mesh_file(path: Path) -> FileMesh | dict[str, NDArray[Any]]:
+def read_mesh_file(path: Path) -> FileMesh | FileImage:
     """Read a mesh file.
 
     Readers are tried one after the other, each in a separate process, until one can read the file.
@@ -103,7 +101,7 @@ def read_mesh_file(path: Path) -> FileMesh | dict[str, NDArray[Any]]:
         path: A file with one of the extensions `SUFFIXES`.
 
     Returns:
-        Points and cells; or for a VTK file with an image the arrays ``values`` [nx, ny, nz] and ``affine`` [4, 4].
+        Points and cells; or the voxels of a VTK file with an image.
 
     Raises:
         InputError: No installed reader can read it; one line with the readers' own reasons.
@@ -116,11 +114,13 @@ def read_mesh_file(path: Path) -> FileMesh | dict[str, NDArray[Any]]:
         if reader.package and importlib.util.find_spec(reader.package) is None:
             missing.append(reader)
             continue
-        arrays, reason = read_isolated(f"{__package__}.{reader.module}", path)
-        if arrays is not None and "points" in arrays and not len(arrays["points"]):
+        found, reason = read_isolated(f"{__package__}.{reader.module}", path)
+        if isinstance(found, FileImage):
+            return found
+        if found is not None and len(found.points):
+            return _checked(found, path)
+        if found is not None:
             reason = "it finds no nodes in it"
-        elif arrays is not None:
-            return _checked(FileMesh.from_arrays(arrays), path) if "mesh" in arrays else arrays
         if reason:
             reasons.append(f"{reader.name}: {shortened(reason)}")
     cures = " or ".join(f'pip install "warp-corot[{reader.extra}]"' for reader in missing)

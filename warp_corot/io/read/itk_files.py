@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 import SimpleITK
-from numpy.typing import NDArray
 
-from .filemesh import Unreadable, as_bytes
+from .filemesh import FileImage, Unreadable
 
 #: ITK uses left-posterior-superior; half a turn about z gives NIfTI's right-anterior-superior.
 RAS_FROM_LPS = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -23,9 +22,8 @@ UNEVEN = 1.0e-3
 DESCRIPTION, MODALITY, POSITION = "0008|103e", "0008|0060", "0020|0032"
 
 
-def read(path: Path) -> dict[str, NDArray[Any]] | None:
-    """Values [nx, ny, nz] and positions of an image, see `warp_corot.io.read.volumes`. For a folder, those of the
-    largest series in it and its subfolders, or None if there is none.
+def read(path: Path) -> FileImage | None:
+    """The voxels of an image; for a folder, those of the largest series in it and its subfolders, None without any.
 
     Raises:
         Unreadable: With ITK's own message; or the image does not have three dimensions and one number a voxel.
@@ -33,13 +31,13 @@ def read(path: Path) -> dict[str, NDArray[Any]] | None:
     try:
         if path.is_dir():
             return _series(path)
-        return _arrays(SimpleITK.ReadImage(str(path)), [])
+        return _voxels(SimpleITK.ReadImage(str(path)), [])
     except RuntimeError as error:
         # ITK names itself and its source files first; the reason comes last.
         raise Unreadable(re.split(r"(?:sitk::|ITK )ERROR:", str(error))[-1]) from None
 
 
-def _arrays(image: Any, notes: list[str]) -> dict[str, NDArray[Any]]:
+def _voxels(image: Any, notes: list[str]) -> FileImage:
     dimensions, numbers = image.GetDimension(), image.GetNumberOfComponentsPerPixel()
     if (dimensions, numbers) != (3, 1):
         raise Unreadable(f"it has {dimensions} dimensions and {numbers} numbers a voxel; it must have 3 and 1")
@@ -47,10 +45,10 @@ def _arrays(image: Any, notes: list[str]) -> dict[str, NDArray[Any]]:
     affine[:3, :3] = np.array(image.GetDirection()).reshape(3, 3) * image.GetSpacing()
     affine[:3, 3] = image.GetOrigin()
     values = np.asarray(SimpleITK.GetArrayFromImage(image)).transpose(2, 1, 0)
-    return {"image": as_bytes([*notes, TURNED]), "values": values, "affine": RAS_FROM_LPS @ affine}
+    return FileImage(values, RAS_FROM_LPS @ affine, [*notes, TURNED])
 
 
-def _series(folder: Path) -> dict[str, NDArray[Any]] | None:
+def _series(folder: Path) -> FileImage | None:
     series = _all_series(folder)
     if not series:
         return None
@@ -64,7 +62,7 @@ def _series(folder: Path) -> dict[str, NDArray[Any]] | None:
     uneven = _unevenness(files)
     if uneven is not None:
         notes.append(f"slices are missing or unevenly spaced, by up to {uneven:.3g} mm")
-    return _arrays(image, notes)
+    return _voxels(image, notes)
 
 
 def _may_be_slice(path: Path) -> bool:

@@ -18,7 +18,7 @@ from warp_corot.inputs.checks import checked_numbers, checked_vector, shown
 from warp_corot.io.files.isolated import read_isolated
 from warp_corot.io.files.quiet import bounded, quietly
 
-from .filemesh import from_bytes
+from .filemesh import FileImage
 
 
 @dataclass(frozen=True)
@@ -65,28 +65,22 @@ def load_volume(path: str | PathLike[str]) -> LoadedVolume:
             f"{source}: unknown format {source.suffix or '(no extension)'}; it must be {', '.join(READERS)}"
         )
     try:
-        values, affine, unit, notes = _read_dicom(source) if source.is_dir() else READERS[suffix or ""](source)
+        image, unit = _read_dicom(source) if source.is_dir() else READERS[suffix or ""](source)
     except ImportError:
         extra = "mesh" if suffix in (".vti", ".vtk") else "scans"
         what = f"{suffix} files" if suffix and not source.is_dir() else "DICOM series"
         raise InputError(f'{source}: reading {what} needs: pip install "warp-corot[{extra}]"') from None
     name = source.name[: len(source.name) - len(suffix or "")] if not source.is_dir() else source.resolve().name
-    return _checked(values, affine, unit, notes, name, source)
+    return volume_of_image(source, image, unit, name)
 
 
-def volume_of_image(path: Path, arrays: dict[str, NDArray[Any]]) -> LoadedVolume:
-    """The volume of an image in a VTK file.
+def volume_of_image(source: Path, image: FileImage, unit: str | None = None, name: str | None = None) -> LoadedVolume:
+    """The volume of a file's voxels.
 
     Raises:
         InputError: See `load_volume`.
     """
-    values, affine, unit, notes = _of_image(arrays)
-    return _checked(values, affine, unit, notes, path.stem, path)
-
-
-def _checked(
-    values: NDArray[Any], affine: NDArray[np.float64], unit: str | None, notes: list[str], name: str, source: Path
-) -> LoadedVolume:
+    values = image.values
     while values.ndim > 3 and values.shape[-1] == 1:
         values = values[..., 0]
     if values.ndim != 3:
@@ -97,41 +91,33 @@ def _checked(
         )
     if not values.size:
         raise InputError(f"{source}: has no voxels, its shape is {values.shape}")
-    return LoadedVolume(values, affine, unit, name, source, notes)
+    return LoadedVolume(values, image.affine, unit, source.stem if name is None else name, source, image.notes)
 
 
-def _read_nifti(path: Path) -> tuple[NDArray[Any], NDArray[np.float64], str | None, list[str]]:
-    import nibabel
-
+def _read_nifti(path: Path) -> tuple[FileImage, str | None]:
+    values, affine, header = _through_nibabel(path, "NIfTI")
     try:
-        with quietly(), bounded(path):
-            image: Any = nibabel.load(path)
-            values = np.asanyarray(image.dataobj)
-    except Exception as error:
-        raise _unreadable(path, "NIfTI", error) from None
-    said = _nifti_unit(image.header)
-    unit = {"meter": "m", "mm": "mm"}.get(said)
-    spacing = np.asarray(image.header.get_zooms(), dtype=np.float64)[:3]
-    affine = np.array(image.affine, dtype=np.float64)
+        said = header.get_xyzt_units()[0]
+    except KeyError:  # a number that the format does not define
+        said = "unknown"
     # For a header without spacing, the format prescribes the unit matrix.
-    if not (spacing > 0.0).all():
+    if not (np.asarray(header.get_zooms(), dtype=np.float64)[:3] > 0.0).all():
         affine[:3, :3] = 0.0
     notes = []
-    if not image.header["sform_code"] and not image.header["qform_code"]:
+    if not header["sform_code"] and not header["qform_code"]:
         notes.append("the header gives no orientation: its axes are taken as right, anterior, superior")
     if said == "micron":
-        affine[:3], unit = 1e-3 * affine[:3], "mm"
-    return values, affine, unit, notes
+        affine[:3], said = 1e-3 * affine[:3], "mm"
+    return FileImage(values, affine, notes), {"meter": "m", "mm": "mm"}.get(said)
 
 
-def _nifti_unit(header: Any) -> str:
-    try:
-        return header.get_xyzt_units()[0]
-    except KeyError:  # a number that the format does not define
-        return "unknown"
+def _read_mgh(path: Path) -> tuple[FileImage, str | None]:
+    values, affine, _ = _through_nibabel(path, path.suffix)
+    return FileImage(values, affine, []), "mm"  # by definition of FreeSurfer's format
 
 
-def _read_mgh(path: Path) -> tuple[NDArray[Any], NDArray[np.float64], str | None, list[str]]:
+def _through_nibabel(path: Path, kind: str) -> tuple[NDArray[Any], NDArray[np.float64], Any]:
+    """Values, affine and header."""
     import nibabel
 
     try:
@@ -139,42 +125,35 @@ def _read_mgh(path: Path) -> tuple[NDArray[Any], NDArray[np.float64], str | None
             image: Any = nibabel.load(path)
             values = np.asanyarray(image.dataobj)
     except Exception as error:
-        raise _unreadable(path, path.suffix, error) from None
-    # FreeSurfer's format is in mm by definition.
-    return values, np.array(image.affine, dtype=np.float64), "mm", []
+        raise _unreadable(path, kind, error) from None
+    return values, np.array(image.affine, dtype=np.float64), image.header
 
 
-def _read_itk(path: Path) -> tuple[NDArray[Any], NDArray[np.float64], str | None, list[str]]:
-    return _of_image(_isolated("SimpleITK", "itk_files", path, path.suffix))
+def _read_itk(path: Path) -> tuple[FileImage, str | None]:
+    return _isolated("SimpleITK", "itk_files", path, path.suffix), None
 
 
-def _read_dicom(path: Path) -> tuple[NDArray[Any], NDArray[np.float64], str | None, list[str]]:
-    values, affine, _, notes = _of_image(_isolated("SimpleITK", "itk_files", path, "DICOM"))
-    if path.is_file() and values.shape[2] < 2:
+def _read_dicom(path: Path) -> tuple[FileImage, str | None]:
+    image = _isolated("SimpleITK", "itk_files", path, "DICOM")
+    if path.is_file() and image.values.shape[2] < 2:
         raise InputError(f"{path}: has a single slice; name the folder with the whole series")
-    return values, affine, "mm", notes
+    return image, "mm"
 
 
-def _read_vti(path: Path) -> tuple[NDArray[Any], NDArray[np.float64], str | None, list[str]]:
-    return _of_image(_isolated("vtkmodules", "vtk_files", path, path.suffix))
+def _read_vti(path: Path) -> tuple[FileImage, str | None]:
+    return _isolated("vtkmodules", "vtk_files", path, path.suffix), None
 
 
-def _isolated(package: str, module: str, path: Path, kind: str) -> dict[str, NDArray[Any]]:
-    """The arrays of an image, from a reader that needs a package and runs in a separate process."""
+def _isolated(package: str, module: str, path: Path, kind: str) -> FileImage:
+    """An image from a reader that needs a package and runs in a separate process."""
     if importlib.util.find_spec(package) is None:
         raise ImportError(package)
-    arrays, reason = read_isolated(f"warp_corot.io.read.{module}", path)
-    if arrays is None and reason is None:
+    image, reason = read_isolated(f"warp_corot.io.read.{module}", path)
+    if image is None and reason is None:
         raise InputError(f"{path}: is a folder without a DICOM series; it must be a file or a folder with one")
-    if arrays is None or "image" not in arrays:
+    if not isinstance(image, FileImage):
         raise _unreadable(path, kind, reason or "it holds a mesh, not an image")
-    return arrays
-
-
-def _of_image(
-    arrays: dict[str, NDArray[Any]],
-) -> tuple[NDArray[Any], NDArray[np.float64], str | None, list[str]]:
-    return arrays["values"], arrays["affine"], None, from_bytes(arrays["image"])
+    return image
 
 
 def _unreadable(path: Path, kind: str, why: object) -> InputError:
@@ -182,8 +161,8 @@ def _unreadable(path: Path, kind: str, why: object) -> InputError:
     return InputError(f"{path}: is not a {kind} file that can be read{f' ({words[:160]})' if words else ''}")
 
 
-#: The reader of each extension.
-READERS: dict[str, Callable[[Path], tuple[NDArray[Any], NDArray[np.float64], str | None, list[str]]]] = {
+#: The reader of each extension, which returns the voxels, and their unit if the file says it.
+READERS: dict[str, Callable[[Path], tuple[FileImage, str | None]]] = {
     ".nii.gz": _read_nifti,
     ".nii": _read_nifti,
     ".mgz": _read_mgh,

@@ -24,9 +24,9 @@ from .filemesh import (
     CORNERS,
     INTERNAL,
     Block,
+    FileImage,
     FileMesh,
     Unreadable,
-    as_bytes,
     corners_note,
     sets_of_numbers,
     whole_numbers,
@@ -52,8 +52,8 @@ MANY_FACED = {
 }
 
 
-def read(path: Path) -> FileMesh | dict[str, NDArray[Any]]:
-    """The cells of a file, or the arrays of an image.
+def read(path: Path) -> FileMesh | FileImage:
+    """The cells of a file, or the voxels of an image.
 
     Raises:
         Unreadable: With VTK's own message.
@@ -287,8 +287,7 @@ def _ints(array: Any) -> NDArray[np.int64]:
         return np.array([array.GetComponent(k, 0) for k in range(array.GetNumberOfTuples())], dtype=np.int64)
 
 
-def _image(grid: Any) -> dict[str, NDArray[Any]]:
-    """Values [nx, ny, nz] and the affine of their positions; see `warp_corot.io.read.volumes`."""
+def _image(grid: Any) -> FileImage:
     extent = np.array(grid.GetExtent()).reshape(3, 2)
     at_points = grid.GetPointData().GetNumberOfArrays() > 0
     data = grid.GetPointData() if at_points else grid.GetCellData()
@@ -306,4 +305,4 @@ def _image(grid: Any) -> dict[str, NDArray[Any]]:
     affine[:3, 3] += affine[:3, :3] @ (extent[:, 0] + (0.0 if at_points else 0.5))
     notes = [] if at_points else ["values belong to cells: voxel centres lie between the grid's points"]
     values = np.array(vtk_to_numpy(array).reshape(tuple(shape), order="F"), order="F")
-    return {"image": as_bytes(notes), "values": values, "affine": affine}
+    return FileImage(values, affine, notes)
