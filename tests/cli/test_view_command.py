@@ -14,7 +14,8 @@ from command_line import run
 
 import warp_corot as wc
 from warp_corot.cli import make_parser
-from warp_corot.cli.options.simulate import add_options
+from warp_corot.cli.options.declared import add_declared
+from warp_corot.cli.options.run import RunOptions
 from warp_corot.cli.parsing import StrictParser
 from warp_corot.cli.prepared import prepared
 from warp_corot.cli.run_file import bodies_of
@@ -36,7 +37,7 @@ def asked(*words):
 
 def test_options_are_those_of_simulate():
     parser = StrictParser(prog="simulate")
-    add_options(parser)
+    add_declared(parser, RunOptions)
     (args,) = asked("box", "--device", "cpu")
     for action in parser._actions:
         if action.dest not in ("help", "input", "device"):

@@ -30,11 +30,7 @@ FAILED = (1, 2, 3)
 
 def subcommand(name: str) -> ModuleType:
     """The module that runs a subcommand; it imports the whole package, which takes a while."""
-    return import_module(f".{_file_of(name)}", __name__)
-
-
-def _file_of(name: str) -> str:
-    return name.replace("-", "_")
+    return import_module(f".{name.replace('-', '_')}", __name__)
 
 
 class Parser(StrictParser):
@@ -72,6 +68,8 @@ def make_parser(needed: Collection[str] = COMMANDS) -> argparse.ArgumentParser:
     """
     from warp_corot import __version__
 
+    from .options import add_command
+
     parser = Parser(
         prog="warp-corot",
         description="Corotational finite elements for soft tissue, on CPU and CUDA.",
@@ -83,7 +81,7 @@ def make_parser(needed: Collection[str] = COMMANDS) -> argparse.ArgumentParser:
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=Parser)
     for name, line in COMMANDS.items():
         if name in needed:
-            import_module(f".options.{_file_of(name)}", __name__).add_parser(subparsers)
+            add_command(subparsers, name)
         else:
             subparsers.add_parser(name, help=line)
     return parser

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 from warp_corot.errors import InputError
 
@@ -55,16 +55,11 @@ def rotation_level(text: str) -> int | float | str:
         return number(text)
 
 
-pressure = quantity("Pa")
-density = quantity("kg/m^3")
-seconds = quantity("s")
 metres = quantity("m")
-per_second = quantity("1/s")
-acceleration = quantity("m/s^2")
 
 
 @dataclass(frozen=True)
-class ValueRange:
+class Interval:
     """A range of numbers with both ends."""
 
     low: float
@@ -74,7 +69,7 @@ class ValueRange:
         return f"{self.low!r}:{self.high!r}"
 
 
-def value_range(text: str) -> ValueRange:
+def value_range(text: str) -> Interval:
     """Two numbers LOW:HIGH, or one without an upper limit."""
     words = text.split(":")
     try:
@@ -83,7 +78,7 @@ def value_range(text: str) -> ValueRange:
         low, high = float("nan"), float("nan")
     if not low <= high:
         raise argparse.ArgumentTypeError(f"{text!r} must be a number or LOW:HIGH, for example 200 or -200:300")
-    return ValueRange(low, high)
+    return Interval(low, high)
 
 
 def unit_of_length(text: str) -> str:
@@ -112,3 +107,19 @@ def tool_shape(text: str) -> Any:
     from .tool_paths import tool_shape as read
 
     return read(text)
+
+
+#: Types of options, with the functions that read them.
+Number = Annotated[float, number]
+WholeNumber = Annotated[int, whole_number]
+Pressure = Annotated[float, quantity("Pa")]
+Density = Annotated[float, quantity("kg/m^3")]
+Seconds = Annotated[float, quantity("s")]
+Metres = Annotated[float, metres]
+PerSecond = Annotated[float, quantity("1/s")]
+Acceleration = Annotated[float, quantity("m/s^2")]
+UnitOfLength = Annotated[str, unit_of_length]
+RotationLevel = Annotated[int | float | str, rotation_level]
+ValueRange = Annotated[Interval, value_range]
+GroundHeight = Annotated[float | str, ground_height]
+Tool = Annotated[Any, tool_shape]

@@ -15,19 +15,11 @@ from warp_corot.errors import InputError
 from warp_corot.io.files.whole import check_output, written_whole
 
 from .loading import Load, value_of
+from .options.declared import add_declared
 from .options.defaults import LOADS
-from .options.simulate import add_options
+from .options.run import OF_THE_RUN, RunOptions
 from .parsing import StrictParser
 
-#: Options with paths, which are relative to the run file.
-PATHS = ("input", "output", "also", "preview", "csv", "tool_path")
-#: Options that all bodies share.
-SHARED = (
-    *("output", "also", "preview", "preview_frames", "preview_views", "csv"),
-    *("gravity", "damping", "viscosity", "duration", "fps", "dt", "device", "ramp"),
-    *("integrator", "static"),
-    *("ground", "no_ground", "drop", "tool", "tool_path", "touch", "self_contact", "friction"),
-)
 #: Keys in tables of loads, besides times and shares.
 VALUES = {"pull": "by", "twist": "degrees", "press": "pressure"}
 
@@ -61,7 +53,7 @@ def bodies_of(args: argparse.Namespace) -> list[argparse.Namespace]:
     tables = data.pop("body", [{}])
     if not isinstance(tables, list) or not tables or not all(isinstance(table, dict) for table in tables):
         raise InputError(f"{path}: 'body' must be tables, each below a line [[body]]")
-    for key in (key for table in tables for key in table if key in SHARED):
+    for key in (key for table in tables for key in table if key in OF_THE_RUN):
         raise InputError(f"{path}: {key!r} is for the whole run; it must stand above the first [[body]]")
     parser, actions = _parser(path)
     asked = list(_tokens_given(args, actions))
@@ -80,8 +72,8 @@ def write_run(path: Path, bodies: Sequence[argparse.Namespace]) -> None:
     if len(bodies) == 1:
         lines = _lines(bodies[0], actions, folder)
     else:
-        lines = _lines(bodies[0], {name: actions[name] for name in SHARED}, folder)
-        own = {name: action for name, action in actions.items() if name not in SHARED}
+        lines = _lines(bodies[0], {name: actions[name] for name in OF_THE_RUN}, folder)
+        own = {name: action for name, action in actions.items() if name not in OF_THE_RUN}
         for body in bodies:
             lines += ["", "[[body]]", *_lines(body, own, folder)]
     try:
@@ -135,7 +127,7 @@ def _parser(path: Path) -> tuple[_Parser, dict[str, argparse.Action]]:
     parser = _Parser(add_help=False, prog="simulate")
     parser.path = path
     parser._negative_number_matcher = _Numbers()  # type: ignore[assignment]
-    add_options(parser)
+    add_declared(parser, RunOptions)
     return parser, {action.dest: action for action in parser._actions if action.dest != "write_run"}
 
 
@@ -162,8 +154,8 @@ def _body_of(
         if name in LOADS and isinstance(value, list):
             curves += [_load(name, entry, path) for entry in value if isinstance(entry, dict)]
             value = [entry for entry in value if not isinstance(entry, dict)]
-        if name in PATHS:
-            several = name in ("also", "tool_path") and isinstance(value, list)
+        if _is_path(actions[name]):
+            several = isinstance(actions[name], argparse._AppendAction) and isinstance(value, list)
             value = [_beside(one, path, name) for one in value] if several else _beside(value, path, name)
         try:
             tokens += _tokens(actions[name], value)
@@ -172,6 +164,11 @@ def _body_of(
     body = parser.parse_args([*tokens, *asked])
     body.curves, body.write_run = curves, None
     return body
+
+
+def _is_path(action: argparse.Action) -> bool:
+    """Whether an option's value is a path, which is relative to the run file."""
+    return action.type is Path or action.dest == "input"
 
 
 def _beside(value: Any, path: Path, name: str) -> Any:
@@ -195,8 +192,8 @@ def _load(kind: str, table: dict[str, Any], path: Path) -> Load:
         raise InputError(f"{path}: {kind} of {table['patch']!r}: {error}") from None
     except (TypeError, ValueError):
         raise InputError(f"{path}: {kind} = {table!r}: a value in it is not a number; it must be one") from None
-    if len(values) != LOADS[kind][0] or (axis is not None and len(axis) != 3):
-        needed = f"{VALUES[kind]} must be {LOADS[kind][0]} numbers, an axis 3"
+    if len(values) != LOADS[kind] or (axis is not None and len(axis) != 3):
+        needed = f"{VALUES[kind]} must be {LOADS[kind]} numbers, an axis 3"
         raise InputError(f"{path}: {kind} of {table['patch']!r}: {needed}")
     return Load(kind, str(table["patch"]), values, times, shares, axis)
 
@@ -249,7 +246,7 @@ def _lines(body: argparse.Namespace, actions: dict[str, argparse.Action], folder
         curves = [_table(load) for load in getattr(body, "curves", ()) if load.kind == name]
         if value == action.default and not curves:
             continue
-        if name in PATHS:
+        if _is_path(action):
             several = isinstance(value, list)
             value = [_relative(str(one), folder, name) for one in (value if several else [value])]
             value = value if several else value[0]

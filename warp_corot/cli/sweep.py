@@ -125,14 +125,14 @@ def options_of(source: str, others: list[str], values: dict[str, Any], folder: P
         InputError: A value is out of its range, or the input's run file is wrong.
     """
     from . import Parser
-    from .options import simulate
+    from .options import add_command
 
     name = folder / RUNS / name_of(values)
     words = ["simulate", source, *others, "-o", f"{name}.usd", "--csv", f"{name}.csv"]
     for option, value in values.items():
         words += [f"--{option.replace('_', '-')}", f"{value!r}" if isinstance(value, float) else str(value)]
     parser = Parser(prog="warp-corot")
-    simulate.add_parser(parser.add_subparsers(dest="command", parser_class=Parser))
+    add_command(parser.add_subparsers(dest="command", parser_class=Parser), "simulate")
     args = parser.parse_args(words)
     args.command_line = "warp-corot " + " ".join(words)
     return args

@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 from warp_corot.inputs.device import checked_device
 
 from . import make_parser, simulate
-from .options.bodies import CHOICES
+from .options.run import CHOICES
 
 EXPLICIT, IMPLICIT = (["--integrator", name] for name in ("symplectic-euler", "backward-euler"))
 #: Options of runs, by what they are called.

@@ -18,8 +18,8 @@ IMPLICIT_DT = 0.01
 AUTO = "auto"
 #: The form of a label or region and its material.
 LABEL = "NAME[@NUMBER[+NUMBER...]]=YOUNG[:POISSON[:DENSITY]]"
-#: Loads: number of values after PATCH, and their names.
-LOADS = {"pull": (3, "DX DY DZ"), "twist": (1, "DEGREES"), "press": (1, "PASCALS")}
+#: Loads: number of values after PATCH.
+LOADS = {"pull": 3, "twist": 1, "press": 1}
 #: Views by name: azimuth and elevation [°].
 VIEWS = {
     "corner": (35.0, 14.0),
@@ -30,3 +30,4 @@ VIEWS = {
     "top": (0.0, 89.9),
     "bottom": (0.0, -89.9),
 }
+SIDES = ", ".join(VIEWS)

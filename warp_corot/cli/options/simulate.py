@@ -1,17 +1,13 @@
-"""The options of ``warp-corot simulate``."""
+"""What ``warp-corot simulate`` says of itself; its options are those of a run."""
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
-
-from warp_corot.cli.parsing import COMMANDS
 from warp_corot.cli.say import EXIT_CODES
 
-from .bodies import add_body_options
-from .defaults import LABEL, VIEWS
-from .motion import add_motion_options
+from .defaults import LABEL
+from .run import RunOptions
 
+OPTIONS = RunOptions
 PATCHES = """patches, for --fix, --pull, --press, --twist and --probe, are expressions:
   names      bottom top (tenths of the height), flat (the largest flat region), surface, all, none; labels of a scan;
              regions and sets of nodes of the file (*NSET, groups of points and surfaces, point data); those of --patch
@@ -28,14 +24,8 @@ is true. Options on the command line are added to all its bodies; paths are rela
   pull = [{ patch = "top", by = [0, 0, 0.02], times = [0, 1, 2], shares = [0, 1, 0] }]
 several bodies are tables [[body]], each with an input and its own options, for example offset = [0, 0, "5cm"]"""
 
-
-def add_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParser:
-    """Add the command to ``warp-corot``."""
-    parser = subparsers.add_parser(
-        "simulate",
-        help=COMMANDS["simulate"],
-        description="Lets a soft body sag and sway under gravity and writes a USD animation, coloured by stress.",
-        epilog=f"""examples:
+DESCRIPTION = "Lets a soft body sag and sway under gravity and writes a USD animation, coloured by stress."
+EPILOG = f"""examples:
   warp-corot simulate warp:bunny -o bunny.usd --preview bunny.gif
   warp-corot simulate warp:bear -o bear.usd
   warp-corot simulate liver.msh --unit mm --young 5kPa --fix "z < zmin + 0.01" -o liver.usd --preview liver.png
@@ -65,91 +55,4 @@ quantities are in SI units or have a unit: 5kPa, 1.06g/cm3, 500ms, 0.2inch.
 
 warp:bear, warp:bunny and box have their own defaults for body and motion.
 
-{EXIT_CODES}""",
-    )
-    add_options(parser)
-    return parser
-
-
-def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the command's options to a parser."""
-    add_input(parser)
-    _add_outputs(parser)
-    parser.add_argument(
-        "--static",
-        action="store_true",
-        help="find where the body is at rest in place of its motion: one frame, or with --pull, --twist or --press a "
-        "state of rest for each frame",
-    )
-    add_body_options(parser)
-    add_motion_options(parser)
-    more = parser.add_argument_group("more results")
-    _add_preview_options(more)
-    more.add_argument(
-        "--probe",
-        action="append",
-        metavar="POINT|PATCH",
-        help='record this point, "X Y Z" [m], or patch in --csv; can be given several times',
-    )
-    more.add_argument(
-        "--csv",
-        type=Path,
-        metavar="FILE.csv",
-        help="write displacement, velocity and reaction of each probe, the forces on ground and tools, and the "
-        "energies, of every frame",
-    )
-    more.add_argument("--write-run", type=Path, metavar="RUN.toml", help="save these options as a run file")
-    add_device(parser)
-
-
-def add_input(parser: argparse.ArgumentParser) -> None:
-    """Add the argument INPUT."""
-    parser.add_argument(
-        "input",
-        metavar="INPUT",
-        help="what to simulate. A mesh with volume, whose other cells are split into tetrahedra: a USD file with a "
-        "TetMesh, or a Mesh with tetraIndices; .vtk, .vtu, .vtm, .msh of Gmsh, .inp of Abaqus, .mesh, .node, "
-        ".ele, .vol and others; warp:bear, a toy bear; or box, the beam of Tagawa et al. 2013. A closed "
-        "surface: .obj, .stl, .ply, .off, .glb, .vtp, a USD file with only Mesh prims, one of the other "
-        "files with only triangles; or warp:bunny. A segmented scan: .nii, .nii.gz, .mgz, .mha, .mhd, .nrrd, "
-        ".vti, or a folder with a DICOM series. Or a run file, .toml",
-    )
-
-
-def _add_outputs(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "-o", "--output", type=Path, metavar="OUT.usd", help="animation to write (.usd, .usdc or .usda)"
-    )
-    parser.add_argument(
-        "--also",
-        type=Path,
-        action="append",
-        metavar="OUT.pvd",
-        help="also write for ParaView, with displacement, velocity, strain and stress: .pvd or .xdmf with all "
-        "frames, or .vtu with the last; can be given several times",
-    )
-
-
-def _add_preview_options(group: argparse._ArgumentGroup) -> None:
-    group.add_argument(
-        "--preview",
-        type=Path,
-        metavar="FILE",
-        help="also draw the last frame (.png), or a film of all frames (.gif, .mp4)",
-    )
-    group.add_argument(
-        "--preview-frames",
-        metavar="LIST",
-        help="draw these frames side by side into the .png, counted from 0, or back from -1, for example 0,12,-1",
-    )
-    group.add_argument(
-        "--preview-views",
-        metavar="LIST",
-        help=f"draw from these sides: {', '.join(VIEWS)}, or AZIMUTH:ELEVATION [°], for example front,left,35:14 "
-        "(default: corner)",
-    )
-
-
-def add_device(parser: argparse.ArgumentParser) -> None:
-    """Add the option --device."""
-    parser.add_argument("--device", help='where to compute: "cpu", "cuda:0", ... (default: a GPU if there is one)')
+{EXIT_CODES}"""

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-import argparse
+from dataclasses import dataclass
 
-from warp_corot.cli.parsing import COMMANDS
-
-
-def add_parser(subparsers: argparse._SubParsersAction) -> argparse.ArgumentParser:
-    """Add the command to ``warp-corot``."""
-    parser = subparsers.add_parser(
-        "warm-up",
-        help=COMMANDS["warm-up"],
-        description="""\
+DESCRIPTION = """\
 Makes short runs of the kinds that simulate and view make most, so that the
 kernels of these are in Warp's cache when you need them. Nothing is written
-elsewhere. Where they already are, the runs take seconds.""",
-    )
-    parser.add_argument("--device", help='"cpu", "cuda:0", ... (default: Warp\'s choice)')
-    parser.add_argument(
-        "--all", action="store_true", help="also all elastic models, remeshing, states of rest and own surfaces"
-    )
-    return parser
+elsewhere. Where they already are, the runs take seconds."""
+
+
+@dataclass(kw_only=True)
+class WarmUpOptions:
+    """All options.
+
+    Attributes:
+        device: "cpu", "cuda:0", ... (default: Warp's choice)
+        all: also all elastic models, remeshing, states of rest and own surfaces
+    """
+
+    device: str | None = None
+    all: bool = False
+
+
+OPTIONS = WarmUpOptions
