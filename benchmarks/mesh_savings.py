@@ -17,7 +17,7 @@ import numpy as np
 from warp_corot.domain import Domain
 from warp_corot.errors import InputError
 from warp_corot.experiments.style import FAINT, INK, LINEAR, OWN_COLOR, new_figure, save, tidy
-from warp_corot.io.pictures.preview import check_picture_path
+from warp_corot.io.files.whole import check_output
 from warp_corot.mesh import TetForest
 
 #: Edge of a root cube [m]; the bodies fit into one cube or a few.
@@ -187,7 +187,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("-o", "--output", default="lod.png", type=Path, help="the picture")
     args = parser.parse_args(arguments)
     try:
-        check_picture_path(args.output)
+        check_output(args.output, (".png",))
         points = study()
         print(*table(points), sep="\n")
         draw(points, args.output)

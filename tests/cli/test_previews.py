@@ -153,7 +153,7 @@ def test_an_mp4_has_all_frames(folder):
         (["--preview", "a.png", "--preview-views", "up"], "'up' must be corner, front"),
         (["--preview", "a.png", "--preview-views", "10:95"], "'10:95' must be"),
         (["--preview-views", "front"], "--preview-views is for --preview, which is not given"),
-        (["--preview", "a.jpg"], "a.jpg: extension .jpg; it must be .png or .gif or .mp4"),
+        (["--preview", "a.jpg"], "a.jpg: extension .jpg; it must be .png, .gif, .mp4"),
     ],
 )
 def test_what_is_refused(folder, capsys, options, said):

@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
         return interrupt_status(signalled)
     except OSError as error:
         print(text, flush=True)
-        complain(f"{folder}: cannot be written to: {error.strerror or error}")
+        complain(str(error))
         return 1
     print(text)
     print(f"\nWritten to {folder}: {', '.join(file.name for file in files)}")

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from warp_corot.errors import InputError
+from warp_corot.io.files.whole import check_output
 from warp_corot.io.pictures.film import FILMS, check_film, frames_shown, write_film
 
 from .implicit import is_static
@@ -215,8 +216,6 @@ def check_preview(args: argparse.Namespace) -> None:
     Raises:
         InputError: It cannot.
     """
-    from warp_corot.io.pictures.preview import check_picture_path
-
     if args.preview is None:
         for name in ("preview_frames", "preview_views"):
             if getattr(args, name) is not None:
@@ -224,7 +223,7 @@ def check_preview(args: argparse.Namespace) -> None:
         return
     if find_spec("matplotlib") is None:
         raise InputError('--preview needs Matplotlib: pip install "warp-corot[plot]"')
-    check_picture_path(args.preview, (".png", *FILMS))
+    check_output(args.preview, (".png", *FILMS))
     check_film(args.preview)
     if is_film(args.preview) and args.preview_frames is not None:
         raise InputError(f"--preview-frames is for a .png; {args.preview} is a film and has all frames")

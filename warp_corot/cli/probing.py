@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from warp_corot.contact.tool import Obstacle, Tool
 from warp_corot.errors import InputError
-from warp_corot.io.files.whole import check_output
+from warp_corot.io.files.whole import writing
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
@@ -130,20 +130,18 @@ class Table:
         """Add a row with the current state.
 
         Raises:
-            OSError: It cannot be written.
+            WriteError: It cannot be written.
         """
-        try:
+        energy = self._sim.energy()
+        values = [value for probe in self._probes for value in probe.values()]
+        values += [value for each in self._obstacles.values() for value in _felt(each)]
+        row = [self._sim.time, *values, energy.kinetic, energy.elastic, energy.gravitational, self._sim.dt]
+        with writing(self.path):
             if self._file is None:
                 self._file = self.path.open("w", newline="")
                 csv.writer(self._file).writerow(self._header())
-            energy = self._sim.energy()
-            values = [value for probe in self._probes for value in probe.values()]
-            values += [value for each in self._obstacles.values() for value in _felt(each)]
-            row = [self._sim.time, *values, energy.kinetic, energy.elastic, energy.gravitational, self._sim.dt]
             csv.writer(self._file).writerow([f"{value:.9g}" for value in row])
             self._file.flush()
-        except OSError as error:
-            raise OSError(f"{self.path}: cannot be written: {error.strerror or error}") from None
 
     def close(self) -> None:
         if self._file is not None:
@@ -175,14 +173,3 @@ def _felt(obstacle: Obstacle) -> list[float]:
     if not isinstance(obstacle, Tool):
         return wrench[:3]
     return [*obstacle.present_pose[0, :3].tolist(), *wrench]
-
-
-def check_table_path(path: Path) -> None:
-    """Check, before a long run, that a table can be written.
-
-    Raises:
-        InputError: It cannot.
-    """
-    if path.suffix.lower() != ".csv":
-        raise InputError(f"{path}: extension {path.suffix or '(none)'}; it must be .csv")
-    check_output(path)

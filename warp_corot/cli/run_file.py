@@ -81,11 +81,8 @@ def write_run(path: Path, bodies: Sequence[argparse.Namespace]) -> None:
         data = text.encode()
     except UnicodeEncodeError:
         raise InputError(f"{path}: a name in the run is not UTF-8, which TOML must be") from None
-    try:
-        with written_whole(path) as part:
-            part.write_bytes(data)
-    except OSError as error:
-        raise OSError(f"{path}: cannot be written: {error.strerror or error}") from None
+    with written_whole(path) as part:
+        part.write_bytes(data)
 
 
 def check_run_path(path: Path, source: str) -> None:
@@ -94,9 +91,7 @@ def check_run_path(path: Path, source: str) -> None:
     Raises:
         InputError: It cannot.
     """
-    if path.suffix.lower() != ".toml":
-        raise InputError(f"{path}: extension {path.suffix or '(none)'}; it must be .toml")
-    check_output(path)
+    check_output(path, (".toml",))
     if path.exists() and Path(source).exists() and path.samefile(source):
         raise InputError(f"{path}: is the input; it must be another file")
 

@@ -16,7 +16,7 @@ from .bodies import Body
 from .in_parts import is_in_parts, run_in_parts
 from .prepared import Run, prepared
 from .previews import Previews, check_preview
-from .probing import Table, check_table_path
+from .probing import Table
 from .ranks import Others, hands_out, leads, serve
 from .run_file import bodies_of, check_run_path, write_run
 from .say import early_end
@@ -113,6 +113,7 @@ def _serve(args: argparse.Namespace, options: list[argparse.Namespace]) -> int:
 
 def _check_output(args: argparse.Namespace, shared: argparse.Namespace) -> None:
     """Check, before a long run, that its results can be written."""
+    from warp_corot.io.files.whole import check_output
     from warp_corot.io.write import check_also
     from warp_corot.io.write.animate import frame_count
     from warp_corot.io.write.usd.pieces import PieceStore
@@ -125,7 +126,7 @@ def _check_output(args: argparse.Namespace, shared: argparse.Namespace) -> None:
     for other in shared.also or ():
         check_also(other)
     if shared.csv is not None:
-        check_table_path(shared.csv)
+        check_output(shared.csv, (".csv",))
     check_preview(shared)
     if args.write_run is not None:
         check_run_path(args.write_run, args.input)

@@ -308,4 +308,4 @@ def write_archive(target: Path, arrays: dict[str, np.ndarray]) -> None:
         with written_whole(target) as part, part.open("wb") as file:
             np.savez(file, allow_pickle=False, **arrays)
     except OSError as error:
-        raise InputError(f"cannot save {target}: {error.strerror or error}") from error
+        raise InputError(f"cannot save {error}") from error

@@ -144,10 +144,8 @@ def check_stage_path(path: Path) -> None:
         InputError: Another extension or a name that OpenUSD cannot take, a folder with this name, an output folder that
             does not exist or is not writable, or a write-protected file.
     """
-    if path.suffix.lower() not in STAGE_SUFFIXES:
-        raise InputError(f"{path}: extension {path.suffix or '(none)'}; it must be {', '.join(STAGE_SUFFIXES)}")
     usd_name(path)
-    check_output(path)
+    check_output(path, STAGE_SUFFIXES)
 
 
 def take_lock(lock: int) -> None:

@@ -49,14 +49,8 @@ def write_film(path: Path, images: Iterator[Image], fps: float) -> None:
     Raises:
         OSError: It cannot be written; a former film stays.
     """
-    try:
-        with written_whole(path) as part:
-            if path.suffix.lower() == ".gif":
-                _write_gif(part, images, fps)
-            else:
-                _write_mp4(part, images, fps)
-    except OSError as error:
-        raise OSError(f"{path}: cannot be written: {error.strerror or error}") from None
+    with written_whole(path) as part:
+        (_write_gif if path.suffix.lower() == ".gif" else _write_mp4)(part, images, fps)
 
 
 def _write_gif(path: Path, images: Iterator[Image], fps: float) -> None:

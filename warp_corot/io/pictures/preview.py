@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from PIL.Image import Image
 
-__all__ = ["Camera", "Picture", "check_picture_path", "draw_body", "render_preview", "render_strip", "value_limits"]
+__all__ = ["Camera", "Picture", "draw_body", "render_preview", "render_strip", "value_limits"]
 
 #: Pixels an inch, on which sizes of type depend; and the margin of a film's window.
 DPI, ROOM = 150.0, 0.06
@@ -103,7 +103,7 @@ def render_strip(
     Raises:
         InputError, OSError: As in `render_preview`.
     """
-    target = check_picture_path(path)
+    target = check_output(path, (".png",))
     if not pictures:
         raise InputError("pictures is empty; it must have at least one body")
     save_picture(
@@ -305,19 +305,6 @@ class Strip:
         self._title.set_position(((width - self._bar) / (2.0 * width), 1.0 - 14 / height))
 
 
-def check_picture_path(path: str | Path, suffixes: Sequence[str] = (".png",)) -> Path:
-    """Check, before a long run, that a picture can be written there.
-
-    Raises:
-        InputError: Another extension, a folder with this name, or no folder to write to.
-    """
-    target = Path(path)
-    if target.suffix.lower() not in suffixes:
-        raise InputError(f"{target}: extension {target.suffix or '(none)'}; it must be {' or '.join(suffixes)}")
-    check_output(target)
-    return target
-
-
 def window_of(pictures: Iterable[Sequence[Picture]], cameras: Sequence[Camera], ground: float) -> tuple[Array, Array]:
     """Lowest and highest picture coordinates of the panels in all frames of a film, with a margin, [2] and [2].
 
@@ -351,8 +338,5 @@ def _same_window(all_axes: Sequence["Axes"], low: Array, high: Array, aspect: fl
 
 def save_picture(picture: "Image", target: Path) -> None:
     """Write to a temporary file and rename it, so that a failure does not destroy a good picture."""
-    try:
-        with written_whole(target) as part:
-            picture.save(part, format="PNG")
-    except OSError as error:
-        raise OSError(f"{target}: cannot be written: {error.strerror or error}") from None
+    with written_whole(target) as part:
+        picture.save(part, format="PNG")

@@ -6,14 +6,11 @@ Points are rest positions; *Warp By Vector* with ``displacement`` shows the movi
 from __future__ import annotations
 
 import importlib.util
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Protocol
 
 from warp_corot.errors import InputError
-from warp_corot.io.files.whole import check_output, written_whole
+from warp_corot.io.files.whole import check_output, writing, written_whole
 
 from .fields import Fields
 
@@ -28,14 +25,14 @@ class Writer(Protocol):
         """Write a frame, or keep it.
 
         Raises:
-            OSError: It could not be written.
+            WriteError: It could not be written.
         """
 
     def close(self) -> None:
         """Finish the file.
 
         Raises:
-            OSError: It could not be written.
+            WriteError: It could not be written.
         """
 
 
@@ -46,12 +43,9 @@ def check_also(path: Path) -> None:
         InputError: Another extension, a library that is not installed, a folder with this name, or an output folder
             that does not exist or cannot be written to.
     """
-    package = PACKAGES.get(path.suffix.lower())
-    if package is None:
-        raise InputError(f"{path}: extension {path.suffix or '(none)'}; it must be {', '.join(PACKAGES)}")
-    if importlib.util.find_spec(package) is None:
+    check_output(path, tuple(PACKAGES))
+    if importlib.util.find_spec(PACKAGES[path.suffix.lower()]) is None:
         raise InputError(f'{path}: writing {path.suffix} files needs: pip install "warp-corot[paraview]"')
-    check_output(path)
     frames = _frames_folder(path)
     if path.suffix.lower() == ".pvd" and frames.exists() and not frames.is_dir():
         raise InputError(f"{frames}: is a file; it must be a folder for the frames of {path.name}")
@@ -68,31 +62,8 @@ def also_writer(path: Path) -> Writer:
     if suffix == ".xdmf":
         from .xdmf import XdmfWriter
 
-        return _Named(path, XdmfWriter(path))
-    return _Named(path, VtuWriter(path) if suffix == ".vtu" else PvdWriter(path))
-
-
-class _Named:
-    """A writer whose errors name its file."""
-
-    def __init__(self, path: Path, writer: Writer):
-        self._path, self._writer = path, writer
-
-    def write(self, fields: Fields) -> None:
-        with self._named():
-            self._writer.write(fields)
-
-    def close(self) -> None:
-        with self._named():
-            self._writer.close()
-
-    @contextmanager
-    def _named(self) -> Iterator[None]:
-        try:
-            yield
-        except (OSError, RuntimeError) as error:  # HDF5 raises both
-            number = getattr(error, "errno", None)
-            raise OSError(f"{self._path}: cannot be written: {os.strerror(number) if number else error}") from None
+        return XdmfWriter(path)
+    return VtuWriter(path) if suffix == ".vtu" else PvdWriter(path)
 
 
 class VtuWriter:
@@ -120,7 +91,8 @@ class PvdWriter:
 
     def write(self, fields: Fields) -> None:
         folder = _frames_folder(self._path)
-        folder.mkdir(exist_ok=True)
+        with writing(folder):
+            folder.mkdir(exist_ok=True)
         name = f"{self._path.stem}_{len(self._listed):05}.vtu"
         write_vtu(folder / name, fields)
         self._listed.append(
@@ -139,7 +111,7 @@ def write_vtu(path: Path, fields: Fields) -> None:
     """Write a frame as a .vtu, completely or not at all.
 
     Raises:
-        OSError: It could not be written.
+        WriteError: It could not be written.
     """
     import meshio
 

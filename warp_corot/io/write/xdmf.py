@@ -8,7 +8,7 @@ from xml.sax.saxutils import escape, quoteattr
 
 import numpy as np
 
-from warp_corot.io.files.whole import written_whole
+from warp_corot.io.files.whole import writing, written_whole
 
 from .fields import Fields
 
@@ -34,6 +34,16 @@ class XdmfWriter:
         self._mesh_text = ""
 
     def write(self, fields: Fields) -> None:
+        with writing(self._path):
+            self._write(fields)
+
+    def close(self) -> None:
+        if self._numbers is not None:
+            with writing(self._path):
+                self._numbers.close()
+        self._numbers = None
+
+    def _write(self, fields: Fields) -> None:
         if self._numbers is None:
             import h5py
 
@@ -59,11 +69,6 @@ class XdmfWriter:
         self._numbers.flush()
         with written_whole(self._path) as part:
             part.write_text(HEAD + "".join(self._grids) + TAIL, "utf-8")
-
-    def close(self) -> None:
-        if self._numbers is not None:
-            self._numbers.close()
-        self._numbers = None
 
     def _stored(self, name: str, values: np.ndarray) -> str:
         self._numbers.create_dataset(name, data=values)

@@ -27,7 +27,7 @@ from pxr import Sdf, Tf
 
 from warp_corot.errors import InputError
 from warp_corot.io.files.usd import check_stage_path, is_locked, reason, take_lock, usd_name
-from warp_corot.io.files.whole import sync
+from warp_corot.io.files.whole import WriteError, sync, writing
 
 from .clips import declare_attributes, new_root, play_pieces, set_time_range, varying_attributes
 
@@ -347,14 +347,13 @@ class PieceStore:
             part = part.with_name(part.name.replace("part-piece-", "part-"))
         try:
             if not layer.Export(usd_name(part)):
-                raise OSError(f"{self.path}: writing {part.name} failed")
-            sync(part)
-            os.replace(part, target)
-            sync(target.parent)
+                raise WriteError(f"{self.path}: writing {part.name} failed")
+            with writing(self.path):
+                sync(part)
+                os.replace(part, target)
+                sync(target.parent)
         except Tf.ErrorException as error:
-            raise OSError(f"{self.path}: cannot be written: {reason(error)}") from None
-        except OSError as error:
-            raise OSError(f"{self.path}: cannot be written: {error.strerror or error}") from None
+            raise WriteError(f"{self.path}: cannot be written: {reason(error)}") from None
         finally:
             with contextlib.suppress(OSError):
                 part.unlink(missing_ok=True)
