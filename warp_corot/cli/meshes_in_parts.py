@@ -15,8 +15,8 @@ from .applies import refuse_options
 from .label_materials import LabelMaterial, covers_all, label_material, numbers_by_name, parse_labels
 from .opened import offset_of, open_input, with_unit
 from .options.defaults import BOX_LEVEL
-from .organs import as_options, domain_of, fineness_of
-from .say import complain
+from .organs import ARGUMENTS, domain_of, fineness_of
+from .say import as_options, complain
 from .several import bodies_in
 from .subject import Subject, box_subject
 from .summary import pressure
@@ -61,10 +61,8 @@ def organ_in_parts(args: argparse.Namespace) -> Subject:
     opened = open_input(args.input)
     refuse_options(args, opened)
     opened = with_unit(opened, args)
-    if args.scale is not None and not args.scale > 0.0:
-        raise InputError(f"scale is {args.scale:g}; it must be a positive number")
     entries: list[LabelMaterial] = []
-    with as_options():
+    with as_options(ARGUMENTS):
         domain = domain_of(opened, args, entries)
         mesh = wd.from_domain(domain, **fineness_of(args, domain))
     for note in opened.notes:

@@ -100,8 +100,10 @@ def with_unit(opened: Opened, args: argparse.Namespace) -> Opened:
     in if the file names none, or that a body is of unlikely size.
 
     Raises:
-        InputError: See `load_tets`.
+        InputError: ``--scale`` is not positive, or see `load_tets`.
     """
+    if args.scale is not None and not 0.0 < args.scale < np.inf:
+        raise InputError(f"scale is {args.scale:g}; it must be a positive number")
     named: str | float | None = None
     if opened.kind == "tets":
         given = None if args.unit is None else metres_per_unit(args.unit)

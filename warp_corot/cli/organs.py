@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import re
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +17,7 @@ from warp_corot.mesh.lattice import checked_level
 from .label_materials import LabelMaterial, numbers_by_name, parse_labels
 from .opened import Opened, offset_of, placed_surface, placed_volume
 from .options.defaults import CUBES_OF_LEVEL, MAX_LEVEL_FOR_ERROR, TETS
+from .say import as_options
 from .subject import Subject
 
 if TYPE_CHECKING:
@@ -38,14 +36,9 @@ DETAIL = 6
 MARGIN = 1.0e-3
 #: Names of Python's arguments on the command line.
 ARGUMENTS = {
-    "unit": "--unit",
-    "cell_size": "--cell-size",
-    "max_level": "--max-level",
-    "surface_error": "--surface-error",
-    "target_elements": "--tets",
-    "min_layers": "--min-layers",
-    "smoothing": "--smoothing",
-}
+    name: f"--{name.replace('_', '-')}"
+    for name in ("unit", "cell_size", "max_level", "surface_error", "min_layers", "smoothing")
+} | {"target_elements": "--tets"}
 #: A scan with more distinct values, or with negative ones, holds intensities, not labels.
 MOST_LABELS = 256
 #: Number of voxels that are checked for this.
@@ -62,10 +55,8 @@ def find_organ(opened: Opened, args: argparse.Namespace) -> Subject:
     Raises:
         InputError: It encloses no body, or an option is out of its range.
     """
-    with as_options():
+    with as_options(ARGUMENTS):
         started = WATCH.clock()
-        if args.scale is not None and not (np.isfinite(args.scale) and args.scale > 0):
-            raise InputError(f"scale is {args.scale:g}; it must be a positive number")
         entries: list[LabelMaterial] = []
         domain = domain_of(opened, args, entries)
         meshing = WATCH.clock()
@@ -239,23 +230,3 @@ def _measured(args: argparse.Namespace, mesh: TetForest, domain: Domain, surface
             stacklevel=2,
         )
     return found
-
-
-@contextmanager
-def as_options() -> Iterator[None]:
-    """Replace Python's argument names by options in error messages."""
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        try:
-            yield
-        except InputError as error:
-            raise InputError(_with_options(str(error))) from None
-    for warning in said:
-        warnings.warn(_with_options(str(warning.message)), warning.category, stacklevel=3)
-
-
-def _with_options(text: str) -> str:
-    for name, option in ARGUMENTS.items():
-        text = re.sub(rf"(?<![-\w]){name}(?= is )", option, text)
-        text = re.sub(rf"(?<![-\w]){name}=", f"{option} ", text)
-    return text

@@ -80,13 +80,9 @@ class Probe:
     def _place(self) -> None:
         """Find the tetrahedron that contains the point, or the nearest one."""
         mesh = self.body.mesh
-        corners = mesh.points[mesh.tets]
-        edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
-        inner = np.linalg.solve(edges, (self.point - corners[:, 0])[:, :, None])[:, :, 0]
-        weights = np.concatenate([1.0 - inner.sum(axis=1, keepdims=True), inner], axis=1)
-        best = int(np.argmax(weights.min(axis=1)))
-        inside = np.clip(weights[best], 0.0, None)
-        self._weights, self._nodes = inside / inside.sum(), mesh.tets[best]
+        (element,), (weights,) = mesh.embed(self.point[None])
+        inside = np.clip(weights, 0.0, None)
+        self._weights, self._nodes = inside / inside.sum(), mesh.tets[element]
         away = float(np.linalg.norm(self._weights @ mesh.points[self._nodes] - self.point))
         size = float(np.linalg.norm(np.ptp(mesh.points[mesh.tets.ravel()], axis=0)))
         if away > OUTSIDE * size:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from warp_corot.errors import InputError
 from warp_corot.remesh.online import OnlineRemesh
+
+from .say import as_options
 
 if TYPE_CHECKING:
     from warp_corot.io.write.animate import Recording
@@ -51,20 +50,8 @@ def remesh_of(args: argparse.Namespace, kind: str) -> OnlineRemesh | None:
     asked = {name: getattr(args, name) for name in ("refine_above", "simplify_below", "capacity")}
     asked |= {"every": args.remesh_every}
     asked |= dict(zip(("min_level", "max_level"), args.remesh_levels or (None, None), strict=True))
-    with as_remesh_options():
+    with as_options(ARGUMENTS):
         return OnlineRemesh(**{name: value for name, value in asked.items() if value is not None})
-
-
-@contextmanager
-def as_remesh_options() -> Iterator[None]:
-    """Replace Python's argument names by options in error messages."""
-    try:
-        yield
-    except InputError as error:
-        text = str(error)
-        for name, option in ARGUMENTS.items():
-            text = re.sub(rf"\b{name}(?=,? (which )?is )", option, text)
-        raise InputError(text) from None
 
 
 def remesh_rows(sim: Simulation, done: Recording) -> list[tuple[str, str]]:

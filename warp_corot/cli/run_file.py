@@ -6,7 +6,7 @@ import argparse
 import json
 import os
 import tomllib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, NoReturn
@@ -56,7 +56,8 @@ def bodies_of(args: argparse.Namespace) -> list[argparse.Namespace]:
     for key in (key for table in tables for key in table if key in OF_THE_RUN):
         raise InputError(f"{path}: {key!r} is for the whole run; it must stand above the first [[body]]")
     parser, actions = _parser(path)
-    asked = list(_tokens_given(args, actions))
+    asked = {name: getattr(args, name) for name, action in actions.items() if getattr(args, name) != action.default}
+    del asked["input"]
     return [_body_of(parser, actions, {**data, **table}, asked, path) for table in tables]
 
 
@@ -121,44 +122,68 @@ def option_of(name: str) -> Callable[[str], Any]:
 def _parser(path: Path) -> tuple[_Parser, dict[str, argparse.Action]]:
     parser = _Parser(add_help=False, prog="simulate")
     parser.path = path
-    parser._negative_number_matcher = _Numbers()  # type: ignore[assignment]
     add_declared(parser, RunOptions)
     return parser, {action.dest: action for action in parser._actions if action.dest != "write_run"}
 
 
-class _Numbers:
-    """Matches every text that begins with a minus and is not an option, as a value."""
-
-    @staticmethod
-    def match(text: str) -> bool:
-        return text.startswith("-") and not text.startswith("--")
-
-
 def _body_of(
-    parser: _Parser, actions: dict[str, argparse.Action], table: dict[str, Any], asked: list[str], path: Path
+    parser: _Parser, actions: dict[str, argparse.Action], table: dict[str, Any], asked: dict[str, Any], path: Path
 ) -> argparse.Namespace:
+    """The options in a table of the file, and those of the command line, which replace them or are added to them."""
     if "input" not in table:
         raise InputError(f"{path}: a body has no 'input'; it must have one")
-    tokens: list[str] = []
-    curves: list[Load] = []
+    body = argparse.Namespace(**{name: action.default for name, action in actions.items()}, curves=[], write_run=None)
     for key, value in table.items():
         name = key.replace("-", "_")
         if name not in actions:
             likely = "".join(f", {near!r} is" for near in get_close_matches(name, actions, 1))
             raise InputError(f"{path}: {key!r} is not an option{likely}; see warp-corot simulate --help")
         if name in LOADS and isinstance(value, list):
-            curves += [_load(name, entry, path) for entry in value if isinstance(entry, dict)]
+            body.curves += [_load(name, entry, path) for entry in value if isinstance(entry, dict)]
             value = [entry for entry in value if not isinstance(entry, dict)]
         if _is_path(actions[name]):
-            several = isinstance(actions[name], argparse._AppendAction) and isinstance(value, list)
+            several = _is_list(actions[name]) and isinstance(value, list)
             value = [_beside(one, path, name) for one in value] if several else _beside(value, path, name)
         try:
-            tokens += _tokens(actions[name], value)
+            setattr(body, name, _value_of(parser, actions[name], value))
         except TypeError:
             raise InputError(f"{path}: {key} = {value!r} does not fit the option") from None
-    body = parser.parse_args([*tokens, *asked])
-    body.curves, body.write_run = curves, None
+    for name, value in asked.items():
+        setattr(body, name, [*(getattr(body, name) or ()), *value] if _is_list(actions[name]) else value)
     return body
+
+
+def _value_of(parser: _Parser, action: argparse.Action, value: Any) -> Any:
+    """The value of an option from that of its key.
+
+    Raises:
+        TypeError: Its type does not fit the option.
+    """
+    if isinstance(value, bool) and action.nargs in (0, "?"):
+        return value if action.nargs == 0 else action.const if value else action.default
+    if action.nargs == 0:
+        raise TypeError
+    if _is_list(action):
+        return [_read(parser, action, entry) for entry in (value if isinstance(value, list) else [value])] or None
+    return _read(parser, action, value)
+
+
+def _read(parser: _Parser, action: argparse.Action, value: Any) -> Any:
+    """A value or values as argparse reads their texts."""
+    words = value if isinstance(action.nargs, int) else [value]
+    if not isinstance(words, list) or any(isinstance(word, bool | list | dict) for word in words):
+        raise TypeError
+    try:
+        if isinstance(action.nargs, int) and len(words) != action.nargs:
+            raise argparse.ArgumentError(action, f"expected {action.nargs} arguments")
+        return parser._get_values(action, [str(word) for word in words])
+    except argparse.ArgumentError as error:
+        parser.error(str(error))
+
+
+def _is_list(action: argparse.Action) -> bool:
+    """Whether an option can be given several times."""
+    return isinstance(action, argparse._AppendAction)
 
 
 def _is_path(action: argparse.Action) -> bool:
@@ -191,47 +216,6 @@ def _load(kind: str, table: dict[str, Any], path: Path) -> Load:
         needed = f"{VALUES[kind]} must be {LOADS[kind]} numbers, an axis 3"
         raise InputError(f"{path}: {kind} of {table['patch']!r}: {needed}")
     return Load(kind, str(table["patch"]), values, times, shares, axis)
-
-
-def _tokens(action: argparse.Action, value: Any) -> list[str]:
-    """A value as words of a command line.
-
-    Raises:
-        TypeError: Its type does not fit the option.
-    """
-    if not action.option_strings:
-        return [str(value)]
-    option = action.option_strings[-1]
-    if action.nargs == 0:
-        if not isinstance(value, bool):
-            raise TypeError
-        return [option] if value else []
-    if action.nargs == "?" and isinstance(value, bool):
-        return [option] if value else []
-    if isinstance(value, bool | dict):
-        raise TypeError
-    if isinstance(action, argparse._AppendAction):
-        entries = value if isinstance(value, list) else [value]
-        return [token for entry in entries for token in _valued(action, option, entry)]
-    return _valued(action, option, value)
-
-
-def _valued(action: argparse.Action, option: str, value: Any) -> list[str]:
-    if action.nargs in (None, "?"):
-        if isinstance(value, list | dict):
-            raise TypeError
-        return [f"{option}={value}"]
-    if not isinstance(value, list | tuple) or any(isinstance(one, list | dict) for one in value):
-        raise TypeError
-    return [option, *map(str, value)]
-
-
-def _tokens_given(args: argparse.Namespace, actions: dict[str, argparse.Action]) -> Iterator[str]:
-    """The words of the command line besides the run file."""
-    for name, action in actions.items():
-        value = getattr(args, name)
-        if name != "input" and value != action.default:
-            yield from _tokens(action, value)
 
 
 def _lines(body: argparse.Namespace, actions: dict[str, argparse.Action], folder: Path) -> list[str]:

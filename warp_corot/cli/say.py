@@ -6,10 +6,13 @@ import os
 import re
 import signal
 import sys
-from contextlib import AbstractContextManager, nullcontext
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any, TextIO
 
-from warp_corot.errors import UnstableError
+from warp_corot.errors import InputError, UnstableError
 
 if TYPE_CHECKING:
     from warp_corot.io.write.animate import Recording
@@ -22,23 +25,6 @@ EXIT_CODES = """exit status:
   130  interrupted (Ctrl-C), 143 terminated (SIGTERM); the written frames are kept"""
 
 
-#: Names of Python's arguments that are also options.
-ARGUMENTS = (
-    "young",
-    "poisson",
-    "density",
-    "dt",
-    "damping",
-    "viscosity",
-    "scale",
-    "duration",
-    "fps",
-    "rotation_level",
-    "dilatation",
-    "friction",
-)
-
-
 class Terminated(KeyboardInterrupt):
     """SIGTERM arrived."""
 
@@ -49,9 +35,32 @@ def interrupt_status(signalled: KeyboardInterrupt) -> int:
 
 
 def as_option(message: str) -> str:
-    """Turn a message about an argument of Python into one about the option with this name."""
-    message = re.sub(rf"^({'|'.join(ARGUMENTS)}) is ", lambda found: f"--{found[1].replace('_', '-')} is ", message)
+    """Turn a message that begins with an argument of Python into one about the option with this name."""
+    from .options.run import RunOptions
+
+    names = "|".join(each.name for each in fields(RunOptions))
+    message = re.sub(rf"^({names}) is ", lambda found: f"--{found[1].replace('_', '-')} is ", message)
     return re.sub(r", or None$", "", message).replace("it must be None, a", "it must be a")
+
+
+@contextmanager
+def as_options(names: Mapping[str, str]) -> Iterator[None]:
+    """Replace names of Python's arguments by those of options, anywhere in errors and warnings."""
+
+    def named(text: str) -> str:
+        for name, option in names.items():
+            text = re.sub(rf"(?<![-\w]){name}(?=,? (which )?is )", option, text)
+            text = re.sub(rf"(?<![-\w]){name}=", f"{option} ", text)
+        return text
+
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        try:
+            yield
+        except InputError as error:
+            raise InputError(named(str(error))) from None
+    for warning in said:
+        warnings.warn(named(str(warning.message)), warning.category, stacklevel=3)
 
 
 def kept_so_far(done: Recording) -> str:

@@ -17,7 +17,8 @@ from .bodies import Body, gravity_of
 from .implicit import integrator_name, is_static
 from .options.defaults import IMPLICIT_DT
 from .ranks import Others, are_several, led_simulation, one_first
-from .remesh import as_remesh_options
+from .remesh import ARGUMENTS
+from .say import as_options
 from .static import check_static, static_integrator
 from .touching import Touched
 
@@ -49,7 +50,7 @@ def make_simulation(
             tried = min(_tried_step(body, damping, viscosity) for body in bodies)
         steps = steps_per_frame(args.fps, args.dt or tried)  # refuses an excessive number
         integrator = SymplecticEuler(None if args.dt is None else 1.0 / (args.fps * steps), damping, viscosity)
-    with as_remesh_options():
+    with as_options(ARGUMENTS):
         make: Any = led_simulation if are_several() else Simulation
         made: Simulation = (make if others is None else others.simulation)(
             bodies=[body.soft for body in bodies],
@@ -72,7 +73,7 @@ def _tried_step(one: Body, damping: float, viscosity: float) -> float:
         tried, remesh = SoftBody(body.mesh, body.material, device=body.device), replace(remesh, every=1)
         tried.fix(body.constrained)
     integrator = SymplecticEuler(damping=damping, viscosity=viscosity)
-    with as_remesh_options():
+    with as_options(ARGUMENTS):
         trial = Simulation(tried, model=model, integrator=integrator, gravity=(0, 0, 0), remesh=remesh)
     dt = trial.dt
     trial.step()

@@ -117,8 +117,6 @@ def find_subject(opened: Opened, args: argparse.Namespace) -> Subject:
     Raises:
         InputError: A mesh that cannot be simulated, or options that do not suit it.
     """
-    if args.scale is not None and not (np.isfinite(args.scale) and args.scale > 0):
-        raise InputError(f"scale is {args.scale:g}; it must be a positive number")
     if opened.kind == "box":
         level = BOX_LEVEL if args.level is None else args.level
         return _box(1.0 if args.scale is None else args.scale, level, offset_of(args))

@@ -6,7 +6,7 @@ import argparse
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -186,21 +186,14 @@ def say_overlaps(touched: Touched, bodies: Sequence[Body], sim: Simulation) -> N
             body.subject.notes.append(f"{where}; they are pushed apart gently")
 
 
-def _holds_axis(mesh: object, obstacle: Obstacle, pose: Floats) -> bool:
+def _holds_axis(mesh: Any, obstacle: Obstacle, pose: Floats) -> bool:
     """Whether a mesh contains a point of an obstacle's axis, which may lie between its nodes."""
     shape = obstacle.shape if isinstance(obstacle, Tool) else obstacle
     half = shape.size[1] if isinstance(shape, Capsule | Cylinder) else 0.0
     x, y, z, w = pose[3:]
     axis = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
     places = pose[:3] + np.linspace(-half, half, 33)[:, None] * axis
-    corners = mesh.points[mesh.tets]  # type: ignore[attr-defined]
-    edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
-    near = [np.flatnonzero(((corners.min(axis=1) <= p) & (p <= corners.max(axis=1))).all(axis=1)) for p in places]
-    for place, found in zip(places, near, strict=True):
-        inner = np.linalg.solve(edges[found], (place - corners[found, 0])[:, :, None])[:, :, 0]
-        if ((inner >= 0.0).all(axis=1) & (inner.sum(axis=1) <= 1.0)).any():
-            return True
-    return False
+    return bool((mesh.embed(places)[1] >= 0.0).all(axis=1).any())
 
 
 def _described(obstacle: Obstacle) -> str:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from pxr import Tf, Usd, UsdGeom
 
 from warp_corot.errors import InputError
@@ -70,9 +71,7 @@ def _check_types(stage: Any, path: Path) -> None:
             attribute, definition = prim.GetAttribute(name), prim.GetPrimDefinition().GetAttributeDefinition(name)
             if not definition or not attribute.HasAuthoredValue():
                 continue
-            value = attribute.Get()
-            value = attribute.Get(Usd.TimeCode.EarliestTime()) if value is None else value
-            due = definition.GetTypeName()
+            value, due = first_value(attribute), definition.GetTypeName()
             if value is not None and not _is_of(value, due):
                 raise InputError(f"{path}: {attribute.GetPath()} must be of type {due}; its values are of another type")
 
@@ -86,6 +85,24 @@ def _is_of(value: Any, due: Any) -> bool:
         return found.ndim > 0
     rank = wanted.ndim + int(due.isArray)
     return found.ndim == rank and found.shape[rank - wanted.ndim :] == wanted.shape and found.dtype.kind in kinds
+
+
+def first_value(attribute: Any) -> Any:
+    """The default value of an attribute or a primvar, else its first time sample; None without one."""
+    value = attribute.Get()
+    return attribute.Get(Usd.TimeCode.EarliestTime()) if value is None else value
+
+
+def in_world(prim: Any, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points [N, 3] of a prim in the world, in the stage's unit, at its first time."""
+    world = world_matrix(prim)
+    return points @ world[:3, :3] + world[3, :3]
+
+
+def world_matrix(prim: Any, time: Usd.TimeCode | None = None) -> NDArray[np.float64]:
+    """From a prim's space to the world, for row vectors, float64 [4, 4]; None: at the first time."""
+    cache = UsdGeom.XformCache(Usd.TimeCode.EarliestTime() if time is None else time)
+    return np.array(cache.GetLocalToWorldTransform(prim), dtype=np.float64)
 
 
 P = ParamSpec("P")

@@ -117,27 +117,41 @@ def _of_mesh_file(path: Path, found: FileMesh | None) -> Read:
 
 
 def _read_trimesh(path: Path) -> Read:
+    points, triangles, objects, offset = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], [], 0
+    for mesh, transform, node, _ in placed_meshes(path):
+        mesh = mesh.copy()
+        mesh.apply_transform(transform)
+        points.append(np.asarray(mesh.vertices, dtype=np.float64).reshape(-1, 3))
+        triangles.append(np.asarray(mesh.faces).reshape(-1, 3) + offset)
+        objects.append((node, len(mesh.faces)))
+        offset += len(mesh.vertices)
+    return np.concatenate(points), np.concatenate(triangles), [], objects
+
+
+def placed_meshes(path: Path, **options: Any) -> list[tuple[Any, NDArray[Any], str, str]]:
+    """The meshes of a file that trimesh reads, each with its place in the scene [4, 4], the name of its node there, and
+    its own; those of its first mesh come first.
+
+    Args:
+        path: The file.
+        options: More arguments of trimesh's ``load_scene``.
+
+    Raises:
+        InputError: trimesh is not installed, or cannot read it.
+    """
     try:
         import trimesh
     except ImportError:
         raise InputError(f'{path}: reading {path.suffix} files needs: pip install "warp-corot[surface]"') from None
     try:
-        options = {"split_objects": True} if path.suffix.lower() == ".obj" else {}
+        options |= {"split_objects": True} if path.suffix.lower() == ".obj" else {}
         with quietly(), bounded(path):
             scene = trimesh.load_scene(path, process=False, **options)
-        places = {name: place for place, name in enumerate(scene.geometry)}
-        points, triangles, objects, offset = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], [], 0
-        for node in sorted(scene.graph.nodes_geometry, key=lambda node: (places[scene.graph[node][1]], str(node))):
-            transform, name = scene.graph[node]
-            if not isinstance(scene.geometry[name], trimesh.Trimesh):
-                continue
-            mesh = scene.geometry[name].copy()
-            mesh.apply_transform(transform)
-            points.append(np.asarray(mesh.vertices, dtype=np.float64).reshape(-1, 3))
-            triangles.append(np.asarray(mesh.faces).reshape(-1, 3) + offset)
-            objects.append((str(node), len(mesh.faces)))
-            offset += len(mesh.vertices)
+        order = list(scene.geometry)
+        found = [(*scene.graph.get(node), str(node)) for node in scene.graph.nodes_geometry]
+        found.sort(key=lambda each: (order.index(each[1]), each[2]))
+        placed = [(scene.geometry[name], np.asarray(matrix), node, name) for matrix, name, node in found]
+        return [each for each in placed if isinstance(each[0], trimesh.Trimesh)]
     except Exception as error:
         why = " ".join(str(error).split())[:120]
         raise InputError(f"{path}: is not a {path.suffix} file that trimesh can read triangles from ({why})") from None
-    return np.concatenate(points), np.concatenate(triangles), [], objects

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, Vt
 
-from warp_corot.errors import InputError
-from warp_corot.io.files.quiet import bounded, quietly
+from warp_corot.io.read.surfaces import placed_meshes
 
 #: Path of the prims.
 ROOT = "/scene"
@@ -24,25 +23,13 @@ def stage_of_file(path: Path) -> Any:
     Raises:
         InputError: trimesh cannot read it.
     """
-    try:
-        import trimesh
-
-        with quietly(), bounded(path):
-            options = {"split_objects": True} if path.suffix.lower() == ".obj" else {}
-            scene = trimesh.load_scene(path, process=False, maintain_order=True, **options)
-        nodes = [(scene.geometry[name], matrix, name) for matrix, name in map(scene.graph.get, _drawn(scene))]
-    except ImportError:
-        raise InputError(f'{path}: reading {path.suffix} files needs: pip install "warp-corot[surface]"') from None
-    except Exception as error:
-        why = " ".join(str(error).split())[:120]
-        raise InputError(f"{path}: is not a {path.suffix} file that trimesh can read triangles from ({why})") from None
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     UsdGeom.Scope.Define(stage, ROOT)
     taken: set[str] = set()
-    for geometry, matrix, name in nodes:
-        if isinstance(geometry, trimesh.Trimesh) and len(geometry.faces):
-            _define(stage, _free_name(name or path.stem, taken), geometry, np.asarray(matrix), path)
+    for geometry, matrix, _, name in placed_meshes(path, maintain_order=True):
+        if len(geometry.faces):
+            _define(stage, _free_name(name or path.stem, taken), geometry, matrix, path)
     return stage
 
 
@@ -62,10 +49,6 @@ def _set_triangles(mesh: Any, points: np.ndarray, triangles: np.ndarray) -> None
     mesh.CreateFaceVertexCountsAttr(Vt.IntArray(len(triangles), 3))
     mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(triangles, np.int32).ravel()))
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
-
-
-def _drawn(scene: Any) -> list[str]:
-    return list(scene.graph.nodes_geometry)
 
 
 def _free_name(name: str, taken: set[str]) -> str:

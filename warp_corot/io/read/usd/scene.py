@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pxr import Tf, Usd, UsdGeom, UsdPhysics
 
 from warp_corot.errors import InputError
-from warp_corot.io.files.usd import metres_per_unit, open_stage, reads_stage
+from warp_corot.io.files.usd import metres_per_unit, open_stage, reads_stage, world_matrix
 from warp_corot.io.read.tetrahedra import USD_SUFFIXES
 from warp_corot.mesh.surfaces.boundary import signed_volumes
 
@@ -105,8 +105,7 @@ class Scene:
 
     def matrix(self, path: str) -> NDArray[np.float64]:
         """From a prim's space to the world, for row vectors, float64 [4, 4]."""
-        prim = self.stage.GetPrimAtPath(path)
-        return np.array(UsdGeom.XformCache(Usd.TimeCode.Default()).GetLocalToWorldTransform(prim), dtype=np.float64)
+        return world_matrix(self.stage.GetPrimAtPath(path), Usd.TimeCode.Default())
 
     def world_points(self, path: str) -> NDArray[np.float64]:
         """Points of a prim in the world, float64 [N, 3]."""
@@ -275,7 +274,7 @@ def _tet_prim(prim: Any, source: Path) -> TetPrim:
 
 def _check_in_world(prim: Any, points: NDArray[np.float64], tets: NDArray[np.int32], name: str) -> None:
     """Refuse tetrahedra that lose their volume in world coordinates, where positions are float32."""
-    matrix = np.array(UsdGeom.XformCache().GetLocalToWorldTransform(prim), dtype=np.float64)
+    matrix = world_matrix(prim, Usd.TimeCode.Default())
     there = (points @ matrix[:3, :3] + matrix[3, :3]).astype(np.float32).astype(np.float64)
     before, after = signed_volumes(points, tets), signed_volumes(there, tets)
     gone = np.count_nonzero(~(after * np.sign(before * np.linalg.det(matrix[:3, :3])) > 0.0))

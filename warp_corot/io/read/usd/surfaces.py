@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pxr import Usd, UsdGeom
 
 from warp_corot.errors import InputError
-from warp_corot.io.files.usd import metres_per_unit, open_stage, reads_stage
+from warp_corot.io.files.usd import first_value, in_world, metres_per_unit, open_stage, reads_stage, world_matrix
 
 
 class DrawnMesh(NamedTuple):
@@ -40,21 +40,18 @@ def drawn_meshes(stage: Any, path: Path) -> Iterator[DrawnMesh]:
     Raises:
         InputError: Faces that do not match their points.
     """
-    time = Usd.TimeCode.EarliestTime()
-    cache = UsdGeom.XformCache(time)
     for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
         mesh = UsdGeom.Mesh(prim)
         if not mesh or mesh.ComputePurpose() in ("guide", "proxy"):
             continue
-        points, triangles, faces = _triangles(mesh, path, time)
+        points, triangles, faces = _triangles(mesh, path)
         if not len(triangles):
             continue
-        world = np.array(cache.GetLocalToWorldTransform(prim), dtype=np.float64)
         left_handed = mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
-        left_handed ^= bool(np.linalg.det(world[:3, :3]) < 0.0)
+        left_handed ^= bool(np.linalg.det(world_matrix(prim)[:3, :3]) < 0.0)
         yield DrawnMesh(
             mesh,
-            points @ world[:3, :3] + world[3, :3],
+            in_world(prim, points),
             triangles[:, ::-1] if left_handed else triangles,
             faces,
             left_handed,
@@ -90,19 +87,16 @@ def read_usd_surface(
     return np.concatenate(points), np.concatenate(triangles), metres, up_axis, notes, objects
 
 
-def _triangles(
-    mesh: UsdGeom.Mesh, path: Path, time: Usd.TimeCode
-) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
+def _triangles(mesh: UsdGeom.Mesh, path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
     """Points, the fans of a mesh's polygons, without holes, and the polygon of each triangle."""
-    points = np.asarray(_earliest(mesh.GetPointsAttr(), time), dtype=np.float64).reshape(-1, 3)
-    counts = np.asarray(_earliest(mesh.GetFaceVertexCountsAttr(), time), dtype=np.int64)
-    indices = np.asarray(_earliest(mesh.GetFaceVertexIndicesAttr(), time), dtype=np.int64)
+    points = _numbers(mesh.GetPointsAttr(), np.float64).reshape(-1, 3)
+    counts, indices = _numbers(mesh.GetFaceVertexCountsAttr()), _numbers(mesh.GetFaceVertexIndicesAttr())
     if (counts < 3).any() or counts.sum() != len(indices):
         raise InputError(f"{path}: {mesh.GetPath()}: faces name {len(indices)} corners; they must name {counts.sum()}")
     bad = indices[(indices < 0) | (indices >= len(points))]
     if len(bad):
         raise InputError(f"{path}: prim {mesh.GetPath()} names point {bad[0]} but has points 0 to {len(points) - 1}")
-    holes = np.asarray(_earliest(mesh.GetHoleIndicesAttr(), time), dtype=np.int64)
+    holes = _numbers(mesh.GetHoleIndicesAttr())
     kept = np.ones(len(counts), bool)
     kept[holes[(holes >= 0) & (holes < len(counts))]] = False
     starts = (np.cumsum(counts) - counts)[kept]
@@ -113,9 +107,7 @@ def _triangles(
     return points, triangles, np.repeat(np.flatnonzero(kept), fans)
 
 
-def _earliest(attribute: Usd.Attribute, time: Usd.TimeCode) -> Any:
-    """An attribute's default value, or its first time sample; empty without one."""
-    value = attribute.Get()
-    if value is None:
-        value = attribute.Get(time)
-    return () if value is None else value
+def _numbers(attribute: Usd.Attribute, dtype: Any = np.int64) -> NDArray[Any]:
+    """An attribute's first value; empty without one."""
+    value = first_value(attribute)
+    return np.asarray(() if value is None else value, dtype=dtype)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pxr import Usd, UsdGeom
 
 from warp_corot.errors import InputError
-from warp_corot.io.files.usd import metres_per_unit, open_stage, reads_stage
+from warp_corot.io.files.usd import first_value, in_world, metres_per_unit, open_stage, reads_stage
 from warp_corot.io.read.filemesh import sets_of_numbers
 
 
@@ -53,7 +53,6 @@ def read_usd_tets(path: Path) -> StageTets:
     stage = open_stage(path)
     metres = metres_per_unit(stage, path)
     up_axis = str(UsdGeom.GetStageUpAxis(stage))
-    cache = UsdGeom.XformCache(Usd.TimeCode.EarliestTime())
 
     all_points: list[NDArray[np.float64]] = []
     all_tets: list[NDArray[np.int64]] = []
@@ -68,8 +67,7 @@ def read_usd_tets(path: Path) -> StageTets:
         if indices.min() < 0 or indices.max() >= len(points):
             bad = indices[(indices < 0) | (indices >= len(points))][0]
             raise InputError(f"{path}: prim {prim.GetPath()} names point {bad} but has points 0 to {len(points) - 1}")
-        world = np.array(cache.GetLocalToWorldTransform(prim), dtype=np.float64)
-        all_points.append(points @ world[:3, :3] + world[3, :3])
+        all_points.append(in_world(prim, points))
         all_tets.append(indices + offset)
         name = prim.GetName()
         taken = {known for known, _ in prims}
@@ -95,8 +93,7 @@ def _node_sets(prim: Any, count: int) -> dict[str, NDArray[np.int64]]:
     for primvar in UsdGeom.PrimvarsAPI(prim).GetPrimvars():
         if primvar.GetInterpolation() != UsdGeom.Tokens.vertex or primvar.IsIndexed():
             continue
-        value = primvar.Get()
-        values = np.asarray(primvar.Get(Usd.TimeCode.EarliestTime()) if value is None else value)
+        values = np.asarray(first_value(primvar))
         if values.shape == (count,) and values.dtype.kind in "iub":
             found |= sets_of_numbers(primvar.GetPrimvarName().replace(":", "_"), values.astype(np.int64))
     return found
@@ -110,9 +107,7 @@ def _tet_indices(prim, path: Path) -> NDArray[np.int64] | None:
         attribute = prim.GetAttribute("tetraIndices")
     else:
         return None
-    value = attribute.Get()
-    if value is None:
-        value = attribute.Get(Usd.TimeCode.EarliestTime())
+    value = first_value(attribute)
     if value is None:
         return None
     flat = np.asarray(value).reshape(-1)
@@ -125,10 +120,7 @@ def _tet_indices(prim, path: Path) -> NDArray[np.int64] | None:
 
 def _rest_points(prim, path: Path) -> NDArray[np.float64]:
     """Points [N, 3] of a prim at rest, in its own space."""
-    attribute = UsdGeom.PointBased(prim).GetPointsAttr()
-    value = attribute.Get()
-    if value is None:
-        value = attribute.Get(Usd.TimeCode.EarliestTime())
+    value = first_value(UsdGeom.PointBased(prim).GetPointsAttr())
     if value is None or len(value) == 0:
         raise InputError(f"{path}: prim {prim.GetPath()} has tetrahedra but no points")
     rest = UsdGeom.PrimvarsAPI(prim).GetPrimvar("rest")
