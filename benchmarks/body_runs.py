@@ -31,9 +31,9 @@ def measured(path: Path, options: list[str], tets: int, device: str) -> dict[str
     import warp as wp
 
     from warp_corot.cli import make_parser
-    from warp_corot.cli.opened import open_input
+    from warp_corot.cli.input_file import open_input
+    from warp_corot.cli.multibody import bodies_in
     from warp_corot.cli.organs import find_organ
-    from warp_corot.cli.several import bodies_in
     from warp_corot.errors import InputError
     from warp_corot.io.read.tetrahedra import load_tets
 
@@ -90,7 +90,7 @@ def _load_kernels(device: str) -> None:
     import trimesh
 
     from warp_corot.cli import make_parser
-    from warp_corot.cli.opened import open_input
+    from warp_corot.cli.input_file import open_input
     from warp_corot.cli.organs import find_organ
 
     with warnings.catch_warnings(), tempfile.TemporaryDirectory() as folder:
@@ -152,6 +152,6 @@ def largest_displacement(path: Path) -> float:
 
 
 def _has_tets(path: Path) -> bool:
-    from warp_corot.cli.opened import open_input
+    from warp_corot.cli.input_file import open_input
 
     return open_input(str(path)).kind == "tets"

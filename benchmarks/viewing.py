@@ -11,7 +11,7 @@ import sys
 import time
 
 from warp_corot.cli import make_parser
-from warp_corot.cli.prepared import prepared
+from warp_corot.cli.run_setup import set_up
 from warp_corot.viewing.messages import frame_told
 from warp_corot.viewing.view import View
 
@@ -43,7 +43,7 @@ def timed(work, seconds: float) -> float:
 def main() -> None:
     given = sys.argv[1:] or ["warp:bunny", "--tets", "20000"]
     args = make_parser().parse_args(["view", *given])
-    ready = prepared([args])
+    ready = set_up([args])
     own = [body.subject.skin or body.subject.surface for body in ready.bodies]
     count = multiprocessing.get_context("spawn").Value("q", 0)
     with View(ready.sim, port=0, own=own) as page:

@@ -14,7 +14,7 @@ import pytest
 from command_line import SHORT, run, simulate
 from stages import frames
 
-from warp_corot.cli.say import interrupt_status
+from warp_corot.cli.exit_status import interrupt_status
 from warp_corot.cli.signals import terminable
 
 OPTIONS = ["young", "poisson", "density", "model", "rotation-level", "fix", "scale", "gravity", "duration", "fps", "dt"]
@@ -25,7 +25,7 @@ OPTIONS += ["smoothing", "draw-tets", "draw-labels"]
 @pytest.fixture(autouse=True)
 def nothing_said_of_compiling(monkeypatch):
     """Suppress the message about compiling, which depends on what ran before and is tested elsewhere."""
-    monkeypatch.setattr("warp_corot.cli.prepared.compiling_said", lambda device: nullcontext())
+    monkeypatch.setattr("warp_corot.cli.run_setup.compiling_said", lambda device: nullcontext())
 
 
 def test_a_free_fall_is_noted(folder, capsys):

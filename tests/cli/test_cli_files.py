@@ -10,7 +10,7 @@ from pxr import Usd, UsdGeom
 from stages import TETS
 
 import warp_corot as wc
-from warp_corot.cli.opened import open_input
+from warp_corot.cli.input_file import open_input
 from warp_corot.mesh.surfaces.boundary import signed_volumes
 
 

@@ -17,8 +17,8 @@ from warp_corot.cli import make_parser
 from warp_corot.cli.options.declared import add_declared
 from warp_corot.cli.options.run import RunOptions
 from warp_corot.cli.parsing import StrictParser
-from warp_corot.cli.prepared import prepared
 from warp_corot.cli.run_file import bodies_of
+from warp_corot.cli.run_setup import set_up
 from warp_corot.cli.view import _carry_over, run_text
 from warp_corot.simulation.remade import remade
 
@@ -116,7 +116,7 @@ def test_ctrl_c_ends_it_quietly(number, status, tmp_path):
 
 
 def test_the_run_file_has_the_state_of_the_page(folder):
-    ready = prepared(asked("box", "--device", "cpu", "--gravity", "0", "0", "-1", "--fix", "z == zmin"))
+    ready = set_up(asked("box", "--device", "cpu", "--gravity", "0", "0", "-1", "--fix", "z == zmin"))
     body = ready.bodies[0]
     options = [body.args]
     stiffer = wc.Isotropic(young=1e3, poisson=0.3, density=10.0)
@@ -131,7 +131,7 @@ def test_the_run_file_has_the_state_of_the_page(folder):
     assert told["remesh"] is True
     assert told["gravity"] == [0.0, 0.0, -1.0]
     (folder / "run.toml").write_bytes(text)
-    again = prepared(asked("run.toml"))
+    again = set_up(asked("run.toml"))
     assert isinstance(again.sim.models[0], wc.StVenantKirchhoff)
     assert again.sim.remeshing.every
     plain = tomllib.loads(run_text(options, ready.sim).decode())
@@ -140,7 +140,7 @@ def test_the_run_file_has_the_state_of_the_page(folder):
 
 
 def test_pressed_patches_stay_pressed_after_a_switch(folder):
-    ready = prepared(
+    ready = set_up(
         asked("box", "--device", "cpu", "--press", "z == zmax", "10", "--ramp", "0.001", "--gravity", 0, 0, 0)
     )
     sim = remade(ready.sim, models=[wc.StVenantKirchhoff()])

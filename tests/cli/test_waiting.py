@@ -14,16 +14,16 @@ termios = pytest.importorskip("termios")
 
 SLOW_SCAN = """
 import sys, time
-from warp_corot.cli import prepared, waiting, main
+from warp_corot.cli import main, run_setup, waiting
 waiting.SILENT = waiting.EVERY = 0.05
-found = prepared.find_body
+found = run_setup.find_body
 def slow(body):
-    from warp_corot.cli.say import complain
+    from warp_corot.cli.exit_status import complain
     time.sleep(1.0)
     complain("of something", kind="note")
     time.sleep(1.0)
     return found(body)
-prepared.find_body = slow
+run_setup.find_body = slow
 sys.exit(main(["simulate", "box", "-o", "a.usd", "--duration", "0.05", "--fps", "40", "--device", "cpu"]))
 """
 

@@ -7,7 +7,7 @@ import trimesh
 from warp_corot.domain import Domain
 from warp_corot.domain.fidelity import fidelity, smallest_dihedral
 from warp_corot.domain.reference import reference_of, volume_along_lines
-from warp_corot.holding.choice import holds_of
+from warp_corot.holding.choice import supports_of
 from warp_corot.mesh import TetForest, TetMesh
 from warp_corot.mesh.pieces import pieces_of
 
@@ -81,7 +81,7 @@ def test_pieces_of_a_mesh_share_faces() -> None:
     tets = np.array([[0, 1, 2, 3], [0, 2, 1, 4], [0, 3, 6, 5]])
     assert pieces_of(tets).tolist() == [0, 0, 1]
     mesh = TetMesh(points, tets)
-    assert len(holds_of(mesh, young=1e6, density=1e3, gravity=(0, 0, -9.81)).pieces) == 2
+    assert len(supports_of(mesh, young=1e6, density=1e3, gravity=(0, 0, -9.81)).pieces) == 2
     assert fidelity(mesh, surface_of(ball(1.0)), samples=100).pieces == 2
 
 

@@ -64,7 +64,7 @@ def test_imports_go_down_the_floors():
 
 
 def test_an_import_of_a_higher_floor_is_seen():
-    up, down = Import("mesh.forest", "cli.say", "lazy", 1), Import("cli.say", "mesh.forest", "load", 1)
+    up, down = Import("mesh.forest", "cli.exit_status", "lazy", 1), Import("cli.exit_status", "mesh.forest", "load", 1)
     assert against_the_floors([up, down]) == [up]
 
 

@@ -7,8 +7,8 @@ import pytest
 import trimesh
 
 import warp_corot as wc
-from warp_corot.holding.choice import holds_of
-from warp_corot.holding.regions import Shape, flat_region
+from warp_corot.holding.choice import supports_of
+from warp_corot.holding.regions import BodyShape, flat_region
 from warp_corot.holding.sag import CoarseBody
 from warp_corot.holding.sag_mesh import MeshBody
 from warp_corot.mesh.pieces import pieces_of
@@ -60,7 +60,7 @@ def soft(mesh) -> float:
 
 
 def held(mesh, young=None):
-    return holds_of(mesh, young=young or soft(mesh), density=DENSITY, gravity=GRAVITY)
+    return supports_of(mesh, young=young or soft(mesh), density=DENSITY, gravity=GRAVITY)
 
 
 def largest_displacement(mesh, nodes, young, seconds) -> float:
@@ -111,11 +111,11 @@ def test_a_body_without_flat_feet_may_lie(shape, lies):
     domain = wc.Domain.from_surface((shape.vertices, shape.faces), up_axis="Z", device="cpu")
     mesh = wc.TetForest.from_domain(domain, target_elements=800, device="cpu")
     given = {"young": soft(mesh), "density": DENSITY, "surface": mesh.surface()}
-    found = holds_of(mesh, gravity=GRAVITY, may_lie=True, **given)
+    found = supports_of(mesh, gravity=GRAVITY, may_lie=True, **given)
     assert found.lies == lies
     assert found.nodes.any() == (not lies)
     for other in ({"gravity": GRAVITY}, {"gravity": (0, 0, 0), "may_lie": True}):
-        assert holds_of(mesh, **given, **other).nodes.any()
+        assert supports_of(mesh, **given, **other).nodes.any()
 
 
 def test_a_standing_body_stays_standing():
@@ -223,7 +223,7 @@ def test_the_largest_flat_region_is_found():
     """A bowl that is filled to the brim."""
     mesh = shaped(lambda x: x * [0.05, 0.05, 0.04] * np.where(x[:, 2:] > 0.0, [1.0, 1.0, 0.1], 1.0))
     faces = boundary_faces(mesh.tets, mesh.points)[0]
-    shape = Shape(mesh.points, np.arange(len(mesh.points)), mesh.points, faces, np.array([0.0, 0.0, 1.0]))
+    shape = BodyShape(mesh.points, np.arange(len(mesh.points)), mesh.points, faces, np.array([0.0, 0.0, 1.0]))
     patch = flat_region(shape)
     assert patch.where.endswith("facing up")
     assert mesh.points[patch.nodes, 2].min() > -0.02
@@ -236,7 +236,7 @@ def test_a_sheet_thinner_than_its_elements_is_held_to_its_corners():
     domain = wc.Domain.from_surface((sheet.vertices, sheet.faces), up_axis="Z")
     forest = wc.TetForest.from_domain(domain, target_elements=5000)
     surface = forest.surface()
-    chosen = holds_of(forest, young=1e3, density=DENSITY, gravity=GRAVITY, surface=surface)
+    chosen = supports_of(forest, young=1e3, density=DENSITY, gravity=GRAVITY, surface=surface)
     assert "flat region" in chosen.words
     around = np.unique(surface.nodes[surface.points[:, 2] > 0.0009])
     off = np.abs(forest.points[around, 2] - 0.001)
@@ -269,12 +269,12 @@ def test_loose_tetrahedra_are_held_each_and_all_move():
 def test_an_asset_softer_than_it_is_meant_to_be_is_held_by_what_carries_it():
     from argparse import Namespace
 
-    from warp_corot.cli.subject import Subject
+    from warp_corot.cli.input_mesh import InputMesh
     from warp_corot.io.read.assets import find_asset
 
     mesh = wc.TetForest.box((1, 1, 1), 0.1, 0)
     for young, fix in ((None, "y < 0.01"), (3e4, "y < 0.01"), (3e3, None)):
-        subject = Subject(mesh, "bunny")
+        subject = InputMesh(mesh, "bunny")
         subject.take(find_asset("warp:bunny"), Namespace(young=young, unit=None, scale=None, offset=None))
         assert subject.fix == fix
         assert subject.young == 3e4

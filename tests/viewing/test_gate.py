@@ -11,7 +11,7 @@ import pytest
 from hands import block
 
 import warp_corot as wc
-from warp_corot.viewing.gate import Gate, is_loopback
+from warp_corot.viewing.access_control import AccessControl, is_loopback
 from warp_corot.viewing.view import View
 
 WEBSOCKET = {
@@ -43,11 +43,11 @@ def status(gate, path="/", **headers):
     ],
 )
 def test_without_a_token_only_this_computer(headers, passes):
-    assert status(Gate("127.0.0.1"), **headers) == (None if passes else 403)
+    assert status(AccessControl("127.0.0.1"), **headers) == (None if passes else 403)
 
 
 def test_with_a_token_only_those_who_bring_it():
-    gate = Gate("0.0.0.0", "open sesame")
+    gate = AccessControl("0.0.0.0", "open sesame")
     here = {"Host": "192.168.0.7:8080"}
     assert status(gate, **here) == 403
     for query in ("token=", "token=open", "token=open+sesame+", "token=Open+sesame", "other=open+sesame"):
@@ -65,23 +65,23 @@ def test_with_a_token_only_those_who_bring_it():
     assert status(gate, Cookie=cookie, Upgrade="websocket", **here) is None
     assert status(gate, Cookie=cookie, Origin="http://evil.example", **here) == 403
     assert status(gate, Cookie=cookie + "x", **here) == 403
-    assert status(Gate("0.0.0.0", "open sesame"), Cookie=cookie.replace("=", "x=", 1), **here) == 403
+    assert status(AccessControl("0.0.0.0", "open sesame"), Cookie=cookie.replace("=", "x=", 1), **here) == 403
 
 
 def test_no_token_where_others_come_is_refused():
     for host in ("0.0.0.0", "192.168.0.7", "::", "example.org"):
         assert not is_loopback(host)
         with pytest.raises(wc.InputError, match="it must have a token"):
-            Gate(host)
+            AccessControl(host)
     for token in ("", "  "):
         with pytest.raises(wc.InputError, match="token is empty"):
-            Gate("127.0.0.1", token)
+            AccessControl("127.0.0.1", token)
 
 
 def test_the_address_tells_the_token():
-    assert Gate("127.0.0.1").address(8080) == "http://127.0.0.1:8080/"
-    assert Gate("0.0.0.0", "a b&c").address(80) == "http://localhost:80/?token=a%20b%26c"
-    assert Gate("::1", "x").address(80) == "http://[::1]:80/?token=x"
+    assert AccessControl("127.0.0.1").address(8080) == "http://127.0.0.1:8080/"
+    assert AccessControl("0.0.0.0", "a b&c").address(80) == "http://localhost:80/?token=a%20b%26c"
+    assert AccessControl("::1", "x").address(80) == "http://[::1]:80/?token=x"
 
 
 # --- the server itself -----------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from hands import TOP, block, session
 
 import warp_corot as wc
 from warp_corot.viewing.cutting import Plane
-from warp_corot.viewing.pacing import Pace
+from warp_corot.viewing.real_time_factor import RealTimeFactor
 from warp_corot.viewing.session import Session
 from warp_corot.viewing.shown import ELEMENTS, INPUT, MARCHED
 
@@ -149,8 +149,8 @@ def test_reset_goes_back_to_the_beginning():
 def test_time_runs_as_requested_or_as_fast_as_it_can(rate, speed, reading, expected, monkeypatch):
     """On a clock of the test: steps take their time at ``rate``, frames are read, and the page waits for the next one.
     The last case has no time to wait: it steps for the rest of each period."""
-    clock, pace, period, due = 100.0, Pace(), 1 / 30, 100.0
-    monkeypatch.setattr("warp_corot.viewing.pacing.time.perf_counter", lambda: clock)
+    clock, pace, period, due = 100.0, RealTimeFactor(), 1 / 30, 100.0
+    monkeypatch.setattr("warp_corot.viewing.real_time_factor.time.perf_counter", lambda: clock)
     simulated = 0.0
     for frame in range(600):
         wanted = pace.wanted(speed, period)

@@ -6,7 +6,7 @@ import warp as wp
 from hands import TOP, block
 
 import warp_corot as wc
-from warp_corot.viewing.hands import HANDS, Drag, patch_around
+from warp_corot.viewing.hands import HANDS, DragHand, patch_around
 from warp_corot.viewing.shown import ELEMENTS, Shown, surfaces_of
 from warp_corot.viewing.springs import HARDEST, MOST_HANDS, MOST_POINTS, Springs
 
@@ -16,7 +16,7 @@ def under_hands(sim):
     return Springs(sim, shown), shown[0]
 
 
-class Stiff(Drag):
+class Stiff(DragHand):
     """A spring as stiff as with the longest step, whatever the step is."""
 
     def __init__(self, springs, shown, pick, radius):
@@ -24,7 +24,7 @@ class Stiff(Drag):
         super().__init__(springs, shown, pick, radius, strength=(dt / 4e-3) ** 2)
 
 
-def hand_at(sim, kind=Drag, radius=0.02, place=TOP):
+def hand_at(sim, kind=DragHand, radius=0.02, place=TOP):
     springs, shown = under_hands(sim)
     return kind(springs, shown, shown.pick(0, place), radius)
 
@@ -126,13 +126,13 @@ def test_recorded_steps_take_up_hands_and_leave_them(device):
     sim = block(device)
     sim.advance(0.2)
     springs, shown = under_hands(sim)
-    hand = Drag(springs, shown, shown.pick(0, TOP), 0.02)
+    hand = DragHand(springs, shown, shown.pick(0, TOP), 0.02)
     revision = sim.system.launch_revision
     hand.move(np.array([0.0, 0.005, 0.0]))
     sim.advance(0.1)
     assert np.linalg.norm(hand.force) > 0.0
     hand.release()
-    second = Drag(springs, shown, shown.pick(0, (0.1, 0.05, 0.1)), 0.02)
+    second = DragHand(springs, shown, shown.pick(0, (0.1, 0.05, 0.1)), 0.02)
     second.move(np.array([0.005, 0.0, 0.0]))
     sim.advance(0.1)
     assert np.linalg.norm(second.force) > 0.0
@@ -147,11 +147,11 @@ def test_the_number_of_hands_is_limited():
     sim = block()
     springs, shown = under_hands(sim)
     pick = shown.pick(0, TOP)
-    hands = [Drag(springs, shown, pick, 0.02) for _ in range(MOST_HANDS)]
+    hands = [DragHand(springs, shown, pick, 0.02) for _ in range(MOST_HANDS)]
     with pytest.raises(LookupError, match="8 hands hold the body already"):
-        Drag(springs, shown, pick, 0.02)
+        DragHand(springs, shown, pick, 0.02)
     hands[3].release()
-    Drag(springs, shown, pick, 0.02)
+    DragHand(springs, shown, pick, 0.02)
 
 
 def test_a_patch_is_near_and_limited():

@@ -17,7 +17,7 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_count, checked_numbers, shown
 from warp_corot.inputs.device import checked_device
 from warp_corot.inputs.loading import BODY, load
-from warp_corot.inputs.turns import TURN, in_turn
+from warp_corot.inputs.simulation_lock import TURN, in_turn
 from warp_corot.kernels.stepping.integrate import RESET_NODES
 from warp_corot.materials.isotropic import Material
 from warp_corot.mesh import TetForest

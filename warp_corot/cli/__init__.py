@@ -19,9 +19,9 @@ from warp_corot.inputs.importing import uncollected
 from warp_corot.inputs.likely import meant
 from warp_corot.inputs.stopwatch import WATCH
 
+from .exit_status import EXIT_CODES, as_option, complain, interrupt_status, open_streams, silence
 from .parsing import COMMANDS, StrictParser
 from .ranks import end_others, fall_silent, let_others_speak, speaks
-from .say import EXIT_CODES, as_option, complain, interrupt_status, open_streams, silence
 from .signals import leaving_at_once, terminable
 
 #: Exit statuses of runs that failed, and not by a signal.

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .bodies import Body
+    from .bodies import RunBody
 
 #: Replacement for bytes that are not UTF-8, which USD's strings must be.
 _ERRORS = "backslashreplace"
 
 
-def about(args: argparse.Namespace, bodies: Sequence[Body]) -> dict[str, Any]:
+def about(args: argparse.Namespace, bodies: Sequence[RunBody]) -> dict[str, Any]:
     """The command, its run file if any, and for each body its input's name and hash, its supports and its loads; for
     the layer's custom data.
 
@@ -29,7 +29,7 @@ def about(args: argparse.Namespace, bodies: Sequence[Body]) -> dict[str, Any]:
     return said | {f"body{number}": _of_body(body) for number, body in enumerate(bodies, start=1)}
 
 
-def _of_body(body: Body) -> dict[str, Any]:
+def _of_body(body: RunBody) -> dict[str, Any]:
     subject, args = body.subject, body.args
     said = {"name": _text(subject.name), "input": _text(args.input), "held": body.held.words}
     if subject.source is not None:

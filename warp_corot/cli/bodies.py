@@ -16,18 +16,18 @@ from warp_corot.materials.isotropic import Isotropic
 from warp_corot.remesh.online import OnlineRemesh
 from warp_corot.simulation.parts import checked_gravity
 
-from .applies import refuse_options
-from .holding import Held, held_as_told, held_by_default, up_of
+from .holding import FixedNodes, held_as_told, held_by_default, up_of
 from .implicit import is_static
+from .input_file import InputFile, open_input, with_unit
+from .input_mesh import InputMesh, find_subject
 from .label_materials import covers_all, label_material, region_material
 from .loading import Load, loads_of, move_patches, ramp_of
-from .opened import Opened, open_input, with_unit
+from .multibody import bodies_in
+from .option_rules import refuse_options
 from .organs import find_organ
-from .patches import Patches
+from .patches import BodyPatches
 from .probing import probes_body
 from .remesh import remesh_of
-from .several import bodies_in
-from .subject import Subject, find_subject
 from .summary import pressure
 from .touching import stands_free
 
@@ -36,7 +36,7 @@ LIGHT = 5.0
 
 
 @dataclass(eq=False)
-class Body:
+class RunBody:
     """A body of a run.
 
     Attributes:
@@ -53,27 +53,27 @@ class Body:
     """
 
     args: argparse.Namespace
-    opened: Opened
+    opened: InputFile
     model: Model
     remesh: OnlineRemesh | None
     loads: list[Load]
-    subject: Subject = field(init=False)
-    patches: Patches = field(init=False)
-    held: Held = field(init=False)
+    subject: InputMesh = field(init=False)
+    patches: BodyPatches = field(init=False)
+    held: FixedNodes = field(init=False)
     soft: SoftBody = field(init=False)
     probes: list[str] = field(default_factory=list)
 
 
-def asked_bodies(args: argparse.Namespace) -> list[Body]:
+def asked_bodies(args: argparse.Namespace) -> list[RunBody]:
     """The bodies of an input, with their options checked as far as possible without meshes."""
     model = model_of(args.model, args.rotation_level, args.dilatation)
     opened = open_input(args.input)
     refuse_options(args, opened)
     remesh, loads = remesh_of(args, opened.kind), loads_of(args)
-    return [Body(own, part, model, remesh, loads) for part, own in bodies_in(with_unit(opened, args), args)]
+    return [RunBody(own, part, model, remesh, loads) for part, own in bodies_in(with_unit(opened, args), args)]
 
 
-def find_body(body: Body) -> Subject:
+def find_body(body: RunBody) -> InputMesh:
     args = body.args
     find = find_subject if body.opened.kind in ("box", "tets") else find_organ
     subject = find(body.opened, args)
@@ -83,7 +83,7 @@ def find_body(body: Body) -> Subject:
     return subject
 
 
-def find_patches(bodies: Sequence[Body]) -> None:
+def find_patches(bodies: Sequence[RunBody]) -> None:
     """Find the patches of all bodies of an input; each body gets the loads and probes on its patches."""
     args = bodies[0].args
     probes, loads = list(args.probe or ()), bodies[0].loads
@@ -91,7 +91,7 @@ def find_patches(bodies: Sequence[Body]) -> None:
         raise InputError("--probe is for --csv, which is not given")
     for body in bodies:
         gravity = gravity_of(args, body.subject)
-        body.patches = Patches(body.subject, up_of(body.subject, gravity), args.patch or ())
+        body.patches = BodyPatches(body.subject, up_of(body.subject, gravity), args.patch or ())
         body.loads, body.probes = loads, probes
         if len(bodies) > 1:
             body.loads = [load for load in loads if body.patches.nodes(load.patch).any()]
@@ -104,7 +104,7 @@ def find_patches(bodies: Sequence[Body]) -> None:
             raise InputError(f"--probe {text!r}: is in none of the bodies")
 
 
-def make_body(body: Body, duration: float, *, alone: bool) -> None:
+def make_body(body: RunBody, duration: float, *, alone: bool) -> None:
     """Make the body with its fixed nodes and moving patches; if it is alone, it may lie on a ground."""
     args, subject = body.args, body.subject
     gravity = gravity_of(args, subject)
@@ -141,7 +141,7 @@ def make_body(body: Body, duration: float, *, alone: bool) -> None:
         )
 
 
-def gravity_of(args: argparse.Namespace, subject: Subject) -> np.ndarray:
+def gravity_of(args: argparse.Namespace, subject: InputMesh) -> np.ndarray:
     given = subject.gravity if args.gravity is None else tuple(args.gravity)
     return np.array(checked_gravity(given, subject.mesh.up_axis))
 
@@ -161,7 +161,7 @@ def model_of(name: str, rotation_level: int | float | str | None, dilatation: st
 
 
 def _material(
-    args: argparse.Namespace, subject: Subject, patches: Patches, stiffer: float = 1.0
+    args: argparse.Namespace, subject: InputMesh, patches: BodyPatches, stiffer: float = 1.0
 ) -> tuple[Isotropic, float | None]:
     """The material, and Young's modulus [Pa] if it was chosen for the body's weight, times a factor."""
     density = subject.density if args.density is None else args.density

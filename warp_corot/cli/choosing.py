@@ -12,11 +12,11 @@ import warp as wp
 from warp_corot.elasticity import Corotated
 from warp_corot.mesh import TetForest
 
-from .bodies import Body
+from .bodies import RunBody
 from .implicit import is_static
 from .options.defaults import IMPLICIT_DT
 from .ranks import are_several
-from .touching import Touched
+from .touching import RunContact
 
 #: The steps that follow the state, over the largest stable one at rest.
 SHORTER = 0.75
@@ -44,7 +44,7 @@ ON_CPU = Cost(3e-5, 25e-9, 2.4), Cost(1e-3, 0.7e-6, 6.0)
 ON_CUDA = Cost(12e-6, 25e-12, 40.0), Cost(1.5e-3, 50e-9, 3.0)
 
 
-def choose_steps(args: argparse.Namespace, bodies: Sequence[Body], touched: Touched, device: wp.Device) -> None:
+def choose_steps(args: argparse.Namespace, bodies: Sequence[RunBody], touched: RunContact, device: wp.Device) -> None:
     """Set ``integrator`` of a body's options to implicit steps if explicit ones would be slower than real time, and
     much slower than these; a note of the body says so.
 
@@ -72,14 +72,14 @@ def choose_steps(args: argparse.Namespace, bodies: Sequence[Body], touched: Touc
     )
 
 
-def may_choose(bodies: Sequence[Body]) -> bool:
+def may_choose(bodies: Sequence[RunBody]) -> bool:
     """Whether the options leave the choice open."""
     args = bodies[0].args
     given = args.integrator or args.dt or args.viscosity or is_static(args) or are_several()
     return not (given or args.self_contact or len(bodies) > 1 or bodies[0].remesh is not None)
 
 
-def _stable_step(body: Body) -> float:
+def _stable_step(body: RunBody) -> float:
     """An estimate of the largest stable step at rest [s]: the smallest height of an element over the speed of sound. It
     was within 10 % for four uniform organs and a box, and is within 25 % where stiffness jumps."""
     mesh, material = body.soft.mesh, body.soft.discretization

@@ -17,7 +17,7 @@ import warp as wp
 
 from warp_corot.inputs.stopwatch import KERNELS, WATCH
 
-from .say import complain
+from .exit_status import complain
 
 Say = Callable[[str], None]
 

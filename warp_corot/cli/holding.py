@@ -10,19 +10,19 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_corot.errors import InputError
-from warp_corot.holding.choice import holds_of
+from warp_corot.holding.choice import supports_of
 from warp_corot.materials.isotropic import Isotropic
 
 if TYPE_CHECKING:
-    from .patches import Patches
-    from .subject import Subject
+    from .input_mesh import InputMesh
+    from .patches import BodyPatches
 
 
 #: Factor on the stiffness that is needed at least.
 MORE = 1.05
 
 
-def up_of(subject: Subject, gravity: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def up_of(subject: InputMesh, gravity: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """The unit vector against gravity; the mesh's up axis without gravity."""
     if not gravity.any():
         return np.eye(3)["XYZ".index(subject.mesh.up_axis)]
@@ -30,7 +30,7 @@ def up_of(subject: Subject, gravity: npt.NDArray[np.float64]) -> npt.NDArray[np.
 
 
 @dataclass(frozen=True, eq=False)
-class Held:
+class FixedNodes:
     """The fixed nodes.
 
     Attributes:
@@ -48,7 +48,7 @@ class Held:
         return int(self.nodes.sum())
 
 
-def held_as_told(subject: Subject, patches: Patches, expressions: Sequence[str], pulled: bool) -> Held:
+def held_as_told(subject: InputMesh, patches: BodyPatches, expressions: Sequence[str], pulled: bool) -> FixedNodes:
     """The nodes of ``--fix``, from all its patches.
 
     Args:
@@ -67,13 +67,13 @@ def held_as_told(subject: Subject, patches: Patches, expressions: Sequence[str],
     if not nodes.any():
         if not pulled:
             subject.notes.append(f"no node is held ({said!r}): the body falls freely")
-        return Held(nodes, "free, nothing is held")
-    return Held(nodes, f"held where {said}")
+        return FixedNodes(nodes, "free, nothing is held")
+    return FixedNodes(nodes, f"held where {said}")
 
 
 def held_by_default(
-    subject: Subject, material: Isotropic, gravity: npt.NDArray[np.float64], *, may_stiffen: bool, may_lie: bool
-) -> tuple[Held, float]:
+    subject: InputMesh, material: Isotropic, gravity: npt.NDArray[np.float64], *, may_stiffen: bool, may_lie: bool
+) -> tuple[FixedNodes, float]:
     """The support of the body, and a factor on its stiffness: above one if no patch would support it with its present
     stiffness.
 
@@ -84,7 +84,7 @@ def held_by_default(
         may_stiffen: Whether Young's modulus was not given.
         may_lie: Whether the body may lie on a ground.
     """
-    holds = holds_of(
+    holds = supports_of(
         subject.mesh,
         young=material.young,
         density=material.density,
@@ -96,10 +96,10 @@ def held_by_default(
         subject.notes.append(
             f"the body lies on a ground, since {holds.lies}, and nothing is fixed (--no-ground or --fix holds it)"
         )
-        return Held(holds.nodes, "lying on a ground", lies=True), 1.0
+        return FixedNodes(holds.nodes, "lying on a ground", lies=True), 1.0
     lines = holds.reasons()
     subject.notes += [*lines[:-1], f"{lines[-1]} (--fix chooses others)"]
-    held = Held(holds.nodes, holds.words)
+    held = FixedNodes(holds.nodes, holds.words)
     if not (1.0 < holds.stiffer < np.inf):
         return held, 1.0
     if may_stiffen:

@@ -20,6 +20,7 @@ from warp_corot.solvers import SymplecticEuler
 
 from .bodies import model_of
 from .compiling import compiling_said
+from .exit_status import complain, early_end
 from .loading import Load, loads_of, ramp_of
 from .meshes_in_parts import (
     OF_ORGANS,
@@ -31,14 +32,13 @@ from .meshes_in_parts import (
     organ_in_parts,
 )
 from .ranks import are_several, hands_out
-from .say import complain, early_end
 from .summary import aligned, milliseconds, speed, wall_time
 
 if TYPE_CHECKING:
     from warp_corot.distributed import Simulation
     from warp_corot.io.write.animate import Recording
 
-    from .subject import Subject
+    from .input_mesh import InputMesh
 
 #: The options with which a mesh is made in parts; with others every rank makes the whole.
 OPTIONS = (
@@ -110,7 +110,7 @@ def run_in_parts(args: argparse.Namespace) -> int:
     return 0
 
 
-def _simulation(args: argparse.Namespace, subject: Subject, duration: float) -> tuple[Simulation, list[Load]]:
+def _simulation(args: argparse.Namespace, subject: InputMesh, duration: float) -> tuple[Simulation, list[Load]]:
     """The simulation of this rank's part, held and moved, and its loads."""
     import warp_corot.distributed as wd
     from warp_corot.distributed import mpi
@@ -201,7 +201,7 @@ class _Table:
 
 
 def _summary(
-    args: argparse.Namespace, sim: Simulation, loads: Sequence[Load], subject: Subject, done: Recording
+    args: argparse.Namespace, sim: Simulation, loads: Sequence[Load], subject: InputMesh, done: Recording
 ) -> str:
     from warp_corot.distributed.divided_mesh import DividedForest
 

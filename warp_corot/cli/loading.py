@@ -21,7 +21,7 @@ from .pressing import pressed, surface_of
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
 
-    from .patches import Patches
+    from .patches import BodyPatches
 
 #: Units of values that have none.
 UNITS = {"pull": "m", "twist": "degree", "press": "Pa"}
@@ -107,7 +107,7 @@ def value_of(kind: str, text: str) -> float:
 
 
 def move_patches(
-    body: SoftBody, loads: Sequence[Load], patches: Patches, ramp: float, fixed: npt.NDArray[np.bool_] | None
+    body: SoftBody, loads: Sequence[Load], patches: BodyPatches, ramp: float, fixed: npt.NDArray[np.bool_] | None
 ) -> None:
     """Prescribe the motion of the patches of ``--pull`` and ``--twist``.
 
@@ -147,7 +147,7 @@ def move_patches(
 
 
 def _turned(
-    load: Load, patches: Patches, mask: npt.NDArray[np.bool_], times: Array, shares: Array
+    load: Load, patches: BodyPatches, mask: npt.NDArray[np.bool_], times: Array, shares: Array
 ) -> tuple[Array, Array]:
     """Keyframes of a twist: times [K], and displacements [K, n, 3]."""
     axis = (

@@ -11,14 +11,14 @@ from warp_corot.errors import InputError
 from warp_corot.experiments import paper
 from warp_corot.materials.isotropic import Isotropic
 
-from .applies import refuse_options
+from .exit_status import as_options, complain
+from .input_file import offset_of, open_input, with_unit
+from .input_mesh import InputMesh, box_subject
 from .label_materials import LabelMaterial, covers_all, label_material, numbers_by_name, parse_labels
-from .opened import offset_of, open_input, with_unit
+from .multibody import bodies_in
+from .option_rules import refuse_options
 from .options.defaults import BOX_LEVEL
 from .organs import ARGUMENTS, domain_of, fineness_of
-from .say import as_options, complain
-from .several import bodies_in
-from .subject import Subject, box_subject
 from .summary import pressure
 
 #: The options of surfaces and scans beside those of boxes.
@@ -41,7 +41,7 @@ def needs_young(args: argparse.Namespace) -> bool:
     return bool(len(np.setdiff1d(volume.values, [0, *(number for of_name in named.values() for number in of_name)])))
 
 
-def box_in_parts(args: argparse.Namespace) -> Subject:
+def box_in_parts(args: argparse.Namespace) -> InputMesh:
     """This rank's part of the box, and its defaults."""
     import warp_corot.distributed as wd
 
@@ -50,7 +50,7 @@ def box_in_parts(args: argparse.Namespace) -> Subject:
     return box_subject(wd.box(paper.CELLS, paper.CELL_SIZE * scale, level, origin=(x, y, z)))
 
 
-def organ_in_parts(args: argparse.Namespace) -> Subject:
+def organ_in_parts(args: argparse.Namespace) -> InputMesh:
     """This rank's part of the body that a surface or a scan encloses, and its defaults.
 
     Raises:
@@ -69,13 +69,13 @@ def organ_in_parts(args: argparse.Namespace) -> Subject:
         complain(note, kind="note")
     loaded = opened.volume or opened.surface
     assert loaded is not None
-    subject = Subject(mesh, loaded.name.encode(errors="replace").decode(), opened.source, labels=entries)
+    subject = InputMesh(mesh, loaded.name.encode(errors="replace").decode(), opened.source, labels=entries)
     if opened.asset:
         subject.take(opened.asset, args)
     return subject
 
 
-def material_in_parts(args: argparse.Namespace, subject: Subject, comm: Any) -> Isotropic:
+def material_in_parts(args: argparse.Namespace, subject: InputMesh, comm: Any) -> Isotropic:
     """The material of this rank's part; all ranks must call this.
 
     Raises:
@@ -92,7 +92,7 @@ def material_in_parts(args: argparse.Namespace, subject: Subject, comm: Any) -> 
     return label_material(subject.mesh, subject.labels, **given)
 
 
-def material_lines(args: argparse.Namespace, subject: Subject) -> list[tuple[str, str]]:
+def material_lines(args: argparse.Namespace, subject: InputMesh) -> list[tuple[str, str]]:
     """The lines of the summary about the material."""
     given = {name: getattr(args, name) for name in ("young", "poisson", "density")}
     given = {name: getattr(subject, name) if value is None else value for name, value in given.items()}

@@ -14,11 +14,11 @@ from warp_corot.inputs.stopwatch import WATCH
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.lattice import checked_level
 
+from .exit_status import as_options
+from .input_file import InputFile, offset_of, placed_surface, placed_volume
+from .input_mesh import InputMesh
 from .label_materials import LabelMaterial, numbers_by_name, parse_labels
-from .opened import Opened, offset_of, placed_surface, placed_volume
 from .options.defaults import CUBES_OF_LEVEL, MAX_LEVEL_FOR_ERROR, TETS
-from .say import as_options
-from .subject import Subject
 
 if TYPE_CHECKING:
     from warp_corot.domain import Domain
@@ -45,7 +45,7 @@ MOST_LABELS = 256
 LOOKED_AT = 10**6
 
 
-def find_organ(opened: Opened, args: argparse.Namespace) -> Subject:
+def find_organ(opened: InputFile, args: argparse.Namespace) -> InputMesh:
     """Mesh the body that a surface or a scan encloses.
 
     Args:
@@ -67,7 +67,7 @@ def find_organ(opened: Opened, args: argparse.Namespace) -> Subject:
         skin = _own_surface(opened, args, domain)
     asset, loaded = opened.asset, opened.volume or opened.surface
     assert loaded is not None
-    subject = Subject(
+    subject = InputMesh(
         mesh,
         loaded.name.encode(errors="replace").decode(),
         opened.source,
@@ -84,7 +84,7 @@ def find_organ(opened: Opened, args: argparse.Namespace) -> Subject:
     return subject
 
 
-def domain_of(opened: Opened, args: argparse.Namespace, entries: list[LabelMaterial]) -> Domain:
+def domain_of(opened: InputFile, args: argparse.Namespace, entries: list[LabelMaterial]) -> Domain:
     """The domain of a surface or a scan; ``entries`` are filled with the materials of its labels."""
     return _scan(opened, args, entries) if opened.kind == "scan" else _surface(opened, args)
 
@@ -98,13 +98,13 @@ def fineness_of(args: argparse.Namespace, domain: Domain) -> dict[str, Any]:
     return {"cell_size": size, "max_level": args.level, "surface_error": args.surface_error, "device": args.device}
 
 
-def _surface(opened: Opened, args: argparse.Namespace) -> Domain:
+def _surface(opened: InputFile, args: argparse.Namespace) -> Domain:
     from warp_corot.domain import Domain
 
     return Domain.from_surface(placed_surface(opened, args), unit=opened.unit, device=args.device)
 
 
-def _scan(opened: Opened, args: argparse.Namespace, entries: list[LabelMaterial]) -> Domain:
+def _scan(opened: InputFile, args: argparse.Namespace, entries: list[LabelMaterial]) -> Domain:
     """The domain of a scan; ``entries`` are filled with the materials of its labels."""
     from warp_corot.domain import Domain
 
@@ -192,7 +192,7 @@ def _mesh(args: argparse.Namespace, domain: Domain) -> TetForest:
         raise InputError(f"{with_tets}{error}") from None
 
 
-def _own_surface(opened: Opened, args: argparse.Namespace, domain: Domain) -> OwnSurface | None:
+def _own_surface(opened: InputFile, args: argparse.Namespace, domain: Domain) -> OwnSurface | None:
     """The input surface, if it is to be drawn."""
     if opened.surface is None or args.skin == "marched":
         return None

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from warp_corot.errors import InputError
 
-from .say import complain, interrupt_status
+from .exit_status import complain, interrupt_status
 
 if TYPE_CHECKING:
     from warp_corot.experiments.paper import Results, Settings

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from warp_corot.body.places import TAKEN, named_nodes
 from warp_corot.errors import InputError
-from warp_corot.holding.regions import LOWEST, Shape, flat_region
+from warp_corot.holding.regions import LOWEST, BodyShape, flat_region
 from warp_corot.inputs.selection import select_nodes
 from warp_corot.mesh.surfaces.boundary import boundary_faces
 
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
     from warp_corot.discretization.elements import Mesh
     from warp_corot.mesh.surfaces.bound import SurfaceMesh
 
-    from .subject import Subject
+    from .input_mesh import InputMesh
 
 Mask = npt.NDArray[np.bool_]
 
 
-class Patches:
+class BodyPatches:
     """The patches of a body.
 
     Args:
@@ -39,7 +39,7 @@ class Patches:
         InputError: Another form, or an invalid name.
     """
 
-    def __init__(self, subject: Subject, up: npt.NDArray[np.float64], given: Sequence[str] = ()):
+    def __init__(self, subject: InputMesh, up: npt.NDArray[np.float64], given: Sequence[str] = ()):
         self.subject = subject
         self.used = subject.used
         self._up, self._given = up, given
@@ -59,9 +59,11 @@ class Patches:
                 raise InputError(f"--patch {text!r}: {name} is already a name; it must be another one")
             self._named[name] = partial(np.array, self.nodes(expression)[self.used])
 
-    def of_mesh(self, mesh: Mesh) -> Patches:
+    def of_mesh(self, mesh: Mesh) -> BodyPatches:
         """The same patches on the body's changed mesh."""
-        return self if mesh is self.subject.mesh else Patches(replace(self.subject, mesh=mesh), self._up, self._given)
+        return (
+            self if mesh is self.subject.mesh else BodyPatches(replace(self.subject, mesh=mesh), self._up, self._given)
+        )
 
     def nodes(self, expression: str) -> Mask:
         """Nodes of a patch, bool [N]; nodes in no tetrahedron are in no patch.
@@ -110,12 +112,12 @@ class Patches:
         return select_nodes(expression, surface.points, bounds=self.subject.bounds, named=named)
 
     @cached_property
-    def shape(self) -> Shape:
+    def shape(self) -> BodyShape:
         """The whole body."""
         mesh, surface = self.subject.mesh, self.subject.surface
         if surface is not None:
-            return Shape(mesh.points, self.used, surface.points, surface.triangles, self._up)
-        return Shape(mesh.points, self.used, mesh.points, boundary_faces(mesh.tets, mesh.points)[0], self._up)
+            return BodyShape(mesh.points, self.used, surface.points, surface.triangles, self._up)
+        return BodyShape(mesh.points, self.used, mesh.points, boundary_faces(mesh.tets, mesh.points)[0], self._up)
 
     def _end(self, way: npt.NDArray[np.float64]) -> Mask:
         return np.isin(self.used, self.shape.beyond(way, LOWEST))

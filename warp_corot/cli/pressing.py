@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from warp_corot.simulation.simulation import Simulation
 
     from .loading import Load
-    from .patches import Patches
+    from .patches import BodyPatches
 
 #: A changing pressure is updated at least this often.
 UPDATES = 200
@@ -25,7 +25,7 @@ UPDATES = 200
 Array = npt.NDArray[np.float64]
 
 
-def press_patches(sim: Simulation, body: SoftBody, loads: Sequence[Load], patches: Patches, ramp: float) -> None:
+def press_patches(sim: Simulation, body: SoftBody, loads: Sequence[Load], patches: BodyPatches, ramp: float) -> None:
     """Apply the pressures of ``--press``.
 
     Args:
@@ -62,7 +62,7 @@ class _Pressure:
         span: Time from the first to the last change of a pressure [s].
     """
 
-    def __init__(self, body: SoftBody, loads: Sequence[Load], patches: Patches, ramp: float):
+    def __init__(self, body: SoftBody, loads: Sequence[Load], patches: BodyPatches, ramp: float):
         surface = surface_of(patches)
         forces = [load.values[0] * pressed(load, patches, surface) for load in loads]
         self._curves = [load.curve(ramp) for load in loads]
@@ -93,12 +93,12 @@ class _Pressure:
         self._done = time >= self._last
 
 
-def surface_of(patches: Patches) -> SurfaceMesh:
+def surface_of(patches: BodyPatches) -> SurfaceMesh:
     """The surface of a body, bound to its nodes."""
     return patches.subject.surface or boundary_surface(patches.subject.mesh)
 
 
-def pressed(load: Load, patches: Patches, surface: SurfaceMesh) -> Array:
+def pressed(load: Load, patches: BodyPatches, surface: SurfaceMesh) -> Array:
     """The nodal forces of a pressure of one pascal on a patch, at the points of the surface [N], [V, 3].
 
     Raises:

@@ -20,7 +20,7 @@ from warp_corot.io.pictures.film import FILMS, check_film, frames_shown, write_f
 
 from .implicit import is_static
 from .options.defaults import VIEWS
-from .shown import DrawnBody, Shown, shown_now
+from .preview_frame import DrawnBody, PreviewFrame, preview_frame
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from warp_corot.io.pictures.preview import Picture
     from warp_corot.simulation.simulation import Simulation
 
-    from .bodies import Body
+    from .bodies import RunBody
 
 MOST_PANELS, MOST_COLUMNS = 12, 4
 #: Pixels of each view of a film, and its approximate number of polygons.
@@ -37,7 +37,7 @@ FILM_SIZE, FILM_PIECES = (640, 540), 15_000
 
 
 @dataclass(frozen=True)
-class Look:
+class CommonView:
     """The common view of all frames of a preview.
 
     Attributes:
@@ -87,7 +87,7 @@ class Previews:
             panels = f"{len(self.frames)} frames from {len(self.views)} sides"
             raise InputError(f"--preview would have {panels}; a picture has at most {MOST_PANELS} panels")
 
-    def add(self, frame: int, bodies: Sequence[Body], sim: Simulation) -> None:
+    def add(self, frame: int, bodies: Sequence[RunBody], sim: Simulation) -> None:
         """Store the current state if its frame is drawn."""
         if frame not in self.frames:
             return
@@ -95,9 +95,9 @@ class Previews:
             self._file = tempfile.TemporaryFile()  # noqa: SIM115 (closed in draw)
             self._bodies = [DrawnBody(body) for body in bodies]
         self._places.append(self._file.tell())
-        shown_now(self._bodies, sim).write(self._file)
+        preview_frame(self._bodies, sim).write(self._file)
 
-    def draw(self, bodies: Sequence[Body], name: str) -> None:
+    def draw(self, bodies: Sequence[RunBody], name: str) -> None:
         """Draw the stored frames.
 
         Args:
@@ -128,7 +128,7 @@ class Previews:
             else:
                 self._draw_picture(name, up_axis, look, bar)
 
-    def _look(self, up_axis: str) -> Look:
+    def _look(self, up_axis: str) -> CommonView:
         """The common view of all frames."""
         from warp_corot.io.pictures.drawing import value_limits
         from warp_corot.io.pictures.preview import Picture, bounds_of, cameras_of, window_of
@@ -142,9 +142,9 @@ class Previews:
         box = np.stack([np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]])
         cameras = cameras_of(self._pictures(shown, ""), up_axis, *VIEWS["corner"], box)
         window = window_of((self._pictures(each, "") for each in self._kept()), cameras, float(ground))
-        return Look(box, cameras, window, (0.0, highest), float(ground))
+        return CommonView(box, cameras, window, (0.0, highest), float(ground))
 
-    def _pictures(self, shown: Shown, frame_title: str) -> list[Picture]:
+    def _pictures(self, shown: PreviewFrame, frame_title: str) -> list[Picture]:
         """A frame from all sides."""
         from warp_corot.io.pictures.preview import Picture
 
@@ -160,7 +160,7 @@ class Previews:
             for view, words in zip(self.views, titles, strict=True)
         ]
 
-    def _draw_picture(self, name: str, up_axis: str, look: Look, bar: Any) -> None:
+    def _draw_picture(self, name: str, up_axis: str, look: CommonView, bar: Any) -> None:
         from warp_corot.io.pictures.preview import cameras_of, draw_strip, save_picture
 
         panels: list[Picture] = []
@@ -178,7 +178,7 @@ class Previews:
         )
         save_picture(drawn, self.args.preview)
 
-    def _images(self, name: str, look: Look, bar: Any) -> Generator[Image, None, None]:
+    def _images(self, name: str, look: CommonView, bar: Any) -> Generator[Image, None, None]:
         """The frames of a film."""
         from warp_corot.io.pictures.preview import Strip
 
@@ -200,10 +200,10 @@ class Previews:
             yield strip.draw(views, name if is_static(self.args) else f"{name}; {shown.time:.2f} s")
             bar.update()
 
-    def _kept(self) -> Iterator[Shown]:
+    def _kept(self) -> Iterator[PreviewFrame]:
         for place in self._places:
             self._file.seek(place)
-            yield Shown.read(self._file)
+            yield PreviewFrame.read(self._file)
 
 
 def is_film(path: Path) -> bool:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
     from warp_corot.simulation.simulation import Simulation
 
-    from .patches import Patches
+    from .patches import BodyPatches
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _POINT = re.compile(rf"\s*({_NUMBER})[\s,]+({_NUMBER})[\s,]+({_NUMBER})\s*")
@@ -44,7 +44,7 @@ class Probe:
         InputError: A point outside the body, a patch without nodes, or an invalid expression.
     """
 
-    def __init__(self, text: str, body: SoftBody, patches: Patches):
+    def __init__(self, text: str, body: SoftBody, patches: BodyPatches):
         self.text, self.body, self._patches = text, body, patches
         match = _POINT.fullmatch(text)
         self.point = np.array([float(part) for part in match.groups()] if match else 3 * [np.nan])
@@ -89,11 +89,11 @@ class Probe:
             raise InputError(f"--probe {self.text!r}: the point is {away:.3g} m outside the body")
 
 
-def probes_body(text: str, patches: Patches) -> bool:
+def probes_body(text: str, patches: BodyPatches) -> bool:
     """Whether a body has the patch, or contains the point in its box.
 
     Raises:
-        InputError: As in `Patches.nodes`.
+        InputError: As in `BodyPatches.nodes`.
     """
     match = _POINT.fullmatch(text)
     if match is None:

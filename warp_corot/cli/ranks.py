@@ -62,7 +62,7 @@ def let_others_speak() -> None:
 
 
 @contextmanager
-def one_first(others: Others | None) -> Iterator[None]:
+def one_first(others: WaitingRanks | None) -> Iterator[None]:
     """Run the block on rank 0 first, then on all other ranks together, which find the kernels that rank 0 compiled;
     only on rank 0 if the others wait for it."""
     if others is not None or not are_several():
@@ -94,7 +94,7 @@ def hands_out(options: Sequence[argparse.Namespace]) -> bool:
     return are_several() and args.ground is None and not any(touches) and not whole and not implicit
 
 
-class Others:
+class WaitingRanks:
     """On rank 0: the ranks that wait for their parts of the bodies."""
 
     def __init__(self) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from warp_corot.errors import InputError
 from warp_corot.remesh.online import OnlineRemesh
 
-from .say import as_options
+from .exit_status import as_options
 
 if TYPE_CHECKING:
     from warp_corot.io.write.animate import Recording

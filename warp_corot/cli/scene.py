@@ -15,8 +15,8 @@ from warp_corot.inputs.device import checked_device
 from warp_corot.inputs.stopwatch import WATCH
 
 from .compiling import compiling_said
+from .exit_status import complain, early_end
 from .implicit import unfinished
-from .say import complain, early_end
 from .summary import aligned, milliseconds, pressure, speed, wall_time
 
 if TYPE_CHECKING:

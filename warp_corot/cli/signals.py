@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import NoReturn
 
-from .say import Terminated, complain
+from .exit_status import Terminated, complain
 
 #: Delay before a signal that could not end the run is checked again [s].
 WAIT = 0.02

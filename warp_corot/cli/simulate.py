@@ -12,14 +12,14 @@ from warp_corot.inputs.stopwatch import WATCH
 from warp_corot.simulation.simulation import Simulation
 
 from .about import about
-from .bodies import Body
+from .bodies import RunBody
+from .exit_status import early_end
 from .in_parts import is_in_parts, run_in_parts
-from .prepared import Run, prepared
 from .previews import Previews, check_preview
 from .probing import Table
-from .ranks import Others, hands_out, leads, serve
+from .ranks import WaitingRanks, hands_out, leads, serve
 from .run_file import bodies_of, check_run_path, write_run
-from .say import early_end
+from .run_setup import RunSetup, set_up
 from .static import rest
 from .summary import summary, title_of
 
@@ -66,12 +66,12 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _prepared(args: argparse.Namespace, options: list[argparse.Namespace]) -> Run:
+def _prepared(args: argparse.Namespace, options: list[argparse.Namespace]) -> RunSetup:
     """The run of the only rank, or of rank 0, which ends the others if the run cannot be made."""
-    others = Others() if hands_out(options) else None
+    others = WaitingRanks() if hands_out(options) else None
     try:
         _check_output(args, options[0])
-        return prepared(options, others)
+        return set_up(options, others)
     except InputError as error:
         if others is not None:
             others.dismiss(error)
@@ -90,7 +90,7 @@ def simulated(args: argparse.Namespace) -> Recording:
     shared = options[0]
     _check_output(args, shared)
     # Runs that are compared have the same kind of steps.
-    ready = prepared(options, chooses=False)
+    ready = set_up(options, chooses=False)
     done = Recording(shared.output)
     table = Table(shared.csv, ready.sim, ready.probes, ready.touched.obstacles) if shared.csv else None
     rest(shared, ready.sim)
@@ -105,7 +105,7 @@ def _serve(args: argparse.Namespace, options: list[argparse.Namespace]) -> int:
             serve(options[0].device)
         else:
             _check_output(args, options[0])
-            prepared(options).sim.serve()  # type: ignore[attr-defined]
+            set_up(options).sim.serve()  # type: ignore[attr-defined]
     except UnstableError:
         return 3
     return 0
@@ -135,7 +135,7 @@ def _check_output(args: argparse.Namespace, shared: argparse.Namespace) -> None:
 def _record(
     args: argparse.Namespace,
     shared: argparse.Namespace,
-    ready: Run,
+    ready: RunSetup,
     done: Recording,
     table: Table | None,
     previews: Previews | None,
@@ -160,14 +160,14 @@ def _record(
         )
 
 
-def _surfaces(bodies: Sequence[Body]) -> list[OwnSurface | SurfaceMesh | None] | None:
+def _surfaces(bodies: Sequence[RunBody]) -> list[OwnSurface | SurfaceMesh | None] | None:
     """The smooth surfaces of bodies; None if none has any, so that tetrahedra are drawn."""
     found = [None if body.args.draw_labels else body.subject.skin or body.subject.surface for body in bodies]
     return found if any(surface is not None for surface in found) else None
 
 
 def _each_frame(
-    progress: Progress, table: Table | None, previews: Previews | None, bodies: Sequence[Body], sim: Simulation
+    progress: Progress, table: Table | None, previews: Previews | None, bodies: Sequence[RunBody], sim: Simulation
 ) -> Progress:
     """The function that is called after each frame."""
 

@@ -12,10 +12,10 @@ from warp_corot.simulation.simulation import Simulation
 from warp_corot.simulation.static import solve_static
 from warp_corot.solvers import BackwardEuler, Integrator, QuasiStatic
 
-from .bodies import Body
+from .bodies import RunBody
 from .implicit import is_static
 from .ranks import are_several
-from .touching import Touched
+from .touching import RunContact
 
 
 def check_static(args: argparse.Namespace, *, touches: bool, remeshes: bool) -> None:
@@ -76,7 +76,7 @@ def _rest_in_contact(sim: Simulation) -> str:
     )
 
 
-def static_integrator(args: argparse.Namespace, bodies: Sequence[Body], touched: Touched) -> Integrator:
+def static_integrator(args: argparse.Namespace, bodies: Sequence[RunBody], touched: RunContact) -> Integrator:
     """The steps from one frame of a static answer to the next; there are none for bodies that only contact holds.
 
     Raises:
@@ -92,6 +92,6 @@ def static_integrator(args: argparse.Namespace, bodies: Sequence[Body], touched:
     return BackwardEuler(1.0 / args.fps)  # makes no step
 
 
-def moves(bodies: Sequence[Body], touched: Touched) -> bool:
+def moves(bodies: Sequence[RunBody], touched: RunContact) -> bool:
     """Whether loads or tools move, so that bodies at rest follow them from frame to frame."""
     return touched.moves or any(body.loads for body in bodies)

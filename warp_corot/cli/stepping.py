@@ -13,18 +13,18 @@ from warp_corot.body.soft_body import SoftBody
 from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import INTEGRATORS, Integrator, SymplecticEuler
 
-from .bodies import Body, gravity_of
+from .bodies import RunBody, gravity_of
+from .exit_status import as_options
 from .implicit import integrator_name, is_static
 from .options.defaults import IMPLICIT_DT
-from .ranks import Others, are_several, led_simulation, one_first
+from .ranks import WaitingRanks, are_several, led_simulation, one_first
 from .remesh import ARGUMENTS
-from .say import as_options
 from .static import check_static, static_integrator
-from .touching import Touched
+from .touching import RunContact
 
 
 def make_simulation(
-    args: argparse.Namespace, bodies: Sequence[Body], touched: Touched, others: Others | None = None
+    args: argparse.Namespace, bodies: Sequence[RunBody], touched: RunContact, others: WaitingRanks | None = None
 ) -> Simulation:
     """The simulation, its kernels compiled; a given step is shortened until a whole number of them makes a frame.
 
@@ -64,7 +64,7 @@ def make_simulation(
         return made
 
 
-def _tried_step(one: Body, damping: float, viscosity: float) -> float:
+def _tried_step(one: RunBody, damping: float, viscosity: float) -> float:
     """The length of a trial step [s], made at rest and without weight: it loads every kernel and moves nothing."""
     tried = body = one.soft
     model, remesh = one.model, one.remesh

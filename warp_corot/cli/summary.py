@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from warp_corot.materials.isotropic import Isotropic
     from warp_corot.simulation.simulation import Simulation
 
-    from .bodies import Body
-    from .subject import Subject
+    from .bodies import RunBody
+    from .input_mesh import InputMesh
 
 #: Maximum number of regions whose materials are listed.
 MOST_KINDS = 8
@@ -39,7 +39,7 @@ DONE = {"pull": "pulled", "twist": "twisted", "press": "pressed"}
 
 
 def summary(
-    bodies: Sequence[Body],
+    bodies: Sequence[RunBody],
     sim: Simulation,
     done: Recording,
     touched: Sequence[tuple[str, str]] = (),
@@ -92,7 +92,7 @@ def wall_time() -> str:
     return f"{sum(WATCH.parts.values()):.2f} s: {', '.join(parts)}"
 
 
-def title_of(bodies: Sequence[Body], gravity: Sequence[float]) -> str:
+def title_of(bodies: Sequence[RunBody], gravity: Sequence[float]) -> str:
     """The title of a picture: the bodies, and what happens to them under this gravity [m/s^2]."""
     names = [body.subject.name for body in bodies]
     left = len(names) - NAMED
@@ -104,7 +104,7 @@ def title_of(bodies: Sequence[Body], gravity: Sequence[float]) -> str:
     return ", ".join([*words, *_happening(bodies, any(gravity))])
 
 
-def _happening(bodies: Sequence[Body], heavy: bool) -> list[str]:
+def _happening(bodies: Sequence[RunBody], heavy: bool) -> list[str]:
     """What happens to bodies, which may have weight, in words."""
     args = bodies[0].args
     kinds = {load.kind for body in bodies for load in body.loads}
@@ -123,7 +123,7 @@ def _happening(bodies: Sequence[Body], heavy: bool) -> list[str]:
     return words
 
 
-def _of_body(body: Body) -> list[tuple[str, str]]:
+def _of_body(body: RunBody) -> list[tuple[str, str]]:
     model = next(name for name, kind in MODELS.items() if type(body.model) is kind)
     level = getattr(body.model, "rotation_level", None)
     words = [model] if level is None else [model, f"rotations of level {level}"]
@@ -143,7 +143,7 @@ def aligned(rows: Sequence[tuple[str, str]]) -> list[str]:
     return [f"  {name:<14}{text}" for name, text in rows]
 
 
-def _body(subject: Subject) -> list[tuple[str, str]]:
+def _body(subject: InputMesh) -> list[tuple[str, str]]:
     """For a body from a surface or a scan, the reports of its domain and its mesh, and their time."""
     if subject.domain is None:
         return [("mesh", _mesh(subject))]
@@ -161,7 +161,7 @@ def _block(name: str, lines: list[str]) -> list[tuple[str, str]]:
     return [(name if first else "", line) for first, line in zip([True] + len(lines) * [False], lines, strict=False)]
 
 
-def _materials(subject: Subject, mesh: Mesh, material: Isotropic) -> list[tuple[str, str]]:
+def _materials(subject: InputMesh, mesh: Mesh, material: Isotropic) -> list[tuple[str, str]]:
     values = [np.ravel(getattr(material, name)) for name in ("young", "poisson", "density")]
     if not subject.labels and all(len(value) == 1 for value in values):
         return [("material", _values(*(value[0] for value in values)))]
@@ -233,7 +233,7 @@ def pressure(pascals: float) -> str:
     return f"{pascals:g} Pa"
 
 
-def _mesh(subject: Subject) -> str:
+def _mesh(subject: InputMesh) -> str:
     nodes, repaired = len(subject.mesh.points), getattr(subject.mesh, "repaired", 0)
     unused = nodes - len(subject.used)
     remarks = [f"{repaired} wound wrongly and repaired"] if repaired else []

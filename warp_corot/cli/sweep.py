@@ -15,7 +15,7 @@ import numpy as np
 from warp_corot.errors import InputError
 from warp_corot.io.files.whole import written_whole
 
-from .say import complain, interrupt_status
+from .exit_status import complain, interrupt_status
 
 if TYPE_CHECKING:
     from warp_corot.distributed.journal import Row
@@ -34,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
     """
     from warp_corot.distributed.sweeping import combinations, sweep
 
-    from .opened import open_input
+    from .input_file import open_input
     from .run_file import bodies_of
 
     if args.output is None:

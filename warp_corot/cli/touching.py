@@ -29,7 +29,7 @@ from .tool_paths import make_tool
 if TYPE_CHECKING:
     from warp_corot.simulation.simulation import Simulation
 
-    from .bodies import Body
+    from .bodies import RunBody
 
 #: Overlaps below this fraction of a body's height are rounding and are not reported.
 SMALL = 1e-5
@@ -40,7 +40,7 @@ Floats = np.ndarray
 
 
 @dataclass(eq=False)
-class Touched:
+class RunContact:
     """What the bodies of a run touch.
 
     Attributes:
@@ -72,7 +72,7 @@ def stands_free(args: argparse.Namespace) -> bool:
     return args.fix is None and (args.ground is not None or args.drop is not None)
 
 
-def touched_by(options: Sequence[argparse.Namespace]) -> Touched:
+def touched_by(options: Sequence[argparse.Namespace]) -> RunContact:
     """The contact that the options request, except the ground, which needs the bodies first.
 
     Args:
@@ -104,7 +104,7 @@ def touched_by(options: Sequence[argparse.Namespace]) -> Touched:
     }
     friction = Contact().friction if shared.friction is None else shared.friction
     contact = Contact(friction=friction, self_contact=shared.self_contact)
-    return Touched(contact if touches else None, tools)
+    return RunContact(contact if touches else None, tools)
 
 
 def _check_drop(options: Sequence[argparse.Namespace]) -> None:
@@ -119,7 +119,7 @@ def _check_drop(options: Sequence[argparse.Namespace]) -> None:
         raise InputError("--drop lets the bodies fall; --fix must be none then, or left out")
 
 
-def place_ground(touched: Touched, args: argparse.Namespace, bodies: Sequence[Body], gravity: Floats) -> None:
+def place_ground(touched: RunContact, args: argparse.Namespace, bodies: Sequence[RunBody], gravity: Floats) -> None:
     """Add the ground of ``--ground`` or ``--drop``, or of a body that lies, to the obstacles.
 
     Raises:
@@ -138,14 +138,14 @@ def place_ground(touched: Touched, args: argparse.Namespace, bodies: Sequence[Bo
     touched.obstacles = {"ground": Ground(up, height), **touched.obstacles}
 
 
-def _touched_points(body: Body, args: argparse.Namespace) -> Floats:
+def _touched_points(body: RunBody, args: argparse.Namespace) -> Floats:
     """The points of a body on which contact will act [m], [n, 3]."""
     is_implicit = INTEGRATORS[integrator_name(args)].is_implicit
     own = None if are_several() and is_implicit else own_surface(body.subject.mesh)
     return body.subject.mesh.points[body.subject.used] if own is None else own.points
 
 
-def say_reach(bodies: Sequence[Body], sim: Simulation) -> None:
+def say_reach(bodies: Sequence[RunBody], sim: Simulation) -> None:
     """Add a note for each body whose tetrahedra reach far beyond its surface, if contact acts on them."""
     if sim.contact is None:
         return
@@ -163,7 +163,7 @@ def say_reach(bodies: Sequence[Body], sim: Simulation) -> None:
             )
 
 
-def say_overlaps(touched: Touched, bodies: Sequence[Body], sim: Simulation) -> None:
+def say_overlaps(touched: RunContact, bodies: Sequence[RunBody], sim: Simulation) -> None:
     """Add a note for each body on the obstacles that it overlaps before the run begins."""
     if sim.contact is None or not touched.obstacles:
         return

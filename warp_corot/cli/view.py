@@ -19,11 +19,11 @@ from warp_corot.errors import InputError
 from warp_corot.materials.isotropic import Isotropic
 
 from .compiling import compiling_said
+from .exit_status import interrupt_status
 from .loading import ramp_of
-from .prepared import Run, prepared
 from .pressing import press_patches
 from .run_file import bodies_of, write_run
-from .say import interrupt_status
+from .run_setup import RunSetup, set_up
 from .summary import title_of
 
 if TYPE_CHECKING:
@@ -36,14 +36,14 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: Bad options, or a page that cannot be opened.
     """
-    from warp_corot.viewing.gate import check_port
+    from warp_corot.viewing.access_control import check_port
     from warp_corot.viewing.server import library
     from warp_corot.viewing.view import View
 
     library()
     check_port(args.host, args.port)
     asked = bodies_of(args)
-    ready = prepared(asked, touches=True)
+    ready = set_up(asked, touches=True)
     with compiling_said(ready.sim.device):
         page = View(
             ready.sim,
@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _carry_over(ready: Run, shared: argparse.Namespace, sim: Simulation) -> None:
+def _carry_over(ready: RunSetup, shared: argparse.Namespace, sim: Simulation) -> None:
     """Press the patches of the new bodies.
 
     Raises:

@@ -12,7 +12,7 @@ from warp_corot.kernels.meshing import domain as kernels
 from .signed import SignedFunction
 
 
-class Pair(SignedFunction):
+class DomainPair(SignedFunction):
     """Two domains and the way they are combined."""
 
     outer: float
@@ -38,7 +38,7 @@ class Pair(SignedFunction):
         return [*self.first._details(), self.word, *self.second._details()]
 
 
-class Union(Pair):
+class UnionDomain(DomainPair):
     """The points in either domain. The label is that of the first domain that holds the point and has one there."""
 
     outer, inner, word = -1.0, -1.0, "and also"
@@ -65,11 +65,11 @@ class Union(Pair):
             return first or self
         rest = self.second.part(name)
         for other in self.first.label_names:
-            rest = Difference(rest, self.first.part(other))
-        return Union(first, rest) if first else rest
+            rest = DifferenceDomain(rest, self.first.part(other))
+        return UnionDomain(first, rest) if first else rest
 
 
-class Intersection(Pair):
+class IntersectionDomain(DomainPair):
     """The points in both domains. Labels are the first's, or the second's if the first has none."""
 
     outer, inner, word = 1.0, 1.0, "cut to"
@@ -92,10 +92,10 @@ class Intersection(Pair):
         if name not in self.label_names:
             return super().part(name)
         one, other = (self.first, self.second) if self.first.label_names else (self.second, self.first)
-        return Intersection(one.part(name), other)
+        return IntersectionDomain(one.part(name), other)
 
 
-class Difference(Pair):
+class DifferenceDomain(DomainPair):
     """The points in the first domain but not in the second; the first's labels."""
 
     outer, inner, word = 1.0, -1.0, "without"
@@ -108,7 +108,7 @@ class Difference(Pair):
 
     def part(self, name: str) -> SignedFunction:
         """See `Domain.part`."""
-        return Difference(self.first.part(name), self.second) if name in self.label_names else super().part(name)
+        return DifferenceDomain(self.first.part(name), self.second) if name in self.label_names else super().part(name)
 
 
 class NamedDomain(SignedFunction):

@@ -9,9 +9,9 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from .combined import Difference, Intersection, NamedDomain, Union
+from .combined import DifferenceDomain, IntersectionDomain, NamedDomain, UnionDomain
 from .function import Function, FunctionDomain
-from .shapes import Box, Capsule, Sphere, Torus
+from .shapes import BoxDomain, CapsuleDomain, SphereDomain, TorusDomain
 from .signed import SignedFunction
 
 if TYPE_CHECKING:
@@ -50,13 +50,13 @@ class Domain(SignedFunction):
         return _Made(NamedDomain(self, name))
 
     def __or__(self, other: Domain) -> Domain:
-        return _Made(Union(self, other)) if isinstance(other, Domain) else NotImplemented
+        return _Made(UnionDomain(self, other)) if isinstance(other, Domain) else NotImplemented
 
     def __and__(self, other: Domain) -> Domain:
-        return _Made(Intersection(self, other)) if isinstance(other, Domain) else NotImplemented
+        return _Made(IntersectionDomain(self, other)) if isinstance(other, Domain) else NotImplemented
 
     def __sub__(self, other: Domain) -> Domain:
-        return _Made(Difference(self, other)) if isinstance(other, Domain) else NotImplemented
+        return _Made(DifferenceDomain(self, other)) if isinstance(other, Domain) else NotImplemented
 
     # Ways to make one.
 
@@ -203,24 +203,24 @@ class Domain(SignedFunction):
     @classmethod
     def sphere(cls, radius: float, centre: Sequence[float] = (0.0, 0.0, 0.0), **options: Any) -> Domain:
         """A ball [m]. Options here and below: ``up_axis``, ``device``."""
-        return _Made(Sphere(radius, centre, **options))
+        return _Made(SphereDomain(radius, centre, **options))
 
     @classmethod
     def box(cls, lower: Sequence[float], upper: Sequence[float], **options: Any) -> Domain:
         """An axis-aligned box between two corners [m]."""
-        return _Made(Box(lower, upper, **options))
+        return _Made(BoxDomain(lower, upper, **options))
 
     @classmethod
     def torus(
         cls, major: float, minor: float, centre: Sequence[float] = (0.0, 0.0, 0.0), axis: str = "Z", **options: Any
     ) -> Domain:
         """A ring: a tube of radius ``minor`` around a circle of radius ``major`` [m] about an axis."""
-        return _Made(Torus(major, minor, centre, axis, **options))
+        return _Made(TorusDomain(major, minor, centre, axis, **options))
 
     @classmethod
     def capsule(cls, start: Sequence[float], end: Sequence[float], radius: float, **options: Any) -> Domain:
         """All points within ``radius`` of the segment between two points [m]."""
-        return _Made(Capsule(start, end, radius, **options))
+        return _Made(CapsuleDomain(start, end, radius, **options))
 
 
 class _Made(Domain):

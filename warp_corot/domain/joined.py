@@ -12,7 +12,7 @@ import warp as wp
 from warp_corot.kernels.meshing import measuring as kernels
 from warp_corot.mesh.side_by_side import in_parts
 
-from .winding import Parts, linked, part_volumes
+from .winding import SurfaceParts, linked, part_volumes
 
 if TYPE_CHECKING:
     from .closing import ClosedSurface
@@ -36,7 +36,7 @@ def joined_parts(closed: ClosedSurface, device: wp.Device) -> tuple[int, np.ndar
     crossings = _crossings(closed, device)
     links.append(crossings)
     # Parts inside the body of others: a cavity in its surroundings, or a part buried in it.
-    groups, outward = Parts(points, triangles, part), part_volumes(points, triangles, part) > 0.0
+    groups, outward = SurfaceParts(points, triangles, part), part_volumes(points, triangles, part) > 0.0
     holders = [groups.holders(groups.corners[groups.slices[own]][0, 0], own) for own in range(count)]
     overlap = len(crossings) > 0
     for own in range(count):

@@ -16,7 +16,7 @@ from .signed import SignedFunction
 from .units import length
 
 
-class Shape(SignedFunction):
+class ShapeDomain(SignedFunction):
     """A shape that one kernel evaluates; its distance is exact."""
 
     def __init__(self, kernel: wp.Kernel, numbers: Sequence[Any], bounds: Any, **options: Any):
@@ -31,10 +31,10 @@ class Shape(SignedFunction):
 
     def _details(self) -> list[str]:
         size = " x ".join(length(edge) for edge in np.ptp(self.bounds, axis=0))
-        return [f"a {type(self).__name__.lower()}, {size}"]
+        return [f"a {type(self).__name__.removesuffix('Domain').lower()}, {size}"]
 
 
-class Sphere(Shape):
+class SphereDomain(ShapeDomain):
     """See `Domain.sphere`."""
 
     def __init__(self, radius: float, centre: Sequence[float], **options: Any):
@@ -42,7 +42,7 @@ class Sphere(Shape):
         super().__init__(kernels.evaluate_sphere, [wp.vec3(*c), r], [c - r, c + r], **options)
 
 
-class Box(Shape):
+class BoxDomain(ShapeDomain):
     """See `Domain.box`."""
 
     def __init__(self, lower: Sequence[float], upper: Sequence[float], **options: Any):
@@ -52,7 +52,7 @@ class Box(Shape):
         super().__init__(kernels.evaluate_box, [wp.vec3(*low), wp.vec3(*high)], [low, high], **options)
 
 
-class Torus(Shape):
+class TorusDomain(ShapeDomain):
     """See `Domain.torus`."""
 
     def __init__(self, major: float, minor: float, centre: Sequence[float], axis: str, **options: Any):
@@ -65,7 +65,7 @@ class Torus(Shape):
         super().__init__(kernels.evaluate_torus, numbers, [c - reach, c + reach], **options)
 
 
-class Capsule(Shape):
+class CapsuleDomain(ShapeDomain):
     """See `Domain.capsule`."""
 
     def __init__(self, start: Sequence[float], end: Sequence[float], radius: float, **options: Any):

@@ -86,7 +86,7 @@ def wind_outwards(
     if volumes.sum() < 0.0:
         flip[:] = True
     inward = np.flatnonzero(volumes * np.where(flip, -1.0, 1.0) < 0.0)
-    groups = Parts(points, triangles, parts)
+    groups = SurfaceParts(points, triangles, parts)
     cavities = 0
     for part in inward:
         if part not in two_sided and groups.is_within_others(int(part)):
@@ -97,7 +97,7 @@ def wind_outwards(
     return np.where(turned[:, None], triangles[:, ::-1], triangles), int(flip.sum()), cavities
 
 
-class Parts:
+class SurfaceParts:
     """Closed parts, each with its triangles and its box."""
 
     def __init__(self, points: np.ndarray, triangles: np.ndarray, parts: np.ndarray):

@@ -18,7 +18,7 @@ from warp_corot.discretization.nodal import padded
 from warp_corot.elasticity import Corotated, ForceField, Model
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.checks import checked_count, refuse_tape, shown
-from warp_corot.inputs.turns import in_turn
+from warp_corot.inputs.simulation_lock import in_turn
 from warp_corot.simulation.parts import checked_gravity, checked_models
 from warp_corot.simulation.resting import checked_obstacles
 from warp_corot.simulation.simulation import Simulation

@@ -16,7 +16,7 @@ from warp_corot.contact.shapes import Shape
 from warp_corot.elasticity import Model
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import shown
-from warp_corot.inputs.turns import in_turn
+from warp_corot.inputs.simulation_lock import in_turn
 from warp_corot.simulation.static import StaticReport
 
 from . import parameters

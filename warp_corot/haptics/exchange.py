@@ -42,7 +42,7 @@ class ToolState:
     torque: Floats
 
 
-class Exchange(Constraint):
+class HapticExchange(Constraint):
     """Publishes a tool's state after each run of steps, and lets the tool follow the device.
 
     It is one of the system's constraints only so that it is launched with them; it exerts no force. On CUDA, kernels

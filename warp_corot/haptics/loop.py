@@ -19,11 +19,11 @@ from warp_corot.inputs.checks import checked_number, shown
 from warp_corot.simulation.simulation import Simulation
 
 from .devices import Device
-from .exchange import Exchange, ToolState
+from .exchange import HapticExchange, ToolState
 from .local_model import LocalModel
 from .passivity import PassivityControl
 from .poses import DeviceError, Pose, checked_pose, way
-from .report import Report, Times
+from .report import Report, TimeSeries
 
 if TYPE_CHECKING:
     from warp_corot.materials.isotropic import Isotropic
@@ -94,11 +94,11 @@ class HapticLoop:
         self._model = LocalModel(_positive(expected, "stiffness", "N/m"), 2.0 * bound / reach**2)
         self._control = PassivityControl(bound, reach, TURN_RATE * self.period)
         assert sim.contact is not None
-        self._exchange = Exchange(sim.system, sim.contact.obstacles, [each is tool for each in given].index(True))
+        self._exchange = HapticExchange(sim.system, sim.contact.obstacles, [each is tool for each in given].index(True))
         self._state: ToolState | None = None
         self._pose: Pose | None = None
         self._updated = self._last = math.nan
-        self._periods, self._delays, self._busy = Times(), Times(), Times()
+        self._periods, self._delays, self._busy = TimeSeries(), TimeSeries(), TimeSeries()
         self._missed = self._updates = 0
         self._is_to_stop = threading.Event()
         self._thread: threading.Thread | None = None

@@ -60,7 +60,7 @@ class Report:
         )
 
 
-class Times:
+class TimeSeries:
     """The last values of a quantity that is measured often, in a ring.
 
     Attributes:

@@ -15,7 +15,7 @@ from warp_corot.discretization.elements import Mesh
 from warp_corot.mesh.pieces import pieces_of
 from warp_corot.mesh.surfaces.boundary import boundary_faces
 
-from .regions import Patch, Shape, broad_sides, flat_region, lowest_part
+from .regions import BodyShape, SupportRegion, broad_sides, flat_region, lowest_part
 
 if TYPE_CHECKING:
     from .sag import CoarseBody
@@ -35,7 +35,7 @@ NAMED = 3
 
 
 @dataclass(frozen=True, eq=False)
-class Hold:
+class Support:
     """How a piece is fixed.
 
     Attributes:
@@ -58,7 +58,7 @@ class Hold:
 
 
 @dataclass(frozen=True, eq=False)
-class Holds:
+class Supports:
     """How a body is fixed, piece by piece, the largest first.
 
     Attributes:
@@ -67,7 +67,7 @@ class Holds:
         lies: The reason why it lies on a ground, in words; empty if it does not.
     """
 
-    pieces: Sequence[Hold]
+    pieces: Sequence[Support]
     count: int
     lies: str = ""
 
@@ -110,15 +110,15 @@ class Holds:
         return lines
 
 
-def _words_of(hold: Hold) -> str:
+def _words_of(hold: Support) -> str:
     return f"{'standing on' if hold.stands else 'held by'} {hold.where}"
 
 
 @dataclass(eq=False)
-class _Piece:
+class _BodyPiece:
     """A piece of a body: its shape, its material, and gravity [m/s^2]."""
 
-    shape: Shape
+    shape: BodyShape
     tets: npt.NDArray[np.integer]
     volumes: npt.NDArray[np.float64]
     young: npt.NDArray[np.float64]
@@ -133,14 +133,14 @@ class _Piece:
         kind = MeshBody if len(self.tets) <= MOST_TETS else CoarseBody
         return kind(self.shape.points, self.tets, self.volumes, self.young, self.density)
 
-    def hold(self) -> Hold:
+    def hold(self) -> Support:
         standing = lowest_part(self.shape)
         if len(standing.nodes) == len(self.shape.nodes):
             return self.held_simply()
         needed, sag, why = self._tried(standing, stands=True)
         if needed <= 1.0:
             return self._of(standing, True, "", sag, 1.0)
-        best: tuple[float, float, Patch] | None = None
+        best: tuple[float, float, SupportRegion] | None = None
         for patch in self._others():
             needed, sag, _ = self._tried(patch, stands=False)
             if best is None or needed < best[0]:
@@ -151,21 +151,21 @@ class _Piece:
             return self.held_simply()
         return self._of(best[2], False, why, best[1], max(best[0], 1.0))
 
-    def held_simply(self) -> Hold:
+    def held_simply(self) -> Support:
         """Fixed at the lower half of its nodes, at least three, but not all."""
         shape = self.shape
         heights = shape.points[shape.nodes] @ shape.up
         count = min(max(len(heights) // 2, 3), len(heights) - 1)
         nodes = np.sort(shape.nodes[np.argsort(heights, kind="stable")[:count]])
-        return Hold(nodes, len(heights), "its lower half", True)
+        return Support(nodes, len(heights), "its lower half", True)
 
-    def _others(self) -> Iterator[Patch]:
+    def _others(self) -> Iterator[SupportRegion]:
         flat = flat_region(self.shape)
         for patch in [*([flat] if flat else []), *broad_sides(self.shape)]:
             if len(patch.nodes) < len(self.shape.nodes):
                 yield patch
 
-    def _tried(self, patch: Patch, *, stands: bool) -> tuple[float, float, str]:
+    def _tried(self, patch: SupportRegion, *, stands: bool) -> tuple[float, float, str]:
         """The factor on the piece's stiffness with which a patch would support it; its sag as a fraction of its
         height; and what is wrong with the patch, in words."""
         shape, g = self.shape, float(np.linalg.norm(self.gravity))
@@ -186,11 +186,11 @@ class _Piece:
         topples = lean / LARGEST_LEAN > sag / LARGEST_SAG
         return needed, sag, f"it would {'topple' if topples else 'sag too far'} on {patch.where}"
 
-    def _of(self, patch: Patch, stands: bool, why: str, sag: float, stiffer: float) -> Hold:
-        return Hold(patch.nodes, len(self.shape.nodes), patch.where, stands, why, sag, stiffer)
+    def _of(self, patch: SupportRegion, stands: bool, why: str, sag: float, stiffer: float) -> Support:
+        return Support(patch.nodes, len(self.shape.nodes), patch.where, stands, why, sag, stiffer)
 
 
-def holds_of(
+def supports_of(
     mesh: Mesh,
     *,
     young: npt.ArrayLike,
@@ -198,7 +198,7 @@ def holds_of(
     gravity: npt.ArrayLike,
     surface: Any = None,
     may_lie: bool = False,
-) -> Holds:
+) -> Supports:
     """Fix a body as a person would, so that it neither falls nor topples.
 
     A piece stands on the lowest tenth of its height if its centre of mass is above that and stays there when the piece
@@ -234,15 +234,15 @@ def holds_of(
     for number in range(count):
         inside, around = of_tet == number, triangles[of_triangle == number]
         tets = mesh.tets[inside]
-        shape = Shape(points, np.unique(tets), drawn, around, up, elements)
+        shape = BodyShape(points, np.unique(tets), drawn, around, up, elements)
         own_young, own_density = (np.broadcast_to(np.ravel(a), len(of_tet))[inside] for a in (young, density))
-        piece = _Piece(shape, tets, volumes[inside], own_young, own_density, g)
+        piece = _BodyPiece(shape, tets, volumes[inside], own_young, own_density, g)
         if may_lie and not small[number] and not shape.has_flat_feet:
-            return Holds([], len(points), "it has no flat feet")
+            return Supports([], len(points), "it has no flat feet")
         holds.append(piece.held_simply() if small[number] and count > 1 else piece.hold())
         if may_lie and not holds[-1].stands:
-            return Holds([], len(points), holds[-1].why_not)
-    return Holds(holds, len(points))
+            return Supports([], len(points), holds[-1].why_not)
+    return Supports(holds, len(points))
 
 
 def piece_of_nodes(mesh: Mesh, of_tet: npt.NDArray[np.integer]) -> npt.NDArray[np.intp]:

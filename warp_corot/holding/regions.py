@@ -33,7 +33,7 @@ Indices = npt.NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
-class Patch:
+class SupportRegion:
     """Nodes of a body, by index, and their place in words."""
 
     nodes: Indices
@@ -56,7 +56,7 @@ class Footprint:
 
 
 @dataclass(frozen=True, eq=False)
-class Shape:
+class BodyShape:
     """A body, or a piece of one.
 
     Attributes:
@@ -139,16 +139,16 @@ class Shape:
         return self.nodes[of_nodes >= reach]
 
 
-def lowest_part(shape: Shape) -> Patch:
+def lowest_part(shape: BodyShape) -> SupportRegion:
     """Nodes in the lowest tenth of the height; the lowest nodes if it contains none."""
     nodes = shape.beyond(-shape.up, LOWEST)
     if not len(nodes):
         heights = shape.points[shape.nodes] @ shape.up
         nodes = shape.nodes[heights <= heights.min() + LOWEST * shape.height]
-    return Patch(nodes, f"its lowest {100 * LOWEST:g} %")
+    return SupportRegion(nodes, f"its lowest {100 * LOWEST:g} %")
 
 
-def flat_region(shape: Shape) -> Patch | None:
+def flat_region(shape: BodyShape) -> SupportRegion | None:
     """The nodes next to the largest flat region of the surface, from a tenth to a half of all; None if no region is
     flat."""
     from scipy.spatial import cKDTree
@@ -168,7 +168,7 @@ def flat_region(shape: Shape) -> Patch | None:
     held = _nearest_layers(off, near, most)
     if np.count_nonzero(held) < least:
         held = np.argsort(np.argsort(away, kind="stable")) < min(least, most)
-    return Patch(shape.nodes[held], f"its largest flat region, {_facing(way, shape.up)}")
+    return SupportRegion(shape.nodes[held], f"its largest flat region, {_facing(way, shape.up)}")
 
 
 def _nearest_layers(off: Array, near: npt.NDArray[np.bool_], most: int) -> npt.NDArray[np.bool_]:
@@ -180,7 +180,7 @@ def _nearest_layers(off: Array, near: npt.NDArray[np.bool_], most: int) -> npt.N
     return near & (off < (1.0 - SAME_LAYER) * first_left_out)
 
 
-def broad_sides(shape: Shape) -> Iterator[Patch]:
+def broad_sides(shape: BodyShape) -> Iterator[SupportRegion]:
     """The outermost tenths along the up axis and the body's principal axes, broadest first."""
     x = shape.skin - shape.skin.mean(axis=0)
     principal = np.linalg.eigh(x.T @ x)[1].T
@@ -193,7 +193,7 @@ def broad_sides(shape: Shape) -> Iterator[Patch]:
         values = np.linalg.eigvalsh(spread.T @ spread / len(nodes))
         found.append((float(values[1] * values[2]), way, nodes))
     for _, way, nodes in sorted(found, key=lambda one: -one[0]):
-        yield Patch(nodes, "its top" if way is shape.up else f"its broad side, {_facing(way, shape.up)}")
+        yield SupportRegion(nodes, "its top" if way is shape.up else f"its broad side, {_facing(way, shape.up)}")
 
 
 def _largest_flat(centroids: Array, normals: Array, areas: Array, layer: float) -> tuple[Array, Indices]:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warp_corot.errors import StabilityWarning, UnstableError, depth_of_user
-from warp_corot.inputs.turns import TURN
+from warp_corot.inputs.simulation_lock import TURN
 from warp_corot.kernels.stepping.pace import GROWTH
 from warp_corot.solvers.guarding.energy_control import EnergyControl
 from warp_corot.solvers.guarding.guard import Fault

@@ -23,7 +23,7 @@ from warp_corot.elasticity import Corotated, Model
 from warp_corot.errors import InputError, StabilityWarning, depth_of_user
 from warp_corot.inputs.checks import checked_count, checked_flag, checked_number, refuse_tape
 from warp_corot.inputs.loading import CONTACT, IMPLICIT, STEPS, STEPS_ON_CPU, load
-from warp_corot.inputs.turns import TURN, in_turn
+from warp_corot.inputs.simulation_lock import TURN, in_turn
 from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.stepping.gauge import find_strains
 from warp_corot.remesh.online import OnlineRemesh

@@ -15,7 +15,7 @@ Vector: TypeAlias = npt.NDArray[np.float64]
 
 
 @dataclass
-class Controls:
+class PageControls:
     """The values of the page's controls.
 
     Attributes:
@@ -44,7 +44,7 @@ class Controls:
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class PageFrame:
     """The picture at one time.
 
     Attributes:

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .shown import Pick, Shown
-from .springs import MOST_POINTS, AllSprings, Patch
+from .springs import MOST_POINTS, AllSprings, HeldPatch
 
 Vector = npt.NDArray[np.float64]
 
@@ -56,11 +56,11 @@ class SpringHand:
         return self._spring.ends
 
 
-class Drag(SpringHand):
+class DragHand(SpringHand):
     """Pulls the tissue after the mouse; the patch may rotate and stretch."""
 
 
-class Press(SpringHand):
+class PressHand(SpringHand):
     """Pushes the rigid patch into the body, as deep as the mouse moves, like a stamp of the patch's shape."""
 
     rigid = True
@@ -69,17 +69,17 @@ class Press(SpringHand):
         self._spring.move(float(np.linalg.norm(motion)) * self._inward)
 
 
-class Grasp(SpringHand):
+class GraspHand(SpringHand):
     """Holds the patch rigidly, and stays where the mouse leaves it, until it is released."""
 
     rigid = True
     stays = True
 
 
-HANDS: dict[str, type[SpringHand]] = {"drag": Drag, "press": Press, "grasp": Grasp}
+HANDS: dict[str, type[SpringHand]] = {"drag": DragHand, "press": PressHand, "grasp": GraspHand}
 
 
-def patch_around(shown: Shown, pick: Pick, radius: float) -> Patch:
+def patch_around(shown: Shown, pick: Pick, radius: float) -> HeldPatch:
     """The points of the shown surface that are at rest within a radius [m] of a place, and at least the corners of its
     triangle; the nearer a point, the larger its weight."""
     corners = shown.triangles[pick.triangle]
@@ -96,4 +96,4 @@ def patch_around(shown: Shown, pick: Pick, radius: float) -> Patch:
     a, b, c = np.moveaxis(shown.rest[shown.triangles], 1, 0)
     areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
     area = float(areas @ there[shown.triangles].mean(axis=1))
-    return Patch(points.astype(np.int32), total / total.sum(), area)
+    return HeldPatch(points.astype(np.int32), total / total.sum(), area)

@@ -12,7 +12,7 @@ from warp_corot.contact.tool import Tool
 from warp_corot.io.pictures.colors import STEEL, TISSUE, stress_colors
 from warp_corot.io.write.solids import Solid, solid_of
 
-from .frames import Frame
+from .frames import PageFrame
 from .server import packed
 from .session import Session
 from .tissue import TISSUES, choices, present
@@ -59,7 +59,7 @@ def page_told(session: Session, title: str, saves: Collection[str]) -> bytes:
     )
 
 
-def topology(session: Session, frame: Frame) -> bytes:
+def topology(session: Session, frame: PageFrame) -> bytes:
     """The rest points and the triangles of each body, and the solids of the obstacles that are drawn."""
     bodies = [(shown.rest, triangles) for shown, triangles in zip(session.shown, frame.triangles, strict=True)]
     given = session.sim.obstacles
@@ -78,7 +78,7 @@ def topology(session: Session, frame: Frame) -> bytes:
     return packed(header, *arrays)
 
 
-def frame_told(session: Session, frame: Frame) -> bytes:
+def frame_told(session: Session, frame: PageFrame) -> bytes:
     """What changes from frame to frame: 13 bytes a point."""
     # Tools that nobody drags need no mark.
     hands = [

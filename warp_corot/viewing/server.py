@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from warp_corot.errors import InputError
 
-from .gate import Gate, check_port
+from .access_control import AccessControl, check_port
 
 #: The types of the page's files, by the ends of their names.
 TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript"}
@@ -133,7 +133,9 @@ class Server:
         InputError: websockets is not installed, or the port is taken.
     """
 
-    def __init__(self, gate: Gate, port: int, take: Callable[[Visitor, Any], None], left: Callable[[Visitor], None]):
+    def __init__(
+        self, gate: AccessControl, port: int, take: Callable[[Visitor, Any], None], left: Callable[[Visitor], None]
+    ):
         self._library = library()
         check_port(gate.host, port)
         self._gate, self._take, self._left = gate, take, left

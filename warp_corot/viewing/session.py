@@ -24,10 +24,10 @@ from warp_corot.simulation.simulation import Simulation
 
 from .colors import Range, Source, sources
 from .cutting import cut
-from .frames import Controls, Frame, Vector
+from .frames import PageControls, PageFrame, Vector
 from .hands import HANDS, SpringHand
 from .implicit_springs import springs_of
-from .pacing import Pace
+from .real_time_factor import RealTimeFactor
 from .shown import Shown, surfaces_of
 from .tools import ToolHand, new_tool
 
@@ -57,14 +57,14 @@ class Session:
         own: Sequence[Any] | None = None,
         made: Callable[[Simulation], None] | None = None,
     ):
-        self.sim, self.controls, self.note, self.busy = sim, Controls(), "", False
+        self.sim, self.controls, self.note, self.busy = sim, PageControls(), "", False
         self._own = list(own or [None] * len(sim.bodies))
         self._made = made
         self.tool, self.gravity = "", sim.gravity
         self._given = sim.obstacles, None if sim.contact is None else sim.contact.options
         self._commands: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self.hands: dict[Any, SpringHand | ToolHand] = {}
-        self.pace = Pace()
+        self.pace = RealTimeFactor()
         self.number = 0
         self._versions: list[int] = []
         self._steps_asked = 0
@@ -235,7 +235,7 @@ class Session:
         self._steps_asked = 0
         self.pace.took(self.sim.total_time - before, stepping)
 
-    def frame(self) -> Frame:
+    def frame(self) -> PageFrame:
         """The present frame."""
         versions = [body.version for body in self.sim.bodies]
         if versions != self._versions:
@@ -247,7 +247,7 @@ class Session:
         largest = max((float(v.max(initial=0.0)) for v in values if v is not None), default=0.0)
         least = 0.0 if source is None else max(map(source.least, self.shown))
         highest = self._range.follow(largest, least)
-        return Frame(
+        return PageFrame(
             number=self.number,
             positions=positions,
             triangles=[shown.triangles for shown in self.shown],

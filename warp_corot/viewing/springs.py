@@ -26,7 +26,7 @@ HARDEST = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Patch:
+class HeldPatch:
     """Points of a shown surface, and the weight of each.
 
     Attributes:
@@ -70,7 +70,7 @@ class AllSprings:
         for springs in self._bodies.values():
             springs.launch()
 
-    def hold(self, body: int, patch: Patch, *, rigid: bool, strength: float = 1.0) -> Spring:
+    def hold(self, body: int, patch: HeldPatch, *, rigid: bool, strength: float = 1.0) -> Spring:
         """Take hold of a patch as it is now.
 
         Args:
@@ -115,7 +115,7 @@ class Spring:
         motion: How far the hand has moved since it took hold [m], float64 [3].
     """
 
-    def __init__(self, owner: BodySprings, slot: int, patch: Patch, rigid: bool, strength: float):
+    def __init__(self, owner: BodySprings, slot: int, patch: HeldPatch, rigid: bool, strength: float):
         self._owner, self.slot = owner, slot
         self.patch, self.rigid, self.strength = patch, rigid, strength
         self.stiffness = self.damping = self.limit = 0.0
@@ -164,7 +164,7 @@ class BodySprings:
     def launch_completion(self) -> None:
         """Launch the count of their work up to the present state, if they count it."""
 
-    def hold(self, patch: Patch, rigid: bool, strength: float) -> Spring:
+    def hold(self, patch: HeldPatch, rigid: bool, strength: float) -> Spring:
         if None not in self._held:
             raise LookupError(f"{MOST_HANDS} hands hold the body already")
         slot = self._held.index(None)

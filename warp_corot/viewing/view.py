@@ -14,9 +14,9 @@ from warp_corot.inputs.checks import checked_flag
 from warp_corot.inputs.checks import shown as as_shown
 from warp_corot.simulation.simulation import Simulation
 
+from .access_control import AccessControl, is_loopback, new_token
 from .commands import Commands
-from .frames import Frame
-from .gate import Gate, is_loopback, new_token
+from .frames import PageFrame
 from .messages import frame_told, page_told, topology
 from .saving import Saving
 from .server import Server, Visitor
@@ -65,7 +65,7 @@ class View:
     ):
         if not isinstance(sim, Simulation):
             raise InputError(f"sim is {as_shown(sim)}; it must be a Simulation, as Simulation(body) makes one")
-        gate = Gate(host, token if token is not None or is_loopback(host) else new_token())
+        gate = AccessControl(host, token if token is not None or is_loopback(host) else new_token())
         self._lock, self._over, self._title = threading.RLock(), threading.Event(), title
         self._thread: threading.Thread | None = None
         self._is_closed = False
@@ -133,7 +133,7 @@ class View:
             self._send(self.session.frame(), waiting)
             self.session.pace.showed(time.perf_counter() - started)
 
-    def _send(self, frame: Frame, visitors: Sequence[Visitor] | None = None) -> None:
+    def _send(self, frame: PageFrame, visitors: Sequence[Visitor] | None = None) -> None:
         """Send a frame to visitors, and what they do not know yet; None: to all, whether they wait for it or not."""
         session = self.session
         state = (session.sim, session.number, session.controls, session.tool, session.busy, session.note)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from warp_corot.cli.exit_status import EXIT_CODES
 from warp_corot.cli.quantities import Acceleration, Density, Metres, Number, PerSecond, Pressure, Seconds
-from warp_corot.cli.say import EXIT_CODES
 
 from .declared import one_of
 

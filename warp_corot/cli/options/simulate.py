@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from warp_corot.cli.say import EXIT_CODES
+from warp_corot.cli.exit_status import EXIT_CODES
 
 from .defaults import LABEL
 from .run import RunOptions

@@ -38,7 +38,7 @@ class Card:
 
 
 @dataclass
-class Part:
+class AbaqusPart:
     """Nodes, elements and sets of a part; a file without parts is one part."""
 
     nodes: dict[int, list[float]] = field(default_factory=dict)
@@ -58,7 +58,7 @@ def read(path: Path) -> FileMesh:
     Raises:
         Unreadable: Inconsistent nodes or elements, or an included file that does not exist.
     """
-    parts: dict[str, Part] = {"": Part()}
+    parts: dict[str, AbaqusPart] = {"": AbaqusPart()}
     instances: list[tuple[str, str, NDArray[np.float64]]] = []
     of_instances: list[tuple[str, str, list[int]]] = []
     here, names = parts[""], {"": ""}
@@ -67,7 +67,7 @@ def read(path: Path) -> FileMesh:
     for card in _cards(path, 0):
         word, given = card.keyword, card.given
         if word == "PART":
-            here = parts.setdefault(given.get("NAME", "").upper(), Part())
+            here = parts.setdefault(given.get("NAME", "").upper(), AbaqusPart())
         elif word == "ENDPART":
             here = parts[""]
         elif word == "INSTANCE":
@@ -168,7 +168,7 @@ def _placed(card: Card) -> NDArray[np.float64]:
     return affine
 
 
-def _elements(card: Card, part: Part, ignored: dict[str, int], notes: list[str]) -> None:
+def _elements(card: Card, part: AbaqusPart, ignored: dict[str, int], notes: list[str]) -> None:
     name = card.given.get("TYPE", "").upper()
     solid, shell = SOLID.match(name), SHELL.match(name)
     count = int(solid[1]) if solid else 6 if name == "STRI65" else int(shell[1][0]) if shell else 0
@@ -212,7 +212,7 @@ def _members(card: Card, sets: dict[str, list[int]], names: dict[str, str]) -> l
 
 
 def _joined(
-    parts: dict[str, Part],
+    parts: dict[str, AbaqusPart],
     instances: list[tuple[str, str, NDArray]],
     of_instances: list[tuple[str, str, list[int]]],
     ignored: dict[str, int],
@@ -253,14 +253,14 @@ def _joined(
     return FileMesh(np.concatenate(points), blocks, names, ignored, notes, joined)
 
 
-def _nodes_of_sets(part: Part) -> dict[str, list[int]]:
+def _nodes_of_sets(part: AbaqusPart) -> dict[str, list[int]]:
     """The nodes of the elements in each element set."""
     corners = {row[0]: row[1:] for rows in part.elements.values() for row in rows}
     sets = part.of_lines | part.sets
     return {name: [node for tag in members for node in corners.get(tag, ())] for name, members in sets.items()}
 
 
-def _regions(part: Part, numbers: dict[str, int]) -> dict[int, int]:
+def _regions(part: AbaqusPart, numbers: dict[str, int]) -> dict[int, int]:
     """The number of each element's set."""
     sets = {**part.of_lines, **part.sets}
     with_section = {name: sets[name] for name in part.sections if name in sets}

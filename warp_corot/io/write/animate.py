@@ -18,8 +18,8 @@ import numpy.typing as npt
 from warp_corot.contact.nodal import contact_at_nodes
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, checked_path, shown
+from warp_corot.inputs.simulation_lock import in_turn
 from warp_corot.inputs.stopwatch import WATCH
-from warp_corot.inputs.turns import in_turn
 from warp_corot.simulation.progress import hidden, is_shown
 from warp_corot.simulation.simulation import Simulation
 

@@ -20,7 +20,7 @@ from warp_corot.inputs.selection import select_nodes
 from warp_corot.io.files.quiet import quietly
 from warp_corot.io.files.usd import first_message
 from warp_corot.io.read.usd.scene import Scene
-from warp_corot.io.write.usd.over import Surface
+from warp_corot.io.write.usd.over import FollowingSurface
 from warp_corot.newton.library import newton
 from warp_corot.newton.state import register_custom_attributes
 
@@ -60,7 +60,7 @@ class StageModel:
     model: Any = None
     soft: list[Body] = field(default_factory=list)
     rigid: dict[str, int] = field(default_factory=dict)
-    surfaces: list[Surface] = field(default_factory=list)
+    surfaces: list[FollowingSurface] = field(default_factory=list)
     surface_points: list[npt.NDArray[np.intp]] = field(default_factory=list)
     cloth: list[slice] = field(default_factory=list)
     ground: npt.NDArray[np.float64] | None = None
@@ -291,10 +291,10 @@ def _find_surfaces(made: StageModel, found: dict[str, Any]) -> None:
         rest = made.model.deformable_visual_meshes[index].rest_vertices.numpy()
         # Newton duplicates points at sharp edges; coincident points move alike.
         _, nearest = cKDTree(rest).query(points)
-        made.surfaces.append(Surface(path, points))
+        made.surfaces.append(FollowingSurface(path, points))
         made.surface_points.append(nearest + starts[index])
     for path, ranges in found["path_cloth_map"].items():
-        made.surfaces.append(Surface(path, made.scene.world_points(path)))
+        made.surfaces.append(FollowingSurface(path, made.scene.world_points(path)))
         made.cloth.append(slice(*ranges["particle"]))
     made.cables = list(found["path_cable_map"])
 

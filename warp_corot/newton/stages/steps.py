@@ -16,7 +16,7 @@ from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.device import checked_device
 from warp_corot.io.read.usd.scene import open_scene
 from warp_corot.io.write.animate import steps_per_frame
-from warp_corot.io.write.usd.over import SceneWriter, State
+from warp_corot.io.write.usd.over import SceneState, SceneWriter
 from warp_corot.newton.following import INTERVAL, RETRIES
 from warp_corot.newton.library import newton
 from warp_corot.newton.solver import SolverCorotated
@@ -154,7 +154,7 @@ class StageSimulation:
         self.frames += 1
         self.time = self.frames / self.fps
 
-    def show(self) -> State:
+    def show(self) -> SceneState:
         """The content of a frame, copied to the host."""
         parts = self.parts
         x, v = self.state.particle_q.numpy(), self.state.particle_qd.numpy()
@@ -165,7 +165,7 @@ class StageSimulation:
             points = self._visuals.update(self.state).points.numpy()
             surfaces = [points[chosen] for chosen in parts.surface_points]
         surfaces += [x[particles].copy() for particles in parts.cloth]
-        return State(
+        return SceneState(
             [x[body.particles].copy() for body in parts.soft],
             [v[body.particles].copy() for body in parts.soft],
             [stress[body.tets] for body in parts.soft],

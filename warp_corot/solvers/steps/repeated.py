@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import warp as wp
 
-from warp_corot.inputs.turns import TURN
+from warp_corot.inputs.simulation_lock import TURN
 from warp_corot.solvers.halo import Halo
 
 

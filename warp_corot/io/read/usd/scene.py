@@ -21,7 +21,7 @@ from warp_corot.mesh.surfaces.boundary import signed_volumes
 from .physics import is_physical, material_said, settle_gravity
 
 
-class Units(NamedTuple):
+class StageUnits(NamedTuple):
     """Units of a stage's numbers: lengths in ``metres``, masses in ``kilograms``, time in seconds.
 
     All other units follow by the rules of UsdPhysics: density in mass over length cubed, and so on.
@@ -79,7 +79,7 @@ class Scene:
 
     path: Path
     stage: Any
-    units: Units
+    units: StageUnits
     up_axis: str
     frame_rate: float | None
     tets: list[TetPrim] = field(default_factory=list)
@@ -171,7 +171,7 @@ def _scene_of(source: Path) -> Scene:
     if not (math.isfinite(kilograms) and kilograms > 0.0):
         raise InputError(f"{source}: kilogramsPerUnit is {kilograms}; it must be a positive number")
     given = stage.GetRootLayer().timeCodesPerSecond if stage.HasAuthoredMetadata("timeCodesPerSecond") else None
-    units = Units(metres_per_unit(stage, source), kilograms)
+    units = StageUnits(metres_per_unit(stage, source), kilograms)
     up_axis = str(UsdGeom.GetStageUpAxis(stage))
     if up_axis not in ("X", "Y", "Z"):
         raise InputError(f"{source}: upAxis is {up_axis!r}; it must be 'Y' or 'Z'")

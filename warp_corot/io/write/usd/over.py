@@ -26,7 +26,7 @@ _OWN = ("subLayers", "subLayerOffsets", "startTimeCode", "endTimeCode", "timeCod
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class FollowingSurface:
     """Points of a Mesh prim that follow a body.
 
     Attributes:
@@ -39,7 +39,7 @@ class Surface:
 
 
 @dataclass(frozen=True)
-class State:
+class SceneState:
     """The content of a frame, in the stage's units and in the world.
 
     Attributes:
@@ -87,7 +87,7 @@ class SceneWriter:
         scene: Scene,
         tets: Sequence[TetPrim],
         bodies: Mapping[str, NDArray[np.float64]],
-        surfaces: Sequence[Surface] = (),
+        surfaces: Sequence[FollowingSurface] = (),
         *,
         fps: float,
         ground: NDArray[np.float64] | None = None,
@@ -122,7 +122,7 @@ class SceneWriter:
         """Stresses [Pa] at the two ends of the colour map so far."""
         return 0.0, self._top
 
-    def write(self, state: State) -> None:
+    def write(self, state: SceneState) -> None:
         """Add a frame.
 
         Raises:

@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     from warp_corot.io.write.skins import Skin
     from warp_corot.simulation.simulation import Simulation
 
-    from .bodies import Body
+    from .bodies import RunBody
 
 
 @dataclass
-class Shown:
+class PreviewFrame:
     """A frame: moved points, triangles, values at the points (NaN on obstacles), rest positions, held nodes, corners of
     the ground [4, 3] or [0, 3], and the time [s]."""
 
@@ -37,7 +37,7 @@ class Shown:
             np.save(file, array, allow_pickle=False)
 
     @classmethod
-    def read(cls, file: IO[bytes]) -> Shown:
+    def read(cls, file: IO[bytes]) -> PreviewFrame:
         x, faces, values, rest, held, ground, time = (np.load(file, allow_pickle=False) for _ in range(7))
         return cls(x, faces, values, rest, held, ground, float(time))
 
@@ -45,7 +45,7 @@ class Shown:
 class DrawnBody:
     """What is drawn of a body: its skins and its stresses, bound again when its mesh has changed."""
 
-    def __init__(self, body: Body):
+    def __init__(self, body: RunBody):
         from warp_corot.io.write.skins import BoundSkins
 
         self.soft = body.soft
@@ -68,7 +68,7 @@ class DrawnBody:
         return self._average(sim.von_mises(self.soft))
 
 
-def shown_now(bodies: Sequence[DrawnBody], sim: Simulation) -> Shown:
+def preview_frame(bodies: Sequence[DrawnBody], sim: Simulation) -> PreviewFrame:
     """The current state of all bodies for drawing."""
     moved: list[np.ndarray] = []
     rest: list[np.ndarray] = []
@@ -89,7 +89,7 @@ def shown_now(bodies: Sequence[DrawnBody], sim: Simulation) -> Shown:
         values.append(np.full(len(points), np.nan))
         held.append(np.zeros(len(points), bool))
     arrays = [np.concatenate(each) for each in (moved, triangles, values, rest, held)]
-    return Shown(
+    return PreviewFrame(
         arrays[0].astype(np.float32), arrays[1], arrays[2].astype(np.float32), arrays[3], arrays[4], ground, sim.time
     )
 

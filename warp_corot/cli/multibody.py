@@ -13,7 +13,7 @@ from warp_corot.errors import InputError
 from warp_corot.io.read.surfaces import LoadedSurface
 from warp_corot.io.read.tetrahedra import LoadedMesh
 
-from .opened import Opened, longest_side
+from .input_file import InputFile, longest_side
 from .options.defaults import TETS
 
 #: More objects are joined: otherwise each would be a body with its own mesh.
@@ -24,7 +24,7 @@ FEWEST_TETS = 100
 SAME = 1.0e-6
 
 
-def bodies_in(opened: Opened, args: argparse.Namespace) -> list[tuple[Opened, argparse.Namespace]]:
+def bodies_in(opened: InputFile, args: argparse.Namespace) -> list[tuple[InputFile, argparse.Namespace]]:
     """The bodies of an input with their options.
 
     The objects of a surface's file are separate bodies if each is closed, none is a cavity of another, and
@@ -57,7 +57,7 @@ def bodies_in(opened: Opened, args: argparse.Namespace) -> list[tuple[Opened, ar
     return found
 
 
-def _of_tets(opened: Opened, join: bool) -> list[Opened]:
+def _of_tets(opened: InputFile, join: bool) -> list[InputFile]:
     """The parts of a file with tetrahedra, which share no nodes."""
     loaded = opened.tets
     assert loaded is not None

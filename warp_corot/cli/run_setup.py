@@ -15,18 +15,18 @@ from warp_corot.inputs.stopwatch import WATCH
 from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import INTEGRATORS
 
-from .bodies import Body, asked_bodies, find_body, find_patches, gravity_of, make_body
+from .bodies import RunBody, asked_bodies, find_body, find_patches, gravity_of, make_body
 from .choosing import choose_steps, may_choose
 from .compiling import compiling_said
+from .exit_status import complain
 from .implicit import integrator_name, is_static
 from .loading import ramp_of
 from .pressing import press_patches
 from .probing import Probe
-from .ranks import Others
-from .say import complain
+from .ranks import WaitingRanks
 from .static import moves
 from .stepping import make_simulation
-from .touching import Touched, place_ground, say_overlaps, say_reach, touched_by
+from .touching import RunContact, place_ground, say_overlaps, say_reach, touched_by
 from .waiting import waiting
 
 #: The command warns that a run will take long if a frame has more steps than this.
@@ -34,7 +34,7 @@ MANY_STEPS = 1e5
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class RunSetup:
     """A run that is ready to start.
 
     Attributes:
@@ -46,17 +46,21 @@ class Run:
         touched: What the bodies touch.
     """
 
-    bodies: Sequence[Body]
+    bodies: Sequence[RunBody]
     sim: Simulation
     probes: Sequence[Probe]
     duration: float
     count: int
-    touched: Touched
+    touched: RunContact
 
 
-def prepared(
-    options: Sequence[argparse.Namespace], others: Others | None = None, *, touches: bool = False, chooses: bool = True
-) -> Run:
+def set_up(
+    options: Sequence[argparse.Namespace],
+    others: WaitingRanks | None = None,
+    *,
+    touches: bool = False,
+    chooses: bool = True,
+) -> RunSetup:
     """Read and mesh the bodies, set up their simulation, and print their notes, and then warnings.
 
     Args:
@@ -76,7 +80,9 @@ def prepared(
     return ready
 
 
-def _made_ready(options: Sequence[argparse.Namespace], others: Others | None, touches: bool, chooses: bool) -> Run:
+def _made_ready(
+    options: Sequence[argparse.Namespace], others: WaitingRanks | None, touches: bool, chooses: bool
+) -> RunSetup:
     shared = options[0]
     device = checked_device(shared.device)
     touched = touched_by(options)
@@ -110,10 +116,10 @@ def _made_ready(options: Sequence[argparse.Namespace], others: Others | None, to
     steps = 1.0 / (shared.fps * sim.dt)
     if steps > MANY_STEPS:
         bodies[0].subject.notes.append(f"{steps:.2g} steps of {sim.dt:.2g} s make a frame: this will take long")
-    return Run(bodies, sim, probes, duration, count, touched)
+    return RunSetup(bodies, sim, probes, duration, count, touched)
 
 
-def _modules(bodies: Sequence[Body], touches: bool, chooses: bool, device: wp.Device) -> list[str]:
+def _modules(bodies: Sequence[RunBody], touches: bool, chooses: bool, device: wp.Device) -> list[str]:
     """Modules of kernels that the run is known to launch, in the order in which it needs them."""
     meshed = any(body.opened.kind in ("surface", "scan") for body in bodies)
     names = [*SURFACES, *MESHING] if meshed else []
@@ -124,7 +130,7 @@ def _modules(bodies: Sequence[Body], touches: bool, chooses: bool, device: wp.De
     return [*names, *(IMPLICIT if meshed and not touches and chooses and may_choose(bodies) else ())]
 
 
-def _frames(args: argparse.Namespace, bodies: Sequence[Body], touched: Touched) -> tuple[float, int]:
+def _frames(args: argparse.Namespace, bodies: Sequence[RunBody], touched: RunContact) -> tuple[float, int]:
     """The duration [s], and the number of frames after the first one."""
     from warp_corot.io.write.animate import frame_count, rounding
 

@@ -19,7 +19,7 @@ from warp_corot.io.read.volumes import LoadedVolume, is_volume, load_volume, vol
 
 
 @dataclass
-class Opened:
+class InputFile:
     """An input that has been read.
 
     Attributes:
@@ -55,7 +55,7 @@ class Opened:
         return self.found is not None and any(block.data for block in self.found.solids)
 
 
-def open_input(name: str) -> Opened:
+def open_input(name: str) -> InputFile:
     """Read the input.
 
     Raises:
@@ -63,13 +63,13 @@ def open_input(name: str) -> Opened:
             makes a body.
     """
     if name == "box":
-        return Opened(name, "box")
+        return InputFile(name, "box")
     if "://" in name:
         raise InputError(f"{name}: is a web address; the input must be a file on this machine")
     asset = find_asset(name)
     path = asset.path if asset else Path(name)
     if path.is_dir() or is_volume(path):
-        return Opened(name, "scan", volume=load_volume(path))
+        return InputFile(name, "scan", volume=load_volume(path))
     if asset is None:
         check_file(path, "mesh")
     suffix = path.suffix.lower()
@@ -77,22 +77,23 @@ def open_input(name: str) -> Opened:
         from warp_corot.io.read.usd.look import has_mesh
 
         drawn = asset.is_surface if asset else has_mesh(path)
-        return Opened(name, "surface", asset, surface=load_surface(name)) if drawn else Opened(name, "tets", asset)
-    if suffix in UP_AXES:
-        return Opened(name, "surface", asset, surface=load_surface(name))
+        if not drawn:
+            return InputFile(name, "tets", asset)
+    if suffix in (*USD_SUFFIXES, *UP_AXES):
+        return InputFile(name, "surface", asset, surface=load_surface(name))
     if suffix_of(path) is None:
         raise unknown_format(path)
     found = read_mesh_file(path)
     if not isinstance(found, FileMesh):
-        return Opened(name, "scan", volume=volume_of_image(path, found))
+        return InputFile(name, "scan", volume=volume_of_image(path, found))
     if found.solids:
-        return Opened(name, "tets", found=found)
+        return InputFile(name, "tets", found=found)
     if found.faces:
-        return Opened(name, "surface", found=found, surface=load_surface(name, found=found))
+        return InputFile(name, "surface", found=found, surface=load_surface(name, found=found))
     raise InputError(f"{path}: has no tetrahedra and no triangles (cell types: {found.kinds()})")
 
 
-def with_unit(opened: Opened, args: argparse.Namespace) -> Opened:
+def with_unit(opened: InputFile, args: argparse.Namespace) -> InputFile:
     """The input with the unit of its coordinates, and with its tetrahedra if it has any [m, or in that unit if the file
     and ``--unit`` name none].
 
@@ -133,7 +134,7 @@ def with_unit(opened: Opened, args: argparse.Namespace) -> Opened:
     return replace(opened, unit=unit)
 
 
-def placed_tets(opened: Opened, args: argparse.Namespace) -> LoadedMesh:
+def placed_tets(opened: InputFile, args: argparse.Namespace) -> LoadedMesh:
     """The tetrahedra in metres."""
     loaded, asset = opened.tets, opened.asset
     assert loaded is not None
@@ -151,8 +152,8 @@ def offset_of(args: argparse.Namespace) -> np.ndarray:
     return np.zeros(3) if args.offset is None else np.array(args.offset, dtype=np.float64)
 
 
-def placed_surface(opened: Opened, args: argparse.Namespace) -> LoadedSurface:
-    """The triangles, scaled and moved, in `Opened.unit`."""
+def placed_surface(opened: InputFile, args: argparse.Namespace) -> LoadedSurface:
+    """The triangles, scaled and moved, in `InputFile.unit`."""
     loaded = opened.surface
     assert loaded is not None
     scale = 1.0 if args.scale is None else args.scale
@@ -165,8 +166,8 @@ def placed_surface(opened: Opened, args: argparse.Namespace) -> LoadedSurface:
     return replace(loaded, points=points, up_axis=args.up or loaded.up_axis, notes=notes)
 
 
-def placed_volume(opened: Opened, args: argparse.Namespace) -> LoadedVolume:
-    """The voxels, scaled and moved, in `Opened.unit`."""
+def placed_volume(opened: InputFile, args: argparse.Namespace) -> LoadedVolume:
+    """The voxels, scaled and moved, in `InputFile.unit`."""
     loaded = opened.volume
     assert loaded is not None
     scale = 1.0 if args.scale is None else args.scale

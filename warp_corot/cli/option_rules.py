@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from warp_corot.errors import InputError
 
-from .opened import Opened
+from .input_file import InputFile
 
 
 class Rule(NamedTuple):
@@ -21,19 +21,19 @@ class Rule(NamedTuple):
     """
 
     options: tuple[str, ...]
-    applies: Callable[[argparse.Namespace, Opened], bool]
+    applies: Callable[[argparse.Namespace, InputFile], bool]
     purpose: str
 
 
-def _is_scan(_: argparse.Namespace, opened: Opened) -> bool:
+def _is_scan(_: argparse.Namespace, opened: InputFile) -> bool:
     return opened.kind == "scan"
 
 
-def _is_meshed(_: argparse.Namespace, opened: Opened) -> bool:
+def _is_meshed(_: argparse.Namespace, opened: InputFile) -> bool:
     return opened.kind in ("surface", "scan")
 
 
-def _is_file(_: argparse.Namespace, opened: Opened) -> bool:
+def _is_file(_: argparse.Namespace, opened: InputFile) -> bool:
     return opened.kind != "box"
 
 
@@ -80,7 +80,7 @@ RULES = (
 )
 
 
-def refuse_options(args: argparse.Namespace, opened: Opened) -> None:
+def refuse_options(args: argparse.Namespace, opened: InputFile) -> None:
     """Check that every given option has an effect.
 
     Raises:

@@ -42,7 +42,7 @@ def new_token() -> str:
     return secrets.token_urlsafe(16)
 
 
-class Gate:
+class AccessControl:
     """Lets requests pass or refuses them.
 
     Args:

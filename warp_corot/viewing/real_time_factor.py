@@ -14,7 +14,7 @@ SLOW = 0.9
 
 
 @dataclass
-class Pace:
+class RealTimeFactor:
     """The speed of simulated time.
 
     Attributes:

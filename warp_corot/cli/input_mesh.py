@@ -17,10 +17,10 @@ from warp_corot.inputs.choices import SHORT_DURATION
 from warp_corot.io.read.tetrahedra import LoadedMesh
 from warp_corot.mesh import TetForest, TetMesh
 
+from .input_file import InputFile, offset_of, placed_tets
 from .label_materials import of_regions, parse_labels
-from .opened import Opened, offset_of, placed_tets
+from .multibody import merged_nodes
 from .options.defaults import BOX_LEVEL, STIFFNESS_PER_WEIGHT
-from .several import merged_nodes
 
 if TYPE_CHECKING:
     from warp_corot.domain import Domain
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 @dataclass
-class Subject:
+class InputMesh:
     """A mesh and its defaults.
 
     Attributes:
@@ -107,7 +107,7 @@ class Subject:
                 self.fix = f"y < {float(f'{asset.fix_below + offset_of(args)[1]:.9g}'):g}"
 
 
-def find_subject(opened: Opened, args: argparse.Namespace) -> Subject:
+def find_subject(opened: InputFile, args: argparse.Namespace) -> InputMesh:
     """The mesh of an input.
 
     Args:
@@ -134,7 +134,7 @@ def find_subject(opened: Opened, args: argparse.Namespace) -> Subject:
         mesh = TetMesh(points, tets, up_axis=loaded.up_axis, labels=labels, label_names=names, node_sets=sets)
     except InputError as error:
         raise InputError(f"{loaded.source}: {error}") from None
-    subject = Subject(mesh, loaded.name, loaded.source, labels=entries, notes=opened.notes)
+    subject = InputMesh(mesh, loaded.name, loaded.source, labels=entries, notes=opened.notes)
     entries[:] = [entry for entry in entries if mesh.elements_of(entry.name).any()]
     if sets:
         subject.notes.append(f"its sets of nodes, for --fix and the like: {_listed(list(named_nodes(mesh)))}")
@@ -170,14 +170,14 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
 
 
-def _box(scale: float, level: int, offset: np.ndarray) -> Subject:
+def _box(scale: float, level: int, offset: np.ndarray) -> InputMesh:
     x, y, z = offset.tolist()
     return box_subject(TetForest.box(paper.CELLS, paper.CELL_SIZE * scale, level, origin=(x, y, z)))
 
 
-def box_subject(mesh: TetForest) -> Subject:
+def box_subject(mesh: TetForest) -> InputMesh:
     """A box with its defaults."""
-    return Subject(
+    return InputMesh(
         mesh,
         "box",
         young=paper.MATERIAL["young"],
