@@ -31,6 +31,7 @@ from .meshes_in_parts import (
     needs_young,
     organ_in_parts,
 )
+from .probing import COLUMNS
 from .ranks import are_several, hands_out
 from .summary import aligned, milliseconds, speed, wall_time
 
@@ -50,9 +51,6 @@ OPTIONS = (
 WHOLE = frozenset({"flat", "surface", "bottom", "top", "nearest"})
 #: The fewest bisections of a box in parts.
 LEAST_LEVEL = 3
-#: Columns of a probe, as in a table of one process.
-COLUMNS = [f"{what}{axis} [{unit}]" for what, unit in (("u", "m"), ("v", "m/s")) for axis in "xyz"]
-COLUMNS += [f"reaction {axis} [N]" for axis in "xyz"]
 
 
 def is_in_parts(options: Sequence[argparse.Namespace]) -> bool:

@@ -19,7 +19,7 @@ from .multibody import bodies_in
 from .option_rules import refuse_options
 from .options.defaults import BOX_LEVEL
 from .organs import ARGUMENTS, domain_of, fineness_of
-from .summary import pressure
+from .summary import values_line
 
 #: The options of surfaces and scans beside those of boxes.
 OF_ORGANS = {"unit", "up", "cell_size", "surface_error", "threshold", "smoothing", "join", "labels", "materials"}
@@ -97,16 +97,12 @@ def material_lines(args: argparse.Namespace, subject: InputMesh) -> list[tuple[s
     given = {name: getattr(args, name) for name in ("young", "poisson", "density")}
     given = {name: getattr(subject, name) if value is None else value for name, value in given.items()}
     if not subject.labels:
-        return [("material", _values(**given))]
+        return [("material", values_line(**given))]
     lines = []
     for entry in subject.labels:
         own = {name: getattr(entry, name) for name in given}
         own = {name: given[name] if value is None else value for name, value in own.items()}
-        lines.append(f"{entry.name}: {_values(**own)}")
+        lines.append(f"{entry.name}: {values_line(**own)}")
     if given["young"] is not None:
-        lines.append(f"all others: {_values(**given)}")
+        lines.append(f"all others: {values_line(**given)}")
     return [("" if number else "material", line) for number, line in enumerate(lines)]
-
-
-def _values(young: float, poisson: float, density: float) -> str:
-    return f"E = {pressure(young)}, nu = {poisson:g}, rho = {density:g} kg/m^3"

@@ -25,18 +25,6 @@ class Rule(NamedTuple):
     purpose: str
 
 
-def _is_scan(_: argparse.Namespace, opened: InputFile) -> bool:
-    return opened.kind == "scan"
-
-
-def _is_meshed(_: argparse.Namespace, opened: InputFile) -> bool:
-    return opened.kind in ("surface", "scan")
-
-
-def _is_file(_: argparse.Namespace, opened: InputFile) -> bool:
-    return opened.kind != "box"
-
-
 RULES = (
     Rule(
         ("skin",),
@@ -44,14 +32,14 @@ RULES = (
         "surfaces",
     ),
     Rule(("level",), lambda _, opened: opened.kind != "tets", "the box, surfaces and scans"),
-    Rule(("unit", "up"), _is_file, "files"),
+    Rule(("unit", "up"), lambda _, opened: opened.kind != "box", "files"),
     Rule(("rotation_level",), lambda _, opened: opened.kind != "tets", "box, surfaces and scans"),
     Rule(
         ("join",),
         lambda args, opened: opened.kind == "tets" or len(opened.surface.objects if opened.surface else ()) > 1,
         "surfaces of several objects and meshes of tetrahedra",
     ),
-    Rule(("labels", "smoothing"), _is_scan, "scans"),
+    Rule(("labels", "smoothing"), lambda _, opened: opened.kind == "scan", "scans"),
     Rule(
         ("threshold",),
         lambda args, opened: opened.kind == "scan" and args.labels is None and args.materials is None,
@@ -59,7 +47,7 @@ RULES = (
     ),
     Rule(
         ("cell_size", "max_level", "surface_error", "tets", "min_layers", "draw_tets"),
-        _is_meshed,
+        lambda _, opened: opened.kind in ("surface", "scan"),
         "surfaces and scans",
     ),
     Rule(
@@ -91,14 +79,11 @@ def refuse_options(args: argparse.Namespace, opened: InputFile) -> None:
             given = getattr(args, name, None)
             if given is not None and given is not False and not rule.applies(args, opened):
                 option = f"--{name.replace('_', '-')}"
-                raise InputError(f"{option} is for {rule.purpose}, and {args.input} is not one{_instead(name, args)}")
+                instead = "; use --scale" if name == "unit" else ""
+                raise InputError(f"{option} is for {rule.purpose}, and {args.input} is not one{instead}")
     if opened.kind != "box" and args.level is not None and (args.tets is not None or args.max_level is not None):
         raise InputError("--level is given, with which neither --tets nor --max-level has an effect")
     if args.labels is not None and args.young is not None:
         raise InputError("--young is given, but --labels gives each label its own")
     if args.draw_labels and args.labels is None and args.materials is None:
         raise InputError("--draw-labels draws the labels that --labels or --materials names")
-
-
-def _instead(name: str, args: argparse.Namespace) -> str:
-    return "; use --scale" if name == "unit" else ""

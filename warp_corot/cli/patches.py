@@ -47,10 +47,10 @@ class BodyPatches:
             "bottom": lambda: self._end(-up),
             "top": lambda: self._end(up),
             "flat": self._flat,
-            "surface": self._surface,
+            "surface": lambda: np.isin(self.used, boundary_faces(subject.mesh.tets, subject.mesh.points)[0]),
         }
         for name, mask in named_nodes(subject.mesh).items():
-            self._named[name] = partial(self._among_used, mask)
+            self._named[name] = lambda mask=mask: mask()[self.used]  # type: ignore[misc]
         for text in given:
             name, equals, expression = (part.strip() for part in text.partition("="))
             if not equals or not re.fullmatch(r"[A-Za-z_]\w*", name) or not expression:
@@ -61,9 +61,9 @@ class BodyPatches:
 
     def of_mesh(self, mesh: Mesh) -> BodyPatches:
         """The same patches on the body's changed mesh."""
-        return (
-            self if mesh is self.subject.mesh else BodyPatches(replace(self.subject, mesh=mesh), self._up, self._given)
-        )
+        if mesh is self.subject.mesh:
+            return self
+        return BodyPatches(replace(self.subject, mesh=mesh), self._up, self._given)
 
     def nodes(self, expression: str) -> Mask:
         """Nodes of a patch, bool [N]; nodes in no tetrahedron are in no patch.
@@ -98,7 +98,7 @@ class BodyPatches:
         """
         tets, mesh = self.subject.mesh.tets, self.subject.mesh
         places = np.searchsorted(self.used, tets)
-        middles = {name: partial(_all_four, nodes, places) for name, nodes in self._named.items()}
+        middles = {name: lambda nodes=nodes: nodes()[places].all(axis=1) for name, nodes in self._named.items()}
         return select_nodes(expression, mesh.points[tets].mean(axis=1), bounds=self.subject.bounds, named=middles)
 
     def on_surface(self, expression: str, surface: SurfaceMesh) -> Mask:
@@ -128,18 +128,7 @@ class BodyPatches:
             raise InputError(f"{self.subject.name}: no region of its surface is flat")
         return np.isin(self.used, patch.nodes)
 
-    def _surface(self) -> Mask:
-        return np.isin(self.used, boundary_faces(self.subject.mesh.tets, self.subject.mesh.points)[0])
-
     def _bound(self, nodes: Callable[[], Mask], surface: SurfaceMesh) -> Mask:
         inside = np.zeros(len(self.subject.mesh.points), bool)
         inside[self.used] = nodes()
         return np.einsum("vn,vn->v", surface.weights, inside[surface.nodes]) >= 0.5
-
-    def _among_used(self, mask: Callable[[], Mask]) -> Mask:
-        return mask()[self.used]
-
-
-def _all_four(nodes: Callable[[], Mask], places: npt.NDArray[np.integer]) -> Mask:
-    """Tetrahedra with all four nodes in a patch."""
-    return nodes()[places].all(axis=1)

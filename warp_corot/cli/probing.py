@@ -25,6 +25,9 @@ _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _POINT = re.compile(rf"\s*({_NUMBER})[\s,]+({_NUMBER})[\s,]+({_NUMBER})\s*")
 #: A point outside by more than this fraction of the body's size is not moved to the nearest point inside.
 OUTSIDE = 0.05
+#: Names and units of the columns of a probe.
+COLUMNS = [f"{what}{axis} [{unit}]" for what, unit in (("u", "m"), ("v", "m/s")) for axis in "xyz"]
+COLUMNS += [f"reaction {axis} [N]" for axis in "xyz"]
 
 Array = npt.NDArray[np.float64]
 
@@ -50,12 +53,6 @@ class Probe:
         self.point = np.array([float(part) for part in match.groups()] if match else 3 * [np.nan])
         self.is_patch = match is None
         self._find()
-
-    @property
-    def columns(self) -> list[str]:
-        """Names and units."""
-        names = [f"{what}{axis} [{unit}]" for what, unit in (("u", "m"), ("v", "m/s")) for axis in "xyz"]
-        return names + [f"reaction {axis} [N]" for axis in "xyz"]
 
     def values(self) -> list[float]:
         """Displacement [m], velocity [m/s] and reaction [N], nine numbers."""
@@ -148,7 +145,7 @@ class Table:
         names = ["time [s]"]
         for probe in self._probes:
             of = f"body {bodies.index(probe.body) + 1}: " if len(bodies) > 1 else ""
-            names += [f"{of}{probe.text} {column}" for column in probe.columns]
+            names += [f"{of}{probe.text} {column}" for column in COLUMNS]
         for name, each in self._obstacles.items():
             names += [f"{name} {column}" for column in _felt_columns(each)]
         return [*names, "kinetic [J]", "elastic [J]", "gravitational [J]", "dt [s]"]

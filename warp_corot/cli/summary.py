@@ -164,17 +164,19 @@ def _block(name: str, lines: list[str]) -> list[tuple[str, str]]:
 def _materials(subject: InputMesh, mesh: Mesh, material: Isotropic) -> list[tuple[str, str]]:
     values = [np.ravel(getattr(material, name)) for name in ("young", "poisson", "density")]
     if not subject.labels and all(len(value) == 1 for value in values):
-        return [("material", _values(*(value[0] for value in values)))]
+        return [("material", values_line(*(value[0] for value in values)))]
     if not subject.labels:
         kinds, counts = np.unique(np.stack(np.broadcast_arrays(*values)), axis=1, return_counts=True)
         ordered = sorted(zip(counts.tolist(), kinds.T.tolist(), strict=True), reverse=True)
-        return _block("material", [f"{_values(*kind)} in {count} tetrahedra" for count, kind in ordered[:MOST_KINDS]])
+        return _block(
+            "material", [f"{values_line(*kind)} in {count} tetrahedra" for count, kind in ordered[:MOST_KINDS]]
+        )
     lines = []
     for label in subject.labels:
         of_label = np.flatnonzero(mesh.elements_of(label.name))
         if len(of_label):
             one = (getattr(material, name)[of_label[0]] for name in ("young", "poisson", "density"))
-            lines.append(f"{label.name}: {_values(*one)}")
+            lines.append(f"{label.name}: {values_line(*one)}")
         else:
             lines.append(f"{label.name}: in no tetrahedron")
     assert mesh.labels is not None
@@ -182,11 +184,11 @@ def _materials(subject: InputMesh, mesh: Mesh, material: Isotropic) -> list[tupl
     if others.any():
         first = np.flatnonzero(others)[0]
         one = (getattr(material, name)[first] for name in ("young", "poisson", "density"))
-        lines.append(f"all others: {_values(*one)}")
+        lines.append(f"all others: {values_line(*one)}")
     return _block("material", lines)
 
 
-def _values(young: float, poisson: float, density: float) -> str:
+def values_line(young: float, poisson: float, density: float) -> str:
     return f"E = {pressure(float(young))}, nu = {poisson:g}, rho = {density:g} kg/m^3"
 
 

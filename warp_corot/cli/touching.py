@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import warp as wp
 
 from warp_corot.contact.options import Contact, checked_friction
 from warp_corot.contact.shapes import Capsule, Cylinder, Ground
@@ -17,7 +16,6 @@ from warp_corot.contact.skin import own_surface
 from warp_corot.contact.tool import Obstacle, Tool
 from warp_corot.domain.units import length
 from warp_corot.errors import InputError
-from warp_corot.kernels.contact.overlaps import find_gaps
 from warp_corot.solvers import INTEGRATORS
 
 from .holding import up_of
@@ -171,11 +169,7 @@ def say_overlaps(touched: RunContact, bodies: Sequence[RunBody], sim: Simulation
     for body, part in zip(bodies, sim.contact.surface.parts, strict=True):
         own = part.skin.own
         at = body.soft.mesh.points[body.subject.used] if own is None else own.points
-        points = wp.array(at.astype(np.float32), dtype=wp.vec3, device=sim.device)
-        gaps = wp.zeros((obstacles.count, len(at)), dtype=wp.float32, device=sim.device)
-        inputs = [obstacles.shapes, obstacles.motions, 0, points, float(body.subject.height)]
-        wp.launch(find_gaps, gaps.shape, inputs, [gaps], device=sim.device)
-        deepest = -gaps.numpy().min(axis=1)
+        deepest = -obstacles.gaps(at, float(body.subject.height)).min(axis=1)
         poses = obstacles.poses()[0]
         for (name, each), depth, pose in zip(touched.obstacles.items(), deepest, poses, strict=True):
             where = f"{name} starts {length(float(depth))} deep in the body"

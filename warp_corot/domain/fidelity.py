@@ -14,7 +14,7 @@ from warp_corot.kernels.meshing import measuring as kernels
 from warp_corot.mesh.surfaces.bodies import boundary_surface
 
 from .domain import Domain
-from .reference import reference_of
+from .reference import reference_of, spread_points
 from .thinness import elements_through
 from .units import length, volume
 from .winding import net_edges
@@ -166,8 +166,9 @@ def fidelity(
     from warp_corot.mesh.pieces import pieces_of
 
     given = reference_of(domain, samples)
-    surface = _own_surface(mesh) if surface is None else surface
-    forth = np.abs(np.asarray(domain.phi(_spread(surface, samples)), np.float64))
+    if surface is None:
+        surface = mesh.surface() if hasattr(mesh, "surface") else boundary_surface(mesh)
+    forth = np.abs(np.asarray(domain.phi(spread_points(surface.points, surface.triangles, samples)[0]), np.float64))
     back = _distances(surface, given.points, domain.device)
     lost = tuple(n for n in domain.label_names if not (n in _labels(mesh) and mesh.elements_of(n).any()))
     found = Fidelity(
@@ -248,21 +249,6 @@ def smallest_dihedral(mesh: TetForest | TetMesh) -> float:
 
 def _labels(mesh: Any) -> tuple[str, ...]:
     return tuple(getattr(mesh, "label_names", ()))
-
-
-def _own_surface(mesh: Any) -> SurfaceMesh:
-    return mesh.surface() if hasattr(mesh, "surface") else boundary_surface(mesh)
-
-
-def _spread(surface: SurfaceMesh, count: int) -> np.ndarray:
-    """Points evenly spread over a surface, float64 [n, 3]."""
-    corners = surface.points[surface.triangles]
-    areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    rng = np.random.default_rng(0)
-    chosen = rng.choice(len(corners), count, p=areas / areas.sum())
-    u, v = np.sqrt(rng.random(count)), rng.random(count)
-    weights = np.stack([1.0 - u, u * (1.0 - v), u * v], axis=1)
-    return np.einsum("nc,ncx->nx", weights, corners[chosen])
 
 
 def _distances(surface: SurfaceMesh, points: np.ndarray, device: wp.Device) -> np.ndarray:

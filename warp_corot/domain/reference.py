@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ import scipy.ndimage
 
 from warp_corot.kernels.meshing.domain import BOUNDARY
 
+from .closing import areas
 from .labels import LabelDomain
 from .signed import SignedFunction
 from .surface import SurfaceDomain
@@ -59,28 +61,33 @@ def reference_of(domain: SignedFunction, count: int) -> Reference:
 def _of_surface(domain: SurfaceDomain, count: int) -> Reference:
     points, triangles = domain.closed.points, domain.closed.triangles.astype(np.int64)
     pieces, piece, crossing = domain.joined
-    corners = points[triangles]
-    areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    rng = np.random.default_rng(0)
-    # At least one of each piece, however small it is.
-    first = np.unique(piece, return_index=True)[1]
-    chosen = np.concatenate([first, rng.choice(len(triangles), count, p=areas / areas.sum())])
-    u, v = np.sqrt(rng.random(len(chosen))), rng.random(len(chosen))
-    weights = np.stack([1.0 - u, u * (1.0 - v), u * v], axis=1)
-    spread = np.einsum("nc,ncx->nx", weights, corners[chosen])
-    own = piece[chosen]
+    # At least one point of each piece, however small it is.
+    spread, chosen = spread_points(points, triangles, count, np.unique(piece, return_index=True)[1])
+    corners, own = points[triangles[chosen]], piece[chosen]
     volume = domain.closed.volume
     if crossing or (domain.sides.known != BOUNDARY).any():
         held = volume_along_lines(domain)
         crossing |= abs(held - volume) > COUNTED_TWICE * volume
         volume = held if crossing else volume
     if crossing:
-        normal = np.cross(corners[chosen, 1] - corners[chosen, 0], corners[chosen, 2] - corners[chosen, 0])
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
         aside = ASIDE * float(np.ptp(domain.bounds, axis=0).max()) * normal
         bounds = ~domain.holds(spread + aside) & domain.holds(spread - aside)
         spread, own = spread[bounds], own[bounds]
     return Reference(volume, spread, own, pieces)
+
+
+def spread_points(
+    points: np.ndarray, triangles: np.ndarray, count: int, first: Sequence[int] | np.ndarray = ()
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points evenly spread over triangles, float64 [n, 3], and the triangle of each; one in each of ``first``, too."""
+    rng, area = np.random.default_rng(0), areas(points, triangles)
+    chosen = rng.choice(len(triangles), count, p=area / area.sum())
+    chosen = np.concatenate([np.asarray(first, chosen.dtype), chosen])
+    u, v = np.sqrt(rng.random(len(chosen))), rng.random(len(chosen))
+    weights = np.stack([1.0 - u, u * (1.0 - v), u * v], axis=1)
+    return np.einsum("nc,ncx->nx", weights, points[triangles[chosen]]), chosen
 
 
 def volume_along_lines(domain: SurfaceDomain) -> float:
@@ -170,9 +177,7 @@ def extent_of(domain: SignedFunction) -> tuple[float, float]:
     """Approximate volume [m^3] and surface area [m^2] of a domain."""
     kind = domain.kind
     if isinstance(kind, SurfaceDomain):
-        corners = kind.closed.points[kind.closed.triangles]
-        crossed = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        return kind.closed.volume, 0.5 * float(np.linalg.norm(crossed, axis=1).sum())
+        return kind.closed.volume, float(areas(kind.closed.points, kind.closed.triangles).sum())
     if isinstance(kind, LabelDomain):
         inside = kind.numbers > 0
         voxel = abs(float(np.linalg.det(kind.affine[:3, :3])))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -75,7 +74,7 @@ def judged_claims(results: Results) -> list[Claim]:
     else:
         moved = results.error(best.case.name, OWN).max()
         said = (
-            f"levels {_listed(run.case.rotation_level for run in good)} give both; fastest is level "
+            f"levels {', '.join(str(run.case.rotation_level) for run in good)} give both; fastest is level "
             f"{best.case.rotation_level}: {speed_up(results, best):.1f} times as fast, {1e3 * moved:.2f} mm moved "
             f"(as shipped, by subtrees: {shipped_speed_up(results, best):.1f} times)"
         )
@@ -121,7 +120,3 @@ def _above_published(results: Results) -> str:
     return (
         f"rotations shared at level {', '.join(above)} are further off" if above else "no shared ones are further off"
     )
-
-
-def _listed(levels: Iterable[int | None]) -> str:
-    return ", ".join(str(level) for level in levels)

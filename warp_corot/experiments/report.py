@@ -43,7 +43,8 @@ def table(results: Results) -> str:
         f"The paper's beam: {len(mesh.points)} nodes, {len(mesh.tets)} tetrahedra of level {s.level}, "
         f"{results.times[-1]:.1f} s in steps of {1e3 * s.dt:.3g} ms, damping {s.damping:.3g} /s",
         f"Device: {device_name(results)}",
-        f"Node {_millimetres(OBSERVED)} mm; errors are distances from St. Venant–Kirchhoff (StVK) at the same time.",
+        f"Node ({', '.join(f'{1e3 * x:g}' for x in OBSERVED)}) mm; errors are distances from "
+        "St. Venant–Kirchhoff (StVK) at the same time.",
         "",
         f"{'':22}{'sinks':>9}{'volume':>9}{'error':>10}{'at':>8}{'error at':>10}   {_time_heading(results)}",
         f"{'model':22}{'mm':>9}{'%':>9}{'max mm':>10}{'s':>8}{'end mm':>10}   {_TIMED}",
@@ -222,7 +223,3 @@ def _level_row(results: Results, run: Run) -> str:
         f"{level:22}{run.rotations:9d}{1e2 * run.growth[-1]:+9.2f}{1e3 * error:10.2f}{1e3 * moved:8.2f}"
         f"{speed_up(results, run):10.2f}   {_times(results, run)}"
     )
-
-
-def _millimetres(point: tuple[float, ...]) -> str:
-    return "(" + ", ".join(f"{1e3 * x:g}" for x in point) + ")"

@@ -1,6 +1,7 @@
 """Rules of OpenUSD for files: names, permission to write, locks, and error messages."""
 
 import functools
+import itertools
 import math
 import os
 import re
@@ -85,6 +86,14 @@ def _is_of(value: Any, due: Any) -> bool:
         return found.ndim > 0
     rank = wanted.ndim + int(due.isArray)
     return found.ndim == rank and found.shape[rank - wanted.ndim :] == wanted.shape and found.dtype.kind in kinds
+
+
+def free_name(name: str, taken: set[str]) -> str:
+    """The name, or with the first number from 2 on that makes it none of those taken; it is taken then."""
+    numbered = (f"{name}_{count}" for count in itertools.count(2))
+    found = name if name not in taken else next(each for each in numbered if each not in taken)
+    taken.add(found)
+    return found
 
 
 def first_value(attribute: Any) -> Any:

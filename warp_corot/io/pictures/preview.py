@@ -188,9 +188,7 @@ class Strip:
         except ImportError:
             raise InputError('pictures need Matplotlib: pip install "warp-corot[plot]"') from None
         if ground is None:
-            given = [(x, p.faces) for p in pictures for x in (p.positions, p.rest) if x is not None]
-            surfaces = [checked_surface(x, faces, "positions") for x, faces in given]
-            ground = min(float((x[tri].reshape(-1, 3) @ cameras[0].world_up).min()) for x, tri in surfaces)
+            ground = float(bounds_of(pictures)[0] @ cameras[0].world_up)
         with_scalars = [p.scalars for p in pictures if p.scalars is not None]
         if with_scalars and value_range is None:
             value_range = (0.0, max(value_limits(scalars)[1] for scalars in with_scalars))

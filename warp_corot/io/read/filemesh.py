@@ -41,7 +41,7 @@ class Block:
     data: dict[str, NDArray[np.int64]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        corners = {**SOLIDS, **FACES}.get(self.kind)
+        corners = CORNERS.get(self.kind)
         if corners is not None and self.nodes.shape[1:] != (corners,):
             raise Unreadable(f"its cells of the kind {self.kind} have the shape {list(self.nodes.shape)}")
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, Vt
 
+from warp_corot.io.files.usd import free_name
 from warp_corot.io.read.surfaces import placed_meshes
 
 #: Path of the prims.
@@ -53,13 +54,7 @@ def _set_triangles(mesh: Any, points: np.ndarray, triangles: np.ndarray) -> None
 
 def _free_name(name: str, taken: set[str]) -> str:
     stem = Path(name).stem if Path(name).suffix.lower() in (".obj", ".stl", ".ply", ".off") else name
-    valid = found = Tf.MakeValidIdentifier(stem)
-    count = 1
-    while found in taken:
-        count += 1
-        found = f"{valid}_{count}"
-    taken.add(found)
-    return found
+    return free_name(Tf.MakeValidIdentifier(stem), taken)
 
 
 def _define(stage: Any, name: str, geometry: Any, matrix: np.ndarray, source: Path) -> None:

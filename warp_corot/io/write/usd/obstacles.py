@@ -12,6 +12,7 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, Vt
 from warp_corot.contact.sampled import TriangleMesh
 from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, Shape, Sphere
 from warp_corot.contact.tool import Obstacle, Tool
+from warp_corot.io.files.usd import free_name
 from warp_corot.io.pictures.colors import STEEL, srgb_to_linear
 from warp_corot.io.write.solids import ground_corners, shape_of
 
@@ -91,16 +92,14 @@ def obstacle_prims(obstacles: Sequence[Obstacle], points: NDArray[np.float64], w
     """A prim for each obstacle that OpenUSD can draw; tools are tool_1, tool_2, ..., others are named by their
     shape.
     """
-    prims, taken = [], set()
+    prims, tools, taken = [], 0, set[str]()
     for each in obstacles:
         shape = shape_of(each)
         if not isinstance(shape, Ground | Sphere | Capsule | Cylinder | Box | TriangleMesh):
             continue
-        base = "tool" if isinstance(each, Tool) else Tf.MakeValidIdentifier(repr(shape))
-        count = 1
-        while (name := f"{base}_{count}" if base == "tool" or count > 1 else base) in taken:
-            count += 1
-        taken.add(name)
+        tools += isinstance(each, Tool)
+        base = f"tool_{tools}" if isinstance(each, Tool) else Tf.MakeValidIdentifier(repr(shape))
+        name = free_name(base, taken)
         prims.append(ObstaclePrim(each, f"{OBSTACLES}/{name}", points, world))
     return prims
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pxr import Gf, Sdf, Tf, UsdGeom, Vt
 
 from warp_corot.errors import InputError
+from warp_corot.io.files.usd import free_name
 from warp_corot.io.pictures.colors import TISSUE, VertexAverage, color_index, srgb_to_linear, stress_colors
 from warp_corot.io.write.skins import Skin
 from warp_corot.mesh.surfaces.bound import SurfaceMesh, vertex_normals
@@ -155,16 +156,7 @@ def skin_paths(skins: Sequence[Skin]) -> list[str]:
     if len(skins) == 1:
         return [SURFACE]
     taken = {TETS, MATERIALS, PHYSICS, OBSTACLES}
-    paths = []
-    for skin in skins:
-        name = path = f"{ROOT}/{Tf.MakeValidIdentifier(skin.name)}"
-        count = 1
-        while path in taken:
-            count += 1
-            path = f"{name}_{count}"
-        taken.add(path)
-        paths.append(path)
-    return paths
+    return [free_name(f"{ROOT}/{Tf.MakeValidIdentifier(skin.name)}", taken) for skin in skins]
 
 
 def declare_triangles(mesh: Any) -> None:
