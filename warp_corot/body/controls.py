@@ -13,7 +13,7 @@ from warp_corot.discretization.nodal import vec3_view
 from warp_corot.discretization.sizes import Sizes
 from warp_corot.errors import InputError
 from warp_corot.inputs.indices import checked_indices
-from warp_corot.inputs.simulation_lock import in_turn
+from warp_corot.inputs.simulation_lock import under_lock
 from warp_corot.materials.directional import Directional
 from warp_corot.materials.isotropic import Material
 
@@ -68,7 +68,7 @@ class Controls:
         """Number of elements of one world."""
         return self.sizes.world_elements
 
-    @in_turn
+    @under_lock
     def fix(self, nodes: Nodes, *, worlds: npt.ArrayLike | None = None) -> None:
         """Fix nodes at their current positions.
 
@@ -83,14 +83,14 @@ class Controls:
         """
         self._hold(self.node_indices(nodes, worlds), self.conditions.patches.still)
 
-    @in_turn
+    @under_lock
     def release(self, nodes: Nodes, *, worlds: npt.ArrayLike | None = None) -> None:
         """Free fixed or prescribed nodes, which keep their velocity. Nodes and worlds as in ``fix``."""
         chosen = self.node_indices(nodes, worlds)
         self.conditions.stop_following(chosen)
         self.conditions.release(self.conditions.patches.nodes(chosen))
 
-    @in_turn
+    @under_lock
     def prescribe(
         self,
         nodes: Nodes,
@@ -132,7 +132,7 @@ class Controls:
         if len(indices):
             self.conditions.follow(keys)
 
-    @in_turn
+    @under_lock
     def load(self, nodes: Nodes, force: npt.ArrayLike, *, worlds: npt.ArrayLike | None = None) -> None:
         """Set the external force on nodes, from the next step on.
 
@@ -166,7 +166,7 @@ class Controls:
         self._make_activation()
         return self._views.hand_out(self.conditions.discretization.activation[: self.element_count])
 
-    @in_turn
+    @under_lock
     def activate(
         self,
         stress: float | npt.ArrayLike | Activation,

@@ -17,7 +17,7 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_count, checked_numbers, shown
 from warp_corot.inputs.device import checked_device
 from warp_corot.inputs.loading import BODY, load
-from warp_corot.inputs.simulation_lock import TURN, in_turn
+from warp_corot.inputs.simulation_lock import SIMULATION_LOCK, under_lock
 from warp_corot.kernels.stepping.integrate import RESET_NODES
 from warp_corot.materials.isotropic import Material
 from warp_corot.mesh import TetForest
@@ -72,7 +72,7 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
     """
 
     def __init__(self, mesh: Mesh, material: Material, *, worlds: int = 1, device: str | wp.Device | None = None):
-        with TURN:
+        with SIMULATION_LOCK:
             _check_made_of(mesh, material)
             self.worlds = checked_count(worlds, "worlds", least=1)
             self.device = checked_device(device)
@@ -163,20 +163,20 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
         return self.nodal_view(self.state.positions)
 
     @positions.setter
-    @in_turn
+    @under_lock
     def positions(self, values: npt.ArrayLike) -> None:
         # In float64 and through displacements, so that no digit is lost.
         self.state.set_displacements(self._checked_vectors(values, "positions") - self.rest_positions)
 
     @property
-    @in_turn
+    @under_lock
     def displacements(self) -> wp.array:
         """Nodal displacements from rest [m], vec3 [worlds * N]: a copy; set the property to change them."""
         self.state.adopt_positions()
         return wp.clone(vec3_view(self.state.displacements[: self.node_count]))
 
     @displacements.setter
-    @in_turn
+    @under_lock
     def displacements(self, values: npt.ArrayLike) -> None:
         self.state.set_displacements(self._checked_vectors(values, "displacements"))
 
@@ -187,7 +187,7 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
         return self.nodal_view(self.state.velocities)
 
     @velocities.setter
-    @in_turn
+    @under_lock
     def velocities(self, values: npt.ArrayLike) -> None:
         given, held = self._checked_vectors(values, "velocities"), self.constrained
         if held.any():
@@ -195,7 +195,7 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
         self.state.set_velocities(given)
 
     @property
-    @in_turn
+    @under_lock
     def reactions(self) -> wp.array:
         """Forces of the supports on fixed and prescribed nodes in the last step [N], vec3 [worlds * N]; zero elsewhere.
 
@@ -285,7 +285,7 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
         self.bindings.append(binding)
         return binding
 
-    @in_turn
+    @under_lock
     def set_initial_state(self) -> None:
         """Let ``Simulation.reset`` restore the current state; by default it restores rest."""
         if self.changing is not None:

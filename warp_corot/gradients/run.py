@@ -18,7 +18,7 @@ from warp_corot.discretization.nodal import padded
 from warp_corot.elasticity import Corotated, ForceField, Model
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.checks import checked_count, refuse_tape, shown
-from warp_corot.inputs.simulation_lock import in_turn
+from warp_corot.inputs.simulation_lock import under_lock
 from warp_corot.simulation.parts import checked_gravity, checked_models
 from warp_corot.simulation.resting import checked_obstacles
 from warp_corot.simulation.simulation import Simulation
@@ -80,7 +80,7 @@ class RunGradient:
         return getattr(self, name)
 
 
-@in_turn
+@under_lock
 def run_gradient(
     body: SoftBody,
     objective: Objective,

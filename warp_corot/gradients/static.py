@@ -16,7 +16,7 @@ from warp_corot.contact.shapes import Shape
 from warp_corot.elasticity import Model
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import shown
-from warp_corot.inputs.simulation_lock import in_turn
+from warp_corot.inputs.simulation_lock import under_lock
 from warp_corot.simulation.static import StaticReport
 
 from . import parameters
@@ -68,7 +68,7 @@ class StaticGradient:
         return getattr(self, name)
 
 
-@in_turn
+@under_lock
 def static_gradient(
     body: SoftBody,
     objective: Objective,

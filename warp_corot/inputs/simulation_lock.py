@@ -1,4 +1,4 @@
-"""Threads that simulate take turns."""
+"""The lock of threads that simulate: one at a time launches."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ R = TypeVar("R")
 PAUSE = 1.0e-4
 
 
-class Turn:
+class SimulationLock:
     """A lock that a thread may take again while it has it, and leave to threads that wait."""
 
     def __init__(self) -> None:
@@ -41,15 +41,15 @@ class Turn:
 
 #: Held while kernels are launched. Warp's captures and tapes belong to the process: what another thread launches in the
 #: meantime would be recorded, too, and would run again with each replay.
-TURN = Turn()
+SIMULATION_LOCK = SimulationLock()
 
 
-def in_turn(function: Callable[P, R]) -> Callable[P, R]:
+def under_lock(function: Callable[P, R]) -> Callable[P, R]:
     """The same function, one thread at a time."""
 
     @functools.wraps(function)
     def alone(*args: P.args, **kwargs: P.kwargs) -> R:
-        with TURN:
+        with SIMULATION_LOCK:
             return function(*args, **kwargs)
 
     return alone

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warp_corot.errors import StabilityWarning, UnstableError, depth_of_user
-from warp_corot.inputs.simulation_lock import TURN
+from warp_corot.inputs.simulation_lock import SIMULATION_LOCK
 from warp_corot.kernels.stepping.pace import GROWTH
 from warp_corot.solvers.guarding.energy_control import EnergyControl
 from warp_corot.solvers.guarding.guard import Fault
@@ -143,9 +143,9 @@ class Running:
     def _run(self, most: int, end: float | None) -> bool:
         """Make steps until something is due, and do that; returns whether the end is reached."""
         sim = self._sim
-        with TURN:
+        with SIMULATION_LOCK:
             reached, now = self._run_alone(most, end)
-        TURN.pass_on()
+        SIMULATION_LOCK.pass_on()
         if reached is None:
             return False
         if any(now % every == 0 for every in sim.hooks.intervals) and sim.total_steps > self._steps_called:

@@ -23,7 +23,7 @@ from warp_corot.elasticity import Corotated, Model
 from warp_corot.errors import InputError, StabilityWarning, depth_of_user
 from warp_corot.inputs.checks import checked_count, checked_flag, checked_number, refuse_tape
 from warp_corot.inputs.loading import CONTACT, IMPLICIT, STEPS, STEPS_ON_CPU, load
-from warp_corot.inputs.simulation_lock import TURN, in_turn
+from warp_corot.inputs.simulation_lock import SIMULATION_LOCK, under_lock
 from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.stepping.gauge import find_strains
 from warp_corot.remesh.online import OnlineRemesh
@@ -107,7 +107,7 @@ class Simulation(Clock):
         obstacles: Obstacle | Sequence[Obstacle] = (),
         contact: Contact | None = None,
     ):
-        with TURN:
+        with SIMULATION_LOCK:
             self.bodies = checked_bodies(bodies, self.ranks)
             self.device, self.worlds = self.bodies[0].device, self.bodies[0].worlds
             self.deterministic = checked_flag(deterministic, "deterministic")
@@ -200,7 +200,7 @@ class Simulation(Clock):
                 every few hundred steps. Unlike ``advance``, this call repeats no step and checks no energies, because
                 users may write to the state between steps.
         """
-        with TURN:
+        with SIMULATION_LOCK:
             refuse_tape()
             if self.device.is_capturing:
                 if self.remeshing.every:
@@ -235,14 +235,14 @@ class Simulation(Clock):
         """
         if not 0 <= checked_number(seconds, "seconds", "s") < math.inf:
             raise InputError(f"cannot advance by {seconds} s; it must be zero or a positive time")
-        with TURN:
+        with SIMULATION_LOCK:
             if self.device.is_capturing:
                 raise InputError("advance cannot be called while its device is capturing; call step, which records")
         self.advance_until(self.total_time + seconds)
 
     def advance_until(self, total_time: float) -> None:
         """Advance until ``total_time`` [s], like ``advance``; do nothing if that time is past."""
-        with TURN:
+        with SIMULATION_LOCK:
             refuse_tape()
         if not checked_number(total_time, "total_time", "s") < math.inf:
             raise InputError(f"cannot advance until {total_time} s; it must be a finite time")
@@ -253,7 +253,7 @@ class Simulation(Clock):
 
     def advance_steps(self, count: int) -> None:
         """Advance by ``count`` time steps, like ``advance``. Steps that a hook makes count."""
-        with TURN:
+        with SIMULATION_LOCK:
             refuse_tape()
         self.running.make(checked_count(count, "count", least=0))
 
@@ -265,7 +265,7 @@ class Simulation(Clock):
         """
         self.hooks.add(callback, every)
 
-    @in_turn
+    @under_lock
     def reset(self, worlds: npt.ArrayLike | wp.array | None = None) -> None:
         """Put worlds back to their initial state: rest, or the state at ``SoftBody.set_initial_state``.
 
@@ -297,17 +297,17 @@ class Simulation(Clock):
 
     # --- looking ---------------------------------------------------------------------------------------------------
 
-    @in_turn
+    @under_lock
     def energy(self) -> Energy:
         """Kinetic, elastic and gravitational energy of all bodies in the present state [J]."""
         return self.world_energies().together
 
-    @in_turn
+    @under_lock
     def world_energies(self) -> WorldEnergies:
         """The energies of each world [J], float64 [worlds]."""
         return find_energies(self.bodies, self.fields, self.gravity)
 
-    @in_turn
+    @under_lock
     def forces(self, body: SoftBody | None = None) -> wp.array:
         """Elastic nodal forces in the present state [N], vec3 [worlds * N], of the first or the given body."""
         chosen = self._index(body)
@@ -315,7 +315,7 @@ class Simulation(Clock):
         forces = self.fields[chosen].elastic_forces(self.bodies[chosen].state.displacements)
         return vec3_view(forces[: self.bodies[chosen].node_count])
 
-    @in_turn
+    @under_lock
     def von_mises(self, body: SoftBody | None = None) -> npt.NDArray[np.float32]:
         """Von Mises stress of each element in the present state [Pa], float32 [worlds * T]."""
         chosen = self._index(body)
@@ -338,7 +338,7 @@ class Simulation(Clock):
 
     # --- keeping ---------------------------------------------------------------------------------------------------
 
-    @in_turn
+    @under_lock
     def save(self, path: str | PathLike[str]) -> None:
         """Write everything needed to continue to one file (.npz, no pickle), whole or not at all; hooks are not saved.
 

@@ -18,7 +18,7 @@ from warp_corot.contact.shapes import Shape
 from warp_corot.elasticity import Corotated, Model
 from warp_corot.errors import ConvergenceError, InputError
 from warp_corot.inputs.checks import checked_count, checked_number, refuse_tape, shown
-from warp_corot.inputs.simulation_lock import in_turn
+from warp_corot.inputs.simulation_lock import under_lock
 from warp_corot.solvers.implicit.nested import nested_start
 from warp_corot.solvers.implicit.preconditioners import check_preconditioner
 from warp_corot.solvers.implicit.static import StaticSolver, status_words
@@ -72,7 +72,7 @@ class StaticReport:
     contacts: tuple[ContactPoint, ...] = field(default=(), repr=False)
 
 
-@in_turn
+@under_lock
 def solve_static(
     body: SoftBody,
     *,

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from warp_corot.contact.nodal import contact_at_nodes
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, checked_path, shown
-from warp_corot.inputs.simulation_lock import in_turn
+from warp_corot.inputs.simulation_lock import under_lock
 from warp_corot.inputs.stopwatch import WATCH
 from warp_corot.simulation.progress import hidden, is_shown
 from warp_corot.simulation.simulation import Simulation
@@ -283,7 +283,7 @@ def progress_bar(count: int, *, wanted: bool = True) -> Iterator[Progress]:
         yield lambda frame, _: bar.update(frame - bar.n)
 
 
-@in_turn
+@under_lock
 def _write_frame(writer: UsdWriter, sim: Simulation, joined: _Joined, done: Recording) -> None:
     positions = [w.positions.numpy() for w in joined.worlds]
     velocities = [w.velocities.numpy() for w in joined.worlds]

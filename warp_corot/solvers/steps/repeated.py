@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import warp as wp
 
-from warp_corot.inputs.simulation_lock import TURN
+from warp_corot.inputs.simulation_lock import SIMULATION_LOCK
 from warp_corot.solvers.halo import Halo
 
 
@@ -21,7 +21,7 @@ def repeat(launch: Callable[[], None], times: int, device: wp.Device, ranks: Hal
             launch()
         return
     launch()
-    with TURN:
+    with SIMULATION_LOCK:
         with wp.ScopedCapture(device=device) as capture:
             launch()
         for _ in range(times - 1):
