@@ -11,7 +11,6 @@ from warp_corot.kernels.contact.vertices import Rigid
 from .obstacles import Obstacles
 from .search import Search
 from .surface import ContactSurface
-from .surface_halo import SurfaceHalo
 
 
 class RigidForces:
