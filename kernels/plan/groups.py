@@ -11,6 +11,7 @@ import warp as wp
 from warp_corot.kernels.remesh.pools import UNUSED, Pools
 
 from .plan import Plan, flat_row
+from .tree import TORN
 
 wp.set_module_options({"enable_backward": False})
 
@@ -95,6 +96,10 @@ def climb(
         return
     left = groups.is_flat[e]
     while pools.parent[e] >= 0:
+        if left > 0 and pools.cut[pools.parent[e]] >= TORN:
+            # No group goes across a cut.
+            groups.makes[e] = 1 + wp.atomic_add(groups.count, 0, 1)
+            left = 0
         e = pools.parent[e]
         former = wp.atomic_add(groups.tally, e, ARRIVED + left)
         if former == 0:

@@ -1,8 +1,8 @@
 """The leaves in complete subtrees, and the others: the lists of a plan (``plan``).
 
 Leaves are in tree order, so the leaves of a subtree are contiguous: eight leaves of one level are a subtree if the
-first and the last have the same ancestor three levels up. Likewise 64 leaves under an ancestor six levels up
-are a group (see ``tables.subtree``). Subtrees are divided into classes; one launch can compute a
+first and the last have the same ancestor three levels up, unless a cut goes through it. Likewise 64 leaves under an
+ancestor six levels up are a group (see ``tables.subtree``). Subtrees are divided into classes; one launch can compute a
 class.
 
 Each thread processes one stretch of the leaves, marks what each leaf begins and counts; sums over the threads give
@@ -12,7 +12,7 @@ the start of its lists, which are thus in tree order for any number of threads.
 import warp as wp
 
 from .plan import Plan, flat_row, level_of, places_t
-from .tree import Tree, above, element_of, parent_of, which_child
+from .tree import Tree, above, element_of, is_torn, parent_of, which_child
 from .units import begins_unit, list_unit
 
 wp.set_module_options({"enable_backward": False})
@@ -64,6 +64,8 @@ def complete(i: int, size: int, depth: int, tree: Tree, plan: Plan):
         if level_of(i + n, plan) != level:
             return -1
     root = above(element_of(i, tree), depth, tree)
+    if is_torn(root, tree):
+        return -1
     if above(element_of(i + size - 1, tree), depth, tree) != root:
         return -1
     return root

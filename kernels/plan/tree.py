@@ -11,6 +11,9 @@ from warp_corot.kernels.tables.shapes import FRAME_SHIFT
 
 #: Number of places past the last node that padding names in turn, so that additions to them seldom collide.
 SINKS = wp.constant(1024)
+#: Bits of ``Tree.cut`` and ``Pools.cut``: n of a leaf for its face opposite to node n; this one of an element whose
+#: leaves do not agree on the nodes that they share.
+TORN = wp.constant(16)
 
 
 @wp.struct
@@ -27,6 +30,7 @@ class Tree:
     # Elements: parents, and nodes in Maubach order.
     parent: wp.array[wp.int32]
     tets: wp.array[wp.vec4i]
+    cut: wp.array[wp.int32]  # as ``Pools.cut``; empty if nothing was ever cut
     # In a uniform tree, for the corners of a unit: the leaf counted from its first one, and the leaf's node.
     corner_leaves: wp.vec4i
     corner_nodes: wp.vec4i
@@ -74,6 +78,14 @@ def above(e: int, steps: int, tree: Tree):
     for _ in range(steps):
         found = tree.parent[found]
     return found
+
+
+@wp.func
+def is_torn(e: int, tree: Tree):
+    """Whether the leaves below an element do not agree on the nodes that they share, because of a cut."""
+    if tree.cut.shape[0] == 0:
+        return False
+    return tree.cut[e] >= TORN
 
 
 @wp.func

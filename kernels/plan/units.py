@@ -9,14 +9,16 @@ import warp as wp
 from warp_corot.kernels.elements.elements import LEVEL_MASK
 
 from .plan import Plan, extent, flat_row, level_of
-from .tree import Tree, code_above, element_of, padding, parent_of, which_child
+from .tree import Tree, code_above, element_of, is_torn, padding, parent_of, which_child
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
 def on_nodes(e: int, tree: Tree):
-    """Whether all corners are nodes of leaves; on the rim of a domain's mesh they may not be."""
+    """Whether all corners are nodes of leaves, the same of all: not on the rim of a domain's mesh, nor at a cut."""
+    if is_torn(e, tree):
+        return False
     if tree.named != 0:
         return True
     tet = tree.tets[e]

@@ -73,6 +73,20 @@ def leave_edges(tet: wp.vec4i, end: int, pools: Pools, edges: WantedEdges):
 
 
 @wp.func
+def halved_cuts(cut: int, end: int):
+    """Which faces of the two halves of a leaf are cut; the face between them is not."""
+    first = int(0)
+    second = int(0)
+    for n in range(1, 4):
+        if n != end and (cut >> n) % 2 == 1:
+            first += wp.lshift(1, n)
+            second += wp.lshift(1, wp.where(n < end, n - 1, n))
+    first += wp.lshift((cut >> end) % 2, end)
+    second += wp.lshift(cut % 2, end)
+    return first, second
+
+
+@wp.func
 def bisect_leaf(e: int, child: int, z: int, pools: Pools, edges: WantedEdges):
     tet = pools.tets[e]
     level = pools.level[e]
@@ -86,6 +100,9 @@ def bisect_leaf(e: int, child: int, z: int, pools: Pools, edges: WantedEdges):
         pools.level[child + n] = level + 1
         pools.parent[child + n] = e
         pools.first_child[child + n] = LIVE
+    first_cut, second_cut = halved_cuts(pools.cut[e], end)
+    pools.cut[child] = first_cut
+    pools.cut[child + 1] = second_cut
     pools.first_child[e] = child
     for n in range(1, 4):
         if n != end:

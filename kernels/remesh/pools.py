@@ -70,6 +70,7 @@ class Pools:
     code: wp.array[
         wp.int32
     ]  # level, mirrored or not, and which of ``frames``, as in ``elements.elements.ForestElements``
+    cut: wp.array[wp.int32]  # which faces of a leaf are cut, and TORN: see ``plan.tree``
     next: wp.array[wp.int32]  # the next tetrahedron around the same edge, during bisection or merging
     free_pairs: wp.array[wp.int32]  # first children
     fresh: wp.array[wp.int32]  # first children made in this pass

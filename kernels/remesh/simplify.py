@@ -1,13 +1,15 @@
 """Removal of nodes, the reverse of bisection.
 
 A node can be removed if all leaves that name it, live or void, are children that were made with it, and all are
-marked: then their parents become leaves. Two children stay if only one is live, or if their labels differ.
+marked: then their parents become leaves. Two children stay if only one is live, if their labels differ, or if their
+parent would heal a cut.
 """
 
 import warp as wp
 
 from warp_corot.kernels.meshing.bisection import refinement_end
 from warp_corot.kernels.meshing.growth import LIVE
+from warp_corot.kernels.plan.tree import TORN
 
 from .pools import CANDIDATES, FREE_PAIRS, LEAVES, NODES_GIVEN, PAIRS_GIVEN, SIMPLIFY, UNUSED, Pools
 from .state import Carried, average_children, quarter_mass, unmake_node
@@ -25,6 +27,21 @@ class Removal:
 
 
 @wp.func
+def whole_cuts(first: int, second: int, end: int):
+    """Which faces of a parent are cut, from its halves; -1 if the face between them is, or half of another one."""
+    if first % 2 == 1:
+        return -1
+    whole = wp.lshift((first >> end) % 2, end) + (second >> end) % 2
+    for n in range(1, 4):
+        if n != end:
+            half = (first >> n) % 2
+            if half != (second >> wp.where(n < end, n - 1, n)) % 2:
+                return -1
+            whole += wp.lshift(half, n)
+    return whole
+
+
+@wp.func
 def offer_node(i: int, min_level: int, kept: int, pools: Pools, carried: Carried, removal: Removal):
     """If this and the next leaf are a pair that may be merged, count them at the node that would be removed."""
     e = pools.leaves[i]
@@ -36,7 +53,10 @@ def offer_node(i: int, min_level: int, kept: int, pools: Pools, carried: Carried
     if carried.label[e] != carried.label[e + 1]:
         return
     parent = pools.parent[e]
-    z = pools.tets[e][refinement_end(level)]
+    end = refinement_end(level)
+    if whole_cuts(pools.cut[e], pools.cut[e + 1], end) < 0 or (pools.cut[parent] & TORN) != 0:
+        return
+    z = pools.tets[e][end]
     before = wp.atomic_exch(removal.head, z, parent)
     pools.next[parent] = before
     wp.atomic_add(removal.willing, z, 2)
@@ -86,6 +106,7 @@ def remove_node(z: int, pools: Pools, carried: Carried, removal: Removal):
         for n in range(1, 4):
             if n != end:
                 wp.atomic_add(pools.valence, tet[n], -1)
+        pools.cut[e] = whole_cuts(pools.cut[child], pools.cut[child + 1], end)
         pools.first_child[e] = LIVE
         # The parent's number stays, for the kernels that order the leaves.
         pools.level[child] = UNUSED

@@ -58,6 +58,7 @@ class Carried:
     gained_momentum: wp.array[wp.vec3d]  # beyond that of the gained mass at the end's velocity
     gain_count: wp.array[wp.int32]
     gainers: wp.array[wp.int32]
+    cut_area: wp.array[wp.float64]  # [1] of all cuts, at rest [m^2]
     impulse: wp.array[wp.vec3d]  # [1] total impulse of supports in all passes [N s]
 
 

@@ -271,7 +271,9 @@ def test_wrong_input_is_named(device):
         wc.Simulation(many, remesh=wc.OnlineRemesh())
     x = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
     general = wc.SoftBody(wc.TetMesh(x, [[0, 1, 2, 3]]), SOFT, device=device)
-    with pytest.raises(wc.InputError, match="only a TetForest can be remeshed; the mesh of this body is a TetMesh"):
+    with pytest.raises(
+        wc.InputError, match="only a TetForest can be remeshed or cut; the mesh of this body is a TetMesh"
+    ):
         wc.Simulation(general, remesh=wc.OnlineRemesh())
 
 

@@ -28,7 +28,7 @@ FLOORS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("elasticity, holding", ("elasticity", "holding")),
     ("solvers", ("solvers",)),
     ("contact", ("contact",)),
-    ("remesh", ("remesh",)),
+    ("remesh, cutting", ("remesh", "cutting")),
     ("simulation", ("simulation",)),
     ("gradients", ("gradients", "frameworks")),
     ("io, newton, experiments, haptics", ("io", "newton", "experiments", "haptics")),

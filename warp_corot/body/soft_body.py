@@ -21,6 +21,7 @@ from warp_corot.inputs.simulation_lock import SIMULATION_LOCK, under_lock
 from warp_corot.kernels.stepping.integrate import RESET_NODES
 from warp_corot.materials.isotropic import Material
 from warp_corot.mesh import TetForest
+from warp_corot.mesh.pieces import pieces_of
 from warp_corot.mesh.surfaces.bodies import boundary_surface
 from warp_corot.mesh.surfaces.boundary import boundary_faces
 
@@ -252,6 +253,17 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
     def surface_faces(self) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
         """``surface_triangles``, and the element of each, int32 [F]."""
         return boundary_faces(self.mesh.tets, self.mesh.points)
+
+    @property
+    def pieces(self) -> int:
+        """The number of pieces into which the body has come, by cuts or from the start; elements joined by faces are
+        one piece, and ``mesh.pieces()`` gives the piece of each."""
+        return int(pieces_of(self.mesh.tets).max()) + 1
+
+    @property
+    def cut_area(self) -> float:
+        """The area of all cuts so far, measured on one side and at rest [m^2]."""
+        return 0.0 if self.changing is None else self.changing.cut_area
 
     def _check_touched(self) -> None:
         if not self.state.is_touched:

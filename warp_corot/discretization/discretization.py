@@ -154,6 +154,10 @@ class MeshChanges(Protocol):
     def forest(self) -> DeviceForest:
         """The mesh on the device."""
 
+    @property
+    def cut_area(self) -> float:
+        """The area of all cuts so far, at rest [m^2]."""
+
     def remember(self) -> None:
         """Save the present mesh and state for ``reset``."""
 

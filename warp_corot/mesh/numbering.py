@@ -33,7 +33,7 @@ def renumbered(order: np.ndarray, ends: np.ndarray, tree: Tree) -> tuple[np.ndar
     moved = ends[order]
     moved = np.where(moved < 0, np.int32(-1), number[moved])
     moved.sort(axis=1)
-    return moved, Tree(number[tree.tets], tree.level, tree.parent, tree.first_child)
+    return moved, Tree(number[tree.tets], tree.level, tree.parent, tree.first_child, tree.cut)
 
 
 def pruned(tree: Tree, empty: np.ndarray) -> tuple[Tree, np.ndarray]:
@@ -84,4 +84,4 @@ def by_levels(tree: Tree) -> Tree:
 def live_or_void(tree: Tree, live: np.ndarray) -> Tree:
     """The tree in which the leaves in a mask bool [M] are live."""
     leaf = np.where(live, np.int32(LIVE), np.int32(VOID))
-    return Tree(tree.tets, tree.level, tree.parent, np.where(tree.first_child < 0, leaf, tree.first_child))
+    return Tree(tree.tets, tree.level, tree.parent, np.where(tree.first_child < 0, leaf, tree.first_child), tree.cut)

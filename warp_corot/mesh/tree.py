@@ -24,12 +24,14 @@ class Tree:
         parent: Index of the parent, -1 for roots, int32 [M].
         first_child: Index of the first of the two children, ``LIVE`` (-1) for leaves, ``VOID`` (-2) for leaves that lie
             outside the body and not part of the mesh, int32 [M].
+        cut: What cuts have separated, as ``kernels.plan.tree.Tree.cut``, int32 [M]; None: nothing.
     """
 
     tets: np.ndarray
     level: np.ndarray
     parent: np.ndarray
     first_child: np.ndarray
+    cut: np.ndarray | None = None
 
     @cached_property
     def leaves(self) -> np.ndarray:

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_corot.discretization.changing.cutting import CutPass
 from warp_corot.discretization.changing.passes import RemeshPass
 from warp_corot.discretization.changing.plan import DevicePlan
 from warp_corot.discretization.changing.pools import DeviceForest, PassCounts
@@ -17,6 +18,7 @@ from warp_corot.discretization.changing.survey import Survey
 from warp_corot.discretization.changing.transfer import Column
 from warp_corot.discretization.clock import Clock
 from warp_corot.errors import InputError
+from warp_corot.kernels.remesh.cut import Surface
 from warp_corot.kernels.remesh.mark import elongation, marking_kernel
 from warp_corot.kernels.remesh.state import MEAN_OF_CONTENTS
 from warp_corot.kernels.stepping.integrate import set_start
@@ -37,18 +39,21 @@ NODE_GRANULE = 256
 
 
 class Changing:
-    """The remeshing of one body.
+    """The remeshing and the cutting of one body.
 
     It is made before the body's force field, whose launches then run over the pools.
 
     Args:
         body: The body.
-        options: The user's options.
+        options: The user's options; None: the mesh only changes where it is cut.
         carried: Numbers of elements that the force field will keep; see ``Model.carried``.
+        is_cut: Whether the body may be cut.
 
     Attributes:
         body: The body.
         options: The user's options with defaults filled in; see `OnlineRemesh.on`.
+        is_remeshed: Whether there were any.
+        cuts: The cuts; None if the body is not cut.
         forest: The pools.
         passes: The passes that change the pools.
         carried_material: The material data that elements carry.
@@ -61,8 +66,11 @@ class Changing:
         InputError: A general mesh, more than one world, or options that do not fit the mesh.
     """
 
-    def __init__(self, body: SoftBody, options: OnlineRemesh, carried: Sequence[str] = ()):
-        self.options = fitted(options, body)
+    def __init__(
+        self, body: SoftBody, options: OnlineRemesh | None, carried: Sequence[str] = (), *, is_cut: bool = False
+    ):
+        self.is_remeshed = options is not None
+        self.options = fitted(options or OnlineRemesh(), body)
         mesh = body.mesh
         assert isinstance(mesh, TetForest)
         self.body = body
@@ -77,8 +85,10 @@ class Changing:
             self.options.capacity,
             density=self.carried_material.density(len(mesh.tets)),
             values=self.carried_material.values,
+            node_capacity=_room_for_nodes(mesh, self.options.capacity) if is_cut else None,
             device=self.device,
         )
+        self.cuts = CutPass(self.forest) if is_cut else None
         self.conditions = CarriedConditions(body, self.forest)
         self.passes = RemeshPass(
             self.forest,
@@ -127,14 +137,27 @@ class Changing:
 
     def run(self) -> None:
         """Make one pass over the mesh, and update what depends on the mesh if it has changed."""
-        self.body.state.adopt_positions()
-        self.conditions.note()
-        self.field.note()
+        self._read_user()
         if self._graph is None:
             self._launch()
         else:
             wp.capture_launch(self._graph)
         self._look()
+
+    def cut(self, surface: Surface) -> float:
+        """Cut the body along a surface, and update what depends on the mesh; returns the area [m^2] at rest."""
+        assert self.cuts is not None
+        before = self.cut_area
+        self._read_user()
+        self.cuts.launch_cut(surface)
+        self._launch_derived()
+        self._look()
+        return self.cut_area - before
+
+    @property
+    def cut_area(self) -> float:
+        """The area of all cuts so far, at rest [m^2]; waits for the device."""
+        return float(self.forest.carriage.arrays.cut_area.numpy()[0])
 
     def renew(self) -> None:
         """Derive everything from the current mesh."""
@@ -176,9 +199,17 @@ class Changing:
         body.follow_mesh(self, self.discretization)
         self._keep_initial_state(initial)
 
+    def _read_user(self) -> None:
+        """Read what the user has written, before the mesh changes."""
+        self.body.state.adopt_positions()
+        self.conditions.note()
+        self.field.note()
+
     def _launch(self) -> None:
         """Launch a pass and everything that is derived from the mesh, or record it."""
         self.passes.launch()
+        if self.cuts is not None:
+            self.cuts.launch_after_pass()
         self._launch_derived()
 
     def _launch_derived(self) -> None:
@@ -243,6 +274,11 @@ class Changing:
         return array[: self.body.node_count].numpy().copy()
 
 
+def _room_for_nodes(mesh: TetForest, capacity: int) -> int:
+    """Places for the nodes of a mesh that is refined up to a capacity and cut."""
+    return 2 * len(mesh.lattice) + (capacity - len(mesh.tets) + 1) // 2 + NODE_GRANULE
+
+
 def fitted(options: OnlineRemesh, body: SoftBody) -> OnlineRemesh:
     """The options with defaults filled in from the body's mesh; see `OnlineRemesh.on`.
 
@@ -252,9 +288,9 @@ def fitted(options: OnlineRemesh, body: SoftBody) -> OnlineRemesh:
     """
     mesh = body.mesh
     if not isinstance(mesh, TetForest):
-        raise InputError(f"only a TetForest can be remeshed; the mesh of this body is a {type(mesh).__name__}")
+        raise InputError(f"only a TetForest can be remeshed or cut; the mesh of this body is a {type(mesh).__name__}")
     if body.worlds > 1:
-        raise InputError(f"worlds is {body.worlds}; only a body in one world can be remeshed")
+        raise InputError(f"worlds is {body.worlds}; only a body in one world can be remeshed or cut")
     numbers = options.parameters
     if numbers is not None and numbers.device != body.device:
         raise InputError(f"parameters is on {numbers.device}; it must be on the body's device, {body.device}")

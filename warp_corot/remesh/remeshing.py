@@ -15,6 +15,7 @@ from .online import OnlineRemesh
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
     from warp_corot.elasticity import ForceField, Model
+    from warp_corot.kernels.remesh.cut import Surface
 
     from .changing import Changing
 
@@ -26,9 +27,10 @@ class Remeshing:
         bodies, models: The simulation's.
         asked: The user's argument: options for all bodies or one entry for each.
         deterministic: Whether runs must be reproducible bit for bit.
+        are_cut: Whether bodies may be cut.
 
     Attributes:
-        changing: The remeshing of each body; None for bodies that are not remeshed.
+        changing: The remeshing and cutting of each body; None for bodies whose mesh never changes.
         every: Steps after which a pass may be due; 0 if there is none.
 
     Raises:
@@ -42,28 +44,36 @@ class Remeshing:
         asked: OnlineRemesh | Sequence[OnlineRemesh | None] | None,
         *,
         deterministic: bool,
+        are_cut: bool = False,
     ):
         if any(body.changing is not None for body in bodies):
-            raise InputError("a body that one simulation remeshes cannot be in another; make a SoftBody of its mesh")
+            raise InputError(
+                "a body that one simulation remeshes or cuts cannot be in another; make a SoftBody of its mesh"
+            )
         options = _one_each(asked, len(bodies))
         self.every = math.gcd(*(int(each.every) for each in options if each is not None))
+        self.are_cut = are_cut
         self.changing: tuple[Changing | None, ...] = (None,) * len(bodies)
-        if not self.every:
+        if not self.every and not are_cut:
             return
         if deterministic and bodies[0].device.is_cuda:
-            raise InputError("a deterministic run on CUDA cannot be remeshed: threads number new nodes in any order")
+            raise InputError(
+                "a deterministic run on CUDA cannot be remeshed or cut: threads number new nodes in any order"
+            )
         from .changing import Changing, fitted
 
         # All checks come before the first body is given pools: an error leaves the bodies unchanged.
         for each, body, model in zip(options, bodies, models, strict=True):
-            if each is not None:
+            if each is not None or are_cut:
                 body.check_own_arrays()
                 if model.kept_of_elements is not None:
-                    raise InputError(f"{model.kept_of_elements}; a body that is remeshed must have another model")
-                fitted(each, body)
+                    raise InputError(
+                        f"{model.kept_of_elements}; a body that is remeshed or cut must have another model"
+                    )
+                fitted(each or OnlineRemesh(), body)
 
         self.changing = tuple(
-            None if each is None else Changing(body, each, model.carried)
+            Changing(body, each, model.carried, is_cut=are_cut) if each is not None or are_cut else None
             for each, body, model in zip(options, bodies, models, strict=True)
         )
         self._said_full: set[int] = set()
@@ -84,15 +94,32 @@ class Remeshing:
         Warns:
             CapacityWarning: A body's capacity does not suffice for the refinement; once.
         """
-        due = [c for c in self.changing if c is not None and steps % c.options.every == 0]
+        due = [c for c in self.changing if c is not None and c.is_remeshed and steps % c.options.every == 0]
         for changing in due:
             changing.run()
-            if changing.is_full and id(changing) not in self._said_full:
-                self._said_full.add(id(changing))
-                most = f"{changing.options.capacity} elements"
-                message = f"the mesh has reached its capacity of {most}; it is not refined further"
-                warnings.warn(message, CapacityWarning, stacklevel=depth_of_user())
+            self._say_full(changing)
         return bool(due)
+
+    def cut(self, surface: Surface, number: int | None = None) -> float:
+        """Cut all bodies, or one, along a surface; returns the area [m^2] at rest.
+
+        Warns:
+            CapacityWarning: As ``run``.
+        """
+        chosen = self.changing if number is None else self.changing[number : number + 1]
+        area = 0.0
+        for changing in chosen:
+            if changing is not None:
+                area += changing.cut(surface)
+                self._say_full(changing)
+        return area
+
+    def _say_full(self, changing: Changing) -> None:
+        if changing.is_full and id(changing) not in self._said_full:
+            self._said_full.add(id(changing))
+            most = f"{changing.options.capacity} elements"
+            message = f"the mesh has reached its capacity of {most}; it is not refined or cut further"
+            warnings.warn(message, CapacityWarning, stacklevel=depth_of_user())
 
     def step_may_change(self) -> bool:
         """Whether the stable step must be found again; call it once after each pass."""

@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from os import PathLike
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +18,8 @@ from warp_corot.contact.grasp import Grasp
 from warp_corot.contact.options import Contact
 from warp_corot.contact.reading import ContactPoint, contact_points
 from warp_corot.contact.tool import Obstacle
+from warp_corot.cutting.plane import Plane, checked_plane
+from warp_corot.discretization.changing.cutting import plane_surface
 from warp_corot.discretization.nodal import vec3_view
 from warp_corot.elasticity import Corotated, Model
 from warp_corot.errors import InputError, StabilityWarning, depth_of_user
@@ -106,6 +108,7 @@ class Simulation(Clock):
         remesh: OnlineRemesh | Sequence[OnlineRemesh | None] | None = None,
         obstacles: Obstacle | Sequence[Obstacle] = (),
         contact: Contact | None = None,
+        cuts: Sequence[Any] | None = None,
     ):
         with SIMULATION_LOCK:
             self.bodies = checked_bodies(bodies, self.ranks)
@@ -116,33 +119,44 @@ class Simulation(Clock):
             self.gravity = checked_gravity(gravity, self.bodies[0].mesh.up_axis)
             touching = checked_contact(obstacles, contact)
             ordered = self.deterministic and self.device.is_cuda
-            check_implicit(self.integrator, remeshes=remesh is not None, ordered=ordered)
-
-            self.remeshing = Remeshing(self.bodies, self.models, remesh, deterministic=self.deterministic)
-            bound = zip(self.models, self.bodies, strict=True)
-            self.fields = tuple(m.bind(body, deterministic=self.deterministic) for m, body in bound)
-            self.remeshing.serve(self.fields)
+            changes = remesh is not None or cuts is not None
+            check_implicit(self.integrator, remeshes=changes, ordered=ordered)
             #: Functions that are called after steps.
             self.hooks = Hooks()
             given = self.integrator.dt
             self.pace = Pace(ANY_STEP if given is None else float(given), self.device)
-            self.system = System(self.bodies, self.fields, self.pace, self.gravity, self.ranks)
-            self._load_kernels(touches=touching is not None)
-            stable = self._find_stable_steps()
-            #: Keeps bodies out of obstacles and out of one another; None without contact.
-            self.contact: Contacts | None = None
-            if touching is not None:
-                own = self.ranks.is_alone or not self.integrator.is_implicit
-                self.contact = Contacts(self.system, *touching, stable_dt=self.stable_dt, dt=given, on_surfaces=own)
-                self.system.constraints.append(self.contact)
-            #: Chooses the step, if none was given.
-            self.safe_step = SafeStep(self.system, self.models, stable) if given is None else None
-            self.guard = Guard(self.system)
-            self.stepper = self.integrator.bind(self.system)
-            check_constraints(self.system, self.stepper, self.integrator)
-            self.recorded = RecordedSteps(self.system, self.stepper, self.guard, self.safe_step)
-            #: Makes the steps.
-            self.running = Running(self)
+            self._make(remesh, touching, are_cut=cuts is not None)
+
+    def _make(
+        self,
+        remesh: OnlineRemesh | Sequence[OnlineRemesh | None] | None,
+        touching: tuple[tuple[Obstacle, ...], Contact] | None,
+        *,
+        are_cut: bool,
+    ) -> None:
+        """Make all that makes steps of the bodies as they are now."""
+        remeshing = Remeshing(self.bodies, self.models, remesh, deterministic=self.deterministic, are_cut=are_cut)
+        self.remeshing, given = remeshing, self.integrator.dt
+        bound = zip(self.models, self.bodies, strict=True)
+        self.fields = tuple(m.bind(body, deterministic=self.deterministic) for m, body in bound)
+        self.remeshing.serve(self.fields)
+        self.system = System(self.bodies, self.fields, self.pace, self.gravity, self.ranks)
+        self._load_kernels(touches=touching is not None)
+        stable = self._find_stable_steps()
+        #: Keeps bodies out of obstacles and out of one another; None without contact.
+        self.contact: Contacts | None = None
+        if touching is not None:
+            own = self.ranks.is_alone or not self.integrator.is_implicit
+            self.contact = Contacts(self.system, *touching, stable_dt=self.stable_dt, dt=given, on_surfaces=own)
+            self.system.constraints.append(self.contact)
+        #: Chooses the step, if none was given.
+        self.safe_step = SafeStep(self.system, self.models, stable) if given is None else None
+        self.guard = Guard(self.system)
+        self.stepper = self.integrator.bind(self.system)
+        check_constraints(self.system, self.stepper, self.integrator)
+        self.recorded = RecordedSteps(self.system, self.stepper, self.guard, self.safe_step)
+        #: Makes the steps.
+        self.running = Running(self)
 
     def _load_kernels(self, touches: bool) -> None:
         """Load the kernels that steps are known to launch, several modules at a time."""
@@ -173,7 +187,8 @@ class Simulation(Clock):
     @property
     def remesh(self) -> tuple[OnlineRemesh | None, ...]:
         """How each body is remeshed, with numbers in place of None; arrays of parameters are live."""
-        return tuple(None if each is None else each.options for each in self.remeshing.changing)
+        changing = self.remeshing.changing
+        return tuple(None if each is None or not each.is_remeshed else each.options for each in changing)
 
     @property
     def solves(self) -> Solves | None:
@@ -415,6 +430,60 @@ class Simulation(Clock):
             stable = self._find_stable_steps()
             if self.safe_step is not None:
                 self.safe_step.find_rest(stable)
+
+    @under_lock
+    def cut(self, plane: Plane, body: SoftBody | None = None) -> float:
+        """Cut bodies along a plane, at once and where they are now.
+
+        Faces of elements are separated that are nearest to the plane; ``body.pieces`` says how many pieces there are
+        afterwards. A simulation made without ``cuts`` is prepared for cutting by its first cut.
+
+        Args:
+            plane: The plane.
+            body: The body; None: all.
+
+        Returns:
+            The area of the cut, at rest [m^2]; zero if the plane meets nothing.
+
+        Raises:
+            InputError: It is not a plane, the body is not one of this simulation's, a body cannot be cut (see
+                ``remesh.Changing``), or the simulation was made without ``cuts`` and remeshes bodies, has grasps or
+                added forces.
+
+        Warns:
+            CapacityWarning: The mesh has no room left for the nodes of a cut; once.
+        """
+        found = checked_plane(plane)
+        number = None if body is None else self._index(body)
+        self._prepare_cuts()
+        area = self.remeshing.cut(plane_surface(found.normal, found.offset, is_deformed=True), number)
+        if area > 0.0:
+            self.guard.forget()
+            stable = self._find_stable_steps()
+            if self.safe_step is not None:
+                self.safe_step.find_rest(stable)
+        return area
+
+    def _prepare_cuts(self) -> None:
+        """Let bodies be cut, if the simulation was not made so."""
+        if self.remeshing.are_cut:
+            return
+        if self.remeshing.every or self.grasps or self.system.forces or not self.ranks.is_alone:
+            raise InputError("the simulation was not made for cuts; Simulation(..., cuts=[]) makes one that is")
+        if self.integrator.is_implicit:
+            check_implicit(self.integrator, remeshes=True, ordered=False)
+        former = self.contact
+        touching = None if former is None else (former.obstacles.given, former.options)
+        if former is not None:
+            former.obstacles.let_go()
+        try:
+            self._make(None, touching, are_cut=True)
+        except BaseException:
+            if former is not None:
+                former.obstacles.take_back()
+            raise
+        if former is not None and self.contact is not None:
+            self.contact.obstacles.continue_from(former.obstacles)
 
     def follow_motion(self) -> None:
         """Remesh the bodies that are due, and adapt the step to the new meshes."""

@@ -9,7 +9,6 @@ import numpy as np
 
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.numbering import renumbered
-from warp_corot.mesh.tree import Tree
 
 if TYPE_CHECKING:
     from .pools import DeviceForest
@@ -23,7 +22,7 @@ def exported(device: DeviceForest) -> TetForest:
     order = device.nodes_in_use
     if source.node_count < len(source.lattice):
         order, stands_for = _without_doubles(order, lattice, np.unique(tree.leaf_tets))
-        tree = Tree(stands_for[tree.tets], tree.level, tree.parent, tree.first_child)
+        tree = replace(tree, tets=stands_for[tree.tets])
         ends = np.where(ends < 0, ends, stands_for[ends])
     new_ends, new_tree = renumbered(order, ends, tree)
     lattice = lattice[order]

@@ -7,7 +7,7 @@ from warp_corot.kernels.remesh.pools import SINKS
 
 #: Arrays of ``kernels.remesh.pools.Pools``, without those that have no meaning after a pass.
 OF_NODES: tuple[str, ...] = ("lattice", "ends", "valence")
-OF_TETRAHEDRA: tuple[str, ...] = ("tets", "level", "parent", "first_child", "code")
+OF_TETRAHEDRA: tuple[str, ...] = ("tets", "level", "parent", "first_child", "code", "cut")
 
 #: Of ``kernels.remesh.state.Carried``.
 CARRIED_BY_NODES: tuple[str, ...] = (

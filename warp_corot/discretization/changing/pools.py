@@ -175,7 +175,8 @@ class DeviceForest:
         parent, child = pools.parent.numpy()[used], pools.first_child.numpy()[used]
         parent = np.where(parent < 0, np.int32(-1), number[parent])
         child = np.where(child < 0, child, number[child])
-        return Tree(pools.tets.numpy()[used], level[used], parent, child), used
+        cut = pools.cut.numpy()[used]
+        return Tree(pools.tets.numpy()[used], level[used], parent, child, cut if cut.any() else None), used
 
     def to_forest(self) -> TetForest:
         """The present mesh on the host, its leaves as here in tree order.
@@ -224,6 +225,8 @@ class DeviceForest:
         pools.code = self._filled(codes, self.tree_capacity, wp.int32)
         pools.frames = device_frames(device).frames
         pools.child_code = wp.array(frames.of_children, dtype=wp.int32, device=device)
+        cut = np.zeros(0, np.int32) if tree.cut is None else tree.cut
+        pools.cut = self._filled(cut, self.tree_capacity, wp.int32)
         pools.next = wp.empty(self.tree_capacity, dtype=wp.int32, device=device)
         free_pairs = np.arange(self.tree_capacity - 2, elements - 1, -2, dtype=np.int32)
         most_pairs = (self.tree_capacity - pools.roots) // 2

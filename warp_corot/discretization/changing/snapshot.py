@@ -20,7 +20,7 @@ from .fields import CARRIED_BY_NODES, CARRIED_BY_TETRAHEDRA, OF_NODES, OF_TETRAH
 #: The contents of unused places, if they are not zero.
 _UNUSED = {"level": int(kernels.UNUSED), "row": int(NO_ROW)}
 
-_CARRIED = (*CARRIED_BY_NODES, *CARRIED_BY_TETRAHEDRA, "impulse")
+_CARRIED = (*CARRIED_BY_NODES, *CARRIED_BY_TETRAHEDRA, "impulse", "cut_area")
 
 
 class Piece(NamedTuple):
@@ -121,3 +121,4 @@ def _in_use(pools: kernels.Pools, carried: Carried, counts: npt.NDArray[np.int32
         yield name, 0, int(counts[kernels.LEAVES])
     yield "void_leaves", 0, pools.void_count
     yield "impulse", 0, 1
+    yield "cut_area", 0, 1

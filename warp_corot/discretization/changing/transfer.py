@@ -105,6 +105,7 @@ class Carriage:
         arrays.gained_momentum = wp.zeros(self._nodes, dtype=wp.vec3d, device=self.device)
         arrays.gain_count = wp.zeros(self._nodes, dtype=wp.int32, device=self.device)
         arrays.gainers = wp.empty(self._nodes, dtype=wp.int32, device=self.device)
+        arrays.cut_area = wp.zeros(1, dtype=wp.float64, device=self.device)
         arrays.impulse = wp.zeros(1, dtype=wp.vec3d, device=self.device)
         self.arrays = arrays
         self._update_inverse_mass()

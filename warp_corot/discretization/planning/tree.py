@@ -42,6 +42,8 @@ def tree_of(forest: TetForest, elements: ForestElements, rotation_level: int | N
         return tree
     tree.roots = int(np.count_nonzero(source.parent < 0))
     tree.leaves, tree.parent = (_read(values, wp.int32, device) for values in (source.leaves, source.parent))
+    if source.cut is not None:
+        tree.cut = _read(source.cut, wp.int32, device)
     if rotation_level is not None:
         tree.tets = _read(source.tets, wp.vec4i, device)
     return tree

@@ -12,6 +12,8 @@ from warp_corot.mesh.growing.detail import Detail
 
 #: Fields of surfaces that are finer than their mesh.
 DETAIL = ("points", "tets", "phi", "labels", "sharp_points", "sharp_triangles")
+#: Fields of trees.
+OF_TREE = tuple(field.name for field in dataclasses.fields(Tree))
 #: Fields of forests that were made from a domain.
 OF_DOMAIN = ("phi", "fill", "labels", "node_labels")
 
@@ -25,8 +27,9 @@ def pack_mesh(mesh: TetForest | TetMesh, prefix: str, arrays: dict[str, np.ndarr
         names = list(mesh.label_names)
         return {"kind": "general", "up_axis": mesh.up_axis, "repaired": mesh.repaired, "label_names": names}
     arrays[prefix + "lattice"], arrays[prefix + "node_ends"] = mesh.lattice, mesh.node_ends
-    for field in dataclasses.fields(Tree):
-        arrays[f"{prefix}tree.{field.name}"] = getattr(mesh.tree, field.name)
+    for name in OF_TREE:
+        if (array := getattr(mesh.tree, name)) is not None:
+            arrays[f"{prefix}tree.{name}"] = array
     if mesh.detail is not None:
         found = {name: getattr(mesh.detail, name) for name in DETAIL}
         arrays.update((f"{prefix}detail.{name}", array) for name, array in found.items() if array is not None)
@@ -56,7 +59,8 @@ def unpack_mesh(described: dict[str, Any], prefix: str, arrays: dict[str, np.nda
         )
         mesh.repaired = described["repaired"]
         return mesh
-    tree = Tree(**{field.name: arrays[f"{prefix}tree.{field.name}"] for field in dataclasses.fields(Tree)})
+    tets, level, parent, first_child = (arrays[f"{prefix}tree.{name}"] for name in OF_TREE if name != "cut")
+    tree = Tree(tets, level, parent, first_child, arrays.get(f"{prefix}tree.cut"))
     x, y, z = described["cells"]
     a, b, c = described["origin"]
     lattice, ends = arrays[prefix + "lattice"], arrays[prefix + "node_ends"]
@@ -82,6 +86,9 @@ def _check_tree(tree: Tree, lattice: np.ndarray, ends: np.ndarray) -> None:
     if shapes != [(count, 4), (nodes, 3), (nodes, 2), *[(count,)] * 3]:
         raise ValueError(f"the tree's arrays have the shapes {shapes}")
     bounds = ((tree.tets, 0, nodes), (ends, -1, nodes), (tree.parent, -1, count), (tree.first_child, -2, count - 1))
-    for array, least, most in (*bounds, (tree.level, 0, 64)):
+    cut = np.zeros(count, np.int32) if tree.cut is None else tree.cut
+    if cut.shape != (count,):
+        raise ValueError(f"the tree's cuts have the shape {cut.shape}")
+    for array, least, most in (*bounds, (tree.level, 0, 64), (cut, 0, 32)):
         if array.dtype.kind != "i" or (array.size and not (array.min() >= least and array.max() < most)):
             raise ValueError("an index of the tree is out of range")

@@ -1,0 +1,404 @@
+"""Cutting: which faces of leaves a surface separates.
+
+A face is cut if the line between the centroids of its two leaves crosses the surface. So a plane separates exactly the
+leaves with centroids on either side, and strips that a blade sweeps one after the other leave no face between them.
+Both leaves keep a bit for the face in ``Pools.cut``; ``split`` then separates nodes.
+
+Leaves near the surface are listed, and their faces meet in a hash table: the second leaf to arrive finds the first.
+"""
+
+import warp as wp
+
+from warp_corot.kernels.meshing.growth import EMPTY, LIVE, claim_slot, edge_key
+
+from .pools import ADDED, FRESH, FULL, LEAVES, REMOVED, Pools
+from .state import Carried
+
+wp.set_module_options({"enable_backward": False})
+
+# Places in ``Cuts.counts``.
+STARS = wp.constant(0)  # listed leaves
+MARKED = wp.constant(1)  # nodes around which leaves may have come apart
+COPIES = wp.constant(2)  # nodes made in this cut
+STAMP = wp.constant(3)  # number of cuts
+FACES = wp.constant(4)  # faces cut in this cut
+COUNTS = 5
+
+#: Leaves are near a surface if it is no farther from their centroids than this many times their farthest node: so are
+#: those on both sides of a cut face, and their neighbours.
+NEAR = wp.constant(wp.float64(2.5))
+#: A leaf's bits in ``Cuts.fresh``: its faces that are cut now, and of these those that it has the surface behind.
+SIDE_SHIFT = wp.constant(4)
+
+
+@wp.struct
+class Surface:
+    """A plane, or triangles wound alike, at rest or in the deformed body."""
+
+    is_deformed: wp.float64  # 1: where nodes are now; 0: where they are at rest
+    normal: wp.vec3d  # of the plane; without triangles
+    offset: wp.float64
+    count: int  # number of triangles
+    points: wp.array[wp.vec3d]
+    triangles: wp.array[wp.vec3i]
+    low: wp.vec3d  # bounds of the triangles
+    high: wp.vec3d
+
+
+@wp.struct
+class Cuts:
+    """Room for one cut: leaves near a surface, then leaves around marked nodes; "stars"."""
+
+    counts: wp.array[wp.int32]
+    room: int  # stars, at most
+    stars: wp.array[wp.int32]  # places in the list of leaves
+    fresh: wp.array[wp.int32]  # [stars] faces cut now
+    # Faces: of star s and opposite to its node n at 4 s + n.
+    slot: wp.array[wp.int32]  # in the table; -1 for none
+    other: wp.array[wp.int32]  # the same face of the other leaf, -1 if there is none
+    keys: wp.array[wp.int64]
+    owner: wp.array[wp.int32]  # [slots] the face that came first, -1
+    # Corners: node n of star s at 4 s + n.
+    link: wp.array[wp.int32]  # another corner of the same component; the smallest is linked to itself
+    copy: wp.array[wp.int32]  # the new node of a smallest corner, -1 if it keeps its own
+    # Nodes.
+    mark: wp.array[wp.int32]  # the last cut in which a node was marked
+    marked: wp.array[wp.int32]
+    keeper: wp.array[wp.int32]  # the smallest corner of all its components, which keeps the node
+    former_mass: wp.array[wp.float64]  # of marked nodes, and of those that new nodes are copies of
+    names: wp.array2d[wp.int32]  # ``Pools.tets``, number by number
+
+
+@wp.func
+def face_node(face: int, n: int):
+    """The n-th local node of the face opposite to a node."""
+    return wp.where(n < face, n, n + 1)
+
+
+@wp.func
+def face_key(tet: wp.vec4i, face: int):
+    """A key of the face's three nodes, in any order; keys of different faces are equal once in 2**63."""
+    a = tet[face_node(face, 0)]
+    b = tet[face_node(face, 1)]
+    c = tet[face_node(face, 2)]
+    low = wp.min(a, wp.min(b, c))
+    high = wp.max(a, wp.max(b, c))
+    mixed = wp.uint64(edge_key(low, high)) * wp.uint64(11400714819323198485)
+    mixed = (mixed ^ (mixed >> wp.uint64(29))) + wp.uint64(a + b + c - low - high)
+    mixed = mixed * wp.uint64(13787848793156543929)
+    return wp.int64((mixed ^ (mixed >> wp.uint64(32))) >> wp.uint64(1))
+
+
+@wp.func
+def meet(s: int, face: int, tet: wp.vec4i, cuts: Cuts):
+    """Enter a face of a star; returns the same face of another star if that came before, else -1."""
+    slot = claim_slot(face_key(tet, face), cuts.keys)
+    if slot < 0:
+        slot = -slot - 1
+    cuts.slot[4 * s + face] = slot
+    return wp.atomic_exch(cuts.owner, slot, 4 * s + face)
+
+
+@wp.func
+def add_star(i: int, pools: Pools, cuts: Cuts):
+    """List a leaf."""
+    s = wp.atomic_add(cuts.counts, STARS, 1)
+    if s >= cuts.room:
+        wp.atomic_max(pools.counts, FULL, 1)
+        return
+    cuts.stars[s] = i
+    cuts.fresh[s] = 0
+    for n in range(4):
+        cuts.slot[4 * s + n] = -1
+        cuts.other[4 * s + n] = -1
+        cuts.link[4 * s + n] = 4 * s + n
+        cuts.copy[4 * s + n] = -1
+
+
+@wp.func
+def star_count(cuts: Cuts):
+    """The number of stars; none if there is no room for all of them."""
+    count = cuts.counts[STARS]
+    return wp.where(count > cuts.room, 0, count)
+
+
+@wp.func
+def place_of(node: int, is_deformed: wp.float64, pools: Pools, carried: Carried):
+    """Where a node is [m]."""
+    p = pools.lattice[node]
+    u = carried.u[node]
+    place = wp.vec3d()
+    for axis in range(3):
+        place[axis] = carried.origin[axis] + wp.float64(p[axis]) * carried.spacing + is_deformed * wp.float64(u[axis])
+    return place
+
+
+@wp.func
+def centroid(tet: wp.vec4i, is_deformed: wp.float64, pools: Pools, carried: Carried):
+    total = wp.vec3d()
+    for n in range(4):
+        total += place_of(tet[n], is_deformed, pools, carried)
+    return wp.float64(0.25) * total
+
+
+@wp.func
+def is_within(x: wp.vec3d, low: wp.vec3d, high: wp.vec3d, margin: wp.float64):
+    inside = bool(True)
+    for axis in range(3):
+        inside = inside and x[axis] >= low[axis] - margin and x[axis] <= high[axis] + margin
+    return inside
+
+
+@wp.func
+def is_near(x: wp.vec3d, far: wp.float64, surface: Surface):
+    """Whether a surface is within a distance of a point, or a little farther."""
+    if surface.count == 0:
+        return wp.abs(wp.dot(surface.normal, x) - surface.offset) <= far
+    if not is_within(x, surface.low, surface.high, far):
+        return False
+    for t in range(surface.count):
+        corners = surface.triangles[t]
+        a = surface.points[corners[0]]
+        b = surface.points[corners[1]]
+        c = surface.points[corners[2]]
+        if is_within(x, wp.min(a, wp.min(b, c)), wp.max(a, wp.max(b, c)), far):
+            normal = wp.cross(b - a, c - a)
+            if wp.abs(wp.dot(normal, x - a)) <= far * wp.length(normal):
+                return True
+    return False
+
+
+@wp.func
+def edge_side(p: wp.vec3d, q: wp.vec3d, a: int, b: int, surface: Surface):
+    """On which side the line p-q passes an edge; exactly opposite if the edge's ends are exchanged."""
+    x = surface.points[wp.min(a, b)]
+    y = surface.points[wp.max(a, b)]
+    side = wp.dot(q - p, wp.cross(x - p, y - p))
+    return wp.where(a < b, side, -side)
+
+
+@wp.func
+def crossing(p: wp.vec3d, q: wp.vec3d, surface: Surface):
+    """The unit normal of the surface where the line from p to q crosses it; zero if it does not."""
+    none = wp.vec3d()
+    zero = wp.float64(0.0)
+    if surface.count == 0:
+        p_behind = wp.dot(surface.normal, p) < surface.offset
+        q_behind = wp.dot(surface.normal, q) < surface.offset
+        if p_behind == q_behind:
+            return none
+        return surface.normal
+    for t in range(surface.count):
+        corners = surface.triangles[t]
+        a = surface.points[corners[0]]
+        normal = wp.cross(surface.points[corners[1]] - a, surface.points[corners[2]] - a)
+        p_behind = wp.dot(normal, p - a) < zero
+        q_behind = wp.dot(normal, q - a) < zero
+        if p_behind != q_behind:
+            first = edge_side(p, q, corners[0], corners[1], surface)
+            second = edge_side(p, q, corners[1], corners[2], surface)
+            third = edge_side(p, q, corners[2], corners[0], surface)
+            least = wp.min(first, wp.min(second, third))
+            most = wp.max(first, wp.max(second, third))
+            if least >= zero or most <= zero:
+                return wp.normalize(normal)
+    return none
+
+
+@wp.kernel(enable_backward=False)
+def begin_cut(
+    # In
+    follows_pass: int,
+    # In and out
+    pools: Pools,
+    cuts: Cuts,
+):
+    counts = cuts.counts
+    if follows_pass == 0:
+        pools.counts[ADDED] = 0
+        pools.counts[REMOVED] = 0
+    counts[STAMP] = counts[STAMP] + 1
+    counts[STARS] = 0
+    counts[MARKED] = 0
+    counts[COPIES] = 0
+    counts[FACES] = 0
+
+
+@wp.kernel(enable_backward=False)
+def list_near(
+    # In
+    threads: int,
+    surface: Surface,
+    carried: Carried,
+    # In and out
+    pools: Pools,
+    cuts: Cuts,
+):
+    """List the leaves near a surface."""
+    for i in range(wp.tid(), pools.counts[LEAVES], threads):
+        tet = pools.leaf_tets[i]
+        x = centroid(tet, surface.is_deformed, pools, carried)
+        far = wp.float64(0.0)
+        for n in range(4):
+            far = wp.max(far, wp.length_sq(place_of(tet[n], surface.is_deformed, pools, carried) - x))
+        if is_near(x, NEAR * wp.sqrt(far), surface):
+            add_star(i, pools, cuts)
+
+
+@wp.kernel(enable_backward=False)
+def cross_faces(
+    # In
+    threads: int,
+    surface: Surface,
+    carried: Carried,
+    # In and out
+    pools: Pools,
+    cuts: Cuts,
+):
+    """Cut the faces between near leaves on different sides."""
+    for f in range(wp.tid(), 4 * star_count(cuts), threads):
+        s = f / 4
+        tet = pools.leaf_tets[cuts.stars[s]]
+        before = meet(s, f % 4, tet, cuts)
+        if before >= 0:
+            cuts.other[f] = before
+            cuts.other[before] = f
+            e = pools.leaves[cuts.stars[s]]
+            if (pools.cut[e] >> (f % 4)) % 2 == 0:
+                other = cuts.stars[before / 4]
+                p = centroid(tet, surface.is_deformed, pools, carried)
+                q = centroid(pools.leaf_tets[other], surface.is_deformed, pools, carried)
+                normal = crossing(p, q, surface)
+                if wp.length_sq(normal) > wp.float64(0.0):
+                    side = wp.where(wp.dot(normal, q - p) > wp.float64(0.0), 0, 1)
+                    cut_side(s, f % 4, side, pools, cuts)
+                    cut_side(before / 4, before % 4, 1 - side, pools, cuts)
+
+
+@wp.func
+def cut_side(s: int, face: int, side: int, pools: Pools, cuts: Cuts):
+    bit = wp.lshift(1, face)
+    wp.atomic_or(pools.cut, pools.leaves[cuts.stars[s]], bit)
+    wp.atomic_or(cuts.fresh, s, bit | wp.lshift(side, SIDE_SHIFT + face))
+
+
+@wp.func
+def heal_side(s: int, face: int, pools: Pools, cuts: Cuts):
+    bit = wp.lshift(1, face)
+    wp.atomic_and(pools.cut, pools.leaves[cuts.stars[s]], ~bit)
+    wp.atomic_and(cuts.fresh, s, ~bit)
+
+
+@wp.kernel(enable_backward=False)
+def join_lone(
+    # In
+    threads: int,
+    # In and out
+    pools: Pools,
+    cuts: Cuts,
+):
+    """Leave a leaf with the leaves on one side of the surface if it would hang on no face."""
+    for s in range(wp.tid(), star_count(cuts), threads):
+        fresh = cuts.fresh[s]
+        if fresh % 16 != 0:
+            bits = pools.cut[pools.leaves[cuts.stars[s]]]
+            hangs = bool(False)
+            side = int(-1)
+            for n in range(4):
+                if (bits >> n) % 2 == 0 and cuts.other[4 * s + n] >= 0:
+                    hangs = True
+                if (fresh >> n) % 2 == 1 and side < 0:
+                    side = (fresh >> (SIDE_SHIFT + n)) % 2
+            if not hangs:
+                for n in range(4):
+                    if (fresh >> n) % 2 == 1 and (fresh >> (SIDE_SHIFT + n)) % 2 == side:
+                        other = cuts.other[4 * s + n]
+                        heal_side(s, n, pools, cuts)
+                        heal_side(other / 4, other % 4, pools, cuts)
+
+
+@wp.func
+def mark_face(tet: wp.vec4i, face: int, carried: Carried, cuts: Cuts):
+    """Mark the nodes of a face, because leaves around them may have come apart."""
+    for n in range(3):
+        node = tet[face_node(face, n)]
+        stamp = cuts.counts[STAMP]
+        if cuts.mark[node] != stamp and wp.atomic_exch(cuts.mark, node, stamp) != stamp:
+            cuts.marked[wp.atomic_add(cuts.counts, MARKED, 1)] = node
+            cuts.keeper[node] = 2147483647
+            cuts.former_mass[node] = carried.mass[node]
+
+
+@wp.func
+def shared_area(tet: wp.vec4i, face: int, normal: wp.vec3d, surface: Surface, pools: Pools, carried: Carried):
+    """The area of the surface that a face stands for, at rest: that of its projection."""
+    a = tet[face_node(face, 0)]
+    b = tet[face_node(face, 1)]
+    c = tet[face_node(face, 2)]
+    zero = wp.float64(0.0)
+    x = place_of(a, zero, pools, carried)
+    at_rest = wp.cross(place_of(b, zero, pools, carried) - x, place_of(c, zero, pools, carried) - x)
+    now = at_rest
+    if surface.is_deformed > zero:
+        x = place_of(a, surface.is_deformed, pools, carried)
+        y = place_of(b, surface.is_deformed, pools, carried)
+        now = wp.cross(y - x, place_of(c, surface.is_deformed, pools, carried) - x)
+    size = wp.length(now)
+    if size == zero:
+        return zero
+    return wp.float64(0.5) * wp.abs(wp.dot(now, normal)) * wp.length(at_rest) / size
+
+
+@wp.kernel(enable_backward=False)
+def count_faces(
+    # In
+    threads: int,
+    surface: Surface,
+    # In and out
+    carried: Carried,
+    pools: Pools,
+    cuts: Cuts,
+):
+    """Add up the area of the faces that are cut now, mark their nodes, and clear the table."""
+    area = wp.float64(0.0)
+    for f in range(wp.tid(), 4 * star_count(cuts), threads):
+        s = f / 4
+        if (cuts.fresh[s] >> (f % 4)) % 2 == 1:
+            tet = pools.leaf_tets[cuts.stars[s]]
+            mark_face(tet, f % 4, carried, cuts)
+            if f < cuts.other[f]:
+                p = centroid(tet, surface.is_deformed, pools, carried)
+                other = pools.leaf_tets[cuts.stars[cuts.other[f] / 4]]
+                normal = crossing(p, centroid(other, surface.is_deformed, pools, carried), surface)
+                area += shared_area(tet, f % 4, normal, surface, pools, carried)
+                wp.atomic_add(cuts.counts, FACES, 1)
+        forget(f, cuts)
+    if area > wp.float64(0.0):
+        wp.atomic_add(carried.cut_area, 0, area)
+
+
+@wp.func
+def forget(f: int, cuts: Cuts):
+    """Take a face out of the table."""
+    slot = cuts.slot[f]
+    if slot >= 0:
+        cuts.keys[slot] = EMPTY
+        cuts.owner[slot] = -1
+
+
+@wp.kernel(enable_backward=False)
+def mark_bisected(
+    # In
+    threads: int,
+    carried: Carried,
+    # In and out
+    pools: Pools,
+    cuts: Cuts,
+):
+    """Mark the nodes of cut faces that the last pass bisected: a midpoint is made once for both sides."""
+    for i in range(wp.tid(), 2 * pools.counts[FRESH], threads):
+        e = pools.fresh[i / 2] + i % 2
+        if pools.first_child[e] == LIVE:
+            for face in range(4):
+                if (pools.cut[e] >> face) % 2 == 1:
+                    mark_face(pools.tets[e], face, carried, cuts)

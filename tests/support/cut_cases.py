@@ -1,0 +1,103 @@
+"""What must hold for a forest on the device after every cut, found independently of the kernels that cut."""
+
+import itertools
+from collections import Counter
+
+import numpy as np
+from remesh_cases import assert_padding
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from warp_corot.mesh.surfaces.boundary import boundary_faces
+
+FACES = [[m for m in range(4) if m != n] for n in range(4)]
+
+
+def face_table(tets):
+    """The two leaves and their local faces at each inner face, [m, 2, 2]; faces are equal if their nodes are."""
+    nodes = np.sort(tets[:, FACES], axis=2).reshape(-1, 3)
+    _, number, count = np.unique(nodes, axis=0, return_inverse=True, return_counts=True)
+    assert count.max() <= 2
+    order = np.argsort(number.ravel(), kind="stable")
+    inner = np.flatnonzero(np.diff(number.ravel()[order]) == 0)
+    both = np.stack([order[inner], order[inner + 1]], axis=1)
+    return np.stack([both // 4, both % 4], axis=2)
+
+
+def star_components(tets, pairs):
+    """A component for each corner of each leaf, [T, 4]: those of one node joined by these inner faces."""
+    links = []
+    for (a, face_a), (b, face_b) in pairs:
+        for n in FACES[face_a]:
+            m = next(m for m in FACES[face_b] if tets[b, m] == tets[a, n])
+            links.append((4 * a + n, 4 * b + m))
+    links = np.array(links).reshape(-1, 2)
+    graph = coo_array((np.ones(len(links)), links.T), shape=(tets.size, tets.size))
+    return connected_components(graph, directed=False)[1].reshape(tets.shape)
+
+
+def assert_cut_sound(device, *, lone=False):
+    """Check a cut forest; returns its mesh."""
+    tets, leaves = device.leaf_tets, device.leaf_elements
+    pools, arrays = device.pools, device.carriage.arrays
+    cut = pools.cut.numpy()
+    faces = face_table(tets)
+    bits = (cut[leaves][:, None] >> np.arange(4)) % 2 == 1
+    at = [bits[faces[:, k, 0], faces[:, k, 1]] for k in range(2)]
+    np.testing.assert_array_equal(*at)  # both leaves of a face know that it is cut
+    whole = faces[~at[0]]
+    # Every node has one component of leaves joined by uncut faces: nothing hangs on a node or an edge.
+    component = star_components(tets, whole.tolist())
+    pairs = np.unique(np.stack([tets.ravel(), component.ravel()], axis=1), axis=0)
+    assert len(pairs) == device.node_count
+    np.testing.assert_array_equal(np.unique(tets), np.arange(device.node_count))
+    if not lone:
+        graph = coo_array((np.ones(len(whole)), whole[:, :, 0].T), shape=(len(tets),) * 2)
+        assert np.bincount(connected_components(graph, directed=False)[1]).min() > 1
+    # Pools.
+    np.testing.assert_array_equal(tets, pools.tets.numpy()[leaves])
+    tree, _ = device.tree()
+    names = np.bincount(tree.tets[tree.first_child < 0].ravel(), minlength=device.node_capacity)
+    np.testing.assert_array_equal(names, pools.valence.numpy())
+    assert_ancestors(tree)
+    assert_padding(device)
+    # What nodes carry.
+    mesh = device.to_forest()
+    masses = np.zeros(device.node_count)
+    quarter = 0.25 * arrays.density.numpy()[leaves] * mesh.volumes
+    np.add.at(masses, tets, quarter[:, None])
+    np.testing.assert_allclose(arrays.mass.numpy()[: len(masses)], masses, rtol=1e-9)
+    np.testing.assert_allclose(arrays.mass32.numpy()[: len(masses)], masses, rtol=1e-6)
+    free = arrays.held.numpy()[: len(masses)] == 0
+    expected = np.where(free, 1.0 / masses, 0.0)
+    np.testing.assert_allclose(arrays.inverse_mass.numpy()[: len(masses)], expected, rtol=1e-6)
+    np.testing.assert_allclose(arrays.rest.numpy()[: len(masses), :3], mesh.points, rtol=1e-6, atol=1e-7)
+    assert_closed(mesh)
+    return mesh
+
+
+def assert_ancestors(tree):
+    """An ancestor has the corners of certain leaves; it is torn if two leaves below name different nodes at a place."""
+    inner = np.flatnonzero(tree.first_child >= 0)
+    cut = np.zeros(len(tree.level), int) if tree.cut is None else tree.cut
+    torn = np.zeros(len(tree.level), bool)
+    for e in inner[np.argsort(-tree.level[inner], kind="stable")]:
+        first = tree.first_child[e]
+        k = 3 - tree.level[e] % 3
+        a, b = tree.tets[first], tree.tets[first + 1]
+        corners = a.copy()
+        corners[k] = b[k - 1]
+        np.testing.assert_array_equal(tree.tets[e], corners)
+        shared = [(n, n - 1 if n < k else n) for n in range(1, 4)]
+        torn[e] = torn[first] or torn[first + 1] or any(a[n] != b[m] for n, m in shared)
+    np.testing.assert_array_equal(cut[inner] >= 16, torn[inner])
+
+
+def assert_closed(mesh):
+    """The boundary of the elements is closed and wound consistently: every edge is passed as often each way."""
+    faces, _ = boundary_faces(mesh.tets, mesh.points)
+    ways = Counter()
+    for face in faces.tolist():
+        for a, b in itertools.pairwise([*face, face[0]]):
+            ways[min(a, b), max(a, b)] += 1 if a < b else -1
+    assert not any(ways.values())

@@ -1,0 +1,1 @@
+"""Cutting: planes that cut at once, and blades that cut while they move."""
