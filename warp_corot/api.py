@@ -7,6 +7,7 @@ from warp_corot.contact.options import Contact
 from warp_corot.contact.sampled import SignedDistance, TriangleMesh
 from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, Sphere
 from warp_corot.contact.tool import Tool
+from warp_corot.cutting.blade import Blade
 from warp_corot.cutting.plane import Plane
 from warp_corot.elasticity.polar import polar_rotation
 from warp_corot.gradients.run import RunGradient, run_gradient
@@ -45,6 +46,7 @@ __all__ = [
     "BDF2",
     "Activation",
     "BackwardEuler",
+    "Blade",
     "Box",
     "CapacityWarning",
     "Capsule",

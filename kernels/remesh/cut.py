@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_corot.kernels.meshing.growth import EMPTY, LIVE, claim_slot, edge_key
 
-from .pools import ADDED, FRESH, FULL, LEAVES, REMOVED, Pools
+from .pools import ADDED, FRESH, FULL, LEAVES, REFINE, REMOVED, Pools
 from .state import Carried
 
 wp.set_module_options({"enable_backward": False})
@@ -40,9 +40,11 @@ class Surface:
     offset: wp.float64
     count: int  # number of triangles
     points: wp.array[wp.vec3d]
-    triangles: wp.array[wp.vec3i]
-    low: wp.vec3d  # bounds of the triangles
-    high: wp.vec3d
+    triangles: wp.array[wp.vec3i]  # those with equal corners are none
+    bounds: wp.array[wp.vec3d]  # [2] of the triangles
+    # Leaves at a triangle are refined to its level; and the energy that faces which it cuts take [J].
+    levels: wp.array[wp.int32]
+    debt: wp.array[wp.float64]
 
 
 @wp.struct
@@ -65,6 +67,8 @@ class Cuts:
     mark: wp.array[wp.int32]  # the last cut in which a node was marked
     marked: wp.array[wp.int32]
     keeper: wp.array[wp.int32]  # the smallest corner of all its components, which keeps the node
+    toughness: float  # energy of a cut [J/m^2], if all elements have the same
+    toughness_column: int  # else a column of ``Carried.values``, or -1
     former_mass: wp.array[wp.float64]  # of marked nodes, and of those that new nodes are copies of
     names: wp.array2d[wp.int32]  # ``Pools.tets``, number by number
 
@@ -150,22 +154,39 @@ def is_within(x: wp.vec3d, low: wp.vec3d, high: wp.vec3d, margin: wp.float64):
 
 
 @wp.func
+def near_triangle(t: int, x: wp.vec3d, far: wp.float64, surface: Surface):
+    """Whether a triangle is within a distance of a point, or a little farther."""
+    corners = surface.triangles[t]
+    if corners[0] == corners[1]:
+        return False
+    a = surface.points[corners[0]]
+    b = surface.points[corners[1]]
+    c = surface.points[corners[2]]
+    if not is_within(x, wp.min(a, wp.min(b, c)), wp.max(a, wp.max(b, c)), far):
+        return False
+    normal = wp.cross(b - a, c - a)
+    return wp.abs(wp.dot(normal, x - a)) <= far * wp.length(normal)
+
+
+@wp.func
 def is_near(x: wp.vec3d, far: wp.float64, surface: Surface):
     """Whether a surface is within a distance of a point, or a little farther."""
     if surface.count == 0:
         return wp.abs(wp.dot(surface.normal, x) - surface.offset) <= far
-    if not is_within(x, surface.low, surface.high, far):
-        return False
-    for t in range(surface.count):
-        corners = surface.triangles[t]
-        a = surface.points[corners[0]]
-        b = surface.points[corners[1]]
-        c = surface.points[corners[2]]
-        if is_within(x, wp.min(a, wp.min(b, c)), wp.max(a, wp.max(b, c)), far):
-            normal = wp.cross(b - a, c - a)
-            if wp.abs(wp.dot(normal, x - a)) <= far * wp.length(normal):
+    if is_within(x, surface.bounds[0], surface.bounds[1], far):
+        for t in range(surface.count):
+            if near_triangle(t, x, far, surface):
                 return True
     return False
+
+
+@wp.func
+def radius(tet: wp.vec4i, x: wp.vec3d, is_deformed: wp.float64, pools: Pools, carried: Carried):
+    """The distance from its centroid to the farthest node of a leaf [m]."""
+    far = wp.float64(0.0)
+    for n in range(4):
+        far = wp.max(far, wp.length_sq(place_of(tet[n], is_deformed, pools, carried) - x))
+    return wp.sqrt(far)
 
 
 @wp.func
@@ -179,15 +200,15 @@ def edge_side(p: wp.vec3d, q: wp.vec3d, a: int, b: int, surface: Surface):
 
 @wp.func
 def crossing(p: wp.vec3d, q: wp.vec3d, surface: Surface):
-    """The unit normal of the surface where the line from p to q crosses it; zero if it does not."""
+    """The unit normal of the surface where the line from p to q crosses it, and the triangle; zero if it does not."""
     none = wp.vec3d()
     zero = wp.float64(0.0)
     if surface.count == 0:
         p_behind = wp.dot(surface.normal, p) < surface.offset
         q_behind = wp.dot(surface.normal, q) < surface.offset
         if p_behind == q_behind:
-            return none
-        return surface.normal
+            return none, -1
+        return surface.normal, -1
     for t in range(surface.count):
         corners = surface.triangles[t]
         a = surface.points[corners[0]]
@@ -201,8 +222,8 @@ def crossing(p: wp.vec3d, q: wp.vec3d, surface: Surface):
             least = wp.min(first, wp.min(second, third))
             most = wp.max(first, wp.max(second, third))
             if least >= zero or most <= zero:
-                return wp.normalize(normal)
-    return none
+                return wp.normalize(normal), t
+    return none, -1
 
 
 @wp.kernel(enable_backward=False)
@@ -238,11 +259,31 @@ def list_near(
     for i in range(wp.tid(), pools.counts[LEAVES], threads):
         tet = pools.leaf_tets[i]
         x = centroid(tet, surface.is_deformed, pools, carried)
-        far = wp.float64(0.0)
-        for n in range(4):
-            far = wp.max(far, wp.length_sq(place_of(tet[n], surface.is_deformed, pools, carried) - x))
-        if is_near(x, NEAR * wp.sqrt(far), surface):
+        if is_near(x, NEAR * radius(tet, x, surface.is_deformed, pools, carried), surface):
             add_star(i, pools, cuts)
+
+
+@wp.kernel(enable_backward=False)
+def mark_near(
+    # In
+    threads: int,
+    surface: Surface,
+    carried: Carried,
+    # In and out
+    pools: Pools,
+):
+    """Mark leaves at triangles for refinement to the triangles' levels."""
+    for i in range(wp.tid(), pools.counts[LEAVES], threads):
+        tet = pools.leaf_tets[i]
+        mark = wp.int8(0)
+        x = centroid(tet, surface.is_deformed, pools, carried)
+        far = radius(tet, x, surface.is_deformed, pools, carried)
+        if is_within(x, surface.bounds[0], surface.bounds[1], far):
+            level = pools.level[pools.leaves[i]]
+            for t in range(surface.count):
+                if level < surface.levels[t] and near_triangle(t, x, far, surface):
+                    mark = REFINE
+        pools.marks[i] = mark
 
 
 @wp.kernel(enable_backward=False)
@@ -268,7 +309,7 @@ def cross_faces(
                 other = cuts.stars[before / 4]
                 p = centroid(tet, surface.is_deformed, pools, carried)
                 q = centroid(pools.leaf_tets[other], surface.is_deformed, pools, carried)
-                normal = crossing(p, q, surface)
+                normal, _t = crossing(p, q, surface)
                 if wp.length_sq(normal) > wp.float64(0.0):
                     side = wp.where(wp.dot(normal, q - p) > wp.float64(0.0), 0, 1)
                     cut_side(s, f % 4, side, pools, cuts)
@@ -349,6 +390,13 @@ def shared_area(tet: wp.vec4i, face: int, normal: wp.vec3d, surface: Surface, po
     return wp.float64(0.5) * wp.abs(wp.dot(now, normal)) * wp.length(at_rest) / size
 
 
+@wp.func
+def toughness_of(e: int, carried: Carried, cuts: Cuts):
+    if cuts.toughness_column >= 0:
+        return carried.values[e, cuts.toughness_column]
+    return cuts.toughness
+
+
 @wp.kernel(enable_backward=False)
 def count_faces(
     # In
@@ -359,7 +407,7 @@ def count_faces(
     pools: Pools,
     cuts: Cuts,
 ):
-    """Add up the area of the faces that are cut now, mark their nodes, and clear the table."""
+    """Add up the area and the energy of the faces that are cut now, mark their nodes, and clear the table."""
     area = wp.float64(0.0)
     for f in range(wp.tid(), 4 * star_count(cuts), threads):
         s = f / 4
@@ -368,10 +416,16 @@ def count_faces(
             mark_face(tet, f % 4, carried, cuts)
             if f < cuts.other[f]:
                 p = centroid(tet, surface.is_deformed, pools, carried)
-                other = pools.leaf_tets[cuts.stars[cuts.other[f] / 4]]
-                normal = crossing(p, centroid(other, surface.is_deformed, pools, carried), surface)
-                area += shared_area(tet, f % 4, normal, surface, pools, carried)
+                i = cuts.stars[cuts.other[f] / 4]
+                q = centroid(pools.leaf_tets[i], surface.is_deformed, pools, carried)
+                normal, t = crossing(p, q, surface)
+                part = shared_area(tet, f % 4, normal, surface, pools, carried)
+                area += part
                 wp.atomic_add(cuts.counts, FACES, 1)
+                if t >= 0:
+                    both = toughness_of(pools.leaves[i], carried, cuts)
+                    both += toughness_of(pools.leaves[cuts.stars[s]], carried, cuts)
+                    wp.atomic_add(surface.debt, t, wp.float64(0.5 * both) * part)
         forget(f, cuts)
     if area > wp.float64(0.0):
         wp.atomic_add(carried.cut_area, 0, area)

@@ -101,6 +101,8 @@ def padding(i: int, pools: Pools):
 
 @wp.kernel(enable_backward=False)
 def begin_pass(
+    # In
+    goes_on: int,  # whether this pass and the last one count as one
     # In and out
     pools: Pools,
 ):
@@ -116,7 +118,8 @@ def begin_pass(
     counts[NODES_GIVEN] = 0
     counts[PAIRS_GIVEN] = 0
     counts[GAINERS] = 0
-    counts[ADDED] = 0
+    if goes_on == 0:
+        counts[ADDED] = 0
     counts[REMOVED] = 0
     counts[FIRST_NEW] = counts[NODE_TOP]
 

@@ -68,7 +68,7 @@ class Anisotropic(Directional):
         bulk = (c[..., :3].sum(-1) + 2.0 * c[..., 3:6].sum(-1)) / 9.0
         mu = (c[..., :3].sum(-1) - c[..., 3:6].sum(-1) + 3.0 * c[..., 6:].sum(-1)) / 15.0
         young, poisson = 9.0 * bulk * mu / (3.0 * bulk + mu), (1.5 * bulk - mu) / (3.0 * bulk + mu)
-        return Isotropic(young, poisson, self.density)
+        return Isotropic(young, poisson, self.density, self.toughness)
 
     def _margin(self) -> Array:
         young, poisson, _shear = self.constants()
@@ -103,6 +103,7 @@ class TransverselyIsotropic(Anisotropic):
         direction: Direction of the fibres in rest space, of any nonzero length: [3], [T, 3], [worlds, T, 3] or a
             function ``f(points [n, 3]) -> [n, 3]``.
         density: Mass per rest volume > 0 [kg/m^3].
+        toughness: Energy that a cut takes for its area >= 0 [J/m^2].
 
     Raises:
         InputError: A value out of its range, a stiffness that is not positive definite, or a direction that is zero or
@@ -119,6 +120,7 @@ class TransverselyIsotropic(Anisotropic):
     shear_along: Field
     direction: Field
     density: Field
+    toughness: Field = 0.0
 
     def __post_init__(self) -> None:
         for name in ("young_along", "young_across", "shear_along"):
@@ -127,6 +129,7 @@ class TransverselyIsotropic(Anisotropic):
         set_checked(self, "poisson_across", "", -1.0, 1.0)
         set_checked(self, "direction", "", -np.inf, np.inf)
         set_checked(self, "density", "kg/m^3", 0.0, np.inf)
+        set_checked(self, "toughness", "J/m^2", 0.0, np.inf, has_low=True)
         if not callable(self.direction):
             object.__setattr__(self, "direction", unit(self.direction, "direction"))
         self._check_definite()
@@ -178,6 +181,7 @@ class Orthotropic(Anisotropic):
             [T, 3, 3], [worlds, T, 3, 3] or a function ``f(points [n, 3]) -> [n, 3, 3]``. Fibres with active stress lie
             along the first.
         density: Mass per rest volume > 0 [kg/m^3].
+        toughness: Energy that a cut takes for its area >= 0 [J/m^2].
 
     Raises:
         InputError: A value out of its range, a stiffness that is not positive definite, or axes that are zero, not
@@ -194,6 +198,7 @@ class Orthotropic(Anisotropic):
     shear: Field
     axes: Field
     density: Field
+    toughness: Field = 0.0
 
     def __post_init__(self) -> None:
         set_checked(self, "young", "Pa", 0.0, np.inf)
@@ -201,6 +206,7 @@ class Orthotropic(Anisotropic):
         set_checked(self, "shear", "Pa", 0.0, np.inf)
         set_checked(self, "axes", "", -np.inf, np.inf)
         set_checked(self, "density", "kg/m^3", 0.0, np.inf)
+        set_checked(self, "toughness", "J/m^2", 0.0, np.inf, has_low=True)
         if not callable(self.axes):
             object.__setattr__(self, "axes", _right_angled(unit(self.axes, "axes")))
         self._check_definite()

@@ -28,6 +28,7 @@ class Material(ABC):
     components: ClassVar[dict[str, tuple[int, ...]]] = {}
 
     density: Field
+    toughness: Field
 
     @property
     @abstractmethod
@@ -94,6 +95,7 @@ class Isotropic(Material):
             ``f(points [n, 3]) -> [n]``, evaluated at the elements' centroids when a body is made.
         poisson: Poisson's ratio, -1 < nu < 0.5, as ``young``.
         density: Mass per rest volume > 0 [kg/m^3], as ``young``.
+        toughness: Energy that a cut takes for its area >= 0 [J/m^2], as ``young``.
 
     Raises:
         InputError: A value out of its range, or arrays of more than two dimensions.
@@ -102,11 +104,13 @@ class Isotropic(Material):
     young: Field
     poisson: Field
     density: Field
+    toughness: Field = 0.0
 
     def __post_init__(self) -> None:
         set_checked(self, "young", "Pa", 0.0, np.inf)
         set_checked(self, "poisson", "", -1.0, 0.5)
         set_checked(self, "density", "kg/m^3", 0.0, np.inf)
+        set_checked(self, "toughness", "J/m^2", 0.0, np.inf, has_low=True)
 
     @property
     def isotropic(self) -> Isotropic:
@@ -123,11 +127,12 @@ class Isotropic(Material):
         return self.young * self.poisson / ((1.0 + self.poisson) * (1.0 - 2.0 * self.poisson))
 
 
-def set_checked(material: Material, name: str, unit: str, low: float, high: float) -> None:
+def set_checked(material: Material, name: str, unit: str, low: float, high: float, *, has_low: bool = False) -> None:
     """Replace a field by its values in float64, unless it is a function.
 
     Raises:
-        InputError: No numbers, a wrong shape, or a value that is not between ``low`` and ``high``.
+        InputError: No numbers, a wrong shape, or a value that is not between ``low`` and ``high``, or ``low`` itself if
+            it ``has_low``.
     """
     given = getattr(material, name)
     if callable(given):
@@ -141,13 +146,14 @@ def set_checked(material: Material, name: str, unit: str, low: float, high: floa
     if len(head) > 2 or values.shape != head + tail:
         wanted = f"be {list(tail)} or have {list(tail)}" if tail else "be a number or have one entry"
         raise InputError(f"{name} has shape {values.shape}; it must {wanted} per element")
-    bad = np.argwhere(~(np.isfinite(values) & (values > low) & (values < high)))
+    bad = np.argwhere(~(np.isfinite(values) & ((values > low) | has_low & (values == low)) & (values < high)))
     if len(bad):
         value = values[tuple(bad[0])]
         if low == -np.inf and high == np.inf:
             bound = "finite"
         else:
-            bound = f"above {low:g}" if high == np.inf else f"above {low:g} and below {high:g}"
+            above = f"{'at least' if has_low else 'above'} {low:g}"
+            bound = above if high == np.inf else f"{above} and below {high:g}"
         what = f"{name}{place(bad[0][: len(head)], head)}"
         raise InputError(f"{what} is {value:g}{' ' + unit if unit else ''}; it must be {bound}")
     object.__setattr__(material, name, values if values.ndim else float(values))

@@ -36,6 +36,7 @@ class FibreReinforced(Directional):
         angle: Angle of either family to ``direction`` [rad], 0 to pi/2; zero: there is one family.
         across: A direction in the plane of both families, at right angles to ``direction``, given likewise; zero: any,
             which is allowed where the angle is zero.
+        toughness: Energy that a cut takes for its area >= 0 [J/m^2].
 
     Raises:
         InputError: A value out of its range, a direction that is zero or not finite, or directions that are not at
@@ -54,6 +55,7 @@ class FibreReinforced(Directional):
     kappa: Field = 0.0
     angle: Field = 0.0
     across: Field = (0.0, 0.0, 0.0)
+    toughness: Field = 0.0
 
     def __post_init__(self) -> None:
         set_checked(self, "young", "Pa", 0.0, np.inf)
@@ -61,6 +63,7 @@ class FibreReinforced(Directional):
         set_checked(self, "k1", "Pa", 0.0, np.inf)
         set_checked(self, "k2", "", 0.0, np.inf)
         set_checked(self, "density", "kg/m^3", 0.0, np.inf)
+        set_checked(self, "toughness", "J/m^2", 0.0, np.inf, has_low=True)
         set_checked(self, "kappa", "", _BELOW, 1.0 / 3.0 + 1e-9)
         set_checked(self, "angle", "rad", _BELOW, np.pi / 2 + 1e-9)
         for name in ("direction", "across"):
@@ -73,7 +76,7 @@ class FibreReinforced(Directional):
     @property
     def isotropic(self) -> Isotropic:
         """The matrix."""
-        return Isotropic(self.young, self.poisson, self.density)
+        return Isotropic(self.young, self.poisson, self.density, self.toughness)
 
     def entries(self) -> Array:
         values = (self.k1, self.k2, self.kappa, self.angle, self.young, self.poisson, 0.0, 0.0, 0.0)

@@ -50,6 +50,12 @@ class CarriedMaterial:
         if former.lame[2] and former.fill is not None:
             own = (Column(array.numpy(), int(MEAN_OF_CONTENTS)) for array in former.lame[:2])
             self.values |= dict(zip(("own_mu", "own_lam"), own, strict=True))
+        tough = np.ravel(self.given.isotropic.toughness)
+        self._is_tough_alike = len(tough) == 1
+        #: Energy of a cut [J/m^2], unless elements carry it.
+        self.toughness = float(tough[0]) if self._is_tough_alike else 0.0
+        if not self._is_tough_alike:
+            self.values["toughness"] = tough
         self._lame = ("own_mu", "own_lam") if "own_mu" in self.values else ("mu", "lam") if former.lame[2] else ()
         #: Lamé's parameters of the material itself [Pa], or the names under which elements carry them.
         self.lame: Any = self._lame or tuple(float(array.numpy()[0]) for array in former.lame[:2])
@@ -86,10 +92,14 @@ class CarriedMaterial:
     def present(self, forest: DeviceForest) -> Material:
         """The material of the current elements."""
         density = self._present_density(forest)
+        tough = self._present_toughness(forest)
         if not self._lame:
-            return Isotropic(self.given.young, self.given.poisson, density)
+            return Isotropic(self.given.young, self.given.poisson, density, tough)
         mu, lam = _of_leaves(forest, self._lame).T
-        return Isotropic(mu * (3.0 * lam + 2.0 * mu) / (lam + mu), 0.5 * lam / (lam + mu), density)
+        return Isotropic(mu * (3.0 * lam + 2.0 * mu) / (lam + mu), 0.5 * lam / (lam + mu), density, tough)
+
+    def _present_toughness(self, forest: DeviceForest) -> Any:
+        return self.given.toughness if self._is_tough_alike else _of_leaves(forest, ("toughness",))[:, 0]
 
     def _present_density(self, forest: DeviceForest) -> Any:
         if not np.ndim(self.given.density):
@@ -148,6 +158,7 @@ class CarriedAnisotropic(CarriedMaterial):
 
     def present(self, forest: DeviceForest) -> Material:
         changed: dict[str, Any] = {"density": self._present_density(forest)}
+        changed["toughness"] = self._present_toughness(forest)
         if self._stiffness_varies:
             changed |= self.given.fields_of_entries(_of_leaves(forest, STIFFNESS_ENTRIES))
         if self._axes_vary:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -48,6 +48,7 @@ class Changing:
         options: The user's options; None: the mesh only changes where it is cut.
         carried: Numbers of elements that the force field will keep; see ``Model.carried``.
         is_cut: Whether the body may be cut.
+        level: The level to which blades refine a mesh that is not remeshed.
 
     Attributes:
         body: The body.
@@ -67,10 +68,16 @@ class Changing:
     """
 
     def __init__(
-        self, body: SoftBody, options: OnlineRemesh | None, carried: Sequence[str] = (), *, is_cut: bool = False
+        self,
+        body: SoftBody,
+        options: OnlineRemesh | None,
+        carried: Sequence[str] = (),
+        *,
+        is_cut: bool = False,
+        level: int | None = None,
     ):
         self.is_remeshed = options is not None
-        self.options = fitted(options or OnlineRemesh(), body)
+        self.options = fitted(options or OnlineRemesh(max_level=level), body)
         mesh = body.mesh
         assert isinstance(mesh, TetForest)
         self.body = body
@@ -88,7 +95,7 @@ class Changing:
             node_capacity=_room_for_nodes(mesh, self.options.capacity) if is_cut else None,
             device=self.device,
         )
-        self.cuts = CutPass(self.forest) if is_cut else None
+        self.cuts = CutPass(self.forest, self.carried_material.toughness) if is_cut else None
         self.conditions = CarriedConditions(body, self.forest)
         self.passes = RemeshPass(
             self.forest,
@@ -130,19 +137,11 @@ class Changing:
         self.renew()
         self.conditions.keep()
         self.survey.settle()
-        if not self.device.is_cuda or wp.is_conditional_graph_supported():
-            with wp.ScopedCapture(device=self.device) as capture:
-                self._launch()
-            self._graph = capture.graph
+        self._graph = self.recorded(self._launch)
 
     def run(self) -> None:
         """Make one pass over the mesh, and update what depends on the mesh if it has changed."""
-        self._read_user()
-        if self._graph is None:
-            self._launch()
-        else:
-            wp.capture_launch(self._graph)
-        self._look()
+        self.change(self._launch, self._graph)
 
     def cut(self, surface: Surface) -> float:
         """Cut the body along a surface, and update what depends on the mesh; returns the area [m^2] at rest."""
@@ -153,6 +152,40 @@ class Changing:
         self._launch_derived()
         self._look()
         return self.cut_area - before
+
+    def launch_cut(self, surface: Surface, refinements: int) -> None:
+        """Launch a cut along triangles, after passes that refine leaves there, and whatever is derived from the mesh;
+        or record it."""
+        assert self.cuts is not None
+        for k in range(refinements):
+            self.cuts.launch_marks(surface)
+            self.passes.launch(marked=True, goes_on=k > 0)
+            self.cuts.launch_after_pass()
+        self.cuts.launch_cut(surface, goes_on=refinements > 0)
+        self._launch_derived()
+
+    def change(self, launch: Callable[[], None], graph: wp.Graph | None) -> bool:
+        """Change the mesh by launches, or by their recording, and update what depends on it; returns whether it has
+        changed."""
+        self._read_user()
+        if graph is None:
+            launch()
+        else:
+            wp.capture_launch(graph)
+        return self._look()
+
+    def recorded(self, launch: Callable[[], None]) -> wp.Graph | None:
+        """A recording of launches; None if the device's graphs have no conditional nodes, which passes need."""
+        if self.device.is_cuda and not wp.is_conditional_graph_supported():
+            return None
+        with wp.ScopedCapture(device=self.device) as capture:
+            launch()
+        return capture.graph
+
+    @property
+    def stiffest_modulus(self) -> float:
+        """2 mu + lambda of the stiffest element [Pa]."""
+        return float(np.max(2.0 * self.discretization.mu.numpy() + self.discretization.lam.numpy()))
 
     @property
     def cut_area(self) -> float:
@@ -227,14 +260,15 @@ class Changing:
         """Results of launches that the host reads, int32."""
         return self.forest.pools.counts, self._plan.class_counts, self.survey.found, self.conditions.found
 
-    def _look(self, *, anyway: bool = False) -> None:
-        """Read the device's results once; if the mesh has changed, update the body and its force field."""
+    def _look(self, *, anyway: bool = False) -> bool:
+        """Read the device's results once; if the mesh has changed, update the body and its force field, and return
+        True."""
         assert self._report is not None
         counted, classes, surveyed, followers = np.split(self._report.numpy(), np.cumsum(self._report_parts)[:-1])
         counts = PassCounts.of(counted)
         self.is_full = counts.full
         if not (counts.added or counts.removed or anyway):
-            return
+            return False
         body = self.body
         limit = self.forest.node_capacity
         nodes = launch_size(counts.nodes, body.sizes.launch_nodes, NODE_GRANULE, limit)
@@ -251,6 +285,7 @@ class Changing:
         self.conditions.follow(followers)
         for binding in body.bindings:
             binding.rebind(self.forest.pools)
+        return True
 
     def _keep_initial_state(self, initial: tuple[wp.array, wp.array] | None) -> None:
         """Let ``reset`` restore rest on the current mesh, or the body's initial state."""

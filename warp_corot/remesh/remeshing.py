@@ -14,6 +14,7 @@ from .online import OnlineRemesh
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
+    from warp_corot.cutting.blade import Blade
     from warp_corot.elasticity import ForceField, Model
     from warp_corot.kernels.remesh.cut import Surface
 
@@ -27,7 +28,7 @@ class Remeshing:
         bodies, models: The simulation's.
         asked: The user's argument: options for all bodies or one entry for each.
         deterministic: Whether runs must be reproducible bit for bit.
-        are_cut: Whether bodies may be cut.
+        blades: The blades that cut bodies, if any can be cut.
 
     Attributes:
         changing: The remeshing and cutting of each body; None for bodies whose mesh never changes.
@@ -44,8 +45,9 @@ class Remeshing:
         asked: OnlineRemesh | Sequence[OnlineRemesh | None] | None,
         *,
         deterministic: bool,
-        are_cut: bool = False,
+        blades: Sequence[Blade] | None = None,
     ):
+        are_cut = blades is not None
         if any(body.changing is not None for body in bodies):
             raise InputError(
                 "a body that one simulation remeshes or cuts cannot be in another; make a SoftBody of its mesh"
@@ -62,6 +64,7 @@ class Remeshing:
             )
         from .changing import Changing, fitted
 
+        level = max((blade.level for blade in blades or () if blade.level is not None), default=None)
         # All checks come before the first body is given pools: an error leaves the bodies unchanged.
         for each, body, model in zip(options, bodies, models, strict=True):
             if each is not None or are_cut:
@@ -73,10 +76,15 @@ class Remeshing:
                 fitted(each or OnlineRemesh(), body)
 
         self.changing = tuple(
-            Changing(body, each, model.carried, is_cut=are_cut) if each is not None or are_cut else None
+            Changing(body, each, model.carried, is_cut=are_cut, level=level) if each is not None or are_cut else None
             for each, body, model in zip(options, bodies, models, strict=True)
         )
         self._said_full: set[int] = set()
+
+    @property
+    def changed(self) -> tuple[Changing, ...]:
+        """The remeshing and cutting of the bodies whose mesh changes."""
+        return tuple(each for each in self.changing if each is not None)
 
     def serve(self, fields: Sequence[ForceField]) -> None:
         """Connect the bodies' force fields, which now exist, to the pools."""

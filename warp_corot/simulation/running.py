@@ -179,9 +179,7 @@ class Running:
         if not passed:
             return None, now
         reached = end is not None and sim.time >= end
-        if sim.remeshing.is_due(now):
-            sim.follow_motion()
-            sim.guard.forget()
+        sim.follow_motion()
         return reached, now
 
     def _is_to_be_judged(self, steps: int) -> bool:
@@ -194,9 +192,7 @@ class Running:
     def _until_due(self, done: int) -> int:
         """Steps until a check, a pass or a hook is due."""
         sim = self._sim
-        every = [self._check_steps, *sim.hooks.intervals]
-        if sim.remeshing.every:
-            every.append(sim.remeshing.every)
+        every = [self._check_steps, *sim.hooks.intervals, *sim.changes_every]
         return min(n - done % n for n in every)
 
     @property

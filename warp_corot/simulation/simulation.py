@@ -6,7 +6,7 @@ import math
 import warnings
 from collections.abc import Callable, Sequence
 from os import PathLike
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +18,8 @@ from warp_corot.contact.grasp import Grasp
 from warp_corot.contact.options import Contact
 from warp_corot.contact.reading import ContactPoint, contact_points
 from warp_corot.contact.tool import Obstacle
+from warp_corot.cutting.blade import Blade, checked_blades
+from warp_corot.cutting.blades import Blades
 from warp_corot.cutting.plane import Plane, checked_plane
 from warp_corot.discretization.changing.cutting import plane_surface
 from warp_corot.discretization.nodal import vec3_view
@@ -73,6 +75,7 @@ class Simulation(Clock):
             never change.
         obstacles: Rigid obstacles of the bodies: shapes at rest, such as ``Ground`` and ``Box``, and tools, which move.
         contact: The options of contact; None: ``Contact()`` if there are obstacles, else no contact.
+        cuts: Blades that cut the bodies; an empty list prepares these for ``cut``.
 
     Attributes:
         bodies: Tuple of the bodies.
@@ -108,7 +111,7 @@ class Simulation(Clock):
         remesh: OnlineRemesh | Sequence[OnlineRemesh | None] | None = None,
         obstacles: Obstacle | Sequence[Obstacle] = (),
         contact: Contact | None = None,
-        cuts: Sequence[Any] | None = None,
+        cuts: Blade | Sequence[Blade] | None = None,
     ):
         with SIMULATION_LOCK:
             self.bodies = checked_bodies(bodies, self.ranks)
@@ -119,24 +122,24 @@ class Simulation(Clock):
             self.gravity = checked_gravity(gravity, self.bodies[0].mesh.up_axis)
             touching = checked_contact(obstacles, contact)
             ordered = self.deterministic and self.device.is_cuda
-            changes = remesh is not None or cuts is not None
+            blades = checked_blades(cuts)
+            changes = remesh is not None or blades is not None
             check_implicit(self.integrator, remeshes=changes, ordered=ordered)
             #: Functions that are called after steps.
             self.hooks = Hooks()
             given = self.integrator.dt
             self.pace = Pace(ANY_STEP if given is None else float(given), self.device)
-            self._make(remesh, touching, are_cut=cuts is not None)
+            self._make(remesh, touching, blades)
 
     def _make(
         self,
         remesh: OnlineRemesh | Sequence[OnlineRemesh | None] | None,
         touching: tuple[tuple[Obstacle, ...], Contact] | None,
-        *,
-        are_cut: bool,
+        blades: tuple[Blade, ...] | None,
     ) -> None:
         """Make all that makes steps of the bodies as they are now."""
-        remeshing = Remeshing(self.bodies, self.models, remesh, deterministic=self.deterministic, are_cut=are_cut)
-        self.remeshing, given = remeshing, self.integrator.dt
+        self.remeshing = Remeshing(self.bodies, self.models, remesh, deterministic=self.deterministic, blades=blades)
+        given = self.integrator.dt
         bound = zip(self.models, self.bodies, strict=True)
         self.fields = tuple(m.bind(body, deterministic=self.deterministic) for m, body in bound)
         self.remeshing.serve(self.fields)
@@ -149,6 +152,12 @@ class Simulation(Clock):
             own = self.ranks.is_alone or not self.integrator.is_implicit
             self.contact = Contacts(self.system, *touching, stable_dt=self.stable_dt, dt=given, on_surfaces=own)
             self.system.constraints.append(self.contact)
+        #: Blades that cut the bodies; None without.
+        self.blades: Blades | None = None
+        if blades:
+            longest = self.stable_dt if given is None else float(given)
+            self.blades = Blades(blades, self.system, self.remeshing.changed, longest)
+            self.system.forces.append(self.blades)
         #: Chooses the step, if none was given.
         self.safe_step = SafeStep(self.system, self.models, stable) if given is None else None
         self.guard = Guard(self.system)
@@ -218,19 +227,18 @@ class Simulation(Clock):
         with SIMULATION_LOCK:
             refuse_tape()
             if self.device.is_capturing:
-                if self.remeshing.every:
+                if self.changes_every:
                     raise InputError(
-                        "a simulation with remesh cannot be recorded by others: launches change with the mesh"
+                        "a simulation with remesh or blades cannot be recorded by others: launches change with the mesh"
                     )
                 self.pace.is_shared = True
                 self.recorded.launch(Segment(1, adopts=True, publishes=True))
                 return
             self.running.step()
-            looks = self.device.is_cpu or bool(self.hooks.intervals) or bool(self.remeshing.every)
+            looks = self.device.is_cpu or bool(self.hooks.intervals) or bool(self.changes_every)
             if looks:
                 self.running.look()
-                if self.remeshing.every:
-                    self.follow_motion()
+                self.follow_motion()
         if looks:
             self.hooks.call(self)
 
@@ -308,6 +316,8 @@ class Simulation(Clock):
             field.reset(chosen)
         for constraint in self.system.constraints:
             constraint.reset(chosen)
+        if self.blades is not None:
+            self.blades.reset(chosen)
         self._control_step()
 
     # --- looking ---------------------------------------------------------------------------------------------------
@@ -458,11 +468,15 @@ class Simulation(Clock):
         self._prepare_cuts()
         area = self.remeshing.cut(plane_surface(found.normal, found.offset, is_deformed=True), number)
         if area > 0.0:
-            self.guard.forget()
-            stable = self._find_stable_steps()
-            if self.safe_step is not None:
-                self.safe_step.find_rest(stable)
+            self._follow_cut()
         return area
+
+    def _follow_cut(self) -> None:
+        """Go on with bodies that were cut just now."""
+        self.guard.forget()
+        stable = self._find_stable_steps()
+        if self.safe_step is not None:
+            self.safe_step.find_rest(stable)
 
     def _prepare_cuts(self) -> None:
         """Let bodies be cut, if the simulation was not made so."""
@@ -477,7 +491,7 @@ class Simulation(Clock):
         if former is not None:
             former.obstacles.let_go()
         try:
-            self._make(None, touching, are_cut=True)
+            self._make(None, touching, ())
         except BaseException:
             if former is not None:
                 former.obstacles.take_back()
@@ -486,9 +500,25 @@ class Simulation(Clock):
             self.contact.obstacles.continue_from(former.obstacles)
 
     def follow_motion(self) -> None:
-        """Remesh the bodies that are due, and adapt the step to the new meshes."""
-        if self.remeshing.run(self.steps):
+        """Cut and remesh the bodies that are due, and adapt the step to the new meshes."""
+        steps, blades = self.steps, self.blades
+        if blades is not None and blades.is_due(steps) and blades.cut():
+            if blades.is_new:
+                self._follow_cut()
+            else:
+                self.guard.forget()
+        if self.remeshing.is_due(steps):
+            self.remeshing.run(steps)
             self._control_step()
+            self.guard.forget()
+            if blades is not None:
+                blades.bind_again()
+
+    @property
+    def changes_every(self) -> tuple[int, ...]:
+        """The numbers of steps after whose multiples ``follow_motion`` is due."""
+        found = (self.remeshing.every, 0 if self.blades is None else self.blades.every)
+        return tuple(every for every in found if every)
 
     def _control_step(self) -> None:
         """Find the stable step again if other elements now limit it."""

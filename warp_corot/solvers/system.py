@@ -29,6 +29,8 @@ class Forces(Protocol):
     energy out say ``is_dissipative = True``. Others add their work to ``support_work`` of the system and have a method
     ``complete_work``, which launches the work up to the present state.
 
+    Forces that remember something between steps list its arrays in ``restored``.
+
     Forces whose launches may change have an attribute ``revision`` that changes with them. ``curvature`` may say how
     stiff a force is; see ``Simulation.add_forces``.
     """
@@ -176,6 +178,7 @@ class System:
     def state(self) -> list[wp.array]:
         """All arrays from which constraints continue, with the accounts."""
         others = [array for each in self.constraints for array in each.state.values()]
+        others += [array for each in self.forces for array in getattr(each, "restored", ())]
         return self.accounts + others + [body.state.contact_forces for body in self.bodies if body.state.is_touched]
 
     def prepare(self) -> None:

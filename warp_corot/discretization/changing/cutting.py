@@ -22,9 +22,10 @@ class CutPass:
 
     Args:
         forest: The forest to cut.
+        toughness: Energy of a cut [J/m^2], unless leaves carry "toughness".
     """
 
-    def __init__(self, forest: DeviceForest):
+    def __init__(self, forest: DeviceForest, toughness: float = 0.0):
         self.forest, self.device = forest, forest.device
         capacity, nodes = forest.capacity, forest.node_capacity
         room = max(capacity // 4, min(capacity, ALL_LEAVES))
@@ -39,17 +40,28 @@ class CutPass:
         cuts.owner = self._ints(size, -1)
         cuts.mark, cuts.marked, cuts.keeper = (self._ints(nodes, 0) for _ in range(3))
         cuts.former_mass = wp.zeros(nodes, dtype=wp.float64, device=self.device)
+        names = forest.carriage.names
+        cuts.toughness, cuts.toughness_column = toughness, names.index("toughness") if "toughness" in names else -1
         cuts.names = forest.pools.tets.view(wp.int32)
 
-    def launch_cut(self, surface: cut_kernels.Surface) -> None:
-        """Launch a cut: which faces the surface crosses, and the separation of their nodes."""
+    def launch_cut(self, surface: cut_kernels.Surface, *, goes_on: bool = False) -> None:
+        """Launch a cut: which faces the surface crosses, and the separation of their nodes.
+
+        Args:
+            surface: A plane or triangles.
+            goes_on: Whether it belongs to a pass that was just launched: then its counts are added to that pass's.
+        """
         pools, carried, cuts = self.forest.pools, self.forest.carriage.arrays, self._cuts
-        self._once(cut_kernels.begin_cut, 0, pools, cuts)
+        self._once(cut_kernels.begin_cut, int(goes_on), pools, cuts)
         self._many(cut_kernels.list_near, surface, carried, pools, cuts)
         self._many(cut_kernels.cross_faces, surface, carried, pools, cuts)
         self._many(cut_kernels.join_lone, pools, cuts)
         self._many(cut_kernels.count_faces, surface, carried, pools, cuts)
         self._launch_split()
+
+    def launch_marks(self, surface: cut_kernels.Surface) -> None:
+        """Launch the marks of leaves at triangles that are to be refined to their levels."""
+        self._many(cut_kernels.mark_near, surface, self.forest.carriage.arrays, self.forest.pools)
 
     def launch_after_pass(self) -> None:
         """Launch the separation of nodes that a pass has made on cut faces; may be recorded with the pass."""
@@ -94,18 +106,4 @@ def plane_surface(normal: npt.ArrayLike, offset: float, *, is_deformed: bool) ->
     surface = cut_kernels.Surface()
     surface.is_deformed = float(is_deformed)
     surface.normal, surface.offset = wp.vec3d(*np.asarray(normal, dtype=float)), float(offset)
-    return surface
-
-
-def triangle_surface(points: wp.array, triangles: wp.array, low: Any, high: Any) -> cut_kernels.Surface:
-    """Triangles at rest.
-
-    Args:
-        points: Vertices [m], vec3d.
-        triangles: Their corners, vec3i, wound alike.
-        low, high: Bounds of the vertices [m].
-    """
-    surface = cut_kernels.Surface()
-    surface.points, surface.triangles, surface.count = points, triangles, len(triangles)
-    surface.low, surface.high = wp.vec3d(*low), wp.vec3d(*high)
     return surface

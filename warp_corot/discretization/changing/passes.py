@@ -99,11 +99,16 @@ class RemeshPass:
         self.forest.pools.marks.assign(whole)
         self._replay(marked=True)
 
-    def launch(self, *, marked: bool = False) -> None:
-        """Launch a pass, or record it within the caller's capture; ``marked``: the marks exist already."""
+    def launch(self, *, marked: bool = False, goes_on: bool = False) -> None:
+        """Launch a pass, or record it within the caller's capture.
+
+        Args:
+            marked: Whether the marks exist already.
+            goes_on: Whether this pass and the last one count as one; neither may remove nodes.
+        """
         forest = self.forest
         pools, carried, edges, removal = forest.pools, forest.carriage.arrays, self._edges, self._removal
-        self._once(pool_kernels.begin_pass, pools)
+        self._once(pool_kernels.begin_pass, int(goes_on), pools)
         if not marked:
             refine_above, simplify_below = self.thresholds
             inputs = [refine_above, simplify_below, self._origin, self._spacing, carried.u, self.parameters]

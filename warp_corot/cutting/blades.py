@@ -1,0 +1,248 @@
+"""The blades of a simulation: their motion, the cuts that they make, and the forces at their edges."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
+
+from warp_corot.contact.obstacles import Obstacles
+from warp_corot.errors import InputError
+from warp_corot.kernels.remesh import blades as kernels
+from warp_corot.kernels.remesh import cut as cut_kernels
+from warp_corot.mesh.lattice import volume_shares
+
+from .blade import Blade
+
+if TYPE_CHECKING:
+    from warp_corot.remesh.changing import Changing
+    from warp_corot.solvers.system import System
+
+#: Distance of points on an edge, and the largest motion between two cuts, over the size of an element there.
+SPACING, MOTION = 0.5, 0.25
+#: Passes that refine before each cut.
+REFINEMENTS = 3
+#: Cuts after which the stable step is found again at the latest.
+FIND_EVERY = 64
+#: The most steps between two cuts.
+MOST_STEPS = 64
+
+
+class BladeMotion(Obstacles):
+    """Where blades are; they bound no step as obstacles do."""
+
+    def update(self) -> None:
+        rates = wp.clone(self.system.motion_rates)
+        super().update()
+        wp.copy(self.system.motion_rates, rates)
+
+
+class EdgePoints:
+    """The edges of blades in one body.
+
+    Args:
+        blades: The blades.
+        changing: The body's.
+        size: Size of its elements where blades cut [m].
+    """
+
+    def __init__(self, blades: Sequence[Blade], changing: Changing, size: float):
+        self.changing, self.device = changing, changing.device
+        rows = [blade.sampled(SPACING * size) for blade in blades]
+        counts = [len(row) for row in rows]
+        self.count = total = sum(counts)
+        edges = self.edges = kernels.Edges()
+        edges.blade = self._ints(np.repeat(np.arange(len(rows)), counts))
+        edges.local = wp.array(np.concatenate(rows), dtype=wp.vec3, device=self.device)
+        goes_on = np.ones(total, np.int32)
+        goes_on[np.cumsum(counts) - 1] = 0
+        edges.goes_on = self._ints(goes_on)
+        edges.x, edges.bounds = (wp.zeros(n, dtype=wp.vec3, device=self.device) for n in (total, 2))
+        edges.push, edges.move = (wp.zeros(2 * total, dtype=wp.vec3, device=self.device) for _ in range(2))
+        edges.dt = wp.zeros(total, dtype=wp.float32, device=self.device)
+        edges.best = wp.zeros(total, dtype=wp.int64, device=self.device)
+        edges.nodes = wp.zeros(total, dtype=wp.vec4i, device=self.device)
+        edges.weights = wp.zeros(total, dtype=wp.vec4, device=self.device)
+        edges.size = wp.zeros(total, dtype=wp.float32, device=self.device)
+        edges.state, edges.former = (wp.zeros(total, dtype=wp.int32, device=self.device) for _ in range(2))
+        edges.work = wp.zeros(len(rows), dtype=wp.float64, device=self.device)
+        edges.modulus = changing.stiffest_modulus
+        surface = self.surface = cut_kernels.Surface()
+        surface.count = 2 * total
+        surface.points = wp.zeros(2 * total, dtype=wp.vec3d, device=self.device)
+        surface.triangles = wp.zeros(2 * total, dtype=wp.vec3i, device=self.device)
+        surface.bounds = wp.zeros(2, dtype=wp.vec3d, device=self.device)
+        levels = [-1 if blade.level is None else blade.level for blade in blades]
+        surface.levels = self._ints(np.repeat(levels, 2 * np.array(counts)))
+        surface.debt = wp.zeros(2 * total, dtype=wp.float64, device=self.device)
+        self.refines = max(levels) >= 0
+        self._graph: wp.Graph | None = None
+        self._is_recorded = False
+
+    @property
+    def restored(self) -> list[wp.array]:
+        """Arrays that a run which went wrong puts back."""
+        edges = self.edges
+        return [edges.work, edges.push, edges.move, edges.dt, self.surface.debt]
+
+    def cut(self, motions: Any) -> bool:
+        """Cut the body along what has been swept since the last time; returns whether its mesh has changed."""
+        launch = partial(self._launch_cut, motions)
+        if not self._is_recorded:
+            self._graph, self._is_recorded = self.changing.recorded(launch), True
+        return self.changing.change(launch, self._graph)
+
+    def _launch_cut(self, motions: Any) -> None:
+        self.launch_sweep(motions)
+        self.changing.launch_cut(self.surface, REFINEMENTS if self.refines else 0)
+        self.launch_binding(motions)
+
+    def launch_sweep(self, motions: Any) -> None:
+        """Launch the search for the strips that the edges have swept since the last one."""
+        self._find(motions)
+        inputs = [self._pools, self._carried, self.edges, self.surface]
+        wp.launch(kernels.sweep, 1, inputs, device=self.device)
+
+    def launch_binding(self, motions: Any) -> None:
+        """Launch the search for the leaves in which the points are, after these have changed."""
+        self._find(motions)
+        wp.launch(kernels.bind_points, self.count, [self._pools, self._carried, self.edges], device=self.device)
+
+    def launch_decision(self, begins: wp.array, motions: Any, pace: Any, wrenches: wp.array) -> None:
+        """Launch the pushes of a step."""
+        inputs = [begins, motions, pace, self._carried, self.edges, self.surface.debt, wrenches]
+        wp.launch(kernels.decide_pushes, self.count, inputs, device=self.device)
+
+    def launch_pushes(self) -> None:
+        """Launch the forces of the pushes on the body's nodes."""
+        wp.launch(
+            kernels.push_tissue, 2 * self.count, [self.edges, self.changing.body.state.forces], device=self.device
+        )
+
+    def restart(self) -> None:
+        """Forget what has been swept."""
+        for array in (self.edges.state, self.edges.work, self.edges.push, self.surface.debt):
+            array.zero_()
+
+    @property
+    def _pools(self) -> Any:
+        return self.changing.forest.pools
+
+    @property
+    def _carried(self) -> Any:
+        return self.changing.forest.carriage.arrays
+
+    def _find(self, motions: Any) -> None:
+        threads = self.changing.forest.threads
+        wp.launch(kernels.place_points, 1, [motions, self.edges], device=self.device)
+        inputs = [threads, self._pools, self._carried, self.edges]
+        wp.launch(kernels.find_leaves, threads, inputs, device=self.device)
+
+    def _ints(self, values: Any) -> wp.array:
+        return wp.array(np.asarray(values, np.int32), dtype=wp.int32, device=self.device)
+
+
+class Blades(BladeMotion):
+    """The blades of a simulation, as forces of its system.
+
+    Args:
+        given: The blades.
+        system: The system.
+        changing: The cutting of each body.
+        longest: The longest step [s].
+
+    Attributes:
+        every: Steps between two cuts.
+
+    Raises:
+        InputError: A blade is too fast to be followed, or another simulation has it.
+    """
+
+    def __init__(self, given: Sequence[Blade], system: System, changing: Sequence[Changing], longest: float):
+        size = min(_size(each, given) for each in changing)
+        fastest = max((blade.fastest() or blade.speed) for blade in given)
+        if not fastest * longest <= size:
+            raise InputError(
+                f"a blade goes {1e3 * fastest * longest:.3g} mm in a step, farther than an element of "
+                f"{1e3 * size:.3g} mm; it must be slower than {size / longest:.3g} m/s"
+            )
+        super().__init__(given, 0.0, system)
+        self.every = int(np.clip(MOTION * size / (fastest * longest), 1, MOST_STEPS))
+        self.of_bodies = [EdgePoints(given, each, size) for each in changing]
+        self._changes = 0
+        self._moved = wp.full(1, -1, dtype=wp.int64, device=self.device)
+        self._begins = wp.zeros(1, dtype=wp.int32, device=self.device)
+        self._sweep()
+
+    # --- as forces ---------------------------------------------------------------------------------------------------
+
+    @property
+    def restored(self) -> list[wp.array]:
+        """Arrays that a run which went wrong puts back."""
+        return [*self.state.values(), self._moved, *(array for each in self.of_bodies for array in each.restored)]
+
+    def add_forces(self) -> None:
+        """Launch the motion of the blades in a step, and the forces at their edges."""
+        pace, offset = self.system.pace.arrays, self.system.offset
+        wp.launch(kernels.begin_step, 1, [pace, offset, self._moved, self._begins], device=self.device)
+        self.launch_targets()
+        starts = self.system.bodies[0].conditions.world_starts
+        inputs = [self._begins, self.motions, pace, starts, offset, self.wrenches]
+        wp.launch(kernels.move_blades, self.count, inputs, device=self.device)
+        for each in self.of_bodies:
+            each.launch_decision(self._begins, self.motions, pace, self.wrenches)
+            each.launch_pushes()
+
+    # --- cuts --------------------------------------------------------------------------------------------------------
+
+    def is_due(self, steps: int) -> bool:
+        """Whether a cut is due after this number of steps."""
+        return steps % self.every == 0
+
+    def cut(self) -> bool:
+        """Cut along what the blades have swept since the last cut; returns whether a mesh has changed."""
+        changed = any([each.cut(self.motions) for each in self.of_bodies])
+        self._changes += changed
+        return changed
+
+    @property
+    def is_new(self) -> bool:
+        """Whether the last cut may be unlike those before: the first, second, fourth, and so on, and each sixty-fourth.
+
+        The stable step is found again then, which takes as long as a hundred steps. A cut makes nodes with few
+        elements, and more of them make the step no shorter.
+        """
+        return self._changes & (self._changes - 1) == 0 or self._changes % FIND_EVERY == 0
+
+    def bind_again(self) -> None:
+        """Find the points' leaves again, after a pass has changed these."""
+        for each in self.of_bodies:
+            each.launch_binding(self.motions)
+
+    def reset(self, chosen: wp.array) -> None:
+        super().reset(chosen)
+        if chosen.numpy()[0]:
+            self._moved.fill_(-1)
+            self._changes = 0
+            for each in self.of_bodies:
+                each.restart()
+            self._sweep()
+
+    def work_of(self, number: int) -> float:
+        """Work of a blade on the tissue [J]; waits for the device."""
+        return float(sum(each.edges.work.numpy()[number] for each in self.of_bodies))
+
+    def _sweep(self) -> None:
+        """Let the blades begin where they are."""
+        for each in self.of_bodies:
+            each.launch_sweep(self.motions)
+
+
+def _size(changing: Changing, blades: Sequence[Blade]) -> float:
+    """Size of the smallest elements of a body, or of those at its blades [m]."""
+    mesh = changing.forest.source
+    finest = max(int(np.max(mesh.levels)), *(-1 if blade.level is None else blade.level for blade in blades), 0)
+    return float(volume_shares(finest) ** (1.0 / 3.0)) * mesh.cell_size
