@@ -391,6 +391,14 @@ def shared_area(tet: wp.vec4i, face: int, normal: wp.vec3d, surface: Surface, po
 
 
 @wp.func
+def filled(i: int, pools: Pools, carried: Carried):
+    """The share of a leaf that is inside the body."""
+    if carried.fill_column < 0:
+        return 1.0
+    return wp.min(carried.values[pools.leaves[i], carried.fill_column], 1.0)
+
+
+@wp.func
 def toughness_of(e: int, carried: Carried, cuts: Cuts):
     if cuts.toughness_column >= 0:
         return carried.values[e, cuts.toughness_column]
@@ -420,6 +428,7 @@ def count_faces(
                 q = centroid(pools.leaf_tets[i], surface.is_deformed, pools, carried)
                 normal, t = crossing(p, q, surface)
                 part = shared_area(tet, f % 4, normal, surface, pools, carried)
+                part *= wp.float64(0.5 * (filled(i, pools, carried) + filled(cuts.stars[s], pools, carried)))
                 area += part
                 wp.atomic_add(cuts.counts, FACES, 1)
                 if t >= 0:

@@ -145,6 +145,37 @@ def test_reset_heals_and_begins_again(device):
     assert blade.work == pytest.approx(work, rel=0.05)
 
 
+@pytest.mark.parametrize("level", [None, 7])
+def test_checkpoints_go_on_with_the_cut(level, device, tmp_path):
+    body, blade = block(device), falling(level=level)
+    sim = cut(body, blade, 0.1)
+    assert 0.0 < body.cut_area < 0.04**2
+    sim.save(tmp_path / "half.npz")
+    again = wc.Simulation.load(tmp_path / "half.npz", device=device)
+    (other,) = again.blades.blades
+    for each in (sim, again):
+        each.advance(0.1)
+    assert again.body.pieces == body.pieces == 2
+    assert again.body.cut_area == pytest.approx(body.cut_area)
+    assert other.work == pytest.approx(blade.work)
+    np.testing.assert_allclose(again.body.positions.numpy(), body.positions.numpy(), atol=1e-7)
+    again.reset()
+    assert again.body.pieces == 1
+
+
+def test_checkpoints_of_bodies_that_are_only_cut_are_not_remeshed(device, tmp_path):
+    body = block(device)
+    sim = wc.Simulation(body, gravity=(0, -50, 0))
+    sim.cut(wc.Plane((1, 0, 0), 0.061))
+    sim.save(tmp_path / "cut.npz")
+    again = wc.Simulation.load(tmp_path / "cut.npz", device=device)
+    assert again.remesh == (None,)
+    for each in (sim, again):
+        each.advance(0.05)
+    np.testing.assert_allclose(again.body.positions.numpy(), body.positions.numpy(), atol=1e-7)
+    assert again.cut(wc.Plane((1, 0, 0), 0.03)) > 0.0
+
+
 def test_implicit_steps_are_cut(device):
     body, blade = block(device), falling()
     cut(body, blade, integrator=wc.BackwardEuler(dt=0.004))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,7 @@ from .skin import Skin, has_own_surface
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
+    from warp_corot.mesh import TetForest
     from warp_corot.mesh.surfaces.bound import SurfaceMesh
 
 #: Room for a body whose mesh changes, over the size of its surface when the room is reserved.
@@ -253,6 +254,10 @@ class ContactSurface:
         body = self.bodies[k]
         if body.changing is None or not self.are_own or not has_own_surface(body.changing.forest.source):
             return Skin.of(body, is_own=self.are_own)
+        if body.cut_area > 0.0:
+            # Points of both lips must not be made one.
+            self._followed.pop(k, None)
+            return Skin.of_surface(cast("TetForest", body.mesh).surface())
         if k not in self._followed:
             self._followed[k] = FollowedSurface(body)
         return self._followed[k].skin()

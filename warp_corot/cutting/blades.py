@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 #: Distance of points on an edge, and the largest motion between two cuts, over the size of an element there.
 SPACING, MOTION = 0.5, 0.25
+#: Arrays of edges from which a run goes on.
+KEPT = ("state", "nodes", "weights", "size", "push", "move", "dt", "work")
 #: Passes that refine before each cut.
 REFINEMENTS = 3
 #: Cuts after which the stable step is found again at the latest.
@@ -155,7 +157,9 @@ class Blades(BladeMotion):
         longest: The longest step [s].
 
     Attributes:
+        blades: The blades.
         every: Steps between two cuts.
+        changes: Cuts that changed a mesh.
 
     Raises:
         InputError: A blade is too fast to be followed, or another simulation has it.
@@ -171,8 +175,9 @@ class Blades(BladeMotion):
             )
         super().__init__(given, 0.0, system)
         self.every = int(np.clip(MOTION * size / (fastest * longest), 1, MOST_STEPS))
+        self.blades = tuple(given)
         self.of_bodies = [EdgePoints(given, each, size) for each in changing]
-        self._changes = 0
+        self.changes = 0
         self._moved = wp.full(1, -1, dtype=wp.int64, device=self.device)
         self._begins = wp.zeros(1, dtype=wp.int32, device=self.device)
         self._sweep()
@@ -183,6 +188,15 @@ class Blades(BladeMotion):
     def restored(self) -> list[wp.array]:
         """Arrays that a run which went wrong puts back."""
         return [*self.state.values(), self._moved, *(array for each in self.of_bodies for array in each.restored)]
+
+    @property
+    def kept(self) -> dict[str, wp.array]:
+        """Everything from which blades go on, by name, besides the meshes."""
+        found = {"now": self.motions.now, "moved": self._moved, "wrenches": self.wrenches, **self.state}
+        for k, each in enumerate(self.of_bodies):
+            found |= {f"{k}.points": each.surface.points, f"{k}.debt": each.surface.debt}
+            found |= {f"{k}.{name}": getattr(each.edges, name) for name in KEPT}
+        return found
 
     def add_forces(self) -> None:
         """Launch the motion of the blades in a step, and the forces at their edges."""
@@ -205,7 +219,7 @@ class Blades(BladeMotion):
     def cut(self) -> bool:
         """Cut along what the blades have swept since the last cut; returns whether a mesh has changed."""
         changed = any([each.cut(self.motions) for each in self.of_bodies])
-        self._changes += changed
+        self.changes += changed
         return changed
 
     @property
@@ -215,7 +229,7 @@ class Blades(BladeMotion):
         The stable step is found again then, which takes as long as a hundred steps. A cut makes nodes with few
         elements, and more of them make the step no shorter.
         """
-        return self._changes & (self._changes - 1) == 0 or self._changes % FIND_EVERY == 0
+        return self.changes & (self.changes - 1) == 0 or self.changes % FIND_EVERY == 0
 
     def bind_again(self) -> None:
         """Find the points' leaves again, after a pass has changed these."""
@@ -226,7 +240,7 @@ class Blades(BladeMotion):
         super().reset(chosen)
         if chosen.numpy()[0]:
             self._moved.fill_(-1)
-            self._changes = 0
+            self.changes = 0
             for each in self.of_bodies:
                 each.restart()
             self._sweep()

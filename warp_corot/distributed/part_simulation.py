@@ -62,8 +62,9 @@ class PartSimulation(on_one.Simulation):
         """
         self.remeshing, self._pass = remeshing, after
 
-    def follow_motion(self) -> None:
+    def follow_motion(self) -> bool:
         self._pass()
+        return True
 
     def _find_stable_steps(self) -> list[float]:
         #: The largest stable step of each part's body at rest [s].

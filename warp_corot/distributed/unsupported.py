@@ -40,6 +40,8 @@ def check_supported(
             "remeshing of meshes that no rank holds whole does not work yet; leave remesh out, let every rank make the "
             "whole mesh, or run on one process"
         )
+    if others.get("cuts") is not None:
+        raise InputError("cutting does not work on several ranks; leave cuts out, or run on one process")
     contact = others.get("contact")
     meets = getattr(contact, "self_contact", False) or (len(bodies) > 1 and (contact or others.get("obstacles")))
     if meets and (in_parts or integrator.is_implicit):

@@ -179,7 +179,8 @@ class Running:
         if not passed:
             return None, now
         reached = end is not None and sim.time >= end
-        sim.follow_motion()
+        if any(now % every == 0 for every in sim.changes_every) and sim.follow_motion():
+            sim.guard.forget()
         return reached, now
 
     def _is_to_be_judged(self, steps: int) -> bool:

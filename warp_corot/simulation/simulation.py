@@ -238,7 +238,8 @@ class Simulation(Clock):
             looks = self.device.is_cpu or bool(self.hooks.intervals) or bool(self.changes_every)
             if looks:
                 self.running.look()
-                self.follow_motion()
+                if self.changes_every:
+                    self.follow_motion()
         if looks:
             self.hooks.call(self)
 
@@ -469,11 +470,11 @@ class Simulation(Clock):
         area = self.remeshing.cut(plane_surface(found.normal, found.offset, is_deformed=True), number)
         if area > 0.0:
             self._follow_cut()
+            self.guard.forget()
         return area
 
     def _follow_cut(self) -> None:
-        """Go on with bodies that were cut just now."""
-        self.guard.forget()
+        """Find the step again for bodies that were cut just now."""
         stable = self._find_stable_steps()
         if self.safe_step is not None:
             self.safe_step.find_rest(stable)
@@ -499,20 +500,19 @@ class Simulation(Clock):
         if former is not None and self.contact is not None:
             self.contact.obstacles.continue_from(former.obstacles)
 
-    def follow_motion(self) -> None:
-        """Cut and remesh the bodies that are due, and adapt the step to the new meshes."""
+    def follow_motion(self) -> bool:
+        """Cut and remesh the bodies that are due, and adapt the step to the new meshes; returns whether meshes may have
+        changed."""
         steps, blades = self.steps, self.blades
-        if blades is not None and blades.is_due(steps) and blades.cut():
-            if blades.is_new:
-                self._follow_cut()
-            else:
-                self.guard.forget()
-        if self.remeshing.is_due(steps):
-            self.remeshing.run(steps)
+        changed = blades is not None and blades.is_due(steps) and blades.cut()
+        if changed and blades is not None and blades.is_new:
+            self._follow_cut()
+        if self.remeshing.run(steps):
+            changed = True
             self._control_step()
-            self.guard.forget()
             if blades is not None:
                 blades.bind_again()
+        return changed
 
     @property
     def changes_every(self) -> tuple[int, ...]:

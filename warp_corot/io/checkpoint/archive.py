@@ -28,7 +28,7 @@ from warp_corot.remesh.online import OnlineRemesh
 from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import INTEGRATORS
 
-from .contact import obstacles_of, pack_contact, unpack_contact
+from .contact import blades_of, obstacles_of, pack_blades, pack_contact, unpack_blades, unpack_contact
 from .mesh import pack_mesh, unpack_mesh
 from .remesh import pack_changing, remesh_options, unpack_changing
 
@@ -39,7 +39,7 @@ Remesh = OnlineRemesh | Sequence[OnlineRemesh | None] | None
 
 FORMAT, FORMAT_IN_PARTS = "warp-corot checkpoint", "warp-corot checkpoint in parts"
 #: The version of checkpoints that is written, and the only one that is read.
-VERSION = 9
+VERSION = 10
 
 #: What the guard continues from.
 GUARDED = ("scale", "drift", "lately", "counted", "work")
@@ -82,6 +82,7 @@ def save_checkpoint(sim: Simulation, path: str | PathLike[str]) -> None:
     packed = zip(sim.bodies, sim.models, sim.fields, sim.remeshing.changing, strict=True)
     for number, (body, model, field, changing) in enumerate(packed):
         header["bodies"].append(pack_body(body, model, field, changing, f"body{number}.", arrays))
+    header["cuts"] = pack_blades(sim, arrays)
     header["contact"] = pack_contact(sim.contact, sim.grasps, arrays)
     arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
     write_archive(target, arrays)
@@ -207,6 +208,7 @@ def _rebuilt_simulation(
             gravity=header["gravity"],
             deterministic=header["deterministic"],
             remesh=remesh_options(header["bodies"], arrays, place, remesh),
+            cuts=blades_of(header["cuts"], arrays),
             **obstacles_of(header["contact"], arrays),
         )
     sim.steps_before_reset, sim.time_before_reset = header["steps_before_reset"], header["time_before_reset"]
@@ -222,6 +224,7 @@ def _rebuilt_simulation(
             field.state[name].assign(arrays[f"body{number}.field.{name}"])
     for name in header["kept"]:
         sim.kept[name].assign(arrays[f"kept.{name}"])
+    unpack_blades(sim.blades, header["cuts"], arrays)
     unpack_contact(sim.contact, header["contact"], arrays)
     sim.guard.resume(**{name: arrays[f"guard.{name}"] for name in GUARDED})
     sim.running.resume(**header["running"])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,7 +14,12 @@ from warp_corot.contact.options import Contact
 from warp_corot.contact.sampled import SignedDistance, TriangleMesh
 from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, Shape, Sphere
 from warp_corot.contact.tool import Obstacle, Tool
+from warp_corot.cutting.blade import Blade, Edge
 from warp_corot.errors import InputError
+
+if TYPE_CHECKING:
+    from warp_corot.cutting.blades import Blades
+    from warp_corot.simulation.simulation import Simulation
 
 Arrays = dict[str, np.ndarray]
 
@@ -25,6 +30,7 @@ SHAPES = {
     "Capsule": lambda size, arrays, prefix: Capsule(size[0], 2.0 * size[1]),
     "Cylinder": lambda size, arrays, prefix: Cylinder(size[0], 2.0 * size[1]),
     "Box": lambda size, arrays, prefix: Box([2.0 * each for each in size]),
+    "Edge": lambda size, arrays, prefix: Edge(arrays[prefix + "points"]),
     "TriangleMesh": lambda size, arrays, prefix: TriangleMesh(arrays[prefix + "points"], arrays[prefix + "triangles"]),
     "SignedDistance": lambda size, arrays, prefix: SignedDistance(
         arrays[prefix + "values"], arrays[prefix + "lower"], spacing=size
@@ -98,6 +104,35 @@ def unpack_contact(contacts: Contacts | None, described: dict[str, Any] | None, 
             array.assign(arrays[f"grasp{k}.{name}"])
 
 
+def pack_blades(sim: Simulation, arrays: Arrays) -> dict[str, Any] | None:
+    """Put the blades of a simulation into arrays; returns the remaining data for JSON, None if bodies cannot be cut."""
+    if not sim.remeshing.are_cut:
+        return None
+    blades = sim.blades
+    if blades is None:
+        return {"blades": []}
+    arrays |= {f"blades.{name}": array.numpy() for name, array in blades.kept.items()}
+    given = enumerate(blades.blades)
+    packed = [_pack_tool(blade, True, f"blade{k}.", arrays) | {"level": blade.level} for k, blade in given]
+    return {"blades": packed, "every": blades.every, "changes": blades.changes}
+
+
+def blades_of(described: dict[str, Any] | None, arrays: Arrays) -> list[Any] | None:
+    """The argument ``cuts`` of a simulation."""
+    if described is None:
+        return None
+    return [_unpacked_tool(each, f"blade{k}.", arrays) for k, each in enumerate(described["blades"])]
+
+
+def unpack_blades(blades: Blades | None, described: dict[str, Any] | None, arrays: Arrays) -> None:
+    """Restore what blades have done, on the present meshes."""
+    if blades is None or described is None:
+        return
+    for name, array in blades.kept.items():
+        array.assign(arrays[f"blades.{name}"])
+    blades.every, blades.changes = int(described["every"]), int(described["changes"])
+
+
 def _pack_grasp(contacts: Contacts, grasp: Grasp, prefix: str, arrays: Arrays) -> dict[str, Any]:
     arrays[prefix + "nodes"] = grasp.nodes
     for name, array in grasp.kept.items():
@@ -140,6 +175,9 @@ def _unpacked_tool(described: dict[str, Any], prefix: str, arrays: Arrays) -> Ob
     if not described["moves"]:
         return shape
     tool = Tool(shape, speed=described["speed"])
+    if isinstance(shape, Edge):
+        options = {"position": place[:3], "quaternion": place[3:], "level": described["level"]}
+        tool = Blade(shape.points, speed=described["speed"], **options)
     tool.pose, tool.is_sent = pose, bool(described["is_sent"])
     if described["follows"]:
         times = _finite(arrays[prefix + "times"])

@@ -50,6 +50,7 @@ def pack_changing(changing: Changing, prefix: str, arrays: Arrays) -> dict[str, 
     for k, each in enumerate(keys):
         arrays[f"{prefix}activation{k}.times"], arrays[f"{prefix}activation{k}.stress"] = each.times, each.stress
     return {
+        "is_remeshed": changing.is_remeshed,
         "options": {name: getattr(options, name) for name in PLAIN},
         "criterion": None if options.criterion is None else _name_of(options.criterion),
         "parameters": parameters is not None,
@@ -116,7 +117,9 @@ def remesh_options(
         InputError: The criterion is not known, and no options replace it.
     """
     kept = [
-        None if each["remesh"] is None else _options(each["remesh"], f"body{number}.remesh.", arrays, device, given)
+        None
+        if each["remesh"] is None or not each["remesh"]["is_remeshed"]
+        else _options(each["remesh"], f"body{number}.remesh.", arrays, device, given)
         for number, each in enumerate(described)
     ]
     if given is None:

@@ -73,6 +73,7 @@ class _Joined:
         self.worlds = [body.world(world) for body in sim.bodies]
         self.up_axis = sim.bodies[0].mesh.up_axis
         self.changing = [changing is not None for changing in sim.remeshing.changing]
+        self.are_cut = sim.remeshing.are_cut
         self._join()
 
     def has_changed(self) -> bool:
@@ -92,7 +93,7 @@ class _Joined:
         """Surfaces that are drawn in place of the boundary of the tetrahedra; None if there are only tetrahedra."""
         if surface is None and not labels and tets is not False and not any(map(has_domain, self.meshes)):
             return None
-        return BoundSkins(self.meshes, surface, labels, self.changing)
+        return BoundSkins(self.meshes, surface, labels, self.changing, self.are_cut)
 
     def _join(self) -> None:
         self._revisions = [world.body.version for world in self.worlds]

@@ -84,12 +84,19 @@ class Skin:
         surface: Bound to the nodes of the drawn mesh.
         look: The USD prim whose faces, texture coordinates and materials it keeps.
         is_boundary: Whether it contains the boundary of the mesh, which changes with the mesh.
+        is_cut: Whether it is the body's own and becomes another one when the body is cut.
     """
 
     name: str
     surface: SurfaceMesh
     look: Look | None = None
     is_boundary: bool = False
+    is_cut: bool = False
+
+    @property
+    def changes(self) -> bool:
+        """Whether its triangles may change."""
+        return self.is_boundary or self.is_cut
 
     def values(self, nodal: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
         """Nodal values [N] at the points of the surface, float32 [V]."""
@@ -118,6 +125,8 @@ class BoundSkins:
             meshes one each, None for the mesh's own.
         labels: Draw each label of a mesh as a separate closed surface.
         changing: Whether each mesh may change: surfaces given for such a mesh may be bound to an earlier one.
+        are_cut: Whether they may be cut. The surface of a body with domain then becomes that of its mesh, as do
+            surfaces in memory; those of files and of labels stay in one piece.
 
     Raises:
         InputError: Surfaces that do not fit, or no mesh has labels.
@@ -129,6 +138,7 @@ class BoundSkins:
         surface: Surface | Sequence[Surface | None] | None = None,
         labels: bool = False,
         changing: Sequence[bool] | None = None,
+        are_cut: bool = False,
     ):
         given = _one_each(surface, len(meshes))
         if labels and not any(map(has_labels, meshes)):
@@ -139,6 +149,10 @@ class BoundSkins:
             _skins_of_one(mesh, _rebound(own, mesh) if moves and isinstance(own, SurfaceMesh) else own, labels)
             for mesh, own, moves in zip(meshes, given, may_change, strict=True)
         ]
+        if are_cut and not labels:
+            self._skins = [
+                [replace(s, is_cut=s.look is None and not s.is_boundary) for s in own] for own in self._skins
+            ]
 
     def on(self, meshes: Sequence[Any]) -> list[Skin]:
         """The skins, bound to the nodes of the current meshes; skins with the same name are joined."""
@@ -153,7 +167,12 @@ class BoundSkins:
 
 
 def _bound_anew(skin: Skin, mesh: Any) -> Skin:
-    surface = boundary_surface(mesh) if skin.is_boundary else _rebound(skin.surface, mesh)
+    if skin.is_boundary:
+        surface = boundary_surface(mesh)
+    elif skin.is_cut and mesh.tree.cut is not None:
+        surface = mesh.surface()
+    else:
+        surface = _rebound(skin.surface, mesh)
     return replace(skin, surface=surface)
 
 
@@ -257,7 +276,8 @@ def _joined(skins: Sequence[Skin]) -> list[Skin]:
     whole = []
     for name, parts in plain.items():
         surface = joined_surfaces([part.surface for part in parts])
-        whole.append(Skin(name, surface, is_boundary=any(part.is_boundary for part in parts)))
+        flags = (any(part.is_boundary for part in parts), any(part.is_cut for part in parts))
+        whole.append(Skin(name, surface, None, *flags))
     return whole + [skin for skin in skins if skin.look is not None]
 
 

@@ -17,7 +17,7 @@ from warp_corot.mesh.pieces import pieces_of
 from .bound import SurfaceMesh
 from .boundary import boundary_faces
 from .embedding import embed
-from .marching import marched
+from .marching import marched, marched_cut
 from .separating import separated
 
 Forest = TypeVar("Forest", bound=ForestArrays)
@@ -27,7 +27,10 @@ def surface(forest: ForestArrays) -> SurfaceMesh:
     """See `TetForest.surface`."""
     if forest.phi is None:
         return boundary_surface(forest)
-    if forest.detail is not None:
+    if forest.tree.cut is not None:
+        # Elements that were left out have no side of a cut.
+        found = marched_cut(forest.points, forest.tets[(forest.phi[forest.tets] < 0).any(axis=1)], forest.phi)
+    elif forest.detail is not None:
         found = _embedded(forest, forest.detail.surface())
     else:
         found = _on_nodes(forest, marched(forest.lattice_points, _all_cut(forest), forest.phi))

@@ -13,7 +13,7 @@ import numpy as np
 from warp_corot.mesh.growing.cut import codes
 
 from .bound import SurfaceMesh
-from .boundary import signed_volumes
+from .boundary import boundary_faces, signed_volumes
 
 Array = np.ndarray
 
@@ -66,6 +66,28 @@ def marched(points: Array, tets: Array, values: Array) -> SurfaceMesh:
             turned = mirrored[chosen]
             ends[turned] = ends[turned][:, ::-1]
             corners.append(ends)
+    return _merged_surface(points, np.concatenate(corners), values)
+
+
+def marched_cut(points: Array, tets: Array, values: Array) -> SurfaceMesh:
+    """As ``marched``, closed where elements have come apart: with the parts that are inside of faces of one element.
+
+    Args:
+        points, values: As for ``marched``.
+        tets: Nodes of all elements with a node inside.
+    """
+    around = marched(points, tets, values)
+    faces, _ = boundary_faces(tets, points)
+    inside = values[faces] < 0
+    corners = [np.stack([around.nodes[around.triangles, n] for n in range(2)], axis=2)]
+    for count in (1, 2, 3):
+        chosen = faces[inside.sum(axis=1) == count]
+        # The first inside node after one that is not begins the polygon.
+        first = np.argmax(inside & ~np.roll(inside, 1, axis=1), axis=1)[inside.sum(axis=1) == count]
+        a, b, c = np.take_along_axis(chosen, (first[:, None] + np.arange(3)) % 3, axis=1).T
+        ends = {1: [(a, a), (a, b), (a, c)], 2: [(a, a), (b, b), (b, c), (a, c)], 3: [(a, a), (b, b), (c, c)]}[count]
+        polygon = np.stack([np.stack(pair, axis=1) for pair in ends], axis=1)
+        corners += [polygon[:, [0, k, k + 1]] for k in range(1, len(ends) - 1)]
     return _merged_surface(points, np.concatenate(corners), values)
 
 

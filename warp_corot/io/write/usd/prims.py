@@ -65,12 +65,12 @@ class SkinPrim:
         skin: The surface.
         path: Path of the prim.
         rest: Points of the body's mesh at rest [m], [N, 3].
-        changing: Whether the mesh may change, and with it the surface if that is the mesh's boundary.
+        changing: Whether the mesh may change, and with it some surfaces.
     """
 
     def __init__(self, skin: Skin, path: str, rest: NDArray[np.float64], *, changing: bool):
         self._path = path
-        self._changing = changing and skin.is_boundary
+        self._changing = changing and skin.changes
         self._said: Skin | None = None
         look = skin.look
         self._with_normals = look is None or (look.had_normals and not look.smooth)

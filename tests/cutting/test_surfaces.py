@@ -1,0 +1,118 @@
+"""Surfaces of bodies that were cut: closed, with both lips, drawn and in contact."""
+
+import itertools
+from collections import Counter
+
+import numpy as np
+import pytest
+from bodies import ball
+from cut_cases import assert_cut_sound
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+import warp_corot as wc
+
+PLANE = wc.Plane((1.0, 0.3, 0.2), 0.03)
+
+
+def organ(device, young=3e4):
+    """A ball whose surface lies within its elements."""
+    mesh = wc.TetForest.from_domain(ball(), cell_size=0.25, max_level=7, device="cpu")
+    body = wc.SoftBody(mesh, wc.Isotropic(young, 0.4, 1000.0), device=device)
+    body.fix("x < xmin + 0.1")
+    return body
+
+
+def assert_closed(triangles):
+    ways = Counter()
+    for face in triangles.tolist():
+        for a, b in itertools.pairwise([*face, face[0]]):
+            ways[min(a, b), max(a, b)] += 1 if a < b else -1
+    assert not any(ways.values())
+
+
+def volume(points, triangles):
+    a, b, c = np.moveaxis(points[triangles].astype(float), 1, 0)
+    return np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0
+
+
+def components(triangles):
+    """The part of each triangle, joined by points, and the number of parts."""
+    used, corners = np.unique(triangles, return_inverse=True)
+    corners = corners.reshape(-1, 3)
+    links = coo_array(
+        (np.ones(2 * len(corners)), (np.repeat(corners[:, 0], 2), corners[:, 1:].ravel())), [len(used)] * 2
+    )
+    count, part = connected_components(links, directed=False)
+    return part[corners[:, 0]], count
+
+
+def test_the_surface_of_a_cut_body_is_closed(device):
+    body = organ(device)
+    before = body.mesh.surface()
+    sim = wc.Simulation(body, gravity=(0, 0, 0))
+    area = sim.cut(PLANE)
+    # The disc's area, of what is inside the body alone.
+    assert area == pytest.approx(np.pi * (0.4**2 - PLANE.offset**2), rel=0.03)
+    assert_cut_sound(body.changing.forest)
+    surface = body.mesh.surface()
+    assert_closed(surface.triangles)
+    assert volume(surface.points, surface.triangles) == pytest.approx(volume(before.points, before.triangles), rel=0.01)
+    assert body.pieces == 2
+    # Each part of the surface is bound to one piece.
+    piece = np.zeros(body.node_count, int)
+    piece[body.mesh.tets] = body.mesh.pieces()[:, None]
+    part, count = components(surface.triangles)
+    assert count == 2
+    for k in range(2):
+        points = np.unique(surface.triangles[part == k])
+        assert len(np.unique(piece[surface.nodes[points]][surface.weights[points] != 0.0])) == 1
+
+
+def test_lips_that_touch_carry_as_if_they_were_whole(device):
+    """A body that is cut across its weight sags as the uncut one does."""
+    sags = []
+    for is_cut in (False, True):
+        body = organ(device, young=2e5)
+        body.release(np.arange(body.node_count))
+        body.fix("y < ymin + 0.1")
+        contact = wc.Contact(friction=0.5, self_contact=True)
+        sim = wc.Simulation(body, gravity=(0, -9.81, 0), contact=contact, integrator=wc.SymplecticEuler(damping=20.0))
+        if is_cut:
+            sim.cut(wc.Plane((0.1, 1.0, 0.0), 0.0))
+            assert body.pieces == 2
+        sim.advance(0.12)
+        sags.append(body.displacements.numpy()[body.mesh.points[:, 1] > 0.2, 1].mean())
+    assert np.abs(body.contact_forces.numpy()).max() > 0.0
+    assert len(body.contact_pressure) == len(body.contact_surface.triangles)
+    assert_closed(body.contact_surface.triangles)
+    assert sags[0] < -0.005
+    assert sags[1] == pytest.approx(sags[0], rel=0.02)
+
+
+@pytest.mark.parametrize("make", [organ, None])
+def test_recordings_show_the_cut(make, device, tmp_path):
+    from pxr import Usd, UsdGeom
+
+    if make is None:
+        body = wc.SoftBody(wc.TetForest.box((2, 1, 1), 0.2, 5), wc.Isotropic(3e4, 0.4, 1000.0), device=device)
+        body.fix("x == xmin")
+    else:
+        body = make(device)
+    sim = wc.Simulation(body, gravity=(0, -9.81, 0), integrator=wc.SymplecticEuler(damping=5.0), cuts=[])
+    plane = PLANE if make else wc.Plane((1.0, 0.3, 0.1), 0.2)
+    sim.on_step(lambda sim: sim.cut(plane) if sim.body.pieces == 1 and sim.time > 0.1 else None)
+    path = tmp_path / "cut.usda"
+    wc.record(sim, path, duration=0.25, fps=12, also=[tmp_path / "cut.pvd"])
+    assert body.pieces == 2
+    stage = Usd.Stage.Open(str(path))
+    mesh = UsdGeom.Mesh.Get(stage, "/SoftBody/surface")
+    parts = []
+    for code in range(int(stage.GetEndTimeCode()) + 1):
+        triangles = np.array(mesh.GetFaceVertexIndicesAttr().Get(code)).reshape(-1, 3)
+        points = np.array(mesh.GetPointsAttr().Get(code))
+        assert triangles.max() < len(points)
+        assert_closed(triangles)
+        parts.append(components(triangles)[1])
+    assert parts[0] == 1
+    assert parts[-1] == 2
