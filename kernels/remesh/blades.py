@@ -55,7 +55,9 @@ class Edges:
     weights: wp.array[wp.vec4]
     size: wp.array[wp.float32]  # of that leaf [m]
     state: wp.array[wp.int32]  # OUTSIDE, AT_SURFACE or IN_TISSUE
-    former: wp.array[wp.int32]  # the same at the last cut
+    former: wp.array[wp.vec3]  # where it was at the last cut [m]
+    last: wp.array[wp.vec3d]  # where its strip ends, at rest [m]
+    swept: wp.array[wp.int32]  # whether it has one
     push: wp.array[wp.vec3]  # [2 P] by the edge from a point to the next one, at the one and the other [N]
     move: wp.array[wp.vec3]  # [2 P] how far these have gone in the step [m]
     dt: wp.array[wp.float32]  # its length [s]
@@ -219,48 +221,76 @@ def bind_points(
     adopt_point(wp.tid(), pools, carried, edges)
 
 
+@wp.func
+def continued(x: wp.vec3, tet: wp.vec4i, carried: Carried):
+    """The place at rest of a point near a leaf, whose deformation goes on beyond it."""
+    w = coordinates(x, tet, carried)
+    place = wp.vec3d()
+    for n in range(4):
+        place += wp.float64(w[n]) * doubled(load_node(carried.rest, tet[n]))
+    return place
+
+
+@wp.func
+def sweep_point(k: int, pools: Pools, carried: Carried, edges: Edges, surface: Surface):
+    """Bind a point, and find from where to where at rest it has come; returns whether it has cut on its way.
+
+    Before it met the tissue and after it left it, the leaf that it met or left says where it was.
+    """
+    count = edges.x.shape[0]
+    former = edges.state[k]
+    left = edges.nodes[k]
+    start = surface.points[count + k]
+    end = adopt_point(k, pools, carried, edges)
+    state = edges.state[k]
+    swept = former != OUTSIDE and state != OUTSIDE
+    if (former != IN_TISSUE or state != IN_TISSUE) and wp.length(end - start) > wp.float64(JUMP * edges.size[k]):
+        swept = False
+    surface.points[count + k] = end
+    edges.last[k] = end
+    if not swept and state == IN_TISSUE:
+        start = continued(edges.former[k], edges.nodes[k], carried)
+        swept = True
+    elif not swept and former == IN_TISSUE:
+        edges.last[k] = continued(edges.x[k], left, carried)
+        swept = True
+    surface.points[k] = start
+    edges.former[k] = edges.x[k]
+    return swept
+
+
 @wp.kernel(enable_backward=False)
 def sweep(
     # In
+    begins: int,
     pools: Pools,
     carried: Carried,
     # In and out
     edges: Edges,
     surface: Surface,
 ):
-    """Bind the points, and find the strips that they have swept; one thread."""
+    """Bind the points, and find the strips that they have swept since the last time; one thread."""
     count = edges.x.shape[0]
     low = wp.vec3d(wp.float64(1.0e30))
     high = wp.vec3d(wp.float64(-1.0e30))
     for k in range(count):
-        edges.former[k] = edges.state[k]
-        surface.points[k] = surface.points[count + k]
-        surface.points[count + k] = adopt_point(k, pools, carried, edges)
+        # What ended the last strips begins the next ones, unless the point was outside.
+        edges.swept[k] = 0
+        if sweep_point(k, pools, carried, edges, surface) and begins == 0:
+            edges.swept[k] = 1
     for k in range(count):
-        swept = bool(False)
-        if edges.goes_on[k] == 1:
-            swept = has_swept(k, count, edges, surface) and has_swept(k + 1, count, edges, surface)
+        surface.points[2 * count + k] = edges.last[k]
         surface.triangles[2 * k] = wp.vec3i(k, k, k)
         surface.triangles[2 * k + 1] = wp.vec3i(k, k, k)
-        if swept:
-            surface.triangles[2 * k] = wp.vec3i(k, k + 1, count + k + 1)
-            surface.triangles[2 * k + 1] = wp.vec3i(k, count + k + 1, count + k)
+        if edges.goes_on[k] == 1 and edges.swept[k] == 1 and edges.swept[k + 1] == 1:
+            end = 2 * count + k
+            surface.triangles[2 * k] = wp.vec3i(k, k + 1, end + 1)
+            surface.triangles[2 * k + 1] = wp.vec3i(k, end + 1, end)
             for n in range(2):
-                for m in range(2):
-                    low = wp.min(low, surface.points[m * count + k + n])
-                    high = wp.max(high, surface.points[m * count + k + n])
+                low = wp.min(low, wp.min(surface.points[k + n], edges.last[k + n]))
+                high = wp.max(high, wp.max(surface.points[k + n], edges.last[k + n]))
     surface.bounds[0] = low
     surface.bounds[1] = high
-
-
-@wp.func
-def has_swept(k: int, count: int, edges: Edges, surface: Surface):
-    """Whether a point has come from one place at rest to another."""
-    if edges.former[k] == OUTSIDE or edges.state[k] == OUTSIDE:
-        return False
-    if edges.former[k] == IN_TISSUE and edges.state[k] == IN_TISSUE:
-        return True
-    return wp.length(surface.points[count + k] - surface.points[k]) <= wp.float64(JUMP * edges.size[k])
 
 
 @wp.func

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 #: Distance of points on an edge, and the largest motion between two cuts, over the size of an element there.
 SPACING, MOTION = 0.5, 0.25
 #: Arrays of edges from which a run goes on.
-KEPT = ("state", "nodes", "weights", "size", "push", "move", "dt", "work")
+KEPT = ("state", "former", "nodes", "weights", "size", "push", "move", "dt", "work")
 #: Passes that refine before each cut.
 REFINEMENTS = 3
 #: Cuts after which the stable step is found again at the latest.
@@ -69,12 +69,14 @@ class EdgePoints:
         edges.nodes = wp.zeros(total, dtype=wp.vec4i, device=self.device)
         edges.weights = wp.zeros(total, dtype=wp.vec4, device=self.device)
         edges.size = wp.zeros(total, dtype=wp.float32, device=self.device)
-        edges.state, edges.former = (wp.zeros(total, dtype=wp.int32, device=self.device) for _ in range(2))
+        edges.state, edges.swept = (wp.zeros(total, dtype=wp.int32, device=self.device) for _ in range(2))
+        edges.former = wp.zeros(total, dtype=wp.vec3, device=self.device)
+        edges.last = wp.zeros(total, dtype=wp.vec3d, device=self.device)
         edges.work = wp.zeros(len(rows), dtype=wp.float64, device=self.device)
         edges.modulus = changing.stiffest_modulus
         surface = self.surface = cut_kernels.Surface()
         surface.count = 2 * total
-        surface.points = wp.zeros(2 * total, dtype=wp.vec3d, device=self.device)
+        surface.points = wp.zeros(3 * total, dtype=wp.vec3d, device=self.device)
         surface.triangles = wp.zeros(2 * total, dtype=wp.vec3i, device=self.device)
         surface.bounds = wp.zeros(2, dtype=wp.vec3d, device=self.device)
         levels = [-1 if blade.level is None else blade.level for blade in blades]
@@ -102,10 +104,10 @@ class EdgePoints:
         self.changing.launch_cut(self.surface, REFINEMENTS if self.refines else 0)
         self.launch_binding(motions)
 
-    def launch_sweep(self, motions: Any) -> None:
-        """Launch the search for the strips that the edges have swept since the last one."""
+    def launch_sweep(self, motions: Any, *, begins: bool = False) -> None:
+        """Launch the search for the strips that the edges have swept since the last one; none if it ``begins``."""
         self._find(motions)
-        inputs = [self._pools, self._carried, self.edges, self.surface]
+        inputs = [int(begins), self._pools, self._carried, self.edges, self.surface]
         wp.launch(kernels.sweep, 1, inputs, device=self.device)
 
     def launch_binding(self, motions: Any) -> None:
@@ -252,7 +254,7 @@ class Blades(BladeMotion):
     def _sweep(self) -> None:
         """Let the blades begin where they are."""
         for each in self.of_bodies:
-            each.launch_sweep(self.motions)
+            each.launch_sweep(self.motions, begins=True)
 
 
 def _size(changing: Changing, blades: Sequence[Blade]) -> float:
