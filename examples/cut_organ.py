@@ -21,7 +21,7 @@ def lobe(x):
 
 
 organ = wc.Domain.from_function(lobe, bounds=[(-0.06, -0.04, -0.02), (0.06, 0.04, 0.02)])
-mesh = wc.TetForest.from_domain(organ, target_elements=2000)
+mesh = wc.TetForest.from_domain(organ, cell_size=0.02, max_level=5)
 tissue = wc.Isotropic(young=8e3, poisson=0.45, density=1060.0, toughness=3.0)
 body = wc.SoftBody(mesh, tissue, device=args.device)
 for side, pull in ((-1.0, "x < xmin + 0.02"), (1.0, "x > xmax - 0.02")):

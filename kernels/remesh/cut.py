@@ -405,6 +405,44 @@ def toughness_of(e: int, carried: Carried, cuts: Cuts):
     return cuts.toughness
 
 
+@wp.func
+def snap_face(
+    tet: wp.vec4i,
+    face: int,
+    normal: wp.vec3d,
+    t: int,
+    surface: Surface,
+    pools: Pools,
+    carried: Carried,
+):
+    """Note how far the nodes of a face are from the surface, which a leaf brings back to rest."""
+    offset = surface.offset
+    if t >= 0:
+        offset = wp.dot(normal, surface.points[surface.triangles[t][0]])
+    zero = wp.float64(0.0)
+    x = place_of(tet[0], surface.is_deformed, pools, carried)
+    at_rest = place_of(tet[0], zero, pools, carried)
+    now = wp.mat33d()
+    before = wp.mat33d()
+    for n in range(3):
+        edge = place_of(tet[n + 1], surface.is_deformed, pools, carried) - x
+        edge_at_rest = place_of(tet[n + 1], zero, pools, carried) - at_rest
+        for axis in range(3):
+            now[axis, n] = edge[axis]
+            before[axis, n] = edge_at_rest[axis]
+    volume = wp.determinant(now)
+    if volume == zero:
+        return
+    back = before * wp.inverse(now)
+    most = radius(tet, centroid(tet, zero, pools, carried), zero, pools, carried)
+    for n in range(3):
+        node = tet[face_node(face, n)]
+        away = offset - wp.dot(normal, place_of(node, surface.is_deformed, pools, carried))
+        move = back * (away * normal)
+        if wp.length(move) <= most:
+            carried.snap[node] = wp.vec4(float(move[0]), float(move[1]), float(move[2]), 0.0)
+
+
 @wp.kernel(enable_backward=False)
 def count_faces(
     # In
@@ -430,6 +468,7 @@ def count_faces(
                 part = shared_area(tet, f % 4, normal, surface, pools, carried)
                 part *= wp.float64(0.5 * (filled(i, pools, carried) + filled(cuts.stars[s], pools, carried)))
                 area += part
+                snap_face(tet, f % 4, normal, t, surface, pools, carried)
                 wp.atomic_add(cuts.counts, FACES, 1)
                 if t >= 0:
                     both = toughness_of(pools.leaves[i], carried, cuts)

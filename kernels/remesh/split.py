@@ -137,6 +137,7 @@ def copy_node(node: int, new: int, pools: Pools, carried: Carried):
     store_node(carried.v, new, load_node(carried.v, node))
     store_node(carried.load, new, load_node(carried.load, node))
     store_node(carried.reaction, new, load_node(carried.reaction, node))
+    store_node(carried.snap, new, load_node(carried.snap, node))
     carried.held[new] = carried.held[node]
     carried.row[new] = carried.row[node]
     carried.mass[new] = wp.float64(0.0)

@@ -41,6 +41,7 @@ class Carried:
     v: wp.array[wp.vec4]
     load: wp.array[wp.vec4]
     reaction: wp.array[wp.vec4]  # force of the support on a held node [N]
+    snap: wp.array[wp.vec4]  # from a node on a cut to the surface that cut there, at rest [m]
     mass: wp.array[wp.float64]
     held: wp.array[wp.uint8]
     row: wp.array[wp.int32]  # the row of keyframes that a held node follows, NO_ROW, or MIXED_ROWS
@@ -149,6 +150,7 @@ def make_node(
     store_node(carried.reaction, z, wp.vec3())
     store_node(carried.u, z, 0.5 * (load_node(carried.u, a) + load_node(carried.u, b)))
     store_node(carried.load, z, wp.vec3())
+    store_node(carried.snap, z, 0.5 * (load_node(carried.snap, a) + load_node(carried.snap, b)))
     va = load_node(carried.v, a)
     vb = load_node(carried.v, b)
     velocity = 0.5 * (va + vb)
@@ -198,6 +200,7 @@ def wipe_node(z: int, carried: Carried):
     store_node(carried.v, z, wp.vec3())
     store_node(carried.load, z, wp.vec3())
     store_node(carried.reaction, z, wp.vec3())
+    store_node(carried.snap, z, wp.vec3())
 
 
 @wp.func
@@ -213,6 +216,7 @@ def move_node(z: int, place: int, carried: Carried):
     store_node(carried.v, place, load_node(carried.v, z))
     store_node(carried.load, place, load_node(carried.load, z))
     store_node(carried.reaction, place, load_node(carried.reaction, z))
+    store_node(carried.snap, place, load_node(carried.snap, z))
     wipe_node(z, carried)
 
 

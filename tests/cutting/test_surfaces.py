@@ -69,6 +69,25 @@ def test_the_surface_of_a_cut_body_is_closed(device):
         assert len(np.unique(piece[surface.nodes[points]][surface.weights[points] != 0.0])) == 1
 
 
+def test_lips_are_as_flat_as_the_plane(device):
+    """Although the faces that were separated are not: they are drawn where the cut went, in rest space and beyond it."""
+    for turned in (False, True):
+        body = organ(device)
+        body.release(np.arange(body.node_count))
+        sim = wc.Simulation(body, gravity=(0, 0, 0))
+        turn = np.array([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]]) if turned else np.eye(3)
+        body.positions = 1.1 * body.mesh.points @ turn.T
+        area = sim.cut(PLANE) * 1.1**2
+        surface = body.mesh.surface()
+        assert_closed(surface.triangles)
+        x = surface.moved(body.displacements.numpy())
+        size = 0.25 * 2.0 ** (-7 / 3)
+        lips = (np.abs(x @ PLANE.normal - PLANE.offset)[surface.triangles] < 0.1 * size).all(axis=1)
+        a, b, c = np.moveaxis(x[surface.triangles[lips]], 1, 0)
+        found = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+        assert found == pytest.approx(2.0 * area, rel=0.06)
+
+
 def test_lips_that_touch_carry_as_if_they_were_whole(device):
     """A body that is cut across its weight sags as the uncut one does."""
     sags = []
@@ -87,7 +106,7 @@ def test_lips_that_touch_carry_as_if_they_were_whole(device):
     assert len(body.contact_pressure) == len(body.contact_surface.triangles)
     assert_closed(body.contact_surface.triangles)
     assert sags[0] < -0.005
-    assert sags[1] == pytest.approx(sags[0], rel=0.02)
+    assert sags[1] == pytest.approx(sags[0], rel=0.05)
 
 
 @pytest.mark.parametrize("make", [organ, None])

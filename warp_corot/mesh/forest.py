@@ -57,6 +57,7 @@ class TetForest(ForestArrays):
         labels: Each leaf's label, its place in ``label_names`` plus one, 0 for none, int32 [T]; None: no labels.
         node_labels: Labels at all lattice points; points outside have the label of the nearest part of the body.
         label_names: Names of the labels.
+        snap: From each node on a cut to the surface that cut there [m], float32 [N, 3]; None: nothing was cut.
         detail: The parts of the body's surface that were resolved more finely than the mesh; None: there are none.
     """
 

@@ -35,6 +35,7 @@ class ForestArrays:
     node_labels: np.ndarray | None = None
     label_names: tuple[str, ...] = ()
     detail: Detail | None = None
+    snap: np.ndarray | None = None
     #: Groups of leaves that share a dilatation, int32 [T], if a larger forest gives them; None: they are found when
     #: needed.
     leaf_groups: np.ndarray | None = None

@@ -36,6 +36,7 @@ def exported(device: DeviceForest) -> TetForest:
         tree=new_tree,
         phi=None if source.phi is None else _from_ends(source.phi, known, new_ends, first=False),
         node_labels=None if source.node_labels is None else _from_ends(source.node_labels, known, new_ends, first=True),
+        snap=None if tree.cut is None else carriage.arrays.snap.numpy()[order, :3],
         fill=None if source.fill is None else carriage.values("fill")[leaves].astype(np.float64),
         labels=None if source.labels is None else carriage.arrays.label.numpy()[leaves],
     )

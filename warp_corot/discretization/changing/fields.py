@@ -16,6 +16,7 @@ CARRIED_BY_NODES: tuple[str, ...] = (
     "v",
     "load",
     "reaction",
+    "snap",
     "mass",
     "held",
     "row",

@@ -94,10 +94,12 @@ class Carriage:
         arrays.mass = wp.array(masses, dtype=wp.float64, device=self.device)
         arrays.mass32 = wp.array(masses, dtype=wp.float32, device=self.device)
         arrays.inverse_mass = wp.zeros(self._nodes, dtype=wp.float32, device=self.device)
-        for name in ("u", "v", "load", "reaction"):
+        for name in ("u", "v", "load", "reaction", "snap"):
             setattr(arrays, name, wp.zeros(self._nodes, dtype=wp.vec4, device=self.device))
         rest = np.zeros((self._nodes, 4), np.float32)
         rest[: self._first_nodes] = padded(source.points)
+        if source.snap is not None:
+            arrays.snap[: self._first_nodes].assign(padded(source.snap[: self._first_nodes]))
         arrays.rest = wp.array(rest, dtype=wp.vec4, device=self.device)
         arrays.held = wp.zeros(self._nodes, dtype=wp.uint8, device=self.device)
         arrays.row = wp.full(self._nodes, int(NO_ROW), dtype=wp.int32, device=self.device)

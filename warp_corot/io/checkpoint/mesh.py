@@ -14,8 +14,8 @@ from warp_corot.mesh.growing.detail import Detail
 DETAIL = ("points", "tets", "phi", "labels", "sharp_points", "sharp_triangles")
 #: Fields of trees.
 OF_TREE = tuple(field.name for field in dataclasses.fields(Tree))
-#: Fields of forests that were made from a domain.
-OF_DOMAIN = ("phi", "fill", "labels", "node_labels")
+#: Fields of forests that were made from a domain, or cut.
+OF_DOMAIN = ("phi", "fill", "labels", "node_labels", "snap")
 
 
 def pack_mesh(mesh: TetForest | TetMesh, prefix: str, arrays: dict[str, np.ndarray]) -> dict[str, Any]:

@@ -167,10 +167,10 @@ class BoundSkins:
 
 
 def _bound_anew(skin: Skin, mesh: Any) -> Skin:
-    if skin.is_boundary:
-        surface = boundary_surface(mesh)
-    elif skin.is_cut and mesh.tree.cut is not None:
+    if skin.changes and mesh.tree.cut is not None:
         surface = mesh.surface()
+    elif skin.is_boundary:
+        surface = boundary_surface(mesh)
     else:
         surface = _rebound(skin.surface, mesh)
     return replace(skin, surface=surface)

@@ -16,7 +16,7 @@ from warp_corot.mesh.pieces import pieces_of
 
 from .bound import SurfaceMesh
 from .boundary import boundary_faces
-from .embedding import embed
+from .embedding import barycentric, embed
 from .marching import marched, marched_cut
 from .separating import separated
 
@@ -26,10 +26,11 @@ Forest = TypeVar("Forest", bound=ForestArrays)
 def surface(forest: ForestArrays) -> SurfaceMesh:
     """See `TetForest.surface`."""
     if forest.phi is None:
-        return boundary_surface(forest)
+        return _snapped(forest, boundary_surface(forest))
     if forest.tree.cut is not None:
         # Elements that were left out have no side of a cut.
-        found = marched_cut(forest.points, forest.tets[(forest.phi[forest.tets] < 0).any(axis=1)], forest.phi)
+        inside = forest.tets[(forest.phi[forest.tets] < 0).any(axis=1)]
+        found = _snapped(forest, marched_cut(forest.points, inside, forest.phi))
     elif forest.detail is not None:
         found = _embedded(forest, forest.detail.surface())
     else:
@@ -101,6 +102,28 @@ def _all_cut(forest: ForestArrays) -> np.ndarray:
     assert forest.phi is not None
     tets = forest.tree.tets[forest.tree.first_child < 0]
     return tets[(forest.phi[tets] < 0).any(axis=1)]
+
+
+def _snapped(forest: ForestArrays, found: SurfaceMesh) -> SurfaceMesh:
+    """The surface with points on cuts where the cuts went, bound to an element on their side."""
+    if forest.snap is None:
+        return found
+    moves = np.einsum("vn,vnc->vc", found.weights, forest.snap[found.nodes].astype(np.float64))
+    points = np.flatnonzero(np.abs(moves).max(axis=1) > 0.0)
+    if not len(points):
+        return found
+    # An element that has both nodes of a point's edge: edges are of one side.
+    ends = np.sort(found.nodes[points][:, :2], axis=1).astype(np.int64)
+    ends[found.weights[points, 1] == 0.0, 1] = ends[found.weights[points, 1] == 0.0, 0]
+    pairs = np.array([(a, b) for a in range(4) for b in range(4)])
+    edges = np.sort(forest.tets[:, pairs], axis=2).reshape(-1, 2).astype(np.int64)
+    keys, first = np.unique(edges[:, 0] << 32 | edges[:, 1], return_index=True)
+    elements = first[np.searchsorted(keys, ends[:, 0] << 32 | ends[:, 1])] // len(pairs)
+    x, nodes, weights = found.points.copy(), found.nodes.copy(), found.weights.copy()
+    x[points] += moves[points]
+    nodes[points] = forest.tets[elements]
+    weights[points] = barycentric(forest, elements, x[points])
+    return replace(found, points=x, nodes=nodes, weights=weights)
 
 
 def _embedded(forest: ForestArrays, found: SurfaceMesh) -> SurfaceMesh:
