@@ -33,9 +33,10 @@ SIDE_SHIFT = wp.constant(4)
 
 @wp.struct
 class Surface:
-    """A plane, or triangles wound alike, at rest or in the deformed body."""
+    """A plane, or triangles wound alike, at rest or in the deformed body; or the stress that faces bear."""
 
     is_deformed: wp.float64  # 1: where nodes are now; 0: where they are at rest
+    stress: float  # above which faces tear [Pa]; zero for planes and triangles
     normal: wp.vec3d  # of the plane; without triangles
     offset: wp.float64
     count: int  # number of triangles
@@ -57,6 +58,7 @@ class Cuts:
     fresh: wp.array[wp.int32]  # [stars] faces cut now
     # Faces: of star s and opposite to its node n at 4 s + n.
     slot: wp.array[wp.int32]  # in the table; -1 for none
+    pull: wp.array[wp.float32]  # stress across it [Pa]
     other: wp.array[wp.int32]  # the same face of the other leaf, -1 if there is none
     keys: wp.array[wp.int64]
     owner: wp.array[wp.int32]  # [slots] the face that came first, -1
@@ -372,7 +374,7 @@ def mark_face(tet: wp.vec4i, face: int, carried: Carried, cuts: Cuts):
 
 @wp.func
 def shared_area(tet: wp.vec4i, face: int, normal: wp.vec3d, surface: Surface, pools: Pools, carried: Carried):
-    """The area of the surface that a face stands for, at rest: that of its projection."""
+    """The area of the surface that a face stands for, at rest: that of its projection, or its own if it tears."""
     a = tet[face_node(face, 0)]
     b = tet[face_node(face, 1)]
     c = tet[face_node(face, 2)]
@@ -384,6 +386,8 @@ def shared_area(tet: wp.vec4i, face: int, normal: wp.vec3d, surface: Surface, po
         x = place_of(a, surface.is_deformed, pools, carried)
         y = place_of(b, surface.is_deformed, pools, carried)
         now = wp.cross(y - x, place_of(c, surface.is_deformed, pools, carried) - x)
+    if surface.stress > 0.0:
+        return wp.float64(0.5) * wp.length(at_rest)
     size = wp.length(now)
     if size == zero:
         return zero
@@ -465,10 +469,13 @@ def count_faces(
                 i = cuts.stars[cuts.other[f] / 4]
                 q = centroid(pools.leaf_tets[i], surface.is_deformed, pools, carried)
                 normal, t = crossing(p, q, surface)
+                if surface.stress > 0.0:
+                    normal = wp.vec3d()
                 part = shared_area(tet, f % 4, normal, surface, pools, carried)
                 part *= wp.float64(0.5 * (filled(i, pools, carried) + filled(cuts.stars[s], pools, carried)))
                 area += part
-                snap_face(tet, f % 4, normal, t, surface, pools, carried)
+                if surface.stress == 0.0:
+                    snap_face(tet, f % 4, normal, t, surface, pools, carried)
                 wp.atomic_add(cuts.counts, FACES, 1)
                 if t >= 0:
                     both = toughness_of(pools.leaves[i], carried, cuts)

@@ -167,6 +167,29 @@ def test_remeshing_goes_on_after_a_cut(device):
     assert_cut_sound(body.changing.forest)
 
 
+def test_a_bar_tears_where_it_is_pulled_too_hard(device):
+    """Beyond a stress, but not below it; from a notch, and at once only where it is pulled most."""
+    areas, pieces = [], []
+    for bound in (1e5, 6e3):
+        body = bar(device)
+        # The slit cuts a fifth of the height.
+        blade = wc.Blade([(0, 0, -0.01), (0, 0, 0.06)], position=(0.101, 0.055, 0))
+        blade.follow([0.0, 0.015, 0.03], [(0.101, 0.055, 0), (0.101, 0.042, 0), (0.101, 0.07, 0)])
+        body.prescribe("x == xmax", times=[0.03, 0.23], displacements=[[0, 0, 0], [0.03, 0, 0]])
+        sim = wc.Simulation(body, gravity=(0, 0, 0), cuts=[blade], integrator=wc.SymplecticEuler(damping=30.0))
+        sim.advance(0.03)
+        slit = body.cut_area
+        assert 0.0 < slit < 0.001
+        sim.on_step(lambda sim, bound=bound: sim.tear(bound), every=5)
+        sim.advance(0.25)
+        assert_cut_sound(body.changing.forest)
+        areas.append(body.cut_area - slit)
+        pieces.append(body.pieces)
+    assert areas[0] == 0.0
+    assert 0.5 * 0.05**2 < areas[1] < 3.0 * 0.05**2  # faces that tear are not in one plane
+    assert pieces[0] == 1 < pieces[1]
+
+
 def test_what_cannot_be_cut_is_said_in_one_line(device):
     mesh = wc.TetForest.box((1, 1, 1), 0.05, 3)
     material = wc.Isotropic(3e4, 0.4, 1000.0)
@@ -185,3 +208,7 @@ def test_what_cannot_be_cut_is_said_in_one_line(device):
     with pytest.raises(wc.InputError, match="only a body in one world"):
         worlds.cut(wc.Plane((1, 0, 0), 0.02))
     assert sim.cut(wc.Plane((1, 0, 0), 7.0)) == 0.0
+    for stress in (0.0, -1.0, np.nan, "a"):
+        with pytest.raises(wc.InputError, match="stress is"):
+            sim.tear(stress)
+    assert sim.tear(1e3) == 0.0

@@ -70,7 +70,7 @@ def test_the_surface_of_a_cut_body_is_closed(device):
 
 
 def test_lips_are_as_flat_as_the_plane(device):
-    """Although the faces that were separated are not: they are drawn where the cut went, in rest space and beyond it."""
+    """Although the faces that were separated are not: lips are drawn where the cut went."""
     for turned in (False, True):
         body = organ(device)
         body.release(np.arange(body.node_count))

@@ -143,12 +143,18 @@ class Changing:
         """Make one pass over the mesh, and update what depends on the mesh if it has changed."""
         self.change(self._launch, self._graph)
 
-    def cut(self, surface: Surface) -> float:
-        """Cut the body along a surface, and update what depends on the mesh; returns the area [m^2] at rest."""
+    def cut(self, surface: Surface | float) -> float:
+        """Cut the body along a surface, or where the stress is above a number [Pa], and update what depends on it.
+
+        Returns the area [m^2] at rest.
+        """
         assert self.cuts is not None
         before = self.cut_area
         self._read_user()
-        self.cuts.launch_cut(surface)
+        if isinstance(surface, float):
+            self.cuts.launch_tear(surface, self.passes.contents)
+        else:
+            self.cuts.launch_cut(surface)
         self._launch_derived()
         self._look()
         return self.cut_area - before

@@ -108,8 +108,8 @@ class Remeshing:
             self._say_full(changing)
         return bool(due)
 
-    def cut(self, surface: Surface, number: int | None = None) -> float:
-        """Cut all bodies, or one, along a surface; returns the area [m^2] at rest.
+    def cut(self, surface: Surface | float, number: int | None = None) -> float:
+        """Cut all bodies, or one, along a surface or where the stress is above a number [Pa]; returns the area [m^2].
 
         Warns:
             CapacityWarning: As ``run``.

@@ -29,6 +29,7 @@ from warp_corot.inputs.checks import checked_count, checked_flag, checked_number
 from warp_corot.inputs.loading import CONTACT, IMPLICIT, STEPS, STEPS_ON_CPU, load
 from warp_corot.inputs.simulation_lock import SIMULATION_LOCK, under_lock
 from warp_corot.kernels.elements.elements import ForestElements
+from warp_corot.kernels.remesh.cut import Surface
 from warp_corot.kernels.stepping.gauge import find_strains
 from warp_corot.remesh.online import OnlineRemesh
 from warp_corot.remesh.remeshing import Remeshing
@@ -465,9 +466,36 @@ class Simulation(Clock):
             CapacityWarning: The mesh has no room left for the nodes of a cut; once.
         """
         found = checked_plane(plane)
+        return self._cut(plane_surface(found.normal, found.offset, is_deformed=True), body)
+
+    @under_lock
+    def tear(self, stress: float, body: SoftBody | None = None) -> float:
+        """Separate faces of elements across which bodies are pulled too hard, at once.
+
+        Of all faces of an element only the one that is pulled most tears in a call, so that tears run:
+        ``sim.on_step(lambda sim: sim.tear(2e4), every=10)``.
+
+        Args:
+            stress: The largest normal stress that a face bears, second Piola-Kirchhoff of an isotropic law [Pa].
+            body: The body; None: all.
+
+        Returns:
+            The area that has come apart, at rest [m^2].
+
+        Raises:
+            InputError: The stress is not positive, or as ``cut``.
+
+        Warns:
+            CapacityWarning: As ``cut``.
+        """
+        if not 0.0 < checked_number(stress, "stress", "Pa") < math.inf:
+            raise InputError(f"stress is {stress}; it must be a positive number [Pa]")
+        return self._cut(float(stress), body)
+
+    def _cut(self, surface: Surface | float, body: SoftBody | None) -> float:
         number = None if body is None else self._index(body)
         self._prepare_cuts()
-        area = self.remeshing.cut(plane_surface(found.normal, found.offset, is_deformed=True), number)
+        area = self.remeshing.cut(surface, number)
         if area > 0.0:
             self._follow_cut()
             self.guard.forget()

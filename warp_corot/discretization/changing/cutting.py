@@ -10,6 +10,8 @@ import warp as wp
 
 from warp_corot.kernels.remesh import cut as cut_kernels
 from warp_corot.kernels.remesh import split as split_kernels
+from warp_corot.kernels.remesh import tear as tear_kernels
+from warp_corot.kernels.remesh.mark import Contents
 
 from .pools import DeviceForest
 
@@ -34,6 +36,7 @@ class CutPass:
         cuts.room = room
         cuts.stars, cuts.fresh = self._ints(room, 0), self._ints(room, 0)
         cuts.slot, cuts.other, cuts.link, cuts.copy = (self._ints(4 * room, -1) for _ in range(4))
+        cuts.pull = wp.zeros(4 * room, dtype=wp.float32, device=self.device)
         # Two leaves share a face; half of the table stays empty.
         size = 1 << (8 * room).bit_length()
         cuts.keys = wp.full(size, wp.int64(-1), dtype=wp.int64, device=self.device)
@@ -55,9 +58,24 @@ class CutPass:
         self._once(cut_kernels.begin_cut, int(goes_on), pools, cuts)
         self._many(cut_kernels.list_near, surface, carried, pools, cuts)
         self._many(cut_kernels.cross_faces, surface, carried, pools, cuts)
-        self._many(cut_kernels.join_lone, pools, cuts)
-        self._many(cut_kernels.count_faces, surface, carried, pools, cuts)
-        self._launch_split()
+        self._launch_end(surface)
+
+    def launch_tear(self, stress: float, contents: Contents) -> None:
+        """Launch a tear: the separation of faces across which the stress [Pa] is larger.
+
+        Args:
+            stress: The bound.
+            contents: The material of leaves.
+        """
+        pools, carried, cuts = self.forest.pools, self.forest.carriage.arrays, self._cuts
+        surface = cut_kernels.Surface()
+        surface.stress = stress
+        self._once(cut_kernels.begin_cut, 0, pools, cuts)
+        self._many(tear_kernels.list_all, pools, cuts)
+        self._many(tear_kernels.pull_faces, contents, carried, pools, cuts)
+        self._many(tear_kernels.choose_faces, surface, pools, cuts)
+        self._many(tear_kernels.tear_faces, pools, cuts)
+        self._launch_end(surface)
 
     def launch_marks(self, surface: cut_kernels.Surface) -> None:
         """Launch the marks of leaves at triangles that are to be refined to their levels."""
@@ -76,6 +94,13 @@ class CutPass:
         return int(self._cuts.counts.numpy()[cut_kernels.FACES])
 
     # --- pieces ------------------------------------------------------------------------------------------------------
+
+    def _launch_end(self, surface: cut_kernels.Surface) -> None:
+        """Launch what follows when faces have been cut."""
+        pools, carried, cuts = self.forest.pools, self.forest.carriage.arrays, self._cuts
+        self._many(cut_kernels.join_lone, pools, cuts)
+        self._many(cut_kernels.count_faces, surface, carried, pools, cuts)
+        self._launch_split()
 
     def _launch_split(self) -> None:
         pools, carried, cuts = self.forest.pools, self.forest.carriage.arrays, self._cuts

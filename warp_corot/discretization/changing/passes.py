@@ -41,6 +41,9 @@ class RemeshPass:
         parameters: Numbers for the criterion, float32 [n] on the device, which may change between passes.
         lame: Lamé's parameters for the criterion [Pa], or the names under which elements carry them.
 
+    Attributes:
+        contents: The material of leaves, ``kernels.remesh.mark.Contents``.
+
     Raises:
         InputError: The thresholds contradict each other, or the levels are out of order or beyond the lattice's depth.
     """
@@ -67,7 +70,7 @@ class RemeshPass:
         self._mark = marking_kernel(checked_criterion(criterion))
         self._origin = wp.vec3d(*forest.source.origin)
         self._spacing = lattice_spacing(forest.source.cell_size)
-        self._contents = self._make_contents(lame)
+        self.contents = self._make_contents(lame)
         self._edges = self._make_edges()
         self._blocks = self._make_blocks()
         self._removal = self._make_removal()
@@ -112,7 +115,7 @@ class RemeshPass:
         if not marked:
             refine_above, simplify_below = self.thresholds
             inputs = [refine_above, simplify_below, self._origin, self._spacing, carried.u, self.parameters]
-            self._many(self._mark, *inputs, self._contents, pools)
+            self._many(self._mark, *inputs, self.contents, pools)
         self._many(remesh_edges.want_marked, self.levels[1], pools, edges)
         self._many(remesh_blocks.clear_blocks, pools, self._blocks)
         self._many(remesh_blocks.list_blocks, pools, self._blocks)
