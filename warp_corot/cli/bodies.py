@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -179,6 +179,8 @@ def _material(
         material = label_material(subject.mesh, subject.labels, young, poisson, density)
     else:
         material = Isotropic(young, poisson, density)
+    if args.toughness is not None:
+        material = replace(material, toughness=args.toughness)
     if args.region:
         material = region_material(subject.mesh, patches.tetrahedra, args.region, material)
     return material, chosen

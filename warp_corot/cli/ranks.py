@@ -88,7 +88,7 @@ def hands_out(options: Sequence[argparse.Namespace]) -> bool:
     from .implicit import integrator_name, is_static
 
     args = options[0]
-    touches = (args.tool, args.tool_path, args.drop, args.touch, args.self_contact)
+    touches = (args.tool, args.tool_path, args.blade, args.drop, args.touch, args.self_contact)
     whole = any(each.remesh or each.rotation_level is not None for each in options)
     implicit = is_static(args) or INTEGRATORS[integrator_name(args)].is_implicit
     return are_several() and args.ground is None and not any(touches) and not whole and not implicit

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 
 from warp_corot.body.soft_body import SoftBody
+from warp_corot.cutting.blade import Blade
+from warp_corot.errors import InputError
 from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import INTEGRATORS, Integrator, SymplecticEuler
 
@@ -20,7 +22,11 @@ from .options.defaults import IMPLICIT_DT
 from .ranks import WaitingRanks, are_several, led_simulation, one_first
 from .remesh import ARGUMENTS
 from .static import check_static, static_integrator
+from .tool_paths import make_blade
 from .touching import RunContact
+
+#: Length of a blade over the size of the largest body, unless the user says.
+LONG = 3.0
 
 
 def make_simulation(
@@ -50,6 +56,7 @@ def make_simulation(
             tried = min(_tried_step(body, damping, viscosity) for body in bodies)
         steps = steps_per_frame(args.fps, args.dt or tried)  # refuses an excessive number
         integrator = SymplecticEuler(None if args.dt is None else 1.0 / (args.fps * steps), damping, viscosity)
+    cuts = blades_of(args, bodies)
     with as_options(ARGUMENTS):
         make: Any = led_simulation if are_several() else Simulation
         made: Simulation = (make if others is None else others.simulation)(
@@ -60,8 +67,21 @@ def make_simulation(
             remesh=[body.remesh for body in bodies] if any(body.remesh for body in bodies) else None,
             obstacles=list(touched.obstacles.values()),
             contact=touched.contact,
+            **({"cuts": cuts} if cuts else {}),
         )
         return made
+
+
+def blades_of(args: argparse.Namespace, bodies: Sequence[RunBody]) -> list[Blade]:
+    """The blades of ``--blade``.
+
+    Raises:
+        InputError: A file is no path, or there is a length and no blade.
+    """
+    if not args.blade and args.blade_length is not None:
+        raise InputError("--blade-length is for --blade, which is not given")
+    size = max(float(np.ptp(body.subject.mesh.points, axis=0).max()) for body in bodies)
+    return [make_blade(path, args.blade_length or LONG * size) for path in args.blade or ()]
 
 
 def _tried_step(one: RunBody, damping: float, viscosity: float) -> float:

@@ -112,6 +112,8 @@ def _happening(bodies: Sequence[RunBody], heavy: bool) -> list[str]:
     words += [word for kind, word in DONE.items() if kind in kinds]
     if args.tool:
         words.append("pressed by a tool" if len(args.tool) == 1 else f"pressed by {len(args.tool)} tools")
+    if args.blade:
+        words.append("cut by a blade" if len(args.blade) == 1 else f"cut by {len(args.blade)} blades")
     if args.drop is not None:
         words.append("dropped on a ground")
     elif args.ground is not None:

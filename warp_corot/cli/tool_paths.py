@@ -8,12 +8,14 @@ import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from warp_corot.contact.shapes import Box, Capsule, Cylinder, Shape, Sphere
 from warp_corot.contact.tool import Tool
+from warp_corot.cutting.blade import Blade
 from warp_corot.domain.units import in_units
 from warp_corot.errors import InputError
 
@@ -27,6 +29,7 @@ COLUMNS = f"{', '.join(POSITION)}, and for turns also {', '.join(TURN)}"
 _HEADER = re.compile(r"\s*([A-Za-z_]+)\s*(?:[\[(]\s*([^\])]+?)\s*[\])])?\s*")
 
 Floats = npt.NDArray[np.float64]
+AnyTool = TypeVar("AnyTool", bound=Tool)
 
 
 @dataclass(frozen=True)
@@ -94,8 +97,11 @@ def make_tool(shape: ToolShape, path: Path) -> Tool:
     Raises:
         InputError: The file cannot be read, or its rows are not a path.
     """
+    return _moved(Tool(shape.make()), path)
+
+
+def _moved(tool: AnyTool, path: Path) -> AnyTool:
     times, positions, turns = read_tool_path(path)
-    tool = Tool(shape.make())
     try:
         if len(times) == 1:
             tool.move(positions[0], None if turns is None else turns[0])
@@ -104,6 +110,11 @@ def make_tool(shape: ToolShape, path: Path) -> Tool:
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     return tool
+
+
+def make_blade(path: Path, length: float) -> Blade:
+    """A straight blade of this length [m] that moves along the path in a file; see ``make_tool``."""
+    return _moved(Blade([(0.0, 0.0, -0.5 * length), (0.0, 0.0, 0.5 * length)]), path)
 
 
 def read_tool_path(path: Path) -> tuple[Floats, Floats, Floats | None]:

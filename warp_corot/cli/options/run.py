@@ -82,6 +82,7 @@ class BodyOptions:
         young (E): Young's modulus [Pa] (default: {STIFFNESS_PER_WEIGHT:g} times density, gravity and height, so that a
             body sags visibly and stands)
         poisson (NU): Poisson's ratio (default: 0.45)
+        toughness (G): energy that a cut takes [J/m^2] (default: 0)
         density (RHO): mass density [kg/m^3] (default: 1000)
         materials (LIST): materials of the file's regions (physical groups, sets or cell data) or of a scan's labels,
             for example liver=3kPa:0.45,vessel@4=30kPa; everything else has --young, --poisson and --density
@@ -109,6 +110,7 @@ class BodyOptions:
     up: str | None = one_of("Y", "Z", type=str.upper)
     young: Pressure | None = None
     poisson: Number | None = None
+    toughness: Number | None = None
     density: Density | None = None
     materials: str | None = None
     regions_by: str | None = None
@@ -212,6 +214,9 @@ class ContactOptions:
             times
         tool_path (PATH.csv): how the tool moves: rows of time [s], x, y, z of its centre [m] and, if it turns,
             quaternions qx, qy, qz, qw; one row for a tool that stays; one path for each --tool, in the same order
+        blade (PATH.csv): cut with a straight edge, along z about its centre, which moves as --tool-path says; can be
+            given several times
+        blade_length (L): length of blades [m] (default: three times the body's size)
         touch: let the bodies touch one another; always on with a ground or a tool
         self_contact: let the bodies touch themselves, too
         friction (MU): coefficient of friction of all contacts (default: 0.3)
@@ -224,6 +229,8 @@ class ContactOptions:
     drop: Metres | None = None
     tool: list[Tool] | None = None
     tool_path: list[Path] | None = None
+    blade: list[Path] | None = None
+    blade_length: Metres | None = None
     touch: bool = False
     self_contact: bool = False
     friction: Number | None = None

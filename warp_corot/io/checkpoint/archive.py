@@ -82,7 +82,7 @@ def save_checkpoint(sim: Simulation, path: str | PathLike[str]) -> None:
     packed = zip(sim.bodies, sim.models, sim.fields, sim.remeshing.changing, strict=True)
     for number, (body, model, field, changing) in enumerate(packed):
         header["bodies"].append(pack_body(body, model, field, changing, f"body{number}.", arrays))
-    header["cuts"] = pack_blades(sim, arrays)
+    header["cuts"] = pack_blades(sim.blades, arrays) if sim.remeshing.are_cut else None
     header["contact"] = pack_contact(sim.contact, sim.grasps, arrays)
     arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
     write_archive(target, arrays)

@@ -19,7 +19,6 @@ from warp_corot.errors import InputError
 
 if TYPE_CHECKING:
     from warp_corot.cutting.blades import Blades
-    from warp_corot.simulation.simulation import Simulation
 
 Arrays = dict[str, np.ndarray]
 
@@ -104,11 +103,8 @@ def unpack_contact(contacts: Contacts | None, described: dict[str, Any] | None, 
             array.assign(arrays[f"grasp{k}.{name}"])
 
 
-def pack_blades(sim: Simulation, arrays: Arrays) -> dict[str, Any] | None:
-    """Put the blades of a simulation into arrays; returns the remaining data for JSON, None if bodies cannot be cut."""
-    if not sim.remeshing.are_cut:
-        return None
-    blades = sim.blades
+def pack_blades(blades: Blades | None, arrays: Arrays) -> dict[str, Any]:
+    """Put the blades of a simulation whose bodies can be cut into arrays; returns the remaining data for JSON."""
     if blades is None:
         return {"blades": []}
     arrays |= {f"blades.{name}": array.numpy() for name, array in blades.kept.items()}
