@@ -69,7 +69,7 @@ template <class Material> struct Prony {
     const Material& material;
     template <class Nodes> COROT_INLINE void begin(const Nodes&) {}
 
-    const float* known(int block, int i) const {
+    COROT_INLINE const float* known(int block, int i) const {
         return material.known.data + (6 * block + i) * static_cast<unsigned long long>(material.count);
     }
 

@@ -15,7 +15,7 @@ template <class Subtrees> struct Leaf {
     const masks8 excluded;
     Frame<lanes8> frame;
     COROT_INLINE lanes8 weight() const { return of.area; }
-    COROT_INLINE int element(int lane) const { return of.units.first.data[of.place(lane)] + number; }
+    COROT_INLINE int element(int lane) const { return of.starts[lane] + number; }
     COROT_INLINE masks8 done() const { return excluded; }
     COROT_INLINE lanes8 values_of(const float* values) const {
         return gather_one([&](int lane) { return values + element(lane); });
@@ -45,6 +45,7 @@ template <class Type, class Units_> struct EightSubtrees {
     const int first, count, end;
     Frame<lanes8> frame;
     lanes8 h, area;
+    int starts[8];  // the first leaf of each among the mesh's elements
     triple<lanes8> x[10], axes[Type::AXES_COUNT];
     template <class Vectors>
     COROT_INLINE EightSubtrees(const Units_& units, int block, int count, const Vectors& u)
@@ -55,6 +56,7 @@ template <class Type, class Units_> struct EightSubtrees {
         // Stresses of a leaf times this add up to forces.
         area = VOLUME[Type::SHAPE] * h * h;
         gather_nodes(u, x);
+        for (int lane = 0; lane < 8; ++lane) starts[lane] = units.first.data[place(lane)];
         for (int i = 0; i < Type::AXES_COUNT; ++i)
             axes[i] = frame.q[0] * Type::AXES[i][0] + frame.q[1] * Type::AXES[i][1] + frame.q[2] * Type::AXES[i][2];
     }
@@ -86,7 +88,7 @@ template <class Type, class Units_> struct EightSubtrees {
         if (!any(left_out)) return;
         for (int lane = 0; lane < end; ++lane)
             for (int number = 0; number < 8; ++number)
-                if (left_out[lane] >> number & 1) list.data[++list.data[0]] = units.first.data[first + lane] + number;
+                if (left_out[lane] >> number & 1) list.data[++list.data[0]] = starts[lane] + number;
     }
     // Says which leaves were left out, a byte a subtree.
     template <class Bytes> COROT_INLINE void flag(const masks8& left_out, const Bytes& flags) const {
