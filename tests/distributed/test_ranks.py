@@ -61,6 +61,15 @@ def test_all_cases_are_the_same_on_seven_ranks(tmp_path):
 
 
 @pytest.mark.slow
+def test_three_ranks_go_on_from_checkpoints_of_four(tmp_path):
+    made_on(4, tmp_path, ("touched", "worlds"))
+    found = made_on(3, tmp_path, ("touched", "worlds"))
+    for name, case in (("touched", "touched"), ("parts", "worlds")):
+        for what in ("x", "numbers"):
+            np.testing.assert_array_equal(found[3][f"{name}.4.{what}"], found[1][f"{case}.True.saved.{what}"])
+
+
+@pytest.mark.slow
 def test_ranks_keep_record_and_reset_bodies_that_are_remeshed(tmp_path):
     found = made_on(3, tmp_path, ranked.REMESHED)
     for case in ranked.REMESHED:

@@ -408,6 +408,26 @@ def worlds_in_parts(stage: Path) -> dict[str, np.ndarray | None]:
     return found
 
 
+def active_in_parts(kept: Path) -> None:
+    """A checkpoint of a muscle in parts keeps its active stress."""
+    import warp_corot.distributed as wd
+
+    mesh = wd.box((4, 1, 1), 0.05, level=5)
+    muscle = wc.TransverselyIsotropic(8e3, 5e3, 0.3, 0.3, 2e3, (1.0, 0.0, 0.0), 1000.0)
+    body = wc.SoftBody(mesh, muscle, device="cpu")
+    body.fix("x < 1e-9")
+    body.activate(2e3 * mesh.points[mesh.tets].mean(axis=1)[:, 0])
+    sim = wd.Simulation(body, deterministic=True, integrator=wc.SymplecticEuler(dt=3e-4))
+    sim.advance(0.01)
+    sim.save(kept)
+    sim.advance(0.01)
+    x, again = wd.gather(body.positions), resumed(kept)[f"{kept.stem}.x"]
+    if sim.rank == 0:
+        assert x is not None
+        assert abs(np.ptp(x[:, 0]) - 0.2) > 1e-5
+        np.testing.assert_array_equal(again, x)
+
+
 def kept_in_parts(kept: Path) -> None:
     """Save the run "worlds" of a mesh in parts."""
     import warp_corot.distributed as wd
@@ -433,7 +453,7 @@ def make_all(folder: Path, size: int, names: list[str]) -> None:
         grown_parts.assert_whole(grown_parts.blobs(), 0.33, max_level=4)
     if size > 2:
         alone = (folder / f"{name}.1.npz" for name in ("forest", *REMESHED))
-        for path in (*alone, *(folder / f"{name}.{size}.npz" for name in KEPT)):
+        for path in (*alone, *(folder / f"{name}.{kept}.npz" for name in KEPT for kept in {size, 4})):
             if path.stem.split(".")[0] in names and path.exists():
                 found |= resumed(path)
         if "forest" in names:
@@ -455,6 +475,8 @@ def make_all(folder: Path, size: int, names: list[str]) -> None:
             grown_parts.assert_refuses()
             grown_parts.assert_whole(wc.Domain.sphere(0.05, device="cpu"), 0.013, max_level=7, surface_error=1e-4)
             grown_parts.assert_moves_as_whole(folder / f"grown.{size}.npz")
+        if "drawn" in names:
+            active_in_parts(folder / "active.3.npz")
         if "touched" in names:
             found["parts.touched.x"] = touched_in_parts(folder / "touches.3.npz")
             found |= resumed(folder / "touches.3.npz")

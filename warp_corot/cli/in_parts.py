@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import csv
+import os
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Sequence
+from contextlib import closing, nullcontext
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -31,7 +32,7 @@ from .meshes_in_parts import (
     needs_young,
     organ_in_parts,
 )
-from .probing import COLUMNS
+from .probing import Probe, Table
 from .ranks import are_several, hands_out
 from .summary import aligned, milliseconds, speed, wall_time
 
@@ -93,12 +94,18 @@ def run_in_parts(args: argparse.Namespace) -> int:
         if note := rounding(duration, args.fps):
             complain(note, kind="note")
         sim, loads = _simulation(args, subject, duration)
-        table = _Table(args, sim)
+        probes = [_PartProbe(text, sim) for text in args.probe or () if args.csv]
+        # All ranks sum the rows, and rank 0 writes them.
+        table = Table(args.csv if sim.rank == 0 else Path(os.devnull), sim, probes) if args.csv else None
     try:
-        with progress_bar(frame_count(duration, args.fps)) as progress, table.open() if args.csv else nullcontext():
+        with (
+            progress_bar(frame_count(duration, args.fps)) as progress,
+            nullcontext() if table is None else closing(table),
+        ):
 
             def each_frame(frame: int, count: int) -> None:
-                table.add()
+                if table is not None:
+                    table.add()
                 progress(frame, count)
 
             wd.record(sim, args.output, duration=duration, fps=args.fps, progress=each_frame, recording=done)
@@ -145,57 +152,34 @@ def _simulation(args: argparse.Namespace, subject: InputMesh, duration: float) -
     return sim, loads
 
 
-class _Table:
-    """``--csv``: the rows that one process writes, summed over ranks and written by rank 0.
+class _PartProbe(Probe):
+    """A probed patch of a body of which each rank has a part.
+
+    Args:
+        text: The patch's expression.
+        sim: The simulation.
 
     Raises:
-        InputError: A probe without nodes.
+        InputError: A patch without nodes.
     """
 
-    def __init__(self, args: argparse.Namespace, sim: Simulation):
-        self._path, self._sim, self._file = args.csv, sim, None
-        body, part = sim.body, sim.following[0].part
+    def __init__(self, text: str, sim: Simulation):
+        self.text, self.body, self.is_patch, self._sim = text, sim.body, True, sim
+        self._find()
+
+    def values(self) -> list[float]:
+        """The values of all ranks' nodes; all ranks must call."""
+        return [float(x) for x in np.sum(self._sim.comm.allgather(np.array(super().values())), axis=0)]
+
+    def _find(self) -> None:
+        self._revision, part = self.body.version, self._sim.following[0].part
         own = part.is_own
-        self._probes = []
-        for text in args.probe or () if args.csv else ():
-            nodes = np.flatnonzero(own & np.isin(np.arange(len(own)), body.node_indices(text)))
-            weights = part.masses[nodes]
-            total = sum(sim.comm.allgather(float(weights.sum())))
-            if not total > 0.0:
-                raise InputError(f"--probe {text!r}: there are no nodes in it")
-            self._probes.append((text, nodes, weights / total))
-
-    @contextmanager
-    def open(self) -> Iterator[None]:
-        """The file, on rank 0; a former one is replaced."""
-        if self._sim.rank != 0:
-            yield
-            return
-        with self._path.open("w", newline="") as self._file:
-            names = [f"{text} {column}" for text, *_ in self._probes for column in COLUMNS]
-            self._write(["time [s]", *names, "kinetic [J]", "elastic [J]", "gravitational [J]", "dt [s]"])
-            yield
-
-    def add(self) -> None:
-        """Add a row with the present state; all ranks must call."""
-        if self._path is None:
-            return
-        sim, state = self._sim, self._sim.body.state
-        arrays = [array.numpy()[:, :3].astype(float) for array in (state.displacements, state.velocities)]
-        reactions = state.reactions.numpy()[:, :3].astype(float)
-        own = [
-            [*(weights @ arrays[0][nodes]), *(weights @ arrays[1][nodes]), *reactions[nodes].sum(axis=0)]
-            for _, nodes, weights in self._probes
-        ]
-        values = np.sum(sim.comm.allgather(np.array(own, float).ravel()), axis=0)
-        energy = sim.energy()
-        row = [sim.time, *values, energy.kinetic, energy.elastic, energy.gravitational, sim.dt]
-        self._write([f"{value:.9g}" for value in row])
-
-    def _write(self, row: Sequence[str]) -> None:
-        if self._file is not None:
-            csv.writer(self._file).writerow(row)
-            self._file.flush()
+        self._nodes = np.flatnonzero(own & np.isin(np.arange(len(own)), self.body.node_indices(self.text)))
+        weights = part.masses[self._nodes]
+        total = sum(self._sim.comm.allgather(float(weights.sum())))
+        if not total > 0.0:
+            raise InputError(f"--probe {self.text!r}: there are no nodes in it")
+        self._weights = weights / total
 
 
 def _summary(

@@ -17,6 +17,7 @@ from warp_corot.io.files.whole import writing
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
+    from warp_corot.distributed import Simulation as OnRanks
     from warp_corot.simulation.simulation import Simulation
 
     from .patches import BodyPatches
@@ -113,7 +114,11 @@ class Table:
     """
 
     def __init__(
-        self, path: Path, sim: Simulation, probes: Sequence[Probe], obstacles: Mapping[str, Obstacle] | None = None
+        self,
+        path: Path,
+        sim: Simulation | OnRanks,
+        probes: Sequence[Probe],
+        obstacles: Mapping[str, Obstacle] | None = None,
     ):
         self.path, self._sim, self._probes = path, sim, probes
         self._obstacles = dict(obstacles or {})

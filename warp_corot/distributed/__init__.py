@@ -6,8 +6,8 @@
 
 from . import mpi
 from .boxes import box
-from .gathering import gather
 from .parallel_growth import from_domain
+from .part_sync import gather
 from .reading import load
 from .recording import record
 from .scatter_mesh import divided

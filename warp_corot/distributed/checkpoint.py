@@ -12,12 +12,12 @@ import numpy as np
 import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
-from warp_corot.errors import InputError
 from warp_corot.io.checkpoint.archive import save_checkpoint
 
+from .contact_checkpoint import gathered_contact, resume_contact
+from .mpi import all_or_none
 from .part_simulation import PartSimulation
 from .part_sync import PartSync
-from .touch_checkpoint import gathered_contact, resume_contact
 
 if TYPE_CHECKING:
     from warp_corot.simulation.simulation import Simulation
@@ -65,8 +65,11 @@ def save(
     contact = None
     if parts.contact is not None:
         contact = gathered_contact(parts, following, comm)
-    guard, failed = parts.guard.state, None
-    if comm.rank == 0:
+    guard = parts.guard.state
+
+    def write() -> None:
+        if comm.rank != 0:
+            return
         told = SimpleNamespace(
             **{name: getattr(parts, name) for name in ("stable_dt", "steps_before_reset", "time_before_reset")},
             **{name: getattr(parts, name) for name in ("device", "gravity", "integrator", "deterministic", "worlds")},
@@ -78,13 +81,9 @@ def save(
             contact=contact,
             grasps=(),
         )
-        try:
-            save_checkpoint(told, path)  # type: ignore[arg-type]
-        except InputError as error:
-            failed = str(error)
-    failed = comm.bcast(failed, root=0)
-    if failed is not None:
-        raise InputError(failed)
+        save_checkpoint(told, path)  # type: ignore[arg-type]
+
+    all_or_none(write, comm)
 
 
 def body_of(name: str, parts: Simulation) -> int | None:

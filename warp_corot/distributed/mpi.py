@@ -6,8 +6,9 @@ import functools
 import sys
 import time
 import traceback
+from collections.abc import Callable
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import warp as wp
 
@@ -15,6 +16,8 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.processes import process_count
 
 from .timeout import TimedCommunicator, patience
+
+V = TypeVar("V")
 
 #: Time for which a waiting rank sleeps between two checks [s].
 REST = 0.01
@@ -75,6 +78,25 @@ def awaited(comm: Any, source: int, tag: int) -> Any:
     while (message := comm.improbe(source=source, tag=tag)) is None:
         time.sleep(REST)
     return message.recv()
+
+
+def all_or_none(act: Callable[[], V], comm: Any) -> V:
+    """Call on every rank; if one fails, all raise its error, which names the rank.
+
+    Raises:
+        OSError, InputError: As one of the calls.
+    """
+    found, failed = None, None
+    try:
+        found = act()
+    except (OSError, InputError) as error:
+        failed = error
+    everybody = comm.allgather(None if failed is None else (type(failed) is not InputError, str(failed)))
+    for rank, told in enumerate(everybody):
+        if told is not None:
+            is_of_system, said = told
+            raise (OSError if is_of_system else InputError)(f"rank {rank} of {comm.size}: {said}") from failed
+    return cast(V, found)
 
 
 def _end_all(comm: Any, kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:

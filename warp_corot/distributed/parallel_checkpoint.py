@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
 from types import SimpleNamespace
@@ -34,12 +34,13 @@ from warp_corot.solvers import INTEGRATORS
 
 from .boxes import box
 from .checkpoint import Values, body_of
+from .contact_checkpoint import obstacles_in, pack_touch, resume_touch
 from .divided_mesh import DividedForest, DividedTetMesh
+from .mpi import all_or_none
 from .part_simulation import PartSimulation
 from .part_sync import PartSync
 from .rejoining import pack_part, rejoined
 from .scatter_mesh import divided
-from .touch_pieces import obstacles_in, pack_touch, resume_touch
 
 Arrays = dict[str, npt.NDArray[Any]]
 
@@ -56,11 +57,11 @@ def save(path: str | PathLike[str], parts: PartSimulation, following: list[PartS
     The files of a former checkpoint of this name are removed once all are written.
 
     Raises:
-        InputError: On all ranks: active stress, bodies that are not in parts, or a rank cannot write.
+        InputError: On all ranks: bodies that are not in parts, or a rank cannot write.
     """
     target = checked_path(path, "path")
-    if not all(each.is_in_parts and not each.whole.discretization.has_activation for each in following):
-        raise InputError("checkpoints of bodies in parts beside others or with active stress do not work yet")
+    if not all(each.is_in_parts for each in following):
+        raise InputError("checkpoints of bodies in parts beside others do not work yet")
     folder = target.with_name(f"{target.stem}.ranks")
     names = [f"step-{parts.total_steps:012d}-rank-{rank:04d}.npz" for rank in range(comm.size)]
     piece: Arrays = {}
@@ -88,7 +89,7 @@ def save(path: str | PathLike[str], parts: PartSimulation, following: list[PartS
             write_archive(target, guard | {"header": np.frombuffer(json.dumps(header).encode(), np.uint8)})
 
     for act in (write_piece, write_header):
-        _together(act, comm)
+        all_or_none(act, comm)
     if comm.rank == 0:
         for former in folder.glob("step-*-rank-*.npz"):
             if former.name not in names:
@@ -155,6 +156,9 @@ def _pack(each: PartSync, model: Model, field: ForceField, k: int, piece: Arrays
                 described.setdefault("axes", {})[name] = axis
             else:
                 piece[f"same/{name}"] = values
+        elif own == "activation":
+            piece[f"stresses{k}/numbers"] = numbers.elements[counted]
+            piece[f"stresses{k}/{name}"] = values.reshape(body.worlds, -1)[:, counted].ravel()
         elif not own.startswith("trajectory"):
             piece[f"same/{name}"] = values
     for number, motion in enumerate(body.conditions.trajectories):
@@ -186,7 +190,8 @@ def _rebuilt_run(
         for k, mesh in enumerate(meshes):
             _take(piece, mesh, k, worlds, arrays)
             counts[k] += _take_motions(piece, mesh, k, counts[k], arrays)
-        touched.append({name: values for name, values in piece.items() if name.startswith("touched/")})
+        prefix = "touched/"
+        touched.append({k.removeprefix(prefix): v for k, v in piece.items() if k.startswith(prefix)})
         arrays |= {name.removeprefix("same/"): values for name, values in piece.items() if name.startswith("same/")}
     if device is None:
         device = "cpu" if header["device"] == "cpu" else wp.get_device()
@@ -206,7 +211,7 @@ def _rebuilt_run(
         kept=kept,
         contact=None,
         touching=obstacles_in(header.get("contact"), arrays),
-        resume_touch=functools.partial(resume_touch, header.get("contact") or {}, arrays, touched),
+        resume_touch=functools.partial(resume_touch, arrays, touched),
         guard=SimpleNamespace(state=guard),
         running=SimpleNamespace(state=header["running"]),
     )
@@ -236,9 +241,10 @@ def _rebuilt_mesh(described: dict[str, Any], k: int, files: Sequence[Path]) -> D
 
 def _take(piece: Arrays, mesh: DividedForest | DividedTetMesh, k: int, worlds: int, arrays: Arrays) -> None:
     """Copy a piece's values to the arrays of this rank's part of the k-th body."""
-    for kind, numbers, copies in (("nodes", mesh.numbers.nodes, worlds), ("elements", mesh.numbers.elements, 1)):
+    nodes, elements = mesh.numbers.nodes, mesh.numbers.elements
+    for kind, numbers, copies in (("nodes", nodes, worlds), ("elements", elements, 1), ("stresses", elements, worlds)):
         prefix = f"{kind}{k}/"
-        given = piece[prefix + "numbers"]
+        given = piece.get(prefix + "numbers", elements[:0])
         _, here, there = np.intersect1d(numbers, given, assume_unique=True, return_indices=True)
         for name, values in piece.items():
             if not name.startswith(prefix) or name == prefix + "numbers":
@@ -263,15 +269,3 @@ def _take_motions(piece: Arrays, mesh: DividedForest | DividedTetMesh, k: int, f
             arrays |= {motion + "times": times, motion + "displacements": to if to.ndim == 2 else to[:, here]}
             count += 1
     return count
-
-
-def _together(act: Callable[[], None], comm: Any) -> None:
-    """Call on every rank; if one fails, all raise its error."""
-    failed = None
-    try:
-        act()
-    except (OSError, InputError) as error:
-        failed = str(error)
-    for rank, said in enumerate(comm.allgather(failed)):
-        if said is not None:
-            raise InputError(f"rank {rank} of {comm.size}: {said}")

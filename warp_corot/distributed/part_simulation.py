@@ -9,7 +9,7 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -18,7 +18,7 @@ import warp as wp
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.shapes import Shape
 from warp_corot.contact.tool import Obstacle, Tool
-from warp_corot.elasticity import Model
+from warp_corot.elasticity import ForceField, Model
 from warp_corot.elasticity.dilatation.options import ELEMENT, SHARED, shares_dilatation
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.mesh import TetForest
@@ -43,6 +43,37 @@ CHANGED = (
 #: several ranks.
 FEW_ELEMENTS = 200_000
 TRIED_STEPS = 10
+
+
+class Passes(NamedTuple):
+    """Passes over whole bodies; of a checkpoint, they go on from one process's simulation.
+
+    Attributes:
+        remeshing: The passes.
+        fields: The force fields of the whole bodies.
+    """
+
+    remeshing: Remeshing
+    fields: tuple[ForceField, ...]
+
+    @classmethod
+    def of(cls, bodies: Sequence[SoftBody], models: Sequence[Model], asked: Any, *, deterministic: bool) -> Passes:
+        """The passes that a user asks for.
+
+        Args:
+            bodies, models, deterministic: The simulation's.
+            asked: As for ``Remeshing``; or passes, which go on.
+
+        Raises:
+            InputError: As ``Remeshing``.
+        """
+        if isinstance(asked, Passes):
+            return asked
+        remeshing = Remeshing(bodies, models, asked, deterministic=deterministic)
+        bound = zip(models, bodies, strict=True)
+        fields = tuple(model.bind(body, deterministic=deterministic) for model, body in bound)
+        remeshing.serve(fields)
+        return cls(remeshing, fields)
 
 
 class PartSimulation(on_one.Simulation):

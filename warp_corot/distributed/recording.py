@@ -14,6 +14,7 @@ from warp_corot.inputs.checks import checked_path
 from warp_corot.io.files.whole import written_whole
 from warp_corot.io.write.animate import Progress, Recording, frame_count
 
+from .mpi import all_or_none
 from .pieces import Piece
 from .simulation import Simulation
 
@@ -96,7 +97,7 @@ class _Pieces:
                 gravity=sim.gravity if sim.rank == 0 else None,
             )
 
-        self._writer = self._together(made)
+        self._writer = all_or_none(made, self._comm)
 
     def record(self, count: int, progress: Progress | None) -> Recording:
         """Write the present frame and ``count`` more."""
@@ -110,8 +111,8 @@ class _Pieces:
                 self._write_frame()
                 if frame == 0:
                     # From now on the joining stage shows the frames written so far.
-                    self._together(writer.flush)
-                    self._together(lambda: self._join(count + 1))
+                    all_or_none(writer.flush, self._comm)
+                    all_or_none(lambda: self._join(count + 1), self._comm)
                 done.stepping += stepped - started
                 done.writing += time.perf_counter() - stepped
                 done.frames = frame + 1
@@ -122,8 +123,8 @@ class _Pieces:
             # Write the waiting frames; the first error is the one to raise.
             writer.__exit__(type(error), error, error.__traceback__)
             raise
-        self._together(writer.close)
-        self._together(lambda: self._join(done.frames))
+        all_or_none(writer.close, self._comm)
+        all_or_none(lambda: self._join(done.frames), self._comm)
         return done
 
     def _make_piece(self) -> None:
@@ -140,25 +141,11 @@ class _Pieces:
         positions = (piece.points + displacements).astype(np.float32)
         stress = piece.of_elements(sim.von_mises())
         self._writer.widen_range(max(self._comm.allgather(self._writer.range_for(stress))))
-        self._together(lambda: self._writer.write(positions, velocities=velocities, von_mises=stress))
+        all_or_none(lambda: self._writer.write(positions, velocities=velocities, von_mises=stress), self._comm)
         lengths = np.linalg.norm(positions.astype(np.float64) - piece.points, axis=1)
         done.final_displacement = max(self._comm.allgather(float(lengths.max(initial=0.0))))
         done.largest_displacement = max(done.largest_displacement, done.final_displacement)
         done.elements.append(sum(self._comm.allgather(len(piece.tets))))
-
-    def _together(self, act: Any) -> Any:
-        """Call on every rank; if one fails, all raise its error."""
-        found, failed = None, None
-        try:
-            found = act()
-        except (OSError, InputError) as error:
-            failed = error
-        everybody = self._comm.allgather(None if failed is None else (type(failed) is not InputError, str(failed)))
-        for rank, told in enumerate(everybody):
-            if told is not None:
-                is_of_system, said = told
-                raise (OSError if is_of_system else InputError)(f"rank {rank} of {self._comm.size}: {said}") from failed
-        return found
 
     def _join(self, frames: int) -> None:
         """Write the stage that refers to all pieces, on rank 0."""

@@ -31,6 +31,7 @@ class GivenBody:
         held: Which nodes of the part are held, bool [worlds * n].
         motions: Prescribed motions: nodes [k], times [K] and displacements [K, 3] or [K, k, 3].
         loads, displacements, velocities: float32 [worlds * n, 3]; None: they are zero.
+        activation: Active stress of the part's elements [Pa], float32 [worlds * t]; None: there is none.
     """
 
     piece: Piece
@@ -41,6 +42,7 @@ class GivenBody:
     loads: Vectors | None
     displacements: Vectors | None
     velocities: Vectors | None
+    activation: Vectors | None
 
     def made(self, device: str | wp.Device | None) -> SoftBody:
         kind, place, options = self.piece
@@ -54,6 +56,8 @@ class GivenBody:
             body.displacements = self.displacements
         if self.velocities is not None:
             body.state.set_velocities(self.velocities)
+        if self.activation is not None:
+            body.activation.assign(self.activation)
         return body
 
 
@@ -80,8 +84,9 @@ def handed_bodies(
     def given() -> Iterator[Any]:
         assert bodies is not None
         for body in bodies:
-            if body.changing is not None or body.discretization.has_activation or body.conditions.activations:
-                raise InputError("bodies that are remeshed or have active stress cannot be handed out to ranks")
+            if body.changing is not None or body.conditions.activations:
+                said = "bodies that are remeshed or follow keyframes of active stress cannot be handed out to ranks"
+                raise InputError(said)
         each = [_pieces(body, comm.size) for body in bodies]
         for own in zip(*each, strict=True):
             nodes.append([there for _, there in own])
@@ -96,8 +101,11 @@ def _pieces(body: SoftBody, ranks: int) -> Iterator[tuple[GivenBody, npt.NDArray
     count = len(body.mesh.tets)
     held = body.constrained
     loads = body.loads.numpy() if body.conditions.has_loads else None
-    state = [array.numpy()[: body.node_count, :3] for array in (body.state.displacements, body.state.velocities)]
-    displacements, velocities = (values if values.any() else None for values in state)
+    displacements, velocities = (
+        array.numpy()[: body.node_count, :3] for array in (body.state.displacements, body.state.velocities)
+    )
+    has_stress = body.discretization.has_activation
+    stress = body.activation.numpy().reshape(body.worlds, -1) if has_stress else None
     moves = [(motion.host_nodes, *motion.keys()) for motion in body.conditions.trajectories]
     for piece in pieces_of(body.mesh, dealt(body.mesh, ranks)):
         numbers = piece[2]["numbers"]
@@ -111,7 +119,10 @@ def _pieces(body: SoftBody, ranks: int) -> Iterator[tuple[GivenBody, npt.NDArray
                 body.worlds,
                 held[there],
                 [moved for each in moves if len((moved := _here(*each, place))[0])],
-                *(None if values is None else values[there] for values in (loads, displacements, velocities)),
+                loads=None if loads is None else loads[there],
+                displacements=displacements[there] if displacements.any() else None,
+                velocities=velocities[there] if velocities.any() else None,
+                activation=None if stress is None else stress[:, numbers.elements].ravel(),
             ),
             there,
         )

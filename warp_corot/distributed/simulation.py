@@ -32,12 +32,10 @@ from warp_corot.simulation.solves import Solves
 from warp_corot.solvers import Integrator, SymplecticEuler
 
 from . import checkpoint, mpi, parallel_checkpoint
-from .gathering import forget, register
 from .halo import CommHalo, MpiHalo
-from .part_simulation import PartSimulation, compile_once, of_their_own, part_of, settled_model
-from .part_sync import PartSync
+from .part_simulation import PartSimulation, Passes, compile_once, of_their_own, part_of, settled_model
+from .part_sync import PartSync, forget, register
 from .parts import Part
-from .passes import Passes
 from .unsupported import check_supported
 
 

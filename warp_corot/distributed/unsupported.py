@@ -12,7 +12,7 @@ from warp_corot.errors import InputError
 from warp_corot.solvers import Integrator
 
 from .divided_mesh import DividedMesh
-from .passes import Passes
+from .part_simulation import Passes
 
 #: Models whose forces need only the elements around a node.
 MODELS = (Corotated, Linear, NeoHookean, StVenantKirchhoff)
