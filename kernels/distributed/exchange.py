@@ -42,26 +42,13 @@ for _kind in (wp.float32, wp.float64, wp.vec3, wp.vec4, wp.int32, wp.uint8):
 
 
 @wp.kernel(enable_backward=False)
-def clear_energies(places: wp.array[wp.int32], energies: wp.array[wp.float64]):
-    """Set energies at some places to zero."""
-    energies[places[wp.tid()]] = wp.float64(0.0)
+def clear_values(places: wp.array[wp.int32], values: wp.array[Any]):
+    """Set the values at some places to zero."""
+    values[places[wp.tid()]] = values.dtype(0)
 
 
-@wp.kernel(enable_backward=False)
-def clear_forces(places: wp.array[wp.int32], forces: wp.array[Any]):
-    """Set forces at some places to zero."""
-    i = places[wp.tid()]
-    forces[i] = forces[i] - forces[i]
-
-
-for _kind in (wp.vec3, wp.vec3l):
-    wp.overload(clear_forces, [wp.array[wp.int32], wp.array[_kind]])
-
-
-@wp.kernel(enable_backward=False)
-def clear_vectors(places: wp.array[wp.int32], vectors: wp.array[wp.vec4]):
-    """Set vectors at some places to zero."""
-    vectors[places[wp.tid()]] = wp.vec4()
+for _kind in (wp.float64, wp.vec3, wp.vec3l, wp.vec4):
+    wp.overload(clear_values, [wp.array[wp.int32], wp.array[_kind]])
 
 
 @wp.kernel(enable_backward=False)

@@ -19,7 +19,7 @@ import grown_parts  # noqa: E402
 
 import warp_corot as wc  # noqa: E402
 from warp_corot.distributed import mpi, root_facade, simulation  # noqa: E402
-from warp_corot.distributed.timeout import TimedCommunicator, patience  # noqa: E402
+from warp_corot.distributed.timeout import TimedCommunicator, longest_wait  # noqa: E402
 from warp_corot.mesh.surfaces.boundary import boundary_faces  # noqa: E402
 
 
@@ -494,7 +494,7 @@ def main() -> None:
         return
     # One rank, which compiles all kernels, then two, and then all three.
     alone = everybody.rank == 2
-    some = TimedCommunicator(mpi.library().COMM_WORLD.Split(int(alone)), patience())
+    some = TimedCommunicator(mpi.library().COMM_WORLD.Split(int(alone)), longest_wait())
     mpi.world = lambda: some  # type: ignore[assignment]
     simulation.compile_once = lambda *_, **__: None
     if alone:

@@ -172,7 +172,7 @@ class _PartProbe(Probe):
         return [float(x) for x in np.sum(self._sim.comm.allgather(np.array(super().values())), axis=0)]
 
     def _find(self) -> None:
-        self._revision, part = self.body.version, self._sim.following[0].part
+        self._revision, part = self.body.version, self._sim.syncs[0].part
         own = part.is_own
         self._nodes = np.flatnonzero(own & np.isin(np.arange(len(own)), self.body.node_indices(self.text)))
         weights = part.masses[self._nodes]
@@ -189,7 +189,7 @@ def _summary(
 
     mesh = sim.body.mesh
     assert isinstance(mesh, DividedForest)
-    nodes = sim.following[0].part.numbers.node_count
+    nodes = sim.syncs[0].part.numbers.node_count
     held = " or ".join(args.fix or [str(subject.fix)])
     shortest, longest = sim.dt_range
     rows = [

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from warp_corot.kernels.distributed.exchange import clear_forces
+from warp_corot.kernels.distributed.exchange import clear_values
 from warp_corot.solvers.halo import Halo
 
 from .surface import ContactSurface
@@ -45,4 +45,4 @@ class SurfaceHalo:
     def clear(self, forces: wp.array) -> None:
         """Launch the reset to zero of forces on nodes of other ranks: their own ranks add them."""
         if len(self._ghosts):
-            wp.launch(clear_forces, len(self._ghosts), [self._ghosts], [forces], device=self._ghosts.device)
+            wp.launch(clear_values, len(self._ghosts), [self._ghosts], [forces], device=self._ghosts.device)

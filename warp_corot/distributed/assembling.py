@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from warp_corot.mesh.surfaces.boundary import boundary_faces, signed_volumes
 
-from .divided_mesh import DividedTetMesh, Numbers
+from .divided_mesh import DividedTetMesh, Numbers, of_whole
 from .partition import along_curve
 
 Longs = npt.NDArray[np.int64]
@@ -144,9 +144,6 @@ def assembled(
     owners = np.zeros(len(here), np.int32)
     is_own = np.isin(here, nodes, assume_unique=True)
     owners[is_own], owners[~is_own] = homes.owners(nodes, here[~is_own])
-    volumes = np.abs(signed_volumes(points, places[counted]))
-    told = comm.allgather((float(volumes.min(initial=np.inf)), points.min(axis=0), points.max(axis=0), len(elements)))
-    smallest, low, high, counts = zip(*told, strict=True)
     numbers = Numbers(
         here,
         all_elements[order],
@@ -159,9 +156,7 @@ def assembled(
         points,
         places,
         numbers=numbers,
-        element_count=sum(counts),
-        bounds=np.array([np.min(low, axis=0), np.max(high, axis=0)]),
-        smallest_volume=min(smallest),
+        **of_whole(points, np.abs(signed_volumes(points, places[counted])), comm),
         outer=_outer(tets, here, homes, comm),
         **described(here, all_elements[order]),
         **options,

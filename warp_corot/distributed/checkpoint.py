@@ -40,7 +40,7 @@ def save(
     path: str | PathLike[str],
     bodies: tuple[SoftBody, ...],
     parts: PartSimulation,
-    following: list[PartSync],
+    syncs: list[PartSync],
     comm: Any,
 ) -> None:
     """Write a checkpoint on rank 0; all ranks must call this, with bodies in which all nodes are up to date.
@@ -49,7 +49,7 @@ def save(
         path: The file.
         bodies: The whole bodies.
         parts: This rank's simulation of parts.
-        following: The ``PartSync`` of each body.
+        syncs: The ``PartSync`` of each body.
         comm: The ranks.
 
     Raises:
@@ -60,11 +60,11 @@ def save(
         values = array.numpy()
         k = body_of(name, parts)
         if k is not None:
-            values = following[k].whole_values(values)
+            values = syncs[k].whole_values(values)
         kept[name] = Values(values)
     contact = None
     if parts.contact is not None:
-        contact = gathered_contact(parts, following, comm)
+        contact = gathered_contact(parts, syncs, comm)
     guard = parts.guard.state
 
     def write() -> None:
@@ -99,24 +99,24 @@ def body_of(name: str, parts: Simulation) -> int | None:
     return None
 
 
-def resume(loaded: Simulation | SimpleNamespace, parts: PartSimulation, following: list[PartSync]) -> None:
+def resume(loaded: Simulation | SimpleNamespace, parts: PartSimulation, syncs: list[PartSync]) -> None:
     """Resume a simulation of parts from a saved one.
 
     Args:
         loaded: The simulation that one process loads from the checkpoint.
         parts: This rank's simulation of parts of the same bodies.
-        following: The ``PartSync`` of each body.
+        syncs: The ``PartSync`` of each body.
     """
     for name, array in parts.kept.items():
         values = loaded.kept[name].numpy()
         k = body_of(name, parts)
         if k is not None:
-            values = following[k].part_values(values)
+            values = syncs[k].part_values(values)
         array.assign(values)
     parts.steps_before_reset, parts.time_before_reset = loaded.steps_before_reset, loaded.time_before_reset
     parts.stable_dt = loaded.stable_dt
     if loaded.contact is not None:
-        resume_contact(loaded.contact, parts, following)
+        resume_contact(loaded.contact, parts, syncs)
     parts.guard.resume(**loaded.guard.state)
     parts.running.resume(**loaded.running.state)
     wp.synchronize_device(parts.device)

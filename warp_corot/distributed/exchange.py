@@ -44,13 +44,13 @@ class ExchangeLists:
             ghosts = ghosts[np.argsort(nodes[ghosts])] if rank != comm.rank else ghosts[:0]
             wanted.append(nodes[ghosts])
             if len(ghosts):
-                received[rank] = _in_worlds(ghosts, worlds, len(nodes))
+                received[rank] = in_worlds(ghosts, worlds, len(nodes))
         place = np.argsort(nodes)
         sent = {}
         for rank, asked in enumerate(comm.alltoall(wanted)):
             if len(asked):
                 own = place[np.searchsorted(nodes[place], asked)].astype(np.int32)
-                sent[rank] = _in_worlds(own, worlds, len(nodes))
+                sent[rank] = in_worlds(own, worlds, len(nodes))
         return cls(sent, received)
 
     @classmethod
@@ -114,5 +114,6 @@ class HostExchange:
         return self._rooms[kind]
 
 
-def _in_worlds(nodes: Ints, worlds: int, count: int) -> Ints:
-    return (nodes + count * np.arange(worlds, dtype=np.int32)[:, None]).ravel()
+def in_worlds(places: Ints, worlds: int, count: int) -> Ints:
+    """Places of one world, of ``count``, in all worlds, int32 [worlds * n]."""
+    return (places + count * np.arange(worlds, dtype=np.int32)[:, None]).ravel()

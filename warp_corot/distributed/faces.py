@@ -30,22 +30,22 @@ class Faces:
     others: Longs
 
 
-def faces_of(tets: Ints, lattice: Ints, first: int, territory: RootCubePartition) -> Faces:
+def faces_of(tets: Ints, lattice: Ints, first: int, partition: RootCubePartition) -> Faces:
     """Find out which faces of ranks' elements are the same; all ranks must call this.
 
     Args:
         tets: The nodes of this rank's elements [n, 4].
         lattice: Lattice points of the nodes.
         first: The number of the first element in the whole mesh.
-        territory: The cubes of each rank.
+        partition: The cubes of each rank.
     """
-    comm = territory.comm
+    comm = partition.comm
     triangles, parents = boundary_faces(tets)
     # The corners in one order name a face on all ranks.
-    keys = np.sort(territory.keys(lattice[triangles.ravel()]).reshape(-1, 3), axis=1)
+    keys = np.sort(partition.keys(lattice[triangles.ravel()]).reshape(-1, 3), axis=1)
     own, others = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     inner = np.zeros(len(triangles), bool)
-    places = territory.across(lattice[triangles])
+    places = partition.across(lattice[triangles])
     taken = comm.alltoall([(keys[each], first + parents[each].astype(np.int64)) for each in places])
     for mine, (their_keys, elements) in zip(places, taken, strict=True):
         found = places_of(*_numbers(keys[mine], their_keys))

@@ -13,7 +13,7 @@ from warp_corot.discretization.groups import group_numbers
 from warp_corot.mesh import TetForest, Tree
 from warp_corot.mesh.numbering import in_order_of_leaves, renumbered, with_virtual
 
-from .divided_mesh import DividedForest, Numbers
+from .divided_mesh import DividedForest, Numbers, of_whole
 from .faces import faces_of
 from .parts import part_of_forest
 from .root_cube_partition import RootCubePartition, places_of
@@ -45,21 +45,21 @@ class Branch:
     outer: Ints
 
 
-def joined(own: TetForest, territory: RootCubePartition) -> DividedForest:
+def joined(own: TetForest, partition: RootCubePartition) -> DividedForest:
     """This rank's part of the mesh that all ranks' leaves make together; all ranks must call this.
 
     Args:
         own: The forest of this rank's root cubes, at least one leaf, with all levels in the order of the tree.
-        territory: The cubes of each rank.
+        partition: The cubes of each rank.
     """
-    comm = territory.comm
+    comm = partition.comm
     leaves, rows = (comm.allgather(len(each)) for each in (own.tets, own.tree.level))
     first, first_row = sum(leaves[: comm.rank]), sum(rows[: comm.rank])
-    keys = territory.keys(own.lattice)
-    owner = _owners(own, keys, territory)
+    keys = partition.keys(own.lattice)
+    owner = _owners(own, keys, partition)
     numbers, node_count = _numbers(owner, own.node_count, keys, comm)
     groups = group_numbers(own, np.arange(len(own.tets)))
-    outer = faces_of(own.tets, own.lattice, first, territory).outer
+    outer = faces_of(own.tets, own.lattice, first, partition).outer
 
     def branch(kept: npt.NDArray[np.bool_]) -> Branch:
         forest, points, stays = part_of_forest(own, kept, groups[kept], True)
@@ -83,28 +83,18 @@ def joined(own: TetForest, territory: RootCubePartition) -> DividedForest:
         given[rank] = branch(kept) if kept.any() else None
     taken = comm.alltoall(given)
     branches = [branch(np.ones(len(own.tets), bool)), *(each for each in taken if each is not None)]
-    points = own.points
-    told = comm.allgather((float(own.volumes.min()), points.min(axis=0), points.max(axis=0)))
-    smallest, low, high = zip(*told, strict=True)
-    return _together(
-        branches,
-        comm.rank,
-        node_count=node_count,
-        element_count=sum(leaves),
-        bounds=np.array([np.min(low, axis=0), np.max(high, axis=0)]),
-        smallest_volume=min(smallest),
-        is_embedded=True,
-    )
+    whole = of_whole(own.points, own.volumes, comm)
+    return _together(branches, node_count=node_count, is_embedded=True, **whole)
 
 
-def _owners(own: TetForest, keys: Longs, territory: RootCubePartition) -> Ints:
+def _owners(own: TetForest, keys: Longs, partition: RootCubePartition) -> Ints:
     """The rank that moves each lattice point, the first with a leaf around it; if no leaf has it, the first rank that
     has it, plus the number of ranks; int32."""
-    comm = territory.comm
+    comm = partition.comm
     claim = np.full(len(keys), comm.rank + comm.size, np.int32)
     claim[: own.node_count] = comm.rank
     owner = claim.copy()
-    places = territory.shared(own.lattice)
+    places = partition.shared(own.lattice)
     taken = comm.alltoall([(keys[each], claim[each]) for each in places])
     for mine, (their_keys, claims) in zip(places, taken, strict=True):
         found = places_of(keys[mine], their_keys)
@@ -135,7 +125,7 @@ def _numbers(owner: Ints, node_count: int, keys: Longs, comm: Any) -> tuple[Long
     return found, total
 
 
-def _together(branches: list[Branch], rank: int, *, node_count: int, **whole: Any) -> DividedForest:
+def _together(branches: list[Branch], *, node_count: int, **whole: Any) -> DividedForest:
     """The part that branches of different ranks make, in the order of the ranks, the rank's own first."""
     forests = [each.forest for each in branches]
     keys, place, inverse = np.unique(

@@ -18,7 +18,7 @@ from warp_corot.solvers.halo import Floats, Halo, Owned, V
 
 from .cards import CardExchange, add_up, take_most
 from .divided_mesh import DividedMesh
-from .exchange import ExchangeLists, HostExchange
+from .exchange import ExchangeLists, HostExchange, in_worlds
 from .multigrid import MultigridOfParts, has_multigrid
 from .parts import Part
 from .reproducible_sums import reproducible_sums
@@ -78,8 +78,7 @@ class OwnedPart(Owned):
         self.whole, self._part = whole, part
         worlds, own = part.worlds, part.numbers
         self.numbers, self.node_count = own.in_worlds(worlds), worlds * own.node_count
-        shift = whole.world_node_count * np.arange(worlds, dtype=np.int32)[:, None]
-        self.places, self.nodes = (own.places + shift).ravel(), part.is_own
+        self.places, self.nodes = in_worlds(own.places, worlds, whole.world_node_count), part.is_own
         self._elements = np.tile(own.counted, worlds)
         self._ghosts, self._copies = (
             wp.array(np.flatnonzero(~each).astype(np.int32), dtype=wp.int32, device=part.device)
@@ -91,11 +90,11 @@ class OwnedPart(Owned):
 
     def clear_ghosts(self, vectors: wp.array) -> None:
         inputs = [self._ghosts]
-        wp.launch(kernels.clear_vectors, len(self._ghosts), inputs, [vectors], device=vectors.device)
+        wp.launch(kernels.clear_values, len(self._ghosts), inputs, [vectors], device=vectors.device)
 
     def clear_copies(self, energies: wp.array) -> None:
         inputs = [self._copies]
-        wp.launch(kernels.clear_energies, len(self._copies), inputs, [energies], device=energies.device)
+        wp.launch(kernels.clear_values, len(self._copies), inputs, [energies], device=energies.device)
 
     @property
     def counted(self) -> wp.array:

@@ -15,7 +15,7 @@ import warp as wp
 from warp_corot.errors import InputError
 from warp_corot.inputs.processes import process_count
 
-from .timeout import TimedCommunicator, patience
+from .timeout import TimedCommunicator, longest_wait
 
 V = TypeVar("V")
 
@@ -49,7 +49,7 @@ def world() -> TimedCommunicator:
     Raises:
         InputError: MPI is not installed, or ``WARP_COROT_PATIENCE`` is not a positive number.
     """
-    comm = TimedCommunicator(library().COMM_WORLD.Dup(), patience())
+    comm = TimedCommunicator(library().COMM_WORLD.Dup(), longest_wait())
     if comm.size > 1:
         sys.excepthook = functools.partial(_end_all, comm)
     return comm

@@ -26,7 +26,7 @@ from warp_corot.solvers.implicit.multigrid.multigrid import MOST_DENSE
 from warp_corot.solvers.implicit.operator import LinearOperator
 
 from .divided_mesh import DividedMesh
-from .exchange import ExchangeLists
+from .exchange import ExchangeLists, in_worlds
 from .partition import sharing_groups
 from .parts import Part
 from .places import Places
@@ -250,7 +250,7 @@ class MultigridOfParts(Multigrid):
         """Places in one world of a whole array and of one of the part, each with the length of a world."""
         (there, length), (own, own_length) = whole, here
         worlds = self._part.worlds
-        return Places(_in_worlds(there, worlds, length), _in_worlds(own, worlds, own_length), self.device, self.device)
+        return Places(in_worlds(there, worlds, length), in_worlds(own, worlds, own_length), self.device, self.device)
 
     def _to_all(self, own: Ints, length: int, **options: Any) -> Complete:
         """The exchange after which every rank has all values of an array, [worlds * length].
@@ -261,7 +261,7 @@ class MultigridOfParts(Multigrid):
             options: As for ``MpiHalo.exchange_of``.
         """
         ranks = self._ranks
-        halo = ExchangeLists.to_all(_in_worlds(own, self._part.worlds, length), ranks.comm)
+        halo = ExchangeLists.to_all(in_worlds(own, self._part.worlds, length), ranks.comm)
         return ranks.exchange_of(halo, TAGS + self._k, **options).launch
 
 
@@ -271,10 +271,6 @@ def has_multigrid(whole: SoftBody, part: Part) -> bool:
     mesh = whole.mesh
     is_whole = isinstance(mesh, TetForest) and not isinstance(mesh, DividedMesh)
     return is_whole and whole.device == part.device and whole.world_node_count > MOST_DENSE
-
-
-def _in_worlds(places: Ints, worlds: int, count: int) -> Ints:
-    return (places + count * np.arange(worlds, dtype=np.int32)[:, None]).ravel()
 
 
 def _ranges(starts: Ints, rows: Ints) -> Ints:

@@ -50,7 +50,7 @@ NODAL = ("displacements", "velocities", "reactions", "constrained", "loads")
 MOTION = ("world", "nodes", "times", "to")
 
 
-def save(path: str | PathLike[str], parts: PartSimulation, following: list[PartSync], comm: Any) -> None:
+def save(path: str | PathLike[str], parts: PartSimulation, syncs: list[PartSync], comm: Any) -> None:
     """Write a checkpoint; all ranks must call.
 
     ``run.npz`` names the files ``run.ranks/step-…-rank-0000.npz`` and so on, each with the nodes that a rank moves.
@@ -60,14 +60,14 @@ def save(path: str | PathLike[str], parts: PartSimulation, following: list[PartS
         InputError: On all ranks: bodies that are not in parts, or a rank cannot write.
     """
     target = checked_path(path, "path")
-    if not all(each.is_in_parts for each in following):
+    if not all(each.is_in_parts for each in syncs):
         raise InputError("checkpoints of bodies in parts beside others do not work yet")
     folder = target.with_name(f"{target.stem}.ranks")
     names = [f"step-{parts.total_steps:012d}-rank-{rank:04d}.npz" for rank in range(comm.size)]
     piece: Arrays = {}
     bodies = [
         _pack(each, model, field, k, piece)
-        for k, (each, model, field) in enumerate(zip(following, parts.models, parts.fields, strict=True))
+        for k, (each, model, field) in enumerate(zip(syncs, parts.models, parts.fields, strict=True))
     ]
     for name, array in parts.kept.items():
         body = body_of(name, parts)
@@ -75,8 +75,8 @@ def save(path: str | PathLike[str], parts: PartSimulation, following: list[PartS
         if body is None:
             piece[f"same/kept.{name}"] = rows
         else:
-            piece[f"nodes{body}/kept.{name}"] = rows[following[body].part.is_own]
-    contact = None if parts.contact is None else pack_touch(parts.contact, following[0], piece)
+            piece[f"nodes{body}/kept.{name}"] = rows[syncs[body].part.is_own]
+    contact = None if parts.contact is None else pack_touch(parts.contact, syncs[0], piece)
     guard = {f"guard.{name}": values for name, values in parts.guard.state.items()}
     header = _header(parts) | {"bodies": bodies, "contact": contact, "pieces": names}
 

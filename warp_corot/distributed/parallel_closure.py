@@ -28,28 +28,28 @@ class GrowingTogether(Growing):
 
     Args:
         domain, cell_size, wishes, device: As for ``Growing``; the number of elements must not be limited.
-        territory: The cubes of each rank.
+        partition: The cubes of each rank.
     """
 
     def __init__(
-        self, domain: Domain, cell_size: float, wishes: Wishes, device: wp.Device, territory: RootCubePartition
+        self, domain: Domain, cell_size: float, wishes: Wishes, device: wp.Device, partition: RootCubePartition
     ):
-        super().__init__(domain, cell_size, wishes, device, territory.own)
-        self._territory = territory
+        super().__init__(domain, cell_size, wishes, device, partition.own)
+        self._partition = partition
         self._known = np.zeros(0, bool)
         self._pending = np.zeros((0, 2), np.int64)
 
     def run(self, first: int = 0) -> None:
         """Bisect elements until all ranks together have a conforming forest; all ranks must call this."""
         self.run_down(first)
-        while self._territory.comm.allreduce(self._exchange()):
+        while self._partition.comm.allreduce(self._exchange()):
             count = self.growth.element_count
             self.growth.close(self.judge.wished, count)
         self.judge.evaluate()
 
     def _exchange(self) -> int:
         """Give other ranks the new active midpoints on their cubes, and take theirs; returns how many there were."""
-        growth, territory = self.growth, self._territory
+        growth, partition = self.growth, self._partition
         lattice, ends = growth.nodes()
         known = np.zeros(growth.node_count, bool)
         known[: len(self._known)] = self._known
@@ -57,13 +57,13 @@ class GrowingTogether(Growing):
         fresh = np.flatnonzero((growth.active[: growth.node_count].numpy() != 0) & ~known & (ends[:, 0] >= 0))
         known[fresh] = True
         given = []
-        for places in territory.shared(lattice[fresh]):
+        for places in partition.shared(lattice[fresh]):
             both = ends[fresh[places]]
-            given.append(np.stack([territory.keys(lattice[both[:, end]]) for end in (0, 1)], axis=1))
-        taken = territory.comm.alltoall(given)
+            given.append(np.stack([partition.keys(lattice[both[:, end]]) for end in (0, 1)], axis=1))
+        taken = partition.comm.alltoall(given)
         pending = np.concatenate([self._pending, *taken])
-        on_faces = np.unique(np.concatenate([np.zeros(0, np.intp), *territory.shared(lattice)]))
-        place = places_of(pending.ravel(), territory.keys(lattice[on_faces])).reshape(-1, 2)
+        on_faces = np.unique(np.concatenate([np.zeros(0, np.intp), *partition.shared(lattice)]))
+        place = places_of(pending.ravel(), partition.keys(lattice[on_faces])).reshape(-1, 2)
         here = (place >= 0).all(axis=1)
         middles = growth.bisect_edges(on_faces[place[here]])
         self._pending = pending[~here]

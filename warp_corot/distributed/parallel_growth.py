@@ -93,16 +93,16 @@ def from_domain(
     cells, _ = grid_around(domain.bounds, size)
     key_room(cells, wishes.max_level)
     starts = _starts(domain, size, wishes, where, checked_shares(comm.size, costs))
-    territory = RootCubePartition(cells, wishes.max_level, starts, comm)
-    growing = GrowingTogether(domain, size, wishes, where, territory)
+    partition = RootCubePartition(cells, wishes.max_level, starts, comm)
+    growing = GrowingTogether(domain, size, wishes, where, partition)
     growing.run()
     resolved = Resolved(growing.grown(), size)
     del growing
-    forest, said = _finished(resolved, domain, sliver, territory)
+    forest, said = _finished(resolved, domain, sliver, partition)
     if said and comm.rank == 0:
         warnings.warn(said, UserWarning, stacklevel=2)
     del resolved
-    return joined(forest, territory)
+    return joined(forest, partition)
 
 
 def _starts(
@@ -136,13 +136,13 @@ def _starts(
     return np.concatenate([[0], used[first], [len(of_cube)]]).astype(np.int64)
 
 
-def _finished(resolved: Resolved, domain: Domain, sliver: float, territory: RootCubePartition) -> tuple[TetForest, str]:
+def _finished(resolved: Resolved, domain: Domain, sliver: float, partition: RootCubePartition) -> tuple[TetForest, str]:
     """This rank's leaves, without empty and nearly empty ones, and what else is left out; as of a whole mesh.
 
     Raises:
         InputError: On all ranks, if there are none.
     """
-    comm, grown, size = territory.comm, resolved.grown, resolved.cell_size
+    comm, grown, size = partition.comm, resolved.grown, resolved.cell_size
     child = resolved.as_wished()
     tree, stays = filled_tree(resolved, child)
     counts = comm.allgather(int((tree.first_child == LIVE).sum()))
@@ -150,11 +150,11 @@ def _finished(resolved: Resolved, domain: Domain, sliver: float, territory: Root
     leaves = tree.leaves
     firsts = np.cumsum([0, *counts])
     volume = resolved.volume[stays[leaves]]
-    faces = faces_of(tree.leaf_tets, grown.lattice, int(firsts[comm.rank]), territory)
+    faces = faces_of(tree.leaf_tets, grown.lattice, int(firsts[comm.rank]), partition)
     elements = Elements(
-        tree.leaf_tets, territory.keys(grown.lattice), resolved.held[stays[leaves]], volume, faces, firsts
+        tree.leaf_tets, partition.keys(grown.lattice), resolved.held[stays[leaves]], volume, faces, firsts
     )
-    held, given_up, said = without_slivers(elements, sliver, domain, territory)
+    held, given_up, said = without_slivers(elements, sliver, domain, partition)
     counts = comm.allgather(int((~given_up).sum()))
     _check_all_have_some(counts, domain, size)
     live = np.zeros(len(tree.level), bool)

@@ -45,7 +45,7 @@ class Elements:
 
 
 def without_slivers(
-    elements: Elements, sliver: float, domain: Domain, territory: RootCubePartition
+    elements: Elements, sliver: float, domain: Domain, partition: RootCubePartition
 ) -> tuple[Floats, Bools, str]:
     """What ``from_domain`` gives up of a whole mesh; all ranks must call this.
 
@@ -56,7 +56,7 @@ def without_slivers(
         The new volumes of the body in this rank's elements; which of these are given up; and a sentence about pieces
         that are left out, empty if they hold next to nothing.
     """
-    graph = _Graph(elements, sliver, territory)
+    graph = _Graph(elements, sliver, partition)
     while True:
         filling = graph.filling()
         try:
@@ -81,8 +81,8 @@ class _MissingError(Exception):
 class _Graph:
     """The elements that stand for themselves, and connected groups of the others."""
 
-    def __init__(self, elements: Elements, sliver: float, territory: RootCubePartition):
-        comm = territory.comm
+    def __init__(self, elements: Elements, sliver: float, partition: RootCubePartition):
+        comm = partition.comm
         self._elements, self._comm = elements, comm
         self._first = int(elements.firsts[comm.rank])
         self._least = sliver * elements.volume

@@ -221,7 +221,7 @@ def of_their_own(obstacles: Obstacle | Sequence[Obstacle]) -> list[Obstacle]:
     return [each.released() if isinstance(each, Tool) else copy.copy(each) for each in given]
 
 
-def settled_model(model: Model, body: SoftBody, comm: Any) -> Model:
+def model_of_whole(model: Model, body: SoftBody, comm: Any) -> Model:
     """The model with the meaning of "auto" for the whole body, because a part may have other materials."""
     if not hasattr(model, "dilatation"):
         return model

@@ -16,6 +16,7 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.checks import shown
 
 from .divided_mesh import DividedMesh
+from .exchange import in_worlds
 from .parts import Part
 from .places import Places
 
@@ -37,15 +38,14 @@ class PartSync:
     def __init__(self, whole: SoftBody, part: Part, comm: Any):
         self.whole, self.part, self._comm = whole, part, comm
         n, count, worlds = len(part.numbers.nodes), whole.world_node_count, whole.worlds
-        shift = np.arange(worlds, dtype=np.int32)[:, None]
-        everywhere = (part.numbers.places + count * shift).ravel()
+        everywhere = in_worlds(part.numbers.places, worlds, count)
         own = np.tile(part.numbers.owner == comm.rank, worlds)
         #: This rank's nodes among those of all worlds of the whole body, int32, and of its part.
         self.own_nodes = everywhere[own]
         devices = whole.device, part.device
         self._all = Places(everywhere, np.arange(worlds * n, dtype=np.int32), *devices)
         self._own = Places(self.own_nodes, np.flatnonzero(own).astype(np.int32), *devices)
-        elements = (part.numbers.element_places + whole.world_element_count * shift).ravel()
+        elements = in_worlds(part.numbers.element_places, worlds, whole.world_element_count)
         self._elements = Places(elements, np.arange(len(elements), dtype=np.int32), *devices)
         #: The numbers of this rank's nodes in the whole mesh, int64; and the number of nodes of the whole mesh.
         self._everywhere = part.numbers.in_worlds(worlds)[own]
@@ -109,8 +109,7 @@ class PartSync:
             # All ranks find the pressure on all of a body's own surface.
             here = self.part.surface_here if own_surface is None else np.arange(len(triangles), dtype=np.int32)
             whole.contact_surface = own_surface
-            shift = np.arange(self.whole.worlds, dtype=np.int32)[:, None]
-            everywhere = (here + len(triangles) * shift).ravel()
+            everywhere = in_worlds(here, self.whole.worlds, len(triangles))
             is_whole = len(self.part.state.contact_pressures) == count
             own = everywhere if is_whole else np.arange(len(everywhere), dtype=np.int32)
             self._triangles = Places(everywhere, own, self.whole.device, self.part.device)
@@ -237,15 +236,15 @@ def _same(a: Trajectory, b: Trajectory) -> bool:
 _all: weakref.WeakSet[PartSync] = weakref.WeakSet()
 
 
-def register(following: Iterable[PartSync]) -> None:
+def register(syncs: Iterable[PartSync]) -> None:
     """Register bodies and their parts for ``gather``."""
-    for each in following:
+    for each in syncs:
         _all.add(each)
 
 
-def forget(following: Iterable[PartSync]) -> None:
+def forget(syncs: Iterable[PartSync]) -> None:
     """Forget bodies and their former parts."""
-    for each in following:
+    for each in syncs:
         _all.discard(each)
 
 

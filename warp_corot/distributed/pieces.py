@@ -21,7 +21,7 @@ class Piece:
     """A rank's piece of all bodies in one world, body after body, as one mesh and one material.
 
     Args:
-        following: The bodies and this rank's parts of them.
+        syncs: The bodies and this rank's parts of them.
         world: The world.
 
     Attributes:
@@ -31,13 +31,13 @@ class Piece:
         skin: The faces on the bodies' surface.
     """
 
-    def __init__(self, following: Sequence[PartSync], world: int):
-        self._following, self._world = following, world
-        self.up_axis = following[0].whole.mesh.up_axis
+    def __init__(self, syncs: Sequence[PartSync], world: int):
+        self._syncs, self._world = syncs, world
+        self.up_axis = syncs[0].whole.mesh.up_axis
         #: The elements of each body that this rank counts, among those of its part; and the nodes of these.
-        self._elements = [np.flatnonzero(each.part.numbers.counted) for each in following]
+        self._elements = [np.flatnonzero(each.part.numbers.counted) for each in syncs]
         self._nodes, tets, faces, first = [], [], [], 0
-        for each, elements in zip(following, self._elements, strict=True):
+        for each, elements in zip(syncs, self._elements, strict=True):
             own = each.part.mesh.tets[elements]
             nodes = np.unique(own)
             number = np.full(each.part.world_node_count, -1, np.int32)
@@ -46,7 +46,7 @@ class Piece:
             faces.append(number[_outer_faces(each)])
             self._nodes.append(nodes)
             first += len(nodes)
-        self.points = np.concatenate([e.part.mesh.points[n] for e, n in zip(following, self._nodes, strict=True)])
+        self.points = np.concatenate([e.part.mesh.points[n] for e, n in zip(syncs, self._nodes, strict=True)])
         self.tets = np.concatenate(tets).astype(np.int32)
         self.fixed = self._nodal("held") > 0
         self.skin = _skin(self.points, np.concatenate(faces))
@@ -62,21 +62,21 @@ class Piece:
         """
         found = []
         for k, nodes in enumerate(self._nodes):
-            first = self._world * self._following[k].part.world_node_count
+            first = self._world * self._syncs[k].part.world_node_count
             found.append(completed(k, name).numpy()[first + nodes, :3])
         return np.concatenate(found)
 
     def of_elements(self, values: Sequence[npt.NDArray[np.float32]]) -> npt.NDArray[np.float32]:
         """Values of the piece's elements, from those of all elements of each part in all worlds."""
         found = []
-        for each, elements, given in zip(self._following, self._elements, values, strict=True):
+        for each, elements, given in zip(self._syncs, self._elements, values, strict=True):
             found.append(given.reshape(each.part.worlds, -1)[self._world, elements])
         return np.concatenate(found)
 
     def _nodal(self, name: str) -> npt.NDArray[np.uint8]:
         """A condition of the nodes, from the bodies that users hold."""
         found = []
-        for each, nodes in zip(self._following, self._nodes, strict=True):
+        for each, nodes in zip(self._syncs, self._nodes, strict=True):
             first = self._world * each.whole.world_node_count
             values = getattr(each.whole.conditions, name).numpy()
             found.append(values[first + each.part.numbers.places[nodes]])
@@ -84,25 +84,25 @@ class Piece:
 
     def _property(self, name: str) -> float | npt.NDArray[np.float64]:
         values = []
-        for each, elements in zip(self._following, self._elements, strict=True):
+        for each, elements in zip(self._syncs, self._elements, strict=True):
             body = each.part
             shape = (body.worlds, body.world_element_count)
             everywhere = np.broadcast_to(getattr(body.material.isotropic, name), shape)
             values.append(everywhere[self._world, elements])
         joined = np.concatenate(values).astype(np.float64)
         # A piece of a mesh that changes may get elements of other materials.
-        varies = any(np.ptp(getattr(e.whole.material.isotropic, name)) > 0 for e in self._following if _changes(e))
+        varies = any(np.ptp(getattr(e.whole.material.isotropic, name)) > 0 for e in self._syncs if _changes(e))
         return float(joined[0]) if (joined == joined[0]).all() and not varies else joined
 
 
-def _changes(following: PartSync) -> bool:
-    return following.whole.changing is not None
+def _changes(sync: PartSync) -> bool:
+    return sync.whole.changing is not None
 
 
-def _outer_faces(following: PartSync) -> Ints:
+def _outer_faces(sync: PartSync) -> Ints:
     """The triangles of the whole body's surface that are faces of elements that this rank counts, by the part's
     nodes."""
-    whole, numbers = following.whole, following.part.numbers
+    whole, numbers = sync.whole, sync.part.numbers
     triangles, parents = whole.surface_faces
     if isinstance(whole.mesh, DividedMesh):
         own = numbers.counted[parents] & whole.mesh.are_outer(triangles)

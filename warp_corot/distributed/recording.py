@@ -128,11 +128,11 @@ class _Pieces:
         return done
 
     def _make_piece(self) -> None:
-        self._following, self._piece = self._sim.following, Piece(self._sim.following, self._world)
+        self._syncs, self._piece = self._sim.syncs, Piece(self._sim.syncs, self._world)
 
     def _write_frame(self) -> None:
         sim, done = self._sim, self.done
-        if sim.following is not self._following:
+        if sim.syncs is not self._syncs:
             self._make_piece()
             piece = self._piece
             self._writer.change_mesh(piece, fixed=piece.fixed, material=piece, skins=[piece.skin])

@@ -39,7 +39,7 @@ class Workers:
     ):
         self.on_all, self.comm = on_all, on_all.comm
         self._wholes, self._nodes = wholes, nodes
-        self._in_parts = any(each.is_in_parts for each in on_all.following)
+        self._in_parts = any(each.is_in_parts for each in on_all.syncs)
         #: Callbacks of rank 0, or of all ranks that hold the whole bodies; and how many there are on any rank.
         self._callbacks: list[Callable[[], None]] = []
         self._called = 0
@@ -100,7 +100,7 @@ class Workers:
         if not self._in_parts:
             self.on_all.collect()
             return
-        for k, each in enumerate(self.on_all.following):
+        for k, each in enumerate(self.on_all.syncs):
             for name in STATE:
                 found = each.gather(getattr(each.whole.state, name))
                 if self._wholes is not None:
@@ -163,12 +163,12 @@ class RootSimulation(OnOne):
         if in_parts:
             wholes = [bodies] if isinstance(bodies, SoftBody) else list(bodies)
             parts, _, nodes = handed_bodies(wholes, options, wholes[0].device, mpi.world())
-            self._crew = Workers(Simulation(parts, **options), wholes, nodes)
+            self._workers = Workers(Simulation(parts, **options), wholes, nodes)
         else:
-            self._crew = Workers(Simulation(bodies, **options))
-        if (remeshing := self._crew.on_all.remeshing) is not None:
+            self._workers = Workers(Simulation(bodies, **options))
+        if (remeshing := self._workers.on_all.remeshing) is not None:
             self.remeshing, self.fields = remeshing
-        self.serve, self.end = self._crew.serve, self._crew.end
+        self.serve, self.end = self._workers.serve, self._workers.end
 
     # --- stepping --------------------------------------------------------------------------------------------------
 
@@ -179,13 +179,13 @@ class RootSimulation(OnOne):
         self.advance_until(self.total_time + seconds)
 
     def advance_until(self, total_time: float) -> None:
-        self._crew.lead("advance_until", total_time)
+        self._workers.lead("advance_until", total_time)
 
     def advance_steps(self, count: int) -> None:
-        self._crew.lead("advance_steps", count)
+        self._workers.lead("advance_steps", count)
 
     def on_step(self, callback: Callable[[OnOne], None], every: int = 1) -> None:
-        self._crew.on_step(lambda: callback(self), every)
+        self._workers.on_step(lambda: callback(self), every)
 
     def reset(self, worlds: Any = None) -> None:
         raise InputError("reset does not work where rank 0 leads others")
@@ -199,7 +199,7 @@ class RootSimulation(OnOne):
     @property
     def contact(self) -> Contacts | None:
         """The contact of all ranks, which is another one after the mesh has changed."""
-        return self._crew.on_all.contact
+        return self._workers.on_all.contact
 
     @contact.setter
     def contact(self, given: Contacts | None) -> None:
@@ -209,28 +209,28 @@ class RootSimulation(OnOne):
 
     @property
     def dt(self) -> float:
-        return self._crew.on_all.dt
+        return self._workers.on_all.dt
 
     @property
     def dt_range(self) -> tuple[float, float]:
-        return self._crew.on_all.dt_range
+        return self._workers.on_all.dt_range
 
     @property
     def solves(self) -> Solves | None:
-        return self._crew.on_all.solves
+        return self._workers.on_all.solves
 
     @property
     def steps(self) -> int:
-        return self._crew.on_all.steps
+        return self._workers.on_all.steps
 
     @property
     def total_steps(self) -> int:
-        return self._crew.on_all.total_steps
+        return self._workers.on_all.total_steps
 
     @property
     def time(self) -> float:
-        return self._crew.on_all.time
+        return self._workers.on_all.time
 
     @property
     def total_time(self) -> float:
-        return self._crew.on_all.total_time
+        return self._workers.on_all.total_time

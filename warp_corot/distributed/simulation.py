@@ -33,7 +33,7 @@ from warp_corot.solvers import Integrator, SymplecticEuler
 
 from . import checkpoint, mpi, parallel_checkpoint
 from .halo import CommHalo, MpiHalo
-from .part_simulation import PartSimulation, Passes, compile_once, of_their_own, part_of, settled_model
+from .part_simulation import PartSimulation, Passes, compile_once, model_of_whole, of_their_own, part_of
 from .part_sync import PartSync, forget, register
 from .parts import Part
 from .unsupported import check_supported
@@ -86,7 +86,7 @@ class Simulation:
         here = None if device is None else checked_device(device)
         cards = comm.size if deterministic and (here or self.bodies[0].device).is_cuda else 0
         check_supported(self.bodies, models, integrator, others, cards)
-        models = tuple(settled_model(m, body, comm) for m, body in zip(models, self.bodies, strict=True))
+        models = tuple(model_of_whole(m, body, comm) for m, body in zip(models, self.bodies, strict=True))
         self.gravity = checked_gravity(gravity, self.bodies[0].mesh.up_axis)
         self._division = costs, here
         self._passes: Passes | None = None
@@ -99,7 +99,7 @@ class Simulation:
         self._parts = self._made(parts)
         if self._passes is not None:
             self._parts.take_remeshing(self._passes.remeshing, self._remesh)
-        register(self._following)
+        register(self._syncs)
 
     def _divided(self, models: Sequence[Model], deterministic: bool) -> list[Part]:
         """This rank's parts of the bodies as they are now."""
@@ -107,17 +107,17 @@ class Simulation:
         parts = [part_of(body, m, comm, costs, here) for body, m in zip(self.bodies, models, strict=True)]
         for part in parts:
             part.discretization.sums_by_subtrees = bool(deterministic)
-        self._following = [PartSync(body, part, comm) for body, part in zip(self.bodies, parts, strict=True)]
-        for each in self._following:
+        self._syncs = [PartSync(body, part, comm) for body, part in zip(self.bodies, parts, strict=True)]
+        for each in self._syncs:
             each.take_over()
         return parts
 
     def _made(self, parts: list[Part]) -> PartSimulation:
         """The simulation of these parts."""
-        for each in self._following:
+        for each in self._syncs:
             each.take_over()
-        settled, records = bool(self._options["deterministic"]), not self._options["integrator"].is_implicit
-        ranks = MpiHalo(self._comm, self.bodies, parts, reproducible=settled, records=records)
+        reproducible, records = bool(self._options["deterministic"]), not self._options["integrator"].is_implicit
+        ranks = MpiHalo(self._comm, self.bodies, parts, reproducible=reproducible, records=records)
         return PartSimulation(ranks, parts, **self._options)
 
     def _remesh(self) -> None:
@@ -134,7 +134,7 @@ class Simulation:
 
     def _divide_anew(self) -> None:
         """Go on with parts of the present meshes; the whole bodies have the state of all nodes."""
-        forget(self._following)
+        forget(self._syncs)
         for body in self.bodies:
             if body.state.is_touched:
                 body.state.make_contact_forces()
@@ -143,7 +143,7 @@ class Simulation:
         if self._parts.contact is not None:
             self._parts.contact.obstacles.let_go()
         self._parts.become(self._made(parts))
-        register(self._following)
+        register(self._syncs)
 
     def __getattr__(self, name: str) -> Any:
         if not name.startswith("_") and hasattr(on_one.Simulation, name):
@@ -200,7 +200,7 @@ class Simulation:
         self._take_over()
         if self._passes is not None:
             self._restore_meshes(worlds)
-        for each in self._following:
+        for each in self._syncs:
             each.take_initial()
         self._parts.reset(worlds)
         self._publish()
@@ -272,7 +272,7 @@ class Simulation:
     def elements_here(self) -> tuple[int, int]:
         """Elements that this rank computes in one world, over all bodies, and how many of these are copies of other
         ranks' elements."""
-        counted = [each.part.numbers.counted for each in self._following]
+        counted = [each.part.numbers.counted for each in self._syncs]
         return sum(map(len, counted)), sum(int((~each).sum()) for each in counted)
 
     @property
@@ -282,7 +282,7 @@ class Simulation:
 
     def exchange_seconds(self, count: int) -> float:
         """The mean time of one exchange alone, over ``count`` of them in a row [s]; all ranks must call this."""
-        probes = [wp.zeros_like(each.part.state.displacements) for each in self._following]
+        probes = [wp.zeros_like(each.part.state.displacements) for each in self._syncs]
         return self._parts.ranks.exchange_seconds(probes, checked_count(count, "count", least=1))
 
     def measured_costs(self, count: int = 20) -> list[float]:
@@ -308,7 +308,7 @@ class Simulation:
 
         If no rank holds the whole mesh, these are the nodes of this rank's part.
         """
-        for k, each in enumerate(self._following):
+        for k, each in enumerate(self._syncs):
             if each.is_in_parts:
                 each.take_ghosts(functools.partial(self.completed, k))
                 continue
@@ -323,12 +323,12 @@ class Simulation:
 
         It is valid until the next call. All ranks must call this.
         """
-        return self._parts.ranks.exchange(k, getattr(self._following[k].part.state, name), copies=True)
+        return self._parts.ranks.exchange(k, getattr(self._syncs[k].part.state, name), copies=True)
 
     @property
-    def following(self) -> list[PartSync]:
+    def syncs(self) -> list[PartSync]:
         """The bodies, each with this rank's part of it."""
-        return self._following
+        return self._syncs
 
     @property
     def remeshing(self) -> Passes | None:
@@ -338,7 +338,7 @@ class Simulation:
     def von_mises(self) -> list[npt.NDArray[np.float32]]:
         """Von Mises stress of each element of this rank's part of each body [Pa], float32 [worlds * t]."""
         self._take_over()
-        return [self._parts.von_mises(each.part) for each in self._following]
+        return [self._parts.von_mises(each.part) for each in self._syncs]
 
     @property
     def solves(self) -> Solves | None:
@@ -369,11 +369,11 @@ class Simulation:
             InputError: On all ranks, if one cannot write to the folder.
         """
         self._take_over()
-        if any(each.is_in_parts for each in self._following):
-            parallel_checkpoint.save(path, self._parts, self._following, self._comm)
+        if any(each.is_in_parts for each in self._syncs):
+            parallel_checkpoint.save(path, self._parts, self._syncs, self._comm)
             return
         self.collect()
-        checkpoint.save(path, self.bodies, self._parts, self._following, self._comm)
+        checkpoint.save(path, self.bodies, self._parts, self._syncs, self._comm)
 
     @classmethod
     def load(
@@ -400,9 +400,9 @@ class Simulation:
         if in_parts is not None:
             options = {name: getattr(in_parts, name) for name in ("integrator", "gravity", "deterministic")}
             made = cls(in_parts.bodies, model=in_parts.models, **options, **in_parts.touching)
-            checkpoint.resume(in_parts, made._parts, made._following)
+            checkpoint.resume(in_parts, made._parts, made._syncs)
             if in_parts.touching:
-                in_parts.resume_touch(made._parts, made._following[0])
+                in_parts.resume_touch(made._parts, made._syncs[0])
             return made
         loaded = on_one.Simulation.load(path, device=device, remesh=remesh)
         touching: dict[str, Any] = {}
@@ -419,17 +419,17 @@ class Simulation:
             deterministic=loaded.deterministic,
             **touching,
         )
-        checkpoint.resume(loaded, made._parts, made._following)
+        checkpoint.resume(loaded, made._parts, made._syncs)
         return made
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
     def _take_over(self) -> None:
-        for k, each in enumerate(self._following):
+        for k, each in enumerate(self._syncs):
             each.take_over()
             self._parts.ranks.exchange(k, each.part.state.displacements)
             each.part.state.publish_positions()
 
     def _publish(self) -> None:
-        for each in self._following:
+        for each in self._syncs:
             each.publish()

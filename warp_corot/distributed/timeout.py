@@ -26,7 +26,7 @@ GRACE = 5.0
 LAST_LOOK = 0.5
 
 
-def patience() -> float:
+def longest_wait() -> float:
     """The time that a rank waits for others [s].
 
     Raises:
