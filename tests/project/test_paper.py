@@ -12,7 +12,7 @@ import warp as wp
 import warp_corot as wc
 from warp_corot.cli import main
 from warp_corot.cli import paper as command
-from warp_corot.cli.options import paper as options
+from warp_corot.cli.options import add_command
 from warp_corot.experiments import figures, report
 from warp_corot.experiments.claims import judged_claims
 from warp_corot.experiments.paper import (
@@ -42,7 +42,7 @@ def coarse(device):
 
 def parsed(*arguments):
     parser = argparse.ArgumentParser()
-    options.add_parser(parser.add_subparsers(required=True))
+    add_command(parser.add_subparsers(required=True), "paper")
     return parser.parse_args(["paper", *map(str, arguments)])
 
 
