@@ -316,7 +316,7 @@ def couple_places(start: int, surface: Surface, holding: Holding, couplings: Cou
     """Write S and D for an assembled matrix."""
     s = start + wp.tid()
     if holding.touched[s] != 0:
-        i = surface.node[s]
+        i = couplings.first + surface.node[s]
         couplings.projected[i] = 1
         couplings.projectors[i] = holding.projectors[s]
         couplings.drag[i] = holding.drag[s]

@@ -7,6 +7,7 @@ all places and then all bearers.
 import warp as wp
 
 from warp_corot.kernels.elements.elements import add_force, load_node, store_node
+from warp_corot.kernels.implicit.assembled import Couplings, couple
 
 from .bearing import borne_force, is_borne
 from .motion import Surface
@@ -119,6 +120,22 @@ def push_at(s: int, force: wp.vec3, surface: Surface, carriers: Carriers, y: wp.
                 add_force(y, carriers.entry[c], w[k] * force)
     elif carriers.compliance[s] > 0.0:
         add_force(y, carriers.entry[s], force)
+
+
+@wp.func
+def couple_at(c: int, places: int, s: int, part: wp.vec3, surface: Surface, carriers: Carriers, couplings: Couplings):
+    """Add a place's free carriers to the c-th product of an assembled matrix, which has ``places`` nodes; returns how
+    many it has then."""
+    if is_borne(s, surface):
+        first = surface.node.shape[0]
+        b = surface.bearing.bearers[s]
+        w = surface.bearing.weights[s]
+        for k in range(4):
+            if w[k] != 0.0 and carriers.compliance[first + b[k]] > 0.0:
+                places = couple(c, places, carriers.entry[first + b[k]], w[k] * part, couplings)
+    elif carriers.compliance[s] > 0.0:
+        places = couple(c, places, carriers.entry[s], part, couplings)
+    return places
 
 
 @wp.func

@@ -8,10 +8,10 @@ passes.
 
 import warp as wp
 
-from warp_corot.kernels.implicit.conjugate_gradients import had_much_to_do
+from warp_corot.kernels.implicit.assembled import Couplings, begin_coupling, end_coupling, root_columns
 from warp_corot.kernels.implicit.line_search import TRIED
 
-from .carriers import Carriers, motion_at, push_at
+from .carriers import Carriers, couple_at, motion_at, push_at
 from .motion import Surface
 from .rows import Rows, row_count
 from .springs import bound_of, spring_state
@@ -174,6 +174,29 @@ def add_row_products(
 
 
 @wp.kernel(enable_backward=False)
+def couple_rows(threads: int, surface: Surface, carriers: Carriers, rows: Rows, joined: Joined, couplings: Couplings):
+    """Add the derivative to an assembled matrix."""
+    i = wp.tid()
+    while i < joined.counts[PUSHING]:
+        row = joined.pushing[i]
+        p = rows.places[row]
+        w = rows.shares[row]
+        roots = root_columns(joined.derivative[row])
+        for axis in range(3):
+            g = wp.vec3(roots[0, axis], roots[1, axis], roots[2, axis])
+            if wp.length_sq(g) > 0.0:
+                c = begin_coupling(couplings)
+                if c >= 0:
+                    places = int(0)
+                    k = int(0)
+                    while k < 4:
+                        places = couple_at(c, places, p[k], w[k] * g, surface, carriers, couplings)
+                        k += 1
+                    end_coupling(c, places, couplings)
+        i += threads
+
+
+@wp.kernel(enable_backward=False)
 def add_row_slopes(
     # In
     threads: int,
@@ -242,45 +265,3 @@ def end_places(
     surface.d[s] = motion_at(s, surface, carriers, d)
     surface.f[s] = surface.f[s] + added[s]
     added[s] = wp.vec3()
-
-
-@wp.kernel(enable_backward=False)
-def judge_round(
-    # In
-    scalars: wp.array2d[wp.float64],
-    iterations: wp.array[wp.int32],
-    changed: wp.array[wp.int32],
-    total: wp.array[wp.int32],
-    settled: wp.float64,
-    near: wp.float64,
-    # In and out
-    locates: wp.array[wp.int32],
-    rounds: wp.array[wp.int32],
-    linear: wp.array[wp.int32],
-    # Out
-    solves: wp.array[wp.int32],
-    going: wp.array[wp.int32],
-):
-    """Solve again until the last solve had next to nothing to do, just after pairs were located."""
-    linear[0] = linear[0] + iterations[0]
-    rounds[0] = rounds[0] + 1
-    solves[0] = rounds[0]
-    was_located = locates[0] != 0 or total[0] == 0
-    is_settled = changed[0] == 0 and not had_much_to_do(scalars, 0, settled)
-    locates[0] = wp.where(changed[0] == 0 and not had_much_to_do(scalars, 0, near), 1, 0)
-    changed[0] = 0
-    going[0] = wp.where(is_settled and was_located, 0, 1)
-
-
-@wp.kernel(enable_backward=False)
-def gather_change(one: wp.array[wp.int32], changed: wp.array[wp.int32]):
-    if one[0] != 0:
-        changed[0] = 1
-
-
-@wp.kernel(enable_backward=False)
-def spread(iterations: wp.array[wp.int32], status: wp.array[wp.int32], both: wp.array2d[wp.int32]):
-    """The same count and status for every world."""
-    world = wp.tid()
-    both[0, world] = iterations[0]
-    both[1, world] = status[0]

@@ -8,12 +8,11 @@ multipliers; in between, spans that are missing are added.
 
 import warp as wp
 
-from warp_corot.kernels.implicit.assembled import Couplings, begin_coupling, couple, end_coupling, root_columns
+from warp_corot.kernels.implicit.assembled import Couplings, begin_coupling, end_coupling, root_columns
 from warp_corot.kernels.implicit.conjugate_gradients import had_much_to_do
 from warp_corot.kernels.implicit.line_search import TRIED
 
-from .bearing import is_borne
-from .carriers import Carriers, motion_at, push_at
+from .carriers import Carriers, couple_at, motion_at, push_at
 from .motion import Surface
 from .rolling import Rolling, share_of_moment, tilted
 from .springs import bound_of, spring_state
@@ -244,18 +243,8 @@ def couple_corners(parts: wp.mat33, corners: wp.vec3i, surface: Surface, carrier
         return
     places = int(0)
     for k in range(3):
-        s = corners[k]
-        if wp.length_sq(parts[k]) == 0.0:
-            continue
-        if is_borne(s, surface):
-            first = surface.node.shape[0]
-            b = surface.bearing.bearers[s]
-            w = surface.bearing.weights[s]
-            for m in range(4):
-                if w[m] != 0.0 and carriers.compliance[first + b[m]] > 0.0:
-                    places = couple(c, places, carriers.entry[first + b[m]], w[m] * parts[k], couplings)
-        elif carriers.compliance[s] > 0.0:
-            places = couple(c, places, carriers.entry[s], parts[k], couplings)
+        if wp.length_sq(parts[k]) > 0.0:
+            places = couple_at(c, places, corners[k], parts[k], surface, carriers, couplings)
     end_coupling(c, places, couplings)
 
 

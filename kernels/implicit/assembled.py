@@ -1,4 +1,4 @@
-"""Linear solves with an assembled matrix: block rows of a body, and contacts as products of vectors beside them.
+"""Linear solves with an assembled matrix: block rows of all bodies, and contacts as products of vectors beside them.
 
 A contact that pushes adds sums of c c^T to the matrix, where c couples the nodes that bear it. Entries of the matrix
 are stored transposed, as in ``multigrid.values``. Nodes that obstacles hold move in the range of a projector S only.
@@ -18,8 +18,8 @@ wp.set_module_options({"enable_backward": False})
 #: the same residual, bunnies of 5 and 30 kPa were 3.1 and 1.2 times as far off; with 0.1, a stiff block that spins
 #: beside an obstacle still had more strain energy than its rotation gives it.
 CLOSER = 0.03
-#: Maximum number of nodes that bear a contact: four for each corner of a triangle.
-PLACES = 12
+#: Maximum number of nodes that bear a contact: four for each of the four places of a pair of soft surfaces.
+PLACES = 16
 
 
 @wp.struct
@@ -33,6 +33,7 @@ class Couplings:
     projected: wp.array[wp.int32]  # whether an obstacle holds a node, by node
     projectors: wp.array[wp.mat33]  # S, by node
     drag: wp.array[wp.mat33]  # the derivative of friction at nodes that are held, by node [N/m]
+    first: int  # the first node of the body whose contacts are added
 
 
 # --- the matrix -------------------------------------------------------------------------------------------------------
@@ -84,11 +85,11 @@ def finish_matrix(
             inverse = s * inverse_block(whole + away) * s
         else:
             inverse = inverse_block(whole)
-    blocks[world * entries + diagonal[k]] = own
+        blocks[world * entries + diagonal[k]] = own
+        if planes.shape[0] > 1:
+            write_planes(world, diagonal[k], entries, own, planes)
     pivots[i] = whole
     inverses[i] = inverse
-    if planes.shape[0] > 1:
-        write_planes(world, diagonal[k], entries, own, planes)
 
 
 @wp.kernel(enable_backward=False)
@@ -132,9 +133,10 @@ def begin_coupling(couplings: Couplings):
 
 
 @wp.func
-def couple(c: int, places: int, node: int, part: wp.vec3, couplings: Couplings):
-    """Add a node to a product that has ``places``; returns how many it has then."""
+def couple(c: int, places: int, entry: int, part: wp.vec3, couplings: Couplings):
+    """Add a node of the body to a product that has ``places``; returns how many it has then."""
     at = int(0)
+    node = couplings.first + entry
     while at < places and couplings.nodes[c, at] != node:
         at += 1
     if at == places:

@@ -167,22 +167,6 @@ def find_middle(
 
 
 @wp.kernel(enable_backward=False)
-def take_step(
-    # In
-    step: wp.array[wp.vec4],
-    # In and out
-    increment: wp.array[wp.vec4],
-    # Out
-    u: wp.array[wp.vec4],
-):
-    """Add a step to the increments and to the stage's displacements."""
-    i = wp.tid()
-    s = load_node(step, i)
-    store_node(increment, i, load_node(increment, i) + s)
-    store_node(u, i, load_node(u, i) + s)
-
-
-@wp.kernel(enable_backward=False)
 def end_step(
     # In
     begins: wp.array[wp.int32],
@@ -238,7 +222,7 @@ def end_step(
     elif wp.dot(d, d) > 0.0:
         moves[0] = 1
     d = d / table[which, STAGE, 0]
-    if status[i / world_nodes] == BROKEN:
+    if status[wp.min(i / world_nodes, status.shape[0] - 1)] == BROKEN:
         d = wp.vec3(wp.nan, wp.nan, wp.nan)
     place = load_node(base, i) + d
     store_node(u, i, place)

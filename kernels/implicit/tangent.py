@@ -4,8 +4,6 @@ import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
 
-from .conjugate_gradients import BROKEN, LIMIT, had_much_to_do
-
 wp.set_module_options({"enable_backward": False})
 
 #: Places in ``scales``: a, b and c.
@@ -100,44 +98,3 @@ def add_vectors(change: wp.array[wp.vec4], d: wp.array[wp.vec4]):
     """d += change."""
     i = wp.tid()
     store_node(d, i, load_node(d, i) + load_node(change, i))
-
-
-@wp.kernel(enable_backward=False)
-def judge_round(
-    # In
-    scalars: wp.array2d[wp.float64],
-    iterations: wp.array[wp.int32],
-    changed: wp.array[wp.int32],
-    settled: wp.float64,
-    # In and out
-    rounds: wp.array[wp.int32],
-    total: wp.array[wp.int32],
-    # Out
-    going: wp.array[wp.int32],
-):
-    """Count a linear solve with contact; another one follows if contact has changed, or if this one had much to do."""
-    again = int(changed[0])
-    for world in range(iterations.shape[0]):
-        total[world] = total[world] + iterations[world]
-        if had_much_to_do(scalars, world, settled):
-            again = 1
-    rounds[0] = rounds[0] + 1
-    going[0] = again
-
-
-@wp.kernel(enable_backward=False)
-def end_rounds(
-    # In
-    rounds: wp.array[wp.int32],
-    most: int,
-    # In and out
-    going: wp.array[wp.int32],
-    # Out
-    status: wp.array[wp.int32],
-):
-    """End the solves of a step after ``most`` of them; the step is unfinished if another one should follow."""
-    if going[0] != 0 and rounds[0] >= most:
-        going[0] = 0
-        for world in range(status.shape[0]):
-            if status[world] != BROKEN:
-                status[world] = LIMIT

@@ -12,6 +12,7 @@ from warp_corot.kernels.contact import joined_places as finding
 from warp_corot.kernels.contact import row_meetings
 from warp_corot.kernels.contact.law import Law
 from warp_corot.kernels.contact.motion import Surface
+from warp_corot.kernels.implicit.assembled import Couplings
 from warp_corot.solvers.system import System
 
 from .carriers import PlaceCarriers
@@ -170,6 +171,10 @@ class JoinedRows:
 
     def add_products(self, x: wp.array, y: wp.array) -> None:
         self._on_rows(kernels.add_row_products, [*self._springs, x, y])
+
+    def launch_couplings(self, couplings: Couplings) -> None:
+        """Launch the addition of the derivative to an assembled matrix."""
+        self._on_rows(kernels.couple_rows, [*self._springs, couplings])
 
     def add_slopes(self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array) -> None:
         """Launch the power along a change; see ``solvers.implicit.line_search``."""

@@ -68,7 +68,7 @@ class ImplicitSteps(Steps):
             wp.zeros(count, dtype=wp.vec4, device=self.device) for _ in range(6)
         )
         self._still = wp.zeros(model.particle_count, dtype=wp.vec3, device=self.device)
-        self._solver = ConjugateGradients(self._operator, count, most=ITERATIONS)  # type: ignore[arg-type]
+        self._solver = ConjugateGradients(self._operator, count, most=ITERATIONS)
         self._solver.tolerance.fill_(TOLERANCE)
         self._search = LineSearch(self._unknowns.worlds, self._unknowns.count, self._links, self.device)
         self._rounds, self._going = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(2))

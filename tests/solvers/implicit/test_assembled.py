@@ -16,9 +16,9 @@ from warp_corot.kernels.implicit.assembled import Couplings
 from warp_corot.kernels.implicit.chosen import COUNTS
 from warp_corot.solvers.implicit import assembled
 from warp_corot.solvers.implicit.assembled import AssembledSolve, suits
+from warp_corot.solvers.implicit.block_system import VectorBlocks
 from warp_corot.solvers.implicit.conjugate_gradients import ConjugateGradients
 from warp_corot.solvers.implicit.tangent import TangentOperator
-from warp_corot.solvers.implicit.touching import FreeOperator, FreePreconditioner
 
 FORESTS = {"uniform": uniform, "mixed": lambda: mixed_forest(level=5), "ball": ball_mesh}
 #: Displacements over edges; with those of 1.5 more than a third of the elements are turned over.
@@ -38,6 +38,14 @@ def operator_of(mesh, device, rng, poisson, amount):
     return operator, ~held
 
 
+def assembled_of(operator):
+    """The assembled matrix of one operator."""
+    blocks = VectorBlocks([len(operator.inverse_mass)])
+    solve = AssembledSolve([operator], blocks, together=False, touches=False)
+    solve.update()
+    return solve
+
+
 def product(apply, x, device):
     """y = A x [n, 3], float64."""
     padded, y = np.zeros((len(x), 4), np.float32), wp.zeros(len(x), dtype=wp.vec4, device=device)
@@ -48,7 +56,7 @@ def product(apply, x, device):
 
 def matrix_of(solve, worlds):
     """The assembled matrices of all worlds in the form that the device reads, float64."""
-    rows, entries, count = solve._rows, solve._pattern.entries, solve._pattern.count
+    rows, entries, count = solve._rows, solve._entries, solve._count
     blocks = rows.blocks.numpy()[:-1].swapaxes(1, 2)
     if solve.device.is_cuda:
         blocks = solve._planes.numpy().reshape(worlds, 3, 3, entries).transpose(0, 3, 2, 1).reshape(-1, 3, 3)
@@ -64,8 +72,7 @@ def matrix_of(solve, worlds):
 def test_the_matrix_is_the_operators(name, poisson, amount, device, rng):
     """From a Poisson's ratio of 0.45 on, elements share their dilatation."""
     operator, free = operator_of(FORESTS[name](), device, rng, poisson, AMOUNTS[amount])
-    solve = AssembledSolve(operator, touches=False)
-    solve.update(operator)
+    solve = assembled_of(operator)
     x = rng.standard_normal((len(free), 3)).astype(np.float32) * free[:, None]
     expected = product(operator.apply, x, device)
     found = (matrix_of(solve, 2) @ x.astype(float).ravel()).reshape(-1, 3)
@@ -78,13 +85,13 @@ def test_the_matrix_is_the_operators(name, poisson, amount, device, rng):
 def test_a_solve_satisfies_the_operator(poisson, device, rng):
     """To its tolerance, by a product of the operator itself; a world without a right side takes no iterations."""
     operator, free = operator_of(ball_mesh(), device, rng, poisson, 0.2)
-    solve = AssembledSolve(operator, touches=False)
-    solve.update(operator)
+    solve = assembled_of(operator)
     b = rng.standard_normal((len(free), 3)).astype(np.float32) * free[:, None]
     b[: len(b) // 2] = 0.0
     cg, x = ConjugateGradients(operator, len(b)), on_device(np.zeros_like(b), operator.field)
     cg.tolerance.fill_(1e-4)
-    cg.launch(solve, on_device(b, operator.field), x)
+    cg.begin(on_device(b, operator.field), x)
+    solve.iterate(cg, x)
     report = cg.report()
     assert report.converged.all()
     assert report.iterations[0] == 0 < report.iterations[1]
@@ -116,13 +123,13 @@ def test_contact_is_in_the_matrix(scene, device, rng):
     """S (A + D + the sum of c c^T) is what the operator does to vectors in the range of S, and solves satisfy it."""
     sim, _ = pressed(scene, device)
     sim.advance_steps(15)
-    (steps,) = sim.recorded._stepper._bodies
-    newton, held, solve = steps.newton, steps.held, steps.lagged.assembled
-    operator, count = FreeOperator(newton.operator, held), 2 * newton.operator.node_count
-    solve.update(newton.operator)
-    held.launch_friction(newton.step, wp.zeros_like(newton.step))
-    solve.take_contact(held)
-    couplings, b = solve.couplings, on_device(rng.standard_normal((count, 3)), newton.operator)
+    (solve_of_step,) = sim.recorded._stepper._solves
+    system, solve = solve_of_step._system, solve_of_step.choice.assembled
+    (held,), count = system.contacts, system.worlds * system.node_count
+    solve.update()
+    held.launch_friction(system.x, wp.zeros_like(system.x))
+    solve.take_contact(system.contacts, None)
+    couplings, b = solve.couplings, on_device(rng.standard_normal((count, 3)), system)
     if held.nodes is not None:
         held.nodes.launch_free(b)
     x = b.numpy()[:, :3].astype(float)
@@ -134,7 +141,7 @@ def test_contact_is_in_the_matrix(scene, device, rng):
     for nodes, parts in zip(couplings.nodes.numpy()[:used], couplings.parts.numpy()[:used, :, :3], strict=True):
         c = parts[nodes >= 0].astype(float)
         found[nodes[nodes >= 0]] += (c * x[nodes[nodes >= 0]]).sum() * c
-    expected = product(operator.apply, x, device)
+    expected = product(system.apply, x, device)
     assert (is_held.sum() > 10) == (scene != "own surface")
     assert couplings.drag.numpy()[is_held].any() == (scene != "own surface")
     assert (used > 0) == (scene != "held")
@@ -142,9 +149,10 @@ def test_contact_is_in_the_matrix(scene, device, rng):
     print(f"{used} products, {error:.1e} of the largest value")
     assert error < 50 * ROUNDING
     change = wp.zeros_like(b)
-    newton.solver.launch(FreePreconditioner(solve, held, b), b, change)
-    left = x - product(operator.apply, change.numpy()[:, :3], device)
-    assert newton.solver.report().converged.all()
+    system.solver.begin(b, change)
+    solve.iterate(system.solver, change)
+    left = x - product(system.apply, change.numpy()[:, :3], device)
+    assert system.solver.report().converged.all()
     assert np.linalg.norm(left) < 1e-4 * np.linalg.norm(x)
 
 

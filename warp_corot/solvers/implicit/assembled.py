@@ -1,7 +1,10 @@
-"""Linear solves of one body with its matrix assembled, each in one launch; see ``kernels.implicit.assembled``."""
+"""Linear solves with the matrix of all bodies assembled, each in one launch; see ``kernels.implicit.assembled``."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,13 +19,13 @@ from warp_corot.kernels.implicit.multigrid.cycle import Rows
 from warp_corot.materials.directional import Directional
 
 from .multigrid.leaf_matrix import LeafMatrix
-from .multigrid.pattern import PatternFinder
-from .operator import LinearOperator, Preconditioner
+from .multigrid.pattern import Pattern, PatternFinder
 from .tangent import TangentOperator
 
 if TYPE_CHECKING:
+    from .block_system import VectorBlocks
     from .conjugate_gradients import ConjugateGradients
-    from .touching import Held
+    from .contact_constraints import ObstacleContact, SoftContact
 
 #: Threads of a block on CUDA, and the lanes that share a row: as many as leave no thread idle, within these bounds.
 THREADS, FEWEST_LANES, MOST_LANES = 512, 4, 16
@@ -46,55 +49,107 @@ def suits(operator: TangentOperator) -> bool:
     )
 
 
+@dataclass(frozen=True, eq=False)
+class _BodyMatrix:
+    """What the matrix of one body is computed from."""
+
+    operator: TangentOperator
+    leaves: LeafMatrix
+    nodes: wp.array
+    free: wp.array
+
+    @property
+    def pattern(self) -> Pattern:
+        return self.leaves.pattern
+
+
 class AssembledSolve:
-    """The matrix of an operator, and conjugate gradients with it in one launch.
+    """The matrices of operators as one, and conjugate gradients with it in one launch.
 
     On the CPU a thread solves a world, with a symmetric sweep over the rows as preconditioner (SSOR); on CUDA resident
-    blocks do, with the inverses of diagonal blocks. ``ConjugateGradients`` takes it in place of a preconditioner.
+    blocks do, with the inverses of diagonal blocks.
 
     Args:
-        operator: An operator that ``suits``.
+        operators: Operators that ``suit``, of bodies whose vectors are the ``blocks`` of one.
+        blocks: These blocks.
+        together: Whether all bodies and worlds are one world of the matrix; otherwise there is one body.
         touches: Whether there may be contacts.
 
     Attributes:
-        touches: As given.
-        diagonal: The blocks on the diagonal without contacts, mat33 [worlds * nodes + 1].
+        blocks, touches: As given.
+        diagonal: The blocks on the diagonal without contacts, mat33 [entries of vectors + 1].
         couplings: The contacts of the present solve.
     """
 
-    def __init__(self, operator: TangentOperator, *, touches: bool):
-        self._operator, self.device, self.touches, self._version = operator, operator.device, touches, -1
+    def __init__(self, operators: Sequence[TangentOperator], blocks: VectorBlocks, *, together: bool, touches: bool):
+        self._operators, self.blocks, self._together, self.touches = list(operators), blocks, together, touches
+        self.device, self._versions = operators[0].device, [-1]
         self.follow()
 
     def follow(self) -> None:
-        """Follow the mesh, if it has changed; not while launches are recorded. Waits for the device."""
-        operator, device = self._operator, self.device
-        sizes = operator.body.discretization.sizes
-        count, worlds = operator.node_count, operator.worlds
-        if self._version == sizes.version:
+        """Follow the meshes, if they have changed; not while launches are recorded. Waits for the device."""
+        device = self.device
+        versions = [operator.body.discretization.sizes.version for operator in self._operators]
+        if self._versions == versions:
             return
-        self._version = sizes.version
-        self._count, self._worlds, nodes = count, worlds, count * worlds
-        members = operator.field.find_members
-        self._nodes = wp.array(np.arange(count), dtype=wp.int32, device=device)
-        self._free = wp.zeros(nodes, dtype=wp.uint8, device=device)
-        finder = PatternFinder(wp.zeros(count, dtype=wp.vec2i, device=device))
-        groups = None if members is None else members(sizes.world_elements)
-        given = [operator.body.discretization, finder, self._nodes, self._nodes, count, self._free, groups]
-        self._leaves = LeafMatrix(*given)
-        self._pattern = found = self._leaves.pattern
+        self._versions = versions
+        self._bodies = [self._body_matrix(operator) for operator in self._operators]
+        self._find_rows()
+        count, nodes = self._count, self.blocks.count
         # One more, since products read past the last.
         self.diagonal, self._inverses, self._pivots = (
             wp.zeros(nodes + 1, dtype=wp.mat33, device=device) for _ in range(3)
         )
-        self._rows = Rows()
-        self._rows.starts, self._rows.columns = found.starts, found.columns
-        self._rows.blocks = wp.zeros(worlds * found.entries + 1, dtype=wp.mat33, device=device)
-        planes = 9 * worlds * found.entries if device.is_cuda else 1
+        self._rows.blocks = wp.zeros(self._worlds * self._entries + 1, dtype=wp.mat33, device=device)
+        planes = 9 * self._worlds * self._entries if device.is_cuda else 1
         self._planes = wp.zeros(planes, dtype=wp.float32, device=device)
         self._vectors = [wp.zeros(nodes, dtype=wp.vec4, device=device) for _ in range(5)]
         self._make_couplings(nodes)
-        self._find_launch(count, worlds)
+        self._find_launch(count, self._worlds)
+
+    def _body_matrix(self, operator: TangentOperator) -> _BodyMatrix:
+        count, device = operator.node_count, self.device
+        members, sizes = operator.field.find_members, operator.body.discretization.sizes
+        nodes = wp.array(np.arange(count), dtype=wp.int32, device=device)
+        free = wp.zeros(count * operator.worlds, dtype=wp.uint8, device=device)
+        finder = PatternFinder(wp.zeros(count, dtype=wp.vec2i, device=device))
+        groups = None if members is None else members(sizes.world_elements)
+        leaves = LeafMatrix(operator.body.discretization, finder, nodes, nodes, count, free, groups)
+        return _BodyMatrix(operator, leaves, nodes, free)
+
+    def _find_rows(self) -> None:
+        """Find the rows of the whole matrix, and where the entries of each body are in it."""
+        self._rows = Rows()
+        if not self._together:
+            (body,) = self._bodies
+            found, self._worlds, self._count = body.pattern, body.operator.worlds, body.operator.node_count
+            self._rows.starts, self._rows.columns, self._diagonal = found.starts, found.columns, found.diagonal
+            self._entries, self._firsts = found.entries, [0]
+            return
+        self._worlds, self._count = 1, self.blocks.count
+        starts, columns, self._firsts, first = [], [], [], 0
+        diagonal = np.zeros(self._count, np.int64)
+        for body, at, end in zip(self._bodies, self.blocks.starts, self.blocks.ends, strict=True):
+            found, count = body.pattern, body.operator.node_count
+            self._firsts.append(first)
+            for world in range(body.operator.worlds):
+                row = at + world * count
+                starts.append(first + found.starts.numpy()[:count])
+                columns.append(row + found.columns.numpy()[: found.entries])
+                diagonal[row : row + count] = first + found.diagonal.numpy()[:count]
+                first += found.entries
+            # Rows of nodes that there may be later have a zero.
+            spare = np.arange(row + count, end)
+            starts.append(first + np.arange(len(spare)))
+            columns.append(spare)
+            diagonal[spare] = starts[-1]
+            first += len(spare)
+        starts.append(np.array([first]))
+        self._entries = first
+        self._rows.starts, self._rows.columns, self._diagonal = (
+            wp.array(each, dtype=wp.int32, device=self.device)
+            for each in (np.concatenate(starts), np.concatenate(columns), diagonal)
+        )
 
     def _make_couplings(self, nodes: int) -> None:
         self.couplings, room = kernels.Couplings(), max(ROOM * nodes, LEAST_ROOM) if self.touches else 1
@@ -108,6 +163,13 @@ class AssembledSolve:
             ("drag", wp.mat33, nodes),
         ):
             setattr(self.couplings, name, wp.zeros(size, dtype=dtype, device=self.device))
+        self._couplings = []
+        for start in self.blocks.starts:
+            own = kernels.Couplings()
+            for name in ("count", "nodes", "parts", "blocks", "projected", "projectors", "drag"):
+                setattr(own, name, getattr(self.couplings, name))
+            own.first = start
+            self._couplings.append(own)
 
     def _find_launch(self, count: int, worlds: int) -> None:
         """Find how blocks share the worlds, and threads the rows."""
@@ -120,7 +182,7 @@ class AssembledSolve:
             teams = min(blocks // self._per_team, worlds)
             own = -(-count // self._per_team)
             # Long rows are shared by more lanes.
-            long = self._pattern.entries > MOST_LANES * count
+            long = self._entries > MOST_LANES * count
             self._lanes, self._block = 2 * FEWEST_LANES if long else FEWEST_LANES, THREADS
             while self._lanes < MOST_LANES and 2 * self._lanes * own <= THREADS:
                 self._lanes *= 2
@@ -131,34 +193,44 @@ class AssembledSolve:
     @property
     def kernels(self) -> list[wp.Kernel]:
         """Kernels of factories that it launches."""
-        return self._leaves.kernels
+        return [kernel for body in self._bodies for kernel in body.leaves.kernels]
 
     # --- launches ----------------------------------------------------------------------------------------------------
 
-    def update(self, operator: LinearOperator) -> None:
-        """Launch the computation of the matrix at the operator's displacements and scales, without contacts."""
-        found, count, blocks = self._pattern, self._count, self._rows.blocks
-        self._launch(values.find_free, count, [count, count, self._nodes, operator.inverse_mass], [self._free])
-        self._leaves.gather(operator, blocks, self._inverses, holds=True)
-        self._launch(kernels.keep_diagonal, count, [count, found.entries, found.diagonal, blocks], [self.diagonal])
+    def update(self) -> None:
+        """Launch the computation of the matrix at the operators' displacements and scales, without contacts."""
+        for body, at, first in zip(self._bodies, self.blocks.starts, self._firsts, strict=True):
+            operator, count = body.operator, body.operator.node_count
+            inputs = [count, count, body.nodes, operator.inverse_mass]
+            dim = (operator.worlds, count)
+            wp.launch(values.find_free, dim, inputs, [body.free], device=self.device)
+            blocks = self._rows.blocks[first : first + operator.worlds * body.pattern.entries + 1]
+            body.leaves.gather(operator, blocks, self._inverses[at:], holds=True)
+        inputs = [self._count, self._entries, self._diagonal, self._rows.blocks]
+        self._launch(kernels.keep_diagonal, self._count, inputs, [self.diagonal])
         if self.device.is_cuda:
-            self._launch(kernels.lay_out, found.entries, [found.entries, blocks], [self._planes])
+            self._launch(kernels.lay_out, self._entries, [self._entries, self._rows.blocks], [self._planes])
         self._empty()
         self._finish()
 
-    def take_contact(self, held: Held) -> None:
+    def take_contact(self, contacts: Sequence[ObstacleContact | None], soft: SoftContact | None) -> None:
         """Launch the exchange of the contacts in the matrix for the present ones."""
         self._empty()
-        held.launch_couplings(self.couplings)
+        for contact, couplings in zip(contacts, self._couplings, strict=True):
+            if contact is not None:
+                contact.launch_couplings(couplings)
+        if soft is not None:
+            soft.launch_couplings(self.couplings)
         self._finish()
 
-    def iterate(self, solver: ConjugateGradients, preconditioner: Preconditioner, x: wp.array, r: wp.array) -> None:
-        found = self._pattern
+    def iterate(self, solver: ConjugateGradients, x: wp.array) -> None:
+        """Launch iterations from the residual of x that a solve has begun with, in the worlds that run."""
         if self._per_team > 1:
             self._barriers.zero_()
-        inputs = [self._worlds, self._count, found.entries, self._per_team, self._lanes, solver.most, self._rows]
-        inputs += [self._planes, found.diagonal, self._inverses, self._pivots, self.couplings]
-        outputs = [x, r, solver.scalars, solver.status, solver.iterations, *self._vectors, self._parts, self._barriers]
+        inputs = [self._worlds, self._count, self._entries, self._per_team, self._lanes, solver.most, self._rows]
+        inputs += [self._planes, self._diagonal, self._inverses, self._pivots, self.couplings]
+        outputs = [x, solver.r, solver.scalars, solver.status, solver.iterations]
+        outputs += [*self._vectors, self._parts, self._barriers]
         wp.launch(kernels.solve, self._dim, inputs, outputs, device=self.device, block_dim=self._block)
 
     # --- on the host -------------------------------------------------------------------------------------------------
@@ -166,15 +238,18 @@ class AssembledSolve:
     def largest_frequency(self) -> float:
         """The largest frequency of a free node among fixed ones at the present displacements [rad/s]; waits for the
         device."""
-        operator, nodes = self._operator, self._worlds * self._count
-        operator.take(operator.body.state.displacements)
-        operator.set_scales(0.0, 0.0, 1.0)
-        self.update(operator)
-        # The arrays of a mesh that changes have more room.
-        mass = operator.inverse_mass.numpy()[:nodes]
-        blocks = self.diagonal.numpy()[:nodes].astype(float)
-        stiffness = np.nan_to_num(np.trace(blocks, axis1=1, axis2=2) / 3.0, posinf=1e38)
-        return float(np.sqrt(max((stiffness * mass).max(initial=0.0), 0.0)))
+        for operator in self._operators:
+            operator.take(operator.body.state.displacements)
+            operator.set_scales(0.0, 0.0, 1.0)
+        self.update()
+        found = [0.0]
+        for operator, own in zip(self._operators, self.blocks.of(self.diagonal), strict=True):
+            # The arrays of a mesh that changes have more room.
+            nodes = operator.worlds * operator.node_count
+            mass, blocks = operator.inverse_mass.numpy()[:nodes], own.numpy()[:nodes].astype(float)
+            stiffness = np.nan_to_num(np.trace(blocks, axis1=1, axis2=2) / 3.0, posinf=1e38)
+            found.append(float((stiffness * mass).max(initial=0.0)))
+        return math.sqrt(max(found))
 
     # --- pieces ------------------------------------------------------------------------------------------------------
 
@@ -184,11 +259,10 @@ class AssembledSolve:
         self.couplings.projected.zero_()
 
     def _finish(self) -> None:
-        found = self._pattern
-        inputs = [self._count, found.entries, found.diagonal, self.diagonal, self.couplings]
+        inputs = [self._count, self._entries, self._diagonal, self.diagonal, self.couplings]
         outputs = [self._rows.blocks, self._pivots, self._inverses, self._planes]
         self._launch(kernels.finish_matrix, self._count, inputs, outputs)
 
     def _launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any]) -> None:
-        """Launch a kernel with ``count`` threads for each world."""
+        """Launch a kernel with ``count`` threads for each world of the matrix."""
         wp.launch(kernel, (self._worlds, count), inputs, outputs, device=self.device)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -11,23 +12,17 @@ from warp_corot.elasticity.viscosity import Viscosity
 from warp_corot.errors import InputError
 from warp_corot.inputs.loading import load
 from warp_corot.kernels.elements.prony import set_elapsed
-from warp_corot.kernels.implicit import conjugate_gradients
-from warp_corot.kernels.implicit import newton as kernels_of_newton
 from warp_corot.kernels.implicit import steps as kernels
 from warp_corot.kernels.stepping.integrate import follow_trajectory
 from warp_corot.solvers.halo import ALONE
 
-from .assembled import AssembledSolve, suits
-from .chosen import ChosenSolve
-from .joined import JoinedSolve
-from .joined_newton import JoinedNewton
+from .block_system import BlockSystem
+from .contact_constraints import Hold, ObstacleContact, Touching
 from .lagged import Lagged
 from .multigrid import Multigrid
 from .newton import Newton
 from .preconditioners import preconditioner_of
 from .tangent import TangentOperator
-from .touching import Held, Hold, Touching, TouchingSolve
-from .touching_newton import TouchingNewton
 from .turning import TurnedState
 
 if TYPE_CHECKING:
@@ -37,6 +32,21 @@ if TYPE_CHECKING:
 
 #: The search for soft surfaces leaves room for motions of this many times what a body that is let go falls in a step.
 FALLS = 2.0
+
+
+@dataclass(frozen=True)
+class StepCounts:
+    """How the solve for a step ended, in each world or in all of them together.
+
+    Attributes:
+        iterations, linear_iterations, status: int32 [worlds] or [1].
+        good: The status of a step that is within the tolerance.
+    """
+
+    iterations: wp.array
+    linear_iterations: wp.array
+    status: wp.array
+    good: int
 
 
 class SharedSteps:
@@ -63,11 +73,6 @@ class SharedSteps:
         if self.rows is not None:
             self.rows.reserve(FALLS * float(np.linalg.norm(system.gravity)) * integrator.dt**2)
         self.begins, self.sturdy = (wp.zeros(1, dtype=wp.int32, device=system.device) for _ in range(2))
-
-    @property
-    def in_one_solve(self) -> bool:
-        """Whether a step with contact is one linearisation of backward Euler."""
-        return self.integrator.tolerance is None and self.integrator.history == 0
 
     @property
     def turns(self) -> bool:
@@ -112,40 +117,32 @@ class BodySteps:
             else empty, int32.
         touched: What each node has touched of soft surfaces, in schemes of second order, else empty, int32; see
             ``kernels.contact.meetings``.
-        lagged: The preconditioner, if it is kept over many steps, else None.
+        preconditioner: That of its own matrix.
+        newton: Newton's method, or the residual of a linearisation.
     """
 
     def __init__(self, shared: SharedSteps, k: int):
         self.shared, self.k = shared, k
-        self._counts: list[wp.array] = []
-        self._good = 0
         system, options = shared.system, shared.integrator
         self.body, self.field, self.system = system.bodies[k], system.fields[k], system
         self.device = self.body.device
         self.viscosity = Viscosity(self.body, self.field, options.viscosity) if options.viscosity else None
         sets = [each.active_set(k) for each in shared.touching]
-        self.held: Held | None = next((each for each in sets if each is not None), None)
+        self.held: ObstacleContact | None = next((each for each in sets if each is not None), None)
         touches = self.held is not None or shared.rows is not None
         # Contact needs a matrix that is positive definite.
         exact = options.tolerance is not None and not touches
         self.operator = TangentOperator(
             self.body, self.field, viscosity=self.viscosity, exact=exact, ranks=system.ranks, number=k
         )
-        self._preconditioner = preconditioner_of(
+        self.preconditioner = preconditioner_of(
             options.preconditioner, self.operator, short_cycles=not exact, few_digits=True
         )
-        self.lagged: Lagged | ChosenSolve | None = None
-        if not exact and isinstance(self._preconditioner, Multigrid):
-            self._preconditioner = self.lagged = Lagged(self._preconditioner, self.operator, system.ranks)
-            if options.preconditioner is None and shared.rows is None and suits(self.operator):
-                assembled = AssembledSolve(self.operator, touches=touches)
-                self._preconditioner = self.lagged = ChosenSolve(
-                    assembled, self.lagged, shares=self.field.shares_dilatation, dt=options.dt
-                )
+        if not exact and isinstance(self.preconditioner, Multigrid):
+            self.preconditioner = Lagged(self.preconditioner, self.operator, system.ranks)
         if self.device.is_cpu:
-            chosen = self.lagged.assembled.kernels if isinstance(self.lagged, ChosenSolve) else []
-            load((), self.device, [*self.operator.tangent.kernels, *chosen])
-        self._make_solvers()
+            load((), self.device, self.operator.tangent.kernels)
+        self.newton: Newton
         like = self.body.state.displacements
         self._none = wp.zeros(1, dtype=wp.vec4, device=self.device)
         wanted = options.history
@@ -161,8 +158,6 @@ class BodySteps:
             self.operator.frame = wp.zeros_like(like)
         self._moves = wp.zeros(1, dtype=wp.int32, device=self.device)
         self._begins = wp.zeros(1, dtype=wp.int32, device=self.device) if shared.rows is None else shared.begins
-        self._is_prepared = False
-        self._one = wp.ones(self.body.worlds, dtype=wp.int32, device=self.device)
         tables = np.stack([options.scheme(options.dt), options.start(options.dt)])
         if touches:
             # The increments of a step with contact begin with zero.
@@ -171,55 +166,42 @@ class BodySteps:
         tables[:, int(kernels.STAGE), 2] = tables[:, int(kernels.STAGE), 0] if touches else 1.0
         self._table = wp.array(tables, dtype=wp.float32, device=self.device)
 
-    def _make_solvers(self) -> None:
-        """Make everything that depends on the mesh."""
+    def take_system(self, system: BlockSystem, number: int) -> None:
+        """Take the linear system in which the body has this number, made for its present mesh."""
         options = self.shared.integrator
-        self._version = self.body.version
         self.newton = Newton(
-            self.operator,
-            self._preconditioner,
+            system,
             self.system.gravity,
+            number=number,
             tolerance=options.tolerance or options.linear_tolerance,
             most=options.iterations,
-            most_linear=options.linear_iterations,
             others=self._add_others,
         )
         self.newton.is_at_stage = options.is_at_stage
         if self.shared.turns:
             self.newton.turned = TurnedState(self.operator, options.dt)
-        self.touching: TouchingSolve | None = None
-        self.touching_newton: TouchingNewton | None = None
-        if self.held is not None and self.shared.rows is None:
-            self.touching = TouchingSolve(self.newton, self.held)
-            if not self.shared.in_one_solve:
-                self.touching_newton = TouchingNewton(self.touching, **options.newton_with_contact)
+
+    def forget(self) -> None:
+        """Forget the motion before the last step, since the mesh has changed."""
+        self.before.fill_(np.nan)
 
     def prepare(self) -> None:
-        """Make everything that launches use, so that they can be recorded."""
+        """Make everything that launches use, so that they can be recorded, before the linear system is prepared."""
         self.operator.prepare()
-        if self.lagged is not None:
-            self.lagged.prepare()
-        elif isinstance(self._preconditioner, Multigrid):
-            self._preconditioner.follow()
+        if isinstance(self.preconditioner, Lagged):
+            self.preconditioner.prepare()
+        elif isinstance(self.preconditioner, Multigrid):
+            self.preconditioner.follow()
         if self.held is not None:
             self.held.prepare()
-            if self.held.springs is not None and hasattr(self._preconditioner, "follow_springs"):
-                self._preconditioner.follow_springs(self.held.springs)
+            if self.held.springs is not None and hasattr(self.preconditioner, "follow_springs"):
+                self.preconditioner.follow_springs(self.held.springs)
         if self.shared.holds and self.shared.integrator.is_at_stage:
             raise InputError("GeneralizedAlpha supports grasps only with spectral_radius=0")
-        if self._version != self.body.version:
-            if self._is_prepared:
-                self.before.fill_(np.nan)
-            self._make_solvers()
-        self._is_prepared = True
         self.operator.stiff_forces = (
             *(each for each in self.system.forces if hasattr(each, "add_stiffness")),
             *self.shared.holds,
         )
-        if isinstance(self.lagged, ChosenSolve):
-            self.lagged.is_open = suits(self.operator)
-        if self.shared.integrator.tolerance is None or self.touching_newton is not None:
-            self.newton.solver.tolerance.fill_(self.shared.integrator.linear_tolerance)
         u = self.body.state.displacements
         self.field.elastic_forces(u)
         self.field.potentials(u)
@@ -241,70 +223,21 @@ class BodySteps:
             self.held.launch_meetings(self.met, self._begins)
         self.system.ranks.max(self._begins)
 
-    def launch_residual(self) -> None:
-        """Launch the forces that are out of balance, if the step is solved for by itself."""
-        if self.shared.integrator.tolerance is None and self.touching_newton is None:
-            self.newton.launch_residual()
-
-    def launch_solve(self) -> None:
-        """Launch the solve for the step."""
-        newton, solver = self.newton, self.newton.solver
-        if self.touching_newton is not None:
-            self._solve_touching(self.touching_newton)
-            return
-        if self.shared.integrator.tolerance is not None:
-            newton.launch_begin()
-            wp.capture_while(newton.running, newton.launch_iteration)
-            self._counts = [newton.iterations, newton.solved, newton.status]
-            self._good = int(kernels_of_newton.CONVERGED)
-            return
-        iterations = solver.iterations
-        if self.touching is None:
-            newton.launch_solve(guessed=True)
-        else:
-            self.touching.launch()
-            iterations = self.touching.iterations
-        self._take(iterations, solver.status)
-
-    def _solve_touching(self, solve: TouchingNewton) -> None:
-        """Launch the solve for a step with contact by Newton's method."""
-        solve.launch()
-        self._take_counts(solve)
-
-    def _take_counts(self, solve: TouchingNewton | JoinedNewton) -> None:
-        if self.lagged is not None:
-            self.lagged.judge(solve.linear_iterations, solve.status)
-        self._counts = [solve.iterations, solve.linear_iterations, solve.status]
-        self._good = int(conjugate_gradients.CONVERGED)
-
-    def take_solved(self, solve: JoinedSolve | JoinedNewton) -> None:
-        """Launch the copy of this body's step from a solve for all bodies."""
-        if isinstance(solve, JoinedNewton):
-            self._take_counts(solve)
-        else:
-            self._take(solve.iterations, solve.status)
-
-    def _take(self, iterations: wp.array, status: wp.array) -> None:
-        newton = self.newton
-        if self.lagged is not None:
-            self.lagged.judge(iterations, status)
-        self._launch(kernels.take_step, [newton.step], [newton.increment, self.body.state.displacements])
-        self.system.ranks.exchange(self.k, self.body.state.displacements)
-        self._counts, self._good = [self._one, iterations, status], int(conjugate_gradients.CONVERGED)
-
-    def launch_end(self, offset: int, *, is_last: bool) -> None:
+    def launch_end(self, offset: int, counts: StepCounts, *, is_last: bool) -> None:
         """Launch the state after the step, and the count of its iterations.
 
         Args:
             offset: As for ``launch_changes``.
+            counts: How the step's solve ended.
             is_last: Whether this may be the last step of a run, whose reactions a user may read.
         """
-        self._end(offset, self._counts[-1])
+        self._end(offset, counts.status)
         if is_last or not self._can_leave_out_reactions:
             self._find_reactions()
         else:
             wp.capture_if(self._moves, self._find_reactions)
-        wp.launch(kernels.count_solves, 1, [*self._counts, self._good], [self.shared.totals], device=self.device)
+        inputs = [counts.iterations, counts.linear_iterations, counts.status, counts.good]
+        wp.launch(kernels.count_solves, 1, inputs, [self.shared.totals], device=self.device)
 
     # --- pieces ------------------------------------------------------------------------------------------------------
 

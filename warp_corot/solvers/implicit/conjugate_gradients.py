@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -12,7 +12,7 @@ import warp as wp
 from warp_corot.kernels.implicit import conjugate_gradients as kernels
 from warp_corot.solvers.halo import ALONE, Halo
 
-from .operator import LinearOperator, Preconditioner
+from .operator import Preconditioner, Product
 from .sums import WorldSums
 
 
@@ -35,21 +35,6 @@ class SolveReport:
     broken: npt.NDArray[np.bool_]
 
 
-class Assembled(Protocol):
-    """A preconditioner whose matrix is assembled, so that a solve is one launch; see ``AssembledSolve``."""
-
-    def iterate(self, solver: ConjugateGradients, preconditioner: Preconditioner, x: wp.array, r: wp.array) -> None:
-        """Launch iterations from the residual r of x, in the worlds that run; ``preconditioner`` is what the solver was
-        given, with this one in it."""
-        ...
-
-
-def assembled_in(preconditioner: Preconditioner) -> Assembled | None:
-    """The assembled matrix that is or is in a preconditioner, if there is one."""
-    found: Any = getattr(preconditioner, "plain", preconditioner)
-    return found if hasattr(found, "iterate") else None
-
-
 class ConjugateGradients:
     """Solves A x = b in all worlds together, each until its own residual is small.
 
@@ -57,12 +42,13 @@ class ConjugateGradients:
     a direction of descent in either case.
 
     Args:
-        operator: A, for its sizes.
+        operator: A.
         length: Entries of vectors.
         most: Maximum number of iterations.
         ranks: The ranks with other nodes of the same worlds.
 
     Attributes:
+        r: The residual of the present solve, vec4.
         tolerance: Norm of the residual over that of b at which a world stops, float64 [worlds] on the device.
         iterations: Number of iterations of the last solve, int32 [worlds] on the device.
         scalars: Scalars of the iteration, see ``kernels.implicit.conjugate_gradients``, float64 [worlds, SCALARS] on
@@ -70,10 +56,10 @@ class ConjugateGradients:
         status: How the last solve ended, see there, int32 [worlds] on the device.
     """
 
-    def __init__(self, operator: LinearOperator, length: int, *, most: int = 1000, ranks: Halo = ALONE):
+    def __init__(self, operator: Product, length: int, *, most: int = 1000, ranks: Halo = ALONE):
         self.operator, self.device, self.worlds, self.most = operator, operator.device, operator.worlds, most
         self._count = operator.node_count
-        self._r, self._z, self._p, self._q = (wp.zeros(length, dtype=wp.vec4, device=self.device) for _ in range(4))
+        self.r, self._z, self._p, self._q = (wp.zeros(length, dtype=wp.vec4, device=self.device) for _ in range(4))
         self._sums = WorldSums(self.worlds, self._count, kernels.COLUMNS, self.device, ranks)
         shape = (self.worlds, kernels.SCALARS)
         self.scalars = wp.zeros(shape, dtype=wp.float64, device=self.device)
@@ -91,10 +77,17 @@ class ConjugateGradients:
         like: wp.array | None = None,
         share: float = 0.0,
     ) -> None:
-        """Launch a solve, recorded or at once.
+        """Launch a solve, recorded or at once, with a preconditioner that is up to date with the operator; see
+        ``begin``."""
+        self.begin(b, x, guessed=guessed, like=like, share=share)
+        self.iterate(preconditioner.apply, x)
+
+    def begin(
+        self, b: wp.array, x: wp.array, *, guessed: bool = False, like: wp.array | None = None, share: float = 0.0
+    ) -> None:
+        """Launch the beginning of a solve.
 
         Args:
-            preconditioner: A preconditioner that is up to date with the operator.
             b: Right side, zero at nodes that are not free, vec4 [worlds * nodes].
             x: The solution.
             guessed: Whether x has a first guess, zero at nodes that are not free; it is scaled so that the energy is
@@ -102,7 +95,7 @@ class ConjugateGradients:
             like: The vector with which the residual is compared, vec4 [worlds * nodes]; None: b.
             share: The solve may end at this share of its first residual, too.
         """
-        r, q, sums = self._r, self._q, self._sums
+        r, q, sums = self.r, self._q, self._sums
         if guessed:
             self.operator.apply(x, q)
             wp.launch(kernels.measure_guess, sums.shape, [b, x, q, *sums.sizes], [sums.parts], device=self.device)
@@ -114,19 +107,14 @@ class ConjugateGradients:
         self._running.zero_()
         outputs = [self.scalars, self.iterations, self.status, self._running]
         sums.launch_scalars(kernels.take_first, [self.tolerance, wp.float64(share)], outputs)
-        matrix = assembled_in(preconditioner)
-        if matrix is None:
-            self.launch_iterations(preconditioner, x)
-        else:
-            matrix.iterate(self, preconditioner, x, r)
 
-    def launch_iterations(self, preconditioner: Preconditioner, x: wp.array) -> None:
-        """Launch iterations one by one, in the worlds that run."""
-        wp.capture_while(self._running, self._iterate, preconditioner=preconditioner, x=x)
+    def iterate(self, apply_inverse: Callable[[wp.array, wp.array], None], x: wp.array) -> None:
+        """Launch iterations one by one, in the worlds that run, with the preconditioner z = B r."""
+        wp.capture_while(self._running, self._iterate, apply_inverse=apply_inverse, x=x)
 
-    def _iterate(self, preconditioner: Preconditioner, x: wp.array) -> None:
-        r, z, p, q, sums = self._r, self._z, self._p, self._q, self._sums
-        preconditioner.apply(r, z)
+    def _iterate(self, apply_inverse: Callable[[wp.array, wp.array], None], x: wp.array) -> None:
+        r, z, p, q, sums = self.r, self._z, self._p, self._q, self._sums
+        apply_inverse(r, z)
         sums.launch_products(r, z, int(kernels.PRODUCT))
         sums.launch_scalars(kernels.take_beta, [], [self.scalars, self.status, self._running])
         self._launch(kernels.take_direction, [z, self.scalars, self._count, p])

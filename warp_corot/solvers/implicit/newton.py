@@ -10,12 +10,10 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.kernels.implicit import newton as kernels
-from warp_corot.kernels.implicit import touching
+from warp_corot.kernels.implicit.increments import move_held
 
-from .conjugate_gradients import ConjugateGradients
-from .operator import Preconditioner
+from .block_system import BlockSystem
 from .sums import WorldSums
-from .tangent import TangentOperator
 from .turning import TurnedState
 
 if TYPE_CHECKING:
@@ -56,18 +54,19 @@ class Newton:
     The unknown is ``increment``; ``body.state.displacements`` follow it as base + increment.
 
     Args:
-        operator: The tangent operator. Its scale a is that of the inertia, or larger, to shorten steps.
-        preconditioner: The preconditioner of the linear solves.
+        system: The linear system of the body, or of several ones, whose steps are solved for elsewhere. The scale a of
+            an operator is that of the inertia, or larger, to shorten steps.
+        number: The number of the body there.
         gravity: [m/s^2].
         tolerance: Tolerance of the residual, and of the last step; see ``NewtonReport``.
         most: Maximum number of iterations.
-        most_linear: Maximum number of iterations of one linear solve.
         others: A function that launches other forces than elastic ones to ``body.state.forces``.
 
     Attributes:
-        residual: Unbalanced forces [N], vec4.
+        operator: The body's operator.
+        residual: Unbalanced forces, the body's right side in the system [N], vec4.
         forces: Room for elastic forces, zero between launches [N], vec4.
-        step: The last step [m], vec4.
+        step: The last step, the body's solution in the system [m], vec4.
         iterations, solved, status: Results of each world, as in ``NewtonReport``, int32 [worlds].
         base, increment: The two parts of displacements [m], vec4.
         inertia: The scale a of the inertia [1/s^2], float32 [1].
@@ -81,29 +80,28 @@ class Newton:
 
     def __init__(
         self,
-        operator: TangentOperator,
-        preconditioner: Preconditioner,
+        system: BlockSystem,
         gravity: Sequence[float],
         *,
+        number: int = 0,
         tolerance: float = 1e-6,
         most: int = 100,
-        most_linear: int = 5000,
         others: Callable[[], None] | None = None,
     ):
-        self.operator, self.preconditioner, self.gravity = operator, preconditioner, wp.vec3(*gravity)
+        operator = self.operator = system.operators[number]
+        self.system, self.solver, self.gravity = system, system.solver, wp.vec3(*gravity)
         self.tolerance, self.most, self._others = tolerance, most, others
-        self.body, self.field, self.device, self.worlds = (
+        self.body, self.field, self.device, self.worlds, self.ranks = (
             operator.body,
             operator.field,
             operator.device,
             operator.worlds,
+            operator.ranks,
         )
-        like = self.body.state.displacements
-        self.forces, self.residual, self._outer, self.step, self.base, self.increment, self.pull = (
-            wp.zeros_like(like) for _ in range(7)
+        self.residual, self.step = (system.blocks.of(vector)[number] for vector in (system.b, system.x))
+        self.forces, self._outer, self.base, self.increment, self.pull = (
+            wp.zeros_like(self.body.state.displacements) for _ in range(5)
         )
-        self.ranks = operator.ranks
-        self.solver = ConjugateGradients(operator, len(like), most=most_linear, ranks=self.ranks)
         self._count = operator.node_count
         self._sums = WorldSums(self.worlds, self._count, kernels.COLUMNS, self.device, self.ranks)
         self._energies = wp.zeros(self.field.energy_count, dtype=wp.float64, device=self.device)
@@ -133,7 +131,9 @@ class Newton:
         self.launch_residual()
         outputs = [self._scalars, self.iterations, self.status, self.running, self.solver.tolerance]
         sums.launch_scalars(kernels.judge_residual, [wp.float64(self.tolerance), self.most], outputs)
-        self.launch_solve()
+        self.linearise()
+        self.system.update()
+        self.system.solve()
         inputs = [self.body.conditions.mass, self.residual, self._outer, self.step, u, *sums.sizes]
         wp.launch(kernels.measure_step, sums.shape, inputs, [sums.parts], device=self.device)
         sums.take_in(int(kernels.SLOPE), int(kernels.OUTER), int(kernels.INERTIA))
@@ -165,16 +165,10 @@ class Newton:
         wp.launch(kernel, sums.shape, inputs, outputs, device=self.device)
         sums.take_in(int(kernels.SQUARE), int(kernels.REFERENCE))
 
-    def launch_solve(self, *, guessed: bool = False) -> None:
-        """Launch the linearisation and its step, from a guess of it in ``step`` if there is one."""
-        self.linearise()
-        self.solver.launch(self.preconditioner, self.residual, self.step, guessed=guessed)
-
     def linearise(self) -> None:
         """Launch the linearisation at the present displacements, or at ``turned``; the residual must be known."""
         if self.turned is None:
             self.operator.take(self.body.state.displacements)
-        self.preconditioner.update(self.operator)
 
     def _launch_trial(self) -> None:
         self._try_step(commits=False)
@@ -203,7 +197,7 @@ class Newton:
             return
         inputs = [self.body.conditions.inverse_mass, self.base, self.share, int(to_end)]
         outputs = [self.increment, self.body.state.displacements]
-        wp.launch(touching.move_held, len(self.step), inputs, outputs, device=self.device)
+        wp.launch(move_held, len(self.step), inputs, outputs, device=self.device)
 
     # --- on the host -------------------------------------------------------------------------------------------------
 

@@ -14,20 +14,13 @@ from typing import Protocol
 import warp as wp
 
 
-class LinearOperator(Protocol):
-    """A symmetric matrix A = a M + b D + c K at one state of a body: mass, damping and stiffness.
-
-    Rows of nodes that are not free are those of the identity, and their diagonal blocks too.
+class Product(Protocol):
+    """A symmetric matrix A as what it does to vectors.
 
     Attributes:
         device: The device of the arrays.
         worlds: Number of copies of the body, which do not interact.
         node_count: Number of nodes of one world; vectors have ``worlds * node_count`` entries or more.
-        inverse_mass: Zero at nodes that are not free, float32 [worlds * nodes] [1/kg].
-        displacements: The displacements of the linearisation, vec4 [worlds * nodes] [m]; they change with each one.
-        scales: a [1/s^2], b [1/s] and c, float32 [3] on the device, so that recorded launches stay valid.
-        revision: Changes whenever launches do, so that they must be recorded again: other arrays, other elements. A
-            new linearisation or new scales do not change it.
     """
 
     @property
@@ -38,6 +31,24 @@ class LinearOperator(Protocol):
 
     @property
     def node_count(self) -> int: ...
+
+    def apply(self, x: wp.array, y: wp.array) -> None:
+        """Launch y = A x; both vec4 [worlds * nodes], different arrays."""
+        ...
+
+
+class LinearOperator(Product, Protocol):
+    """A symmetric matrix A = a M + b D + c K at one state of a body: mass, damping and stiffness.
+
+    Rows of nodes that are not free are those of the identity, and their diagonal blocks too.
+
+    Attributes:
+        inverse_mass: Zero at nodes that are not free, float32 [worlds * nodes] [1/kg].
+        displacements: The displacements of the linearisation, vec4 [worlds * nodes] [m]; they change with each one.
+        scales: a [1/s^2], b [1/s] and c, float32 [3] on the device, so that recorded launches stay valid.
+        revision: Changes whenever launches do, so that they must be recorded again: other arrays, other elements. A
+            new linearisation or new scales do not change it.
+    """
 
     @property
     def inverse_mass(self) -> wp.array: ...
@@ -50,10 +61,6 @@ class LinearOperator(Protocol):
 
     @property
     def revision(self) -> int: ...
-
-    def apply(self, x: wp.array, y: wp.array) -> None:
-        """Launch y = A x; both vec4 [worlds * nodes], different arrays."""
-        ...
 
     def diagonal_blocks(self) -> wp.array:
         """Launch the 3x3 blocks on the diagonal of A, and return their array, mat33 [worlds * nodes]."""

@@ -14,6 +14,7 @@ import warp as wp
 from warp_corot.elasticity import ForceField
 from warp_corot.kernels.implicit import newton as kernels
 
+from .block_system import BlockSystem
 from .newton import Newton, NewtonReport
 from .preconditioners import preconditioner_of
 from .tangent import TangentOperator
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 SHIFT = 1.0
 #: The smallest fraction of the load that is added in one step.
 LEAST_SHARE = 1.0 / 64.0
+#: Maximum number of iterations of a linear solve.
+LINEAR_ITERATIONS = 5000
 #: Newton's tolerance for intermediate states.
 ROUGH = 1e-3
 
@@ -63,7 +66,8 @@ class StaticSolver:
         self.body, self.field, self._load_steps, self._least_share = body, field, load_steps, least_share
         self.operator = TangentOperator(body, field, exact=True)
         chosen = preconditioner_of(preconditioner, self.operator, few_digits=True)
-        self.newton = Newton(self.operator, chosen, gravity, tolerance=tolerance, most=most)
+        system = BlockSystem([self.operator], [chosen], most=LINEAR_ITERATIONS)
+        self.newton = Newton(system, gravity, tolerance=tolerance, most=most)
         self.iterations = self.linear_iterations = 0
         self.share = 0.0
 

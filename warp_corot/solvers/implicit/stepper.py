@@ -9,8 +9,8 @@ import warp as wp
 from warp_corot.solvers.integrator import Stepper
 
 from .body_steps import BodySteps, SharedSteps
-from .joined import JoinedSolve
-from .joined_newton import JoinedNewton
+from .lagged import Lagged
+from .step_solve import StepSolve
 
 if TYPE_CHECKING:
     from warp_corot.solvers.system import System
@@ -38,10 +38,10 @@ class ImplicitStepper(Stepper):
         system.lag, system.is_implicit = 0.0, True
         self.system, self.integrator, self.shared = system, integrator, SharedSteps(system, integrator)
         self.totals = self.shared.totals
-        self._joined: JoinedSolve | None = None
-        self._joined_newton: JoinedNewton | None = None
         self._is_sturdy = False
         self._bodies = [BodySteps(self.shared, k) for k in range(len(system.bodies))]
+        coupled = [[body] for body in self._bodies] if self.shared.rows is None else [self._bodies]
+        self._solves = [StepSolve(self.shared, bodies) for bodies in coupled]
 
     @property
     def kept(self) -> dict[str, wp.array]:
@@ -50,17 +50,19 @@ class ImplicitStepper(Stepper):
         kept |= {f"velocities.{k}": body.before for k, body in enumerate(self._bodies)}
         kept |= {f"meetings.{k}": body.met for k, body in enumerate(self._bodies) if body.met.size}
         kept |= {f"touched.{k}": body.touched for k, body in enumerate(self._bodies) if body.touched.size}
-        lagged = [(k, body.lagged) for k, body in enumerate(self._bodies) if body.lagged is not None]
-        return kept | {f"setup.{k}.{name}": array for k, each in lagged for name, array in each.state.items()}
+        states = [
+            (k, body.preconditioner.state)
+            for k, body in enumerate(self._bodies)
+            if isinstance(body.preconditioner, Lagged)
+        ]
+        states += [(k, solve.choice.state) for k, solve in enumerate(self._solves) if solve.choice is not None]
+        return kept | {f"setup.{k}.{name}": array for k, state in states for name, array in state.items()}
 
     def prepare(self) -> None:
-        before = [body.newton for body in self._bodies]
-        for body in self._bodies:
-            body.prepare()
+        for solve in self._solves:
+            solve.prepare()
         if self.shared.rows is not None:
             self.shared.rows.prepare()
-            if self._joined is None or before != [body.newton for body in self._bodies]:
-                self._join()
 
     def continue_from(self, other: Stepper) -> None:
         assert isinstance(other, ImplicitStepper)
@@ -91,50 +93,5 @@ class ImplicitStepper(Stepper):
                 each.launch_motion(offset)
             for hold in self.shared.holds:
                 hold.launch_begin()
-            if self._joined is not None:
-                self._launch_joined(offset, self._joined)
-                continue
-            for body in self._bodies:
-                body.launch_changes(offset)
-                body.launch_begin()
-                body.launch_residual()
-                body.launch_solve()
-                body.launch_end(offset, is_last=offset == count - 1)
-
-    def _launch_joined(self, offset: int, joined: JoinedSolve) -> None:
-        """Launch a step of all bodies together."""
-        assert self.shared.rows is not None
-        wp.copy(self.shared.begins, self.shared.sturdy)
-        for body in self._bodies:
-            body.launch_changes(offset)
-        touched = [body.touched for body in self._bodies]
-        if self.integrator.history:
-            self.shared.rows.launch_meetings(offset, touched, self.shared.begins)
-        for body in self._bodies:
-            body.launch_begin()
-        solve: JoinedSolve | JoinedNewton = joined
-        if self._joined_newton is None:
-            for body in self._bodies:
-                body.launch_residual()
-        else:
-            solve = self._joined_newton
-        solve.launch(offset)
-        if self.integrator.history:
-            self.shared.rows.launch_touched(touched)
-        for body in self._bodies:
-            body.take_solved(solve)
-            body.launch_end(offset, is_last=True)
-
-    def _join(self) -> None:
-        assert self.shared.rows is not None
-        options, newtons = self.integrator, [body.newton for body in self._bodies]
-        self._joined = JoinedSolve(
-            newtons,
-            [body.held for body in self._bodies],
-            self.shared.rows,
-            worlds=self.system.bodies[0].worlds,
-            tolerance=options.linear_tolerance,
-            most=options.linear_iterations,
-        )
-        if not self.shared.in_one_solve:
-            self._joined_newton = JoinedNewton(self._joined, newtons, **options.newton_with_contact)
+            for solve in self._solves:
+                solve.launch(offset, is_last=offset == count - 1)

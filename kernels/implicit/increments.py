@@ -1,4 +1,4 @@
-"""Newton's method for an implicit step with contact: increments, and when they are good enough."""
+"""Increments of an implicit step from linear solves, and when they are good enough."""
 
 import warp as wp
 
@@ -61,6 +61,7 @@ def add_product(product: wp.array[wp.vec4], r: wp.array[wp.vec4]):
 @wp.kernel(enable_backward=False)
 def take_increments(
     # In
+    adds: int,
     count: int,
     inverse_mass: wp.array[wp.float32],
     base: wp.array[wp.vec4],
@@ -72,16 +73,20 @@ def take_increments(
     u: wp.array[wp.vec4],
     sizes: wp.array2d[wp.float32],
 ):
-    """Take a share of d as the increment of free nodes, and find the largest change and displacement of each world."""
+    """Take a share of d as the increment of free nodes, or add it with ``adds``, and find the largest change and
+    displacement of each world; all are one if ``sizes`` has one row."""
     i = wp.tid()
-    world = i / count
     if inverse_mass[i] > 0.0:
         after = share[0] * load_node(d, i)
-        wp.atomic_max(sizes, world, CHANGE, wp.length(after - load_node(increment, i)))
-        store_node(increment, i, after)
+        if adds != 0:
+            after += load_node(increment, i)
         place = load_node(base, i) + after
+        if sizes.shape[0] > 0:
+            world = wp.min(i / count, sizes.shape[0] - 1)
+            wp.atomic_max(sizes, world, CHANGE, wp.length(after - load_node(increment, i)))
+            wp.atomic_max(sizes, world, REACH, wp.length(place))
+        store_node(increment, i, after)
         store_node(u, i, place)
-        wp.atomic_max(sizes, world, REACH, wp.length(place))
 
 
 @wp.kernel(enable_backward=False)

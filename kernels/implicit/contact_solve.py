@@ -1,0 +1,62 @@
+"""Decisions between the linear solves of a step with contact."""
+
+import warp as wp
+
+from .conjugate_gradients import BROKEN, LIMIT, had_much_to_do
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel(enable_backward=False)
+def gather_change(one: wp.array[wp.int32], changed: wp.array[wp.int32]):
+    if one[0] != 0:
+        changed[0] = 1
+
+
+@wp.kernel(enable_backward=False)
+def judge_round(
+    # In
+    scalars: wp.array2d[wp.float64],
+    iterations: wp.array[wp.int32],
+    changed: wp.array[wp.int32],
+    pairs: wp.array[wp.int32],
+    settled: wp.float64,
+    near: wp.float64,
+    # In and out
+    locates: wp.array[wp.int32],
+    rounds: wp.array[wp.int32],
+    total: wp.array[wp.int32],
+    # Out
+    solves: wp.array[wp.int32],
+    going: wp.array[wp.int32],
+):
+    """Count a linear solve. Another one follows if contact has changed, if this one had much to do, or if it did not
+    follow just after pairs of soft surfaces were located; they are located if it had little to do."""
+    is_settled = changed[0] == 0
+    is_near = changed[0] == 0
+    for world in range(iterations.shape[0]):
+        total[world] = total[world] + iterations[world]
+        is_settled = is_settled and not had_much_to_do(scalars, world, settled)
+        is_near = is_near and not had_much_to_do(scalars, world, near)
+    rounds[0] = rounds[0] + 1
+    solves[0] = rounds[0]
+    going[0] = wp.where(is_settled and (locates[0] != 0 or pairs[0] == 0), 0, 1)
+    locates[0] = wp.where(is_near, 1, 0)
+
+
+@wp.kernel(enable_backward=False)
+def end_rounds(
+    # In
+    rounds: wp.array[wp.int32],
+    most: int,
+    # In and out
+    going: wp.array[wp.int32],
+    # Out
+    status: wp.array[wp.int32],
+):
+    """End the solves of a step after ``most`` of them; the step is unfinished if another one should follow."""
+    if going[0] != 0 and rounds[0] >= most:
+        going[0] = 0
+        for world in range(status.shape[0]):
+            if status[world] != BROKEN:
+                status[world] = LIMIT
