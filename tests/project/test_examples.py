@@ -36,8 +36,8 @@ def test_example(script, device, tmp_path, monkeypatch, capsys):
     first, last = (np.array(points.Get(code)) for code in (0, stage.GetEndTimeCode()))
     assert stage.GetEndTimeCode() >= 3
     assert np.isfinite(last).all()
-    if script.stem == "remesh":
-        assert len(last) > len(first)  # the mesh was refined
+    if script.stem in ("remesh", "cut_organ"):
+        assert len(last) > len(first)  # the mesh was refined, or cut
     else:
         assert np.abs(last - first).max() > 1e-4  # something moves
     if script.stem == "sweep":

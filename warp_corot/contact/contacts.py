@@ -201,7 +201,7 @@ class Contacts:
                 state.contact_forces.zero_()
             start, count, arrays = self.surface.nodes_of(k)
             places = self._count(k) if follows else 0
-            inputs = [start, count, part.start, places, self.split.first(k), self.split.buffer, self.law.grain]
+            inputs: list = [start, count, part.start, places, self.split.first(k), self.split.buffer, self.law.grain]
             inputs += [arrays, surface.arrays]
             inputs += [int(counts), damping, system.gravity, conditions.inverse_mass, int(conditions.has_loads)]
             inputs += [conditions.loads, system.pace.arrays, offset, state.velocities]
