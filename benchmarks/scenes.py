@@ -3,23 +3,31 @@
 
     python benchmarks/scenes.py [--device cuda:0] [--scenes standing,dropped] [--elements 20000,100000]
         [--young 5e3,3e4] [--poisson 0.44,0.49] [--integrators explicit,implicit] [--duration 1] [--limit 20]
-        [--errors] [--json FILE]
+        [--only WORDS] [--errors WORDS] [--rows FILE]
 
 Explicit steps follow the state; implicit ones are ``BackwardEuler`` of 1/60 s. A row simulates ``--duration`` seconds,
 or as much of them as ``--limit`` seconds of wall time after the first frame allow, in frames of 1/60 s. Its real-time
 factor is simulated over wall time after the first frame. That one is given apart, because it has what is compiled or
-recorded when steps begin. A scene that ends in an error or in positions that are not finite is a failure. ``--errors``
-compares positions at the end with the same scene in a quarter of the step and with a tenth of the tolerances, over the
-body's size.
+recorded when steps begin. Launches are counted in one more step, where the host makes them: a loop on the device counts
+once. A scene that ends in an error, in positions that are not finite or with elements turned over is a failure.
+
+``--only`` leaves the rows whose name has all of these words, as in ``--only "dropped 20000 implicit"``; a row's name is
+that of the scene, the elements asked for, Young's modulus, Poisson's ratio and the steps. ``--errors`` compares
+positions at the end of such rows with the same scene in a quarter of the step and with a tenth of the tolerances, over
+the body's size. ``--rows`` adds each row to a file when it ends, as a line of JSON; rows that the file has are not
+repeated, so that a run that was stopped goes on.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
+import json
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -28,7 +36,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 import warp.examples
-from measure import machine, number, save, table, tell
+from measure import machine, number, table, tell
 from scipy.spatial import cKDTree
 
 import warp_corot as wc
@@ -38,7 +46,7 @@ FRAME = 1.0 / 60.0
 DOWN = (0.0, -9.81, 0.0)
 HEADER = (
     *("scene", "elements", "kPa", "nu", "steps", "simulated, s", "real time", "ms a frame", "ms a step"),
-    "steps a frame",
+    *("steps a frame", "launches a step"),
     *("iterations", "unfinished", "first frame, s", "ready, s", "error, %"),
 )
 
@@ -54,6 +62,10 @@ class Setting:
     device: wp.Device
     implicit: bool
     shorter: int = 1
+
+    @property
+    def steps(self) -> str:
+        return "implicit" if self.implicit else "explicit"
 
     def material(self) -> wc.Isotropic:
         return wc.Isotropic(self.young, self.poisson, 1000.0)
@@ -197,6 +209,10 @@ def worlds(at: Setting) -> wc.Simulation:
 SCENES = {scene.__name__: scene for scene in (standing, dropped, pressed, lifted, squeezed, coiled, refined, worlds)}
 
 
+#: From this size on, only these scenes.
+LARGE, LARGE_SCENES = 500_000, ("standing", "dropped")
+
+
 # --- rows ------------------------------------------------------------------------------------------------------------
 
 
@@ -207,7 +223,7 @@ def measured(scene: Callable[[Setting], wc.Simulation], at: Setting, duration: f
         "elements": at.elements,
         "young": at.young,
         "poisson": at.poisson,
-        "steps": "implicit" if at.implicit else "explicit",
+        "steps": at.steps,
     }
     try:
         started = time.perf_counter()
@@ -230,11 +246,57 @@ def measured(scene: Callable[[Setting], wc.Simulation], at: Setting, duration: f
             row["iterations"] = sim.solves.linear_iterations / max(sim.solves.steps, 1)
             row["unfinished"] = sim.solves.unfinished
         row["positions"] = [body.positions.numpy() for body in sim.bodies]
+        turned = sum(turned_over(body) for body in sim.bodies)
         if not all(np.isfinite(each).all() for each in row["positions"]):
             row["failure"] = "positions are not finite"
+        elif turned:
+            row["failure"] = f"{turned} elements are turned over at {sim.time:.3g} s"
+        row["launches"] = launches(sim)
     except Exception as error:
         row["failure"] = f"{type(error).__name__}: {error}"
     return row
+
+
+def turned_over(body: wc.SoftBody) -> int:
+    """The number of elements whose volume is not positive."""
+    mesh = body.mesh
+    corners = body.positions.numpy()[:, :3].reshape(body.worlds, -1, 3)[:, mesh.tets]
+    rest = mesh.points[mesh.tets]
+    edges, at_rest = corners[..., 1:, :] - corners[..., :1, :], rest[:, 1:] - rest[:, :1]
+    return int((np.linalg.det(edges) * np.sign(np.linalg.det(at_rest)) <= 0.0).sum())
+
+
+def launches(sim: wc.Simulation) -> int | None:
+    """The kernels that one more step launches; None if bodies are remeshed, whose steps cannot be recorded alone."""
+    if any(sim.remesh):
+        return None
+    with counted() as count:
+        if sim.device.is_cuda:
+            with wp.ScopedCapture(sim.device, force_module_load=False):
+                sim.step()
+        else:
+            sim.step()
+    return count[0]
+
+
+@contextmanager
+def counted() -> Iterator[list[int]]:
+    """Count the kernels that the host launches."""
+    count, launch, again = [0], wp.launch, wp.Launch.launch
+
+    def launched(*args: Any, **options: Any) -> Any:
+        count[0] += not options.get("record_cmd", False)
+        return launch(*args, **options)
+
+    def repeated(*args: Any, **options: Any) -> Any:
+        count[0] += 1
+        return again(*args, **options)
+
+    wp.launch, wp.Launch.launch = launched, repeated  # type: ignore[assignment, method-assign]
+    try:
+        yield count
+    finally:
+        wp.launch, wp.Launch.launch = launch, again  # type: ignore[method-assign]
 
 
 def of_frames(frames: list[tuple[float, int]]) -> dict[str, float]:
@@ -269,6 +331,7 @@ def words(row: dict[str, Any]) -> list[str]:
         1e3 * row["frame"],
         1e3 * row["step"],
         row["a_frame"],
+        row.get("launches"),
         row.get("iterations"),
     ]
     rest = [number(each) for each in scaled]
@@ -277,30 +340,43 @@ def words(row: dict[str, Any]) -> list[str]:
     return [*own, *rest, *ends, "–" if error is None else number(100.0 * error)]
 
 
+def settings(options: argparse.Namespace, device: wp.Device) -> Iterator[tuple[str, Setting, str]]:
+    """The scene, the setting and the name of each row, the smallest bodies first."""
+    of_bodies = itertools.product(sorted(options.elements), options.young, options.poisson)
+    for (elements, young, poisson), name in itertools.product(of_bodies, options.scenes):
+        if elements >= LARGE and name not in LARGE_SCENES:
+            continue
+        for steps in options.integrators:
+            at = Setting(elements, young, poisson, device, steps == "implicit")
+            yield name, at, f"{name} {elements} {young:g} {poisson:g} {steps}"
+
+
+def are_in(asked: str | None, name: str) -> bool:
+    return asked is not None and set(asked.split()) <= set(name.split())
+
+
 def main() -> int:
     options = _parser().parse_args()
     device = checked_device(options.device)
-    rows: list[dict[str, Any]] = []
-    for elements in options.elements:
-        for young in options.young:
-            for poisson in options.poisson:
-                for name in options.scenes:
-                    for steps in options.integrators:
-                        at = Setting(elements, young, poisson, device, steps == "implicit")
-                        row = measured(SCENES[name], at, options.duration, options.limit)
-                        if options.errors and "failure" not in row:
-                            finer = Setting(elements, young, poisson, device, steps == "implicit", 4)
-                            other = measured(SCENES[name], finer, row["simulated"], np.inf)
-                            row["error"] = error_of(row, other)
-                        row.pop("positions", None)
-                        rows.append(row)
-                        tell("  ".join(words(row)))
-    print(table(HEADER, [words(row) for row in rows], 1))
-    if options.json:
-        save(options.json, {**machine(device), "rows": rows})
-    failures = [row for row in rows if "failure" in row]
-    for row in failures:
-        print(f"FAILED: {row['scene']}, {row['elements']} elements, {row['steps']}: {row['failure']}", file=sys.stderr)
+    lines = options.rows.read_text(encoding="utf-8").splitlines() if options.rows and options.rows.exists() else []
+    rows = {row["name"]: row for row in map(json.loads, lines)}
+    for scene, at, name in settings(options, device):
+        if name in rows or not are_in(options.only, name):
+            continue
+        row = {"name": name, "machine": machine(device), **measured(SCENES[scene], at, options.duration, options.limit)}
+        if are_in(options.errors, name) and "failure" not in row:
+            finer = Setting(at.elements, at.young, at.poisson, device, at.implicit, 4)
+            row["error"] = error_of(row, measured(SCENES[scene], finer, row["simulated"], np.inf))
+        row.pop("positions", None)
+        rows[name] = row
+        tell("  ".join(words(row)))
+        if options.rows:
+            with options.rows.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(row) + "\n")
+    print(table(HEADER, [words(row) for row in rows.values()], 1))
+    failures = [f"{name}: {row['failure']}" for name, row in rows.items() if "failure" in row]
+    for line in failures:
+        print(f"FAILED: {line}", file=sys.stderr)
     return int(bool(failures))
 
 
@@ -322,9 +398,10 @@ def _parser() -> argparse.ArgumentParser:
     of.add_argument("--integrators", type=several(str), default=["explicit", "implicit"])
     of.add_argument("--duration", type=float, default=1.0, help="simulated time of a row [s]")
     of.add_argument("--limit", type=float, default=20.0, help="wall time of a row [s]")
-    of.add_argument("--errors", action="store_true", help="also run with finer steps, and compare")
+    of.add_argument("--only", metavar="WORDS", default="", help="only the rows whose names have these words")
+    of.add_argument("--errors", metavar="WORDS", nargs="?", const="", help="rows to run with finer steps, too")
     of.add_argument("--device", help="default: CUDA if there is a card, else the CPU")
-    of.add_argument("--json", type=Path, help="write the rows to this file")
+    of.add_argument("--rows", type=Path, help="add each row to this file, and leave out those that it has")
     return of
 
 

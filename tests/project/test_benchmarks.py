@@ -331,16 +331,17 @@ def test_the_haptic_loop_is_timed(run, tmp_path):
 @pytest.mark.parametrize("scenes", ["standing,dropped,worlds", "pressed,lifted,refined", "squeezed"])
 def test_standing_scenes_run_through(scenes, run, tmp_path):
     """All steps are solved, and positions stay finite."""
-    path = tmp_path / "rows.json"
+    path = tmp_path / "rows.jsonl"
     small = ["--elements", "600", "--young", "5e3", "--poisson", "0.49", "--duration", "0.1", "--device", "cpu"]
-    done = run("scenes.py", "--scenes", scenes, *small, "--json", path)
+    done = run("scenes.py", "--scenes", scenes, *small, "--rows", path)
     assert done.returncode == 0, done.stderr
-    rows = json.loads(path.read_text(encoding="utf-8"))["rows"]
+    rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
     assert [row["scene"] for row in rows] == [name for name in scenes.split(",") for _ in range(2)]
     for row in rows:
         assert row["factor"] > 0.0
         assert "failure" not in row, row
         assert not row.get("unfinished"), row
+        assert row["launches"] is None or row["launches"] > 0
 
 
 def test_implicit_steps_are_timed(run, tmp_path):
