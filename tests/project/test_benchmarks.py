@@ -344,6 +344,21 @@ def test_standing_scenes_run_through(scenes, run, tmp_path):
         assert row["launches"] is None or row["launches"] > 0
 
 
+def test_beam_of_sofa_bends(run):
+    done = run("sofa_beam.py", "--steps", 5)
+    assert done.returncode == 0, done.stderr
+    assert "18954 tetrahedra" in done.stdout
+    assert " 0 unfinished" in done.stdout
+
+
+@pytest.mark.slow
+def test_newtons_hanging_bodies_are_timed(run):
+    pytest.importorskip("newton")
+    done = run("newton_hanging.py", "--frames", 12)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("Solver") == 3
+
+
 def test_implicit_steps_are_timed(run, tmp_path):
     path = tmp_path / "steps.json"
     options = ["--levels", 3, "--tolerances", "1e-2", "--repeats", 1, "--json", path]
