@@ -208,6 +208,7 @@ def rows(options: argparse.Namespace, device: wp.Device, names: list[str]) -> It
 def plot(found: list[Row], path: Path) -> None:
     """Iterations over elements."""
     from matplotlib import pyplot
+    from matplotlib.ticker import NullFormatter
 
     figure, axes = pyplot.subplots(1, 2, figsize=(10, 4), sharey=True, layout="constrained")
     for axis, body in zip(axes, ("beam", "balls"), strict=True):
@@ -218,6 +219,7 @@ def plot(found: list[Row], path: Path) -> None:
                 if line:
                     axis.loglog(*zip(*line, strict=True), style, marker="o", color=f"C{n}", label=f"{name}, {poisson}")
         axis.set(title=body, xlabel="elements")
+        axis.xaxis.set_minor_formatter(NullFormatter())  # its numbers would overlap
         axis.grid(alpha=0.3)
     axes[0].set_ylabel("iterations")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right upper", fontsize=8)

@@ -183,7 +183,7 @@ class SurfaceDomain(SignedFunction):
         said = [
             (closed.dropped, f"{closed.dropped} triangles without area or there twice left out"),
             (closed.turned, f"{closed.turned} triangles wound against their neighbours turned round"),
-            (closed.inside_out, f"{closed.inside_out} parts inside out turned round"),
+            (closed.inside_out, f"{closed.inside_out} part{'s'[: closed.inside_out != 1]} inside out turned round"),
             (closed.pieces > 1, f"{closed.pieces} separate parts"),
             (closed.cavities, f"{closed.cavities} cavities"),
             (self.overlapping, f"parts overlap in {self.overlapping:.1%} of what is enclosed"),
