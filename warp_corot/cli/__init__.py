@@ -56,7 +56,8 @@ class Parser(StrictParser):
             name = options[0].partition("=")[0]
             self.error(f"there is no option {name}{meant(name, self._option_string_actions)}")
         if unknown:
-            self.error(f"{unknown[0]!r} is one word too many; names with spaces need quotation marks")
+            cure = "names with spaces need quotation marks, and a unit follows its number without one, as in 5kPa"
+            self.error(f"{unknown[0]!r} is one word too many; {cure}")
         return found, unknown
 
 
