@@ -22,6 +22,12 @@ def test_stiff_bodies_take_implicit_steps_and_say_why(tmp_path, capsys):
     assert steps_of(capsys, *path) == (False, False)
 
 
+def test_steps_that_would_be_unstable_are_implicit(tmp_path, capsys):
+    path = ["-o", tmp_path / "box.usd"]
+    assert steps_of(capsys, *path, "--young", "30kPa", "--dt", "16ms") == (True, True)
+    assert steps_of(capsys, *path, "--young", "10Pa", "--dt", "4ms") == (False, False)
+
+
 @pytest.mark.parametrize(
     "given", [["--integrator", "symplectic-euler"], ["--dt", "2us"], ["--viscosity", "1us"], ["--self-contact"]]
 )

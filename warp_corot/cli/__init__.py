@@ -133,7 +133,7 @@ def _main(argv: Sequence[str] | None) -> int:
         complain(as_option(str(error)))
         return 2
     except UnstableError as error:
-        complain(str(error))
+        complain(as_option(str(error)))
         return 3
     except KeyboardInterrupt as signalled:
         complain("interrupted", kind="")

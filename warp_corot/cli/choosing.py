@@ -22,6 +22,8 @@ from .touching import RunContact
 SHORTER = 0.75
 #: Bodies with shorter stable steps than this [s] are left to the explicit ones, which refuse them.
 SHORTEST = 1e-12
+#: Steps up to this length [s] are explicit if users give it.
+LONG = 2e-3
 #: Implicit steps are chosen if they are faster by this factor, since explicit ones resolve more of the motion.
 FASTER = 2.0
 
@@ -45,8 +47,8 @@ ON_CUDA = Cost(12e-6, 25e-12, 40.0), Cost(1.5e-3, 50e-9, 3.0)
 
 
 def choose_steps(args: argparse.Namespace, bodies: Sequence[RunBody], touched: RunContact, device: wp.Device) -> None:
-    """Set ``integrator`` of a body's options to implicit steps if explicit ones would be slower than real time, and
-    much slower than these; a note of the body says so.
+    """Set ``integrator`` of a body's options to implicit steps if explicit ones would be slower than real time and
+    much slower than these, or unstable with the step that users give; a note of the body says so.
 
     The choice is made for one body of the corotated law on a forest, which touches neither itself nor other bodies.
     """
@@ -62,12 +64,16 @@ def choose_steps(args: argparse.Namespace, bodies: Sequence[RunBody], touched: R
     if step < SHORTEST:
         return
     slow = SHORTER * step / explicit.of(*size)
-    fast = IMPLICIT_DT / implicit.of(*size)
-    if slow >= 1.0 or fast < FASTER * slow:
+    fast = (args.dt or IMPLICIT_DT) / implicit.of(*size)
+    if args.dt is not None and args.dt > FASTER * step:
+        why = f"unstable from about {1e3 * step:.2g} ms on"
+    elif args.dt is None and slow < 1.0 and fast >= FASTER * slow:
+        why = f"about {fast / slow:.1g} times as slow"
+    else:
         return
     args.integrator = "backward-euler"
     body.subject.notes.append(
-        f"implicit steps, which damp vibrations, since explicit ones would be about {fast / slow:.1g} times as slow "
+        f"implicit steps, which damp vibrations, since explicit ones would be {why} "
         "(--integrator symplectic-euler makes those)"
     )
 
@@ -75,7 +81,8 @@ def choose_steps(args: argparse.Namespace, bodies: Sequence[RunBody], touched: R
 def may_choose(bodies: Sequence[RunBody]) -> bool:
     """Whether the options leave the choice open."""
     args = bodies[0].args
-    given = args.integrator or args.dt or args.viscosity or is_static(args) or are_several()
+    is_short = args.dt is not None and args.dt <= LONG
+    given = args.integrator or is_short or args.viscosity or is_static(args) or are_several()
     return not (given or args.self_contact or len(bodies) > 1 or bodies[0].remesh is not None)
 
 

@@ -40,6 +40,7 @@ def as_option(message: str) -> str:
 
     names = "|".join(each.name for each in fields(RunOptions))
     message = re.sub(rf"^({names}) is ", lambda found: f"--{found[1].replace('_', '-')} is ", message)
+    message = message.replace("take a shorter step, or dt=None, which", "take a shorter --dt, or none, which")
     return re.sub(r", or None$", "", message).replace("it must be None, a", "it must be a")
 
 
@@ -67,7 +68,8 @@ def kept_so_far(done: Recording) -> str:
     """The result of a run that ended early."""
     if not done.frames:
         return "no frame was written"
-    return f"{done.frames} frames, {done.simulated:.3g} s, are kept in {done.path}"
+    frames = "1 frame is" if done.frames == 1 else f"{done.frames} frames, {done.simulated:.3g} s, are"
+    return f"{frames} kept in {done.path}"
 
 
 def early_end(error: BaseException, done: Recording) -> int:
@@ -76,7 +78,7 @@ def early_end(error: BaseException, done: Recording) -> int:
         complain(f"interrupted; {kept_so_far(done)}", kind="")
         return interrupt_status(error)
     if isinstance(error, UnstableError):
-        complain(f"{error}; {kept_so_far(done)}")
+        complain(f"{as_option(str(error))}; {kept_so_far(done)}")
         return 3
     complain(str(error))
     return 1
