@@ -21,7 +21,8 @@ CLASSES = [
     [
         (
             lambda: wc.Isotropic(1e3),
-            "Isotropic: missing a required argument: 'poisson'; it must be Isotropic(young, poisson, density, toughness=0.0)",
+            "Isotropic: missing a required argument: 'poisson'; "
+            "it must be Isotropic(young, poisson, density, toughness=0.0)",
         ),
         (
             lambda: wc.Tool(wc.Sphere(0.1), position=(0, 0, 0)),
