@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import warp as wp
 
+from warp_corot.inputs.loading import load
+from warp_corot.kernels.implicit import conjugate_gradients
+from warp_corot.kernels.implicit import newton as kernels_of_newton
 from warp_corot.solvers.integrator import Stepper
 
-from .body_steps import BodySteps, SharedSteps
+from .assembled import AssembledSolve, suits
+from .block_system import BlockSystem, VectorBlocks
+from .body_steps import BodySteps, SharedSteps, StepCounts
+from .chosen import ChosenSolve
 from .lagged import Lagged
-from .step_solve import StepSolve
+from .linearised_step import LinearisedStep
 
 if TYPE_CHECKING:
     from warp_corot.solvers.system import System
@@ -95,3 +102,108 @@ class ImplicitStepper(Stepper):
                 hold.launch_begin()
             for solve in self._solves:
                 solve.launch(offset, is_last=offset == count - 1)
+
+
+class StepSolve:
+    """The solve for a step of bodies whose unknowns are coupled: one body, or all of them if soft surfaces may touch.
+
+    Args:
+        shared: What the steps of all bodies share.
+        bodies: The bodies.
+
+    Attributes:
+        choice: The choice between two ways of solving, or None.
+    """
+
+    def __init__(self, shared: SharedSteps, bodies: Sequence[BodySteps]):
+        self._shared, self._bodies, self._versions = shared, list(bodies), [-1]
+        self._soft = shared.rows
+        self._touches = shared.rows is not None or bodies[0].held is not None
+        self.choice = self._made_choice()
+
+    def _made_choice(self) -> ChosenSolve | None:
+        bodies, options = self._bodies, self._shared.integrator
+        operators = [body.operator for body in bodies]
+        lagged = [body.preconditioner for body in bodies if isinstance(body.preconditioner, Lagged)]
+        if options.preconditioner is not None or len(lagged) < len(bodies) or not all(map(suits, operators)):
+            return None
+        blocks = VectorBlocks([len(operator.inverse_mass) for operator in operators])
+        assembled = AssembledSolve(operators, blocks, together=self._soft is not None, touches=self._touches)
+        if assembled.device.is_cpu:
+            load((), assembled.device, assembled.kernels)
+        shares = any(body.field.shares_dilatation for body in bodies)
+        return ChosenSolve(assembled, operators, lagged, shares=shares, dt=options.dt)
+
+    def prepare(self) -> None:
+        """Make everything that launches use, so that they can be recorded."""
+        bodies = self._bodies
+        for body in bodies:
+            body.prepare()
+        if self.choice is not None:
+            self.choice.prepare()
+        versions = [body.body.version for body in bodies]
+        if versions != self._versions:
+            if self._versions != [-1]:
+                for body in bodies:
+                    body.forget()
+            self._versions = versions
+            self._make()
+        if self.choice is not None:
+            self.choice.is_open = all(suits(body.operator) for body in bodies)
+        if self._linearised is not None:
+            self._system.solver.tolerance.fill_(self._shared.integrator.linear_tolerance)
+
+    def _make(self) -> None:
+        """Make everything that depends on the meshes."""
+        bodies, options = self._bodies, self._shared.integrator
+        self._system = BlockSystem(
+            [body.operator for body in bodies],
+            [body.preconditioner for body in bodies],
+            contacts=[body.held for body in bodies],
+            soft=self._soft,
+            choice=self.choice,
+            most=options.linear_iterations,
+            ranks=self._shared.system.ranks,
+        )
+        for number, body in enumerate(bodies):
+            body.take_system(self._system, number)
+        newtons = [body.newton for body in bodies]
+        self._linearised: LinearisedStep | None = None
+        if self._touches or options.tolerance is None:
+            self._linearised = LinearisedStep(
+                self._system, newtons, tolerance=options.tolerance, most=options.iterations
+            )
+            solve, good = self._linearised, int(conjugate_gradients.CONVERGED)
+            self._counts = StepCounts(solve.iterations, solve.linear_iterations, solve.status, good)
+        else:
+            (newton,) = newtons
+            good = int(kernels_of_newton.CONVERGED)
+            self._counts = StepCounts(newton.iterations, newton.solved, newton.status, good)
+
+    def launch(self, offset: int, *, is_last: bool) -> None:
+        """Launch the ``offset``-th step since the clock was last advanced; ``is_last`` as for ``BodySteps``."""
+        bodies, shared = self._bodies, self._shared
+        if self._soft is not None:
+            wp.copy(shared.begins, shared.sturdy)
+        for body in bodies:
+            body.launch_changes(offset)
+        touched = [body.touched for body in bodies]
+        keeps = self._soft is not None and shared.integrator.history > 0
+        if self._soft is not None and keeps:
+            self._soft.launch_meetings(offset, touched, shared.begins)
+        for body in bodies:
+            body.launch_begin()
+        self._solve(offset)
+        if self._soft is not None and keeps:
+            self._soft.launch_touched(touched)
+        for body in bodies:
+            body.launch_end(offset, self._counts, is_last=is_last)
+
+    def _solve(self, offset: int) -> None:
+        if self._linearised is None:
+            newton = self._bodies[0].newton
+            newton.launch_begin()
+            wp.capture_while(newton.running, newton.launch_iteration)
+            return
+        self._linearised.launch(offset)
+        self._system.judge(self._counts.linear_iterations, self._counts.status)
