@@ -71,6 +71,8 @@ class Contact:
 class Contacts:
     """All that there may be. Numbers: S for each obstacle, then T for each obstacle, and then the pairs."""
 
+    first_triangle: int  # the first number of a triangle
+    first_pair: int  # the first number of a pair
     rigid: Rigid
     triangles: wp.array[wp.vec3i]
     touches: Touches
@@ -83,9 +85,7 @@ def contact_of(number: int, all: Contacts):
     """The contact with a number, which has been located in this step."""
     found = Contact()
     places = all.rigid.surface.node.shape[0]
-    at_places = places * all.rigid.forces.shape[0]
-    at_triangles = at_places + all.touches.force.shape[0] * all.touches.force.shape[1]
-    if number < at_places:
+    if number < all.first_triangle:
         o = number // places
         s = number % places
         away = all.rigid.away[o, s]
@@ -98,9 +98,9 @@ def contact_of(number: int, all: Contacts):
         found.force = all.rigid.forces[o, s]
         found.more = all.rigid.more[o, s]
         found.acts = all.rigid.acts[o, s]
-    elif number < at_triangles:
-        o = (number - at_places) // all.triangles.shape[0]
-        t = (number - at_places) % all.triangles.shape[0]
+    elif number < all.first_pair:
+        o = (number - all.first_triangle) // all.triangles.shape[0]
+        t = (number - all.first_triangle) % all.triangles.shape[0]
         c = all.triangles[t]
         w = all.touches.shares[o, t]
         found.places = wp.vec4i(c[0], c[1], c[2], -1)
@@ -113,7 +113,7 @@ def contact_of(number: int, all: Contacts):
         found.more = all.touches.more[o, t]
         found.acts = all.touches.acts[o, t]
     else:
-        row = number - at_triangles
+        row = number - all.first_pair
         found.places = all.rows.places[row]
         found.weights = all.rows.shares[row]
         found.normal = all.rows.normal[row]
@@ -129,22 +129,20 @@ def contact_of(number: int, all: Contacts):
 def keep(number: int, contact: Contact, all: Contacts):
     """Store what an iteration changes."""
     places = all.rigid.surface.node.shape[0]
-    at_places = places * all.rigid.forces.shape[0]
-    at_triangles = at_places + all.touches.force.shape[0] * all.touches.force.shape[1]
-    if number < at_places:
+    if number < all.first_triangle:
         o = number // places
         s = number % places
         all.rigid.forces[o, s] = contact.force
         all.rigid.more[o, s] = contact.more
         all.rigid.acts[o, s] = contact.acts
-    elif number < at_triangles:
-        o = (number - at_places) // all.triangles.shape[0]
-        t = (number - at_places) % all.triangles.shape[0]
+    elif number < all.first_pair:
+        o = (number - all.first_triangle) // all.triangles.shape[0]
+        t = (number - all.first_triangle) % all.triangles.shape[0]
         all.touches.force[o, t] = contact.force
         all.touches.more[o, t] = contact.more
         all.touches.acts[o, t] = contact.acts
     else:
-        row = number - at_triangles
+        row = number - all.first_pair
         all.rows.force[row] = contact.force
         all.rows.more[row] = contact.more
         all.rows.acts[row] = contact.acts
@@ -171,28 +169,20 @@ def share_of(weight: float):
 
 
 @wp.func
-def add_weights(contact: Contact, times: int, buffer: int, surface: Surface, sums: Sums):
-    """Count a contact that acts at the nodes of its places, so many times: 1, or -1 if it does not any more."""
-    nodes = surface.node.shape[0]
-    for k in range(4):
-        weight = contact.weights[k]
-        if weight != 0.0:
-            s = contact.places[k]
-            if is_borne(s, surface):
-                b = surface.bearing.bearers[s]
-                w = surface.bearing.weights[s]
-                for m in range(4):
-                    if w[m] != 0.0:
-                        sums.touched[nodes + b[m]] = 1
-                        wp.atomic_add(sums.weights, buffer, nodes + b[m], times * share_of(weight * w[m]))
-            else:
-                sums.touched[s] = 1
-                wp.atomic_add(sums.weights, buffer, s, times * share_of(weight))
+def add_at(n: int, weight: float, times: int, force: wp.vec3, buffer: int, grain: float, sums: Sums):
+    """Add a contact's part at a node; see ``add``."""
+    if times != 0:
+        sums.touched[n] = 1
+        wp.atomic_add(sums.weights, buffer, n, times * share_of(weight))
+    if wp.dot(force, force) > 0.0:
+        wp.atomic_add(sums.forces, buffer, n, grains_of(weight * force, grain))
 
 
 @wp.func
-def add_force(contact: Contact, force: wp.vec3, buffer: int, grain: float, surface: Surface, sums: Sums):
-    """Add a force to the nodes of a contact's places."""
+def add(contact: Contact, times: int, force: wp.vec3, buffer: int, grain: float, surface: Surface, sums: Sums):
+    """Add a contact's weights at the nodes of its places so many times, 1 if it begins to act and -1 if it ends; and a
+    force.
+    """
     nodes = surface.node.shape[0]
     for k in range(4):
         weight = contact.weights[k]
@@ -203,9 +193,9 @@ def add_force(contact: Contact, force: wp.vec3, buffer: int, grain: float, surfa
                 w = surface.bearing.weights[s]
                 for m in range(4):
                     if w[m] != 0.0:
-                        wp.atomic_add(sums.forces, buffer, nodes + b[m], grains_of((weight * w[m]) * force, grain))
+                        add_at(nodes + b[m], weight * w[m], times, force, buffer, grain, sums)
             else:
-                wp.atomic_add(sums.forces, buffer, s, grains_of(weight * force, grain))
+                add_at(s, weight, times, force, buffer, grain, sums)
 
 
 @wp.func
@@ -251,18 +241,16 @@ def locate(number: int, dt: float, all: Contacts, sums: Sums):
     surface = all.rigid.surface
     law = all.rigid.law
     places = surface.node.shape[0]
-    at_places = places * all.rigid.forces.shape[0]
-    at_triangles = at_places + all.touches.force.shape[0] * all.touches.force.shape[1]
     is_near = bool(False)
-    if number < at_places:
+    if number < all.first_triangle:
         is_near = begin_place(number % places, number // places, dt, all.rigid)
-    elif number < at_triangles:
-        pair = number - at_places
+    elif number < all.first_pair:
+        pair = number - all.first_triangle
         is_near = find_touch(
             pair // all.triangles.shape[0], pair % all.triangles.shape[0], all.rigid, all.triangles, all.touches
         )
     else:
-        is_near = locate_row(number - at_triangles, law, surface, all.meeting, all.rows)
+        is_near = locate_row(number - all.first_pair, law, surface, all.meeting, all.rows)
     if not is_near:
         return 0
     contact = contact_of(number, all)
@@ -277,9 +265,7 @@ def locate(number: int, dt: float, all: Contacts, sums: Sums):
     if pushes or required_opening(contact, opens, loose, law, dt, surface) > 0.0:
         contact.acts = ACTS
         for buffer in range(2):
-            add_weights(contact, 1, buffer, surface, sums)
-            if pushes:
-                add_force(contact, contact.force, buffer, law.grain, surface, sums)
+            add(contact, 1, contact.force, buffer, law.grain, surface, sums)
         keep(number, contact, all)
     return 1
 
@@ -333,10 +319,7 @@ def iterate(number: int, before: int, dt: float, all: Contacts, sums: Sums):
     elif wanted > 0.0:
         counted += 1
         contact.acts = BEGINS
-    if counted != 0:
-        add_weights(contact, counted, 1 - before, surface, sums)
-    if wp.dot(added, added) > 0.0:
-        add_force(contact, added, 1 - before, law.grain, surface, sums)
+    add(contact, counted, added, 1 - before, law.grain, surface, sums)
     keep(number, contact, all)
 
 
@@ -382,9 +365,9 @@ def solve_contacts(
                     if (near.flags[s] & BESIDE) != 0:
                         number = (k % obstacles) * places + s
                 elif k < touches:
-                    number = places * obstacles + near.touches[k - beside]
+                    number = all.first_triangle + near.touches[k - beside]
                 elif k < count:
-                    number = places * obstacles + all.touches.force.shape[0] * all.touches.force.shape[1] + k - touches
+                    number = all.first_pair + k - touches
                 may_act = int(0)
                 if number >= 0:
                     may_act = locate(number, dt, all, sums)

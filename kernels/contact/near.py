@@ -84,11 +84,9 @@ def reserve(surface: Surface, motions: Motions, obstacles: int, watch: Watch, ne
 
 
 @wp.kernel(enable_backward=False)
-def report_search(watch: Watch, near: Near, most: wp.array[wp.int32], report: wp.array[wp.float64]):
-    """Report to the host the largest number of near pairs, how often an item moved too far, the number of searches, and
-    the number of nodes or triangles that are near something.
-    """
+def report_search(watch: Watch, most: wp.array[wp.int32], report: wp.array[wp.float64]):
+    """Report to the host the largest number of near pairs, how often an item moved too far, and the number of
+    searches."""
     report[0] = wp.float64(most[0])
     report[1] = wp.float64(watch.missed[0])
     report[2] = wp.float64(watch.searches[0])
-    report[3] = wp.float64(wp.max(near.count[0], near.touch_count[0]))

@@ -66,9 +66,10 @@ class MassSplit:
         self.sums.touched = wp.zeros(count, dtype=wp.int32, device=device)
         self.sums.weights = wp.zeros((2, count), dtype=wp.int32, device=device)
         self.sums.forces = wp.zeros((2, count), dtype=wp.vec3l, device=device)
-        contacts = room
+        self._at_places = self._at_triangles = 0
         if self._rigid is not None:
-            contacts += self._rigid.forces.size + self._rigid.touches.force.size
+            self._at_places, self._at_triangles = self._rigid.forces.size, self._rigid.touches.force.size
+        contacts = self._at_places + self._at_triangles + room
         self.sums.live = wp.zeros(contacts, dtype=wp.int32, device=device)
         self.sums.live_count = wp.zeros(2, dtype=wp.int32, device=device)
         self.sums.arrived = wp.zeros(1, dtype=wp.uint64, device=device)
@@ -121,6 +122,7 @@ class MassSplit:
 
     def _launch(self, first: int, last: int) -> None:
         contacts = kernels.Contacts()
+        contacts.first_triangle, contacts.first_pair = self._at_places, self._at_places + self._at_triangles
         contacts.triangles, contacts.touches = self.surface.triangles, Touches()
         if self._rigid is not None:
             contacts.rigid, contacts.touches = self._rigid.arrays, self._rigid.touches

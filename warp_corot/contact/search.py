@@ -25,7 +25,7 @@ MOST_THREADS = 1 << 18
 #: Threads that find the fastest item on CUDA, at most: each ends with an atomic maximum.
 MEASURING_THREADS = 1 << 14
 #: The report of the device to the host: see ``kernels.contact.near.report_search``.
-PAIRS, MISSED, SEARCHES, NEAR = range(4)
+PAIRS, MISSED, SEARCHES = range(3)
 
 
 class Search:
@@ -53,7 +53,7 @@ class Search:
         self.surface, self.obstacles, self.device = surface, obstacles, surface.device
         self.farthest = MOST * size
         self.finders: list[Callable[[], None]] = []
-        self._report = Mapped(4, self.device)
+        self._report = Mapped(3, self.device)
         self.most = wp.zeros(1, dtype=wp.int32, device=self.device)
         watch, device = kernels.Watch(), self.device
         watch.least = wp.full(1, LEAST * size, dtype=wp.float32, device=device)
@@ -79,16 +79,6 @@ class Search:
         """Number of threads for a list with this room."""
         return 1 if self.device.is_cpu else min(max(room, 1), MOST_THREADS)
 
-    @property
-    def at_nodes(self) -> list:
-        """The number of threads for the nodes that have something near them, and these nodes."""
-        return [self.threads(self.surface.count), self.near]
-
-    @property
-    def at_touches(self) -> list:
-        """The same for obstacles at triangles."""
-        return [self.threads(len(self.near.touches)), self.near]
-
     # --- what the host sees ----------------------------------------------------------------------------------------
 
     def follow(self) -> None:
@@ -102,7 +92,6 @@ class Search:
             self.near.count, self.near.touch_count = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
             pairs = self.obstacles.count * self.surface.triangle_count if self.obstacles.have_edges else 0
             self.near.touches = wp.zeros(pairs, dtype=wp.int32, device=device)
-            self._report.values[NEAR] = count
             self._taken = self.surface.revision
         self.forget()
 
@@ -126,12 +115,6 @@ class Search:
     def count(self) -> int:
         """The number of searches so far, by the report of the last run."""
         return int(self._report.values[SEARCHES])
-
-    @property
-    def most_near(self) -> int:
-        """The number of nodes or of triangles that were near something, the larger one, by the report of the last run;
-        before, the number of all nodes."""
-        return int(self._report.values[NEAR])
 
     def widen(self) -> None:
         """Search with a larger margin from now on, if something has moved too far.
@@ -197,9 +180,7 @@ class Search:
 
     def launch_report(self) -> None:
         """Launch the report to the host after a run."""
-        wp.launch(
-            near_kernels.report_search, 1, [self.watch, self.near, self.most, self._report.array], device=self.device
-        )
+        wp.launch(near_kernels.report_search, 1, [self.watch, self.most, self._report.array], device=self.device)
 
     def _search(self, is_framed: bool, sleeps: bool) -> None:
         arrays, obstacles = self.surface.arrays, self.watch.poses.size

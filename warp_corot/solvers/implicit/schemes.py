@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, TypedDict
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -27,13 +27,6 @@ SHORTEST = 1e-15
 TOLERANCE = 1e-4
 
 Table = npt.NDArray[np.float64]
-
-
-class NewtonOptions(TypedDict):
-    """The options of Newton's method; see ``TouchingNewton``."""
-
-    tolerance: float
-    most: int
 
 
 @dataclass(frozen=True)
@@ -104,11 +97,6 @@ class ImplicitIntegrator(Integrator):
     def is_at_stage(self) -> bool:
         """Whether forces are balanced before the end of the step."""
         return False
-
-    @property
-    def newton_with_contact(self) -> NewtonOptions:
-        """The options of Newton's method with contact."""
-        return {"tolerance": self.tolerance or 1.0, "most": 1 if self.tolerance is None else self.iterations}
 
     @abstractmethod
     def scheme(self, dt: float) -> Table:
