@@ -23,7 +23,7 @@ from .pairs import list_by_warp, locate_row
 from .rows import Meeting, Rows, row_count
 from .supports import MOSTLY, left_between
 from .touches import Touches, find_touch
-from .vertices import Rigid, across, anchor, begin_place
+from .vertices import ACTS, BEGINS, ENDS, OUT, WAITS, Rigid, across, anchor, begin_place
 
 wp.set_module_options({"enable_backward": False})
 
@@ -31,9 +31,6 @@ wp.set_module_options({"enable_backward": False})
 BLOCK = 256
 #: Weights are summed in multiples of one over this.
 SHARES = wp.constant(1048576.0)
-#: Whether a contact acts: no; yes, since the last iteration, so that its weight is in the sums of one buffer only; yes;
-#: no, since the last iteration.
-WAITS, BEGINS, ACTS, ENDS = (wp.constant(k) for k in range(4))
 #: The first phase of a step. Iterations follow, and then the end.
 LOCATE = wp.constant(0)
 #: Threads of a warp.
@@ -330,6 +327,7 @@ def solve_contacts(
     first: int,
     last: int,
     iterations: int,
+    are_separate: int,
     near: Near,
     pace: Pace,
     # In and out
@@ -342,13 +340,15 @@ def solve_contacts(
     Args:
         threads: The number of threads, of blocks that are all resident on CUDA.
         first, last: The phases, from 0 to ``iterations`` + 1.
+        are_separate: Whether no two contacts share a node: places that are nodes, and one obstacle. Then a thread goes
+            through all phases of a place by itself.
     """
     thread = wp.tid()
     dt = float(pace.seconds[DT])
     obstacles = all.rigid.forces.shape[0]
     phase = int(first)
     while phase <= last:
-        if phase > first:
+        if phase > first and are_separate == 0:
             synchronize_grid(sums.arrived)
         k = int(thread)
         if phase == LOCATE:
@@ -371,11 +371,16 @@ def solve_contacts(
                 may_act = int(0)
                 if number >= 0:
                     may_act = locate(number, dt, all, sums)
-                list_by_warp(sums.live, sums.live_count, number, may_act)
+                list_by_warp(sums.live, sums.live_count, number, wp.where(are_separate != 0, 0, may_act))
                 k += threads
         elif phase <= iterations:
-            while k < sums.live_count[0]:
-                iterate(sums.live[k], (phase - 1) % 2, dt, all, sums)
+            live = wp.where(are_separate != 0, near.count[0], sums.live_count[0])
+            while k < live:
+                number = sums.live[k]
+                if are_separate != 0:
+                    number = near.nodes[k]
+                if are_separate == 0 or all.rigid.acts[0, number] != OUT:
+                    iterate(number, (phase - 1) % 2, dt, all, sums)
                 k += threads
         else:
             if thread == 0:

@@ -10,6 +10,9 @@ wp.set_module_options({"enable_backward": False})
 
 #: Gaps of more than so many times the motion of their places and obstacles do not close in a step.
 FORESEEN = wp.constant(4.0)
+#: Whether a contact acts: it cannot in this step; no; yes, since the last iteration, so that its weight is in the sums
+#: of one buffer only; yes; no, since the last iteration. See ``mass_split``.
+OUT, WAITS, BEGINS, ACTS, ENDS = (wp.constant(k) for k in range(-1, 4))
 
 
 @wp.struct
@@ -45,7 +48,7 @@ def begin_place(s: int, o: int, dt: float, rigid: Rigid):
     was = rigid.forces[o, s]
     rigid.forces[o, s] = wp.vec3()
     rigid.more[o, s] = wp.vec3()
-    rigid.acts[o, s] = 0
+    rigid.acts[o, s] = OUT
     if rigid.surface.yielding[s] == 0.0:
         return False
     world = rigid.surface.world[s]
@@ -66,6 +69,7 @@ def begin_place(s: int, o: int, dt: float, rigid: Rigid):
     if anchor[3] > 0.0:
         held = wp.transform_point(now, wp.vec3(anchor[0], anchor[1], anchor[2]))
         moved -= settled(rigid.law, dt) * across(x - held, n)
+    rigid.acts[o, s] = WAITS
     rigid.away[o, s] = wp.vec4(n[0], n[1], n[2], gap)
     rigid.moved[o, s] = moved
     push = wp.max(wp.dot(was, n), 0.0)

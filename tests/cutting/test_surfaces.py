@@ -113,6 +113,7 @@ def test_lips_that_touch_carry_as_if_they_were_whole(device):
 def test_recordings_show_the_cut(make, device, tmp_path):
     from pxr import Usd, UsdGeom
 
+    pytest.importorskip("meshio")
     if make is None:
         body = wc.SoftBody(wc.TetForest.box((2, 1, 1), 0.2, 5), wc.Isotropic(3e4, 0.4, 1000.0), device=device)
         body.fix("x == xmin")

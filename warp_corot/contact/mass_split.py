@@ -19,6 +19,9 @@ from .surface_halo import SurfaceHalo
 
 #: Number of iterations if contacts share nodes, and otherwise: then the first one is exact.
 ITERATIONS, EXACT = 4, 1
+#: On CUDA one launch makes all phases, whose blocks of threads are resident, if there is room for so many contacts for
+#: each of their threads; and the most blocks of other launches.
+MOST_TURNS, MOST_BLOCKS = 16, 1024
 
 
 class MassSplit:
@@ -52,7 +55,7 @@ class MassSplit:
         self._search, self._law, self._pace, self._shared = search, law, pace, shared
         self._rigid, self._pairs, self._taken = rigid, pairs, (-1, -1)
         alone = pairs is None and not surface.is_borne and (rigid is None or rigid.is_separate)
-        self.iterations = EXACT if alone else ITERATIONS
+        self._are_separate, self.iterations = alone, EXACT if alone else ITERATIONS
         self.follow()
 
     def follow(self) -> None:
@@ -73,9 +76,13 @@ class MassSplit:
         self.sums.live = wp.zeros(contacts, dtype=wp.int32, device=device)
         self.sums.live_count = wp.zeros(2, dtype=wp.int32, device=device)
         self.sums.arrived = wp.zeros(1, dtype=wp.uint64, device=device)
-        self._threads: int = 1
+        #: Whether one launch makes all phases, and its threads, or those of a launch for each phase.
+        self._is_one, self._threads = True, 1
         if device.is_cuda:
-            self._threads = kernels.BLOCK * max(min(-(-contacts // kernels.BLOCK), device.sm_count), 1)
+            blocks = max(-(-contacts // kernels.BLOCK), 1)
+            self._is_one = self._are_separate or blocks <= MOST_TURNS * device.sm_count
+            most = device.sm_count if self._is_one and not self._are_separate else MOST_BLOCKS
+            self._threads = kernels.BLOCK * min(blocks, most)
 
     @property
     def buffer(self) -> int:
@@ -91,7 +98,8 @@ class MassSplit:
         """Launch all phases of a step."""
         last = self.iterations + 1
         if self._shared.ranks.is_alone:
-            self._launch(0, last)
+            for first, end in [(0, last)] if self._is_one else [(phase, phase) for phase in range(last + 1)]:
+                self._launch(first, end)
             return
         self._shared.exchange(self.surface.arrays.yielding)
         for phase in range(last + 1):
@@ -132,7 +140,7 @@ class MassSplit:
         contacts.meeting, contacts.rows = Meeting(), Rows()
         if self._pairs is not None:
             contacts.meeting, contacts.rows = self._pairs.meeting, self._pairs.rows
-        inputs = [self._threads, first, last, self.iterations, self._search.near, self._pace]
+        inputs = [self._threads, first, last, self.iterations, int(self._are_separate), self._search.near, self._pace]
         wp.launch(
             kernels.solve_contacts,
             self._threads,
