@@ -50,15 +50,29 @@ class Sums:
 
 
 @wp.struct
+class Parents:
+    """The nodes that move a place, by their numbers in ``Sums``: those that bear it, or itself."""
+
+    nodes: wp.vec4i
+    weights: wp.vec4  # zero for none
+    inverse_masses: wp.vec4  # as ``Surface.yielding`` [m/N]
+
+
+@wp.struct
 class Contact:
     """A contact: up to four places with weights, whose weighted motion opens it."""
 
     places: wp.vec4i  # -1 for none
     weights: wp.vec4
+    parents: Parents  # of the first place
     normal: wp.vec3
     gap: float  # [m]
     moved: wp.vec3  # motion of the obstacle's point in this step [m]
     friction: float
+    loose: float  # the sum of the places' shares of free nodes
+    opens: wp.vec3  # its motion in this step without contact forces [m]
+    free: wp.vec3  # the part of this that free nodes have
+    least: float  # how much it must open [m]
     force: wp.vec3  # on the side with positive weights [N]
     more: wp.vec3  # its change in the last iteration [N]
     acts: int
@@ -78,7 +92,29 @@ class Contacts:
 
 
 @wp.func
-def contact_of(number: int, all: Contacts):
+def parents_of(s: int, surface: Surface):
+    """The nodes that move a place."""
+    found = Parents()
+    if is_borne(s, surface):
+        b = surface.bearing.bearers[s]
+        nodes = surface.node.shape[0]
+        found.nodes = b + wp.vec4i(nodes, nodes, nodes, nodes)
+        found.weights = surface.bearing.weights[s]
+        found.inverse_masses = wp.vec4(
+            surface.bearing.yielding[b[0]],
+            surface.bearing.yielding[b[1]],
+            surface.bearing.yielding[b[2]],
+            surface.bearing.yielding[b[3]],
+        )
+    else:
+        found.nodes = wp.vec4i(s, s, s, s)
+        found.weights = wp.vec4(1.0, 0.0, 0.0, 0.0)
+        found.inverse_masses = wp.vec4(surface.yielding[s], 0.0, 0.0, 0.0)
+    return found
+
+
+@wp.func
+def contact_of(number: int, dt: float, all: Contacts):
     """The contact with a number, which has been located in this step."""
     found = Contact()
     places = all.rigid.surface.node.shape[0]
@@ -119,6 +155,22 @@ def contact_of(number: int, all: Contacts):
         found.force = all.rows.force[row]
         found.more = all.rows.more[row]
         found.acts = all.rows.acts[row]
+    surface = all.rigid.surface
+    found.parents = parents_of(found.places[0], surface)
+    found.opens = -found.moved
+    for k in range(4):
+        weight = found.weights[k]
+        if weight != 0.0:
+            s = found.places[k]
+            share = loose_share(s, surface)
+            found.loose += wp.abs(weight) * share
+            found.opens += weight * surface.d[s]
+            if share > 0.0:
+                found.free += weight * surface.d[s]
+    gap = found.gap
+    if found.loose < MOSTLY:
+        gap += left_between(found.places, found.weights, gap, found.loose, found.normal, surface)
+    found.least = least_motion(gap, all.rigid.law, dt)
     return found
 
 
@@ -180,56 +232,35 @@ def add(contact: Contact, times: int, force: wp.vec3, buffer: int, grain: float,
     """Add a contact's weights at the nodes of its places so many times, 1 if it begins to act and -1 if it ends; and a
     force.
     """
-    nodes = surface.node.shape[0]
     for k in range(4):
         weight = contact.weights[k]
         if weight != 0.0:
-            s = contact.places[k]
-            if is_borne(s, surface):
-                b = surface.bearing.bearers[s]
-                w = surface.bearing.weights[s]
-                for m in range(4):
-                    if w[m] != 0.0:
-                        add_at(nodes + b[m], weight * w[m], times, force, buffer, grain, sums)
-            else:
-                add_at(s, weight, times, force, buffer, grain, sums)
+            parents = contact.parents
+            if k > 0:
+                parents = parents_of(contact.places[k], surface)
+            for m in range(4):
+                w = parents.weights[m]
+                if w != 0.0:
+                    add_at(parents.nodes[m], weight * w, times, force, buffer, grain, sums)
 
 
 @wp.func
-def motion_of(s: int, buffer: int, grain: float, surface: Surface, sums: Sums):
-    """The motion of a place in this step with the forces of a buffer [m]; and how far it moves for each unit of force
-    if all contacts at its nodes push in proportion to their weights [m/N].
+def pushed(parents: Parents, buffer: int, grain: float, sums: Sums):
+    """How far the forces of a buffer move a place in this step [m]; and how far it moves for each unit of force if all
+    contacts at its nodes push in proportion to their weights [m/N].
     """
-    if not is_borne(s, surface):
-        mobility = surface.yielding[s]
-        d = surface.d[s] + mobility * force_of(sums.forces[buffer, s], grain)
-        return d, mobility * float(sums.weights[buffer, s]) / SHARES
-    nodes = surface.node.shape[0]
-    b = surface.bearing.bearers[s]
-    w = surface.bearing.weights[s]
     d = wp.vec3()
     compliance = float(0.0)
     # Without branches, so that CUDA loads all at once.
-    for k in range(4):
-        mobility = surface.bearing.yielding[b[k]]
-        force = force_of(sums.forces[buffer, nodes + b[k]], grain)
-        d += w[k] * (surface.bearing.d[b[k]] + mobility * force)
-        compliance += wp.abs(w[k]) * mobility * float(sums.weights[buffer, nodes + b[k]])
+    for m in range(4):
+        n = parents.nodes[m]
+        mobility = parents.inverse_masses[m]
+        d += (parents.weights[m] * mobility) * force_of(sums.forces[buffer, n], grain)
+        compliance += wp.abs(parents.weights[m]) * mobility * float(sums.weights[buffer, n])
     return d, compliance / SHARES
 
 
 # --- the phases of a step --------------------------------------------------------------------------------------------
-
-
-@wp.func
-def required_opening(contact: Contact, opens: wp.vec3, loose: float, law: Law, dt: float, surface: Surface):
-    """How much more a contact must open than it does [m]; ``opens``: its motion in this step; ``loose``: the sum of its
-    places' shares of free nodes.
-    """
-    gap = contact.gap
-    if loose < MOSTLY:
-        gap += left_between(contact.places, contact.weights, contact.gap, loose, contact.normal, surface)
-    return least_motion(gap, law, dt) - wp.dot(opens, contact.normal)
 
 
 @wp.func
@@ -250,16 +281,9 @@ def locate(number: int, dt: float, all: Contacts, sums: Sums):
         is_near = locate_row(number - all.first_pair, law, surface, all.meeting, all.rows)
     if not is_near:
         return 0
-    contact = contact_of(number, all)
-    opens = -contact.moved
-    loose = float(0.0)
-    for k in range(4):
-        if contact.weights[k] != 0.0:
-            s = contact.places[k]
-            opens += contact.weights[k] * surface.d[s]
-            loose += wp.abs(contact.weights[k]) * loose_share(s, surface)
+    contact = contact_of(number, dt, all)
     pushes = wp.dot(contact.force, contact.force) > 0.0
-    if pushes or required_opening(contact, opens, loose, law, dt, surface) > 0.0:
+    if pushes or contact.least > wp.dot(contact.opens, contact.normal):
         contact.acts = ACTS
         for buffer in range(2):
             add(contact, 1, contact.force, buffer, law.grain, surface, sums)
@@ -268,27 +292,23 @@ def locate(number: int, dt: float, all: Contacts, sums: Sums):
 
 
 @wp.func
-def iterate(number: int, before: int, dt: float, all: Contacts, sums: Sums):
+def iterate(contact: Contact, before: int, law: Law, surface: Surface, sums: Sums):
     """Correct the force of a contact, with the sums of the buffer ``before`` and into the other one."""
-    surface = all.rigid.surface
-    law = all.rigid.law
-    contact = contact_of(number, all)
-    opens = -contact.moved
+    opens = contact.opens
+    free = contact.free
     compliance = float(0.0)
-    loose = float(0.0)
-    free = wp.vec3()
     for k in range(4):
-        if contact.weights[k] != 0.0:
-            s = contact.places[k]
-            weight = wp.abs(contact.weights[k])
-            share = loose_share(s, surface)
-            motion, own = motion_of(s, before, law.grain, surface, sums)
-            opens += contact.weights[k] * motion
-            loose += weight * share
-            if share > 0.0:
-                compliance += weight * own
-                free += contact.weights[k] * motion
-    wanted = required_opening(contact, opens, loose, law, dt, surface)
+        weight = contact.weights[k]
+        if weight != 0.0:
+            parents = contact.parents
+            if k > 0:
+                parents = parents_of(contact.places[k], surface)
+            motion, own = pushed(parents, before, law.grain, sums)
+            opens += weight * motion
+            free += weight * motion
+            compliance += wp.abs(weight) * own
+    n = contact.normal
+    wanted = contact.least - wp.dot(opens, n)
     # The other buffer has not got the last changes yet.
     added = contact.more
     contact.more = wp.vec3()
@@ -302,8 +322,7 @@ def iterate(number: int, before: int, dt: float, all: Contacts, sums: Sums):
     if contact.acts == ACTS:
         force = wp.vec3()
         if compliance > 0.0:
-            n = contact.normal
-            wanted -= left_to_held(wanted + wp.dot(free, n), loose)
+            wanted -= left_to_held(wanted + wp.dot(free, n), contact.loose)
             normal_force = wp.max(wp.dot(contact.force, n) + wanted / compliance, 0.0)
             sideways = across(contact.force, n) - across(opens, n) / compliance
             force = normal_force * n + held_back(sideways, normal_force, contact.friction)
@@ -317,7 +336,7 @@ def iterate(number: int, before: int, dt: float, all: Contacts, sums: Sums):
         counted += 1
         contact.acts = BEGINS
     add(contact, counted, added, 1 - before, law.grain, surface, sums)
-    keep(number, contact, all)
+    return contact
 
 
 @wp.kernel(enable_backward=False, grid_stride=False, launch_bounds=(BLOCK, 2))
@@ -345,55 +364,76 @@ def solve_contacts(
     """
     thread = wp.tid()
     dt = float(pace.seconds[DT])
+    surface = all.rigid.surface
+    law = all.rigid.law
     obstacles = all.rigid.forces.shape[0]
-    phase = int(first)
-    while phase <= last:
+    k = int(thread)
+    if first == LOCATE:
+        beside = near.count[0] * obstacles
+        touches = beside + near.touch_count[0]
+        count = touches + row_count(all.rows)
+        places = surface.node.shape[0]
+        # Warps stay together.
+        beyond = count + wp.where(threads > 1, thread % WARP, 0)
+        while k < beyond:
+            number = int(-1)
+            if k < beside:
+                s = near.nodes[k // obstacles]
+                if (near.flags[s] & BESIDE) != 0:
+                    number = (k % obstacles) * places + s
+            elif k < touches:
+                number = all.first_triangle + near.touches[k - beside]
+            elif k < count:
+                number = all.first_pair + k - touches
+            may_act = int(0)
+            if number >= 0:
+                may_act = locate(number, dt, all, sums)
+            list_by_warp(sums.live, sums.live_count, number, wp.where(are_separate != 0, 0, may_act))
+            k += threads
+    phase = wp.max(first, LOCATE + 1)
+    live = int(0)
+    own = int(-1)
+    mine = Contact()
+    while phase <= wp.min(last, iterations):
         if phase > first and are_separate == 0:
             synchronize_grid(sums.arrived)
-        k = int(thread)
-        if phase == LOCATE:
-            beside = near.count[0] * obstacles
-            touches = beside + near.touch_count[0]
-            count = touches + row_count(all.rows)
-            places = all.rigid.surface.node.shape[0]
-            # Warps stay together.
-            beyond = count + wp.where(threads > 1, thread % WARP, 0)
-            while k < beyond:
-                number = int(-1)
-                if k < beside:
-                    s = near.nodes[k // obstacles]
-                    if (near.flags[s] & BESIDE) != 0:
-                        number = (k % obstacles) * places + s
-                elif k < touches:
-                    number = all.first_triangle + near.touches[k - beside]
-                elif k < count:
-                    number = all.first_pair + k - touches
-                may_act = int(0)
-                if number >= 0:
-                    may_act = locate(number, dt, all, sums)
-                list_by_warp(sums.live, sums.live_count, number, wp.where(are_separate != 0, 0, may_act))
-                k += threads
-        elif phase <= iterations:
+        if own < 0:
             live = wp.where(are_separate != 0, near.count[0], sums.live_count[0])
-            while k < live:
+        k = int(thread)
+        while k < live:
+            number = own
+            contact = mine
+            if k != thread or own < 0:
                 number = sums.live[k]
                 if are_separate != 0:
                     number = near.nodes[k]
-                if are_separate == 0 or all.rigid.acts[0, number] != OUT:
-                    iterate(number, (phase - 1) % 2, dt, all, sums)
-                k += threads
-        else:
-            if thread == 0:
-                sums.live_count[1] = sums.live_count[0]
-                sums.live_count[0] = 0
-            while k < near.count[0]:
-                s = near.nodes[k]
-                d, _compliance = motion_of(s, iterations % 2, all.rigid.law.grain, all.rigid.surface, sums)
-                all.rigid.surface.d[s] = d
-                if (near.flags[s] & BESIDE) != 0:
-                    anchor(s, all.rigid)
-                k += threads
+                contact = contact_of(number, dt, all)
+            if contact.acts != OUT:
+                contact = iterate(contact, (phase - 1) % 2, law, surface, sums)
+            # A thread's first contact stays in registers.
+            if k == thread:
+                own = number
+                mine = contact
+            else:
+                keep(number, contact, all)
+            k += threads
         phase += 1
+    if own >= 0:
+        keep(own, mine, all)
+    if last > iterations:
+        if first < last and are_separate == 0:
+            synchronize_grid(sums.arrived)
+        if thread == 0:
+            sums.live_count[1] = sums.live_count[0]
+            sums.live_count[0] = 0
+        k = int(thread)
+        while k < near.count[0]:
+            s = near.nodes[k]
+            d, _compliance = pushed(parents_of(s, surface), iterations % 2, law.grain, sums)
+            surface.d[s] = surface.d[s] + d
+            if (near.flags[s] & BESIDE) != 0:
+                anchor(s, all.rigid)
+            k += threads
 
 
 # --- results ---------------------------------------------------------------------------------------------------------
