@@ -14,6 +14,9 @@ from .watch import Watch, begin_obstacle, pair_of
 
 wp.set_module_options({"enable_backward": False})
 
+#: Number of threads of a block on CUDA: few, so that the places of a small surface are on many multiprocessors.
+BLOCK = 64
+
 
 @wp.func
 def foreseen(
@@ -81,7 +84,8 @@ def begin_step(
     nodes: Surface,
     surface: Surface,
 ):
-    """Find the positions of a body's surface nodes and their motion in this step without contact; move obstacles.
+    """Find the positions of a body's surface nodes and their motion in this step without contact, unless contact
+    sleeps; move obstacles.
 
     Args:
         start, count: The first of the ``nodes``, which are places or bear them, and how many there are.
@@ -96,6 +100,8 @@ def begin_step(
     if k < obstacles:
         world, o = pair_of(k, watch)
         begin_obstacle(world, o, motions, pace, world_starts, offset, watches, watch)
+    if watch.awake[0] == 0:
+        return
     if k < count:
         s = start + k
         i = nodes.node[s]

@@ -1,14 +1,23 @@
-"""Surface nodes and triangles that are near obstacles."""
+"""The search for surface nodes and triangles that are near obstacles, and what comes before and after any search."""
 
 import warp as wp
 
-from .near import AROUND, BESIDE, Near, leave_room, mark
+from warp_corot.kernels.stepping.threads import spread_thread, synchronize_grid
+
+from .extremes import raise_by_warp
+from .near import AROUND, BESIDE, Near, add_motion, begin_search, leave_room, mark
 from .shapes import GROUND, distance_to, sure_distance
+from .sleep import end_search
 from .touches import Touches
 from .vertices import Rigid
-from .watch import FARTHEST, Watch
+from .watch import ASKED, FARTHEST, Watch, fastest_motion
 
 wp.set_module_options({"enable_backward": False})
+
+#: The phases of a search. ``BESIDE_OBSTACLES`` follows those of other kernels.
+ASK, MEASURE, RESERVE, BESIDE_OBSTACLES, END = (wp.constant(k) for k in range(5))
+#: Number of threads of a block on CUDA.
+BLOCK = wp.constant(64)
 
 
 @wp.func
@@ -17,18 +26,9 @@ def horizon(watch: Watch):
     return wp.min(watch.room[0], FARTHEST * watch.size)
 
 
-@wp.kernel(enable_backward=False)
-def find_nodes_beside(
-    # In
-    watch: Watch,
-    # Out
-    near: Near,
-    rigid: Rigid,
-):
-    """Mark nodes that may touch an obstacle before the next search. Obstacles exert no forces on other nodes."""
-    s = wp.tid()
-    if watch.due[0] == 0:
-        return
+@wp.func
+def find_node(s: int, watch: Watch, rigid: Rigid, near: Near):
+    """Mark a node that may touch an obstacle before the next search. Obstacles exert no forces on other nodes."""
     if rigid.surface.node[s] >= 0:
         world = rigid.surface.world[s]
         for o in range(rigid.forces.shape[0]):
@@ -45,22 +45,11 @@ def find_nodes_beside(
         rigid.anchors[o, s] = wp.vec4()
 
 
-@wp.kernel(enable_backward=False)
-def find_triangles_beside(
-    # In
-    watch: Watch,
-    rigid: Rigid,
-    triangles: wp.array[wp.vec3i],
-    # Out
-    near: Near,
-    touches: Touches,
+@wp.func
+def find_triangle(
+    o: int, t: int, watch: Watch, rigid: Rigid, triangles: wp.array[wp.vec3i], near: Near, touches: Touches
 ):
-    """List triangles that may touch an obstacle before the next search. Obstacles exert no forces on other
-    triangles.
-    """
-    o, t = wp.tid()
-    if watch.due[0] == 0:
-        return
+    """List a triangle that may touch an obstacle before the next search. Obstacles exert no forces on other ones."""
     corners = triangles[t]
     if rigid.shapes.kind[o] != GROUND and corners[0] >= 0:
         world = rigid.surface.world[corners[0]]
@@ -83,3 +72,70 @@ def find_triangles_beside(
     touches.shares[o, t] = wp.vec3()
     touches.force[o, t] = wp.vec3()
     touches.acts[o, t] = 0
+
+
+@wp.kernel(enable_backward=False, grid_stride=False, launch_bounds=(64, 4))
+def search_near(
+    # In
+    threads: int,
+    first: int,
+    last: int,
+    asks: int,
+    sleeps: int,
+    triangles: wp.array[wp.vec3i],
+    # In and out
+    rigid: Rigid,
+    watch: Watch,
+    near: Near,
+    touches: Touches,
+    arrived: wp.array[wp.uint64],
+):
+    """Make some phases of a search, if one is due. Those for soft surfaces come before ``BESIDE``.
+
+    Args:
+        threads: The number of threads, of blocks that are all resident on CUDA.
+        first, last: The phases.
+        asks: Whether margins count motion relative to a frame: 0: no; 1: to that of nodes near other surfaces; 2: to
+            that of all nodes.
+        sleeps: Whether contact may sleep after the search.
+        arrived: As for ``synchronize_grid``.
+    """
+    thread = wp.tid()
+    if watch.due[0] == 0:
+        return
+    surface = rigid.surface
+    places = surface.node.shape[0]
+    obstacles = rigid.forces.shape[0]
+    poses = watch.poses.shape[0] * watch.poses.shape[1]
+    start = spread_thread(thread, threads, BLOCK)
+    phase = int(first)
+    while phase <= last:
+        if phase > first:
+            synchronize_grid(arrived)
+        k = int(start)
+        if phase == ASK:
+            while asks != 0 and k * ASKED < places:
+                add_motion(k * ASKED, asks == 2, surface, near, watch)
+                k += threads
+        elif phase == MEASURE:
+            fastest = float(0.0)
+            while k < wp.max(places, poses):
+                fastest = wp.max(fastest, fastest_motion(k, poses, surface, rigid.motions, watch))
+                k += threads
+            raise_by_warp(watch.fastest, fastest)
+        elif phase == RESERVE:
+            while k < wp.max(places, wp.max(poses, watch.drift.shape[0])):
+                begin_search(k, poses, surface, rigid.motions, watch, near)
+                k += threads
+        elif phase == BESIDE_OBSTACLES:
+            while obstacles > 0 and k < places + touches.force.shape[0] * touches.force.shape[1]:
+                if k < places:
+                    find_node(k, watch, rigid, near)
+                else:
+                    pair = k - places
+                    count = triangles.shape[0]
+                    find_triangle(pair // count, pair % count, watch, rigid, triangles, near, touches)
+                k += threads
+        elif thread == 0:
+            end_search(sleeps, near, watch)
+        phase += 1

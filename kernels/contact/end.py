@@ -9,6 +9,7 @@ from warp_corot.kernels.stepping.integrate import by_vectors
 from warp_corot.kernels.stepping.pace import Pace
 from warp_corot.kernels.stepping.work import count_constraint
 
+from .begin import BLOCK as BLOCK
 from .mass_split import Sums, force_of
 from .motion import Surface
 from .watch import Watch, follow_node
@@ -59,7 +60,7 @@ def end_contact(
         i = nodes.node[s]
         if i >= 0:
             force = wp.vec3()
-            if sums.touched[first + k] != 0:
+            if watch.awake[0] != 0 and sums.touched[first + k] != 0:
                 force = force_of(sums.forces[buffer, first + k], grain)
                 sums.touched[first + k] = 0
                 for other in range(2):
@@ -73,7 +74,7 @@ def end_contact(
                     count_constraint(
                         i, force, total, damping, gravity, inverse_mass, has_load, load, pace, offset, v, account
                     )
-    if k < places and surface.node[place_start + k] >= 0:
+    if watch.awake[0] != 0 and k < places and surface.node[place_start + k] >= 0:
         follow_node(place_start + k, surface, watch)
 
 

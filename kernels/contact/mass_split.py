@@ -13,7 +13,7 @@ iterations of a step in one launch.
 import warp as wp
 
 from warp_corot.kernels.stepping.pace import DT, Pace
-from warp_corot.kernels.stepping.threads import synchronize_grid
+from warp_corot.kernels.stepping.threads import spread_thread, synchronize_blocks, synchronize_grid
 
 from .bearing import is_borne, loose_share
 from .law import Law, held_back, least_motion, left_to_held
@@ -27,8 +27,9 @@ from .vertices import ACTS, BEGINS, ENDS, OUT, WAITS, Rigid, across, anchor, beg
 
 wp.set_module_options({"enable_backward": False})
 
-#: Number of threads of a block on CUDA.
-BLOCK = 256
+#: Number of threads of a block on CUDA: few, because the work of few contacts takes its time in the exchange of one
+#: multiprocessor with memory.
+BLOCK = wp.constant(64)
 #: Weights are summed in multiples of one over this.
 SHARES = wp.constant(1048576.0)
 #: The first phase of a step. Iterations follow, and then the end.
@@ -46,7 +47,8 @@ class Sums:
     forces: wp.array2d[wp.vec3l]  # [2, S + B] in multiples of ``Law.grain``
     live: wp.array[wp.int32]  # contacts that may act in this step, by their numbers
     live_count: wp.array[wp.int32]  # [2] how many in this step while forces are found, and in the last one
-    arrived: wp.array[wp.uint64]  # [1] blocks at the barrier, ever
+    # [2] blocks at the barrier for all of them, ever; and in this step at that for blocks with contacts that may act
+    arrived: wp.array[wp.uint64]
 
 
 @wp.struct
@@ -339,7 +341,7 @@ def iterate(contact: Contact, before: int, law: Law, surface: Surface, sums: Sum
     return contact
 
 
-@wp.kernel(enable_backward=False, grid_stride=False, launch_bounds=(BLOCK, 2))
+@wp.kernel(enable_backward=False, grid_stride=False, launch_bounds=(64, 4))
 def solve_contacts(
     # In
     threads: int,
@@ -347,6 +349,7 @@ def solve_contacts(
     last: int,
     iterations: int,
     are_separate: int,
+    awake: wp.array[wp.int32],
     near: Near,
     pace: Pace,
     # In and out
@@ -359,15 +362,19 @@ def solve_contacts(
     Args:
         threads: The number of threads, of blocks that are all resident on CUDA.
         first, last: The phases, from 0 to ``iterations`` + 1.
+        awake: Whether contact is awake, [1]; there are no contacts if it is not.
         are_separate: Whether no two contacts share a node: places that are nodes, and one obstacle. Then a thread goes
             through all phases of a place by itself.
     """
     thread = wp.tid()
+    if awake[0] == 0:
+        return
     dt = float(pace.seconds[DT])
     surface = all.rigid.surface
     law = all.rigid.law
     obstacles = all.rigid.forces.shape[0]
-    k = int(thread)
+    start = spread_thread(thread, threads, BLOCK)
+    k = int(start)
     if first == LOCATE:
         beside = near.count[0] * obstacles
         touches = beside + near.touch_count[0]
@@ -394,16 +401,25 @@ def solve_contacts(
     live = int(0)
     own = int(-1)
     mine = Contact()
+    blocks = int(1)
     while phase <= wp.min(last, iterations):
         if phase > first and are_separate == 0:
-            synchronize_grid(sums.arrived)
+            if phase == LOCATE + 1:
+                synchronize_grid(sums.arrived)
+            else:
+                synchronize_blocks(sums.arrived, 1, blocks)
         if own < 0:
             live = wp.where(are_separate != 0, near.count[0], sums.live_count[0])
-        k = int(thread)
+            # Only blocks that have any of them wait for one another.
+            blocks = wp.clamp((live + WARP - 1) // WARP, 1, wp.max(threads // BLOCK, 1))
+        k = int(start)
+        if thread // BLOCK >= blocks:
+            phase = iterations
+            live = 0
         while k < live:
             number = own
             contact = mine
-            if k != thread or own < 0:
+            if k != start or own < 0:
                 number = sums.live[k]
                 if are_separate != 0:
                     number = near.nodes[k]
@@ -411,7 +427,7 @@ def solve_contacts(
             if contact.acts != OUT:
                 contact = iterate(contact, (phase - 1) % 2, law, surface, sums)
             # A thread's first contact stays in registers.
-            if k == thread:
+            if k == start:
                 own = number
                 mine = contact
             else:
@@ -424,9 +440,10 @@ def solve_contacts(
         if first < last and are_separate == 0:
             synchronize_grid(sums.arrived)
         if thread == 0:
+            sums.arrived[1] = wp.uint64(0)
             sums.live_count[1] = sums.live_count[0]
             sums.live_count[0] = 0
-        k = int(thread)
+        k = int(start)
         while k < near.count[0]:
             s = near.nodes[k]
             d, _compliance = pushed(parents_of(s, surface), iterations % 2, law.grain, sums)

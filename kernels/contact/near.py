@@ -3,7 +3,7 @@
 import warp as wp
 
 from .motion import Motions, Surface
-from .watch import ALONE, ASKED, FARTHEST, PARTS, Watch, common_motion, reserve_node, reserve_obstacle
+from .watch import ALONE, FARTHEST, PARTS, Watch, common_motion, reserve_node, reserve_obstacle
 
 wp.set_module_options({"enable_backward": False})
 
@@ -39,13 +39,10 @@ def leave_room(room: float, watch: Watch):
         wp.atomic_min(watch.room, 0, room)
 
 
-@wp.kernel(enable_backward=False)
-def find_common_motion(everywhere: int, surface: Surface, near: Near, watch: Watch):
-    """Sum the motion of nodes that were near other surfaces; of all nodes if there were none, or ``everywhere``."""
-    s = ASKED * wp.tid()
-    if watch.due[0] == 0 or surface.node[s] < 0:
-        return
-    if everywhere == 0 and near.count[0] > 0 and (near.flags[s] & PAIRED) == 0:
+@wp.func
+def add_motion(s: int, everywhere: bool, surface: Surface, near: Near, watch: Watch):
+    """Add the motion of a node that was near another surface; of any node if there were none, or ``everywhere``."""
+    if surface.node[s] < 0 or (not everywhere and near.count[0] > 0 and (near.flags[s] & PAIRED) == 0):
         return
     world = surface.world[s]
     motion = surface.d[s] / watch.size
@@ -56,13 +53,10 @@ def find_common_motion(everywhere: int, surface: Surface, near: Near, watch: Wat
         wp.atomic_add(watch.asked, world, 3, wp.int64(1))
 
 
-@wp.kernel(enable_backward=False)
-def reserve(surface: Surface, motions: Motions, obstacles: int, watch: Watch, near: Near):
-    """Begin a search: record the positions of nodes and the poses of obstacles, and how far they may move from there,
-    with a thread for each of either, and for each world."""
-    s = wp.tid()
-    if watch.due[0] == 0:
-        return
+@wp.func
+def begin_search(s: int, obstacles: int, surface: Surface, motions: Motions, watch: Watch, near: Near):
+    """Begin a search: record the position of a node and the pose of an obstacle, and how far they may move from there,
+    and the frame of a world, each of the number ``s``."""
     if s < obstacles:
         reserve_obstacle(s, motions, watch)
     if s < watch.drift.shape[0]:

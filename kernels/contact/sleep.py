@@ -12,7 +12,7 @@ from warp_corot.kernels.stepping.pace import DONE, DT, Pace
 
 from .motion import Motions, Surface
 from .near import Near
-from .watch import SKIN, Watch, begin_obstacle, pair_of, reserved, stays, wake
+from .watch import HIT, SKIN, Watch, begin_obstacle, pair_of, reserved, stays, wake
 
 wp.set_module_options({"enable_backward": False})
 
@@ -147,23 +147,22 @@ def choose_calm(is_clear: bool, needed: float, watch: Watch):
     return True
 
 
-@wp.kernel(enable_backward=False)
+@wp.func
 def end_search(sleeps: int, near: Near, watch: Watch):
     """End a search. Contact sleeps after it if nothing is near and there is as much room as would be reserved.
 
     Args:
         sleeps: Whether it may, and the search is repeated while it is due.
     """
-    if watch.due[0] == 0:
-        return
     watch.due[0] = 0
     watch.awake[0] = 1
     is_clear = near.count[0] == 0 and near.touch_count[0] == 0
     if sleeps != 0:
         meets = watch.most_calm > 0.0
-        needed = watch.spread * reserved(watch.fastest[0], 1.0, watch)
+        needed = watch.spread * reserved(watch.fastest[0], 1.0, HIT, watch)
         room = 0.5 * watch.room[0]
-        reserve = wp.where(meets, watch.calm[0], watch.least[0] + room)
+        # Everything may move by what is reserved for something at rest, too.
+        reserve = wp.where(meets, watch.calm[0], reserved(0.0, 1.0, watch.hit, watch) + room)
         if is_clear and reserve >= needed:
             watch.free[0] = reserve / watch.spread
             watch.free[1] = room

@@ -4,7 +4,6 @@ import warp as wp
 
 from warp_corot.kernels.stepping.pace import Pace
 
-from .extremes import raise_by_warp
 from .motion import Motions, Surface, distance_between, move_obstacle
 
 wp.set_module_options({"enable_backward": False})
@@ -15,8 +14,9 @@ AHEAD = wp.constant(16.0)
 #: this many elements, more than any stable step covers.
 FAST = wp.constant(2.0)
 FARTHEST = wp.constant(64.0)
-#: An item that is hit moves as far as the item that hits it; this many times that motion is reserved.
-HIT = wp.constant(2.0)
+#: An item that is hit moves as far as the item that hits it; this many times that motion is reserved: more where there
+#: are only obstacles, beside which few nodes are, for light nodes vibrate with the length of a few steps.
+HIT, HIT_BESIDE = wp.constant(2.0), wp.constant(8.0)
 #: Nodes with nothing near may move this many times as far, and as many elements: few of them come near anything. In
 #: self-contact they may not move more elements: so much of the body is that near.
 ALONE = wp.constant(4.0)
@@ -44,6 +44,7 @@ class Watch:
     asked: wp.array2d[wp.int64]  # [W, 4] sum of motions in the step of the search, and the number of nodes
     size: float  # size of the smallest element [m]
     most_alone: float  # how many elements nodes with nothing near may move
+    hit: float  # how many times the largest motion is reserved for anything
     is_implicit: int  # whether steps are so long that hardly any search lasts for two
     fastest: wp.array[wp.float32]  # [1] largest motion in the step of the search
     due: wp.array[wp.int32]  # [1] whether a search is due
@@ -76,11 +77,12 @@ def wake(watch: Watch):
 
 
 @wp.func
-def reserved(step: float, farther: float, watch: Watch):
-    """How far an item may move, given its motion in the present step; ``farther``: so many times as far."""
+def reserved(step: float, farther: float, hit: float, watch: Watch):
+    """How far an item may move, given its motion in the present step; ``farther``: so many times as far; ``hit``: how
+    many times the largest motion if it is hit."""
     farthest = wp.max(wp.min(farther, watch.most_alone) * watch.size, FAST * step)
     ahead = wp.min(farther * AHEAD * step, farthest)
-    hit = HIT * watch.fastest[0]
+    hit *= watch.fastest[0]
     ahead = wp.where(watch.is_implicit != 0, wp.max(ahead, hit), ahead + hit)
     return watch.least[0] + wp.min(ahead, FARTHEST * watch.size)
 
@@ -99,7 +101,7 @@ def common_motion(world: int, watch: Watch):
 def watch_nodes(surface: Surface, watch: Watch):
     """Check before a step whether nodes have been moved from outside, or have begun to move faster."""
     s = wp.tid()
-    if surface.node[s] < 0:
+    if surface.node[s] < 0 or watch.awake[0] == 0:
         return
     world = surface.world[s]
     common = watch.common[world]
@@ -163,24 +165,17 @@ def move_obstacles(motions: Motions, pace: Pace, world_starts: wp.array[wp.float
     begin_obstacle(world, o, motions, pace, world_starts, offset, 0, watch)
 
 
-@wp.kernel(enable_backward=False)
-def find_fastest(threads: int, surface: Surface, motions: Motions, obstacles: int, watch: Watch):
-    """Find the motion in this step of the fastest node or obstacle."""
-    thread = wp.tid()
-    if watch.due[0] == 0:
-        return
+@wp.func
+def fastest_motion(k: int, obstacles: int, surface: Surface, motions: Motions, watch: Watch):
+    """The motion in this step of a node or an obstacle with a number, whichever is faster [m]."""
     fastest = float(0.0)
-    s = int(thread)
-    while s < surface.node.shape[0]:
-        if surface.node[s] >= 0:
-            fastest = wp.max(fastest, wp.length(surface.d[s] - common_motion(surface.world[s], watch)))
-        s += threads
-    k = int(thread)
-    while k < obstacles:
+    if k < surface.node.shape[0] and surface.node[k] >= 0:
+        fastest = wp.length(surface.d[k] - common_motion(surface.world[k], watch))
+    if k < obstacles:
         world, o = pair_of(k, watch)
-        fastest = wp.max(fastest, distance_between(motions.now[world, o], motions.later[world, o], motions.reach[o]))
-        k += threads
-    raise_by_warp(watch.fastest, fastest)
+        motion = distance_between(motions.now[world, o], motions.later[world, o], motions.reach[o])
+        fastest = wp.max(fastest, motion)
+    return fastest
 
 
 @wp.func
@@ -190,7 +185,7 @@ def reserve_obstacle(k: int, motions: Motions, watch: Watch):
     now = motions.now[world, o]
     watch.poses[world, o] = now
     step = distance_between(now, motions.later[world, o], motions.reach[o])
-    watch.reach_of[world, o] = reserved(step, 1.0, watch)
+    watch.reach_of[world, o] = reserved(step, 1.0, watch.hit, watch)
 
 
 @wp.func
@@ -198,4 +193,4 @@ def reserve_node(s: int, farther: float, surface: Surface, watch: Watch):
     """Record the place of a node and how far it may move from there."""
     watch.places[s] = surface.x[s]
     step = wp.length(surface.d[s] - common_motion(surface.world[s], watch))
-    watch.reach[s] = wp.max(reserved(step, farther, watch), watch.calm[0])
+    watch.reach[s] = wp.max(reserved(step, farther, watch.hit, watch), watch.calm[0])

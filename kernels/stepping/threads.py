@@ -25,22 +25,52 @@ def synchronize_any(flag: int) -> int:
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
+    return gridDim.x;
+#else
+    return 1;
+#endif
+""")
+def block_count() -> int:
+    """The number of blocks of the launch."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
     __syncthreads();
-    if (gridDim.x == 1) return;
+    if (blocks == 1) return;
     if (threadIdx.x == 0) {
-        unsigned long long* count = reinterpret_cast<unsigned long long*>(arrived.data);
+        unsigned long long* count = reinterpret_cast<unsigned long long*>(&wp::index(arrived, which));
         __threadfence();
-        const unsigned long long goal = (atomicAdd(count, 1ull) / gridDim.x + 1ull) * gridDim.x;
+        const unsigned long long goal = (atomicAdd(count, 1ull) / blocks + 1ull) * blocks;
         while (*reinterpret_cast<volatile unsigned long long*>(count) < goal) {}
         __threadfence();
     }
     __syncthreads();
 #endif
 """)
-def synchronize_grid(arrived: wp.array[wp.uint64]):
-    """Wait for all threads of the launch, whose blocks must all be resident. ``arrived`` [1] counts blocks, ever; a
-    launch with another number of blocks has another one."""
+def synchronize_blocks(arrived: wp.array[wp.uint64], which: int, blocks: int):
+    """Wait for all threads of so many blocks, which must all be resident. ``arrived[which]`` counts blocks that have
+    waited together since it was zero."""
     ...
+
+
+@wp.func
+def synchronize_grid(arrived: wp.array[wp.uint64]):
+    """Wait for all threads of the launch, whose blocks must all be resident. ``arrived[0]`` counts blocks, ever; a
+    launch with another number of blocks has another one."""
+    synchronize_blocks(arrived, 0, block_count())
+
+
+@wp.func
+def spread_thread(thread: int, threads: int, block: int):
+    """The first item of a thread if each warp takes the next 32 items in another block, so that few items are spread
+    over many multiprocessors. ``block``: the number of threads of a block."""
+    if threads < block:
+        return thread
+    blocks = threads // block
+    within = thread % block
+    return ((within // 32) * blocks + thread // block) * 32 + within % 32
 
 
 @wp.func

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from warp_corot.kernels.contact import bearing, motion, sums
-from warp_corot.kernels.contact.begin import BEGIN_STEP
+from warp_corot.kernels.contact.begin import BEGIN_STEP, BLOCK
 from warp_corot.kernels.contact.end import END_CONTACT
 from warp_corot.kernels.contact.law import SETTLING, Law
 from warp_corot.solvers.halo import ALONE
@@ -192,7 +192,7 @@ class Contacts:
         self.search.launch(offset, follows=True, sleeps=self.sleep is not None)
         self.split.launch()
         self._is_explicit = True
-        follows = bool(self.search.finders) and not surface.is_whole
+        follows = self.search.is_needed and not surface.is_whole
         for k, (body, part) in enumerate(zip(system.bodies, surface.parts, strict=True)):
             state, conditions, accounts = body.state, body.conditions, system.constraint_accounts(k)
             counts = bool(accounts) and self.counts_work
@@ -212,7 +212,7 @@ class Contacts:
                 accounts[0] if counts else None,
                 state.contact_forces,
             ]
-            self._launch(END_CONTACT[conditions.loads.dtype], max(count, places), inputs, outputs)
+            self._launch(END_CONTACT[conditions.loads.dtype], max(count, places), inputs, outputs, BLOCK)
         if surface.is_whole:
             self.split.launch_clear()
             self.search.launch_after()
@@ -364,7 +364,7 @@ class Contacts:
             frames = system.worlds if begins and k == 0 else 0
             inputs += [frames, moved, obstacles.motions, world_starts, int(moves)]
             outputs = [self.search.watch, arrays, surface.arrays]
-            self._launch(BEGIN_STEP[conditions.loads.dtype], max(count, borne, moved, frames), inputs, outputs)
+            self._launch(BEGIN_STEP[conditions.loads.dtype], max(count, borne, moved, frames), inputs, outputs, BLOCK)
         if isinstance(surface, WholeSurface):
             surface.complete()
         elif self.rigid is not None and self.rigid.have_edges:
@@ -402,5 +402,5 @@ class Contacts:
         """Number of places of a body in all worlds."""
         return self.system.worlds * self.surface.parts[k].nodes
 
-    def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+    def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list, block: int = 256) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block)

@@ -19,9 +19,11 @@ from .surface_halo import SurfaceHalo
 
 #: Number of iterations if contacts share nodes, and otherwise: then the first one is exact.
 ITERATIONS, EXACT = 4, 1
-#: On CUDA one launch makes all phases, whose blocks of threads are resident, if there is room for so many contacts for
-#: each of their threads; and the most blocks of other launches.
-MOST_TURNS, MOST_BLOCKS = 16, 1024
+BLOCK = int(kernels.BLOCK)
+#: On CUDA one launch makes all phases if there is room for so many blocks of contacts for each multiprocessor. Its
+#: blocks of threads are resident: one on each multiprocessor for few contacts, else so many; and the most blocks of
+#: other launches.
+FEW_TURNS, MOST_TURNS, BLOCKS_EACH, MOST_BLOCKS = 4, 64, 4, 4096
 
 
 class MassSplit:
@@ -75,14 +77,17 @@ class MassSplit:
         contacts = self._at_places + self._at_triangles + room
         self.sums.live = wp.zeros(contacts, dtype=wp.int32, device=device)
         self.sums.live_count = wp.zeros(2, dtype=wp.int32, device=device)
-        self.sums.arrived = wp.zeros(1, dtype=wp.uint64, device=device)
+        self.sums.arrived = wp.zeros(2, dtype=wp.uint64, device=device)
         #: Whether one launch makes all phases, and its threads, or those of a launch for each phase.
         self._is_one, self._threads = True, 1
         if device.is_cuda:
-            blocks = max(-(-contacts // kernels.BLOCK), 1)
-            self._is_one = self._are_separate or blocks <= MOST_TURNS * device.sm_count
-            most = device.sm_count if self._is_one and not self._are_separate else MOST_BLOCKS
-            self._threads = kernels.BLOCK * min(blocks, most)
+            blocks, each = max(-(-contacts // BLOCK), 1), device.sm_count
+            self._is_one = self._are_separate or blocks <= MOST_TURNS * each
+            if self._is_one and not self._are_separate:
+                most = each if blocks <= FEW_TURNS * each else BLOCKS_EACH * each
+            else:
+                most = MOST_BLOCKS
+            self._threads = BLOCK * min(blocks, most)
 
     @property
     def buffer(self) -> int:
@@ -124,9 +129,9 @@ class MassSplit:
         forces, arrays = self.sums.forces[0], self.surface.arrays
         if self._pairs is not None:
             inputs = [self._law.grain, self._pairs.rows]
-            wp.launch(kernels.add_pairs, self._pairs.room, inputs, [forces], device=self.device)
+            wp.launch(kernels.add_pairs, self._pairs.room, inputs, [forces], device=self.device, block_dim=BLOCK)
         inputs = [self._law.grain, totals, forces]
-        wp.launch(kernels.place_forces, self.surface.count, inputs, [arrays], device=self.device)
+        wp.launch(kernels.place_forces, self.surface.count, inputs, [arrays], device=self.device, block_dim=BLOCK)
 
     def _launch(self, first: int, last: int) -> None:
         contacts = kernels.Contacts()
@@ -140,12 +145,14 @@ class MassSplit:
         contacts.meeting, contacts.rows = Meeting(), Rows()
         if self._pairs is not None:
             contacts.meeting, contacts.rows = self._pairs.meeting, self._pairs.rows
-        inputs = [self._threads, first, last, self.iterations, int(self._are_separate), self._search.near, self._pace]
+        search = self._search
+        inputs = [self._threads, first, last, self.iterations, int(self._are_separate)]
+        inputs += [search.watch.awake, search.near, self._pace]
         wp.launch(
             kernels.solve_contacts,
             self._threads,
             inputs,
             [contacts, self.sums],
             device=self.device,
-            block_dim=min(self._threads, kernels.BLOCK),
+            block_dim=min(self._threads, BLOCK),
         )

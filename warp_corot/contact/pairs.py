@@ -10,6 +10,7 @@ from warp_corot.kernels.contact import boxes
 from warp_corot.kernels.contact import search as search_kernels
 from warp_corot.kernels.contact.crushed import mark_crushed
 from warp_corot.kernels.contact.rows import Meeting, Rows
+from warp_corot.kernels.contact.watch import HIT
 from warp_corot.solvers.halo import ALONE, Halo
 
 from .options import Contact
@@ -56,10 +57,10 @@ class Pairs:
         self.surface, self.search, self.device = surface, search, surface.device
         self.friction, self.meets_itself, self._flat_edges = options.friction, options.self_contact, options.flat_edges
         self.revision, self._room, self._taken, self._built = 0, 0, -1, 0
-        search.watch.most_calm = CALM_ITSELF if self.meets_itself else CALM
+        search.watch.most_calm, search.watch.hit = CALM_ITSELF if self.meets_itself else CALM, float(HIT)
         if self.meets_itself:
             search.watch.most_alone = 1.0
-        search.finders.append(self._find)
+        search.find_pairs = self._find
         self.follow()
 
     # --- places and room -------------------------------------------------------------------------------------------

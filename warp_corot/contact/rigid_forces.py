@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from warp_corot.kernels.contact import beside, sums, touches
+from warp_corot.kernels.contact import sums, touches
 from warp_corot.kernels.contact.law import Law
 from warp_corot.kernels.contact.vertices import Rigid
 
@@ -35,7 +35,7 @@ class RigidForces:
         self.surface, self.obstacles, self.search, self.device = surface, obstacles, search, surface.device
         self._law, self._taken = law, -1
         self.have_edges = obstacles.have_edges
-        search.finders.append(self._find)
+        search.rigid = self
         self.follow()
 
     def follow(self) -> None:
@@ -93,14 +93,6 @@ class RigidForces:
         inputs = [self.surface.corner_starts, self.surface.corners, self.touches, self.forces]
         wp.launch(sums.share_touches, self.forces.shape, inputs, [self.totals], device=self.device)
         return self.totals
-
-    def _find(self) -> None:
-        """Launch the search for nodes and triangles near obstacles."""
-        watch, near, rigid = self.search.watch, self.search.near, self.arrays
-        wp.launch(beside.find_nodes_beside, self.surface.count, [watch], [near, rigid], device=self.device)
-        if self.have_edges:
-            dim, inputs = (self.obstacles.count, self.surface.triangle_count), [watch, rigid, self.surface.triangles]
-            wp.launch(beside.find_triangles_beside, dim, inputs, [near, self.touches], device=self.device)
 
     @property
     def arrays(self) -> Rigid:

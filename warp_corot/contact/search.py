@@ -4,17 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import TYPE_CHECKING
 
 import warp as wp
 
 from warp_corot.errors import UnstableError
+from warp_corot.kernels.contact import beside
 from warp_corot.kernels.contact import near as near_kernels
-from warp_corot.kernels.contact import sleep
 from warp_corot.kernels.contact import watch as kernels
+from warp_corot.kernels.contact.touches import Touches
+from warp_corot.kernels.contact.vertices import Rigid
 from warp_corot.solvers.guarding.mapped import Mapped
 
 from .obstacles import Obstacles
 from .surface import ContactSurface
+
+if TYPE_CHECKING:
+    from .rigid_forces import RigidForces
 
 #: The least motion that is reserved for anything between two searches, as a fraction of the smallest element's size: at
 #: first, and at most after something that was hit has moved farther in one step than was reserved.
@@ -22,8 +28,8 @@ LEAST, MOST = 0.05, 4.0
 WIDER = 4.0
 #: Maximum number of threads that process a list on CUDA.
 MOST_THREADS = 1 << 18
-#: Threads that find the fastest item on CUDA, at most: each ends with an atomic maximum.
-MEASURING_THREADS = 1 << 14
+#: Number of threads of a block, and of resident blocks on each multiprocessor.
+BLOCK, BLOCKS_EACH = int(beside.BLOCK), 4
 #: The report of the device to the host: see ``kernels.contact.near.report_search``.
 PAIRS, MISSED, SEARCHES = range(3)
 
@@ -44,7 +50,8 @@ class Search:
     Attributes:
         watch: The places at the last search, as a struct for kernels.
         near: The nodes that have something near them.
-        finders: The launches of a search.
+        rigid: Forces of obstacles, if there are any.
+        find_pairs: The launch of the search for pairs of soft surfaces, if they may touch.
         most: The largest number of pairs so far, int32 [1].
         farthest: The largest value of the least motion that is reserved [m].
     """
@@ -52,14 +59,16 @@ class Search:
     def __init__(self, surface: ContactSurface, obstacles: Obstacles, size: float, *, branches: bool = True):
         self.surface, self.obstacles, self.device = surface, obstacles, surface.device
         self.farthest = MOST * size
-        self.finders: list[Callable[[], None]] = []
+        self.rigid: RigidForces | None = None
+        self.find_pairs: Callable[[], None] | None = None
         self._report = Mapped(3, self.device)
         self.most = wp.zeros(1, dtype=wp.int32, device=self.device)
         watch, device = kernels.Watch(), self.device
         watch.least = wp.full(1, LEAST * size, dtype=wp.float32, device=device)
         watch.fastest = wp.zeros(1, dtype=wp.float32, device=device)
-        watch.size, watch.most_alone = size, float(kernels.ALONE)
+        watch.size, watch.most_alone, watch.hit = size, float(kernels.ALONE), float(kernels.HIT_BESIDE)
         watch.due, watch.missed, watch.searches = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(3))
+        self._arrived = wp.zeros(1, dtype=wp.uint64, device=device)
         watch.awake = wp.ones(1, dtype=wp.int32, device=device)
         watch.room, watch.free = (wp.zeros(n, dtype=wp.float32, device=device) for n in (1, 2))
         watch.calm = wp.zeros(3, dtype=wp.float32, device=device)
@@ -149,9 +158,14 @@ class Search:
     # --- launches --------------------------------------------------------------------------------------------------
 
     @property
+    def is_needed(self) -> bool:
+        """Whether anything may touch."""
+        return self.rigid is not None or self.find_pairs is not None
+
+    @property
     def can_sleep(self) -> bool:
         """Whether the device can leave out contact while nothing is near."""
-        return self._branches and bool(self.finders)
+        return self._branches and self.is_needed
 
     def launch(self, offset: int, *, follows: bool = False, sleeps: bool = False) -> None:
         """Launch a search, if it is due in this step.
@@ -161,21 +175,22 @@ class Search:
             follows: Whether margins count motion relative to a frame, which the steps move; not with obstacles.
             sleeps: Whether contact may sleep after the search.
         """
-        if not self.finders:
+        if not self.is_needed:
             return
         if offset == 0:
             self._on_nodes(kernels.watch_nodes, [self.surface.arrays, self.watch])
         search = partial(self._search, follows and not self.obstacles.count, sleeps)
-        if self._branches and sleeps:
-            wp.capture_while(self.watch.due, search)
-        elif self._branches:
-            wp.capture_if(self.watch.due, search)
-        else:
+        # A branch takes longer on CUDA than a launch that ends at once, and a search beside obstacles is one launch.
+        if not self._branches or (self.find_pairs is None and self.device.is_cuda):
             search()
+        elif sleeps:
+            wp.capture_while(self.watch.due, search)
+        else:
+            wp.capture_if(self.watch.due, search)
 
     def launch_after(self) -> None:
         """Launch the test after a step whether a search is due."""
-        if self.finders:
+        if self.is_needed:
             self._on_nodes(kernels.follow_nodes, [self.surface.arrays, self.watch])
 
     def launch_report(self) -> None:
@@ -183,19 +198,26 @@ class Search:
         wp.launch(near_kernels.report_search, 1, [self.watch, self.most, self._report.array], device=self.device)
 
     def _search(self, is_framed: bool, sleeps: bool) -> None:
-        arrays, obstacles = self.surface.arrays, self.watch.poses.size
-        inputs = [arrays, self.obstacles.motions, obstacles, self.watch]
-        dim = max(self.surface.count, obstacles, self.surface.worlds)
-        threads = 1 if self.device.is_cpu else min(dim, MEASURING_THREADS)
-        if is_framed:
-            few = -(-self.surface.count // kernels.ASKED)
-            asked = [int(len(self.surface.parts) == 1), arrays, self.near, self.watch]
-            wp.launch(near_kernels.find_common_motion, few, asked, device=self.device)
-        wp.launch(kernels.find_fastest, threads, [threads, *inputs], device=self.device)
-        wp.launch(near_kernels.reserve, dim, [*inputs, self.near], device=self.device)
-        for find in self.finders:
-            find()
-        wp.launch(sleep.end_search, 1, [int(sleeps), self.near, self.watch], device=self.device)
+        asks = 0 if not is_framed else 2 if len(self.surface.parts) == 1 else 1
+        if self.find_pairs is None:
+            self._launch(beside.ASK, beside.END, asks, sleeps)
+            return
+        self._launch(beside.ASK, beside.RESERVE, asks, sleeps)
+        self.find_pairs()
+        self._launch(beside.BESIDE_OBSTACLES, beside.END, asks, sleeps)
+
+    def _launch(self, first: int, last: int, asks: int, sleeps: bool) -> None:
+        """Launch phases of a search."""
+        rigid, touches, triangles, threads = Rigid(), Touches(), 0, 1
+        rigid.surface, rigid.motions = self.surface.arrays, self.obstacles.motions
+        if self.rigid is not None:
+            rigid, touches, triangles = self.rigid.arrays, self.rigid.touches, self.rigid.touches.force.size
+        if self.device.is_cuda:
+            blocks = -(-max(self.surface.count + triangles, self.watch.poses.size) // BLOCK)
+            threads = BLOCK * min(max(blocks, 1), BLOCKS_EACH * self.device.sm_count)
+        inputs = [threads, int(first), int(last), asks, int(sleeps), self.surface.triangles]
+        outputs = [rigid, self.watch, self.near, touches, self._arrived]
+        wp.launch(beside.search_near, threads, inputs, outputs, device=self.device, block_dim=min(threads, BLOCK))
 
     def _on_nodes(self, kernel: wp.Kernel, inputs: list) -> None:
         wp.launch(kernel, self.surface.count, inputs, device=self.device)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
@@ -29,8 +30,9 @@ from .system import System
 #: long as ten steps; and where one launch makes many steps. ``Stepper.graph_steps`` limits both.
 CPU_GRAPH_STEPS = 8
 BLOCK_STEPS = 1024
-#: A segment of up to this many steps is recorded whole when it comes a second time: recording costs many replays.
-SHORT = 8
+#: A segment of up to so many steps is recorded whole once it has come so often: recording it takes as long as hundreds
+#: of replays, which would be felt in a scene that has to keep up.
+SHORT, OFTEN = 8, 64
 #: The most graphs that are kept.
 MOST_GRAPHS = 256
 
@@ -109,7 +111,7 @@ class RecordedSteps:
         self._safe_step = safe_step
         self._flushed = FlushedSubnormals(system.device)
         self._graphs: dict[Segment, wp.Graph] = {}
-        self._asked: set[Segment] = set()
+        self._asked: Counter[Segment] = Counter()
         #: How calm the bodies are; see ``Schedule``.
         self.calm = UNKNOWN
         self._revisions = (-1, -1)
@@ -158,13 +160,13 @@ class RecordedSteps:
         self._pace.advance(segment.count)
 
     def replay(self, segment: Segment) -> None:
-        """Replay a segment: one recording if it is short and was asked for before, else recordings of its pieces."""
+        """Replay a segment: one recording if it is short and comes often, else recordings of its pieces."""
         self._follow_bodies()
-        if segment in self._graphs or segment in self._asked:
+        if segment.count <= SHORT:
+            self._asked[segment] += 1
+        if segment in self._graphs or self._asked[segment] > OFTEN:
             self._replay_recording(segment)
             return
-        if segment.count <= SHORT:
-            self._asked.add(segment)
         if self.in_blocks:
             pieces = segment.pieces(BLOCK_STEPS)
         else:
