@@ -7,7 +7,7 @@ from warp_corot.kernels.stepping.threads import least_of_lanes, same_in_lanes
 from .extremes import extend_down, extend_up
 from .motion import Surface
 from .rows import BAND, Meeting, triangle_normal
-from .watch import Watch
+from .watch import Watch, ahead_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -29,8 +29,33 @@ def triangle_reach(surface: Surface, meeting: Meeting, c: wp.vec3i):
 
 
 @wp.func
+def lower_end(s: int, surface: Surface, meeting: Meeting):
+    """The least coordinates on the way that a place is expected to take."""
+    x = surface.x[s]
+    return wp.min(x, x + ahead_at(s, meeting.ahead))
+
+
+@wp.func
+def upper_end(s: int, surface: Surface, meeting: Meeting):
+    x = surface.x[s]
+    return wp.max(x, x + ahead_at(s, meeting.ahead))
+
+
+@wp.func
 def edge_reach(meeting: Meeting, e: wp.vec2i):
     return wp.max(meeting.reach[e[0]], meeting.reach[e[1]])
+
+
+@wp.func
+def triangle_start(c: wp.vec3i, surface: Surface, meeting: Meeting):
+    first = wp.min(lower_end(c[0], surface, meeting), lower_end(c[1], surface, meeting))
+    return wp.min(first, lower_end(c[2], surface, meeting))
+
+
+@wp.func
+def triangle_end(c: wp.vec3i, surface: Surface, meeting: Meeting):
+    first = wp.max(upper_end(c[0], surface, meeting), upper_end(c[1], surface, meeting))
+    return wp.max(first, upper_end(c[2], surface, meeting))
 
 
 @wp.kernel(enable_backward=False)
@@ -43,13 +68,10 @@ def box_triangles(surface: Surface, meeting: Meeting, lower: wp.array[wp.vec3], 
         upper[t] = lower[t]
         return
     meeting.normals[t] = triangle_normal(surface, c)
-    a = surface.x[c[0]]
-    b = surface.x[c[1]]
-    e = surface.x[c[2]]
     far = triangle_reach(surface, meeting, c) + BAND * triangle_size(surface, c)
     beyond = wp.vec3(far, far, far)
-    lower[t] = wp.min(a, wp.min(b, e)) - beyond
-    upper[t] = wp.max(a, wp.max(b, e)) + beyond
+    lower[t] = triangle_start(c, surface, meeting) - beyond
+    upper[t] = triangle_end(c, surface, meeting) + beyond
 
 
 @wp.kernel(enable_backward=False)
@@ -67,8 +89,8 @@ def box_edges(surface: Surface, meeting: Meeting, lower: wp.array[wp.vec3], uppe
     b = surface.x[e[1]]
     far = edge_reach(meeting, e) + BAND * wp.length(b - a)
     beyond = wp.vec3(far, far, far)
-    lower[k] = wp.min(a, b) - beyond
-    upper[k] = wp.max(a, b) + beyond
+    lower[k] = wp.min(lower_end(e[0], surface, meeting), lower_end(e[1], surface, meeting)) - beyond
+    upper[k] = wp.max(upper_end(e[0], surface, meeting), upper_end(e[1], surface, meeting)) + beyond
 
 
 @wp.kernel(enable_backward=False)
@@ -138,8 +160,8 @@ def bound_bodies(
             # No side and no triangle needs a larger box.
             far = triangle_reach(surface, meeting, c) + BAND * longest_side(a, b, e)
             beyond = wp.vec3(far, far, far)
-            low = wp.min(low, wp.min(a, wp.min(b, e)) - beyond)
-            high = wp.max(high, wp.max(a, wp.max(b, e)) + beyond)
+            low = wp.min(low, triangle_start(c, surface, meeting) - beyond)
+            high = wp.max(high, triangle_end(c, surface, meeting) + beyond)
         t += lanes
     # One thread of a warp with one body is enough.
     first = wp.tid() % LANES == 0

@@ -19,7 +19,7 @@ from .springs import bound_of, spring_state
 wp.set_module_options({"enable_backward": False})
 
 #: The stiffness of a pair over that of its nodes.
-STIFF = wp.constant(4.0)
+STIFF = wp.constant(16.0)
 #: A pair that has begun to push so often in a step is no longer located again.
 OFTEN = wp.constant(3)
 #: Lists of pairs.
@@ -243,6 +243,17 @@ def end_rows(threads: int, rows: Rows, joined: Joined, added: wp.array[wp.vec3])
             for k in range(4):
                 wp.atomic_add(added, p[k], w[k] * force)
         rows.acts[row] = acts
+        row += threads
+
+
+@wp.kernel(enable_backward=False)
+def keep_row_forces(threads: int, rows: Rows, joined: Joined, searches: wp.array[wp.int32]):
+    """Keep forces for another search in the same step."""
+    row = wp.tid()
+    if row == 0:
+        searches[0] = searches[0] + 1
+    while row < row_count(rows):
+        rows.force[row] = wp.where(joined.stiffness[row] > 0.0, joined.force[row], wp.vec3())
         row += threads
 
 

@@ -10,11 +10,19 @@ from .joined import NEAR, OFTEN, STIFF, Joined, opened_by
 from .law import Law, held_back
 from .motion import Surface
 from .rows import Meeting, Rows, row_count
-from .springs import kept_gap
+from .springs import kept_gap, least_gap
 from .supports import left_at_pair, loose_at_pair, loose_part
 from .vertices import across
+from .watch import Watch, wake
 
 wp.set_module_options({"enable_backward": False})
+
+#: When pairs are located: at the beginning of a step, there again after another search, and after motions.
+FIRST, REPEATED, LATER = wp.constant(1), wp.constant(2), wp.constant(0)
+#: The most searches in a step after the first one.
+SEARCHES = wp.constant(8)
+#: What is left in each solve of how far a place has strayed before.
+FADING = wp.constant(0.7)
 
 
 @wp.kernel(enable_backward=False)
@@ -25,7 +33,7 @@ def begin_places(surface: Surface, joined: Joined):
 
 
 @wp.kernel(enable_backward=False)
-def place_nodes(is_first: int, d: wp.array[wp.vec4], joined: Joined, carriers: Carriers, surface: Surface):
+def place_nodes(which: int, d: wp.array[wp.vec4], joined: Joined, carriers: Carriers, surface: Surface):
     """Put places where pairs are to be located: where the step begins, or after motions d. Pairs that were near are
     forgotten.
     """
@@ -37,9 +45,38 @@ def place_nodes(is_first: int, d: wp.array[wp.vec4], joined: Joined, carriers: C
     if surface.node[s] < 0:
         return
     x = joined.start[s]
-    if is_first == 0:
+    if which == LATER:
         x += motion_at(s, surface, carriers, d)
     surface.x[s] = x
+
+
+@wp.kernel(enable_backward=False)
+def find_strays(
+    # In
+    d: wp.array[wp.vec4],
+    joined: Joined,
+    carriers: Carriers,
+    searches: wp.array[wp.int32],
+    # Out
+    watch: Watch,
+    surface: Surface,
+    again: wp.array[wp.int32],
+):
+    """Ask for another search along the way of motions d if places have strayed beyond their reach, where pairs may be
+    missing."""
+    s = wp.tid()
+    if surface.node[s] < 0:
+        return
+    motion = motion_at(s, surface, carriers, d) + gone_at(s, surface, carriers)
+    surface.d[s] = motion
+    far = wp.length(joined.start[s] + motion - watch.places[s] - watch.ahead[s])
+    watch.strayed[s] = wp.max(far, FADING * watch.strayed[s])
+    if far > watch.reach[s]:
+        if searches[0] < SEARCHES:
+            again[0] = 1
+            wake(watch)
+        else:
+            wp.atomic_add(watch.missed, 0, 1)
 
 
 @wp.kernel(enable_backward=False)
@@ -51,7 +88,7 @@ def empty_crowds(joined: Joined, carriers: Carriers):
 @wp.func
 def locate(
     row: int,
-    is_first: int,
+    which: int,
     law: Law,
     dt: float,
     d: wp.array[wp.vec4],
@@ -62,17 +99,20 @@ def locate(
     joined: Joined,
 ):
     was = joined.force[row]
-    pushed = wp.dot(was, was) > 0.0
-    if is_first != 0:
+    if which != LATER:
         was = rows.force[row]
-        pushed = wp.dot(was, was) > 0.0
         joined.target[row] = 0.0
-    elif pushed:
+    pushed = wp.dot(was, was) > 0.0
+    if which == FIRST:
+        rows.acts[row] = int(pushed)
+    elif which == REPEATED:
+        pushed = rows.acts[row] != 0
+    elif pushed and joined.stiffness[row] > 0.0:
         e = opened_by(row, d, rows, surface, carriers) - joined.base[row]
         if wp.abs(rows.gap[row] + wp.dot(rows.normal[row], e) - joined.target[row]) <= law.slack:
             was = joined.multiplier[row]
     stays = bool(False)
-    if is_first != 0:
+    if which != LATER:
         joined.pushed[row] = 0
         joined.begun[row] = 0
     else:
@@ -84,6 +124,9 @@ def locate(
     joined.multiplier[row] = wp.vec3()
     joined.force[row] = wp.vec3()
     joined.stiffness[row] = 0.0
+    if which != LATER:
+        # For pairs that are located again before the first solve.
+        joined.force[row] = was
     if not is_near:
         joined.most[row] = 0.0
         return
@@ -102,13 +145,17 @@ def locate(
     joined.stiffness[row] = 1.0
     joined.given[row] = given
     opened = opened_by(row, d, rows, surface, carriers)
-    if is_first != 0:
-        joined.base[row] = wp.vec3()
-        allowed = left_at_pair(p, w, rows.gap[row], rows.normal[row], surface)
-        joined.target[row] = kept_gap(rows.gap[row] + allowed, pushed, law, dt) - allowed
-    elif not stays:
-        joined.base[row] = opened
     n = rows.normal[row]
+    if not stays:
+        joined.base[row] = wp.vec3()
+        allowed = left_at_pair(p, w, rows.gap[row], n, surface)
+        if which != LATER:
+            joined.target[row] = kept_gap(rows.gap[row] + allowed, pushed, law, dt) - allowed
+        else:
+            joined.base[row] = opened
+            # What is deeper than the two have gone in the step began as an overlap.
+            began = rows.gap[row] + wp.length(opened + given) + allowed
+            joined.target[row] = wp.min(joined.target[row], least_gap(began, law, dt) - allowed)
     push = wp.max(wp.dot(was, n), 0.0)
     joined.multiplier[row] = push * n + held_back(across(was, n), push, meeting.friction)
     gap = rows.gap[row] + wp.dot(n, opened - joined.base[row])
@@ -123,7 +170,7 @@ def locate(
 def locate_rows(
     # In
     threads: int,
-    is_first: int,
+    which: int,
     law: Law,
     pace: Pace,
     d: wp.array[wp.vec4],
@@ -141,7 +188,7 @@ def locate_rows(
     if joined.locates[0] == 0:
         count = 0
     while row < count:
-        locate(row, is_first, law, dt, d, surface, meeting, carriers, rows, joined)
+        locate(row, which, law, dt, d, surface, meeting, carriers, rows, joined)
         row += threads
 
 

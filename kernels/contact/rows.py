@@ -30,6 +30,7 @@ class Meeting:
     normals: wp.array[wp.vec3]  # [T] at the last search
     outs: wp.array[wp.vec3]  # [E] the sums of the two normals at each edge, at the last search
     reach: wp.array[wp.float32]  # [S] how far a node may move until the next search for pairs [m]
+    ahead: wp.array[wp.vec3]  # see ``Watch``
     lower: wp.array2d[wp.vec3]  # [worlds, bodies] bounds of the places that a body may reach [m]
     upper: wp.array2d[wp.vec3]
     groups: int  # groups of boxes in a world: one for each body, or one for all of them

@@ -3,13 +3,13 @@
 import warp as wp
 
 from .bearing import share_bearers
-from .boxes import edge_reach, root_of, triangle_reach, triangle_size
+from .boxes import edge_reach, lower_end, root_of, triangle_reach, triangle_size, upper_end
 from .closest import on_segments, on_triangle, point_of
 from .locate import BORDER, ENDS, FACING, edge_normal, node_faces_at_rest
 from .motion import Surface
 from .near import CRUSHED, PAIRED, Near, mark
 from .rows import BAND, BAND_AT_REST, Meeting, Rows, row_count
-from .watch import Watch
+from .watch import Watch, ahead_at
 
 wp.set_module_options({"enable_backward": False})
 
@@ -35,6 +35,7 @@ class OldRows:
     starts: wp.array[wp.int32]  # [S + E]
     counts: wp.array[wp.int32]  # [S + E]
     other: wp.array[wp.int32]
+    acts: wp.array[wp.int32]
     force: wp.array[wp.vec3]
 
 
@@ -102,6 +103,12 @@ def is_beside(way: wp.vec3, normal: wp.vec3, far: float, size: float, longest: f
 
 
 @wp.func
+def approach(s: int, r: int, meeting: Meeting):
+    """How far two places are expected to move relative to each other in an implicit step [m]."""
+    return wp.length(ahead_at(s, meeting.ahead) - ahead_at(r, meeting.ahead))
+
+
+@wp.func
 def node_is_near(s: int, t: int, out: wp.vec3, surface: Surface, meeting: Meeting, near: Near):
     """Whether a node and a triangle may touch before the next search; ``out`` is the normal at the node."""
     c = meeting.triangles[t]
@@ -126,7 +133,11 @@ def node_is_near(s: int, t: int, out: wp.vec3, surface: Surface, meeting: Meetin
     x = surface.x[s]
     way = x - point_of(on_triangle(x, a, b, e), a, b, e)
     distance = wp.length(way)
+    nearing = float(0.0)
     far = meeting.reach[s] + triangle_reach(surface, meeting, c)
+    for k in range(3):
+        nearing = wp.max(nearing, approach(s, c[k], meeting))
+    far += nearing
     if distance > far:
         size = triangle_size(surface, c)
         if wp.dot(way, normal) >= 0.0 or not (distance <= far + BAND * size):
@@ -158,10 +169,11 @@ def is_opposite(e: wp.vec2i, m: int, meeting: Meeting):
 
 
 @wp.func
-def flat_edges_cross(k: int, m: int, s: float, t: float, way: wp.vec3, surface: Surface, meeting: Meeting):
+def flat_edges_cross(k: int, m: int, far: float, s: float, t: float, way: wp.vec3, surface: Surface, meeting: Meeting):
     """Whether flat edges k and m of surfaces that face each other may cross before the next search.
 
     Args:
+        far: How far the two may move relative to each other [m].
         s, t: Where they are closest, as shares of their lengths.
         way: From there on m to there on k [m].
     """
@@ -170,7 +182,6 @@ def flat_edges_cross(k: int, m: int, s: float, t: float, way: wp.vec3, surface: 
     out = edge_normal(surface, meeting, m)
     if wp.dot(out, edge_normal(surface, meeting, k)) > FACING:
         return False
-    far = edge_reach(meeting, e) + edge_reach(meeting, f)
     if wp.length(way - wp.dot(way, out) * out) > far:
         return False
     of_first = ENDS - far / wp.length(surface.x[e[1]] - surface.x[e[0]])
@@ -214,7 +225,12 @@ def edge_is_near(k: int, m: int, is_sharp: bool, out: wp.vec3, surface: Surface,
     s, t = on_segments(p, q, a, b)
     way = p + s * (q - p) - a - t * (b - a)
     band = BAND * wp.min(wp.length(q - p), wp.length(b - a))
-    if not (wp.length(way) <= edge_reach(meeting, e) + edge_reach(meeting, f) + band):
+    far = edge_reach(meeting, e) + edge_reach(meeting, f)
+    far += wp.max(
+        wp.max(approach(e[0], f[0], meeting), approach(e[0], f[1], meeting)),
+        wp.max(approach(e[1], f[0], meeting), approach(e[1], f[1], meeting)),
+    )
+    if not (wp.length(way) <= far + band):
         return False
     other = bend(surface, meeting, m)
     # Sharp edges find flat ones; the first of two sharp or flat edges finds the pair.
@@ -222,7 +238,7 @@ def edge_is_near(k: int, m: int, is_sharp: bool, out: wp.vec3, surface: Surface,
         return False
     if is_sharp:
         return other <= SHARP or m > k
-    return other <= SHARP and m > k and flat_edges_cross(k, m, s, t, way, surface, meeting)
+    return other <= SHARP and m > k and flat_edges_cross(k, m, far, s, t, way, surface, meeting)
 
 
 @wp.func
@@ -256,8 +272,8 @@ def near_node(
     count = int(0)
     reach = meeting.reach[i]
     beyond = wp.vec3(reach, reach, reach)
-    low = surface.x[i] - beyond
-    high = surface.x[i] + beyond
+    low = lower_end(i, surface, meeting) - beyond
+    high = upper_end(i, surface, meeting) + beyond
     out = wp.vec3()
     knows = bool(False)
     for g in range(meeting.groups):
@@ -285,12 +301,10 @@ def near_edge(
     """Count the edges near one that is sharp, or flat, and keep the first ones, or write all if a start is given."""
     count = int(0)
     e = meeting.edges[k]
-    a = surface.x[e[0]]
-    b = surface.x[e[1]]
     reach = edge_reach(meeting, e)
     beyond = wp.vec3(reach, reach, reach)
-    low = wp.min(a, b) - beyond
-    high = wp.max(a, b) + beyond
+    low = wp.min(lower_end(e[0], surface, meeting), lower_end(e[1], surface, meeting)) - beyond
+    high = wp.max(upper_end(e[0], surface, meeting), upper_end(e[1], surface, meeting)) + beyond
     own = float(0.0)
     out = wp.vec3()
     knows = bool(False)
@@ -399,10 +413,13 @@ def find_pairs(
         other = rows.other[row]
         while before < last and old.other[before] < other:
             before += 1
+        acts = int(0)
         force = wp.vec3()
         if before < last and old.other[before] == other:
+            acts = old.acts[before]
             force = old.force[before]
         rows.owner[row] = i
+        rows.acts[row] = acts
         rows.force[row] = force
         mark_row(i, other, meeting, near)
 
@@ -419,6 +436,7 @@ def keep_rows(watch: Watch, rows: Rows, old: OldRows):
     row = int(i)
     while row < row_count(rows):
         old.other[row] = rows.other[row]
+        old.acts[row] = rows.acts[row]
         old.force[row] = rows.force[row]
         row += owners
 

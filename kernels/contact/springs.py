@@ -45,9 +45,10 @@ def kept_gap(gap: float, pushed: bool, law: Law, dt: float):
     """
     if pushed and wp.abs(gap) <= law.slack:
         return gap
-    if pushed and gap < 0.0 and law.slack > 0.0:
+    if pushed and gap < 0.0:
         # What the slack lets pass in each step of a tool's way would add up.
-        return gap + wp.min(-0.5 * gap, law.recovery * dt)
+        opening = wp.max(-law.settling * gap, wp.min(-0.5 * gap, law.slack))
+        return gap + wp.min(opening, law.recovery * dt)
     return least_gap(gap, law, dt)
 
 

@@ -14,6 +14,9 @@ AHEAD = wp.constant(16.0)
 #: this many elements, more than any stable step covers.
 FAST = wp.constant(2.0)
 FARTHEST = wp.constant(64.0)
+#: In implicit steps as much is reserved around the place where a node is expected to go as it has last strayed from
+#: there, but at most so many elements: a step in which one strays farther has another search.
+STRAYED = wp.constant(0.25)
 #: An item that is hit moves as far as the item that hits it; this many times that motion is reserved: more where there
 #: are only obstacles, beside which few nodes are, for light nodes vibrate with the length of a few steps.
 HIT, HIT_BESIDE = wp.constant(2.0), wp.constant(8.0)
@@ -45,7 +48,10 @@ class Watch:
     size: float  # size of the smallest element [m]
     most_alone: float  # how many elements nodes with nothing near may move
     hit: float  # how many times the largest motion is reserved for anything
-    is_implicit: int  # whether steps are so long that hardly any search lasts for two
+    # [S] in implicit steps: how far places are expected to go in the step of the search, around which ``reach`` is what
+    # they may stray, and how far they have strayed [m]; else empty
+    ahead: wp.array[wp.vec3]
+    strayed: wp.array[wp.float32]
     fastest: wp.array[wp.float32]  # [1] largest motion in the step of the search
     due: wp.array[wp.int32]  # [1] whether a search is due
     awake: wp.array[wp.int32]  # [1] whether steps look for forces; otherwise nothing is near (see ``sleep``)
@@ -83,8 +89,21 @@ def reserved(step: float, farther: float, hit: float, watch: Watch):
     farthest = wp.max(wp.min(farther, watch.most_alone) * watch.size, FAST * step)
     ahead = wp.min(farther * AHEAD * step, farthest)
     hit *= watch.fastest[0]
-    ahead = wp.where(watch.is_implicit != 0, wp.max(ahead, hit), ahead + hit)
-    return watch.least[0] + wp.min(ahead, FARTHEST * watch.size)
+    return watch.least[0] + wp.min(ahead + hit, FARTHEST * watch.size)
+
+
+@wp.func
+def ahead_at(s: int, ahead: wp.array[wp.vec3]):
+    """How far a place is expected to go in an implicit step, zero in explicit ones [m]."""
+    if ahead.shape[0] == 0:
+        return wp.vec3()
+    return ahead[s]
+
+
+@wp.func
+def way_from_search(s: int, surface: Surface, watch: Watch):
+    """The way of a place from where the last search expected it [m]."""
+    return surface.x[s] - watch.places[s] - ahead_at(s, watch.ahead) - watch.drift[surface.world[s]]
 
 
 @wp.func
@@ -105,7 +124,7 @@ def watch_nodes(surface: Surface, watch: Watch):
         return
     world = surface.world[s]
     common = watch.common[world]
-    gone = surface.x[s] - watch.places[s] - (watch.drift[world] - common)
+    gone = way_from_search(s, surface, watch) + common
     if not stays(wp.length(gone), wp.length(surface.d[s] - common), watch.reach[s]):
         wake(watch)
 
@@ -115,10 +134,10 @@ def follow_node(s: int, surface: Surface, watch: Watch):
     """Check after a step whether the next one could move the node too far, or this one has."""
     world = surface.world[s]
     step = surface.d[s]
-    gone = wp.length(surface.x[s] + step - watch.places[s] - watch.drift[world])
+    gone = wp.length(way_from_search(s, surface, watch) + step)
     if not stays(gone, wp.length(step - watch.common[world]), watch.reach[s]):
         wake(watch)
-        if gone > watch.reach[s]:
+        if gone > watch.reach[s] and watch.ahead.shape[0] == 0:
             wp.atomic_add(watch.missed, 0, 1)
 
 
@@ -192,5 +211,9 @@ def reserve_obstacle(k: int, motions: Motions, watch: Watch):
 def reserve_node(s: int, farther: float, surface: Surface, watch: Watch):
     """Record the place of a node and how far it may move from there."""
     watch.places[s] = surface.x[s]
+    if watch.ahead.shape[0] > 0:
+        watch.ahead[s] = surface.d[s]
+        watch.reach[s] = watch.least[0] + wp.min(watch.strayed[s], STRAYED * watch.size)
+        return
     step = wp.length(surface.d[s] - common_motion(surface.world[s], watch))
     watch.reach[s] = wp.max(reserved(step, farther, watch.hit, watch), watch.calm[0])

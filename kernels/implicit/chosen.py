@@ -13,8 +13,6 @@ ASSEMBLED, MULTIGRID, AGE, WAIT = (wp.constant(k) for k in range(4))
 COUNTS = 4
 #: The least and the most of that number of steps.
 SOON, LATE = wp.constant(64), wp.constant(4096)
-#: Multigrid is tried if assembled solves cost as much as so many of its iterations.
-WORTH = wp.constant(10)
 #: The iterations of an assembled step that has not been solved for, or had more contacts than room.
 DEAR = wp.constant(1 << 24)
 
@@ -25,6 +23,7 @@ def choose(
     iterations: wp.array[wp.int32],
     status: wp.array[wp.int32],
     touches: int,
+    worth: int,
     cost: int,
     couplings: Couplings,
     # In and out
@@ -35,6 +34,7 @@ def choose(
 
     Args:
         touches: Whether there may be contacts, because of which steps may end before they are solved for either way.
+        worth: Multigrid is tried if assembled solves cost as much as so many of its iterations.
         cost: What an iteration of multigrid costs, in assembled ones.
         couplings: The contacts of the last assembled solve.
     """
@@ -54,7 +54,7 @@ def choose(
         if is_known and counts[AGE] < counts[WAIT]:
             is_over = 5 * cost * counts[MULTIGRID] < 4 * most
         else:
-            is_over = most > WORTH * cost
+            is_over = most > worth * cost
         is_for_nothing = is_over and is_known and counts[AGE] == 1
     else:
         counts[MULTIGRID] = most

@@ -53,7 +53,7 @@ class JoinedRows:
 
     def __init__(self, system: System, pairs: Pairs, law: Law):
         self._system, self._pairs, self._law, self.device = system, pairs, law, system.device
-        self.locates, self.solves = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(2))
+        self.locates, self.solves, self._searches = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(3))
         self._made = (-1, -1, -1)
         self._carriers = PlaceCarriers(pairs.surface, system.bodies)
         self._places: Surface | None = None
@@ -92,9 +92,10 @@ class JoinedRows:
         self._places.x = wp.zeros_like(arrays.x)
 
     def reserve(self, motion: float) -> None:
-        """Search for pairs with a larger margin, if anything may begin to move so far in a step [m]."""
+        """Search for pairs along the way that is expected, from which anything may stray so far in a step [m]."""
         bounds = [self._system.ranks.owned(body).bounds for body in self._system.bodies]
         self._pairs.search.serve_implicit(motion, max(float(np.linalg.norm(high - low)) for low, high in bounds))
+        self._pairs.meeting.ahead = self._pairs.search.watch.ahead
 
     # --- launches ----------------------------------------------------------------------------------------------------
 
@@ -139,20 +140,48 @@ class JoinedRows:
 
     def launch_search(self, offset: int) -> None:
         """Launch a search for pairs, if it is due."""
+        self._searches.zero_()
         self._pairs.search.launch(offset)
 
-    def launch_located(self, d: wp.array, *, is_first: bool) -> None:
-        """Launch the search for the closest points of pairs, at the beginning of the step or after motions d, if it is
-        due."""
+    def launch_searched_again(self, d: wp.array, again: wp.array) -> None:
+        """Launch another search along the way of motions d if they have strayed from the way of the last one.
+
+        Args:
+            d: Motions [m], vec4.
+            again: Nonzero afterwards if so; then it must be solved again, int32 [1].
+        """
+        again.zero_()
+        surface = self._pairs.surface
+        inputs = [d, self._joined, self._carriers.arrays, self._searches]
+        outputs = [self._pairs.search.watch, surface.arrays, again]
+        wp.launch(finding.find_strays, surface.count, inputs, outputs, device=self.device)
+        wp.capture_if(again, self._search_again, d=d)
+
+    def _search_again(self, d: wp.array) -> None:
+        self._on_rows(kernels.keep_row_forces, [self._pairs.rows, self._joined, self._searches])
+        self._pairs.search.launch(1)
+        self.solves.zero_()
+        self.locates.fill_(1)
+        self._locate(finding.REPEATED, d)
+
+    def launch_first(self, d: wp.array) -> None:
+        """Launch the search for the closest points of pairs when the step begins, with a guess d of the motions."""
+        inputs = [self._pairs.surface.arrays, self._joined]
+        wp.launch(finding.begin_places, self._pairs.surface.count, inputs, device=self.device)
+        self.locates.fill_(1)
+        self._locate(finding.FIRST, d)
+
+    def launch_located(self, d: wp.array) -> None:
+        """Launch the same after motions d, if it is due."""
+        self._locate(finding.LATER, d)
+
+    def _locate(self, which: int, d: wp.array) -> None:
         surface, joined, count = self._places, self._joined, self._pairs.surface.count
         carriers = self._carriers.arrays
-        if is_first:
-            inputs = [self._pairs.surface.arrays, joined]
-            wp.launch(finding.begin_places, count, inputs, device=self.device)
-        inputs = [int(is_first), d, joined, carriers, surface]
+        inputs = [int(which), d, joined, carriers, surface]
         wp.launch(finding.place_nodes, count, inputs, device=self.device)
         wp.launch(finding.empty_crowds, len(carriers.crowd), [joined, carriers], device=self.device)
-        inputs = [int(is_first), self._law, self._system.pace.arrays, d, surface, self._pairs.meeting]
+        inputs = [int(which), self._law, self._system.pace.arrays, d, surface, self._pairs.meeting]
         self._on_rows(finding.locate_rows, [*inputs, carriers, self._pairs.rows, joined])
         self._on_rows(finding.stiffen_rows, self._springs)
 

@@ -80,7 +80,7 @@ class Pairs:
         meeting.corner_starts, meeting.corners = surface.corner_starts, surface.corners
         meeting.normals = wp.zeros(surface.triangle_count, dtype=wp.vec3, device=device)
         meeting.outs = wp.zeros(edges, dtype=wp.vec3, device=device)
-        meeting.reach = self.search.watch.reach
+        meeting.reach, meeting.ahead = self.search.watch.reach, self.search.watch.ahead
         shape = (surface.worlds, len(surface.parts))
         meeting.lower, meeting.upper = (wp.zeros(shape, dtype=wp.vec3, device=device) for _ in range(2))
         meeting.meets_itself, meeting.friction = int(self.meets_itself), self.friction
@@ -119,9 +119,9 @@ class Pairs:
         rows.total = wp.zeros(1, dtype=wp.int32, device=device)
         for kept in (rows, old):
             kept.starts, kept.counts = (wp.zeros(owners, dtype=wp.int32, device=device) for _ in range(2))
-            kept.other = wp.zeros(room, dtype=wp.int32, device=device)
+            kept.other, kept.acts = (wp.zeros(room, dtype=wp.int32, device=device) for _ in range(2))
             kept.force = wp.zeros(room, dtype=wp.vec3, device=device)
-        rows.owner, rows.acts = (wp.zeros(room, dtype=wp.int32, device=device) for _ in range(2))
+        rows.owner = wp.zeros(room, dtype=wp.int32, device=device)
         rows.normal, rows.more = (wp.zeros(room, dtype=wp.vec3, device=device) for _ in range(2))
         rows.places = wp.zeros(room, dtype=wp.vec4i, device=device)
         rows.shares = wp.zeros(room, dtype=wp.vec4, device=device)

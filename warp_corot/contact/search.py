@@ -79,7 +79,7 @@ class Search:
         watch.poses = wp.zeros(shape, dtype=wp.transform, device=device)
         watch.reach_of = wp.zeros(shape, dtype=wp.float32, device=device)
         self.watch, self.near = watch, near_kernels.Near()
-        self._taken = -1
+        self._taken, self._foresees = -1, False
         #: Whether the device can skip recorded launches; otherwise every kernel of a search tests whether it is due.
         self._branches = device.is_cpu or (branches and wp.is_conditional_graph_supported())
         self.follow()
@@ -97,6 +97,7 @@ class Search:
             count, device = self.surface.count, self.device
             self.watch.places = wp.zeros(count, dtype=wp.vec3, device=device)
             self.watch.reach = wp.zeros(count, dtype=wp.float32, device=device)
+            self._foresee()
             self.near.flags, self.near.nodes = (wp.zeros(count, dtype=wp.int32, device=device) for _ in range(2))
             self.near.count, self.near.touch_count = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(2))
             pairs = self.obstacles.count * self.surface.triangle_count if self.obstacles.have_edges else 0
@@ -137,18 +138,25 @@ class Search:
         self.watch.missed.zero_()
         self._report.values[MISSED] = 0.0
         wider = WIDER * least
-        if self.watch.is_implicit and least < self.farthest:
+        if self._foresees and least < self.farthest:
             wider = min(wider, self.farthest)
         if wider > self.farthest:
             raise UnstableError(f"surfaces that are hit go farther than {1e3 * self.farthest:.3g} mm in one step")
         self.watch.least.fill_(wider)
 
     def serve_implicit(self, motion: float, extent: float) -> None:
-        """Serve implicit steps, in which anything may begin to move so far, and at most an extent [m]."""
-        self.watch.is_implicit, self.farthest = 1, max(self.farthest, extent)
+        """Serve implicit steps, each with a search along the way that is expected, from which anything may stray by a
+        motion, and at most an extent [m]."""
+        self._foresees, self.farthest = True, max(self.farthest, extent)
+        self._foresee()
         motion = min(motion, self.farthest / WIDER)
         if motion > float(self.watch.least.numpy()[0]):
             self.watch.least.fill_(motion)
+
+    def _foresee(self) -> None:
+        count = self.surface.count if self._foresees else 0
+        self.watch.ahead = wp.zeros(count, dtype=wp.vec3, device=self.device)
+        self.watch.strayed = wp.zeros(count, dtype=wp.float32, device=self.device)
 
     def continue_from(self, former: Search) -> None:
         """Take the margins of another search."""

@@ -17,6 +17,7 @@ from warp_corot.kernels.implicit.chosen import COUNTS
 from warp_corot.solvers.implicit import assembled
 from warp_corot.solvers.implicit.assembled import AssembledSolve, suits
 from warp_corot.solvers.implicit.block_system import VectorBlocks
+from warp_corot.solvers.implicit.chosen import WORTH
 from warp_corot.solvers.implicit.conjugate_gradients import ConjugateGradients
 from warp_corot.solvers.implicit.tangent import TangentOperator
 
@@ -302,5 +303,5 @@ def test_the_choice_costs_little_in_a_long_run(assembled, multigrid):
     for _ in range(steps):
         total += assembled if choice.numpy()[0] else cost * multigrid
         taken.fill_(assembled if choice.numpy()[0] else multigrid)
-        wp.launch(chosen.choose, 1, [taken, status, 1, cost, couplings], [counts, choice], device="cpu")
+        wp.launch(chosen.choose, 1, [taken, status, 1, WORTH, cost, couplings], [counts, choice], device="cpu")
     assert total < 1.05 * steps * min(assembled, cost * multigrid)

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
     from .schemes import ImplicitIntegrator
 
-#: The search for soft surfaces leaves room for motions of this many times what a body that is let go falls in a step.
-FALLS = 2.0
+#: The search for soft surfaces leaves room for this many times what a body that is let go falls in a step.
+FALLS = 0.25
 
 
 @dataclass(frozen=True)

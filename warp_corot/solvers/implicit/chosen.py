@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 #: which has twice as many entries in a row, and on CUDA. On an H200 it was 29 to 38 for organs of 20,000 and 100,000
 #: elements.
 COST_ON_CPU, SHARED_ON_CPU, COST = 5, 3, 32
+#: Multigrid is tried if assembled solves cost as much as so many of its iterations; never where soft surfaces meet,
+#: whose contact it does not know.
+WORTH, NEVER = 10, 1 << 20
 #: The length of a step times the largest frequency of a node among fixed ones, above which multigrid solves first. A
 #: bunny of 20,000 elements has 70 at 5 kPa and 171 at 30 kPa, and takes 190 and 410 iterations on CUDA.
 STIFF = 300.0
@@ -98,7 +101,8 @@ class ChosenSolve:
         self._either(None, judge_set_ups)
         if not self.is_open:
             return
-        inputs = [iterations, status, int(self.assembled.touches), self._cost, self.assembled.couplings]
+        worth = WORTH if system.soft is None else NEVER
+        inputs = [iterations, status, int(self.assembled.touches), worth, self._cost, self.assembled.couplings]
         wp.launch(kernels.choose, 1, inputs, [self._counts, self._is_assembled], device=self.device)
 
     def _update_multigrid(self) -> None:

@@ -53,7 +53,9 @@ class ContactSolve:
         if not system.ranks.is_alone:
             self._search = SharedLineSearch(*sizes, contacts[0], self.device, system.ranks)
         self.iterations = wp.zeros_like(system.solver.iterations)
-        self._rounds, self._going, *none = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(5))
+        self._rounds, self._going, self._again, *none = (
+            wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(6)
+        )
         self._is_alone = len(contacts) == 1
         self._changed = contacts[0].changed if self._is_alone else wp.zeros(1, dtype=wp.int32, device=self.device)
         soft = system.soft
@@ -77,8 +79,7 @@ class ContactSolve:
             if contact is not None:
                 contact.launch_begin(newton.body.state.displacements, x, own)
         if soft is not None:
-            soft.locates.fill_(1)
-            soft.launch_located(system.x, is_first=True)
+            soft.launch_first(system.x)
         for newton in self._newtons:
             newton.move_held(to_end=False)
 
@@ -92,8 +93,11 @@ class ContactSolve:
         """Launch the linear solves, until contact no longer changes."""
         for count in (self._rounds, self.iterations, *self._of_pairs[1:]):
             count.zero_()
-        self._going.fill_(1)
-        wp.capture_while(self._going, self._round)
+        if self.system.soft is None:
+            self._until_settled()
+        else:
+            self._again.fill_(1)
+            wp.capture_while(self._again, self._until_settled)
 
     def launch_end(self) -> None:
         """Launch the results of contact for users."""
@@ -111,12 +115,18 @@ class ContactSolve:
 
     # --- pieces ------------------------------------------------------------------------------------------------------
 
+    def _until_settled(self) -> None:
+        self._going.fill_(1)
+        wp.capture_while(self._going, self._round)
+        if self.system.soft is not None:
+            self.system.soft.launch_searched_again(self.system.x, self._again)
+
     def _round(self) -> None:
         system, soft, d = self.system, self.system.soft, self.system.x
         for contact, (own,) in self._each(d):
             contact.launch_imposed(own)
         if soft is not None:
-            soft.launch_located(d, is_first=False)
+            soft.launch_located(d)
             soft.update(d)
         system.apply_bodies(d, self._q)
         wp.launch(find_rest, len(d), [system.b, self._q, self._rest], device=self.device)
