@@ -9,7 +9,6 @@ multipliers; in between, spans that are missing are added.
 import warp as wp
 
 from warp_corot.kernels.implicit.assembled import Couplings, begin_coupling, end_coupling, root_columns
-from warp_corot.kernels.implicit.conjugate_gradients import had_much_to_do
 from warp_corot.kernels.implicit.line_search import TRIED
 
 from .carriers import Carriers, couple_at, motion_at, push_at
@@ -107,10 +106,8 @@ def push_corners(
 @wp.kernel(enable_backward=False)
 def judge_spans(
     # In
-    scalars: wp.array2d[wp.float64],
-    near: wp.float64,
+    locates: wp.array[wp.int32],
     count: wp.array[wp.int32],
-    changed: wp.array[wp.int32],
     rounds: wp.array[wp.int32],
     most: int,
     # In and out
@@ -118,16 +115,13 @@ def judge_spans(
     solves: wp.array[wp.int32],
     going: wp.array[wp.int32],
 ):
-    """Find all spans again before the next solve if the last one had little to do. The step is solved for only if spans
+    """Find all spans again before the next solve if contacts are to be located. The step is solved for only if spans
     had just been found again, or there are none.
     """
     solves[0] = rounds[0]
     if going[0] == 0 and due[0] == 0 and count[0] > 0:
         going[0] = 1
-    is_near = changed[0] == 0
-    for world in range(scalars.shape[0]):
-        is_near = is_near and not had_much_to_do(scalars, world, near)
-    due[0] = wp.where(is_near, 1, 0)
+    due[0] = locates[0]
     if going[0] == 0 or rounds[0] >= most:
         solves[0] = 0
 

@@ -8,7 +8,7 @@ import warp as wp
 
 from warp_corot.kernels.elements.lanes import constants, native
 
-from .conjugate_gradients import BROKEN, CONVERGED, END, LIMIT, NEGATIVE, RR, RUNNING
+from .conjugate_gradients import BROKEN, CONVERGED, END, LIMIT, NEGATIVE, RR, RUNNING, WITHIN
 from .multigrid.cycle import Rows
 from .multigrid.values import inverse_block
 
@@ -166,6 +166,7 @@ _NUMBERS = constants(
     BROKEN=int(BROKEN),
     RR=int(RR),
     END=int(END),
+    WITHIN=int(WITHIN),
     CLOSER=CLOSER,
     PLACES=PLACES,
 )

@@ -27,12 +27,6 @@ def is_number(a: wp.float64):
 
 
 @wp.func
-def had_much_to_do(scalars: wp.array2d[wp.float64], world: int, times: wp.float64):
-    """Whether a world's residual began at more than so many times the tolerance."""
-    return scalars[world, BEGAN] > times * times * scalars[world, WITHIN]
-
-
-@wp.func
 def stop(status: wp.array[wp.int32], running: wp.array[wp.int32], world: int, how: int):
     status[world] = how
     wp.atomic_sub(running, 0, 1)

@@ -2,9 +2,15 @@
 
 import warp as wp
 
-from .conjugate_gradients import BROKEN, LIMIT, had_much_to_do
+from .conjugate_gradients import BEGAN, BROKEN, LIMIT, WITHIN
 
 wp.set_module_options({"enable_backward": False})
+
+#: A step is solved for if the residual of a solve begins at less than this many times the tolerance.
+SETTLED = wp.constant(wp.float64(10.0))
+#: Contacts are located again once it begins at less than this many times the tolerance, and either that, or this share
+#: of where it began just after they were located: forces that are not in balance are no good multipliers.
+NEAR, BALANCED = wp.constant(wp.float64(100.0)), wp.constant(wp.float64(0.3))
 
 
 @wp.kernel(enable_backward=False)
@@ -20,10 +26,9 @@ def judge_round(
     iterations: wp.array[wp.int32],
     changed: wp.array[wp.int32],
     pairs: wp.array[wp.int32],
-    settled: wp.float64,
-    near: wp.float64,
     # In and out
     locates: wp.array[wp.int32],
+    outer: wp.array[wp.float64],
     rounds: wp.array[wp.int32],
     total: wp.array[wp.int32],
     # Out
@@ -31,13 +36,24 @@ def judge_round(
     going: wp.array[wp.int32],
 ):
     """Count a linear solve. Another one follows if contact has changed, if this one had much to do, or if it did not
-    follow just after pairs of soft surfaces were located; they are located if it had little to do."""
+    follow just after pairs of soft surfaces were located; contacts are located again if it had little to do.
+
+    Args:
+        locates: Whether contacts were located before this solve; then whether they are before the next one.
+        outer: Squares of the residuals of worlds when contacts had been located.
+    """
     is_settled = changed[0] == 0
     is_near = changed[0] == 0
     for world in range(iterations.shape[0]):
         total[world] = total[world] + iterations[world]
-        is_settled = is_settled and not had_much_to_do(scalars, world, settled)
-        is_near = is_near and not had_much_to_do(scalars, world, near)
+        began = scalars[world, BEGAN]
+        within = scalars[world, WITHIN]
+        if locates[0] != 0 or rounds[0] == 0:
+            outer[world] = began
+        is_done = began <= SETTLED * SETTLED * within
+        is_settled = is_settled and is_done
+        is_balanced = is_done or began <= BALANCED * BALANCED * outer[world]
+        is_near = is_near and is_balanced and began <= NEAR * NEAR * within
     rounds[0] = rounds[0] + 1
     solves[0] = rounds[0]
     going[0] = wp.where(is_settled and (locates[0] != 0 or pairs[0] == 0), 0, 1)

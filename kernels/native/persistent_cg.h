@@ -72,7 +72,7 @@ for (int world = team; world < worlds; world += teams) {
         *four_at(p, first + i) = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
         *four_at(s, first + i) = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
     }
-    const double within = sc[END], end = CLOSER * within;
+    const double within = sc[END], end = within > sc[WITHIN] ? within : CLOSER * within;
     double before = 0.0, alpha = 0.0, square = sc[RR];
     int found = RUNNING, done = 0;
     while (true) {

@@ -54,7 +54,7 @@ const auto residual = [&]() {
     return total;
 };
 if (status.data[world] != RUNNING) return;
-const double end = CLOSER * numbers[END];
+const double end = numbers[END] > numbers[WITHIN] ? numbers[END] : CLOSER * numbers[WITHIN];
 forward(rest, half);
 double product = 0.0, now = numbers[RR];
 for (int i = 0; i < count; ++i) {

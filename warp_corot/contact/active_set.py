@@ -166,20 +166,16 @@ class ActiveSet:
         if self._spans is not None:
             self._locate(spans.MISSING, d)
 
-    def launch_going(
-        self, scalars: wp.array, near: float, changed: wp.array, rounds: wp.array, most: int, going: wp.array
-    ) -> None:
+    def launch_going(self, locates: wp.array, rounds: wp.array, most: int, going: wp.array) -> None:
         """Launch the decision whether obstacles between nodes are looked for again, and another solve follows for that.
 
         Args:
-            scalars: Of the last linear solve; see ``kernels.implicit.conjugate_gradients``.
-            near: They are if it began at less than this many times the tolerance.
-            changed: Whether contact has changed, int32 [1].
+            locates: Whether contacts are to be located again, int32 [1].
             rounds, most: The number of solves in the step, int32 [1], and its maximum.
             going: Whether another solve follows, int32 [1].
         """
         if self._spans is not None:
-            self._spans.launch_judgement(scalars, near, changed, rounds, most, going)
+            self._spans.launch_judgement(locates, rounds, most, going)
 
     def launch_end(self, d: wp.array) -> None:
         """Launch the results of contact for users."""

@@ -83,10 +83,8 @@ class BorneSet:
         self._spans.update(d, is_solved=True)
         self._spans.launch_located(kernels.MISSING, d, self.changed)
 
-    def launch_going(
-        self, scalars: wp.array, near: float, changed: wp.array, rounds: wp.array, most: int, going: wp.array
-    ) -> None:
-        self._spans.launch_judgement(scalars, near, changed, rounds, most, going)
+    def launch_going(self, locates: wp.array, rounds: wp.array, most: int, going: wp.array) -> None:
+        self._spans.launch_judgement(locates, rounds, most, going)
 
     def launch_end(self, d: wp.array) -> None:
         self._spans.update(d)

@@ -131,11 +131,9 @@ class Spans:
         for each in self._items:
             self._on_listed(finding.stiffen_spans, each, [*self._places(each), each.touches, each.spans])
 
-    def launch_judgement(
-        self, scalars: wp.array, near: float, changed: wp.array, rounds: wp.array, most: int, going: wp.array
-    ) -> None:
+    def launch_judgement(self, locates: wp.array, rounds: wp.array, most: int, going: wp.array) -> None:
         """Launch the decision whether they are found again; see ``kernels.judge_spans``."""
-        inputs = [scalars, wp.float64(near), self._count, changed, rounds, most]
+        inputs = [locates, self._count, rounds, most]
         wp.launch(kernels.judge_spans, 1, [*inputs, self._due, self._solves, going], device=self.device)
 
     def update(self, d: wp.array, *, is_solved: bool = False) -> None:

@@ -104,7 +104,12 @@ def pressed(scene, device, **options):
     """Two worlds of a body on the ground, under a ball that presses it for 10 steps and then drags it: nodes that are
     held, a ball between nodes, or places on the body's own surface."""
     contact = wc.Contact(friction=0.3)
-    if scene == "own surface":
+    bodies = []
+    if scene == "soft surfaces":
+        body = block(device, level=4, worlds=2, origin=(0.0, 0.0, 0.02))
+        bodies.append(block(device, level=3, worlds=2))
+        below, top = ground(0.0), 0.04
+    elif scene == "own surface":
         body = wc.SoftBody(brick_mesh(), SOFT, worlds=2, device=device)
         below, top = ground(-0.007), 0.007
     else:
@@ -115,29 +120,35 @@ def pressed(scene, device, **options):
     path = [(x, y, top + radius), (x, y, top + radius - 0.003), (x + 0.004, y, top + radius - 0.003)]
     tool.follow([0.0, 0.1, 0.2], path)
     integrator = wc.BackwardEuler(dt=0.01, damping=2.0, **options)
-    sim = wc.Simulation(body, obstacles=[below, tool], contact=contact, integrator=integrator, gravity=DOWN)
+    bodies.append(body)
+    sim = wc.Simulation(bodies, obstacles=[below, tool], contact=contact, integrator=integrator, gravity=DOWN)
     return sim, tool
 
 
-@pytest.mark.parametrize("scene", ["held", "between nodes", "own surface"])
+@pytest.mark.parametrize("scene", ["held", "between nodes", "own surface", "soft surfaces"])
 def test_contact_is_in_the_matrix(scene, device, rng):
-    """S (A + D + the sum of c c^T) is what the operator does to vectors in the range of S, and solves satisfy it."""
+    """S (A + D + the sum of c c^T) is what the operator does to vectors in the range of S, and solves satisfy it. Where
+    soft surfaces may meet, it is one matrix for all bodies and worlds."""
     sim, _ = pressed(scene, device)
     sim.advance_steps(15)
     (solve_of_step,) = sim.recorded._stepper._solves
     system, solve = solve_of_step._system, solve_of_step.choice.assembled
-    (held,), count = system.contacts, system.worlds * system.node_count
+    count = system.worlds * system.node_count
     solve.update()
-    held.launch_friction(system.x, wp.zeros_like(system.x))
-    solve.take_contact(system.contacts, None)
+    if system.soft is not None:
+        system.soft.update(system.x)
     couplings, b = solve.couplings, on_device(rng.standard_normal((count, 3)), system)
-    if held.nodes is not None:
-        held.nodes.launch_free(b)
+    rest = system.blocks.of(wp.zeros_like(system.x))
+    for held, x, r, own in zip(system.contacts, system.blocks.of(system.x), rest, system.blocks.of(b), strict=True):
+        held.launch_friction(x, r)
+        if held.nodes is not None:
+            held.nodes.launch_free(own)
+    solve.take_contact(system.contacts, system.soft)
     x = b.numpy()[:, :3].astype(float)
     projectors = np.tile(np.eye(3), (count, 1, 1))
     is_held = couplings.projected.numpy() != 0
     projectors[is_held] = couplings.projectors.numpy()[:-1][is_held]
-    found = (matrix_of(solve, 2) @ x.ravel()).reshape(-1, 3)
+    found = (matrix_of(solve, system.worlds) @ x.ravel()).reshape(-1, 3)
     used = int(couplings.count.numpy()[0])
     for nodes, parts in zip(couplings.nodes.numpy()[:used], couplings.parts.numpy()[:used, :, :3], strict=True):
         c = parts[nodes >= 0].astype(float)

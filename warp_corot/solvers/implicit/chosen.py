@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 #: which has twice as many entries in a row, and on CUDA. On an H200 it was 29 to 38 for organs of 20,000 and 100,000
 #: elements.
 COST_ON_CPU, SHARED_ON_CPU, COST = 5, 3, 32
+#: So many times as much on the CPU with contact, whose springs multigrid takes into all its matrices before each solve.
+WITH_CONTACT = 2
 #: Multigrid is tried if assembled solves cost as much as so many of its iterations; never where soft surfaces meet,
 #: whose contact it does not know.
 WORTH, NEVER = 10, 1 << 20
@@ -59,7 +61,7 @@ class ChosenSolve:
         self._is_assembled = wp.ones(1, dtype=wp.int32, device=self.device)
         self._counts = wp.zeros(kernels.COUNTS, dtype=wp.int32, device=self.device)
         self.is_open = True
-        on_cpu = SHARED_ON_CPU if shares else COST_ON_CPU
+        on_cpu = (SHARED_ON_CPU if shares else COST_ON_CPU) * (WITH_CONTACT if assembled.touches else 1)
         self._cost = on_cpu if self.device.is_cpu else COST
 
     @property

@@ -19,10 +19,6 @@ if TYPE_CHECKING:
 
 #: A solve ends at this share of its first residual, because contact may change after it.
 SHARE = 0.15
-#: A step is solved for if the residual of a solve begins at less than this many times the tolerance.
-SETTLED = 10.0
-#: Places of contact are found again once the residual of a solve begins at less than this many times the tolerance.
-NEAR = 100.0
 #: Maximum number of linear solves in a step with contact of soft surfaces.
 ROUNDS = 100
 
@@ -53,6 +49,7 @@ class ContactSolve:
         if not system.ranks.is_alone:
             self._search = SharedLineSearch(*sizes, contacts[0], self.device, system.ranks)
         self.iterations = wp.zeros_like(system.solver.iterations)
+        self._outer = wp.zeros(system.worlds, dtype=wp.float64, device=self.device)
         self._rounds, self._going, self._again, *none = (
             wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(6)
         )
@@ -160,11 +157,11 @@ class ContactSolve:
         system.ranks.max(self._changed)
         total, locates, solves = self._of_pairs
         solver = system.solver
-        inputs = [solver.scalars, solver.iterations, self._changed, total, SETTLED, NEAR]
-        outputs = [locates, self._rounds, self.iterations, solves, self._going]
+        inputs = [solver.scalars, solver.iterations, self._changed, total]
+        outputs = [locates, self._outer, self._rounds, self.iterations, solves, self._going]
         wp.launch(kernels.judge_round, 1, inputs, outputs, device=self.device)
         for contact, () in self._each():
-            contact.launch_going(solver.scalars, NEAR, contact.changed, self._rounds, self._most, self._going)
+            contact.launch_going(locates, self._rounds, self._most, self._going)
         if not self._is_alone:
             self._changed.zero_()
         wp.launch(kernels.end_rounds, 1, [self._rounds, self._most], [self._going, solver.status], device=self.device)
