@@ -185,15 +185,6 @@ def hold_places(
 
 
 @wp.kernel(enable_backward=False)
-def leave_free(start: int, surface: Surface, holding: Holding, v: wp.array[wp.vec4]):
-    """v = S v."""
-    s = start + wp.tid()
-    if holding.touched[s] != 0:
-        i = surface.node[s]
-        store_node(v, i, holding.projectors[s] * load_node(v, i))
-
-
-@wp.kernel(enable_backward=False)
 def leave_yielding(start: int, surface: Surface, holding: Holding, v: wp.array[wp.vec4]):
     """v = S T v, where T makes the directions in which friction is stiff as small as that makes them."""
     s = start + wp.tid()

@@ -91,10 +91,6 @@ class ActiveSet:
         self._rounds.zero_()
         self._holding.released.zero_()
 
-    def launch_free(self, v: wp.array) -> None:
-        """Launch v = S v, without the directions that are held."""
-        self._launch(kernels.leave_free, [self._surface, self._holding, v])
-
     def launch_yielding(self, v: wp.array) -> None:
         """Launch v = S T v, with directions in which friction is stiff made small."""
         self._launch(kernels.leave_yielding, [self._surface, self._holding, v])

@@ -11,7 +11,7 @@ import warp as wp
 from warp_corot.solvers.halo import ALONE, Halo
 
 from .conjugate_gradients import ConjugateGradients
-from .operator import LinearOperator, Preconditioner
+from .operator import Preconditioner
 
 if TYPE_CHECKING:
     from .chosen import ChosenSolve
@@ -47,8 +47,8 @@ class BlockSystem:
     """S (A + D + R) x = b: A of each body, the drag D and the projector S of its contact with obstacles, and the
     derivative R of contact between soft surfaces.
 
-    A ``LinearOperator`` and a ``Preconditioner`` for vectors in the range of S. The preconditioner is block diagonal:
-    S T B T S of each body's own B, where T takes the stiffness of friction into account.
+    All vectors are in the range of S. The preconditioner is block diagonal: S T B T S of each body's own B, where T
+    takes the stiffness of friction into account; or the whole matrix is assembled, see ``choice``.
 
     Args:
         operators: A of each body.
@@ -114,7 +114,7 @@ class BlockSystem:
 
     # --- as a preconditioner -----------------------------------------------------------------------------------------
 
-    def update(self, operator: LinearOperator | None = None) -> None:
+    def update(self) -> None:
         """Launch the update after new linearisations or new scales of the operators."""
         if self.choice is not None:
             self.choice.update()
