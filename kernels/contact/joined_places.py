@@ -69,7 +69,8 @@ def find_strays(
         return
     motion = motion_at(s, surface, carriers, d) + gone_at(s, surface, carriers)
     surface.d[s] = motion
-    far = wp.length(joined.start[s] + motion - watch.places[s] - watch.ahead[s])
+    way = joined.start[s] + motion - watch.places[s]
+    far = wp.length(way - watch.ahead[s] - watch.drift[surface.world[s]])
     watch.strayed[s] = wp.max(far, FADING * watch.strayed[s])
     if far > watch.reach[s]:
         if searches[0] < SEARCHES:

@@ -48,8 +48,8 @@ class Watch:
     size: float  # size of the smallest element [m]
     most_alone: float  # how many elements nodes with nothing near may move
     hit: float  # how many times the largest motion is reserved for anything
-    # [S] in implicit steps: how far places are expected to go in the step of the search, around which ``reach`` is what
-    # they may stray, and how far they have strayed [m]; else empty
+    # [S] in implicit steps: how far places are expected to go in the step of the search beyond the frame, around which
+    # ``reach`` is what they may stray, and how far they have strayed [m]; else empty
     ahead: wp.array[wp.vec3]
     strayed: wp.array[wp.float32]
     fastest: wp.array[wp.float32]  # [1] largest motion in the step of the search
@@ -212,7 +212,7 @@ def reserve_node(s: int, farther: float, surface: Surface, watch: Watch):
     """Record the place of a node and how far it may move from there."""
     watch.places[s] = surface.x[s]
     if watch.ahead.shape[0] > 0:
-        watch.ahead[s] = surface.d[s]
+        watch.ahead[s] = surface.d[s] - common_motion(surface.world[s], watch)
         watch.reach[s] = watch.least[0] + wp.min(watch.strayed[s], STRAYED * watch.size)
         return
     step = wp.length(surface.d[s] - common_motion(surface.world[s], watch))

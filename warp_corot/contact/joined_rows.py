@@ -141,7 +141,7 @@ class JoinedRows:
     def launch_search(self, offset: int) -> None:
         """Launch a search for pairs, if it is due."""
         self._searches.zero_()
-        self._pairs.search.launch(offset)
+        self._pairs.search.launch(offset, follows=True)
 
     def launch_searched_again(self, d: wp.array, again: wp.array) -> None:
         """Launch another search along the way of motions d if they have strayed from the way of the last one.
@@ -159,7 +159,7 @@ class JoinedRows:
 
     def _search_again(self, d: wp.array) -> None:
         self._on_rows(kernels.keep_row_forces, [self._pairs.rows, self._joined, self._searches])
-        self._pairs.search.launch(1)
+        self._pairs.search.launch(1, follows=True)
         self.solves.zero_()
         self.locates.fill_(1)
         self._locate(finding.REPEATED, d)
