@@ -8,7 +8,7 @@ import warp as wp
 
 from warp_corot.kernels.elements.lanes import constants, native
 
-from .conjugate_gradients import BROKEN, CONVERGED, END, LIMIT, NEGATIVE, RR, RUNNING, WITHIN
+from .conjugate_gradients import BEGAN, BROKEN, CONVERGED, END, LIMIT, NEGATIVE, RR, RUNNING, WITHIN
 from .multigrid.cycle import Rows
 from .multigrid.values import inverse_block
 
@@ -16,8 +16,9 @@ wp.set_module_options({"enable_backward": False})
 
 #: These solves leave smoother residuals than multigrid, so the square of the residual must be this much smaller. To
 #: the same residual, bunnies of 5 and 30 kPa were 3.1 and 1.2 times as far off; with 0.1, a stiff block that spins
-#: beside an obstacle still had more strain energy than its rotation gives it.
-CLOSER = 0.03
+#: beside an obstacle still had more strain energy than its rotation gives it. Solves that end at a share of their first
+#: residual need that only if they begin at less than this many times the tolerance, and may be the last of a step.
+CLOSER, SETTLED = 0.03, 10.0
 #: Maximum number of nodes that bear a contact: four for each of the four places of a pair of soft surfaces.
 PLACES = 16
 
@@ -167,6 +168,8 @@ _NUMBERS = constants(
     RR=int(RR),
     END=int(END),
     WITHIN=int(WITHIN),
+    BEGAN=int(BEGAN),
+    SETTLED=SETTLED,
     CLOSER=CLOSER,
     PLACES=PLACES,
 )

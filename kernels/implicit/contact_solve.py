@@ -2,12 +2,13 @@
 
 import warp as wp
 
+from .assembled import SETTLED as NEARLY_SOLVED
 from .conjugate_gradients import BEGAN, BROKEN, LIMIT, WITHIN
 
 wp.set_module_options({"enable_backward": False})
 
 #: A step is solved for if the residual of a solve begins at less than this many times the tolerance.
-SETTLED = wp.constant(wp.float64(10.0))
+SETTLED = wp.constant(wp.float64(NEARLY_SOLVED))
 #: Contacts are located again once it begins at less than this many times the tolerance, and either that, or this share
 #: of where it began just after they were located: forces that are not in balance are no good multipliers.
 NEAR, BALANCED = wp.constant(wp.float64(100.0)), wp.constant(wp.float64(0.3))

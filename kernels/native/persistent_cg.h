@@ -72,7 +72,8 @@ for (int world = team; world < worlds; world += teams) {
         *four_at(p, first + i) = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
         *four_at(s, first + i) = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
     }
-    const double within = sc[END], end = within > sc[WITHIN] ? within : CLOSER * within;
+    const bool is_last = !(sc[END] > sc[WITHIN] && sc[BEGAN] > SETTLED * SETTLED * sc[WITHIN]);
+    const double within = sc[END], end = is_last ? CLOSER * within : within;
     double before = 0.0, alpha = 0.0, square = sc[RR];
     int found = RUNNING, done = 0;
     while (true) {

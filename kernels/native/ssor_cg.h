@@ -54,7 +54,8 @@ const auto residual = [&]() {
     return total;
 };
 if (status.data[world] != RUNNING) return;
-const double end = numbers[END] > numbers[WITHIN] ? numbers[END] : CLOSER * numbers[WITHIN];
+const bool is_last = !(numbers[END] > numbers[WITHIN] && numbers[BEGAN] > SETTLED * SETTLED * numbers[WITHIN]);
+const double end = is_last ? CLOSER * numbers[END] : numbers[END];
 forward(rest, half);
 double product = 0.0, now = numbers[RR];
 for (int i = 0; i < count; ++i) {
