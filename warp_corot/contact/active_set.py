@@ -25,7 +25,6 @@ class ActiveSet:
         k: The number of the body.
     """
 
-    rounds = 16
     #: Springs are not in the preconditioner: most contact here holds nodes.
     springs = None
 

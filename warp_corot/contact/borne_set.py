@@ -27,7 +27,6 @@ class BorneSet:
         k: The number of the body.
     """
 
-    rounds = 100
     #: No node is held.
     nodes = None
 

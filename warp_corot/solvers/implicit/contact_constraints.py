@@ -29,8 +29,6 @@ class ObstacleContact(Protocol):
     """
 
     changed: wp.array
-    #: Maximum number of linear solves in a step.
-    rounds: int
 
     @property
     def count(self) -> int: ...

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 #: A solve ends at this share of its first residual, because contact may change after it.
 SHARE = 0.15
-#: Maximum number of linear solves in a step with contact of soft surfaces.
+#: Maximum number of linear solves in a step with contact.
 ROUNDS = 100
 
 
@@ -43,7 +43,6 @@ class ContactSolve:
             wp.zeros(length, dtype=wp.vec4, device=self.device) for _ in range(4)
         )
         contacts = [each for each in system.contacts if each is not None]
-        self._most = ROUNDS if system.soft is not None else max(each.rounds for each in contacts)
         sizes = system.worlds, system.node_count
         self._search = LineSearch(*sizes, self, self.device)
         if not system.ranks.is_alone:
@@ -161,10 +160,10 @@ class ContactSolve:
         outputs = [locates, self._outer, self._rounds, self.iterations, solves, self._going]
         wp.launch(kernels.judge_round, 1, inputs, outputs, device=self.device)
         for contact, () in self._each():
-            contact.launch_going(locates, self._rounds, self._most, self._going)
+            contact.launch_going(locates, self._rounds, ROUNDS, self._going)
         if not self._is_alone:
             self._changed.zero_()
-        wp.launch(kernels.end_rounds, 1, [self._rounds, self._most], [self._going, solver.status], device=self.device)
+        wp.launch(kernels.end_rounds, 1, [self._rounds, ROUNDS], [self._going, solver.status], device=self.device)
 
     def _each(self, *vectors: wp.array) -> Iterator[tuple[ObstacleContact, list[wp.array]]]:
         """The contacts of bodies with obstacles, and these bodies' blocks of vectors."""
