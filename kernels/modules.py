@@ -4,13 +4,15 @@ No kernel has an adjoint. Its module must say so, too: otherwise the module's ha
 Warp's cache, depends on ``wp.config.enable_backward``, and a program with another setting compiles the same code again.
 """
 
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import warp as wp
 
 
 def unique_kernel(cpu_compiler_flags: str | None = None, native: wp.ModuleBuildOptions | None = None, **options: Any):
-    """The decorator of kernels that factories make: each has a module of its own.
+    """The decorator of kernels that factories make, and of those that few runs launch: each has a module of its own.
 
     Args:
         cpu_compiler_flags: Flags for the CPU's compiler; None: Warp's.
@@ -19,3 +21,34 @@ def unique_kernel(cpu_compiler_flags: str | None = None, native: wp.ModuleBuildO
     """
     of_module = {"enable_backward": False, "cpu_compiler_flags": cpu_compiler_flags, "extra_build_options": native}
     return wp.kernel(module="unique", enable_backward=False, module_options=of_module, **options)
+
+
+class Family:
+    """Factories with the same arguments, whose kernels the same runs launch: those of the same arguments are one
+    module, which takes less time to compile than one for each.
+
+    Args:
+        name: The beginning of the modules' names.
+    """
+
+    def __init__(self, name: str):
+        self._name, self._factories, self._names = name, [], set()
+        self._made = functools.cache(self._make)
+
+    def member(self, factory: Callable[..., wp.Kernel]) -> Callable[..., wp.Kernel]:
+        """The decorator of a factory: its kernels are made with those of all others, and once."""
+        self._factories.append(factory)
+        return functools.wraps(factory)(lambda *given: self._made(*given)[factory.__name__])
+
+    def kernel(self):
+        """The decorator of kernels within factories."""
+        return wp.kernel(module=self._module, enable_backward=False)
+
+    def _make(self, *given: Any) -> dict[str, wp.Kernel]:
+        name = "_".join([self._name, *(getattr(each, "key", None) or str(each) for each in given)])
+        while name in self._names:  # functions of closures may share their names
+            name += "_"
+        self._names.add(name)
+        self._module = wp.get_module(name)
+        self._module.options["enable_backward"] = False
+        return {factory.__name__: factory(*given) for factory in self._factories}

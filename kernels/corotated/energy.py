@@ -10,14 +10,18 @@ from typing import Any
 
 import warp as wp
 
-from warp_corot.kernels.elements.constitutive import IsotropicMaterial, hooke_energy, symmetric
-from warp_corot.kernels.elements.forces import own_gradient
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, corotated_strain, hooke, hooke_energy, symmetric
+from warp_corot.kernels.elements.elements import frame, local_gradient
+from warp_corot.kernels.elements.forces import element_energies, element_von_mises, own_gradient
 from warp_corot.kernels.math.matrices import identity3, reciprocal
-from warp_corot.kernels.math.quaternion import robust_rotation
+from warp_corot.kernels.math.rotation import quick_rotation, rotation_out_of_line
+from warp_corot.kernels.modules import Family
 
 from .algebraic import FAR, FLAT, NEAR, stretch_trace
 
 wp.set_module_options({"enable_backward": False})
+
+OF_OWN_ROTATIONS = Family(__name__)
 
 
 @wp.func
@@ -51,7 +55,7 @@ def stretch_energy(w: wp.mat33, mu: float, lam: float):
 @wp.func(inline=False)
 def turned_energy(f: wp.mat33, mu: float, lam: float):
     """The density of F, for every F."""
-    strain = symmetric(wp.transpose(robust_rotation(f)) * f) - identity3()
+    strain = symmetric(wp.transpose(rotation_out_of_line(f)) * f) - identity3()
     return hooke_energy(strain, mu, lam)
 
 
@@ -69,3 +73,22 @@ def own_density(elements: Any, t: int, material: IsotropicMaterial, u: wp.array[
     """The density of an element with its own rotation."""
     i = t * material.stride
     return corotated_energy(own_gradient(elements, t, u), material.mu[i], material.lam[i])
+
+
+@wp.func
+def own_cauchy(elements: Any, t: int, material: IsotropicMaterial, u: wp.array[wp.vec4]):
+    """Cauchy stress of an element for display, with its own rotation."""
+    i = t * material.stride
+    g = local_gradient(elements, t, u)
+    q = frame(elements, t)
+    return hooke(corotated_strain(g, q, quick_rotation(q + g)), material.mu[i], material.lam[i])
+
+
+@OF_OWN_ROTATIONS.member
+def own_energies(Elements: type) -> wp.Kernel:
+    return element_energies(Elements, IsotropicMaterial, own_density, OF_OWN_ROTATIONS.kernel)
+
+
+@OF_OWN_ROTATIONS.member
+def own_von_mises(Elements: type) -> wp.Kernel:
+    return element_von_mises(Elements, IsotropicMaterial, own_cauchy, OF_OWN_ROTATIONS.kernel)

@@ -63,6 +63,11 @@ class Dilatation(NamedTuple):
     curvature: wp.Function
     holding: wp.Function
 
+    @property
+    def key(self) -> str:
+        """What names kernels, as functions' keys do."""
+        return self.lanes[-1]
+
 
 @wp.func
 def small_dilatation(a: wp.mat33):

@@ -3,10 +3,11 @@
 A law is device functions (elements, t, material, u) of element t at nodal displacements u: ``stress``, the first
 Piola-Kirchhoff stress as ``elements.scatter_stress`` takes it; ``density``, the energy density; and ``cauchy``, a
 tensor with the invariants of the Cauchy stress. ``Elements`` is a struct of ``elements``, ``Material`` the struct that
-the law reads.
+the law reads; ``kernel`` is the decorator, of a ``Family`` if there is one.
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import warp as wp
@@ -124,10 +125,12 @@ def repair_forces(Elements: type, Material: type, stress: wp.Function) -> wp.Ker
 
 
 @functools.cache
-def element_energies(Elements: type, Material: type, density: wp.Function) -> wp.Kernel:
+def element_energies(
+    Elements: type, Material: type, density: wp.Function, kernel: Callable = unique_kernel
+) -> wp.Kernel:
     """Strain energy of each element [J], in float64 so that sums over millions keep their digits."""
 
-    @unique_kernel()
+    @kernel()
     def element_energies(
         # In
         elements: Elements,
@@ -162,10 +165,12 @@ def add_energies(Elements: type, Material: type, density: wp.Function) -> wp.Ker
 
 
 @functools.cache
-def element_von_mises(Elements: type, Material: type, cauchy: wp.Function) -> wp.Kernel:
+def element_von_mises(
+    Elements: type, Material: type, cauchy: wp.Function, kernel: Callable = unique_kernel
+) -> wp.Kernel:
     """Von Mises stress of each element [Pa]."""
 
-    @unique_kernel()
+    @kernel()
     def element_von_mises(
         # In
         elements: Elements,

@@ -13,7 +13,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_corot.kernels.modules import unique_kernel
+from warp_corot.kernels.modules import Family, unique_kernel
 
 from .constitutive import IsotropicMaterial
 from .dilatation import Dilatation, mean_of, pressure_stress_of
@@ -21,6 +21,8 @@ from .elements import add_nodal_forces, rest_volume
 from .forces import in_local_frame, own_gradient
 
 wp.set_module_options({"enable_backward": False})
+
+OF_ELEMENTS = Family(__name__)
 
 
 @wp.func
@@ -68,11 +70,11 @@ def weight_law_at(of: Dilatation) -> wp.Function:
 # --- the first pass ---------------------------------------------------------------------------------------------------
 
 
-@functools.cache
+@OF_ELEMENTS.member
 def measure_elements(Elements: type, of: Dilatation) -> wp.Kernel:
     measure = of.measure
 
-    @unique_kernel()
+    @OF_ELEMENTS.kernel()
     def measure_elements(
         # In
         elements: Elements,
@@ -154,12 +156,12 @@ def scatter(elements: Any, targets: wp.vec4i, t: int, stress: wp.mat33, f: wp.ar
     add_nodal_forces(elements, t, in_local_frame(elements, t, stress), targets, f)
 
 
-@functools.cache
+@OF_ELEMENTS.member
 def scatter_pressures(Elements: type, of: Dilatation) -> wp.Kernel:
     """Add forces."""
     pressure_stress = pressure_stress_of(of)
 
-    @unique_kernel()
+    @OF_ELEMENTS.kernel()
     def scatter_pressures(
         # In
         elements: Elements,
@@ -211,12 +213,12 @@ def add_product(Elements: type, of: Dilatation) -> wp.Kernel:
     return add_product
 
 
-@functools.cache
+@OF_ELEMENTS.member
 def add_energies(Elements: type, of: Dilatation) -> wp.Kernel:
     """Add each element's share of the energy [J]."""
     measure, holding = of.measure, of.holding
 
-    @unique_kernel()
+    @OF_ELEMENTS.kernel()
     def add_energies(
         # In
         elements: Elements,
@@ -235,12 +237,12 @@ def add_energies(Elements: type, of: Dilatation) -> wp.Kernel:
     return add_energies
 
 
-@functools.cache
+@OF_ELEMENTS.member
 def unshare(Elements: type, of: Dilatation) -> wp.Kernel:
     """Replace w' of the shared dilatation by the difference of an element's own w' and that."""
     measure, slope_of = of.measure, of.slope
 
-    @unique_kernel()
+    @OF_ELEMENTS.kernel()
     def unshare(
         # In
         elements: Elements,

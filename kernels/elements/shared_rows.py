@@ -6,11 +6,9 @@ reads ten nodes for eight elements and no element. What elements add besides is 
 some of them are held from turning over, to ``add_held``.
 """
 
-import functools
-
 import warp as wp
 
-from warp_corot.kernels.modules import unique_kernel
+from warp_corot.kernels.modules import Family
 
 from .constitutive import IsotropicMaterial
 from .dilatation import Dilatation, mean_of
@@ -19,6 +17,8 @@ from .forces import in_local_frame, own_gradient
 from .shared_dilatation import is_live, place_of, range_of, scatter
 
 wp.set_module_options({"enable_backward": False})
+
+OF_GROUPS = Family(__name__)
 
 #: Threads that share a group on CUDA.
 THREADS = 8
@@ -145,13 +145,13 @@ def add_row(rows: wp.array[wp.vec4], place: int, row: wp.vec3):
     rows[place] = rows[place] + wp.vec4(row[0], row[1], row[2], 0.0)
 
 
-@functools.cache
+@OF_GROUPS.member
 def write_rows(Elements: type, of: Dilatation) -> wp.Kernel:
     """A thread a group, which also leaves (lambda_e h'', w', 0, 0) to its elements: the first for
     ``add_held``, the others as ``shared_dilatation`` and ``shared_diagonal`` take them."""
     measure, slope_of, curvature_of, holding = of.measure, of.slope, of.curvature, of.holding
 
-    @unique_kernel()
+    @OF_GROUPS.kernel()
     def write_rows(
         # In
         elements: Elements,
@@ -260,12 +260,12 @@ def add_row_products(
     add_group(thread % lanes, lanes, begin, groups.ends[g], found.factors[g][0], groups.nodes, found.rows, p, y)
 
 
-@functools.cache
+@OF_GROUPS.member
 def add_held(Elements: type, of: Dilatation) -> wp.Kernel:
     """y += K p of the elements that are held from turning over. Each thread does one group; most groups have none."""
     measure = of.measure
 
-    @unique_kernel()
+    @OF_GROUPS.kernel()
     def add_held(
         # In
         elements: Elements,

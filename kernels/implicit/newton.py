@@ -5,13 +5,10 @@ solutions have none. Increments keep the digits of short steps. The residual is 
 the others. The device decides from each world's scalars, so an iteration can be recorded.
 """
 
-from typing import Any
-
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
 from warp_corot.kernels.stepping.balance import most_of_lanes, sum_of_lanes
-from warp_corot.kernels.stepping.integrate import by_vectors, vector_at
 
 from .conjugate_gradients import NEGATIVE, is_number
 from .sums import add_up, dot64
@@ -42,67 +39,6 @@ LOOSEST, TIGHTEST = wp.constant(wp.float64(0.1)), wp.constant(wp.float64(1e-5))
 TRUSTED = wp.constant(wp.float64(1e-3))
 #: After a whole step below this relative size, the next one may be the last and is solved for accurately.
 NEAR = wp.constant(wp.float64(1e-3))
-
-
-@wp.kernel(enable_backward=False)
-def find_residual(
-    # In
-    gravity: wp.vec3,
-    mass: wp.array[wp.float32],
-    inverse_mass: wp.array[wp.float32],
-    has_load: int,
-    load: wp.array[Any],
-    external_share: wp.array[wp.float32],
-    inertia: wp.array[wp.float32],
-    pull: wp.array[wp.vec4],
-    increment: wp.array[wp.vec4],
-    count: int,
-    threads: int,
-    lanes: int,
-    # In and out
-    f: wp.array[wp.vec4],
-    others: wp.array[wp.vec4],
-    # Out
-    r: wp.array[wp.vec4],
-    outer: wp.array[wp.vec4],
-    parts: wp.array3d[wp.float64],
-):
-    """r = f + outer at free nodes, outer = others + external + m (pull - a d).
-
-    Afterwards f and the other forces are zero, ready for the next sums.
-    """
-    world, thread = wp.tid()
-    square = wp.float64(0.0)
-    reference = wp.float64(0.0)
-    k = thread
-    while k < count:
-        i = world * count + k
-        internal = load_node(f, i)
-        other = load_node(others, i)
-        external = mass[i] * gravity
-        if has_load != 0:
-            external += vector_at(load, i)
-        external = external_share[0] * external
-        rest = wp.vec3()
-        push = wp.vec3()
-        if inverse_mass[i] > 0.0:
-            external += other + mass[i] * load_node(pull, i)
-            push = external - (inertia[0] * mass[i]) * load_node(increment, i)
-            rest = internal + push
-            reference += dot64(external, external)
-        else:
-            reference += dot64(internal, internal)
-        square += dot64(rest, rest)
-        store_node(r, i, rest)
-        store_node(outer, i, push)
-        store_node(f, i, wp.vec3())
-        store_node(others, i, wp.vec3())
-        k += threads
-    square = sum_of_lanes(square)
-    reference = sum_of_lanes(reference)
-    if thread % lanes == 0:
-        parts[world, thread / lanes, SQUARE] = square
-        parts[world, thread / lanes, REFERENCE] = reference
 
 
 @wp.kernel(enable_backward=False)
@@ -386,6 +322,3 @@ def judge_step(
             promised = scalars[world, SLOPE_NOW]
             if correction <= tolerance or promised <= tolerance * tolerance * scalars[world, ENERGY_NOW]:
                 stop(status, running, world, CONVERGED)
-
-
-FIND_RESIDUAL = by_vectors(find_residual, "load")

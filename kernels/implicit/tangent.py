@@ -3,6 +3,7 @@
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
+from warp_corot.kernels.modules import unique_kernel
 
 wp.set_module_options({"enable_backward": False})
 
@@ -52,7 +53,7 @@ def finish_blocks(
     blocks[i] = block
 
 
-@wp.kernel(enable_backward=False)
+@unique_kernel()
 def invert_blocks(blocks: wp.array[wp.mat33], inverses: wp.array[wp.mat33]):
     """Invert symmetric blocks; an indefinite block is made positive definite first."""
     i = wp.tid()

@@ -9,7 +9,8 @@ from warp_corot.kernels.modules import unique_kernel
 
 from .windings import Lines, winding_number
 
-wp.set_module_options({"enable_backward": False})
+# As in ``measuring``.
+wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 #: Search radius for the closest triangle [m]: unlimited.
 FAR = 1.0e15
@@ -190,7 +191,7 @@ def evaluate_surface(
     phi[i] = sign * wp.length(apart)
 
 
-@wp.kernel(enable_backward=False)
+@unique_kernel()
 def count_windings(
     # In
     points: wp.array[wp.vec3],

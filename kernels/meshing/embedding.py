@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from warp_corot.kernels.modules import unique_kernel
+
 from .bisection import refinement_end
 from .growth import VOID
 
@@ -104,7 +106,7 @@ def nearest_faces(
     faces[i] = wp.where(found.result, found.face, -1)
 
 
-@wp.kernel(enable_backward=False)
+@unique_kernel()
 def find_holders(
     # In
     tree: wp.uint64,

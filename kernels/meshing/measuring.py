@@ -2,7 +2,10 @@
 
 import warp as wp
 
-wp.set_module_options({"enable_backward": False})
+from warp_corot.kernels.modules import unique_kernel
+
+# Warp would unroll loops of up to 16 rounds, and compile each round's search by itself.
+wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 #: Maximum number of triangles of its own part that an edge can pass.
 MOST_OWN_HITS = wp.constant(8)
@@ -31,7 +34,7 @@ def measure_distances(
     distances[i] = distance
 
 
-@wp.kernel(enable_backward=False)
+@unique_kernel()
 def find_crossed_parts(
     # In
     points: wp.array[wp.vec3],

@@ -6,14 +6,24 @@ A byte for each subtree, with a bit for each leaf, says which these are. On CUDA
 reads the bytes of eight subtrees at a time, which are nearly always all zero, and processes their leaves in order.
 """
 
+from typing import Any
+
 import warp as wp
 
 from warp_corot.kernels.corotated.algebraic import FLAT, stretch_stress, turned_stress
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, rotated_stress
-from warp_corot.kernels.elements.elements import ForestElements, frame, local_gradient, nodal_forces, scatter_stress
+from warp_corot.kernels.elements.elements import (
+    ForestElements,
+    GeneralElements,
+    frame,
+    local_gradient,
+    nodal_forces,
+    scatter_stress,
+)
 from warp_corot.kernels.elements.merging import add_four_forces
 from warp_corot.kernels.math.matrices import identity3
 from warp_corot.kernels.math.quaternion import robust_rotation
+from warp_corot.kernels.modules import unique_kernel
 
 from .left_out import LEAVES, LIST_BLOCK, LISTS, WARP, LeftOut, any_left_out, entry_count, leave, leaves_of_entries
 
@@ -49,7 +59,7 @@ def scatter_turned(
 
 
 @wp.func
-def own_stress(elements: ForestElements, t: int, material: IsotropicMaterial, u: wp.array[wp.vec4]):
+def own_stress(elements: Any, t: int, material: IsotropicMaterial, u: wp.array[wp.vec4]):
     """First Piola-Kirchhoff stress of element t with its own rotation, times Q, for any F."""
     q = frame(elements, t)
     w = wp.transpose(q) * local_gradient(elements, t, u)
@@ -73,7 +83,7 @@ def root_rotation(roots: ForestElements, s: int, u: wp.array[wp.vec4]):
 # --- by a list ------------------------------------------------------------------------------------------------------
 
 
-@wp.kernel(enable_backward=False, grid_stride=False)
+@unique_kernel(grid_stride=False)
 def repair_listed_own(
     # In
     threads: int,
@@ -123,7 +133,7 @@ def repair_listed_own(
     leave(listed, threads // LIST_BLOCK)
 
 
-@wp.kernel(enable_backward=False, grid_stride=False)
+@unique_kernel(grid_stride=False)
 def repair_listed_shared(
     # In
     threads: int,
@@ -186,6 +196,52 @@ def repair_own(
 
 
 @wp.kernel(enable_backward=False)
+def repair_elements(
+    # In
+    elements: GeneralElements,
+    material: IsotropicMaterial,
+    u: wp.array[wp.vec4],
+    # In and out
+    listed: wp.array[wp.int32],
+    # Out
+    f: wp.array[wp.vec4],
+):
+    """Add the forces of listed elements (their number, then their indices), by one thread, which empties the list."""
+    for i in range(listed[0]):
+        t = listed[i + 1]
+        p = own_stress(elements, t, material, u)
+        scatter_stress(elements, t, p, f)
+    listed[0] = 0
+
+
+@wp.kernel(enable_backward=False)
+def turn_listed(
+    # In
+    elements: GeneralElements,
+    u: wp.array[wp.vec4],
+    # In and out
+    listed: wp.array[wp.int32],
+    # Out
+    gradients: wp.array[wp.vec4],
+):
+    """Write the kept gradients of listed elements, by one thread, which empties the list; see
+    ``corotated.kept_gradients``."""
+    for i in range(listed[0]):
+        t = listed[i + 1]
+        turn = robust_rotation(identity3() + local_gradient(elements, t, u))
+        rows = elements.rest_inverse[t]
+        root = wp.sqrt(elements.volume[t])
+        for n in range(3):
+            h = root * (turn * wp.vec3(rows[n, 0], rows[n, 1], rows[n, 2]))
+            for axis in range(3):
+                place = 18 * (t / 8) + 2 * (3 * n + axis) + (t % 8) / 4
+                four = gradients[place]
+                four[t % 4] = h[axis]
+                gradients[place] = four
+    listed[0] = 0
+
+
+@unique_kernel()
 def repair_shared(
     # In
     flagged: wp.array[wp.uint64],

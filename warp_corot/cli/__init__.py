@@ -175,14 +175,18 @@ def _run(argv: Sequence[str] | None) -> int:
         from warp_corot.inputs.starting import start_warp
 
         logging.basicConfig(format="warp-corot: warning: %(message)s", level=logging.WARNING)
+        try:
+            start_warp()
+        except OSError as error:
+            complain(
+                f"Warp's kernel cache {error.filename or ''}: {error.strerror or error}; name a folder that can be "
+                "written to in the environment variable WARP_CACHE_PATH"
+            )
+            return 1
+        if args.command in ("simulate", "view"):
+            from .compiling import begin_compiling
+
+            begin_compiling(args.device)
         module = subcommand(args.command)
-    try:
-        start_warp()
-    except OSError as error:
-        complain(
-            f"Warp's kernel cache {error.filename or ''}: {error.strerror or error}; name a folder that can be written "
-            "to in the environment variable WARP_CACHE_PATH"
-        )
-        return 1
     WATCH.switch("preparing")
     return module.run(args)

@@ -10,11 +10,14 @@ import functools
 import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import warp as wp
 
+from warp_corot.errors import InputError
+from warp_corot.inputs.device import checked_device
+from warp_corot.inputs.loading import BODY, begin_loading
 from warp_corot.inputs.stopwatch import KERNELS, WATCH
 
 from .exit_status import complain
@@ -51,6 +54,13 @@ def compiling_said(device: wp.Device, say: Say = say_plainly) -> Iterator[None]:
     finally:
         if tell in _waiting:
             _waiting.remove(tell)
+
+
+def begin_compiling(device: str | None) -> None:
+    """Begin to load what all runs launch, while Python imports the rest; that a device is not there is said later."""
+    _listen()
+    with suppress(InputError):
+        begin_loading(BODY, checked_device(device))
 
 
 @functools.cache

@@ -10,7 +10,17 @@ from dataclasses import dataclass
 import warp as wp
 
 from warp_corot.inputs.device import checked_device
-from warp_corot.inputs.loading import BODY, CONTACT, IMPLICIT, MESHING, STEPS, STEPS_ON_CPU, SURFACES, begin_loading
+from warp_corot.inputs.loading import (
+    BODY,
+    CONTACT,
+    EXPLICIT,
+    IMPLICIT,
+    MESHING,
+    STEPS,
+    STEPS_ON_CPU,
+    SURFACES,
+    begin_loading,
+)
 from warp_corot.inputs.stopwatch import WATCH
 from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import INTEGRATORS
@@ -123,11 +133,12 @@ def _modules(bodies: Sequence[RunBody], touches: bool, chooses: bool, device: wp
     """Modules of kernels that the run is known to launch, in the order in which it needs them."""
     meshed = any(body.opened.kind in ("surface", "scan") for body in bodies)
     names = [*SURFACES, *MESHING] if meshed else []
-    if device.is_cuda:
-        return [*names, *BODY, *STEPS]
     explicit = not INTEGRATORS[integrator_name(bodies[0].args)].is_implicit
-    names += [*(CONTACT if touches and explicit else ()), *BODY, *STEPS_ON_CPU]
-    return [*names, *(IMPLICIT if meshed and not touches and chooses and may_choose(bodies) else ())]
+    names += [*(CONTACT if touches and explicit and device.is_cpu else ()), *BODY]
+    names += STEPS_ON_CPU if device.is_cpu else STEPS
+    if meshed and not touches and chooses and may_choose(bodies):
+        return [*names, *IMPLICIT]
+    return [*names, *(EXPLICIT if explicit else ())]
 
 
 def _frames(args: argparse.Namespace, bodies: Sequence[RunBody], touched: RunContact) -> tuple[float, int]:

@@ -16,6 +16,7 @@ from warp_corot.discretization.members import Members
 from warp_corot.discretization.plan import FlatLeaves, Plan
 from warp_corot.discretization.subtrees import Batch, chosen
 from warp_corot.errors import InputError
+from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.forces import (
     element_energies,
@@ -143,7 +144,7 @@ class ForceField(ABC):
         return discretization.plan(subtrees=False, deterministic=self.deterministic)
 
     @property
-    def kernels(self) -> list[wp.Kernel]:
+    def kernels(self) -> list[LoadedKernel]:
         """Kernels of factories that steps on the CPU launch; each that is named is loaded beside others."""
         return []
 
@@ -382,11 +383,11 @@ class ElementField(ForceField):
         self._stress_function = stress
 
     @property
-    def kernels(self) -> list[wp.Kernel]:
+    def kernels(self) -> list[LoadedKernel]:
         return [*self._force_kernels, self._energies, self._von_mises]
 
     @property
-    def _force_kernels(self) -> list[wp.Kernel]:
+    def _force_kernels(self) -> list[LoadedKernel]:
         return [self._forces]
 
     @property

@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import cache
 from importlib import import_module
+from typing import TypeAlias
 
 import warp as wp
 
@@ -23,17 +24,17 @@ MESHING = (
     *("meshing.domain", "meshing.elements", "meshing.embedding", "meshing.growth"),
     *("meshing.coarsening", "meshing.surface_points", "meshing.leaves"),
 )
-#: Modules for bodies, and for their explicit steps.
+#: Modules for bodies, for all steps, and for explicit ones whose length is chosen.
 BODY = ("plan.lists", "plan.batches", "stepping.conditions")
-STEPS = ("stepping.integrate", "stepping.balance", "stepping.lanczos", "stepping.gauge", "stepping.pace")
+STEPS = ("stepping.integrate", "stepping.balance", "stepping.pace")
 STEPS_ON_CPU = ("elements.general_cpu", "subtrees.repair", *STEPS, "stepping.subnormals")
-#: Modules for implicit steps of bodies on forests on the CPU.
+EXPLICIT = ("stepping.lanczos", "stepping.gauge")
+#: Modules for implicit steps of bodies on forests.
 IMPLICIT = (
-    *("implicit.steps", "implicit.multigrid.values", "implicit.multigrid.pattern", "plan.levels", "implicit.newton"),
+    *("implicit.steps", "implicit.multigrid.values", "implicit.multigrid.pattern", "plan.levels", "implicit.residual"),
     *("elements.shared_rows", "implicit.tangent", "implicit.turning", "implicit.multigrid.shared"),
-    *("corotated.kept_gradients", "implicit.assembled", "implicit.multigrid.leaves_cpu"),
-    *("implicit.conjugate_gradients", "implicit.multigrid.sweeps", "implicit.multigrid.cycle", "implicit.lagged"),
-    *("implicit.sums", "implicit.chosen"),
+    *("implicit.assembled", "implicit.conjugate_gradients", "implicit.multigrid.sweeps"),
+    *("implicit.multigrid.cycle", "implicit.lagged", "implicit.sums", "implicit.chosen"),
 )
 #: Modules for explicit contact with obstacles on the CPU.
 CONTACT = (
@@ -41,21 +42,25 @@ CONTACT = (
     *("contact.watch", "contact.near", "contact.end", "contact.bearing"),
 )
 
-#: What was begun: modules by device.
-_begun: dict[tuple[wp.Module, str], Future] = {}
+#: A kernel, or one with the number of threads of its blocks on CUDA, if that is not Warp's default.
+LoadedKernel: TypeAlias = wp.Kernel | tuple[wp.Kernel, int]
+
+#: What was begun: modules by device and number of threads.
+_begun: dict[tuple[wp.Module, str, int | None], Future] = {}
 #: When loading began [s].
 _since: list[float] = []
 
 
-def begin_loading(names: Iterable[str], device: wp.Device, kernels: Iterable[wp.Kernel] = ()) -> list[Future]:
+def begin_loading(names: Iterable[str], device: wp.Device, kernels: Iterable[LoadedKernel] = ()) -> list[Future]:
     """Begin to load modules of ``warp_corot.kernels``, and those of kernels, in other threads and in this order."""
-    modules = [wp.get_module(import_module(f"warp_corot.kernels.{name}").__name__) for name in names]
+    modules = [(wp.get_module(import_module(f"warp_corot.kernels.{name}").__name__), None) for name in names]
+    pairs = [each if isinstance(each, tuple) else (each, None) for each in kernels]
     found = []
-    for module in (*modules, *(kernel.module for kernel in kernels)):
-        key = (module, str(device))
+    for module, threads in (*modules, *((kernel.module, threads) for kernel, threads in pairs)):
+        key = (module, str(device), threads)
         if key not in _begun:
             _since[:] = _since or [time.monotonic()]
-            _begun[key] = _threads().submit(wp.load_module, module, device)
+            _begun[key] = _threads().submit(wp.load_module, module, device, block_dim=threads)
         found.append(_begun[key])
     return found
 
@@ -70,11 +75,16 @@ def progress() -> tuple[int, int, float | None] | None:
     return done, count, left if 4 * done >= count else None
 
 
-def load(names: Iterable[str], device: wp.Device, kernels: Iterable[wp.Kernel] = ()) -> None:
+def load(names: Iterable[str], device: wp.Device, kernels: Iterable[LoadedKernel] = ()) -> None:
     """Load modules as `begin_loading` does, and wait for them."""
+    wait_for(begin_loading(names, device, kernels))
+
+
+def wait_for(modules: Iterable[Future]) -> None:
+    """Wait for modules that are being loaded."""
     try:
         with WATCH.part(KERNELS):
-            for module in begin_loading(names, device, kernels):
+            for module in modules:
                 module.result()
     except BaseException:
         give_up()

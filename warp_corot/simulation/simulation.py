@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from os import PathLike
 from typing import NoReturn
 
@@ -26,7 +27,17 @@ from warp_corot.discretization.nodal import vec3_view
 from warp_corot.elasticity import Corotated, Model
 from warp_corot.errors import InputError, StabilityWarning, depth_of_user
 from warp_corot.inputs.checks import checked_count, checked_flag, checked_number, refuse_tape
-from warp_corot.inputs.loading import CONTACT, IMPLICIT, STEPS, STEPS_ON_CPU, load
+from warp_corot.inputs.loading import (
+    CONTACT,
+    EXPLICIT,
+    IMPLICIT,
+    STEPS,
+    STEPS_ON_CPU,
+    LoadedKernel,
+    begin_loading,
+    load,
+    wait_for,
+)
 from warp_corot.inputs.simulation_lock import SIMULATION_LOCK, under_lock
 from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.remesh.cut import Surface
@@ -145,7 +156,7 @@ class Simulation(Clock):
         self.fields = tuple(m.bind(body, deterministic=self.deterministic) for m, body in bound)
         self.remeshing.serve(self.fields)
         self.system = System(self.bodies, self.fields, self.pace, self.gravity, self.ranks)
-        self._load_kernels(touches=touching is not None)
+        loading = self._load_kernels(touches=touching is not None)
         stable = self._find_stable_steps()
         #: Keeps bodies out of obstacles and out of one another; None without contact.
         self.contact: Contacts | None = None
@@ -163,23 +174,25 @@ class Simulation(Clock):
         self.safe_step = SafeStep(self.system, self.models, stable) if given is None else None
         self.guard = Guard(self.system)
         self.stepper = self.integrator.bind(self.system)
+        wait_for(loading)
         check_constraints(self.system, self.stepper, self.integrator)
         self.recorded = RecordedSteps(self.system, self.stepper, self.guard, self.safe_step)
         #: Makes the steps.
         self.running = Running(self)
 
-    def _load_kernels(self, touches: bool) -> None:
-        """Load the kernels that steps are known to launch, several modules at a time."""
-        if self.device.is_cuda:
-            load(STEPS, self.device)
-            return
-        explicit = not self.integrator.is_implicit
-        kernels = [find_strains(body.discretization.element_kind) for body in self.bodies if self.integrator.dt is None]
-        kernels += [kernel for field in self.fields for kernel in field.kernels]
+    def _load_kernels(self, touches: bool) -> list[Future]:
+        """Load the kernels that steps are known to launch, several modules at a time; returns those to wait for."""
+        explicit, chosen, on_cpu = not self.integrator.is_implicit, self.integrator.dt is None, self.device.is_cpu
+        names = [*(STEPS_ON_CPU if on_cpu else STEPS), *(EXPLICIT if chosen else ())]
+        if touches and explicit and on_cpu:
+            names = [*CONTACT, *names]
         if not explicit and any(body.discretization.element_kind is ForestElements for body in self.bodies):
-            load((*STEPS_ON_CPU, *IMPLICIT), self.device, kernels)
-        else:
-            load((*(CONTACT if touches and explicit else ()), *STEPS_ON_CPU), self.device, kernels)
+            names += IMPLICIT
+        kernels: list[LoadedKernel] = [find_strains(b.discretization.element_kind) for b in self.bodies if chosen]
+        kernels += [kernel for field in self.fields for kernel in field.kernels]
+        # Explicit steps need the forces at once, to find their length.
+        load(names, self.device, kernels if explicit else ())
+        return begin_loading((), self.device, kernels)
 
     # --- stepping --------------------------------------------------------------------------------------------------
 

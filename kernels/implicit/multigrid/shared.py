@@ -9,19 +9,19 @@ Smoothing takes the diagonal with these weights, and so keeps its bound. On coar
 nodes and few have more, ``bound_diagonal`` keeps it.
 """
 
-import functools
-
 import warp as wp
 
 from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.kernels.elements.elements import ForestElements, nodal_forces, rest_volume
 from warp_corot.kernels.elements.forces import in_local_frame, own_gradient
 from warp_corot.kernels.elements.shared_rows import GroupNodes, first_entry
-from warp_corot.kernels.modules import unique_kernel
+from warp_corot.kernels.modules import Family
 
 from .pattern import key_of
 
 wp.set_module_options({"enable_backward": False})
+
+OF_MATRIX = Family(__name__)
 
 
 @wp.kernel(enable_backward=False)
@@ -84,12 +84,12 @@ def kept_share(lam: float, mu: float, most: float):
     return share
 
 
-@functools.cache
+@OF_MATRIX.member
 def write_rows(of: Dilatation) -> wp.Kernel:
     """Write the rows at displacements u, with w - 1 in the fourth lane; lambda counts as ``most`` mu at most."""
     measure, curvature_of = of.measure, of.curvature
 
-    @unique_kernel()
+    @OF_MATRIX.kernel()
     def write_rows(
         # In
         world_elements: int,
@@ -145,12 +145,12 @@ def write_rows(of: Dilatation) -> wp.Kernel:
     return write_rows
 
 
-@functools.cache
+@OF_MATRIX.member
 def add_held_blocks(of: Dilatation) -> wp.Kernel:
     """Add the stiffness of elements that are held from turning over, off the diagonal; see ``elements.dilatation``."""
     measure, holding = of.measure, of.holding
 
-    @unique_kernel()
+    @OF_MATRIX.kernel()
     def add_held_blocks(
         # In
         world_elements: int,

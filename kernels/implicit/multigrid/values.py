@@ -108,7 +108,7 @@ class Leaves:
     rows: wp.array[wp.vec4]
 
 
-@wp.kernel(enable_backward=False)
+@unique_kernel()
 def gather_leaves(
     # In
     leaves: Leaves,

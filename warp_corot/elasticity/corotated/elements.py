@@ -18,6 +18,7 @@ from warp_corot.elasticity.stress_law import StressLaw
 from warp_corot.elasticity.structs import Kept
 from warp_corot.elasticity.tangent import Tangent
 from warp_corot.errors import InputError
+from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.corotated.corotated import (
     extract_rotations,
     given_cauchy,
@@ -26,13 +27,13 @@ from warp_corot.kernels.corotated.corotated import (
     own_stress,
     scatter_matrix_product,
 )
-from warp_corot.kernels.corotated.energy import own_density
+from warp_corot.kernels.corotated.energy import own_energies, own_von_mises
 from warp_corot.kernels.corotated.tangent import exact_differential, given_differential, own_differential
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
-from warp_corot.kernels.elements.elements import GeneralElements
-from warp_corot.kernels.elements.forces import element_energies, element_von_mises, repair_forces, scatter_forces
+from warp_corot.kernels.elements.forces import element_energies, element_von_mises, scatter_forces
 from warp_corot.kernels.elements.general_cpu import scatter_law_elements
-from warp_corot.kernels.math.rotation import byers_xu, quick_rotation
+from warp_corot.kernels.math.rotation import quick_rotation
+from warp_corot.kernels.subtrees.repair import repair_elements
 
 from .tangents import ExactTangent, KeptExactTangent, KeptTangent, RotatedTangent
 
@@ -83,12 +84,7 @@ def rotated_material(isotropic: IsotropicMaterial, rotations: wp.array, unit: wp
 
 def general_lanes(elements: Elements) -> Lanes:
     """Launches over general elements on the CPU, each with its own rotation."""
-    return Lanes(elements, elements, scatter=scatter_law_elements("corotated"), repair=repair_elements())
-
-
-def repair_elements() -> wp.Kernel:
-    """The kernel for the general elements that those launches leave out."""
-    return repair_forces(GeneralElements, IsotropicMaterial, own_stress(byers_xu))
+    return Lanes(elements, elements, scatter=scatter_law_elements("corotated"), repair=repair_elements)
 
 
 class CorotatedField(ForceField):
@@ -110,17 +106,20 @@ class CorotatedField(ForceField):
             self._forces = scatter_forces(kind, RotatedMaterial, given_stress)
         else:
             self._forces = scatter_matrix_product(model.stiffness == "sparse")
-        self._energies = element_energies(kind, RotatedMaterial, given_density)
-        in_one = model.level is None and model.own_rotation is quick_rotation
-        self._own_energies = element_energies(kind, IsotropicMaterial, own_density) if in_one else None
-        self._von_mises = element_von_mises(kind, RotatedMaterial, given_cauchy)
+        self._has_own_outputs = model.level is None and model.own_rotation is quick_rotation
+        if self._has_own_outputs:
+            self._energies, self._von_mises = own_energies(kind), own_von_mises(kind)
+        else:
+            self._energies = element_energies(kind, RotatedMaterial, given_density)
+            self._von_mises = element_von_mises(kind, RotatedMaterial, given_cauchy)
 
     @property
-    def kernels(self) -> list[wp.Kernel]:
-        return [*self._force_kernels, self._extract, self._von_mises, self._own_energies or self._energies]
+    def kernels(self) -> list[LoadedKernel]:
+        of_rotations = [] if self._has_own_outputs else [self._extract]
+        return [*self._force_kernels, *of_rotations, self._von_mises, self._energies]
 
     @property
-    def _force_kernels(self) -> list[wp.Kernel]:
+    def _force_kernels(self) -> list[LoadedKernel]:
         return [self._own if self._fused else self._forces]
 
     @property
@@ -226,15 +225,17 @@ class CorotatedField(ForceField):
         return StressLaw(own_stress(rotation), exact_differential(rotation), self.isotropic)
 
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
-        if self._own_energies is not None:
-            self.launch(self._own_energies, self.element_count, [self.elements, self.isotropic, u], [energies])
-            return
-        self.extract_rotations(u)
-        self._launch_with_rotations(self._energies, self.isotropic, u, energies)
+        self._write(self._energies, self.isotropic, u, energies)
 
     def write_von_mises(self, u: wp.array, stress: wp.array) -> None:
+        self._write(self._von_mises, self.isotropic_shown, u, stress)
+
+    def _write(self, kernel: wp.Kernel, isotropic: IsotropicMaterial, u: wp.array, output: wp.array) -> None:
+        if self._has_own_outputs:
+            self.launch(kernel, self.element_count, [self.elements, isotropic, u], [output])
+            return
         self.extract_rotations(u)
-        self._launch_with_rotations(self._von_mises, self.isotropic_shown, u, stress)
+        self._launch_with_rotations(kernel, isotropic, u, output)
 
     def _sharing(self) -> Rotations:
         """The units whose rotations elements use; made on first use, because forces with own rotations do not need
@@ -279,10 +280,10 @@ class LanesField(CorotatedField):
         self._lanes = general_lanes(self.elements)
 
     @property
-    def _force_kernels(self) -> list[wp.Kernel]:
+    def _force_kernels(self) -> list[LoadedKernel]:
         groups = None if self._dilating is None else self._dilating.groups
         forces = scatter_law_elements("corotated") if groups is None else groups.kernel("corotated")
-        return [forces, repair_elements()]
+        return [forces, repair_elements]
 
     def share_dilatation(self, dilating: Dilating) -> bool:
         self._dilating = dilating
@@ -297,4 +298,4 @@ class LanesField(CorotatedField):
         if self._dilating is None or self._dilating.groups is None:
             self._lanes.scatter_forces(self.isotropic, u, f)
         else:
-            self._dilating.groups.scatter_forces("corotated", u, f, repair_elements())
+            self._dilating.groups.scatter_forces("corotated", u, f, repair_elements)

@@ -43,10 +43,8 @@ class LeftOutLeaves:
         own = [batch.count for batch in plan.batches if batch.sharing is Sharing.OWN]
         return cls([*own, len(plan.flat)], [batch for batch in plan.batches if batch.sharing is Sharing.ROOT], device)
 
-    @staticmethod
-    def load(device: wp.Device) -> None:
-        """Compile the kernels that launches will need."""
-        wp.load_module(repair_listed_own.module, device, block_dim=LIST_BLOCK)
+    #: The kernel for leaves with own rotations.
+    kernel = (repair_listed_own, LIST_BLOCK)
 
     def list_of(self, batch: Batch) -> LeftOut:
         """The list that a batch's kernel appends to."""

@@ -11,6 +11,7 @@ from warp_corot.discretization.awaited import Awaited
 from warp_corot.discretization.plan import FlatLeaves, Plan
 from warp_corot.discretization.subtrees import GROUPED_LEAVES, Batch
 from warp_corot.elasticity.paths.clusters import ChangingClusterScatter, ClusterScatter, grouped_and_others
+from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.clusters.laws import isotropic_law
 from warp_corot.kernels.corotated.algebraic import corotated_stress
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
@@ -78,6 +79,14 @@ class OwnLaunches:
         is_divided = self._awaited is not None and self._awaited.is_used
         return (self._clusters, self.batches) if isinstance(self._clusters, ClusterScatter) and not is_divided else None
 
+    @property
+    def kernels(self) -> list[LoadedKernel]:
+        """The kernels that launches take."""
+        found: list[LoadedKernel] = [(self._kernel(batch), BLOCK) for batch in self.batches if self._is_single]
+        if self._stretches is not None:
+            found.append((scatter_stretches(self._material.stride == 0), BLOCK))
+        return [*found, *([self._clusters.kernel] if isinstance(self._clusters, ClusterScatter) else [])]
+
     @staticmethod
     def suit(plan: Plan) -> bool:
         """Whether a plan of own rotations has more than one large batch, or may come to have."""
@@ -86,9 +95,9 @@ class OwnLaunches:
         return 8 * sum(batch.count for batch in plan.batches if batch.grouped) < UNIFORM_LEAVES
 
     @staticmethod
-    def load(uniform: bool, device: wp.Device) -> None:
-        """Compile the kernels that launches over a changing mesh will need."""
-        wp.load_module(scatter_stretches(uniform).module, device, block_dim=BLOCK)
+    def later_kernel(uniform: bool) -> LoadedKernel:
+        """The kernel that launches over a changing mesh take."""
+        return scatter_stretches(uniform), BLOCK
 
     def scatter_forces(self, u: wp.array, f: wp.array, left_out: LeftOut) -> None:
         """Add the forces of displacements u to f, both vec4, and put subtrees with leaves left out on a list."""
@@ -117,10 +126,11 @@ class OwnLaunches:
                 self._clusters(self._material, u, f)
 
     def _launch(self, batch: Batch, u: wp.array, f: wp.array, left_out: LeftOut) -> None:
-        material = self._material
-        kernel = scatter_subtrees_own(batch.shape, True, material.stride == 0, True)
-        inputs, outputs = [batch.subtrees, material, u], [f, batch.flagged, left_out]
-        wp.launch(kernel, batch.count, inputs=inputs, outputs=outputs, device=self._device, block_dim=BLOCK)
+        inputs, outputs = [batch.subtrees, self._material, u], [f, batch.flagged, left_out]
+        wp.launch(self._kernel(batch), batch.count, inputs, outputs, device=self._device, block_dim=BLOCK)
+
+    def _kernel(self, batch: Batch) -> wp.Kernel:
+        return scatter_subtrees_own(batch.shape, True, self._material.stride == 0, True)
 
 
 def _fewest_grouped(plan: Plan) -> int:

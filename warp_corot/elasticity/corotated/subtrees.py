@@ -19,6 +19,7 @@ from warp_corot.elasticity.paths.grouped import GroupedLanes
 from warp_corot.elasticity.paths.lanes import Lanes, as_general
 from warp_corot.elasticity.structs import Kept
 from warp_corot.elasticity.tangent import Tangent
+from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.clusters.laws import isotropic_law
 from warp_corot.kernels.corotated.algebraic import corotated_stress
 from warp_corot.kernels.corotated.near_rotations import share_near_rotations
@@ -28,14 +29,13 @@ from warp_corot.kernels.elements.general_cpu import rest_matrices, scatter_law_e
 from warp_corot.kernels.elements.lanes import LANES
 from warp_corot.kernels.subtrees import cpu as subtree_cpu
 from warp_corot.kernels.subtrees import cuda as subtree_cuda
-from warp_corot.kernels.subtrees.repair import repair_own, repair_shared
+from warp_corot.kernels.subtrees.repair import repair_elements, repair_own, repair_shared
 
 from .elements import (
     CorotatedField,
     CorotatedOptions,
     Rotations,
     general_lanes,
-    repair_elements,
     rotated_material,
 )
 from .left_out import LeftOutLeaves
@@ -74,30 +74,28 @@ class SubtreeField(CorotatedField):
             self._clusters.derive()
 
     @property
-    def _force_kernels(self) -> list[wp.Kernel]:
-        of_subtrees = [self._kernel(*kind) for kind in self.plan.kinds]
+    def _force_kernels(self) -> list[LoadedKernel]:
+        if self._own_launches is not None:
+            return [*self._own_launches.kernels, LeftOutLeaves.kernel]
+        of_subtrees: list[LoadedKernel] = [(self._kernel(*kind), self._block) for kind in self.plan.kinds]
         if self._groups is not None:
-            return [*of_subtrees, self._groups.kernel("corotated"), repair_elements()]
+            return [*of_subtrees, self._groups.kernel("corotated"), repair_elements]
         if self._flat_lanes is not None:
-            return [*of_subtrees, scatter_law_elements("corotated"), repair_elements()]
-        return of_subtrees
+            return [*of_subtrees, scatter_law_elements("corotated"), repair_elements]
+        of_leaves = [self._own if self.plan.flat.unit is None else self._forces] if len(self.plan.flat) else []
+        return [*of_subtrees, *of_leaves]
 
     def load_kernels(self) -> None:
         one_launch = self._listed and self.rotation_level is None
-        for shape, grouped, sharing in () if one_launch else self.plan.kinds:
-            kernel = self._kernel(shape, grouped, sharing)
-            wp.load_module(kernel.module, self.device, block_dim=self._block)
-        single = [self._forces, self._own, self._extract, repair_own]
+        kinds = () if one_launch else self.plan.kinds
+        found: list[LoadedKernel] = [(self._kernel(*kind), self._block) for kind in kinds]
+        found += [self._forces, self._own, self._extract, repair_own]
         if self._groups is not None:
-            single += [self._groups.kernel("corotated"), repair_elements()]
+            found += [self._groups.kernel("corotated"), repair_elements]
         elif self.device.is_cpu:
-            single += [scatter_law_elements("corotated"), repair_elements()]
-        for kernel in single:
-            wp.load_module(kernel.module, self.device)
-        if self._listed:
-            LeftOutLeaves.load(self.device)
-        if one_launch:
-            OwnLaunches.load(self._uniform, self.device)
+            found += [scatter_law_elements("corotated"), repair_elements]
+        found += [LeftOutLeaves.kernel] if self._listed else []
+        load((), self.device, [*found, *([OwnLaunches.later_kernel(self._uniform)] if one_launch else [])])
 
     def share_dilatation(self, dilating: Dilating) -> bool:
         if self.device.is_cuda or any(sharing is not Sharing.OWN for _shape, _grouped, sharing in self.plan.kinds):
@@ -182,7 +180,7 @@ class SubtreeField(CorotatedField):
             self._launch_batch(batch, kernel, material, u, f)
         flat = self.plan.flat
         if self._groups is not None:
-            self._groups.scatter_forces("corotated", u, f, repair_elements())
+            self._groups.scatter_forces("corotated", u, f, repair_elements)
         elif len(flat):
             isotropic = self._flat_material
             if self._flat_lanes is not None:

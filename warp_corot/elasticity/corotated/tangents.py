@@ -16,13 +16,13 @@ from warp_corot.kernels.corotated.kept_gradients import (
     KeptGradients,
     add_kept_product,
     turn_gradients,
-    turn_listed,
 )
 from warp_corot.kernels.corotated.tangent import KeptStrains, keep_strains, kept_differential
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.elements.general_cpu import rest_matrices
 from warp_corot.kernels.elements.lanes import LANES
+from warp_corot.kernels.subtrees.repair import turn_listed
 
 if TYPE_CHECKING:
     from .elements import CorotatedField

@@ -10,6 +10,7 @@ import warp as wp
 
 from warp_corot.elasticity.paths.clusters import SUBTREE, ClusterScatter
 from warp_corot.elasticity.structs import Kept
+from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.clusters.sharing import SharingMaterial, measure_pairs, shared_pressure, sharing_law
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import Dilatation
@@ -52,6 +53,11 @@ class ClusteredGroups:
             shared_pressure(of),
             lambda isotropic: made(isotropic, lam(), self._listed, self._sums),
         )
+
+    @property
+    def kernel(self) -> LoadedKernel:
+        """The kernel of the sums."""
+        return self._kernel, self._scatter.layout.threads
 
     def add_up(self, stride: int, u: wp.array) -> None:
         """Launch the sums of the groups' dilatation at displacements u, before the forces; ``stride`` is lambda's."""

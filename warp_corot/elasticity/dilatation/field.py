@@ -19,6 +19,7 @@ from warp_corot.discretization.subtrees import Batch
 from warp_corot.elasticity.model import ForceField, SmallForces
 from warp_corot.elasticity.paths.dilating import Dilating
 from warp_corot.elasticity.tangent import Tangent
+from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.elements import shared_diagonal
 from warp_corot.kernels.elements import shared_dilatation as kernels
 from warp_corot.kernels.elements.dilatation import VOLUME, Dilatation
@@ -110,18 +111,18 @@ class DilatationField(ForceField):
         return self.plan.batches if self._clustered is None else self._kept
 
     @property
-    def kernels(self) -> list[wp.Kernel]:
-        own = [kernels.measure_elements(self.kind, self.of), kernels.scatter_pressures(self.kind, self.of)]
-        own += [kernels.unshare(self.kind, self.of), kernels.add_energies(self.kind, self.of)]
-        own.append(kernels.share_in_groups(self.kind, kernels.law_at(self.of)))
+    def kernels(self) -> list[LoadedKernel]:
+        own: list[LoadedKernel] = [(self._kernel(batch.shape, batch.grouped), self._block) for batch in self._batches]
+        own += [] if self._clustered is None else [self._clustered.kernel]
+        in_groups = kernels.share_in_groups(self.kind, kernels.law_at(self.of))
+        own += [kernels.measure_elements(self.kind, self.of), in_groups, *self._others.kernels]
         return [*self.shear.kernels, *own]
 
     def load_kernels(self) -> None:
         self.shear.load_kernels()
-        for shape, grouped, _sharing in [] if self._joined else self.plan.kinds:
-            wp.load_module(self._kernel(shape, grouped).module, self.device, block_dim=self._block)
-        for kernel in self._others.kernels:
-            wp.load_module(kernel.module, self.device, block_dim=256)
+        kinds = [] if self._joined else self.plan.kinds
+        own = [(self._kernel(shape, grouped), self._block) for shape, grouped, _sharing in kinds]
+        load((), self.device, [*own, *self._others.kernels])
 
     def derive(self) -> None:
         self._others.derive()

@@ -36,8 +36,7 @@ class SharedTangent(Tangent):
 
     @property
     def kernels(self) -> list[wp.Kernel]:
-        of = self.field.kind, self.field.of
-        return [*self.shear.kernels, kernels.write_rows(*of), *([kernels.add_held(*of)] if self._holds else [])]
+        return [*self.shear.kernels, kernels.write_rows(self.field.kind, self.field.of)]
 
     def prepare(self, u: wp.array) -> None:
         super().prepare(u)

@@ -15,6 +15,7 @@ from warp_corot.discretization.clusters.single import axis_words, changing_clust
 from warp_corot.discretization.elements import Elements
 from warp_corot.discretization.plan import FlatLeaves, LeafCounts, Plan
 from warp_corot.discretization.subtrees import GROUPED_LEAVES, Batch
+from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.clusters.elements import AlignedElements, align_elements
 from warp_corot.kernels.clusters.laws import ActiveMaterial
 from warp_corot.kernels.clusters.pair_elements import GeneralPairs, LatticePairs
@@ -127,6 +128,11 @@ class ClusterScatter:
         """
         self.layout = replace(self.layout, resident=self.layout.resident - 1)
         self._kernel, self._wrapped = scatter_pairs(self.Pairs, Material, law, self.layout, given), wrapped
+
+    @property
+    def kernel(self) -> LoadedKernel:
+        """The kernel that launches take."""
+        return self._kernel, self.layout.threads
 
     def __call__(
         self, material: IsotropicMaterial | ActiveMaterial | ReinforcedMaterial, u: wp.array, f: wp.array

@@ -11,6 +11,7 @@ from warp_corot.discretization.clusters.single import order_in_clusters
 from warp_corot.discretization.elements import in_worlds
 from warp_corot.elasticity.corotated.elements import CorotatedOptions, LeafField
 from warp_corot.elasticity.model import LawField
+from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.clusters.laws import isotropic_law
 from warp_corot.kernels.elements.general_cuda import corotated_law
 from warp_corot.mesh import TetForest
@@ -53,6 +54,10 @@ class LawGeneralField(LawField):
         self._scatter = ClusterScatter(self.elements, isotropic_law(stress), chosen=clustered(discretization))
 
     @property
+    def _force_kernels(self) -> list[LoadedKernel]:
+        return [self._scatter.kernel]
+
+    @property
     def in_clusters(self) -> tuple[ClusterScatter, Sequence[Batch]]:
         return self._scatter, ()
 
@@ -67,6 +72,10 @@ class CorotatedGeneralField(LeafField):
         super().__init__(discretization, model, deterministic=False)
         law = isotropic_law(corotated_law(model.own_rotation))
         self._scatter = ClusterScatter(self.elements, law, chosen=clustered(discretization))
+
+    @property
+    def _force_kernels(self) -> list[LoadedKernel]:
+        return [self._scatter.kernel]
 
     @property
     def in_clusters(self) -> tuple[ClusterScatter, Sequence[Batch]]:

@@ -9,6 +9,7 @@ import warp as wp
 from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.plan import Plan
 from warp_corot.elasticity.model import LawField
+from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.elements.general_cpu import rest_matrices, scatter_law_elements
 from warp_corot.kernels.elements.lanes import LANES
 from warp_corot.kernels.elements.law_lanes import LawInLanes
@@ -42,7 +43,7 @@ class LawLanesField(LawField):
         return discretization.plan()
 
     @property
-    def _force_kernels(self) -> list[wp.Kernel]:
+    def _force_kernels(self) -> list[LoadedKernel]:
         kernels = [self._kernel(shape) for shape, _grouped, _sharing in self.plan.kinds]
         dilating, of_leaves = self._dilating, scatter_law_elements(self._law)
         if dilating is not None and dilating.groups is not None:
@@ -50,8 +51,7 @@ class LawLanesField(LawField):
         return [*kernels, of_leaves]
 
     def load_kernels(self) -> None:
-        for kernel in self._force_kernels:
-            wp.load_module(kernel.module, self.device, block_dim=256)
+        load((), self.device, self._force_kernels)
 
     def _kernel(self, shape: int) -> wp.Kernel:
         return scatter_law_subtrees(shape, self._law, None if self._dilating is None else self._dilating.of)

@@ -9,6 +9,7 @@ import warp as wp
 from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.plan import Plan
 from warp_corot.elasticity.model import LawField
+from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.clusters.laws import isotropic_law
 from warp_corot.kernels.subtrees import cuda as subtree_cuda
 from warp_corot.kernels.subtrees.laws import scatter_subtrees
@@ -49,10 +50,15 @@ class LawSubtreeField(LawField):
     def plan_of(self, discretization: Discretization) -> Plan:
         return discretization.plan(deterministic=self.deterministic)
 
+    @property
+    def _force_kernels(self) -> list[LoadedKernel]:
+        of_subtrees: list[LoadedKernel] = [(kernel, subtree_cuda.BLOCK) for kernel in self._kernels]
+        of_subtrees += [] if self._flat is None else [self._forces]
+        return [*of_subtrees, *([] if self._clusters is None else [self._clusters.kernel])]
+
     def load_kernels(self) -> None:
-        for shape, grouped, _sharing in self.plan.kinds:
-            wp.load_module(self._kernel(shape, grouped).module, self.device, block_dim=subtree_cuda.BLOCK)
-        wp.load_module(self._forces.module, self.device)
+        kernels = [self._kernel(shape, grouped) for shape, grouped, _sharing in self.plan.kinds]
+        load((), self.device, [self._forces, *((kernel, subtree_cuda.BLOCK) for kernel in kernels)])
 
     def follow(self) -> None:
         self._batches, self._flat, self._clusters = others_in_clusters(self.plan, isotropic_law(self._stress))

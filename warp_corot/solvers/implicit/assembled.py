@@ -12,6 +12,7 @@ import warp as wp
 
 from warp_corot.elasticity.corotated.elements import CorotatedField
 from warp_corot.elasticity.dilatation.field import DilatationField
+from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.implicit import assembled as kernels
 from warp_corot.kernels.implicit.multigrid import values
@@ -191,9 +192,10 @@ class AssembledSolve:
         self._barriers = wp.zeros(STRIDE * teams, dtype=wp.uint32, device=self.device)
 
     @property
-    def kernels(self) -> list[wp.Kernel]:
-        """Kernels of factories that it launches."""
-        return [kernel for body in self._bodies for kernel in body.leaves.kernels]
+    def kernels(self) -> list[LoadedKernel]:
+        """Kernels that it launches, beside those of ``loading.IMPLICIT``."""
+        found: list[LoadedKernel] = [kernel for body in self._bodies for kernel in body.leaves.kernels]
+        return [*found, *([(kernels.solve, self._block)] if self.device.is_cuda else [])]
 
     # --- launches ----------------------------------------------------------------------------------------------------
 

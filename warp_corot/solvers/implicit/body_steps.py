@@ -140,8 +140,7 @@ class BodySteps:
         )
         if not exact and isinstance(self.preconditioner, Multigrid):
             self.preconditioner = Lagged(self.preconditioner, self.operator, system.ranks)
-        if self.device.is_cpu:
-            load((), self.device, self.operator.tangent.kernels)
+        load((), self.device, self.operator.tangent.kernels)
         self.newton: Newton
         like = self.body.state.displacements
         self._none = wp.zeros(1, dtype=wp.vec4, device=self.device)

@@ -11,6 +11,7 @@ import warp as wp
 
 from warp_corot.kernels.implicit import newton as kernels
 from warp_corot.kernels.implicit.increments import move_held
+from warp_corot.kernels.implicit.residual import FIND_RESIDUAL
 
 from .block_system import BlockSystem
 from .sums import WorldSums
@@ -161,7 +162,7 @@ class Newton:
         inputs: list[Any] = [self.gravity, conditions.mass, conditions.inverse_mass, int(conditions.has_loads)]
         inputs += [conditions.loads, self.external_share, self.inertia, self.pull, self.increment, *sums.sizes]
         outputs = [self.forces, body.state.forces, self.residual, self._outer, sums.parts]
-        kernel = kernels.FIND_RESIDUAL[conditions.loads.dtype]
+        kernel = FIND_RESIDUAL[conditions.loads.dtype]
         wp.launch(kernel, sums.shape, inputs, outputs, device=self.device)
         sums.take_in(int(kernels.SQUARE), int(kernels.REFERENCE))
 

@@ -129,8 +129,7 @@ class StepSolve:
             return None
         blocks = VectorBlocks([len(operator.inverse_mass) for operator in operators])
         assembled = AssembledSolve(operators, blocks, together=self._soft is not None, touches=self._touches)
-        if assembled.device.is_cpu:
-            load((), assembled.device, assembled.kernels)
+        load((), assembled.device, assembled.kernels)
         shares = any(body.field.shares_dilatation for body in bodies)
         return ChosenSolve(assembled, operators, lagged, shares=shares, dt=options.dt)
 

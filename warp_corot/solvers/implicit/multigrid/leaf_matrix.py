@@ -64,11 +64,9 @@ class LeafMatrix:
 
     @property
     def kernels(self) -> list[wp.Kernel]:
-        """Kernels of factories that it launches."""
-        if self._members is None:
-            return [self._write_frames]
-        law = self._members.law
-        return [self._write_frames, shared.write_rows(law), shared.add_held_blocks(law)]
+        """Kernels that it launches, beside those of ``loading.IMPLICIT``."""
+        found = [self._write_frames, gather_leaves_on_cpu if self.device.is_cpu else values.gather_leaves]
+        return found if self._members is None else [*found, shared.write_rows(self._members.law)]
 
     @property
     def _elements(self) -> ForestElements:

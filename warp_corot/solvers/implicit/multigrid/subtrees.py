@@ -15,6 +15,7 @@ import warp as wp
 from warp_corot.discretization.discretization import Discretization, FixedMesh
 from warp_corot.discretization.members import Members
 from warp_corot.discretization.subtrees import Batch
+from warp_corot.inputs.loading import load
 from warp_corot.kernels.corotated import turned_subtrees
 from warp_corot.kernels.elements.elements import ForestElements, Subtrees
 from warp_corot.kernels.implicit.multigrid import diagonals, roots, subtrees
@@ -161,8 +162,7 @@ class SubtreeLevel(SmoothedLevel):
         self._product = [turned_subtrees.add_subtree_products(*kind) for kind in kinds]
         self._diagonal = [diagonals.add_diagonals(*kind) for kind in kinds]
         self._roots = [roots.write_roots(*kind) for kind in kinds]
-        for kernel in self._product + self._diagonal + self._roots:
-            wp.load_module(kernel.module, self.device, block_dim=self._block)
+        load((), self.device, [(kernel, self._block) for kernel in self._product + self._diagonal + self._roots])
 
     def _launch_subtrees(self, kernel: wp.Kernel, batch: Batch, inputs: list[Any], outputs: list[Any]) -> None:
         wp.launch(kernel, batch.count, inputs, outputs, device=self.device, block_dim=self._block)
