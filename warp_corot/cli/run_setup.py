@@ -134,8 +134,7 @@ def _modules(bodies: Sequence[RunBody], touches: bool, chooses: bool, device: wp
     meshed = any(body.opened.kind in ("surface", "scan") for body in bodies)
     names = [*SURFACES, *MESHING] if meshed else []
     explicit = not INTEGRATORS[integrator_name(bodies[0].args)].is_implicit
-    names += [*(CONTACT if touches and explicit and device.is_cpu else ()), *BODY]
-    names += STEPS_ON_CPU if device.is_cpu else STEPS
+    names += [*BODY, *(CONTACT if touches and explicit else ()), *(STEPS_ON_CPU if device.is_cpu else STEPS)]
     if meshed and not touches and chooses and may_choose(bodies):
         return [*names, *IMPLICIT]
     return [*names, *(EXPLICIT if explicit else ())]

@@ -25,9 +25,9 @@ MESHING = (
     *("meshing.coarsening", "meshing.surface_points", "meshing.leaves"),
 )
 #: Modules for bodies, for all steps, and for explicit ones whose length is chosen.
-BODY = ("plan.lists", "plan.batches", "stepping.conditions")
+BODY = ("plan.lists", "plan.batches", "elements.general_cpu", "stepping.conditions")
 STEPS = ("stepping.integrate", "stepping.balance", "stepping.pace")
-STEPS_ON_CPU = ("elements.general_cpu", "subtrees.repair", *STEPS, "stepping.subnormals")
+STEPS_ON_CPU = ("subtrees.repair", *STEPS, "stepping.subnormals")
 EXPLICIT = ("stepping.lanczos", "stepping.gauge")
 #: Modules for implicit steps of bodies on forests.
 IMPLICIT = (
@@ -36,7 +36,7 @@ IMPLICIT = (
     *("implicit.assembled", "implicit.conjugate_gradients", "implicit.multigrid.sweeps"),
     *("implicit.multigrid.cycle", "implicit.lagged", "implicit.sums", "implicit.chosen"),
 )
-#: Modules for explicit contact with obstacles on the CPU.
+#: Modules for explicit contact with obstacles.
 CONTACT = (
     *("contact.mass_split", "contact.begin", "contact.sums", "contact.beside", "contact.sleep", "contact.overlaps"),
     *("contact.watch", "contact.near", "contact.end", "contact.bearing"),
@@ -52,11 +52,11 @@ _since: list[float] = []
 
 
 def begin_loading(names: Iterable[str], device: wp.Device, kernels: Iterable[LoadedKernel] = ()) -> list[Future]:
-    """Begin to load modules of ``warp_corot.kernels``, and those of kernels, in other threads and in this order."""
+    """Begin to load modules of kernels, and modules of ``warp_corot.kernels``, in other threads and in this order."""
     modules = [(wp.get_module(import_module(f"warp_corot.kernels.{name}").__name__), None) for name in names]
     pairs = [each if isinstance(each, tuple) else (each, None) for each in kernels]
     found = []
-    for module, threads in (*modules, *((kernel.module, threads) for kernel, threads in pairs)):
+    for module, threads in (*((kernel.module, threads) for kernel, threads in pairs), *modules):
         key = (module, str(device), threads)
         if key not in _begun:
             _since[:] = _since or [time.monotonic()]

@@ -39,6 +39,7 @@ from warp_corot.inputs.loading import (
     wait_for,
 )
 from warp_corot.inputs.simulation_lock import SIMULATION_LOCK, under_lock
+from warp_corot.kernels.contact.crushed import count_crushed
 from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.remesh.cut import Surface
 from warp_corot.kernels.stepping.gauge import find_strains
@@ -184,11 +185,12 @@ class Simulation(Clock):
         """Load the kernels that steps are known to launch, several modules at a time; returns those to wait for."""
         explicit, chosen, on_cpu = not self.integrator.is_implicit, self.integrator.dt is None, self.device.is_cpu
         names = [*(STEPS_ON_CPU if on_cpu else STEPS), *(EXPLICIT if chosen else ())]
-        if touches and explicit and on_cpu:
+        if touches and explicit:
             names = [*CONTACT, *names]
         if not explicit and any(body.discretization.element_kind is ForestElements for body in self.bodies):
             names += IMPLICIT
-        kernels: list[LoadedKernel] = [find_strains(b.discretization.element_kind) for b in self.bodies if chosen]
+        kernels: list[LoadedKernel] = [find_strains(body.discretization.element_kind) for body in self.bodies if chosen]
+        kernels += [count_crushed(body.discretization.element_kind) for body in self.bodies if touches]
         kernels += [kernel for field in self.fields for kernel in field.kernels]
         # Explicit steps need the forces at once, to find their length.
         load(names, self.device, kernels if explicit else ())
