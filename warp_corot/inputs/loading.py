@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import cache
 from importlib import import_module
+from types import ModuleType
 from typing import TypeAlias
 
 import warp as wp
@@ -52,8 +53,11 @@ _since: list[float] = []
 
 
 def begin_loading(names: Iterable[str], device: wp.Device, kernels: Iterable[LoadedKernel] = ()) -> list[Future]:
-    """Begin to load modules of kernels, and modules of ``warp_corot.kernels``, in other threads and in this order."""
-    modules = [(wp.get_module(import_module(f"warp_corot.kernels.{name}").__name__), None) for name in names]
+    """Begin to load modules of kernels, and modules of ``warp_corot.kernels``, in other threads and in this order.
+
+    A module with a ``BLOCK`` is loaded for so many threads of a block."""
+    files = [import_module(f"warp_corot.kernels.{name}") for name in names]
+    modules = [(wp.get_module(file.__name__), block_of(file)) for file in files]
     pairs = [each if isinstance(each, tuple) else (each, None) for each in kernels]
     found = []
     for module, threads in (*((kernel.module, threads) for kernel, threads in pairs), *modules):
@@ -63,6 +67,12 @@ def begin_loading(names: Iterable[str], device: wp.Device, kernels: Iterable[Loa
             _begun[key] = _threads().submit(wp.load_module, module, device, block_dim=threads)
         found.append(_begun[key])
     return found
+
+
+def block_of(file: ModuleType) -> int | None:
+    """The number of threads of a block with which a file's kernels are launched on CUDA; None: Warp's default."""
+    block = getattr(file, "BLOCK", None)
+    return None if block is None else int(block)
 
 
 def progress() -> tuple[int, int, float | None] | None:
