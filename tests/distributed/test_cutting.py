@@ -7,10 +7,10 @@ import pytest
 
 import warp_corot as wc
 from warp_corot.distributed import boxes
-from warp_corot.distributed.boxes import numbered_nodes
 from warp_corot.distributed.cutting import cut_box
 from warp_corot.distributed.partition import Partition
 from warp_corot.distributed.parts import part_of_mesh
+from warp_corot.distributed.root_cube_partition import numbered_points
 from warp_corot.mesh.lattice import LATTICE_BITS
 from warp_corot.mesh.tree import Tree
 from warp_corot.mesh.uniform import halvings
@@ -103,7 +103,7 @@ def test_copies_get_their_numbers_from_the_ranks_that_move_them():
             return none if len(sent) == 1 else [told(k, keys) for k, keys in enumerate(sent[0])]
 
         comm = SimpleNamespace(rank=rank, size=3, allgather=lambda _: counts, alltoall=alltoall)
-        numbers, count = numbered_nodes(cut, comm)
+        numbers, count = numbered_points(cut.owner, cut.keys, comm)
         _, nodes = part_of_mesh(mesh, dealt.needed(mesh, rank), dealt)
         np.testing.assert_array_equal(numbers, nodes)
         assert count == len(mesh.points)

@@ -162,10 +162,10 @@ def test_a_part_without_subtrees_has_the_forces_of_the_whole():
 def test_a_divided_forest_is_made_whole_again():
     mesh = wc.TetForest.from_domain(wc.Domain.sphere(0.05), target_elements=1000)
     parts, fewest = [], len(mesh.tree.level)
-    for kind, place, options in pieces_of(mesh, dealt(mesh, 3)):
+    for (kind, place, options), _ in pieces_of(mesh, dealt(mesh, 3)):
         parts.append({})
         part = kind(*place, **options)
-        told = pack_part(part, "", parts[-1])
+        told = pack_part(part, parts[-1])
         fewest = min(fewest, len(part.tree.level))
     whole = rejoined(told, parts)
     for name in ("tets", "points", "fill", "levels"):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -14,10 +13,9 @@ from warp_corot.mesh.uniform import halvings
 from warp_corot.mesh.uniform_part import SUBTREE_DEPTH
 
 from . import mpi
-from .cutting import Cut, cut_box
+from .cutting import cut_box
 from .divided_mesh import DividedForest, Numbers
-
-Longs = npt.NDArray[np.int64]
+from .root_cube_partition import numbered_points
 
 #: Elements and grid points of the whole box are numbered in 64 bits.
 MOST_ELEMENTS = 2**58
@@ -57,7 +55,7 @@ def box(
     if count > MOST_ELEMENTS:
         raise InputError(f"level is {level}, which gives {count} tetrahedra; there must be at most {MOST_ELEMENTS}")
     cut = cut_box(cells, level, comm.size, comm.rank, costs)
-    nodes, node_count = numbered_nodes(cut, comm)
+    nodes, node_count = numbered_points(cut.owner, cut.keys, comm)
     here = tuple(np.arange(n, dtype=np.int32) for n in (len(nodes), len(cut.elements)))
     numbers = Numbers(nodes, cut.elements, cut.owner, cut.counted, node_count, *here)
     highest = (np.array(cells) << LATTICE_BITS) * (cell_size / 2**LATTICE_BITS)
@@ -74,26 +72,3 @@ def box(
         element_count=count,
         bounds=np.array([origin, np.asarray(origin) + highest]),
     )
-
-
-def numbered_nodes(cut: Cut, comm: Any) -> tuple[Longs, int]:
-    """The numbers of a part's nodes in the whole box, int64 [n], and the number of nodes of the whole box.
-
-    The nodes of the whole box are in the order in which its leaves first name them. So the nodes that a rank moves have
-    consecutive numbers; the rank sends them to the ranks that hold copies. All ranks must call this.
-
-    Args:
-        cut: This rank's part.
-        comm: The ranks.
-    """
-    own = np.flatnonzero(cut.owner == comm.rank)
-    counts = comm.allgather(len(own))
-    found = np.full(len(cut.owner), -1, np.int64)
-    found[own] = sum(counts[: comm.rank]) + np.arange(len(own))
-    ghosts = [np.flatnonzero((cut.owner == rank) & (found < 0)) for rank in range(comm.size)]
-    asked = comm.alltoall([cut.keys[nodes] for nodes in ghosts])
-    order = own[np.argsort(cut.keys[own])]
-    told = [found[order[np.searchsorted(cut.keys[order], keys)]] for keys in asked]
-    for nodes, numbers in zip(ghosts, comm.alltoall(told), strict=True):
-        found[nodes] = numbers
-    return found, sum(counts)

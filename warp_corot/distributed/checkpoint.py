@@ -1,53 +1,54 @@
 """Checkpoints of a run on several ranks: the files that one process would write, from which any number of ranks can
-resume."""
+resume, and one process."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from os import PathLike
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
-from warp_corot.io.checkpoint.archive import save_checkpoint
+from warp_corot.io.checkpoint.archive import load_checkpoint, save_checkpoint
+from warp_corot.io.checkpoint.contact import obstacles_of, pack_obstacles
 
-from .contact_checkpoint import gathered_contact, resume_contact
+from .contact_checkpoint import SurfaceShare, gathered_contact, packed, resume_contact
 from .mpi import all_or_none
 from .part_simulation import PartSimulation
 from .part_sync import PartSync
+from .scatter_bodies import gathered_body, handed_bodies
 
 if TYPE_CHECKING:
     from warp_corot.simulation.simulation import Simulation
 
 #: The beginnings of the names of kept nodal arrays; other kept arrays are the same on all ranks.
 DIRECTIONS, VELOCITIES, HISTORY, MEETINGS, SETUP = "directions", "velocities.", "history.", "meetings.", "setup."
+#: What a simulation is made with, and what else it continues from.
+MADE_WITH = ("models", "integrator", "gravity", "deterministic")
+RESUMED = ("stable_dt", "steps_before_reset", "time_before_reset")
 
 
 @dataclass(frozen=True, eq=False)
 class Values:
     """Numbers in place of an array on a device."""
 
-    values: np.ndarray
+    values: Any
 
-    def numpy(self) -> np.ndarray:
+    def numpy(self) -> Any:
         return self.values
 
 
-def save(
-    path: str | PathLike[str],
-    bodies: tuple[SoftBody, ...],
-    parts: PartSimulation,
-    syncs: list[PartSync],
-    comm: Any,
-) -> None:
-    """Write a checkpoint on rank 0; all ranks must call this, with bodies in which all nodes are up to date.
+def save(path: str | PathLike[str], parts: PartSimulation, syncs: list[PartSync], comm: Any) -> None:
+    """Write a checkpoint on rank 0, which gets the whole bodies for that; all ranks must call this, with bodies in
+    which all nodes are up to date if every rank holds them.
 
     Args:
         path: The file.
-        bodies: The whole bodies.
         parts: This rank's simulation of parts.
         syncs: The ``PartSync`` of each body.
         comm: The ranks.
@@ -55,35 +56,72 @@ def save(
     Raises:
         InputError: On all ranks, if rank 0 cannot write.
     """
+    wholes = [gathered_body(each, comm) for each in syncs]
     kept = {}
     for name, array in parts.kept.items():
-        values = array.numpy()
-        k = body_of(name, parts)
-        if k is not None:
-            values = syncs[k].whole_values(values)
-        kept[name] = Values(values)
-    contact = None
-    if parts.contact is not None:
-        contact = gathered_contact(parts, syncs, comm)
+        k, values = body_of(name, parts), array.numpy()
+        kept[name] = Values(values) if k is None else Values(syncs[k].gather_part(values))
+    contact = None if parts.contact is None else gathered_contact(parts, syncs, wholes, comm)
     guard = parts.guard.state
 
     def write() -> None:
         if comm.rank != 0:
             return
+        names = (*MADE_WITH, *RESUMED, "device", "worlds", "fields", "remeshing", "running")
         told = SimpleNamespace(
-            **{name: getattr(parts, name) for name in ("stable_dt", "steps_before_reset", "time_before_reset")},
-            **{name: getattr(parts, name) for name in ("device", "gravity", "integrator", "deterministic", "worlds")},
-            **{name: getattr(parts, name) for name in ("models", "fields", "remeshing")},
-            bodies=bodies,
+            **{name: getattr(parts, name) for name in names},
+            bodies=wholes,
             kept=kept,
             guard=SimpleNamespace(state=guard),
-            running=parts.running,
             contact=contact,
             grasps=(),
         )
-        save_checkpoint(told, path)  # type: ignore[arg-type]
+        save_checkpoint(told, path, in_parts=any(each.is_in_parts for each in syncs))  # type: ignore[arg-type]
 
     all_or_none(write, comm)
+
+
+def device_of_parts(path: str | PathLike[str]) -> str | None:
+    """The device of a checkpoint of bodies in parts, or this rank's card; None if the file is another one."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            header = json.loads(archive["header"].tobytes())
+    except Exception:  # whoever reads it as a checkpoint says what is wrong
+        return None
+    return ("cpu" if header["device"] == "cpu" else str(wp.get_device())) if header.get("in_parts") else None
+
+
+def load_in_parts(path: str | PathLike[str], device: str | wp.Device, comm: Any) -> tuple[list[SoftBody], Any]:
+    """This rank's parts of the bodies of a checkpoint that rank 0 reads, and what a simulation of them continues from;
+    all ranks must call this.
+
+    Raises:
+        InputError: On all ranks, as ``load_checkpoint``.
+    """
+    sims: list[Simulation] = []
+
+    def told(nodes: list[npt.NDArray[np.int64]]) -> SimpleNamespace:
+        (sim,) = sims
+        kept = {}
+        for name, array in sim.kept.items():
+            k, values = body_of(name, sim), array.numpy()
+            kept[name] = Values(values if k is None else values[nodes[k]])
+        given = {name: getattr(sim, name) for name in (*MADE_WITH, *RESUMED)}
+        here = SimpleNamespace(**given, kept=kept, contact=None, obstacles=None)
+        here.guard, here.running = (SimpleNamespace(state=each.state) for each in (sim.guard, sim.running))
+        if sim.contact is not None:
+            arrays: dict[str, Any] = {}
+            here.obstacles = pack_obstacles(sim.contact, arrays), arrays
+            here.contact = packed(sim.contact, SurfaceShare.of(sim.body)).at(nodes[0])
+        return here
+
+    def bodies() -> list[SoftBody]:
+        sims.append(load_checkpoint(path, "cpu"))
+        return list(sims[0].bodies)
+
+    parts, here, _ = handed_bodies(bodies, told, device, comm)
+    here.touching = {} if here.obstacles is None else obstacles_of(*here.obstacles)
+    return parts, here
 
 
 def body_of(name: str, parts: Simulation) -> int | None:
@@ -103,18 +141,15 @@ def resume(loaded: Simulation | SimpleNamespace, parts: PartSimulation, syncs: l
     """Resume a simulation of parts from a saved one.
 
     Args:
-        loaded: The simulation that one process loads from the checkpoint.
+        loaded: The simulation that one process loads from the checkpoint, or what ``load_in_parts`` gives.
         parts: This rank's simulation of parts of the same bodies.
         syncs: The ``PartSync`` of each body.
     """
     for name, array in parts.kept.items():
-        values = loaded.kept[name].numpy()
-        k = body_of(name, parts)
-        if k is not None:
-            values = syncs[k].part_values(values)
-        array.assign(values)
-    parts.steps_before_reset, parts.time_before_reset = loaded.steps_before_reset, loaded.time_before_reset
-    parts.stable_dt = loaded.stable_dt
+        k, values = body_of(name, parts), loaded.kept[name].numpy()
+        array.assign(values if k is None else syncs[k].part_values(values))
+    for name in RESUMED:
+        setattr(parts, name, getattr(loaded, name))
     if loaded.contact is not None:
         resume_contact(loaded.contact, parts, syncs)
     parts.guard.resume(**loaded.guard.state)

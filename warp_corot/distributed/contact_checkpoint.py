@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.contacts import Contacts
 from warp_corot.contact.keeping import keep_again, kept_arrays
-from warp_corot.io.checkpoint.contact import obstacles_of, pack_obstacles
 from warp_corot.solvers.system import System
 
 from .part_simulation import PartSimulation, of_their_own
@@ -58,11 +56,29 @@ class SurfaceShare:
         return node, (node >= 0) & self.own[node]
 
 
-def packed(here: Contacts, share: SurfaceShare) -> tuple[Arrays, Arrays]:
-    """What one step leaves for the next: arrays of the nodes that this rank moves, and of triangles."""
+@dataclass(frozen=True, eq=False)
+class Touch:
+    """What one step leaves for the next.
+
+    Attributes:
+        nodal, triangles: Arrays of nodes, and of the triangles around them.
+        common: What is the same on all ranks: poses and wrenches of obstacles, and the law.
+    """
+
+    nodal: Arrays
+    triangles: Arrays
+    common: Arrays
+
+    def at(self, nodes: npt.NDArray[np.integer]) -> Touch:
+        """The same of some of the nodes."""
+        return replace(self, nodal={name: values[nodes] for name, values in self.nodal.items()})
+
+
+def packed(here: Contacts, share: SurfaceShare) -> Touch:
+    """That of the nodes that a rank moves."""
     assert here.rigid is not None
     node, chosen = share.places(here)
-    nodal: Arrays = {}
+    nodal: Arrays = {"body": here.system.bodies[0].state.contact_forces.numpy()[: len(share.own)][share.own]}
     triangles: Arrays = {"triangles": share.triangles}
     for name in NODAL:
         values = np.moveaxis(getattr(here.rigid, name).numpy(), 0, 1)
@@ -74,7 +90,7 @@ def packed(here: Contacts, share: SurfaceShare) -> tuple[Arrays, Arrays]:
         values = getattr(here.rigid.touches, name).numpy()[:, : share.worlds * count]
         shape = (len(values), share.worlds, count, 3)
         triangles[name] = np.moveaxis(values.reshape(shape), 2, 0) if values.size else np.zeros(0)
-    return nodal, triangles
+    return Touch(nodal, triangles, common_of(here))
 
 
 def take(here: Contacts, share: SurfaceShare, nodal: Arrays, pieces: Sequence[Arrays]) -> None:
@@ -110,102 +126,66 @@ def take(here: Contacts, share: SurfaceShare, nodal: Arrays, pieces: Sequence[Ar
     here.search.forget()
 
 
-def gathered_contact(parts: PartSimulation, everything: Sequence[PartSync], comm: Any) -> Contacts | None:
+def gathered_contact(
+    parts: PartSimulation, everything: Sequence[PartSync], wholes: Sequence[SoftBody | None], comm: Any
+) -> Contacts | None:
     """The state from which contact of the whole body continues, on rank 0; None elsewhere. All ranks must call this.
 
     Args:
         parts: This rank's simulation of its parts.
-        everything: The ``PartSync`` of each body; the whole bodies have contact forces of all nodes.
+        everything: The ``PartSync`` of each body.
+        wholes: On rank 0 the whole bodies; those that other ranks hold, too, have contact forces of all nodes.
         comm: The ranks.
     """
     here = parts.contact
     assert here is not None
+    body = wholes[0]
     if here.surface.is_whole:
         # All ranks have all of it.
         kept = copy.copy(here)
-        kept.system = SimpleNamespace(bodies=[each.whole for each in everything])  # type: ignore[assignment]
+        kept.system = SimpleNamespace(bodies=wholes)  # type: ignore[assignment]
         return kept if comm.rank == 0 else None
-    part, body = everything[0].part, everything[0].whole
-    given = comm.gather((everything[0].own_nodes, *packed(here, SurfaceShare.of(part))), root=0)
+    touch = packed(here, SurfaceShare.of(everything[0].part))
+    given = comm.gather((everything[0].numbers, touch), root=0)
     if given is None:
         return None
-    forces = wp.clone(body.state.contact_forces)
+    assert body is not None
+    nodal: Arrays = {}
+    for nodes, each in given:
+        for name, values in each.nodal.items():
+            nodal.setdefault(name, np.zeros((body.node_count, *values.shape[1:]), values.dtype))[nodes] = values
     system = System([body], (), parts.pace, parts.gravity)
     whole = Contacts(system, of_their_own(here.obstacles.given), here.options, stable_dt=parts.stable_dt)
-    body.state.contact_forces.assign(forces)
-    nodal: Arrays = {}
-    for nodes, own, _ in given:
-        for name, values in own.items():
-            nodal.setdefault(name, np.zeros((body.node_count, *values.shape[1:]), values.dtype))[nodes] = values
-    take(whole, SurfaceShare.of(body), nodal, [triangles for *_, triangles in given])
-    _take_common(whole, common_of(here))
+    take(whole, SurfaceShare.of(body), nodal, [each.triangles for _, each in given])
+    body.state.contact_forces.assign(nodal["body"])
+    _take_common(whole, touch.common)
     return whole
 
 
-def resume_contact(loaded: Contacts, parts: PartSimulation, everything: Sequence[PartSync]) -> None:
+def resume_contact(loaded: Contacts | Touch, parts: PartSimulation, everything: Sequence[PartSync]) -> None:
     """Continue from the contact of the whole body.
 
     Args:
-        loaded: That contact.
+        loaded: That contact; or of a body in parts, what is left of it here.
         parts: This rank's simulation of its parts.
         everything: The ``PartSync`` of each body.
     """
-    here = parts.contact
+    here, part = parts.contact, everything[0].part
     assert here is not None
     if here.surface.is_whole:
+        assert isinstance(loaded, Contacts)
         kept = {name: array.numpy() for name, array in kept_arrays(loaded).items()}
         keep_again(here, loaded.surface.rooms, 0 if loaded.pairs is None else loaded.pairs.room, kept)
+        common = common_of(loaded)
+        for each in everything:
+            each.take_contact_forces()
     else:
-        part, (nodal, triangles) = everything[0].part, packed(loaded, SurfaceShare.of(everything[0].whole))
-        everywhere = part.numbers.in_worlds(part.worlds)
-        take(here, SurfaceShare.of(part), {name: values[everywhere] for name, values in nodal.items()}, [triangles])
-    _take_common(here, common_of(loaded))
-    for each in everything:
-        each.take_contact_forces()
-
-
-def pack_touch(here: Contacts, sync: PartSync, piece: Arrays) -> dict[str, Any]:
-    """Put this rank's contact into its piece; returns what is the same on all ranks.
-
-    Args:
-        here: Contact of this rank's part.
-        sync: The ``PartSync`` of the body.
-        piece: The piece.
-    """
-    part = sync.part
-    nodal, triangles = packed(here, SurfaceShare.of(part))
-    assert part.state.contact_forces is not None
-    nodal["body"] = part.state.contact_forces.numpy()[: len(part.is_own)][part.is_own]
-    obstacles = common_of(here)
-    described = pack_obstacles(here, obstacles)
-    for prefix, arrays in (("nodes0/contact.", nodal), ("touched/", triangles), ("same/contact.", obstacles)):
-        piece |= {prefix + name: values for name, values in arrays.items()}
-    return described
-
-
-def obstacles_in(described: dict[str, Any] | None, arrays: Arrays) -> dict[str, Any]:
-    """The arguments ``obstacles`` and ``contact`` of a simulation."""
-    return obstacles_of(described, _of_contact(arrays))
-
-
-def resume_touch(arrays: Arrays, pieces: Sequence[Arrays], parts: PartSimulation, sync: PartSync) -> None:
-    """Continue from the contact of a checkpoint in parts.
-
-    Args:
-        arrays: Arrays of the nodes of this rank's part, and those that are the same on all ranks.
-        pieces: The arrays of triangles of all pieces.
-        parts: This rank's simulation of its part.
-        sync: The ``PartSync`` of the body.
-    """
-    here, given = parts.contact, _of_contact(arrays)
-    assert here is not None
-    take(here, SurfaceShare.of(sync.part), given, pieces)
-    sync.publish()  # makes room for forces
-    forces = sync.whole.state.contact_forces
-    assert forces is not None
-    forces.assign(given["body"])
-    _take_common(here, given)
-    sync.take_contact_forces()
+        if isinstance(loaded, Contacts):
+            loaded = packed(loaded, SurfaceShare.of(everything[0].whole)).at(part.numbers.in_worlds(part.worlds))
+        take(here, SurfaceShare.of(part), loaded.nodal, [loaded.triangles])
+        part.state.contact_forces.assign(np.where(part.is_own[:, None], loaded.nodal["body"], 0.0))
+        common = loaded.common
+    _take_common(here, common)
 
 
 def common_of(here: Contacts) -> Arrays:
@@ -221,7 +201,3 @@ def _take_common(to: Contacts, common: Arrays) -> None:
     for name in MOTIONS:
         getattr(to.obstacles.motions, name).assign(common[f"motions.{name}"])
     to.obstacles.wrenches.assign(common["wrenches"])
-
-
-def _of_contact(arrays: Arrays) -> Arrays:
-    return {name.removeprefix("contact."): values for name, values in arrays.items() if name.startswith("contact.")}

@@ -13,7 +13,7 @@ from warp_corot.mesh.tree import Tree
 from warp_corot.mesh.uniform import halvings
 from warp_corot.mesh.uniform_part import SUBTREE_DEPTH, uniform_part, vertices_of
 
-from .partition import checked_shares
+from .partition import checked_shares, nobody_empty
 
 Ints = npt.NDArray[np.int32]
 Longs = npt.NDArray[np.int64]
@@ -89,12 +89,8 @@ def dealt_starts(subtrees: int, ranks: int, costs: npt.ArrayLike | None) -> Long
     leaves, half = 1 << SUBTREE_DEPTH, 1 << (SUBTREE_DEPTH - 1)
     # A subtree belongs to the rank whose share contains its middle.
     bounds = np.cumsum(shares)[:-1] * (leaves * subtrees)
-    turn = np.arange(ranks)
     starts = np.concatenate([[0], np.ceil((bounds - half) / leaves)]).astype(np.int64)
-    starts = np.maximum.accumulate(np.maximum(starts - turn, 0)) + turn
-    starts = np.minimum(starts, subtrees - ranks + turn)
-    starts[0] = 0
-    return np.append(starts, subtrees)
+    return np.append(nobody_empty(starts, subtrees), subtrees)
 
 
 def keys_of(nodes: Ints, cells: tuple[int, int, int], intervals: int) -> Longs:

@@ -16,7 +16,7 @@ from warp_corot.mesh.numbering import in_order_of_leaves, renumbered, with_virtu
 from .divided_mesh import DividedForest, Numbers, of_whole
 from .faces import faces_of
 from .parts import part_of_forest
-from .root_cube_partition import RootCubePartition, places_of
+from .root_cube_partition import RootCubePartition, numbered_points, places_of
 
 Ints = npt.NDArray[np.int32]
 Longs = npt.NDArray[np.int64]
@@ -57,7 +57,7 @@ def joined(own: TetForest, partition: RootCubePartition) -> DividedForest:
     first, first_row = sum(leaves[: comm.rank]), sum(rows[: comm.rank])
     keys = partition.keys(own.lattice)
     owner = _owners(own, keys, partition)
-    numbers, node_count = _numbers(owner, own.node_count, keys, comm)
+    numbers, node_count = numbered_points(owner, keys, comm)
     groups = group_numbers(own, np.arange(len(own.tets)))
     outer = faces_of(own.tets, own.lattice, first, partition).outer
 
@@ -101,28 +101,6 @@ def _owners(own: TetForest, keys: Longs, partition: RootCubePartition) -> Ints:
         both = found >= 0
         owner[mine[both]] = np.minimum(owner[mine[both]], claims[found[both]])
     return owner
-
-
-def _numbers(owner: Ints, node_count: int, keys: Longs, comm: Any) -> tuple[Longs, int]:
-    """The numbers of lattice points in the whole mesh, int64, and the number of its nodes.
-
-    Nodes are in the order in which the leaves of the whole mesh first name them; lattice points that no leaf names
-    follow, rank after rank.
-    """
-    found = np.full(len(owner), -1, np.int64)
-    before = 0
-    for claim in (comm.rank, comm.rank + comm.size):
-        mine = np.flatnonzero(owner == claim)
-        counts = comm.allgather(len(mine))
-        found[mine] = before + sum(counts[: comm.rank]) + np.arange(len(mine))
-        if claim == comm.rank:
-            before = total = sum(counts)
-    ghosts = [np.flatnonzero((owner % comm.size == rank) & (found < 0)) for rank in range(comm.size)]
-    asked = comm.alltoall([keys[each] for each in ghosts])
-    told = comm.alltoall([found[places_of(each, keys)] for each in asked])
-    for places, numbers in zip(ghosts, told, strict=True):
-        found[places] = numbers
-    return found, total
 
 
 def _together(branches: list[Branch], *, node_count: int, **whole: Any) -> DividedForest:

@@ -29,7 +29,7 @@ from .faces import faces_of
 from .ghost_layer import joined
 from .parallel_closure import GrowingTogether
 from .parallel_slivers import Elements, without_slivers
-from .partition import checked_shares
+from .partition import checked_shares, nobody_empty
 from .root_cube_partition import RootCubePartition, key_room
 
 if TYPE_CHECKING:
@@ -130,9 +130,7 @@ def _starts(
         raise InputError(f"the body is in {len(used)} cubes for {ranks} ranks; take fewer ranks, or smaller cubes")
     middle = np.cumsum(of_cube[used]) - 0.5 * of_cube[used]
     first = np.searchsorted(middle, np.cumsum(shares)[:-1] * of_cube.sum())
-    turn = np.arange(1, ranks)
-    first = np.maximum.accumulate(np.maximum(first - turn, 0)) + turn
-    first = np.minimum(first, len(used) - ranks + turn)
+    first = nobody_empty(np.append(0, first), len(used))[1:]
     return np.concatenate([[0], used[first], [len(of_cube)]]).astype(np.int64)
 
 

@@ -48,7 +48,7 @@ class PartSync:
         elements = in_worlds(part.numbers.element_places, worlds, whole.world_element_count)
         self._elements = Places(elements, np.arange(len(elements), dtype=np.int32), *devices)
         #: The numbers of this rank's nodes in the whole mesh, int64; and the number of nodes of the whole mesh.
-        self._everywhere = part.numbers.in_worlds(worlds)[own]
+        self.numbers = part.numbers.in_worlds(worlds)[own]
         self._total = worlds * part.numbers.node_count
         #: The number in the part of each node that this rank moves, -1 for others.
         self._number = np.full(worlds * count, -1, np.int32)
@@ -153,21 +153,23 @@ class PartSync:
         elsewhere.
         """
         values = array.numpy()
-        given = self._comm.gather((self._everywhere, values[self.own_nodes]), root=0)
+        return self._together(values[self.own_nodes], None if self.is_in_parts else values)
+
+    def gather_part(self, values: npt.NDArray[Any]) -> npt.NDArray[Any] | None:
+        """Values of all nodes of the whole body on rank 0, from those of the parts' nodes, [n, …]; zero at nodes of no
+        element, and in the room for nodes of a body that is remeshed. None elsewhere.
+        """
+        room = None if self.is_in_parts else np.zeros((len(self.whole.state.displacements), *values.shape[1:]))
+        return self._together(values[self._number[self.own_nodes]], room)
+
+    def _together(self, own: npt.NDArray[Any], elsewhere: npt.NDArray[Any] | None) -> npt.NDArray[Any] | None:
+        given = self._comm.gather((self.numbers, own), root=0)
         if given is None:
             return None
-        found = np.zeros((self._total, *values.shape[1:]), values.dtype) if self.is_in_parts else values.copy()
-        for nodes, own in given:
-            found[nodes] = own
-        return found
-
-    def whole_values(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Values of all nodes of the whole body on all ranks, from those of the parts' nodes, [n, …]; zero at nodes of
-        no element, and in the room for nodes of a body that is remeshed.
-        """
-        found = np.zeros((len(self.whole.state.displacements), *values.shape[1:]), values.dtype)
-        for nodes, own in self._comm.allgather((self.own_nodes, values[self._number[self.own_nodes]])):
-            found[nodes] = own
+        found = np.zeros((self._total, *own.shape[1:])) if elsewhere is None else elsewhere
+        found = found.astype(own.dtype)
+        for nodes, values in given:
+            found[nodes] = values
         return found
 
     def part_values(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:

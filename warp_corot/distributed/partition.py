@@ -83,7 +83,7 @@ class Partition:
         else:
             ends = np.cumsum(sizes) - 0.5 * sizes
             rank_of_group = np.searchsorted(np.cumsum(shares)[:-1] * len(groups), ends, side="right")
-            rank_of_group = _nobody_empty(rank_of_group, ranks)
+            rank_of_group = _without_gaps(rank_of_group, ranks)
             rank = np.empty(len(groups), np.int32)
             rank[order] = np.repeat(rank_of_group, sizes)
         owner = np.full(len(mesh.points), ranks, np.int32)
@@ -139,13 +139,20 @@ def _ordered(groups: Ints) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
     return np.argsort(place[inverse], kind="stable"), sizes[turn]
 
 
-def _nobody_empty(rank_of_group: npt.NDArray[np.intp], ranks: int) -> npt.NDArray[np.intp]:
-    """The same ascending ranks, changed so that each has at least one group."""
-    count = len(rank_of_group)
-    starts = np.searchsorted(rank_of_group, np.arange(ranks))
-    starts = np.maximum.accumulate(np.maximum(starts - np.arange(ranks), 0)) + np.arange(ranks)
-    starts = np.minimum(starts, count - ranks + np.arange(ranks))
-    starts[0] = 0
+def nobody_empty(starts: npt.NDArray[np.integer], count: int) -> npt.NDArray[np.int64]:
+    """The same ascending first items of each rank, changed so that each of the ranks has at least one of ``count``."""
+    turn = np.arange(len(starts))
+    found: npt.NDArray[np.int64] = np.minimum(
+        np.maximum.accumulate(np.maximum(starts - turn, 0)) + turn, count - len(starts) + turn
+    )
+    found[0] = 0
+    return found
+
+
+def _without_gaps(rank_of_item: npt.NDArray[np.intp], ranks: int) -> npt.NDArray[np.intp]:
+    """The same ascending ranks, changed so that each has at least one item."""
+    count = len(rank_of_item)
+    starts = nobody_empty(np.searchsorted(rank_of_item, np.arange(ranks)), count)
     return np.searchsorted(starts, np.arange(count), side="right") - 1
 
 
@@ -176,7 +183,7 @@ def _along_curve(mesh: TetMesh, ranks: int, shares: npt.NDArray[np.float64]) -> 
     order = np.argsort(along_curve(centre, centre.min(axis=0), extent), kind="stable")
     turn = np.searchsorted(np.cumsum(shares)[:-1] * len(order), np.arange(len(order)) + 0.5, side="right")
     rank = np.empty(len(order), np.int32)
-    rank[order] = _nobody_empty(turn, ranks)
+    rank[order] = _without_gaps(turn, ranks)
     return rank
 
 

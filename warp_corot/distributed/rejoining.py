@@ -1,4 +1,4 @@
-"""Divided meshes in checkpoints: each rank's arrays, and the whole mesh that they make together."""
+"""Divided meshes put together: each rank's arrays, and the whole mesh that they make."""
 
 from __future__ import annotations
 
@@ -16,9 +16,8 @@ from .divided_mesh import DividedForest, DividedTetMesh
 Arrays = dict[str, npt.NDArray[Any]]
 
 
-def pack_part(mesh: DividedForest | DividedTetMesh, prefix: str, arrays: Arrays) -> dict[str, Any]:
-    """Put a rank's part of a divided mesh into arrays whose names begin with ``prefix``; returns what is the same on
-    all ranks."""
+def pack_part(mesh: DividedForest | DividedTetMesh, arrays: Arrays) -> dict[str, Any]:
+    """Put a rank's part of a divided mesh into arrays; returns what is the same on all ranks."""
     numbers = mesh.numbers
     counted = np.flatnonzero(numbers.counted)
     found: Arrays = {"nodes": numbers.nodes, "elements": numbers.elements[counted]}
@@ -26,7 +25,9 @@ def pack_part(mesh: DividedForest | DividedTetMesh, prefix: str, arrays: Arrays)
     described |= {"element_count": mesh.element_count, "node_count": numbers.node_count}
     if mesh.labels is not None:
         found["labels"] = mesh.labels[counted]
-    if isinstance(mesh, DividedForest):
+    if isinstance(mesh, DividedForest) and mesh.is_box:
+        described |= {"level": int(mesh.tree.leaf_levels[0])}
+    elif isinstance(mesh, DividedForest):
         assert numbers.tree is not None
         assert numbers.lattice is not None
         tree, points = mesh.tree, numbers.lattice
@@ -38,16 +39,17 @@ def pack_part(mesh: DividedForest | DividedTetMesh, prefix: str, arrays: Arrays)
         found |= {"parent": _numbered(tree.parent, numbers.tree), "child": _numbered(first_child, numbers.tree)}
         if mesh.fill is not None:
             found["fill"] = mesh.fill[counted]
-        described |= {"cells": mesh.cells, "cell_size": mesh.cell_size, "origin": mesh.origin}
     else:
         found |= {"coordinates": mesh.points, "tets": numbers.nodes[mesh.tets[counted]]}
         found |= {f"set.{name}": mask for name, mask in mesh.node_sets.items()}
-    arrays |= {prefix + name: values for name, values in found.items()}
+    if isinstance(mesh, DividedForest):
+        described |= {"cells": mesh.cells, "cell_size": mesh.cell_size, "origin": mesh.origin}
+    arrays |= found
     return described
 
 
 def rejoined(described: dict[str, Any], parts: Sequence[Arrays]) -> TetForest | TetMesh:
-    """The whole mesh, from the arrays of all parts without their prefixes.
+    """The whole mesh, from the arrays of all parts.
 
     Void tetrahedra of a forest that no part needs are not there again.
     """
@@ -62,8 +64,10 @@ def rejoined(described: dict[str, Any], parts: Sequence[Arrays]) -> TetForest | 
             for name, mask in sets.items():
                 mask[part["nodes"]] = part[f"set.{name}"]
         return TetMesh(points, tets, up_axis=up_axis, labels=labels, label_names=names, node_sets=sets)
+    place = described["cells"], described["cell_size"], described["origin"]
+    if "level" in described:
+        return TetForest.box(*place[:2], described["level"], origin=place[2], up_axis=up_axis)
     lattice, ends, tree = _tree_of(parts)
-    place = tuple(described["cells"]), described["cell_size"], tuple(described["origin"])
     return TetForest(*place, lattice, ends, tree, up_axis, fill=fill, labels=labels, label_names=names)
 
 

@@ -99,3 +99,30 @@ def places_of(wanted: Longs, keys: Longs) -> Longs:
     order = np.argsort(keys)
     place = order[np.searchsorted(keys, wanted, sorter=order).clip(max=len(keys) - 1)]
     return np.where(keys[place] == wanted, place, -1)
+
+
+def numbered_points(owner: Ints, keys: Longs, comm: Any) -> tuple[Longs, int]:
+    """The numbers of lattice points in the whole mesh, int64, and the number of its nodes; all ranks must call this.
+
+    Nodes are in the order in which the leaves of the whole mesh first name them, so that those of a rank have
+    consecutive numbers; lattice points that no leaf names follow, rank after rank.
+
+    Args:
+        owner: The rank that moves each point, plus the number of ranks if no leaf names the point, int32 [n].
+        keys: The points' keys, the same on all ranks, int64 [n].
+        comm: The ranks.
+    """
+    found = np.full(len(owner), -1, np.int64)
+    before = 0
+    for claim in (comm.rank, comm.rank + comm.size):
+        mine = np.flatnonzero(owner == claim)
+        counts = comm.allgather(len(mine))
+        found[mine] = before + sum(counts[: comm.rank]) + np.arange(len(mine))
+        if claim == comm.rank:
+            before = total = sum(counts)
+    ghosts = [np.flatnonzero((owner % comm.size == rank) & (found < 0)) for rank in range(comm.size)]
+    asked = comm.alltoall([keys[each] for each in ghosts])
+    told = comm.alltoall([found[places_of(each, keys)] for each in asked])
+    for places, numbers in zip(ghosts, told, strict=True):
+        found[places] = numbers
+    return found, total

@@ -13,6 +13,7 @@ from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.contacts import Contacts
 from warp_corot.contact.reading import ContactPoint
 from warp_corot.errors import InputError, UnstableError
+from warp_corot.simulation.clock import Clock
 from warp_corot.simulation.simulation import Simulation as OnOne
 from warp_corot.simulation.solves import Solves
 
@@ -70,8 +71,8 @@ class Workers:
             self._served = True
             self.comm.bcast(None, root=0)
 
-    def lead(self, name: str, amount: float) -> None:
-        """On rank 0: advance on all ranks."""
+    def lead(self, name: str, amount: Any) -> None:
+        """On rank 0: call a method of the simulation on all ranks, with one argument."""
         self.comm.bcast((name, amount), root=0)
         self._make(name, amount)
 
@@ -122,7 +123,7 @@ class Workers:
             if values is not None:
                 body.loads.assign(values)
 
-    def _make(self, name: str, amount: float) -> None:
+    def _make(self, name: str, amount: Any) -> None:
         if name.startswith("_"):
             getattr(self, name)(amount)
             return
@@ -162,7 +163,7 @@ class RootSimulation(OnOne):
         super().__init__(bodies, **{name: value for name, value in options.items() if name not in elsewhere})
         if in_parts:
             wholes = [bodies] if isinstance(bodies, SoftBody) else list(bodies)
-            parts, _, nodes = handed_bodies(wholes, options, wholes[0].device, mpi.world())
+            parts, _, nodes = handed_bodies(lambda: wholes, lambda _: options, wholes[0].device, mpi.world())
             self._workers = Workers(Simulation(parts, **options), wholes, nodes)
         else:
             self._workers = Workers(Simulation(bodies, **options))
@@ -188,13 +189,13 @@ class RootSimulation(OnOne):
         self._workers.on_step(lambda: callback(self), every)
 
     def reset(self, worlds: Any = None) -> None:
-        raise InputError("reset does not work where rank 0 leads others")
+        self._workers.lead("reset", worlds)
+
+    def save(self, path: Any) -> None:
+        self._workers.lead("save", path)
 
     def contacts(self) -> list[ContactPoint]:
         raise InputError("contacts does not work where rank 0 leads others")
-
-    def save(self, path: Any) -> None:
-        raise InputError("save does not work where rank 0 leads others")
 
     @property
     def contact(self) -> Contacts | None:
@@ -205,32 +206,10 @@ class RootSimulation(OnOne):
     def contact(self, given: Contacts | None) -> None:
         assert given is None
 
-    # --- the clock -------------------------------------------------------------------------------------------------
-
     @property
-    def dt(self) -> float:
-        return self._workers.on_all.dt
-
-    @property
-    def dt_range(self) -> tuple[float, float]:
-        return self._workers.on_all.dt_range
+    def clock(self) -> Clock:
+        return self._workers.on_all.clock
 
     @property
     def solves(self) -> Solves | None:
         return self._workers.on_all.solves
-
-    @property
-    def steps(self) -> int:
-        return self._workers.on_all.steps
-
-    @property
-    def total_steps(self) -> int:
-        return self._workers.on_all.total_steps
-
-    @property
-    def time(self) -> float:
-        return self._workers.on_all.time
-
-    @property
-    def total_time(self) -> float:
-        return self._workers.on_all.total_time

@@ -12,19 +12,22 @@ from warp_corot.contact.skin import has_own_surface
 from warp_corot.discretization.elements import Mesh
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import shown
+from warp_corot.io.checkpoint.mesh import box_level
 from warp_corot.mesh import TetForest, TetMesh
 from warp_corot.mesh.surfaces.boundary import boundary_faces, signed_volumes
+from warp_corot.mesh.uniform_part import SUBTREE_DEPTH
 
 from . import mpi
-from .divided_mesh import DividedForest, DividedTetMesh
+from .boxes import box
+from .divided_mesh import DividedForest, DividedTetMesh, Numbers
 from .partition import Partition
 from .parts import numbered_part
 
 #: The tag of the messages that bring parts.
 TAG = 77
 
-#: A rank's part on its way: the class, its arguments and its options.
-Piece = tuple[type, tuple[Any, ...], dict[str, Any]]
+#: A rank's part on its way: the class or the function that makes it, its arguments and its options.
+Piece = tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]
 
 
 def divided(make: Callable[[], Mesh], *, costs: npt.ArrayLike | None = None) -> DividedForest | DividedTetMesh:
@@ -50,7 +53,7 @@ def divided(make: Callable[[], Mesh], *, costs: npt.ArrayLike | None = None) -> 
         mesh = make()
         if not isinstance(mesh, TetForest | TetMesh):
             raise InputError(f"make gives {shown(mesh)}; it must give a TetForest or a TetMesh")
-        return pieces_of(mesh, dealt(mesh, comm.size, costs))
+        return (piece for piece, _ in pieces_of(mesh, dealt(mesh, comm.size, costs), costs))
 
     kind, place, options = handed_out(pieces, comm)
     made: DividedForest | DividedTetMesh = kind(*place, **options)
@@ -97,8 +100,9 @@ def dealt(mesh: Mesh, ranks: int, costs: npt.ArrayLike | None = None) -> Partiti
     return Partition.of(mesh, ranks, costs, grouped=isinstance(mesh, TetMesh))
 
 
-def pieces_of(mesh: Mesh, division: Partition) -> Iterator[Piece]:
-    """Each rank's part, one after another."""
+def pieces_of(mesh: Mesh, division: Partition, costs: npt.ArrayLike | None = None) -> Iterator[tuple[Piece, Numbers]]:
+    """Each rank's part, one after another, and the numbers in it; of a box, how all ranks make their parts."""
+    level = box_level(mesh) if isinstance(mesh, TetForest) else None
     outer = boundary_faces(mesh.tets)[0]
     used = mesh.points[np.unique(mesh.tets)]
     volumes = mesh.volumes if isinstance(mesh, TetForest) else signed_volumes(mesh.points, mesh.tets)
@@ -111,6 +115,11 @@ def pieces_of(mesh: Mesh, division: Partition) -> Iterator[Piece]:
     }
     for rank in range(1 + int(division.rank_of_element.max())):
         part, elements, numbers = numbered_part(mesh, division, rank, prunes=True)
+        if level is not None and level >= SUBTREE_DEPTH:
+            assert isinstance(mesh, TetForest)
+            like = {"origin": mesh.origin, "up_axis": mesh.up_axis, "costs": costs}
+            yield (box, (mesh.cells, mesh.cell_size, level), like), numbers
+            continue
         given: dict[str, Any] = {
             "numbers": numbers,
             "outer": _here(outer, numbers.nodes, len(mesh.points)),
@@ -119,12 +128,12 @@ def pieces_of(mesh: Mesh, division: Partition) -> Iterator[Piece]:
         if isinstance(part, TetForest):
             place: tuple[Any, ...] = (part.cells, part.cell_size, part.origin, part.lattice, part.node_ends, part.tree)
             given |= {"fill": part.fill, "leaf_groups": part.leaf_groups, "is_embedded": has_own_surface(mesh)}
-            yield DividedForest, place, whole | given
+            yield (DividedForest, place, whole | given), numbers
         else:
             assert isinstance(mesh, TetMesh)
             sets = {name: mask[numbers.nodes] for name, mask in mesh.node_sets.items()}
             given |= {"element_groups": part.element_groups, "node_sets": sets}
-            yield DividedTetMesh, (part.points, part.tets), whole | given
+            yield (DividedTetMesh, (part.points, part.tets), whole | given), numbers
 
 
 def _here(faces: npt.NDArray[np.int32], nodes: npt.NDArray[np.integer], count: int) -> npt.NDArray[np.int32]:

@@ -16,10 +16,11 @@ from warp_corot.contact.contacts import Contacts
 from warp_corot.contact.tool import Obstacle
 from warp_corot.elasticity import Corotated, Model
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_count
+from warp_corot.inputs.checks import checked_count, checked_path
 from warp_corot.inputs.device import checked_device
 from warp_corot.remesh.online import OnlineRemesh
 from warp_corot.simulation import simulation as on_one
+from warp_corot.simulation.clock import Clock
 from warp_corot.simulation.energy import Energy, WorldEnergies
 from warp_corot.simulation.parts import (
     checked_bodies,
@@ -31,7 +32,7 @@ from warp_corot.simulation.parts import (
 from warp_corot.simulation.solves import Solves
 from warp_corot.solvers import Integrator, SymplecticEuler
 
-from . import checkpoint, mpi, parallel_checkpoint
+from . import checkpoint, mpi
 from .halo import CommHalo, MpiHalo
 from .part_simulation import PartSimulation, Passes, compile_once, model_of_whole, of_their_own, part_of
 from .part_sync import PartSync, forget, register
@@ -39,7 +40,7 @@ from .parts import Part
 from .unsupported import check_supported
 
 
-class Simulation:
+class Simulation(Clock):
     """One or several soft bodies, stepped together by all ranks of an MPI run.
 
     Every rank makes the same bodies and calls the same methods in the same order. A rank computes its part of every
@@ -154,26 +155,23 @@ class Simulation:
 
     def step(self) -> None:
         """Advance by one time step, like ``warp_corot.Simulation.step``. All ranks must call this."""
-        self._take_over()
-        self._parts.step()
-        self._publish()
+        self._lead(self._parts.step)
 
     def advance(self, seconds: float) -> None:
         """Advance by ``seconds``, like ``warp_corot.Simulation.advance``. All ranks must call this."""
-        self._take_over()
-        self._parts.advance(seconds)
-        self._publish()
+        self._lead(self._parts.advance, seconds)
 
     def advance_until(self, total_time: float) -> None:
         """Advance until ``total_time`` [s], like ``advance``; do nothing if that time is past."""
-        self._take_over()
-        self._parts.advance_until(total_time)
-        self._publish()
+        self._lead(self._parts.advance_until, total_time)
 
     def advance_steps(self, count: int) -> None:
         """Advance by ``count`` time steps, like ``advance``."""
+        self._lead(self._parts.advance_steps, count)
+
+    def _lead(self, act: Callable[..., None], *amount: float) -> None:
         self._take_over()
-        self._parts.advance_steps(count)
+        act(*amount)
         self._publish()
 
     def on_step(self, callback: Callable[[Simulation], None], every: int = 1) -> None:
@@ -224,6 +222,11 @@ class Simulation:
         return self.bodies[0]
 
     @property
+    def clock(self) -> PartSimulation:
+        """This rank's simulation of its parts."""
+        return self._parts
+
+    @property
     def worlds(self) -> int:
         """Number of copies of the bodies."""
         return self._parts.worlds
@@ -237,36 +240,6 @@ class Simulation:
     def stable_dt(self) -> float:
         """Largest linearly stable step at rest [s], estimated."""
         return self._parts.stable_dt
-
-    @property
-    def dt(self) -> float:
-        """The time step [s]; if none was given, the one that the present state allows."""
-        return self._parts.dt
-
-    @property
-    def dt_range(self) -> tuple[float, float]:
-        """The shortest and the longest time step so far [s]."""
-        return self._parts.dt_range
-
-    @property
-    def steps(self) -> int:
-        """Time steps done, since the last ``reset()`` if there was one."""
-        return self._parts.steps
-
-    @property
-    def total_steps(self) -> int:
-        """Time steps done, including those before resets."""
-        return self._parts.total_steps
-
-    @property
-    def time(self) -> float:
-        """Simulated time [s], since the last ``reset()`` if there was one."""
-        return self._parts.time
-
-    @property
-    def total_time(self) -> float:
-        """Simulated time [s], including that before resets."""
-        return self._parts.total_time
 
     @property
     def elements_here(self) -> tuple[int, int]:
@@ -361,19 +334,15 @@ class Simulation:
         """Write a checkpoint on rank 0, like ``warp_corot.Simulation.save``; all ranks must call this.
 
         One process, or any number of ranks, can resume from it. Afterwards the bodies of all ranks are up to date at
-        all nodes.
-        Of bodies in parts, every rank writes the nodes that it moves to ``run.ranks/`` beside ``run.npz``, and any
-        number of ranks can resume from these files.
+        all nodes that they have. Of bodies in parts, rank 0 needs memory for the whole bodies meanwhile.
 
         Raises:
-            InputError: On all ranks, if one cannot write to the folder.
+            InputError: On all ranks, if rank 0 cannot write to the folder.
         """
         self._take_over()
-        if any(each.is_in_parts for each in self._syncs):
-            parallel_checkpoint.save(path, self._parts, self._syncs, self._comm)
-            return
-        self.collect()
-        checkpoint.save(path, self.bodies, self._parts, self._syncs, self._comm)
+        if not all(each.is_in_parts for each in self._syncs):
+            self.collect()
+        checkpoint.save(path, self._parts, self._syncs, self._comm)
 
     @classmethod
     def load(
@@ -389,35 +358,33 @@ class Simulation:
         A resumed deterministic run gives the same bits as an uninterrupted one.
 
         Args:
-            path: The file, which every rank reads; of bodies in parts also the files beside it.
+            path: The file, which every rank reads; of bodies in parts rank 0 alone, which hands out parts.
             device: The device; None: the one on which it was saved, or the rank's own card.
             remesh: As for ``warp_corot.Simulation.load``.
 
         Raises:
             InputError: As for ``warp_corot.Simulation.load``, or a run that does not work on several ranks.
         """
-        in_parts = parallel_checkpoint.load(path, device)
-        if in_parts is not None:
-            options = {name: getattr(in_parts, name) for name in ("integrator", "gravity", "deterministic")}
-            made = cls(in_parts.bodies, model=in_parts.models, **options, **in_parts.touching)
-            checkpoint.resume(in_parts, made._parts, made._syncs)
-            if in_parts.touching:
-                in_parts.resume_touch(made._parts, made._syncs[0])
-            return made
-        loaded = on_one.Simulation.load(path, device=device, remesh=remesh)
-        touching: dict[str, Any] = {}
-        if loaded.contact is not None:
-            touching = {"obstacles": of_their_own(loaded.contact.obstacles.given), "contact": loaded.contact.options}
-        if any(loaded.remesh):
-            touching["remesh"] = Passes(loaded.remeshing, loaded.fields)
-        check_supported(loaded.bodies, loaded.models, loaded.integrator, touching)
+        loaded: Any
+        where = checkpoint.device_of_parts(checked_path(path, "path"))
+        if where is not None:
+            bodies, loaded = checkpoint.load_in_parts(path, where if device is None else device, mpi.world())
+            others = loaded.touching
+        else:
+            loaded, others = on_one.Simulation.load(path, device=device, remesh=remesh), {}
+            bodies = loaded.bodies
+            if loaded.contact is not None:
+                given = of_their_own(loaded.contact.obstacles.given)
+                others |= {"obstacles": given, "contact": loaded.contact.options}
+            if any(loaded.remesh):
+                others["remesh"] = Passes(loaded.remeshing, loaded.fields)
         made = cls(
-            loaded.bodies,
+            bodies,
             model=loaded.models,
             integrator=loaded.integrator,
             gravity=loaded.gravity,
             deterministic=loaded.deterministic,
-            **touching,
+            **others,
         )
         checkpoint.resume(loaded, made._parts, made._syncs)
         return made

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 Remesh = OnlineRemesh | Sequence[OnlineRemesh | None] | None
 
-FORMAT, FORMAT_IN_PARTS = "warp-corot checkpoint", "warp-corot checkpoint in parts"
+FORMAT = "warp-corot checkpoint"
 #: The version of checkpoints that is written, and the only one that is read.
 VERSION = 10
 
@@ -47,8 +47,12 @@ GUARDED = ("scale", "drift", "lately", "counted", "work")
 MATERIALS = {kind.__name__: kind for kind in (Isotropic, TransverselyIsotropic, Orthotropic, FibreReinforced)}
 
 
-def save_checkpoint(sim: Simulation, path: str | PathLike[str]) -> None:
+def save_checkpoint(sim: Simulation, path: str | PathLike[str], *, in_parts: bool = False) -> None:
     """Write the simulation's state to ``path``, completely or not at all: to a temporary file, synced, then renamed.
+
+    Args:
+        sim, path: As above.
+        in_parts: Whether several ranks shall have only parts of the bodies when they continue.
 
     Raises:
         InputError: The folder does not exist, the path is a folder, it cannot be written to, or an obstacle of a class
@@ -74,7 +78,7 @@ def save_checkpoint(sim: Simulation, path: str | PathLike[str]) -> None:
         "bodies": [],
         "kept": sorted(sim.kept),
         "running": sim.running.state,
-    }
+    } | ({"in_parts": True} if in_parts else {})
     for name, array in sim.kept.items():
         arrays[f"kept.{name}"] = array.numpy()
     for name, values in sim.guard.state.items():
@@ -166,8 +170,6 @@ def load_checkpoint(
                 raise InputError(f"{what}: {name} is not an array")
         header = json.loads(arrays["header"].tobytes())
         check_version(header, source)
-        if header["format"] == FORMAT_IN_PARTS:
-            raise InputError(f"{source} is a checkpoint of bodies in parts; warp_corot.distributed.Simulation loads it")
         if header["format"] != FORMAT:
             raise InputError(what)
     except InputError:

@@ -9,6 +9,7 @@ import numpy as np
 
 from warp_corot.mesh import TetForest, TetMesh, Tree
 from warp_corot.mesh.growing.detail import Detail
+from warp_corot.mesh.tree import UniformTree
 
 #: Fields of surfaces that are finer than their mesh.
 DETAIL = ("points", "tets", "phi", "labels", "sharp_points", "sharp_triangles")
@@ -26,6 +27,9 @@ def pack_mesh(mesh: TetForest | TetMesh, prefix: str, arrays: dict[str, np.ndarr
             arrays[prefix + "labels"] = mesh.labels
         names = list(mesh.label_names)
         return {"kind": "general", "up_axis": mesh.up_axis, "repaired": mesh.repaired, "label_names": names}
+    place = {"up_axis": mesh.up_axis, "cells": mesh.cells, "cell_size": mesh.cell_size, "origin": mesh.origin}
+    if (level := box_level(mesh)) is not None:
+        return {"kind": "box", "level": level} | place
     arrays[prefix + "lattice"], arrays[prefix + "node_ends"] = mesh.lattice, mesh.node_ends
     for name in OF_TREE:
         if (array := getattr(mesh.tree, name)) is not None:
@@ -36,15 +40,16 @@ def pack_mesh(mesh: TetForest | TetMesh, prefix: str, arrays: dict[str, np.ndarr
     of_domain = [name for name in OF_DOMAIN if getattr(mesh, name) is not None]
     for name in of_domain:
         arrays[f"{prefix}domain.{name}"] = getattr(mesh, name)
-    return {
-        "kind": "forest",
-        "of_domain": of_domain,
-        "label_names": mesh.label_names,
-        "up_axis": mesh.up_axis,
-        "cells": mesh.cells,
-        "cell_size": mesh.cell_size,
-        "origin": mesh.origin,
-    }
+    return {"kind": "forest", "of_domain": of_domain, "label_names": mesh.label_names} | place
+
+
+def box_level(mesh: TetForest) -> int | None:
+    """The level with which ``TetForest.box`` makes a forest; None: it makes no such forest."""
+    if not isinstance(mesh.tree, UniformTree) or any(getattr(mesh, name) is not None for name in OF_DOMAIN):
+        return None
+    box = TetForest.box(mesh.cells, mesh.cell_size, mesh.tree.depth, origin=mesh.origin, up_axis=mesh.up_axis)
+    same = np.array_equal(box.lattice, mesh.lattice) and np.array_equal(box.tree.leaf_tets, mesh.tree.leaf_tets)
+    return mesh.tree.depth if same else None
 
 
 def unpack_mesh(described: dict[str, Any], prefix: str, arrays: dict[str, np.ndarray]) -> TetForest | TetMesh:
@@ -59,6 +64,10 @@ def unpack_mesh(described: dict[str, Any], prefix: str, arrays: dict[str, np.nda
         )
         mesh.repaired = described["repaired"]
         return mesh
+    if described["kind"] == "box":
+        cells, origin = tuple(described["cells"]), tuple(described["origin"])
+        up_axis, level = described["up_axis"], described["level"]
+        return TetForest.box(cells, described["cell_size"], level, origin=origin, up_axis=up_axis)
     tets, level, parent, first_child = (arrays[f"{prefix}tree.{name}"] for name in OF_TREE if name != "cut")
     tree = Tree(tets, level, parent, first_child, arrays.get(f"{prefix}tree.cut"))
     x, y, z = described["cells"]
