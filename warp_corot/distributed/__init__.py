@@ -8,9 +8,8 @@ from . import mpi
 from .boxes import box
 from .parallel_growth import from_domain
 from .part_sync import gather
-from .reading import load
 from .recording import record
-from .scatter_mesh import divided
+from .scatter_mesh import divided, load
 from .simulation import Simulation
 from .sweeping import sweep
 

@@ -45,20 +45,6 @@ class Numbers:
         return (self.nodes + self.node_count * np.arange(worlds, dtype=np.int64)[:, None]).ravel()
 
 
-def of_whole(points: npt.NDArray[np.float64], volumes: npt.NDArray[np.float64], comm: Any) -> dict[str, Any]:
-    """What all ranks know of the whole mesh, as arguments of a part; all ranks must call this.
-
-    Args:
-        points: The coordinates of the nodes around this rank's own elements [m], float64 [n, 3].
-        volumes: The volumes of these elements [m^3], float64 [t].
-        comm: The ranks.
-    """
-    told = comm.allgather((len(volumes), float(volumes.min(initial=np.inf)), points.min(axis=0), points.max(axis=0)))
-    counts, smallest, low, high = zip(*told, strict=True)
-    bounds = np.array([np.min(low, axis=0), np.max(high, axis=0)])
-    return {"element_count": sum(counts), "bounds": bounds, "smallest_volume": min(smallest)}
-
-
 class DividedMesh:
     """A rank's part of a mesh: the elements around the nodes that the rank moves.
 

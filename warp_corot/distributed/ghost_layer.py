@@ -13,7 +13,7 @@ from warp_corot.discretization.groups import group_numbers
 from warp_corot.mesh import TetForest, Tree
 from warp_corot.mesh.numbering import in_order_of_leaves, renumbered, with_virtual
 
-from .divided_mesh import DividedForest, Numbers, of_whole
+from .divided_mesh import DividedForest, Numbers
 from .faces import faces_of
 from .parts import part_of_forest
 from .root_cube_partition import RootCubePartition, numbered_points, places_of
@@ -83,8 +83,12 @@ def joined(own: TetForest, partition: RootCubePartition) -> DividedForest:
         given[rank] = branch(kept) if kept.any() else None
     taken = comm.alltoall(given)
     branches = [branch(np.ones(len(own.tets), bool)), *(each for each in taken if each is not None)]
-    whole = of_whole(own.points, own.volumes, comm)
-    return _together(branches, node_count=node_count, is_embedded=True, **whole)
+    volumes = own.volumes
+    told = comm.allgather((len(volumes), float(volumes.min()), own.points.min(axis=0), own.points.max(axis=0)))
+    counts, smallest, low, high = zip(*told, strict=True)
+    whole = {"element_count": sum(counts), "smallest_volume": min(smallest)}
+    bounds = np.array([np.min(low, axis=0), np.max(high, axis=0)])
+    return _together(branches, node_count=node_count, is_embedded=True, bounds=bounds, **whole)
 
 
 def _owners(own: TetForest, keys: Longs, partition: RootCubePartition) -> Ints:

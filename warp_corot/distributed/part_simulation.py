@@ -29,7 +29,7 @@ from warp_corot.simulation.energy import WorldEnergies
 from warp_corot.solvers.halo import Halo
 
 from . import mpi
-from .divided_mesh import DividedForest, DividedMesh, DividedTetMesh
+from .divided_mesh import DividedForest, DividedMesh
 from .halo import MpiHalo
 from .partition import Partition
 from .parts import Part
@@ -158,12 +158,6 @@ def part_of(body: SoftBody, model: Model, comm: Any, costs: npt.ArrayLike | None
     """
     level = getattr(model, "level", None)
     if isinstance(body.mesh, DividedMesh):
-        ungrouped = isinstance(body.mesh, DividedTetMesh) and body.mesh.element_groups is None
-        if ungrouped and getattr(model, "dilatation", ELEMENT) == SHARED:
-            raise InputError(
-                "the mesh was read in parts, so its elements cannot share their dilatation; dilatation must be "
-                "'element', or take warp_corot.distributed.divided"
-            )
         if costs is not None:
             raise InputError("the mesh is divided already; give costs to warp_corot.distributed.box or divided")
         if level is not None and not body.mesh.is_box:

@@ -177,26 +177,16 @@ def _dealt_general(mesh: TetMesh, ranks: int, shares: npt.NDArray[np.float64]) -
 
 
 def _along_curve(mesh: TetMesh, ranks: int, shares: npt.NDArray[np.float64]) -> Ints:
-    """The ranks of elements along the curve through their centroids."""
+    """The ranks of elements along the curve that interleaves the bits of their centroids' coordinates."""
     centre = mesh.points[mesh.tets].mean(axis=1)
     extent = max(float(np.ptp(centre, axis=0).max()), 1e-300)
-    order = np.argsort(along_curve(centre, centre.min(axis=0), extent), kind="stable")
+    place = np.minimum(((centre - centre.min(axis=0)) / extent * 2**CURVE_BITS).astype(np.int64), 2**CURVE_BITS - 1)
+    key = np.zeros(len(centre), np.int64)
+    for bit in range(CURVE_BITS):
+        for axis in range(3):
+            key |= (place[:, axis] >> bit & 1) << (3 * bit + axis)
+    order = np.argsort(key, kind="stable")
     turn = np.searchsorted(np.cumsum(shares)[:-1] * len(order), np.arange(len(order)) + 0.5, side="right")
     rank = np.empty(len(order), np.int32)
     rank[order] = _without_gaps(turn, ranks)
     return rank
-
-
-def along_curve(points: npt.NDArray[np.float64], low: npt.NDArray[np.float64], extent: float) -> npt.NDArray[np.int64]:
-    """The places of points along the curve that interleaves the bits of their coordinates in a cube, int64 [n].
-
-    Args:
-        points: [m], [n, 3].
-        low, extent: The cube's lowest corner and its edge [m].
-    """
-    place = np.minimum(((points - low) / extent * 2**CURVE_BITS).astype(np.int64), 2**CURVE_BITS - 1)
-    key = np.zeros(len(points), np.int64)
-    for bit in range(CURVE_BITS):
-        for axis in range(3):
-            key |= (place[:, axis] >> bit & 1) << (3 * bit + axis)
-    return key

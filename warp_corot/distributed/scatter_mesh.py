@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from os import PathLike
 from typing import Any
 
 import numpy as np
@@ -58,6 +59,25 @@ def divided(make: Callable[[], Mesh], *, costs: npt.ArrayLike | None = None) -> 
     kind, place, options = handed_out(pieces, comm)
     made: DividedForest | DividedTetMesh = kind(*place, **options)
     return made
+
+
+def load(
+    path: str | PathLike[str],
+    scale: float = 1.0,
+    *,
+    unit: str | float | None = None,
+    up_axis: str | None = None,
+    regions: str | None = None,
+) -> DividedForest | DividedTetMesh:
+    """This rank's part of a file's tetrahedra, which rank 0 reads and divides; all ranks must call this.
+
+    Args:
+        path, scale, unit, up_axis, regions: As for ``TetMesh.load``.
+
+    Raises:
+        InputError: On all ranks: as for ``divided``, or the file cannot be read.
+    """
+    return divided(lambda: TetMesh.load(path, scale, unit=unit, up_axis=up_axis, regions=regions))
 
 
 def handed_out(make: Callable[[], Iterator[Any]], comm: Any) -> Any:
