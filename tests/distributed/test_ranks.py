@@ -211,7 +211,7 @@ def test_a_checkpoint_in_parts_goes_on_with_any_number_of_ranks(runs, size):
 
 def test_a_checkpoint_of_a_body_in_parts_goes_on(runs):
     """Of divided meshes, and with contact."""
-    for name, case in (("divided", "forest"), ("general", "newmark"), ("touches", "touched")):
+    for name, case in (("divided", "forest"), ("led", "forest"), ("general", "newmark"), ("touches", "touched")):
         for what in ("x", "numbers"):
             np.testing.assert_array_equal(runs[3][f"{name}.3.{what}"], runs[1][f"{case}.True.saved.{what}"])
 

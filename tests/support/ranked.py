@@ -347,8 +347,8 @@ def general_loaded(file: Path) -> np.ndarray | None:
     return wd.gather(body.positions)
 
 
-def led() -> np.ndarray | None:
-    """The run "forest" of a body that only rank 0 has whole; other ranks get parts."""
+def led(kept: Path) -> np.ndarray | None:
+    """The run "forest" of a body that only rank 0 has whole, saved; other ranks get parts."""
     everybody = mpi.world()
     if everybody.rank > 0:
         root_facade.Workers.joined("cpu").serve()
@@ -356,6 +356,7 @@ def led() -> np.ndarray | None:
     body = body_of(graded(), 0.49)
     sim = root_facade.RootSimulation(body, in_parts=True, deterministic=True)
     moved(sim, body)
+    sim.save(kept)
     positions, called = body.positions.numpy().copy(), []
     sim.on_step(lambda sim: called.append(sim.time), every=1)
     sim.advance_steps(2)
@@ -442,7 +443,8 @@ def make_all(folder: Path, size: int, names: list[str]) -> None:
             if path.stem.split(".")[0] in names and path.exists():
                 found |= resumed(path)
         if "forest" in names:
-            found |= made("forest", False, None) | {"led.x": led()}
+            found |= made("forest", False, None) | {"led.x": led(folder / "led.3.npz")}
+            found |= resumed(folder / "led.3.npz")
             found["divided.x"] = forest_divided(folder / "divided.3.npz")
             found |= resumed(folder / "divided.3.npz")
         if "newmark" in names:

@@ -19,7 +19,7 @@ from warp_corot.inputs.checks import checked_count, checked_path, shown
 
 from .journal import Journal, Row, key_of
 from .tables import write_tables
-from .workers import local_executor, timed, timed_together, worker_count
+from .workers import local_executor, timed, worker_count
 
 Parameters = Mapping[str, Sequence[Any]] | Sequence[Mapping[str, Any]]
 #: The parameters of runs that one call makes, and such a call.
@@ -77,7 +77,7 @@ def sweep(
     left = [run for run in runs if not journal.is_done(run)]
     with _bar(len(runs), progress) as show:
         show(len(runs) - len(left))
-        of_runs = partial(timed if together is None else timed_together, function)
+        of_runs = partial(timed, function, together is not None)
         shares = [tuple(left[k : k + size]) for k in range(0, len(left), size)]
         for done in _made(of_runs, shares, executor, window, retries):
             journal.note({name: done[name] for name in runs[0]}, done)

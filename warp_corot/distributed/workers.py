@@ -37,39 +37,30 @@ def local_executor(workers: int) -> ProcessPoolExecutor:
     return ProcessPoolExecutor(workers, mp_context=context, initializer=_begin, initargs=(turn,))
 
 
-def timed(function: Callable[..., Any], runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """The results of a function for the parameters of one run as a row of a table, with its time.
+def timed(function: Callable[..., Any], together: bool, runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """The results of a function for the parameters of the runs that one call makes, as rows of a table; each has an
+    equal share of the time.
+
+    Args:
+        function: The function.
+        together: Whether it takes and returns lists for all runs; otherwise there is one run.
+        runs: The parameters of each run.
 
     Raises:
-        InputError: The function returns neither a number nor a dictionary of numbers and texts.
-    """
-    (run,) = runs
-    began = time.perf_counter()
-    found = _named(function(**run))
-    seconds = time.perf_counter() - began
-    return [{name: _checked(value, name, run) for name, value in found.items()} | {"seconds": seconds}]
-
-
-def timed_together(function: Callable[..., Any], runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """The same of several runs that one call makes; each has an equal share of the time.
-
-    Raises:
-        InputError: The function returns neither a list for all runs nor a dictionary of such lists.
+        InputError: The function returns neither numbers nor dictionaries of numbers and texts, or no lists of them.
     """
     began = time.perf_counter()
-    given = _named(function(**{name: [run[name] for run in runs] for name in runs[0]}))
+    found = function(**({name: [run[name] for run in runs] for name in runs[0]} if together else runs[0]))
     seconds = (time.perf_counter() - began) / len(runs)
-    for name, values in given.items():
+    found = found if isinstance(found, Mapping) else {"result": found}
+    for name, values in found.items() if together else ():
         if isinstance(values, str) or not hasattr(values, "__len__") or len(values) != len(runs):
             raise InputError(f"the function gives {name} = {values!r}; it must be a list of {len(runs)}, one a run")
     return [
-        {name: _checked(values[k], name, run) for name, values in given.items()} | {"seconds": seconds}
+        {name: _checked(values[k] if together else values, name, run) for name, values in found.items()}
+        | {"seconds": seconds}
         for k, run in enumerate(runs)
     ]
-
-
-def _named(given: Any) -> Mapping[str, Any]:
-    return given if isinstance(given, Mapping) else {"result": given}
 
 
 def _checked(value: Any, name: str, run: Mapping[str, Any]) -> Any:
