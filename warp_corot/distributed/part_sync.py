@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import weakref
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_corot.body.activation import Activation, ElementActivation
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.body.trajectory import NodeKeyframes, Trajectory
 from warp_corot.errors import InputError
@@ -54,6 +56,7 @@ class PartSync:
         self._number = np.full(worlds * count, -1, np.int32)
         self._number[self.own_nodes] = np.flatnonzero(own)
         self._trajectories: list[Trajectory] = []
+        self._activations: list[ElementActivation] = []
         #: Triangles of the surface around this rank's nodes; None before there is contact.
         self._triangles: Places | None = None
 
@@ -91,6 +94,8 @@ class PartSync:
         whole, part = self.whole, self.part
         for name in STATE:
             self._own.to_whole(getattr(part.state, name), getattr(whole.state, name))
+        if self._activations:
+            self._elements.to_whole(part.discretization.activation, whole.discretization.activation)
         whole.state.publish_positions()
         whole.conditions.world_starts.assign(part.conditions.world_starts)
         if part.state.is_touched:
@@ -205,7 +210,7 @@ class PartSync:
 
     def _take_keyframes(self) -> None:
         given = self.whole.conditions.trajectories
-        if len(given) == len(self._trajectories) and all(map(_same, given, self._trajectories)):
+        if len(given) == len(self._trajectories) and all(map(operator.is_, given, self._trajectories)):
             return
         self._trajectories = list(given)
         found = []
@@ -222,15 +227,22 @@ class PartSync:
 
     def _take_activation(self) -> None:
         whole, part = self.whole, self.part
-        if whole.conditions.activations:
-            raise InputError("active stress along keyframes does not work on several ranks yet; set it between steps")
-        if whole.discretization.has_activation:
-            part.conditions.make_activation()
-            self._elements.to_part(whole.discretization.activation, part.discretization.activation)
-
-
-def _same(a: Trajectory, b: Trajectory) -> bool:
-    return a is b
+        if not whole.discretization.has_activation:
+            return
+        part.conditions.make_activation()
+        self._elements.to_part(whole.discretization.activation, part.discretization.activation)
+        given = whole.conditions.activations
+        if len(given) == len(self._activations) and all(map(operator.is_, given, self._activations)):
+            return
+        self._activations, found = list(given), []
+        number = np.full(whole.worlds * whole.world_element_count, -1, np.int32)
+        number[self._elements.whole] = self._elements.part
+        for each in given:
+            here, stress = number[each.elements.numpy()], each.stress.numpy()
+            if (own := here >= 0).any():
+                keys = Activation(each.times.numpy(), stress[:, own] if stress.shape[1] > 1 else stress)
+                found.append(ElementActivation.of_keys(here[own], keys, part.device))
+        part.conditions.set_activations(found)
 
 
 # --- gathering -------------------------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -22,6 +23,11 @@ from .scatter_mesh import Piece, dealt, handed_out, pieces_of
 
 Longs = npt.NDArray[np.int64]
 
+#: Keyframes of nodes and of elements: the beginning of their arrays' names, how many there are, whose, and of what.
+KEYFRAMES = (
+    ("trajectory", "trajectories", "nodes", "displacements"),
+    ("activation", "activations", "elements", "stress"),
+)
 #: Arrays of a body with an entry for each node of all worlds, by the ends of their names.
 NODAL = ("displacements", "velocities", "reactions", "constrained", "loads")
 
@@ -74,9 +80,8 @@ def handed_bodies(
         assert told is not None
         bodies = wholes()
         for body in bodies:
-            if body.changing is not None or body.conditions.activations:
-                said = "bodies that are remeshed or follow keyframes of active stress cannot be handed out to ranks"
-                raise InputError(said)
+            if body.changing is not None:
+                raise InputError("bodies that are remeshed cannot be handed out to ranks")
         each = [_pieces(body, comm.size) for body in bodies]
         for own in zip(*each, strict=True):
             nodes.append([there for _, there in own])
@@ -92,25 +97,33 @@ def gathered_body(each: PartSync, comm: Any) -> SoftBody | None:
     if not each.is_in_parts:
         return body if comm.rank == 0 else None
     described, arrays = _packed(body)
-    owned, counted = each.part.is_own, np.flatnonzero(numbers.counted)
-    everywhere, elements = numbers.in_worlds(body.worlds), numbers.elements[counted]
-    there = np.where(owned, everywhere, -1)
-    kinds = {name: _kind_of(body, name, values) for name, values in arrays.items()}
-    cut = {name: _cut(arrays[name], *kind, np.flatnonzero(owned), counted, body.worlds) for name, kind in kinds.items()}
+    owned, counted, worlds = each.part.is_own, np.flatnonzero(numbers.counted), body.worlds
+    everywhere, elements = numbers.in_worlds(worlds), numbers.elements[counted]
+    cut: dict[str, tuple[Any, str, int]] = {}
+    for name, values in arrays.items():
+        kind = _kind_of(body, name, values)
+        cut[name] = _cut(values, *kind, np.flatnonzero(owned), counted, worlds), *kind
     of_mesh: Arrays = {}
     mesh = pack_part(body.mesh, of_mesh)  # type: ignore[arg-type]
-    motions = _motions(described, arrays, there)
-    given = comm.gather((everywhere[owned], elements, cut, motions, of_mesh), root=0)
+    total, count = worlds * numbers.node_count, mesh["element_count"]
+    of_elements = np.where(numbers.counted, numbers.elements + count * np.arange(worlds)[:, None], -1).ravel()
+    keyframes = _keyframes(described, arrays, np.where(owned, everywhere, -1), of_elements)
+    given = comm.gather((everywhere[owned], elements, cut, keyframes, of_mesh), root=0)
     if given is None:
         return None
     whole: Arrays = {}
-    total, count = body.worlds * numbers.node_count, mesh["element_count"]
-    for nodes, numbered, values, _, _ in given:
-        for name, (kind, axis) in kinds.items():
-            _put(whole, name, values[name], kind, axis, nodes, numbered, (total, count, body.worlds))
-    motions = [motion for *_, moved, _ in given for motion in moved]
+    for nodes, numbered, there, _, _ in given:
+        for name, (own, what, axis) in there.items():
+            if what == "same":
+                whole.setdefault(name, own)
+                continue
+            shape = list(own.shape)
+            shape[axis] = total if what == "nodes" else count
+            found = np.moveaxis(whole.setdefault(name, np.zeros(shape, own.dtype)), axis, 0)
+            found[nodes if what == "nodes" else numbered] = np.moveaxis(own, axis, 0)
+    keyframes = [list(itertools.chain(*of_kind)) for of_kind in zip(*(each for *_, each, _ in given), strict=True)]
     joined = rejoined(mesh, [of_mesh for *_, of_mesh in given])
-    return _made(*_with_motions(described, whole, motions), body.worlds, wp.get_device("cpu"), joined)
+    return _made(*_with_keyframes(described, whole, keyframes), worlds, wp.get_device("cpu"), joined)
 
 
 def _packed(body: SoftBody) -> tuple[dict[str, Any], Arrays]:
@@ -130,13 +143,16 @@ def _pieces(body: SoftBody, ranks: int) -> Iterator[tuple[GivenBody, Longs]]:
     described, arrays = _packed(body)
     for piece, numbers in pieces_of(body.mesh, dealt(body.mesh, ranks)):
         there = numbers.in_worlds(body.worlds)
-        place = np.full(body.node_count, -1, np.int64)
-        place[there] = np.arange(len(there))
+        in_all = numbers.elements + body.world_element_count * np.arange(body.worlds)[:, None]
+        places = []
+        for items, number in ((there, body.node_count), (in_all.ravel(), body.worlds * body.world_element_count)):
+            places.append(np.full(number, -1, np.int64))
+            places[-1][items] = np.arange(len(items))
         cut = {
             name: _cut(values, *_kind_of(body, name, values), there, numbers.elements, body.worlds)
             for name, values in arrays.items()
         }
-        given = _with_motions(described, cut, _motions(described, arrays, place))
+        given = _with_keyframes(described, cut, _keyframes(described, arrays, *places))
         yield GivenBody(piece, *given, body.worlds), there
 
 
@@ -144,12 +160,12 @@ def _kind_of(body: SoftBody, name: str, values: npt.NDArray[Any]) -> tuple[str, 
     """What the entries of an array belong to: nodes or elements of all worlds, elements of one, or nothing; and the
     axis along which they lie."""
     material = body.material
-    if name.startswith("trajectory"):
-        return "motion", 0
+    if _of_keyframes(name) is not None:
+        return "same", 0
     if name.rpartition(".")[2] in NODAL:
         return "nodes", 0
     if name == "activation":
-        return "stresses", 0
+        return "stresses", 1
     axis = values.ndim - len(material.components.get(name, ())) - 1
     varies = hasattr(material, name) and axis >= 0 and values.shape[axis] == body.world_element_count > 1
     return ("elements", axis) if varies else ("same", 0)
@@ -157,48 +173,40 @@ def _kind_of(body: SoftBody, name: str, values: npt.NDArray[Any]) -> tuple[str, 
 
 def _cut(values: npt.NDArray[Any], kind: str, axis: int, nodes: Longs, elements: Longs, worlds: int) -> Any:
     """The values of some nodes of all worlds and elements of one world."""
-    if kind == "stresses":
-        return values.reshape(worlds, -1)[:, elements]
-    return values if kind in ("same", "motion") else np.take(values, nodes if kind == "nodes" else elements, axis)
+    if kind == "same":
+        return values
+    values = values.reshape(worlds, -1) if kind == "stresses" else values
+    return np.take(values, nodes if kind == "nodes" else elements, axis)
 
 
-def _put(
-    whole: Arrays,
-    name: str,
-    values: npt.NDArray[Any],
-    kind: str,
-    axis: int,
-    nodes: Longs,
-    elements: Longs,
-    counts: tuple[int, int, int],
-) -> None:
-    """Put what ``_cut`` gave into an array of the whole body."""
-    if kind in ("same", "motion"):
-        whole.setdefault(name, values)
-        return
-    axis, number = (1, elements) if kind == "stresses" else (axis, nodes if kind == "nodes" else elements)
-    shape = list(values.shape)
-    shape[axis] = counts[0] if kind == "nodes" else counts[1]
-    found = whole.setdefault(name, np.zeros(shape, values.dtype))
-    np.moveaxis(found, axis, 0)[number] = np.moveaxis(values, axis, 0)
-
-
-def _motions(described: dict[str, Any], arrays: Arrays, place: Longs) -> list[Arrays]:
-    """The prescribed motions of the nodes that have a place, with these places for nodes."""
-    found = []
-    for k in range(described["trajectories"]):
-        given = {name: arrays[f"trajectory{k}.{name}"] for name in ("nodes", "times", "displacements")}
-        here, to = place[given["nodes"]] >= 0, given["displacements"]
-        if here.any():
-            of_each = to if to.ndim == 2 else to[:, here]
-            found.append(given | {"nodes": place[given["nodes"]][here].astype(np.int32), "displacements": of_each})
+def _keyframes(described: dict[str, Any], arrays: Arrays, nodes: Longs, elements: Longs) -> list[list[Arrays]]:
+    """The keyframes, of each kind, of the nodes and elements that have a place, with these places."""
+    found: list[list[Arrays]] = []
+    for (prefix, count, whose, what), place in zip(KEYFRAMES, (nodes, elements), strict=True):
+        found.append([])
+        for k in range(described[count]):
+            items, times, values = (arrays[f"{prefix}{k}.{name}"] for name in (whose, "times", what))
+            here = place[items] >= 0
+            if here.any():
+                of_each = values[:, here] if values.ndim == 3 or (what == "stress" and values.shape[1] > 1) else values
+                found[-1].append({whose: place[items[here]].astype(np.int32), "times": times, what: of_each})
     return found
 
 
-def _with_motions(described: dict[str, Any], arrays: Arrays, motions: list[Arrays]) -> tuple[dict[str, Any], Arrays]:
-    """The same body with other motions."""
-    kept = {name: values.ravel() if name == "activation" else values for name, values in arrays.items()}
-    kept = {name: values for name, values in kept.items() if not name.startswith("trajectory")}
-    for k, motion in enumerate(motions):
-        kept |= {f"trajectory{k}.{name}": values for name, values in motion.items()}
-    return described | {"trajectories": len(motions)}, kept
+def _with_keyframes(
+    described: dict[str, Any], arrays: Arrays, keyframes: list[list[Arrays]]
+) -> tuple[dict[str, Any], Arrays]:
+    """The same body with other keyframes."""
+    kept = {name: values for name, values in arrays.items() if _of_keyframes(name) is None}
+    if "activation" in kept:
+        kept["activation"] = kept["activation"].ravel()
+    counts = {}
+    for (prefix, count, _, _), given in zip(KEYFRAMES, keyframes, strict=True):
+        counts[count] = len(given)
+        kept |= {f"{prefix}{k}.{name}": values for k, each in enumerate(given) for name, values in each.items()}
+    return described | counts, kept
+
+
+def _of_keyframes(name: str) -> str | None:
+    """The beginning of a name, if it is that of an array of keyframes."""
+    return next((prefix for prefix, *_ in KEYFRAMES if name.startswith(prefix) and "." in name), None)
