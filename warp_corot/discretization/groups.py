@@ -2,7 +2,8 @@
 
 Groups are found from the bottom of the tree upwards. When eight or more leaves below an element are in no group yet
 (there are at most 14), they form one. So a complete subtree of three levels is always a group. Fewer than eight leaves
-of a root remain: four or more form a group; fewer join the remaining leaves of the other roots of their cube.
+of a root remain: four or more form a group; fewer join the remaining leaves of the other roots of their cube. No group
+goes across a cut: what is left below a child of a torn element is one.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_corot.kernels.plan.tree import TORN
 from warp_corot.mesh import TetForest, TetMesh
 
 from .matching import neighbour_groups
@@ -80,8 +82,10 @@ def group_numbers(forest: TetForest, leaves: npt.NDArray[np.integer]) -> npt.NDA
     count = 0
     for depth in range(int(level.max(initial=0)), -1, -1):
         here = np.flatnonzero((level == depth) & (group < 0))
-        _, element, sizes = np.unique(above[here], return_inverse=True, return_counts=True)
+        elements, element, sizes = np.unique(above[here], return_inverse=True, return_counts=True)
         makes_one = sizes >= (LEAST if depth else LEAST_OF_ROOT)
+        if depth and forest.tree.cut is not None:
+            makes_one |= forest.tree.cut[forest.tree.above(elements, 1)] >= int(TORN)
         number = np.cumsum(makes_one, dtype=np.int32) - 1 + count
         grouped = makes_one[element]
         group[here[grouped]] = number[element[grouped]]

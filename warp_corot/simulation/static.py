@@ -115,7 +115,7 @@ def solve_static(
 
     Raises:
         InputError: An argument has another type or is out of its range, the model does not support the mesh or the
-            precision, the body is remeshed, or all its nodes are held.
+            precision, or all its nodes are held.
     """
     report, _ = static_answer(
         body,
@@ -151,8 +151,6 @@ def static_answer(
     if not isinstance(body, SoftBody):
         raise InputError(f"body is {shown(body)}; it must be a SoftBody")
     check_whole(body)
-    if body.changing is not None:
-        raise InputError("the body is remeshed; solve_static needs a mesh that stays as it is")
     if not 0.0 < checked_number(tolerance, "tolerance") < 1.0:
         raise InputError(f"tolerance is {tolerance}; it must be between 0 and 1")
     tolerance = max(tolerance, LEAST_TOLERANCE)

@@ -276,9 +276,10 @@ class DilatationField(ForceField):
     def groups(self) -> list[npt.NDArray[np.int32]]:
         """The elements of each group that shares a dilatation, of all worlds."""
         found = []
-        for starts, members, _live, count in self.batches_of_groups():
+        for starts, members, live, count in self.batches_of_groups():
             begins, of_groups = starts.numpy(), members.numpy()
-            for g in range(count):
+            # Launches over a mesh that changes go beyond its groups.
+            for g in range(min(count, int(live.numpy()[0])) if len(live) else count):
                 if len(of_groups):
                     found.append(of_groups[begins[g] : begins[g + 1]])
                 else:

@@ -82,7 +82,7 @@ class HostDilatation:
 def sharing_of(field: DilatationField) -> Any:
     """The elements of one world that share a dilatation, sparse [groups, T]: one for each element of a group."""
     count = len(field.discretization.mesh.tets)
-    groups = [group for group in field.groups() if group[0] < count]
+    groups = [group for group in field.groups() if len(group) and group[0] < count]
     rows = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
     columns = np.concatenate(groups)
     return csr_matrix(coo_matrix((np.ones(len(columns)), (rows, columns)), (len(groups), count)))
