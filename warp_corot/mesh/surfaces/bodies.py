@@ -13,6 +13,7 @@ from warp_corot.mesh.forest_arrays import ForestArrays
 from warp_corot.mesh.growing.detail import Detail
 from warp_corot.mesh.numbering import in_order_of_leaves, live_or_void, renumbered, with_virtual
 from warp_corot.mesh.pieces import pieces_of
+from warp_corot.mesh.tree import LIVE
 
 from .bound import SurfaceMesh
 from .boundary import boundary_faces
@@ -28,9 +29,8 @@ def surface(forest: ForestArrays) -> SurfaceMesh:
     if forest.phi is None:
         return _snapped(forest, boundary_surface(forest))
     if forest.tree.cut is not None:
-        # Elements that were left out have no side of a cut.
-        inside = forest.tets[(forest.phi[forest.tets] < 0).any(axis=1)]
-        found = _snapped(forest, marched_cut(forest.points, inside, forest.phi))
+        marched_surface = marched_cut(forest.lattice_points, _away_from_cuts(forest), forest.phi)
+        found = _snapped(forest, _on_nodes(forest, marched_surface))
     elif forest.detail is not None:
         found = _embedded(forest, forest.detail.surface())
     else:
@@ -101,6 +101,18 @@ def _all_cut(forest: ForestArrays) -> np.ndarray:
     """Nodes of all leaves that hold a part of the body, including leaves that were left out, int32 [n, 4]."""
     assert forest.phi is not None
     tets = forest.tree.tets[forest.tree.first_child < 0]
+    return tets[(forest.phi[tets] < 0).any(axis=1)]
+
+
+def _away_from_cuts(forest: ForestArrays) -> np.ndarray:
+    """As `_all_cut`, without leaves that were left out beside a cut: they are on no side of it."""
+    _, place, count = np.unique(forest.lattice, axis=0, return_inverse=True, return_counts=True)
+    is_beside = np.zeros(len(forest.lattice), bool)
+    is_beside[forest.tets[(count[place.ravel()] > 1)[forest.tets].any(axis=1)]] = True
+    tree = forest.tree
+    whole = (tree.first_child == LIVE) | ((tree.first_child < 0) & ~is_beside[tree.tets].any(axis=1))
+    tets = tree.tets[whole]
+    assert forest.phi is not None
     return tets[(forest.phi[tets] < 0).any(axis=1)]
 
 
