@@ -15,9 +15,9 @@ from warp_corot.kernels.contact.motion import Motions, move_obstacle
 from warp_corot.kernels.elements.elements import load_node
 from warp_corot.kernels.stepping.pace import DONE, DT, Pace
 
-from .cut import Surface
+from .cut import BUNDLE, Surface
 from .pools import LEAVES, Pools
-from .state import Carried, doubled
+from .state import Carried, doubled, modulus_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -29,6 +29,9 @@ LEAST = wp.constant(-1.5)
 INSIDE = wp.constant(-0.02)
 #: The nearest surface counts up to this distance, over the size of the element there.
 REACH = wp.constant(1.0)
+#: No point is found in a leaf that has a node farther from the blade than this many times its size: so is none in
+#: leaves that are stretched to three times their length.
+FAR = wp.constant(10.0)
 #: A point that is outside now or was before, and is farther on at rest than this many times that size, has not cut.
 JUMP = wp.constant(2.0)
 #: Fraction of its motion relative to the tissue that a push may stop in a step: points share nodes.
@@ -49,20 +52,25 @@ class Edges:
     local: wp.array[wp.vec3]  # in the blade's frame [m]
     goes_on: wp.array[wp.int32]  # whether the next point is on the same edge
     x: wp.array[wp.vec3]  # where it is [m]
-    bounds: wp.array[wp.vec3]  # [2] of these places
+    bounds: wp.array[wp.vec3d]  # [2] of these places
     best: wp.array[wp.int64]  # quality and leaf
     nodes: wp.array[wp.vec4i]  # of that leaf
     weights: wp.array[wp.vec4]
     size: wp.array[wp.float32]  # of that leaf [m]
     state: wp.array[wp.int32]  # OUTSIDE, AT_SURFACE or IN_TISSUE
     former: wp.array[wp.vec3]  # where it was at the last cut [m]
-    last: wp.array[wp.vec3d]  # where its strip ends, at rest [m]
-    swept: wp.array[wp.int32]  # whether it has one
+    swept: wp.array[wp.int32]  # whether it has cut since then
     push: wp.array[wp.vec3]  # [2 P] by the edge from a point to the next one, at the one and the other [N]
     move: wp.array[wp.vec3]  # [2 P] how far these have gone in the step [m]
     dt: wp.array[wp.float32]  # its length [s]
     work: wp.array[wp.float64]  # [blades] done on the tissue [J]
-    modulus: float  # of the stiffest element [Pa]
+    modulus: wp.array[wp.float32]  # of the leaf that each is in [Pa]
+    common: float  # modulus of all leaves that carry none
+
+
+@wp.func
+def single(a: wp.vec3d):
+    return wp.vec3(float(a[0]), float(a[1]), float(a[2]))
 
 
 @wp.func
@@ -105,23 +113,34 @@ def move_blades(
 
 
 @wp.kernel(enable_backward=False)
+def empty_boxes(
+    # Out
+    bounds: wp.array[wp.vec3d],
+):
+    """Begin boxes, the lowest and the highest corner of each in turn."""
+    b = wp.tid()
+    bounds[b] = wp.vec3d(wp.float64(1.0e30 * (1.0 - 2.0 * float(b % 2))))
+
+
+@wp.func
+def extend_box(b: int, low: wp.vec3d, high: wp.vec3d, bounds: wp.array[wp.vec3d]):
+    wp.atomic_min(bounds, 2 * b, low)
+    wp.atomic_max(bounds, 2 * b + 1, high)
+
+
+@wp.kernel(enable_backward=False)
 def place_points(
     # In
     motions: Motions,
     # In and out
     edges: Edges,
 ):
-    """Find where points are, and their bounds; one thread, as there are few."""
-    low = wp.vec3(1.0e30)
-    high = wp.vec3(-1.0e30)
-    for k in range(edges.local.shape[0]):
-        x = wp.transform_point(motions.later[0, edges.blade[k]], edges.local[k])
-        edges.x[k] = x
-        edges.best[k] = wp.int64(-1)
-        low = wp.min(low, x)
-        high = wp.max(high, x)
-    edges.bounds[0] = low
-    edges.bounds[1] = high
+    """Find where points are, and extend their box."""
+    k = wp.tid()
+    x = wp.transform_point(motions.later[0, edges.blade[k]], edges.local[k])
+    edges.x[k] = x
+    edges.best[k] = wp.int64(-1)
+    extend_box(0, doubled(x), doubled(x), edges.bounds)
 
 
 @wp.func
@@ -151,21 +170,23 @@ def find_leaves(
     edges: Edges,
 ):
     """Find the leaf in which each point has the highest quality."""
+    box_low = single(edges.bounds[0])
+    box_high = single(edges.bounds[1])
     for i in range(wp.tid(), pools.counts[LEAVES], threads):
         tet = pools.leaf_tets[i]
         low = tissue_place(tet[0], carried)
         high = low
+        size = float(carried.size[pools.level[pools.leaves[i]]])
+        if are_apart(low, high, box_low, box_high, FAR * size):
+            continue
         for n in range(1, 4):
             low = wp.min(low, tissue_place(tet[n], carried))
             high = wp.max(high, tissue_place(tet[n], carried))
-        margin = wp.vec3(wp.length(high - low))
-        low -= margin
-        high += margin
-        if are_apart(low, high, edges.bounds[0], edges.bounds[1]):
+        if are_apart(low, high, box_low, box_high, REACH * size):
             continue
         for k in range(edges.x.shape[0]):
             x = edges.x[k]
-            if not are_apart(low, high, x, x):
+            if not are_apart(low, high, x, x, REACH * size):
                 quality = wp.min(coordinates(x, tet, carried))
                 if quality > LEAST:
                     rank = wp.int64(int((quality - LEAST) * QUALITIES))
@@ -173,10 +194,11 @@ def find_leaves(
 
 
 @wp.func
-def are_apart(low: wp.vec3, high: wp.vec3, other_low: wp.vec3, other_high: wp.vec3):
+def are_apart(low: wp.vec3, high: wp.vec3, other_low: wp.vec3, other_high: wp.vec3, gap: float):
+    """Whether there is a gap between two boxes."""
     apart = bool(False)
     for axis in range(3):
-        apart = apart or low[axis] > other_high[axis] or high[axis] < other_low[axis]
+        apart = apart or low[axis] - gap > other_high[axis] or high[axis] + gap < other_low[axis]
     return apart
 
 
@@ -190,7 +212,7 @@ def adopt_point(k: int, pools: Pools, carried: Carried, edges: Edges):
     i = int(edges.best[k] & wp.int64(4294967295))
     tet = pools.leaf_tets[i]
     weights = coordinates(edges.x[k], tet, carried)
-    size = float(wp.pow(carried.volume[pools.level[pools.leaves[i]]], wp.float64(1.0 / 3.0)))
+    size = float(carried.size[pools.level[pools.leaves[i]]])
     state = int(IN_TISSUE)
     if wp.min(weights) < INSIDE:
         state = int(AT_SURFACE)
@@ -205,6 +227,7 @@ def adopt_point(k: int, pools: Pools, carried: Carried, edges: Edges):
     edges.nodes[k] = tet
     edges.weights[k] = weights
     edges.size[k] = size
+    edges.modulus[k] = modulus_of(pools.leaves[i], edges.common, carried)
     edges.state[k] = state
     return place
 
@@ -231,36 +254,8 @@ def continued(x: wp.vec3, tet: wp.vec4i, carried: Carried):
     return place
 
 
-@wp.func
-def sweep_point(k: int, pools: Pools, carried: Carried, edges: Edges, surface: Surface):
-    """Bind a point, and find from where to where at rest it has come; returns whether it has cut on its way.
-
-    Before it met the tissue and after it left it, the leaf that it met or left says where it was.
-    """
-    count = edges.x.shape[0]
-    former = edges.state[k]
-    left = edges.nodes[k]
-    start = surface.points[count + k]
-    end = adopt_point(k, pools, carried, edges)
-    state = edges.state[k]
-    swept = former != OUTSIDE and state != OUTSIDE
-    if (former != IN_TISSUE or state != IN_TISSUE) and wp.length(end - start) > wp.float64(JUMP * edges.size[k]):
-        swept = False
-    surface.points[count + k] = end
-    edges.last[k] = end
-    if not swept and state == IN_TISSUE:
-        start = continued(edges.former[k], edges.nodes[k], carried)
-        swept = True
-    elif not swept and former == IN_TISSUE:
-        edges.last[k] = continued(edges.x[k], left, carried)
-        swept = True
-    surface.points[k] = start
-    edges.former[k] = edges.x[k]
-    return swept
-
-
 @wp.kernel(enable_backward=False)
-def sweep(
+def sweep_points(
     # In
     begins: int,
     pools: Pools,
@@ -269,28 +264,55 @@ def sweep(
     edges: Edges,
     surface: Surface,
 ):
-    """Bind the points, and find the strips that they have swept since the last time; one thread."""
+    """Bind points, and find from where to where at rest each has come, and whether it has cut on its way.
+
+    What ended the last strips begins the next ones. Before a point met the tissue and after it left it, the leaf that
+    it met or left says where it was.
+    """
+    k = wp.tid()
     count = edges.x.shape[0]
-    low = wp.vec3d(wp.float64(1.0e30))
-    high = wp.vec3d(wp.float64(-1.0e30))
-    for k in range(count):
-        # What ended the last strips begins the next ones, unless the point was outside.
-        edges.swept[k] = 0
-        if sweep_point(k, pools, carried, edges, surface) and begins == 0:
-            edges.swept[k] = 1
-    for k in range(count):
-        surface.points[2 * count + k] = edges.last[k]
-        surface.triangles[2 * k] = wp.vec3i(k, k, k)
-        surface.triangles[2 * k + 1] = wp.vec3i(k, k, k)
-        if edges.goes_on[k] == 1 and edges.swept[k] == 1 and edges.swept[k + 1] == 1:
-            end = 2 * count + k
-            surface.triangles[2 * k] = wp.vec3i(k, k + 1, end + 1)
-            surface.triangles[2 * k + 1] = wp.vec3i(k, end + 1, end)
-            for n in range(2):
-                low = wp.min(low, wp.min(surface.points[k + n], edges.last[k + n]))
-                high = wp.max(high, wp.max(surface.points[k + n], edges.last[k + n]))
-    surface.bounds[0] = low
-    surface.bounds[1] = high
+    former = edges.state[k]
+    left = edges.nodes[k]
+    start = surface.points[count + k]
+    end = adopt_point(k, pools, carried, edges)
+    last = end
+    state = edges.state[k]
+    swept = former != OUTSIDE and state != OUTSIDE
+    if (former != IN_TISSUE or state != IN_TISSUE) and wp.length(end - start) > wp.float64(JUMP * edges.size[k]):
+        swept = False
+    if not swept and state == IN_TISSUE:
+        start = continued(edges.former[k], edges.nodes[k], carried)
+        swept = True
+    elif not swept and former == IN_TISSUE:
+        last = continued(edges.x[k], left, carried)
+        swept = True
+    edges.former[k] = edges.x[k]
+    edges.swept[k] = wp.where(swept and begins == 0, 1, 0)
+    surface.points[k] = start
+    surface.points[count + k] = end
+    surface.points[2 * count + k] = last
+
+
+@wp.kernel(enable_backward=False)
+def sweep_strips(
+    # In
+    edges: Edges,
+    # In and out
+    surface: Surface,
+):
+    """Make the triangles that the edges have swept since the last time, and extend their boxes."""
+    k = wp.tid()
+    last = 2 * edges.x.shape[0] + k
+    surface.triangles[2 * k] = wp.vec3i(k, k, k)
+    surface.triangles[2 * k + 1] = wp.vec3i(k, k, k)
+    if edges.goes_on[k] == 1 and edges.swept[k] == 1 and edges.swept[k + 1] == 1:
+        surface.triangles[2 * k] = wp.vec3i(k, k + 1, last + 1)
+        surface.triangles[2 * k + 1] = wp.vec3i(k, last + 1, last)
+        for n in range(2):
+            low = wp.min(surface.points[k + n], surface.points[last + n])
+            high = wp.max(surface.points[k + n], surface.points[last + n])
+            extend_box(0, low, high, surface.bounds)
+            extend_box(1 + 2 * k / BUNDLE, low, high, surface.bounds)
 
 
 @wp.func
@@ -315,10 +337,11 @@ def push_of(k: int, move: wp.vec3, along: wp.vec3, most: float, dt: float, carri
         w = edges.weights[k][m]
         yielding += w * w * carried.inverse_mass[edges.nodes[k][m]]
     # Neither inertia nor elasticity stops more than a fraction of the motion.
-    holds = edges.modulus * size * dt
+    modulus = edges.modulus[k]
+    holds = modulus * size * dt
     if yielding > 0.0:
         holds += 1.0 / (yielding * dt)
-    return wp.min(wp.min(most, STRENGTH * edges.modulus * size * size) / speed, HOLD * holds) * v
+    return wp.min(wp.min(most, STRENGTH * modulus * size * size) / speed, HOLD * holds) * v
 
 
 @wp.kernel(enable_backward=False)

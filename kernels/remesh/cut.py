@@ -9,10 +9,11 @@ Leaves near the surface are listed, and their faces meet in a hash table: the se
 
 import warp as wp
 
+from warp_corot.kernels.elements.elements import load_node
 from warp_corot.kernels.meshing.growth import EMPTY, LIVE, claim_slot, edge_key
 
 from .pools import ADDED, FRESH, FULL, LEAVES, REFINE, REMOVED, Pools
-from .state import Carried
+from .state import Carried, doubled
 
 wp.set_module_options({"enable_backward": False})
 
@@ -25,8 +26,14 @@ FACES = wp.constant(4)  # faces cut in this cut
 COUNTS = 5
 
 #: Leaves are near a surface if it is no farther from their centroids than this many times their farthest node: so are
-#: those on both sides of a cut face, and their neighbours.
-NEAR = wp.constant(wp.float64(2.5))
+#: those on both sides of a cut face, and their neighbours, whose centroids are at most 1.36 times as far at rest.
+#: Planes cut bodies that are deformed.
+NEAR = wp.constant(wp.float64(1.4))
+NEAR_DEFORMED = wp.constant(wp.float64(2.5))
+#: At rest, no node of a leaf is farther from its centroid than this many times the cube root of its volume.
+RADIUS = wp.constant(wp.float64(1.71))
+#: Triangles that have a box in common.
+BUNDLE = wp.constant(16)
 #: A leaf's bits in ``Cuts.fresh``: its faces that are cut now, and of these those that it has the surface behind.
 SIDE_SHIFT = wp.constant(4)
 
@@ -42,7 +49,7 @@ class Surface:
     count: int  # number of triangles
     points: wp.array[wp.vec3d]
     triangles: wp.array[wp.vec3i]  # those with equal corners are none
-    bounds: wp.array[wp.vec3d]  # [2] of the triangles
+    bounds: wp.array[wp.vec3d]  # of all triangles, and of each ``BUNDLE``: the lowest and the highest corner
     # Leaves at a triangle are refined to its level; and the energy that faces which it cuts take [J].
     levels: wp.array[wp.int32]
     debt: wp.array[wp.float64]
@@ -97,12 +104,17 @@ def face_key(tet: wp.vec4i, face: int):
 
 @wp.func
 def meet(s: int, face: int, tet: wp.vec4i, cuts: Cuts):
-    """Enter a face of a star; returns the same face of another star if that came before, else -1."""
+    """Enter a face of a star; returns the same face of another star if that came before, else -1, and notes both."""
     slot = claim_slot(face_key(tet, face), cuts.keys)
     if slot < 0:
         slot = -slot - 1
-    cuts.slot[4 * s + face] = slot
-    return wp.atomic_exch(cuts.owner, slot, 4 * s + face)
+    f = 4 * s + face
+    cuts.slot[f] = slot
+    before = wp.atomic_exch(cuts.owner, slot, f)
+    if before >= 0:
+        cuts.other[f] = before
+        cuts.other[before] = f
+    return before
 
 
 @wp.func
@@ -129,13 +141,18 @@ def star_count(cuts: Cuts):
 
 
 @wp.func
+def is_cut(f: int, pools: Pools, cuts: Cuts):
+    """Whether the face of a star is cut."""
+    return (pools.cut[pools.leaves[cuts.stars[f / 4]]] >> (f % 4)) % 2 == 1
+
+
+@wp.func
 def place_of(node: int, is_deformed: wp.float64, pools: Pools, carried: Carried):
     """Where a node is [m]."""
     p = pools.lattice[node]
-    u = carried.u[node]
-    place = wp.vec3d()
-    for axis in range(3):
-        place[axis] = carried.origin[axis] + wp.float64(p[axis]) * carried.spacing + is_deformed * wp.float64(u[axis])
+    place = carried.origin + carried.spacing * wp.vec3d(wp.float64(p[0]), wp.float64(p[1]), wp.float64(p[2]))
+    if is_deformed != wp.float64(0.0):
+        place += is_deformed * doubled(load_node(carried.u, node))
     return place
 
 
@@ -148,25 +165,43 @@ def centroid(tet: wp.vec4i, is_deformed: wp.float64, pools: Pools, carried: Carr
 
 
 @wp.func
-def is_within(x: wp.vec3d, low: wp.vec3d, high: wp.vec3d, margin: wp.float64):
-    inside = bool(True)
+def boxes_meet(low: wp.vec3d, high: wp.vec3d, other_low: wp.vec3d, other_high: wp.vec3d, far: wp.float64):
+    """Whether two boxes are within a distance of one another, or a little farther."""
+    meet = bool(True)
     for axis in range(3):
-        inside = inside and x[axis] >= low[axis] - margin and x[axis] <= high[axis] + margin
-    return inside
+        meet = meet and high[axis] >= other_low[axis] - far and low[axis] <= other_high[axis] + far
+    return meet
+
+
+@wp.func
+def next_near(first: int, p: wp.vec3d, q: wp.vec3d, far: wp.float64, surface: Surface):
+    """The next triangle, from one on, whose box is within a distance of that around two points; their number if there
+    is none."""
+    low = wp.min(p, q)
+    high = wp.max(p, q)
+    t = int(first)
+    while t < surface.count:
+        bundle = 2 + 2 * (t / BUNDLE)
+        if t % BUNDLE == 0 and not boxes_meet(low, high, surface.bounds[bundle], surface.bounds[bundle + 1], far):
+            t += BUNDLE
+        else:
+            corners = surface.triangles[t]
+            a = surface.points[corners[0]]
+            b = surface.points[corners[1]]
+            c = surface.points[corners[2]]
+            near = boxes_meet(low, high, wp.min(a, wp.min(b, c)), wp.max(a, wp.max(b, c)), far)
+            if near and corners[0] != corners[1]:
+                return t
+            t += 1
+    return surface.count
 
 
 @wp.func
 def near_triangle(t: int, x: wp.vec3d, far: wp.float64, surface: Surface):
-    """Whether a triangle is within a distance of a point, or a little farther."""
+    """Whether the plane of a triangle is within a distance of a point."""
     corners = surface.triangles[t]
-    if corners[0] == corners[1]:
-        return False
     a = surface.points[corners[0]]
-    b = surface.points[corners[1]]
-    c = surface.points[corners[2]]
-    if not is_within(x, wp.min(a, wp.min(b, c)), wp.max(a, wp.max(b, c)), far):
-        return False
-    normal = wp.cross(b - a, c - a)
+    normal = wp.cross(surface.points[corners[1]] - a, surface.points[corners[2]] - a)
     return wp.abs(wp.dot(normal, x - a)) <= far * wp.length(normal)
 
 
@@ -175,10 +210,11 @@ def is_near(x: wp.vec3d, far: wp.float64, surface: Surface):
     """Whether a surface is within a distance of a point, or a little farther."""
     if surface.count == 0:
         return wp.abs(wp.dot(surface.normal, x) - surface.offset) <= far
-    if is_within(x, surface.bounds[0], surface.bounds[1], far):
-        for t in range(surface.count):
-            if near_triangle(t, x, far, surface):
-                return True
+    t = next_near(0, x, x, far, surface)
+    while t < surface.count:
+        if near_triangle(t, x, far, surface):
+            return True
+        t = next_near(t + 1, x, x, far, surface)
     return False
 
 
@@ -211,7 +247,8 @@ def crossing(p: wp.vec3d, q: wp.vec3d, surface: Surface):
         if p_behind == q_behind:
             return none, -1
         return surface.normal, -1
-    for t in range(surface.count):
+    t = next_near(0, p, q, zero, surface)
+    while t < surface.count:
         corners = surface.triangles[t]
         a = surface.points[corners[0]]
         normal = wp.cross(surface.points[corners[1]] - a, surface.points[corners[2]] - a)
@@ -225,6 +262,7 @@ def crossing(p: wp.vec3d, q: wp.vec3d, surface: Surface):
             most = wp.max(first, wp.max(second, third))
             if least >= zero or most <= zero:
                 return wp.normalize(normal), t
+        t = next_near(t + 1, p, q, zero, surface)
     return none, -1
 
 
@@ -247,6 +285,16 @@ def begin_cut(
     counts[FACES] = 0
 
 
+@wp.func
+def is_far(i: int, far: wp.float64, surface: Surface, pools: Pools, carried: Carried):
+    """Whether one of its nodes shows that a leaf is farther from all triangles than so many times its radius."""
+    if surface.count == 0:
+        return False
+    x = place_of(pools.leaf_tets[i][0], wp.float64(0.0), pools, carried)
+    far *= RADIUS * carried.size[pools.level[pools.leaves[i]]]
+    return not boxes_meet(x, x, surface.bounds[0], surface.bounds[1], far)
+
+
 @wp.kernel(enable_backward=False)
 def list_near(
     # In
@@ -258,10 +306,13 @@ def list_near(
     cuts: Cuts,
 ):
     """List the leaves near a surface."""
+    near = wp.where(surface.is_deformed > wp.float64(0.0), NEAR_DEFORMED, NEAR)
     for i in range(wp.tid(), pools.counts[LEAVES], threads):
         tet = pools.leaf_tets[i]
+        if is_far(i, near + wp.float64(1.0), surface, pools, carried):
+            continue
         x = centroid(tet, surface.is_deformed, pools, carried)
-        if is_near(x, NEAR * radius(tet, x, surface.is_deformed, pools, carried), surface):
+        if is_near(x, near * radius(tet, x, surface.is_deformed, pools, carried), surface):
             add_star(i, pools, cuts)
 
 
@@ -276,15 +327,17 @@ def mark_near(
 ):
     """Mark leaves at triangles for refinement to the triangles' levels."""
     for i in range(wp.tid(), pools.counts[LEAVES], threads):
-        tet = pools.leaf_tets[i]
         mark = wp.int8(0)
-        x = centroid(tet, surface.is_deformed, pools, carried)
-        far = radius(tet, x, surface.is_deformed, pools, carried)
-        if is_within(x, surface.bounds[0], surface.bounds[1], far):
+        if not is_far(i, wp.float64(2.0), surface, pools, carried):
+            tet = pools.leaf_tets[i]
+            x = centroid(tet, surface.is_deformed, pools, carried)
+            far = radius(tet, x, surface.is_deformed, pools, carried)
             level = pools.level[pools.leaves[i]]
-            for t in range(surface.count):
+            t = next_near(0, x, x, far, surface)
+            while t < surface.count:
                 if level < surface.levels[t] and near_triangle(t, x, far, surface):
                     mark = REFINE
+                t = next_near(t + 1, x, x, far, surface)
         pools.marks[i] = mark
 
 
@@ -303,33 +356,28 @@ def cross_faces(
         s = f / 4
         tet = pools.leaf_tets[cuts.stars[s]]
         before = meet(s, f % 4, tet, cuts)
-        if before >= 0:
-            cuts.other[f] = before
-            cuts.other[before] = f
-            e = pools.leaves[cuts.stars[s]]
-            if (pools.cut[e] >> (f % 4)) % 2 == 0:
-                other = cuts.stars[before / 4]
-                p = centroid(tet, surface.is_deformed, pools, carried)
-                q = centroid(pools.leaf_tets[other], surface.is_deformed, pools, carried)
-                normal, _t = crossing(p, q, surface)
-                if wp.length_sq(normal) > wp.float64(0.0):
-                    side = wp.where(wp.dot(normal, q - p) > wp.float64(0.0), 0, 1)
-                    cut_side(s, f % 4, side, pools, cuts)
-                    cut_side(before / 4, before % 4, 1 - side, pools, cuts)
+        if before >= 0 and not is_cut(f, pools, cuts):
+            p = centroid(tet, surface.is_deformed, pools, carried)
+            q = centroid(pools.leaf_tets[cuts.stars[before / 4]], surface.is_deformed, pools, carried)
+            normal, _t = crossing(p, q, surface)
+            if wp.length_sq(normal) > wp.float64(0.0):
+                side = wp.where(wp.dot(normal, q - p) > wp.float64(0.0), 0, 1)
+                cut_side(f, side, pools, cuts)
+                cut_side(before, 1 - side, pools, cuts)
 
 
 @wp.func
-def cut_side(s: int, face: int, side: int, pools: Pools, cuts: Cuts):
-    bit = wp.lshift(1, face)
-    wp.atomic_or(pools.cut, pools.leaves[cuts.stars[s]], bit)
-    wp.atomic_or(cuts.fresh, s, bit | wp.lshift(side, SIDE_SHIFT + face))
+def cut_side(f: int, side: int, pools: Pools, cuts: Cuts):
+    bit = wp.lshift(1, f % 4)
+    wp.atomic_or(pools.cut, pools.leaves[cuts.stars[f / 4]], bit)
+    wp.atomic_or(cuts.fresh, f / 4, bit | wp.lshift(side, SIDE_SHIFT + f % 4))
 
 
 @wp.func
-def heal_side(s: int, face: int, pools: Pools, cuts: Cuts):
-    bit = wp.lshift(1, face)
-    wp.atomic_and(pools.cut, pools.leaves[cuts.stars[s]], ~bit)
-    wp.atomic_and(cuts.fresh, s, ~bit)
+def heal_side(f: int, pools: Pools, cuts: Cuts):
+    bit = wp.lshift(1, f % 4)
+    wp.atomic_and(pools.cut, pools.leaves[cuts.stars[f / 4]], ~bit)
+    wp.atomic_and(cuts.fresh, f / 4, ~bit)
 
 
 @wp.kernel(enable_backward=False)
@@ -344,20 +392,18 @@ def join_lone(
     for s in range(wp.tid(), star_count(cuts), threads):
         fresh = cuts.fresh[s]
         if fresh % 16 != 0:
-            bits = pools.cut[pools.leaves[cuts.stars[s]]]
             hangs = bool(False)
             side = int(-1)
             for n in range(4):
-                if (bits >> n) % 2 == 0 and cuts.other[4 * s + n] >= 0:
+                if cuts.other[4 * s + n] >= 0 and not is_cut(4 * s + n, pools, cuts):
                     hangs = True
                 if (fresh >> n) % 2 == 1 and side < 0:
                     side = (fresh >> (SIDE_SHIFT + n)) % 2
             if not hangs:
                 for n in range(4):
                     if (fresh >> n) % 2 == 1 and (fresh >> (SIDE_SHIFT + n)) % 2 == side:
-                        other = cuts.other[4 * s + n]
-                        heal_side(s, n, pools, cuts)
-                        heal_side(other / 4, other % 4, pools, cuts)
+                        heal_side(4 * s + n, pools, cuts)
+                        heal_side(cuts.other[4 * s + n], pools, cuts)
 
 
 @wp.func

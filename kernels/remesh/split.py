@@ -16,9 +16,9 @@ from warp_corot.kernels.elements.elements import load_node, store_node
 from warp_corot.kernels.meshing.bisection import refinement_end
 from warp_corot.kernels.plan.tree import TORN
 
-from .cut import COPIES, MARKED, STAMP, STARS, Cuts, add_star, face_node, forget, meet, star_count
+from .cut import COPIES, MARKED, STAMP, STARS, Cuts, add_star, face_node, forget, is_cut, meet, star_count
 from .pools import ADDED, FULL, LEAVES, NODE_TOP, Pools
-from .state import Carried, quarter_mass
+from .state import Carried, copy_node, quarter_mass, refresh_mass
 
 wp.set_module_options({"enable_backward": False})
 
@@ -98,7 +98,7 @@ def unite_corners(
     for f in range(wp.tid(), 4 * star_count(cuts), threads):
         s = f / 4
         i = cuts.stars[s]
-        if (pools.cut[pools.leaves[i]] >> (f % 4)) % 2 == 0:
+        if not is_cut(f, pools, cuts):
             tet = pools.leaf_tets[i]
             before = meet(s, f % 4, tet, cuts)
             if before >= 0:
@@ -126,23 +126,6 @@ def choose_keepers(
                 wp.atomic_min(cuts.keeper, node, c)
 
 
-@wp.func
-def copy_node(node: int, new: int, pools: Pools, carried: Carried):
-    pools.lattice[new] = pools.lattice[node]
-    pools.ends[new] = pools.ends[node]
-    pools.valence[new] = 0
-    pools.touched[new] = 0
-    store_node(carried.rest, new, load_node(carried.rest, node))
-    store_node(carried.u, new, load_node(carried.u, node))
-    store_node(carried.v, new, load_node(carried.v, node))
-    store_node(carried.load, new, load_node(carried.load, node))
-    store_node(carried.reaction, new, load_node(carried.reaction, node))
-    store_node(carried.snap, new, load_node(carried.snap, node))
-    carried.held[new] = carried.held[node]
-    carried.row[new] = carried.row[node]
-    carried.mass[new] = wp.float64(0.0)
-
-
 @wp.kernel(enable_backward=False)
 def copy_nodes(
     # In
@@ -159,7 +142,12 @@ def copy_nodes(
             if cuts.mark[node] == cuts.counts[STAMP] and cuts.keeper[node] != c:
                 new = pools.counts[NODE_TOP] + wp.atomic_add(cuts.counts, COPIES, 1)
                 if new < pools.node_limit:
-                    copy_node(node, new, pools, carried)
+                    pools.lattice[new] = pools.lattice[node]
+                    pools.ends[new] = pools.ends[node]
+                    pools.valence[new] = 0
+                    pools.touched[new] = 0
+                    carried.mass[new] = wp.float64(0.0)
+                    copy_node(node, new, carried)
                     cuts.former_mass[new] = cuts.former_mass[node]
                     cuts.copy[c] = new
                 else:
@@ -204,11 +192,7 @@ def settle(node: int, carried: Carried, cuts: Cuts):
     if share != 1.0:
         store_node(carried.load, node, share * load_node(carried.load, node))
         store_node(carried.reaction, node, share * load_node(carried.reaction, node))
-    carried.mass32[node] = float(mass)
-    inverse = float(0.0)
-    if carried.held[node] == wp.uint8(0) and mass > wp.float64(0.0):
-        inverse = float(wp.float64(1.0) / mass)
-    carried.inverse_mass[node] = inverse
+    refresh_mass(node, carried)
 
 
 @wp.func

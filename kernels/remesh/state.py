@@ -35,6 +35,7 @@ class Carried:
     origin: wp.vec3d  # of the lattice [m]
     spacing: wp.float64  # of its points [m]
     volume: wp.array[wp.float64]  # rest volume by level [m^3]
+    size: wp.array[wp.float64]  # its cube root [m]
     # Nodes; these arrays include padding.
     rest: wp.array[wp.vec4]  # rest position [m]
     u: wp.array[wp.vec4]
@@ -53,6 +54,8 @@ class Carried:
     values: wp.array2d[wp.float32]
     merging: wp.array[wp.int32]  # MEAN, MEAN_OF_CONTENTS, … of each column of values
     fill_column: int  # column of the filled fraction, -1 if all elements are full
+    mu_column: int  # columns of Lamé's parameters times the filled fraction, -1 if all elements have the same
+    lam_column: int
     numbers: wp.array2d[wp.int32]  # whole numbers; a parent has its first child's
     # During removal of nodes.
     gained_mass: wp.array[wp.float64]
@@ -71,6 +74,14 @@ def doubled(a: wp.vec3):
 @wp.func
 def quarter_mass(e: int, level: int, carried: Carried):
     return wp.float64(0.25) * carried.density[e] * carried.volume[level]
+
+
+@wp.func
+def modulus_of(e: int, common: float, carried: Carried):
+    """2 mu + lambda of a leaf, times its filled fraction [Pa]; what is common to all leaves that carry none."""
+    if carried.mu_column < 0:
+        return common
+    return 2.0 * carried.values[e, carried.mu_column] + carried.values[e, carried.lam_column]
 
 
 @wp.func
@@ -188,6 +199,19 @@ def give_to_end(
 
 
 @wp.func
+def copy_node(z: int, to: int, carried: Carried):
+    """Copy the data of a node but its mass."""
+    carried.held[to] = carried.held[z]
+    carried.row[to] = carried.row[z]
+    store_node(carried.rest, to, load_node(carried.rest, z))
+    store_node(carried.u, to, load_node(carried.u, z))
+    store_node(carried.v, to, load_node(carried.v, z))
+    store_node(carried.load, to, load_node(carried.load, z))
+    store_node(carried.reaction, to, load_node(carried.reaction, z))
+    store_node(carried.snap, to, load_node(carried.snap, z))
+
+
+@wp.func
 def wipe_node(z: int, carried: Carried):
     """Clear the data of a removed node."""
     carried.mass[z] = wp.float64(0.0)
@@ -209,14 +233,7 @@ def move_node(z: int, place: int, carried: Carried):
     carried.mass[place] = carried.mass[z]
     carried.mass32[place] = carried.mass32[z]
     carried.inverse_mass[place] = carried.inverse_mass[z]
-    carried.held[place] = carried.held[z]
-    carried.row[place] = carried.row[z]
-    store_node(carried.rest, place, load_node(carried.rest, z))
-    store_node(carried.u, place, load_node(carried.u, z))
-    store_node(carried.v, place, load_node(carried.v, z))
-    store_node(carried.load, place, load_node(carried.load, z))
-    store_node(carried.reaction, place, load_node(carried.reaction, z))
-    store_node(carried.snap, place, load_node(carried.snap, z))
+    copy_node(z, place, carried)
     wipe_node(z, carried)
 
 
@@ -258,6 +275,17 @@ def settle_ends(
         carried.gain_count[end] = 0
 
 
+@wp.func
+def refresh_mass(i: int, carried: Carried):
+    """Update the mass of a node for stepping."""
+    mass = carried.mass[i]
+    carried.mass32[i] = float(mass)
+    inverse = float(0.0)
+    if carried.held[i] == wp.uint8(0) and mass > wp.float64(0.0):
+        inverse = float(wp.float64(1.0) / mass)
+    carried.inverse_mass[i] = inverse
+
+
 @wp.kernel(enable_backward=False)
 def refresh_masses(
     # In
@@ -271,9 +299,4 @@ def refresh_masses(
     if pools.counts[ADDED] + pools.counts[REMOVED] == 0:
         count = 0
     for i in range(wp.tid(), count, threads):
-        mass = carried.mass[i]
-        carried.mass32[i] = float(mass)
-        inverse = float(0.0)
-        if carried.held[i] == wp.uint8(0) and mass > wp.float64(0.0):
-            inverse = float(wp.float64(1.0) / mass)
-        carried.inverse_mass[i] = inverse
+        refresh_mass(i, carried)

@@ -7,7 +7,7 @@ enough.
 import warp as wp
 
 from .pools import LEAVES, Pools
-from .state import Carried
+from .state import Carried, modulus_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -25,8 +25,6 @@ def find_stiffest(
     threads: int,
     goes: wp.array[wp.int32],
     modulus: float,
-    mu_column: int,
-    lam_column: int,
     pools: Pools,
     carried: Carried,
     # Out
@@ -34,7 +32,7 @@ def find_stiffest(
 ):
     """Largest (2 mu + lambda) / (density volume^(2/3)) [1/s^2] of the leaves, as a float's bits, and the finest level.
 
-    ``modulus`` is 2 mu + lambda [Pa] if all elements have the same, and columns of ``values`` are negative.
+    ``modulus`` is 2 mu + lambda [Pa] if all elements have the same.
     """
     count = wp.where(goes[0] != 0, pools.counts[LEAVES], 0)
     most = float(0.0)
@@ -42,11 +40,8 @@ def find_stiffest(
     for i in range(wp.tid(), count, threads):
         e = pools.leaves[i]
         level = pools.level[e]
-        stiffness = modulus
-        if mu_column >= 0:
-            stiffness = 2.0 * carried.values[e, mu_column] + carried.values[e, lam_column]
-        size = wp.pow(float(carried.volume[level]), 2.0 / 3.0)
-        most = wp.max(most, stiffness / (float(carried.density[e]) * size))
+        size = carried.size[level]
+        most = wp.max(most, modulus_of(e, modulus, carried) / float(carried.density[e] * size * size))
         finest = wp.max(finest, level)
     # Positive floats have the order of their bits. Few threads reach the write.
     bits = wp.cast(most, wp.int32)

@@ -8,7 +8,7 @@ and no other face of its leaves is pulled harder, so that a tear runs instead of
 import warp as wp
 
 from .criteria import green_strain
-from .cut import Cuts, Surface, add_star, cut_side, face_node, meet, star_count
+from .cut import Cuts, Surface, add_star, cut_side, face_node, is_cut, meet, star_count
 from .mark import Contents, load_state
 from .pools import LEAVES, Pools
 from .state import Carried
@@ -49,17 +49,14 @@ def pull_faces(
             normal = wp.cross(element.rest[face_node(face, 1)] - a, element.rest[face_node(face, 2)] - a)
             normal = wp.normalize(normal)
             cuts.pull[4 * s + face] = element.lam * wp.trace(e) + 2.0 * element.mu * wp.dot(normal, e * normal)
-            before = meet(s, face, pools.leaf_tets[i], cuts)
-            if before >= 0:
-                cuts.other[4 * s + face] = before
-                cuts.other[before] = 4 * s + face
+            meet(s, face, pools.leaf_tets[i], cuts)
 
 
 @wp.func
 def mean_pull(f: int, pools: Pools, cuts: Cuts):
     """The mean stress across a face that holds two leaves together; zero across others."""
     other = cuts.other[f]
-    if other < 0 or (pools.cut[pools.leaves[cuts.stars[f / 4]]] >> (f % 4)) % 2 == 1:
+    if other < 0 or is_cut(f, pools, cuts):
         return 0.0
     return 0.5 * (cuts.pull[f] + cuts.pull[other])
 
@@ -99,6 +96,5 @@ def tear_faces(
     """Cut the chosen faces."""
     for f in range(wp.tid(), 4 * star_count(cuts), threads):
         if cuts.link[f] == 1:
-            other = cuts.other[f]
-            cut_side(f / 4, f % 4, 0, pools, cuts)
-            cut_side(other / 4, other % 4, 1, pools, cuts)
+            cut_side(f, 0, pools, cuts)
+            cut_side(cuts.other[f], 1, pools, cuts)

@@ -61,13 +61,35 @@ def test_the_force_on_a_blade_is_the_toughness_times_its_length(device):
     assert mean[3] == pytest.approx(-0.02 * mean[1], rel=0.1)
 
 
-def test_the_work_of_a_blade_is_that_of_the_cut_and_what_moves(device):
-    body, blade = block(device), falling()
+@pytest.mark.parametrize("seed", range(2))
+def test_the_work_of_a_blade_is_that_of_the_cut_and_what_moves(seed, device):
+    assert_energy_is_balanced(seed, device)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2, 22))
+def test_the_work_of_random_cuts_is_balanced(seed, device):
+    assert_energy_is_balanced(seed, device)
+
+
+def assert_energy_is_balanced(seed, device):
+    """A straight blade goes in a random direction to a random depth, through a body without damping."""
+    rng = np.random.default_rng(seed)
+    body = block(device, level=int(rng.integers(6, 8)))
+    way = np.array([0.25 * rng.normal(), -1.0, 0.25 * rng.normal()])
+    way /= np.linalg.norm(way)
+    edge = np.cross(way, rng.normal(size=3) * [1.0, 0.2, 1.0])
+    edge *= 0.09 / np.linalg.norm(edge)
+    begin = np.array([0.06, 0.02, 0.02]) + rng.normal(size=3) * [0.012, 0.004, 0.004] - 0.04 * way
+    blade = wc.Blade([-edge, edge], position=begin)
+    blade.follow([0.0, 0.2], [begin, begin + rng.uniform(0.05, 0.1) * way])
     sim = cut(body, blade, damping=0.0)
     energy, (edges,) = sim.energy(), sim.blades.of_bodies
-    paid = TOUGHNESS * body.cut_area - edges.surface.debt.numpy().sum()
-    assert paid > 0.9 * TOUGHNESS * body.cut_area  # what the blade owes as it leaves is of one element
-    assert blade.work == pytest.approx(paid + energy.elastic + energy.kinetic, rel=0.01)
+    # What the edge owes for the last row of elements that it has cut.
+    owed = edges.surface.debt.numpy().sum()
+    assert 0.0 < owed < 0.25 * TOUGHNESS * body.cut_area
+    cost = TOUGHNESS * body.cut_area + energy.elastic + energy.kinetic
+    assert blade.work + owed == pytest.approx(cost, rel=0.02)
 
 
 def test_a_cut_that_stops_halfway_opens_under_load(device):
@@ -189,34 +211,6 @@ def test_implicit_steps_are_cut(device):
     assert blade.work == pytest.approx(TOUGHNESS * body.cut_area, rel=0.2)
 
 
-@pytest.mark.parametrize("seed", range(8))
-def test_random_blades_leave_sound_bodies(seed, device):
-    assert_random_blade(seed, device)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", range(8, 200))
-def test_many_random_blades_leave_sound_bodies(seed, device):
-    assert_random_blade(seed, device)
-
-
-def assert_random_blade(seed, device):
-    """A bent blade that goes to random places and turns, through a body that swings."""
-    rng = np.random.default_rng(seed)
-    body = block(device, level=int(rng.integers(4, 8)), toughness=float(rng.choice([0.0, 2.0, 20.0])))
-    edge = np.column_stack([0.01 * rng.normal(size=(3, 2)), np.linspace(-0.04, 0.04, 3)])
-    blade = wc.Blade(edge, level=rng.choice([None, 7]))
-    centre = np.array([0.06, 0.02, 0.02])
-    places = centre + rng.normal(size=(4, 3)) * [0.03, 0.03, 0.01]
-    blade.follow(np.linspace(0.0, 0.15, 4), places, rng.normal(size=(4, 4)))
-    sim = wc.Simulation(body, gravity=20.0 * rng.normal(size=3), cuts=[blade], integrator=wc.SymplecticEuler())
-    for _ in range(3):
-        sim.advance(0.05)
-        mesh = assert_cut_sound(body.changing.forest)
-    assert np.isfinite(body.positions.numpy()).all()
-    assert mesh.volumes.sum() == pytest.approx(3 * 0.04**3, rel=1e-9)
-
-
 def test_bad_blades_are_refused_in_one_line(device):
     for edge, said in [
         ([(0, 0, 0)], "at least two"),
@@ -239,7 +233,14 @@ def test_bad_blades_are_refused_in_one_line(device):
     fast = falling(seconds=0.001)
     with pytest.raises(wc.InputError, match=r"a blade goes .* mm in a step"):
         wc.Simulation(block(device), cuts=[fast])
-    wc.Simulation(block(device), cuts=[blade])
+    sim = wc.Simulation(block(device), gravity=(0, 0, 0), cuts=[blade])
+    blade.follow([0.0, 1.0], [(0, 0, 0), (0, 0, 0.01)])
+    with pytest.raises(wc.InputError, match=r"a blade goes .* mm in a step"):
+        blade.follow([0.0, 0.001], [(0, 0, 0), (0, 0.06, 0)])
+    with pytest.raises(wc.InputError, match="finite"):
+        blade.follow([0.0, 1.0], [(0, 0, 0), (0, np.nan, 0)])
+    sim.advance(0.5)  # along the last good path
+    np.testing.assert_allclose(blade.present_pose[0, :3], [0, 0, 0.005], atol=1e-3)
     with pytest.raises(wc.InputError, match="two simulations"):
         wc.Simulation(block(device), cuts=[blade])
     with pytest.raises(wc.InputError, match="toughness is -1"):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import warp as wp
 from cut_cases import assert_cut_sound
 from remesh_cases import momentum, moving, random_marks
 from remeshed import bar, near, twin
@@ -9,6 +10,7 @@ from remeshed import bar, near, twin
 import warp_corot as wc
 from warp_corot.discretization.changing.cutting import CutPass, plane_surface
 from warp_corot.discretization.changing.passes import RemeshPass
+from warp_corot.kernels.remesh.cut import Surface
 
 STEPS = wc.SymplecticEuler(dt=2e-4, damping=1.0)
 
@@ -90,6 +92,22 @@ def test_a_cut_body_moves_as_one_that_was_cut_before(model, device):
     np.testing.assert_allclose(body.positions.numpy(), other.body.positions.numpy(), atol=1e-6)
 
 
+@pytest.mark.parametrize("precision", ["float32", "float64"])
+def test_a_cut_body_rests_as_one_that_was_cut_before(precision, device):
+    body = bar(device, poisson=0.48)
+    sim = wc.Simulation(body, integrator=STEPS, cuts=[])
+    sim.cut(wc.Plane((0.1, 1.0, 0.0), 0.03))
+    sim.advance(0.01)
+    other = twin(body, wc.Corotated(), sim).body
+    for each in (body, other):
+        each.displacements = np.zeros((each.node_count, 3))
+        report = wc.solve_static(each, gravity=(0, -9.81, 0), precision=precision)
+        assert report.converged, report.message
+    assert body.pieces == 2
+    np.testing.assert_allclose(body.positions.numpy(), other.positions.numpy(), atol=2e-6)
+    sim.advance(0.01)
+
+
 def test_a_shared_dilatation_does_not_reach_across_a_cut(device):
     """Elements on one side do not feel how those on the other are squeezed."""
     body = bar(device, poisson=0.48)
@@ -141,6 +159,34 @@ def test_supports_motions_and_loads_are_carried(device):
     end = points[:, 0] > 0.2 - 1e-9
     np.testing.assert_allclose(body.displacements.numpy()[end], np.tile([0.01, 0, 0], (end.sum(), 1)), atol=1e-6)
     np.testing.assert_array_equal(body.displacements.numpy()[points[:, 0] < 1e-9], 0.0)
+
+
+def slit(corners, device):
+    """A triangle in the body at rest, [3, 3] [m]."""
+    surface = Surface()
+    surface.count = 1
+    surface.points = wp.array(corners, dtype=wp.vec3d, device=device)
+    surface.triangles = wp.array([[0, 1, 2]], dtype=wp.vec3i, device=device)
+    box = np.stack([corners.min(axis=0), corners.max(axis=0)])
+    surface.bounds = wp.array(np.tile(box, (2, 1)), dtype=wp.vec3d, device=device)
+    surface.levels = wp.array([-1], dtype=wp.int32, device=device)
+    surface.debt = wp.zeros(1, dtype=wp.float64, device=device)
+    return surface
+
+
+def test_a_hundred_slits_hardly_slow_implicit_steps(device, rng):
+    found = []
+    for count in (0, 100):
+        body = bar(device, level=5)
+        sim = wc.Simulation(body, integrator=wc.BackwardEuler(dt=0.01), gravity=(0, -9.81, 0), cuts=[])
+        for _ in range(count):
+            centre = rng.uniform([0.02, 0.0, 0.0], [0.2, 0.05, 0.05])
+            body.changing.cut(slit(centre + 0.015 * rng.normal(size=(3, 3)), device))
+        assert body.cut_area > 0.0 or not count
+        sim.advance_steps(8)
+        assert sim.solves.unfinished == 0
+        found.append(sim.solves.linear_iterations)
+    assert found[1] < 1.5 * found[0]
 
 
 def test_reset_heals(device):

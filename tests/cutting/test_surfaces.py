@@ -1,12 +1,9 @@
 """Surfaces of bodies that were cut: closed, with both lips, drawn and in contact."""
 
-import itertools
-from collections import Counter
-
 import numpy as np
 import pytest
 from bodies import ball
-from cut_cases import assert_cut_sound
+from cut_cases import assert_closed, assert_cut_sound
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -21,14 +18,6 @@ def organ(device, young=3e4):
     body = wc.SoftBody(mesh, wc.Isotropic(young, 0.4, 1000.0), device=device)
     body.fix("x < xmin + 0.1")
     return body
-
-
-def assert_closed(triangles):
-    ways = Counter()
-    for face in triangles.tolist():
-        for a, b in itertools.pairwise([*face, face[0]]):
-            ways[min(a, b), max(a, b)] += 1 if a < b else -1
-    assert not any(ways.values())
 
 
 def volume(points, triangles):

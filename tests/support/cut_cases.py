@@ -1,8 +1,5 @@
 """What must hold for a forest on the device after every cut, found independently of the kernels that cut."""
 
-import itertools
-from collections import Counter
-
 import numpy as np
 from remesh_cases import assert_padding
 from scipy.sparse import coo_array
@@ -26,12 +23,10 @@ def face_table(tets):
 
 def star_components(tets, pairs):
     """A component for each corner of each leaf, [T, 4]: those of one node joined by these inner faces."""
-    links = []
-    for (a, face_a), (b, face_b) in pairs:
-        for n in FACES[face_a]:
-            m = next(m for m in FACES[face_b] if tets[b, m] == tets[a, n])
-            links.append((4 * a + n, 4 * b + m))
-    links = np.array(links).reshape(-1, 2)
+    (a, face_a), (b, _) = np.moveaxis(pairs, 0, 2)
+    here = np.array(FACES)[face_a]
+    there = (tets[a[:, None], here][:, :, None] == tets[b][:, None, :]).argmax(axis=2)
+    links = np.stack([4 * a[:, None] + here, 4 * b[:, None] + there], axis=2).reshape(-1, 2)
     graph = coo_array((np.ones(len(links)), links.T), shape=(tets.size, tets.size))
     return connected_components(graph, directed=False)[1].reshape(tets.shape)
 
@@ -47,7 +42,7 @@ def assert_cut_sound(device, *, lone=False):
     np.testing.assert_array_equal(*at)  # both leaves of a face know that it is cut
     whole = faces[~at[0]]
     # Every node has one component of leaves joined by uncut faces: nothing hangs on a node or an edge.
-    component = star_components(tets, whole.tolist())
+    component = star_components(tets, whole)
     pairs = np.unique(np.stack([tets.ravel(), component.ravel()], axis=1), axis=0)
     assert len(pairs) == device.node_count
     np.testing.assert_array_equal(np.unique(tets), np.arange(device.node_count))
@@ -72,7 +67,7 @@ def assert_cut_sound(device, *, lone=False):
     expected = np.where(free, 1.0 / masses, 0.0)
     np.testing.assert_allclose(arrays.inverse_mass.numpy()[: len(masses)], expected, rtol=1e-6)
     np.testing.assert_allclose(arrays.rest.numpy()[: len(masses), :3], mesh.points, rtol=1e-6, atol=1e-7)
-    assert_closed(mesh)
+    assert_closed(boundary_faces(mesh.tets, mesh.points)[0])
     return mesh
 
 
@@ -81,23 +76,23 @@ def assert_ancestors(tree):
     inner = np.flatnonzero(tree.first_child >= 0)
     cut = np.zeros(len(tree.level), int) if tree.cut is None else tree.cut
     torn = np.zeros(len(tree.level), bool)
-    for e in inner[np.argsort(-tree.level[inner], kind="stable")]:
-        first = tree.first_child[e]
-        k = 3 - tree.level[e] % 3
+    for level in np.unique(tree.level[inner])[::-1]:
+        above = inner[tree.level[inner] == level]
+        first = tree.first_child[above]
+        k = 3 - level % 3
         a, b = tree.tets[first], tree.tets[first + 1]
         corners = a.copy()
-        corners[k] = b[k - 1]
-        np.testing.assert_array_equal(tree.tets[e], corners)
-        shared = [(n, n - 1 if n < k else n) for n in range(1, 4)]
-        torn[e] = torn[first] or torn[first + 1] or any(a[n] != b[m] for n, m in shared)
+        corners[:, k] = b[:, k - 1]
+        np.testing.assert_array_equal(tree.tets[above], corners)
+        differ = [a[:, n] != b[:, n - 1 if n < k else n] for n in range(1, 4)]
+        torn[above] = torn[first] | torn[first + 1] | np.any(differ, axis=0)
     np.testing.assert_array_equal(cut[inner] >= 16, torn[inner])
 
 
-def assert_closed(mesh):
-    """The boundary of the elements is closed and wound consistently: every edge is passed as often each way."""
-    faces, _ = boundary_faces(mesh.tets, mesh.points)
-    ways = Counter()
-    for face in faces.tolist():
-        for a, b in itertools.pairwise([*face, face[0]]):
-            ways[min(a, b), max(a, b)] += 1 if a < b else -1
-    assert not any(ways.values())
+def assert_closed(triangles):
+    """A surface is closed and wound consistently: every edge is passed as often each way."""
+    edges = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64)
+    ways = np.where(edges[:, 0] < edges[:, 1], 1, -1)
+    edges.sort(axis=1)
+    _, number = np.unique(edges[:, 0] << 32 | edges[:, 1], return_inverse=True)
+    assert not np.bincount(number, weights=ways).any()

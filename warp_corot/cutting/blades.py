@@ -24,22 +24,13 @@ if TYPE_CHECKING:
 #: Distance of points on an edge, and the largest motion between two cuts, over the size of an element there.
 SPACING, MOTION = 0.5, 0.25
 #: Arrays of edges from which a run goes on.
-KEPT = ("state", "former", "nodes", "weights", "size", "push", "move", "dt", "work")
+KEPT = ("state", "former", "nodes", "weights", "size", "modulus", "push", "move", "dt", "work")
 #: Passes that refine before each cut.
 REFINEMENTS = 3
-#: Cuts after which the stable step is found again at the latest.
-FIND_EVERY = 64
+#: Cuts in a row that change no mesh, after which the stable step is found again; that takes as long as a hundred steps.
+SETTLED = 64
 #: The most steps between two cuts.
 MOST_STEPS = 64
-
-
-class BladeMotion(Obstacles):
-    """Where blades are; they bound no step as obstacles do."""
-
-    def update(self) -> None:
-        rates = wp.clone(self.system.motion_rates)
-        super().update()
-        wp.copy(self.system.motion_rates, rates)
 
 
 class EdgePoints:
@@ -62,23 +53,22 @@ class EdgePoints:
         goes_on = np.ones(total, np.int32)
         goes_on[np.cumsum(counts) - 1] = 0
         edges.goes_on = self._ints(goes_on)
-        edges.x, edges.bounds = (wp.zeros(n, dtype=wp.vec3, device=self.device) for n in (total, 2))
+        edges.x, edges.bounds = wp.zeros(total, dtype=wp.vec3, device=self.device), self._boxes(1)
         edges.push, edges.move = (wp.zeros(2 * total, dtype=wp.vec3, device=self.device) for _ in range(2))
         edges.dt = wp.zeros(total, dtype=wp.float32, device=self.device)
         edges.best = wp.zeros(total, dtype=wp.int64, device=self.device)
         edges.nodes = wp.zeros(total, dtype=wp.vec4i, device=self.device)
         edges.weights = wp.zeros(total, dtype=wp.vec4, device=self.device)
-        edges.size = wp.zeros(total, dtype=wp.float32, device=self.device)
+        edges.size, edges.modulus = (wp.zeros(total, dtype=wp.float32, device=self.device) for _ in range(2))
         edges.state, edges.swept = (wp.zeros(total, dtype=wp.int32, device=self.device) for _ in range(2))
         edges.former = wp.zeros(total, dtype=wp.vec3, device=self.device)
-        edges.last = wp.zeros(total, dtype=wp.vec3d, device=self.device)
         edges.work = wp.zeros(len(rows), dtype=wp.float64, device=self.device)
-        edges.modulus = changing.stiffest_modulus
+        edges.common = changing.carried_material.modulus
         surface = self.surface = cut_kernels.Surface()
         surface.count = 2 * total
         surface.points = wp.zeros(3 * total, dtype=wp.vec3d, device=self.device)
         surface.triangles = wp.zeros(2 * total, dtype=wp.vec3i, device=self.device)
-        surface.bounds = wp.zeros(2, dtype=wp.vec3d, device=self.device)
+        surface.bounds = self._boxes(1 + -(-surface.count // int(cut_kernels.BUNDLE)))
         levels = [-1 if blade.level is None else blade.level for blade in blades]
         surface.levels = self._ints(np.repeat(levels, 2 * np.array(counts)))
         surface.debt = wp.zeros(2 * total, dtype=wp.float64, device=self.device)
@@ -102,29 +92,30 @@ class EdgePoints:
     def _launch_cut(self, motions: Any) -> None:
         self.launch_sweep(motions)
         self.changing.launch_cut(self.surface, REFINEMENTS if self.refines else 0)
-        self.launch_binding(motions)
+        self.launch_binding(motions, moved=self.refines)
 
     def launch_sweep(self, motions: Any, *, begins: bool = False) -> None:
         """Launch the search for the strips that the edges have swept since the last one; none if it ``begins``."""
         self._find(motions)
-        inputs = [int(begins), self._pools, self._carried, self.edges, self.surface]
-        wp.launch(kernels.sweep, 1, inputs, device=self.device)
+        self._launch(kernels.empty_boxes, [self.surface.bounds], len(self.surface.bounds))
+        self._launch(kernels.sweep_points, [int(begins), self._pools, self._carried, self.edges, self.surface])
+        self._launch(kernels.sweep_strips, [self.edges, self.surface])
 
-    def launch_binding(self, motions: Any) -> None:
-        """Launch the search for the leaves in which the points are, after these have changed."""
-        self._find(motions)
-        wp.launch(kernels.bind_points, self.count, [self._pools, self._carried, self.edges], device=self.device)
+    def launch_binding(self, motions: Any, *, moved: bool = True) -> None:
+        """Launch the binding of the points to the leaves in which they are, and their search if these have moved in the
+        list of leaves."""
+        if moved:
+            self._find(motions)
+        self._launch(kernels.bind_points, [self._pools, self._carried, self.edges])
 
     def launch_decision(self, begins: wp.array, motions: Any, pace: Any, wrenches: wp.array) -> None:
         """Launch the pushes of a step."""
         inputs = [begins, motions, pace, self._carried, self.edges, self.surface.debt, wrenches]
-        wp.launch(kernels.decide_pushes, self.count, inputs, device=self.device)
+        self._launch(kernels.decide_pushes, inputs)
 
     def launch_pushes(self) -> None:
         """Launch the forces of the pushes on the body's nodes."""
-        wp.launch(
-            kernels.push_tissue, 2 * self.count, [self.edges, self.changing.body.state.forces], device=self.device
-        )
+        self._launch(kernels.push_tissue, [self.edges, self.changing.body.state.forces], 2 * self.count)
 
     def restart(self) -> None:
         """Forget what has been swept."""
@@ -141,15 +132,22 @@ class EdgePoints:
 
     def _find(self, motions: Any) -> None:
         threads = self.changing.forest.threads
-        wp.launch(kernels.place_points, 1, [motions, self.edges], device=self.device)
-        inputs = [threads, self._pools, self._carried, self.edges]
-        wp.launch(kernels.find_leaves, threads, inputs, device=self.device)
+        self._launch(kernels.empty_boxes, [self.edges.bounds], 2)
+        self._launch(kernels.place_points, [motions, self.edges])
+        self._launch(kernels.find_leaves, [threads, self._pools, self._carried, self.edges], threads)
+
+    def _launch(self, kernel: wp.Kernel, inputs: list[Any], dim: int | None = None) -> None:
+        """Launch a kernel over the points, or another number of threads."""
+        wp.launch(kernel, self.count if dim is None else dim, inputs, device=self.device)
+
+    def _boxes(self, count: int) -> wp.array:
+        return wp.zeros(2 * count, dtype=wp.vec3d, device=self.device)
 
     def _ints(self, values: Any) -> wp.array:
         return wp.array(np.asarray(values, np.int32), dtype=wp.int32, device=self.device)
 
 
-class Blades(BladeMotion):
+class Blades(Obstacles):
     """The blades of a simulation, as forces of its system.
 
     Args:
@@ -161,28 +159,39 @@ class Blades(BladeMotion):
     Attributes:
         blades: The blades.
         every: Steps between two cuts.
-        changes: Cuts that changed a mesh.
+        unchanged: Cuts since the last one that changed a mesh; at least ``SETTLED`` before the first.
 
     Raises:
         InputError: A blade is too fast to be followed, or another simulation has it.
     """
 
     def __init__(self, given: Sequence[Blade], system: System, changing: Sequence[Changing], longest: float):
-        size = min(_size(each, given) for each in changing)
-        fastest = max((blade.fastest() or blade.speed) for blade in given)
-        if not fastest * longest <= size:
-            raise InputError(
-                f"a blade goes {1e3 * fastest * longest:.3g} mm in a step, farther than an element of "
-                f"{1e3 * size:.3g} mm; it must be slower than {size / longest:.3g} m/s"
-            )
+        self._size, self._longest = min(_size(each, given) for each in changing), longest
         super().__init__(given, 0.0, system)
-        self.every = int(np.clip(MOTION * size / (fastest * longest), 1, MOST_STEPS))
         self.blades = tuple(given)
-        self.of_bodies = [EdgePoints(given, each, size) for each in changing]
-        self.changes = 0
+        self.of_bodies = [EdgePoints(given, each, self._size) for each in changing]
+        self.unchanged = SETTLED
         self._moved = wp.full(1, -1, dtype=wp.int64, device=self.device)
         self._begins = wp.zeros(1, dtype=wp.int32, device=self.device)
         self._sweep()
+
+    def update(self) -> None:
+        """As ``Obstacles.update``; but blades bound no step, and faster ones cut more often.
+
+        Raises:
+            InputError: A blade is too fast to be followed.
+        """
+        size = self._size
+        far = self._longest * max((blade.fastest() or blade.speed) for blade in self.tools)
+        if not far <= size:
+            raise InputError(
+                f"a blade goes {1e3 * far:.3g} mm in a step, farther than an element of {1e3 * size:.3g} mm; "
+                f"it must be slower than {size / self._longest:.3g} m/s"
+            )
+        self.every = int(np.clip(MOTION * size / far, 1, MOST_STEPS))
+        rates = wp.clone(self.system.motion_rates)
+        super().update()
+        wp.copy(self.system.motion_rates, rates)
 
     # --- as forces ---------------------------------------------------------------------------------------------------
 
@@ -221,17 +230,13 @@ class Blades(BladeMotion):
     def cut(self) -> bool:
         """Cut along what the blades have swept since the last cut; returns whether a mesh has changed."""
         changed = any([each.cut(self.motions) for each in self.of_bodies])
-        self.changes += changed
+        self.unchanged = 0 if changed else self.unchanged + 1
         return changed
 
     @property
-    def is_new(self) -> bool:
-        """Whether the last cut may be unlike those before: the first, second, fourth, and so on, and each sixty-fourth.
-
-        The stable step is found again then, which takes as long as a hundred steps. A cut makes nodes with few
-        elements, and more of them make the step no shorter.
-        """
-        return self.changes & (self.changes - 1) == 0 or self.changes % FIND_EVERY == 0
+    def has_settled(self) -> bool:
+        """Whether meshes have just been the same for some cuts after one that changed them."""
+        return self.unchanged == SETTLED
 
     def bind_again(self) -> None:
         """Find the points' leaves again, after a pass has changed these."""
@@ -242,10 +247,14 @@ class Blades(BladeMotion):
         super().reset(chosen)
         if chosen.numpy()[0]:
             self._moved.fill_(-1)
-            self.changes = 0
+            self.unchanged = SETTLED
             for each in self.of_bodies:
                 each.restart()
             self._sweep()
+
+    def continue_from(self, former: Obstacles) -> None:
+        super().continue_from(former)
+        self._sweep()
 
     def work_of(self, number: int) -> float:
         """Work of a blade on the tissue [J]; waits for the device."""

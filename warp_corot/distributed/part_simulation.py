@@ -97,11 +97,6 @@ class PartSimulation(on_one.Simulation):
         self._pass()
         return True
 
-    def _find_stable_steps(self) -> list[float]:
-        #: The largest stable step of each part's body at rest [s].
-        self.stable_steps = super()._find_stable_steps()
-        return self.stable_steps
-
     def become(self, other: PartSimulation) -> None:
         """Go on with the parts of another simulation, at the same time and with the same hooks."""
         self.guard.forget()

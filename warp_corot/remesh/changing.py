@@ -189,11 +189,6 @@ class Changing:
         return capture.graph
 
     @property
-    def stiffest_modulus(self) -> float:
-        """2 mu + lambda of the stiffest element [Pa]."""
-        return float(np.max(2.0 * self.discretization.mu.numpy() + self.discretization.lam.numpy()))
-
-    @property
     def cut_area(self) -> float:
         """The area of all cuts so far, at rest [m^2]; waits for the device."""
         return float(self.forest.carriage.arrays.cut_area.numpy()[0])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from os import PathLike
@@ -15,17 +14,14 @@ import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.contacts import Contacts
-from warp_corot.contact.grasp import Grasp
 from warp_corot.contact.options import Contact
 from warp_corot.contact.reading import ContactPoint, contact_points
 from warp_corot.contact.tool import Obstacle
 from warp_corot.cutting.blade import Blade, checked_blades
 from warp_corot.cutting.blades import Blades
-from warp_corot.cutting.plane import Plane, checked_plane
-from warp_corot.discretization.changing.cutting import plane_surface
 from warp_corot.discretization.nodal import vec3_view
 from warp_corot.elasticity import Corotated, Model
-from warp_corot.errors import InputError, StabilityWarning, depth_of_user
+from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_count, checked_flag, checked_number, refuse_tape
 from warp_corot.inputs.loading import (
     CONTACT,
@@ -41,19 +37,17 @@ from warp_corot.inputs.loading import (
 from warp_corot.inputs.simulation_lock import SIMULATION_LOCK, under_lock
 from warp_corot.kernels.contact.crushed import count_crushed
 from warp_corot.kernels.elements.elements import ForestElements
-from warp_corot.kernels.remesh.cut import Surface
 from warp_corot.kernels.stepping.gauge import find_strains
 from warp_corot.remesh.online import OnlineRemesh
 from warp_corot.remesh.remeshing import Remeshing
-from warp_corot.solvers import Integrator, SymplecticEuler, largest_frequency
+from warp_corot.solvers import Integrator, SymplecticEuler
 from warp_corot.solvers.guarding.guard import Guard
-from warp_corot.solvers.halo import ALONE, Halo
 from warp_corot.solvers.recorded import RecordedSteps, Segment
 from warp_corot.solvers.steps.pace import Pace
 from warp_corot.solvers.steps.safe_step import ANY_STEP, SafeStep
 from warp_corot.solvers.system import NEVER, Forces, System
 
-from .clock import Clock
+from .cutting import Cutting
 from .energy import Energy, WorldEnergies, find_energies
 from .hooks import Hooks
 from .parts import (
@@ -71,7 +65,7 @@ from .running import Running
 from .solves import Solves
 
 
-class Simulation(Clock):
+class Simulation(Cutting):
     """One or several soft bodies, stepped together.
 
     Args:
@@ -109,7 +103,6 @@ class Simulation(Clock):
         CapacityWarning: A mesh has no room left for refinement; once.
     """
 
-    ranks: Halo = ALONE
     #: Whether this process prints and writes.
     is_root = True
 
@@ -369,11 +362,6 @@ class Simulation(Clock):
         """Shapes and tools that bodies touch, as they were given."""
         return () if self.contact is None else self.contact.obstacles.given
 
-    @property
-    def grasps(self) -> tuple[Grasp, ...]:
-        """The grasps that hold now."""
-        return tuple(each for each in self.system.constraints if isinstance(each, Grasp))
-
     def contacts(self) -> list[ContactPoint]:
         """The contacts of the last step, with places, normals, gaps and forces; waits for the device."""
         return [] if self.contact is None else contact_points(self.contact)
@@ -416,25 +404,6 @@ class Simulation(Clock):
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
-    def _find_stable_steps(self) -> list[float]:
-        """The largest stable step of each body at rest [s]; ``stable_dt`` is the smallest of them."""
-        if self.integrator.is_implicit:
-            self.stable_dt = math.inf
-            return [math.inf] * len(self.bodies)
-        bound = enumerate(zip(self.bodies, self.fields, strict=True))
-        frequencies = [largest_frequency(body, f.stiffest, self.ranks, k) for k, (body, f) in bound]
-        added = sum(getattr(each, "curvature", 0.0) for each in self.system.forces)
-        steps = [self.integrator.stable_step(math.sqrt(frequency**2 + added)) for frequency in frequencies]
-        self.stable_dt = min(steps)
-        given = self.integrator.dt
-        if given is not None and float(given) > self.stable_dt:
-            warnings.warn(
-                f"the time step {float(given):.3g} s is beyond the largest stable one, about {self.stable_dt:.3g} s",
-                StabilityWarning,
-                stacklevel=depth_of_user(),
-            )
-        return steps
-
     def add_forces(self, forces: Forces) -> None:
         """Add forces besides elasticity to every step from now on.
 
@@ -454,126 +423,4 @@ class Simulation(Clock):
         self.system.forces.append(forces)
         self.system.changes += 1
         if curvature > 0.0:
-            stable = self._find_stable_steps()
-            if self.safe_step is not None:
-                self.safe_step.find_rest(stable)
-
-    @under_lock
-    def cut(self, plane: Plane, body: SoftBody | None = None) -> float:
-        """Cut bodies along a plane, at once and where they are now.
-
-        Faces of elements are separated that are nearest to the plane; ``body.pieces`` says how many pieces there are
-        afterwards. A simulation made without ``cuts`` is prepared for cutting by its first cut.
-
-        Args:
-            plane: The plane.
-            body: The body; None: all.
-
-        Returns:
-            The area of the cut, at rest [m^2]; zero if the plane meets nothing.
-
-        Raises:
-            InputError: It is not a plane, the body is not one of this simulation's, a body cannot be cut (see
-                ``remesh.Changing``), or the simulation was made without ``cuts`` and remeshes bodies, has grasps or
-                added forces.
-
-        Warns:
-            CapacityWarning: The mesh has no room left for the nodes of a cut; once.
-        """
-        found = checked_plane(plane)
-        return self._cut(plane_surface(found.normal, found.offset, is_deformed=True), body)
-
-    @under_lock
-    def tear(self, stress: float, body: SoftBody | None = None) -> float:
-        """Separate faces of elements across which bodies are pulled too hard, at once.
-
-        Of all faces of an element only the one that is pulled most tears in a call, so that tears run:
-        ``sim.on_step(lambda sim: sim.tear(2e4), every=10)``.
-
-        Args:
-            stress: The largest normal stress that a face bears, second Piola-Kirchhoff of an isotropic law [Pa].
-            body: The body; None: all.
-
-        Returns:
-            The area that has come apart, at rest [m^2].
-
-        Raises:
-            InputError: The stress is not positive, or as ``cut``.
-
-        Warns:
-            CapacityWarning: As ``cut``.
-        """
-        if not 0.0 < checked_number(stress, "stress", "Pa") < math.inf:
-            raise InputError(f"stress is {stress}; it must be a positive number [Pa]")
-        return self._cut(float(stress), body)
-
-    def _cut(self, surface: Surface | float, body: SoftBody | None) -> float:
-        number = None if body is None else self._index(body)
-        self._prepare_cuts()
-        area = self.remeshing.cut(surface, number)
-        if area > 0.0:
-            self._follow_cut()
-            self.guard.forget()
-        return area
-
-    def _follow_cut(self) -> None:
-        """Find the step again for bodies that were cut just now."""
-        stable = self._find_stable_steps()
-        if self.safe_step is not None:
-            self.safe_step.find_rest(stable)
-
-    def _prepare_cuts(self) -> None:
-        """Let bodies be cut, if the simulation was not made so."""
-        if self.remeshing.are_cut:
-            return
-        if self.remeshing.every or self.grasps or self.system.forces or not self.ranks.is_alone:
-            raise InputError("the simulation was not made for cuts; Simulation(..., cuts=[]) makes one that is")
-        if self.integrator.is_implicit:
-            check_implicit(self.integrator, remeshes=True, ordered=False)
-        former = self.contact
-        touching = None if former is None else (former.obstacles.given, former.options)
-        if former is not None:
-            former.obstacles.let_go()
-        try:
-            self._make(None, touching, ())
-        except BaseException:
-            if former is not None:
-                former.obstacles.take_back()
-            raise
-        if former is not None and self.contact is not None:
-            self.contact.obstacles.continue_from(former.obstacles)
-
-    def follow_motion(self) -> bool:
-        """Cut and remesh the bodies that are due, and adapt the step to the new meshes; returns whether meshes may have
-        changed."""
-        steps, blades = self.steps, self.blades
-        changed = blades is not None and blades.is_due(steps) and blades.cut()
-        if changed and blades is not None and blades.is_new:
-            self._follow_cut()
-        if self.remeshing.run(steps):
-            changed = True
-            self._control_step()
-            if blades is not None:
-                blades.bind_again()
-        return changed
-
-    @property
-    def changes_every(self) -> tuple[int, ...]:
-        """The numbers of steps after whose multiples ``follow_motion`` is due."""
-        found = (self.remeshing.every, 0 if self.blades is None else self.blades.every)
-        return tuple(every for every in found if every)
-
-    def _control_step(self) -> None:
-        """Find the stable step again if other elements now limit it."""
-        if not self.remeshing.step_may_change():
-            return
-        stable = self._find_stable_steps()
-        if self.safe_step is not None:
-            self.safe_step.find_rest(stable)
-
-    def _index(self, body: SoftBody | None) -> int:
-        if body is None:
-            return 0
-        if not isinstance(body, SoftBody) or body not in self.bodies:
-            raise InputError("the body is not one of this simulation's")
-        return self.bodies.index(body)
+            self._find_step()

@@ -184,7 +184,6 @@ class RecordedSteps:
                 self._stepper.prepare()
         else:
             self._graphs.clear()
-            self._asked.clear()
             self._stepper.prepare()
             self._guard.prepare()
             self._revisions = (self._guard.revision, revision)

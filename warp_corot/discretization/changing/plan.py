@@ -26,6 +26,9 @@ from warp_corot.mesh.lattice import MAX_LEVEL
 from .pools import DeviceForest
 from .sizes import launch_size
 
+#: Launches over leaves outside subtrees grow by at least about this part of all leaves.
+LEAST_FLAT = 128
+
 
 class DevicePlan:
     """The ``plan.Plan`` of a forest that changes, derived from its leaves by launches.
@@ -122,7 +125,8 @@ class DevicePlan:
         """
         classes = self._plan.classes
         limits = [self._most_subtrees] * classes + [self.counts.most] * 2
-        granules = [GRANULE] * classes + [1, 1]
+        # Cuts move some leaves after others out of subtrees.
+        granules = [GRANULE] * classes + [1 << (self.forest.capacity // LEAST_FLAT).bit_length(), 1]
         wanted = counts[: self._rows].tolist()
         wanted[-1] += 1  # the first unit is padding
         sizes = [launch_size(*of_row) for of_row in zip(wanted, self._sizes, granules, limits, strict=True)]

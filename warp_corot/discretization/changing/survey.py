@@ -51,30 +51,30 @@ class Survey:
         found: The launches' results, int32, for ``read``.
         last: The mesh when its step was found last.
         finest_level: The finest level of the present mesh.
+        stiffness: Of its stiffest element; see ``Findings``.
     """
 
     def __init__(self, forest: DeviceForest, modulus: float):
         self._forest = forest
-        names = forest.carriage.names
-        self._inputs = [modulus, *(names.index(name) if name in names else -1 for name in ("mu", "lam"))]
+        self._modulus = modulus
         self.found = wp.zeros(kernels.PLACES, dtype=wp.int32, device=forest.device)
         self.last = Findings()
         self.finest_level = 0
-        self._stiffness, self._finest = 0.0, 0
+        self.stiffness, self._finest = 0.0, 0
 
     def launch(self, goes: wp.array) -> None:
         """Launch the measurement of the elements if ``goes`` [1] is not zero; may be recorded."""
         forest = self._forest
         device, threads = forest.device, forest.threads
         wp.launch(begin_counts, dim=kernels.PLACES, inputs=[goes], outputs=[self.found], device=device)
-        inputs = [threads, goes, *self._inputs, forest.pools, forest.carriage.arrays]
+        inputs = [threads, goes, self._modulus, forest.pools, forest.carriage.arrays]
         wp.launch(kernels.find_stiffest, dim=threads, inputs=inputs, outputs=[self.found], device=device)
         inputs = [threads, goes, forest.pools]
         wp.launch(kernels.count_finest, dim=threads, inputs=inputs, outputs=[self.found], device=device)
 
     def read(self, found: npt.NDArray[np.int32]) -> None:
         """Take a copy of ``found`` of a mesh that has changed."""
-        self._stiffness = float(found[: int(kernels.STIFFEST) + 1].view(np.float32)[-1])
+        self.stiffness = float(found[: int(kernels.STIFFEST) + 1].view(np.float32)[-1])
         self.finest_level = int(found[kernels.FINEST_LEVEL])
         self._finest = int(found[kernels.FINEST_COUNTS :].sum())
         self.last.changes += 1
@@ -82,9 +82,9 @@ class Survey:
     def step_may_change(self) -> bool:
         """Whether the stable step must be found again; call it once a pass."""
         last = self.last
-        softer = self._stiffness < (1.0 - ALIKE) * last.stiffness
+        softer = self.stiffness < (1.0 - ALIKE) * last.stiffness
         last.softer_for = last.softer_for + 1 if softer else 0
-        stiffer = self._stiffness > (1.0 + ALIKE) * last.stiffness
+        stiffer = self.stiffness > (1.0 + ALIKE) * last.stiffness
         grown = not softer and self._finest > GROWTH * last.finest
         if not (stiffer or grown or last.softer_for > PATIENCE or last.changes > MOST_CHANGES):
             return False
@@ -93,4 +93,4 @@ class Survey:
 
     def settle(self) -> None:
         """Record that the step has been found for the present mesh."""
-        self.last = Findings(self._stiffness, self._finest)
+        self.last = Findings(self.stiffness, self._finest)

@@ -81,13 +81,15 @@ class Carriage:
         arrays.spacing = lattice_spacing(source.cell_size)
         volume = volume_shares(np.arange(MAX_LEVEL + 1)) * source.cell_size**3
         arrays.volume = wp.array(volume, dtype=wp.float64, device=self.device)
+        arrays.size = wp.array(np.cbrt(volume), dtype=wp.float64, device=self.device)
         arrays.density = self._of_elements(leaves, per_leaf, elements, wp.float64)
         labels = np.zeros(len(leaves)) if source.labels is None else source.labels
         arrays.label = self._of_elements(leaves, labels, elements, wp.int32)
         arrays.values = self._table(leaves, {n: c.values for n, c in columns.items()}, elements, wp.float32)
         merging = [column.merging for column in columns.values()]
         arrays.merging = wp.array(merging, dtype=wp.int32, device=self.device)
-        arrays.fill_column = self.names.index("fill") if "fill" in columns else -1
+        for name in ("fill", "mu", "lam"):
+            setattr(arrays, f"{name}_column", self.names.index(name) if name in columns else -1)
         arrays.numbers = self._table(leaves, numbers, elements, wp.int32)
         masses = np.zeros(self._nodes)
         np.add.at(masses, source.tets, (0.25 * per_leaf * volume[source.levels])[:, None])

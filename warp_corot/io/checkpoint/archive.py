@@ -39,7 +39,7 @@ Remesh = OnlineRemesh | Sequence[OnlineRemesh | None] | None
 
 FORMAT = "warp-corot checkpoint"
 #: The version of checkpoints that is written, and the only one that is read.
-VERSION = 10
+VERSION = 11
 
 #: What the guard continues from.
 GUARDED = ("scale", "drift", "lately", "counted", "work")
@@ -86,7 +86,9 @@ def save_checkpoint(sim: Simulation, path: str | PathLike[str], *, in_parts: boo
     packed = zip(sim.bodies, sim.models, sim.fields, sim.remeshing.changing, strict=True)
     for number, (body, model, field, changing) in enumerate(packed):
         header["bodies"].append(pack_body(body, model, field, changing, f"body{number}.", arrays))
-    header["cuts"] = pack_blades(sim.blades, arrays) if sim.remeshing.are_cut else None
+    header["cuts"] = None
+    if sim.remeshing.are_cut:
+        header["cuts"] = pack_blades(sim.blades, arrays) | {"stable_steps": sim.stable_steps}
     header["contact"] = pack_contact(sim.contact, sim.grasps, arrays)
     arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
     write_archive(target, arrays)
@@ -226,7 +228,9 @@ def _rebuilt_simulation(
             field.state[name].assign(arrays[f"body{number}.field.{name}"])
     for name in header["kept"]:
         sim.kept[name].assign(arrays[f"kept.{name}"])
-    unpack_blades(sim.blades, header["cuts"], arrays)
+    if header["cuts"] is not None:
+        sim.stable_steps = header["cuts"]["stable_steps"]
+        unpack_blades(sim.blades, header["cuts"], arrays)
     unpack_contact(sim.contact, header["contact"], arrays)
     sim.guard.resume(**{name: arrays[f"guard.{name}"] for name in GUARDED})
     sim.running.resume(**header["running"])

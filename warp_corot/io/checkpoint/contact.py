@@ -110,7 +110,7 @@ def pack_blades(blades: Blades | None, arrays: Arrays) -> dict[str, Any]:
     arrays |= {f"blades.{name}": array.numpy() for name, array in blades.kept.items()}
     given = enumerate(blades.blades)
     packed = [_pack_tool(blade, True, f"blade{k}.", arrays) | {"level": blade.level} for k, blade in given]
-    return {"blades": packed, "every": blades.every, "changes": blades.changes}
+    return {"blades": packed, "every": blades.every, "unchanged": blades.unchanged}
 
 
 def blades_of(described: dict[str, Any] | None, arrays: Arrays) -> list[Any] | None:
@@ -120,13 +120,13 @@ def blades_of(described: dict[str, Any] | None, arrays: Arrays) -> list[Any] | N
     return [_unpacked_tool(each, f"blade{k}.", arrays) for k, each in enumerate(described["blades"])]
 
 
-def unpack_blades(blades: Blades | None, described: dict[str, Any] | None, arrays: Arrays) -> None:
+def unpack_blades(blades: Blades | None, described: dict[str, Any], arrays: Arrays) -> None:
     """Restore what blades have done, on the present meshes."""
-    if blades is None or described is None:
+    if blades is None:
         return
     for name, array in blades.kept.items():
         array.assign(arrays[f"blades.{name}"])
-    blades.every, blades.changes = int(described["every"]), int(described["changes"])
+    blades.every, blades.unchanged = int(described["every"]), int(described["unchanged"])
 
 
 def _pack_grasp(contacts: Contacts, grasp: Grasp, prefix: str, arrays: Arrays) -> dict[str, Any]:

@@ -1,0 +1,25 @@
+"""Random blades through twelve bodies leave no inverted, lost or doubled element, and closed surfaces."""
+
+import pytest
+from blade_cases import BODIES, RandomBlades
+
+
+@pytest.mark.parametrize("name", BODIES)
+def test_random_blades_leave_sound_bodies(name, device):
+    send(name, 0, device)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(1, 18))
+@pytest.mark.parametrize("name", BODIES)
+def test_a_thousand_random_blades_leave_sound_bodies(name, seed, device):
+    send(name, seed, device)
+
+
+def send(name, seed, device):
+    """Send five blades through a body, one after another."""
+    blades = RandomBlades(name, seed, device)
+    for k in range(5):
+        if k:
+            blades.again()
+        blades.run()
