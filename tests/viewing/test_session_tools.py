@@ -226,6 +226,29 @@ def test_a_visitor_puts_a_tool_into_the_scene_presses_with_it_and_takes_it_away(
     assert not page.hands
 
 
+def test_a_visitor_cuts_with_a_knife_and_takes_it_away():
+    page = Session(block())
+    page.use_tool("knife", (0.3, 0.05, 0.1))
+    (knife,) = page.given
+    assert page.frame().poses[0][0] > 0.1
+    page.press_tool(1, 0)
+    place = knife.present_pose[0, :3].copy()
+    page.move(1, np.array([-0.1, 0.0512, 0.1]) - place)
+    whole = page.frame().triangles[0]
+    shown = page.number
+    frame = still(page, 1.0)
+    assert page.number > shown
+    assert page.sim.body.cut_area > 0.005
+    assert len(frame.triangles[0]) > len(whole)
+    assert list(page.hands) == [1]  # it is still held
+    assert page.note == ""
+    pieces = page.sim.body.pieces
+    page.use_tool("ball", (0.3, 0.05, 0.1))
+    assert (len(page.given), page.sim.blades) == (1, None)
+    assert page.sim.body.pieces == pieces
+    page.reset()
+
+
 def test_a_tool_of_the_page_leaves_those_of_the_user_where_they_are():
     page, tool = with_tool()
     tool.move((0.05, 0.05, 0.2152))

@@ -14,6 +14,7 @@ from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.grasp import Grasp
 from warp_corot.contact.options import Contact
 from warp_corot.contact.tool import Obstacle
+from warp_corot.cutting.blade import Blade
 from warp_corot.elasticity import Model
 from warp_corot.errors import InputError
 from warp_corot.materials.isotropic import Material
@@ -31,6 +32,7 @@ def remade(
     grasps: Sequence[Grasp] | None = None,
     obstacles: Sequence[Obstacle] | None = None,
     contact: Contact | None = None,
+    cuts: Sequence[Blade] | None = None,
     gravity: npt.ArrayLike | None = None,
 ) -> Simulation:
     """A new simulation that continues this one: new bodies with the present meshes, states, loads, supports and
@@ -46,12 +48,16 @@ def remade(
         grasps: The grasps that go on; None: all.
         obstacles: The obstacles from now on; None: the present ones, with their contact.
         contact: The options of contact with them.
+        cuts: The blades from now on; None: the present ones.
         gravity: [m/s^2]; None: the present one.
 
     Raises:
         InputError: A body is remeshed and follows keyframes; or as ``Simulation``. The given simulation is unchanged.
     """
     bodies = [_copy_of(body, None if materials is None else materials[k]) for k, body in enumerate(sim.bodies)]
+    blades = () if sim.blades is None else sim.blades.blades
+    if cuts is None:
+        cuts = blades
     with tools_lent(sim):
         again = Simulation(
             bodies,
@@ -62,7 +68,10 @@ def remade(
             remesh=remesh if remesh is not None and any(remesh) else None,
             obstacles=sim.obstacles if obstacles is None else obstacles,
             contact=contact if obstacles is not None or sim.contact is None else sim.contact.options,
+            cuts=cuts if cuts or sim.remeshing.are_cut else None,
         )
+        if sim.blades is not None and again.blades is not None:
+            again.blades.continue_from(sim.blades)
         if sim.contact is not None and again.contact is not None:
             again.contact.obstacles.continue_from(sim.contact.obstacles)
         for grasp in sim.grasps if grasps is None else grasps:
@@ -75,15 +84,16 @@ def remade(
 
 @contextmanager
 def tools_lent(sim: Simulation) -> Iterator[None]:
-    """Let another simulation take the tools of this one; if the block raises, they are given back."""
-    obstacles = None if sim.contact is None else sim.contact.obstacles
-    if obstacles is not None:
-        obstacles.let_go()
+    """Let another simulation take the tools and blades of this one; if the block raises, they are given back."""
+    lent = [] if sim.contact is None else [sim.contact.obstacles]
+    lent += [] if sim.blades is None else [sim.blades]
+    for each in lent:
+        each.let_go()
     try:
         yield
     except BaseException:
-        if obstacles is not None:
-            obstacles.take_back()
+        for each in lent:
+            each.take_back()
         raise
 
 

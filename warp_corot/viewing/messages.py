@@ -62,7 +62,6 @@ def page_told(session: Session, title: str, saves: Collection[str]) -> bytes:
 def topology(session: Session, frame: PageFrame) -> bytes:
     """The rest points and the triangles of each body, and the solids of the obstacles that are drawn."""
     bodies = [(shown.rest, triangles) for shown, triangles in zip(session.shown, frame.triangles, strict=True)]
-    given = session.sim.obstacles
     solids = [solid_of(tool.shape) or _NOTHING for tool in session.tools]
     grounds = [number for number, tool in enumerate(session.tools) if isinstance(tool.shape, Ground)]
     parts = [*bodies, *((solid.points, solid.triangles) for solid in solids)]
@@ -70,7 +69,7 @@ def topology(session: Session, frame: PageFrame) -> bytes:
         "kind": "topology",
         "bodies": [[len(points), len(triangles)] for points, triangles in bodies],
         "solids": [[len(solid.points), len(solid.triangles)] for solid in solids],
-        "movable": [isinstance(each, Tool) for each in given],
+        "movable": [isinstance(each, Tool) for each in session.given],
         "grounds": grounds,
     }
     arrays = [np.ascontiguousarray(points, np.float32) for points, _ in parts]

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from warp_corot.contact.tool import Tool
+from warp_corot.contact.tool import Obstacle, Tool
+from warp_corot.cutting.blade import Blade
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.loading import CONTACT, load
 from warp_corot.io.pictures.colors import color_index
@@ -30,6 +31,9 @@ from .implicit_springs import springs_of
 from .real_time_factor import RealTimeFactor
 from .shown import Shown, surfaces_of
 from .tools import ToolHand, new_tool
+
+#: The way of a knife in a step over the size of the smallest element, at most.
+HALF_ELEMENT = 0.5
 
 
 class Session:
@@ -62,6 +66,7 @@ class Session:
         self._made = made
         self.tool, self.gravity = "", sim.gravity
         self._given = sim.obstacles, None if sim.contact is None else sim.contact.options
+        self._cuts = () if sim.blades is None else sim.blades.blades
         self._commands: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self.hands: dict[Any, SpringHand | ToolHand] = {}
         self.pace = RealTimeFactor()
@@ -117,7 +122,7 @@ class Session:
             InputError: Something is being saved, or as ``remade``; then nothing has changed.
         """
         self._check_free()
-        what.setdefault("remesh", [None if c is None else c.options for c in self.sim.remeshing.changing])
+        what.setdefault("remesh", list(self.sim.remesh))
         held = {grasp for hand in self.hands.values() if isinstance(hand, ToolHand) for grasp in hand.grasps}
         what.setdefault("grasps", [grasp for grasp in self.sim.grasps if grasp not in held])
         with tools_lent(self.sim):
@@ -140,8 +145,15 @@ class Session:
         """
         given, contact = self._given
         points = np.concatenate([shown.positions for shown in self.shown])
-        added = [new_tool(name, self.size, self.up, place, points, self.sim.integrator.dt)] if name else []
-        self.switch(obstacles=[*given, *added], contact=contact)
+        added: list[Tool] = []
+        if name:
+            dt = self.sim.integrator.dt
+            least = min(body.discretization.smallest_volume for body in self.sim.bodies) ** (1.0 / 3.0)
+            fastest_cut = HALF_ELEMENT * least / float(dt or self.sim.stable_dt)
+            added = [new_tool(name, self.size, self.up, place, points, dt, fastest_cut)]
+        cuts = [each for each in added if isinstance(each, Blade)]
+        tools = [each for each in added if each not in cuts]
+        self.switch(obstacles=[*given, *tools], contact=contact, cuts=[*self._cuts, *cuts])
         self.tool = name
 
     def close(self) -> None:
@@ -174,7 +186,7 @@ class Session:
         Raises:
             InputError: The obstacle is not a ``Tool``, something else moves it, or there is no tissue to grasp.
         """
-        given = self.sim.obstacles[number]
+        given = self.given[number]
         if not isinstance(given, Tool):
             raise InputError(f"the {given!r} does not move; a Tool of its shape would")
         self.let_go(owner)
@@ -240,6 +252,8 @@ class Session:
         versions = [body.version for body in self.sim.bodies]
         if versions != self._versions:
             self._versions = versions
+            if self.sim.remeshing.are_cut:
+                self._show_cuts()
             self.springs.refit()
         positions = [shown.read() for shown in self.shown]
         source = self.sources.get(self.controls.colors)
@@ -283,9 +297,16 @@ class Session:
         return np.stack([np.min([p.min(axis=0) for p in points], 0), np.max([p.max(axis=0) for p in points], 0)])
 
     @property
+    def given(self) -> list[Obstacle]:
+        """The rigid obstacles that bodies touch, as they were given, and the blades that cut them."""
+        return [*self.sim.obstacles, *(() if self.sim.blades is None else self.sim.blades.blades)]
+
+    @property
     def tools(self) -> list[Tool]:
-        """The rigid obstacles that bodies touch."""
-        return [] if self.sim.contact is None else self.sim.contact.obstacles.tools
+        """The same as tools."""
+        sim = self.sim
+        moved = (None if sim.contact is None else sim.contact.obstacles, sim.blades)
+        return [tool for each in moved if each is not None for tool in each.tools]
 
     def _check_free(self) -> None:
         if self.busy:
@@ -309,6 +330,14 @@ class Session:
         self.number += 1
         for shown in self.shown:
             shown.read()
+
+    def _show_cuts(self) -> None:
+        """Show the surfaces of bodies that may have been cut. Only hands on tools go on: places of tissue are new."""
+        self.surfaces = [surfaces_of(body.mesh) for body in self.sim.bodies]
+        kept = {owner: hand for owner, hand in self.hands.items() if isinstance(hand, ToolHand)}
+        self.hands = {owner: hand for owner, hand in self.hands.items() if owner not in kept}
+        self._show()
+        self.hands |= kept
 
     def _surface(self, mesh: Any, surfaces: dict[str, SurfaceMesh]) -> SurfaceMesh:
         name = self.controls.surface

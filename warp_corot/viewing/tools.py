@@ -13,6 +13,7 @@ from warp_corot.contact.grasp import Grasp
 from warp_corot.contact.obstacles import LARGEST_SHARE
 from warp_corot.contact.shapes import Capsule, Shape, Sphere, turn_from_z
 from warp_corot.contact.tool import Tool
+from warp_corot.cutting.blade import Blade, Edge
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_choice, checked_vector
 
@@ -22,23 +23,31 @@ Vector = npt.NDArray[np.float64]
 SHAPES: dict[str, Callable[..., Shape]] = {
     "ball": lambda size, **pose: Sphere(radius=0.1 * size, **pose),
     "rod": lambda size, **pose: Capsule(radius=0.04 * size, length=0.5 * size, **pose),
+    "knife": lambda size, **pose: Edge(np.array([[0.0, 0.0, -0.4], [0.0, 0.0, 0.4]]) * size, **pose),
 }
 #: The highest speed of these tools over the size of the bodies [1/s].
 BRISK = 5.0
 
 
 def new_tool(
-    name: str, size: float, up: Vector, place: npt.ArrayLike, bodies: npt.NDArray[np.floating], dt: float | None
+    name: str,
+    size: float,
+    up: Vector,
+    place: npt.ArrayLike,
+    bodies: npt.NDArray[np.floating],
+    dt: float | None,
+    fastest_cut: float,
 ) -> Tool:
     """A tool that the page offers.
 
     Args:
         name: A name in ``SHAPES``.
         size: The size of the bodies [m].
-        up: The direction in which a rod points, [3].
+        up: The direction in which a rod or an edge points, [3].
         place: Its first place [m], [3]; it is moved away until it is clear of the box around the bodies.
         bodies: Points of the bodies [m], [V, 3].
         dt: The length of steps if it is given [s]; the tool is slow enough for it.
+        fastest_cut: The highest speed of a knife [m/s].
 
     Raises:
         InputError: There is no such tool, or the place is not three finite numbers.
@@ -52,6 +61,9 @@ def new_tool(
         there = there + 0.1 * size * away / np.linalg.norm(away)
     shape = SHAPES[name](size, position=there, quaternion=turn_from_z(up))
     speed = BRISK * size
+    if isinstance(shape, Edge):
+        speed = min(speed, fastest_cut)
+        return Blade(shape.points, speed=speed, position=shape.position, quaternion=shape.quaternion)
     return Tool(shape, speed=speed if dt is None else min(speed, 0.99 * LARGEST_SHARE * shape.thickness / dt))
 
 
@@ -87,6 +99,8 @@ class ToolHand:
         """
         if self.grasps:
             return
+        if isinstance(self.tool, Blade):
+            raise InputError("a knife holds no tissue; choose another hand")
         obstacles, number = self.tool.place_among_obstacles()
         for body in bodies:
             nodes = np.unique(body.surface_triangles)

@@ -12,9 +12,12 @@ import numpy.typing as npt
 from warp_corot.contact.sampled import TriangleMesh
 from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, Shape, Sphere
 from warp_corot.contact.tool import Obstacle, Tool
+from warp_corot.cutting.blade import Edge
 
 #: Points around a round shape, and from the pole of a ball to its equator.
 AROUND, TO_EQUATOR = 32, 8
+#: Height of a drawn blade over the length of its edge.
+BLADE_HEIGHT = 0.15
 #: Half of the edge of a drawn ground, in sizes of the bodies on it.
 GROUND_SIZE = 1.2
 
@@ -50,6 +53,8 @@ def solid_of(shape: Shape) -> Solid | None:
         return Solid(np.asarray(shape.points, dtype=np.float64), np.asarray(shape.triangles, dtype=np.int32))
     if isinstance(shape, Box):
         return _box(np.array(shape.size))
+    if isinstance(shape, Edge):
+        return _sheet(shape.points)
     radius, half, _ = shape.size
     if isinstance(shape, Sphere | Capsule):
         angles = np.linspace(0.0, 0.5 * np.pi, TO_EQUATOR + 1)
@@ -100,6 +105,16 @@ def _revolved(profile: Floats) -> Solid:
     a = 1 + (len(rings) - 1) * AROUND
     triangles.append(np.stack([a + this, np.full_like(this, last), a + following], axis=1))
     return Solid(points, np.concatenate(triangles).astype(np.int32))
+
+
+def _sheet(edge: Floats) -> Solid:
+    """Both sides of a sheet behind a polyline [n, 3]."""
+    along = edge[-1] - edge[0]
+    aside = np.eye(3)[np.argmin(np.abs(along))]
+    back = BLADE_HEIGHT * np.cross(np.cross(along, aside), along) / max(float(np.linalg.norm(along)), 1e-30)
+    a, n = np.arange(len(edge) - 1), len(edge)
+    front = np.concatenate([np.stack([a, a + 1, a + n + 1], axis=1), np.stack([a, a + n + 1, a + n], axis=1)])
+    return Solid(np.concatenate([edge, edge + back]), np.concatenate([front, front[:, ::-1]]).astype(np.int32))
 
 
 def _box(half: Floats) -> Solid:

@@ -6,6 +6,7 @@ const HINTS = {
   'grasp,': 'Drag the body; it stays where you leave it',
   'drag,ball': 'Drag the ball against the body',
   'drag,rod': 'Drag the rod against the body',
+  'drag,knife': 'Drag the knife through the body',
   'grasp,ball': 'Bring the ball to the body, then press on it again to grip',
 };
 const VIEW = 'drag beside it to turn · wheel: zoom · right button: move · double click: fit';
