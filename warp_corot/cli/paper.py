@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     text = report.table(results)
     try:
         folder.mkdir(exist_ok=True)
-        report.write_json(folder / RESULTS, results)
+        report.write_json(folder / RESULTS, report.to_json(results))
         files = [folder / RESULTS, *figures.draw_figures(folder, results)]
     except KeyboardInterrupt as signalled:
         complain(f"interrupted while writing; every file in {folder} is complete", kind="")

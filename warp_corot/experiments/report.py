@@ -42,7 +42,7 @@ def table(results: Results) -> str:
     lines = [
         f"The paper's beam: {len(mesh.points)} nodes, {len(mesh.tets)} tetrahedra of level {s.level}, "
         f"{results.times[-1]:.1f} s in steps of {1e3 * s.dt:.3g} ms, damping {s.damping:.3g} /s",
-        f"Device: {device_name(results)}",
+        f"Device: {device_name(results.device)}",
         f"Node ({', '.join(f'{1e3 * x:g}' for x in OBSERVED)}) mm; errors are distances from "
         "St. Venant–Kirchhoff (StVK) at the same time.",
         "",
@@ -83,14 +83,7 @@ def to_json(results: Results) -> dict:
     return {
         "schema": SCHEMA,
         "schema_version": SCHEMA_VERSION,
-        "versions": {
-            "warp_corot": __version__,
-            "warp": wp.config.version,
-            "numpy": np.__version__,
-            "python": platform.python_version(),
-        },
-        "machine": {"system": platform.system(), "processor": processor_name(), "cores": os.cpu_count()},
-        "device": {"alias": str(results.device), "name": device_name(results), "cuda": results.device.is_cuda},
+        **environment(results.device),
         "settings": {
             **{f"{name}{unit}": getattr(s, name) for name, unit in (("duration", "_s"), ("dt", "_s"), ("level", ""))},
             "damping_per_s": s.damping,
@@ -118,20 +111,34 @@ def to_json(results: Results) -> dict:
     }
 
 
-def write_json(path: Path, results: Results) -> None:
-    """Write results.json to a temporary file and rename it.
+def environment(device: wp.Device) -> dict:
+    """Versions, machine and device, as plain values."""
+    return {
+        "versions": {
+            "warp_corot": __version__,
+            "warp": wp.config.version,
+            "numpy": np.__version__,
+            "python": platform.python_version(),
+        },
+        "machine": {"system": platform.system(), "processor": processor_name(), "cores": os.cpu_count()},
+        "device": {"alias": str(device), "name": device_name(device), "cuda": device.is_cuda},
+    }
+
+
+def write_json(path: Path, content: dict) -> None:
+    """Write a JSON file to a temporary file and rename it.
 
     Raises:
         OSError: It could not be written; a former file stays.
     """
-    text = json.dumps(to_json(results), indent=1, ensure_ascii=False, allow_nan=False)
+    text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
     with written_whole(path) as part:
         part.write_text(text + "\n", encoding="utf-8")
 
 
-def device_name(results: Results) -> str:
+def device_name(device: wp.Device) -> str:
     """Name of the GPU or the processor."""
-    return results.device.name if results.device.is_cuda else f"CPU ({processor_name()}, one core)"
+    return device.name if device.is_cuda else f"CPU ({processor_name()}, one core)"
 
 
 def processor_name() -> str:

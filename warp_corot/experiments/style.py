@@ -32,7 +32,7 @@ def head(figure: Figure, title: str, results: Results) -> None:
     figure.text(0.012, 0.97, title, fontsize=12.5, color=INK, va="top", weight="bold")
     about = (
         f"beam 64 × 64 × 192 mm under its weight, {len(mesh.points)} nodes, {len(mesh.tets)} tetrahedra, "
-        f"{results.times[-1]:.1f} s simulated · {device_name(results)}"
+        f"{results.times[-1]:.1f} s simulated · {device_name(results.device)}"
     )
     figure.text(0.012, 0.912, about, fontsize=8.5, color=FAINT, va="top")
 

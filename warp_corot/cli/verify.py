@@ -1,0 +1,81 @@
+"""``warp-corot verify``: cases with known answers as a table, and as JSON."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+from warp_corot.errors import InputError
+from warp_corot.inputs.likely import meant
+from warp_corot.io.files.whole import check_output
+
+from .exit_status import complain
+
+if TYPE_CHECKING:
+    from warp_corot.experiments.verification import Row
+
+#: Exit status if a row does not pass.
+BEYOND = 4
+HEAD = f"{'case':18}{'quantity':38}{'result':>11}{'reference':>11} {'':6}{'error':>9}{'allowed':>9}  "
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command; returns the exit status.
+
+    Raises:
+        InputError: There is no such case or device, or the file cannot be written; nothing was run.
+    """
+    from warp_corot.experiments.report import environment, write_json
+    from warp_corot.experiments.verification import CASES, Setup, run_case
+    from warp_corot.inputs.device import checked_device
+    from warp_corot.simulation.progress import hidden
+
+    from .compiling import compiling_said
+
+    if args.list:
+        for case in CASES.values():
+            print(f"{case.name:18}{case.about}\n{'':18}reference: {case.source}")
+        return 0
+    names = list(dict.fromkeys(args.cases or CASES))
+    for name in names:
+        if name not in CASES:
+            raise InputError(f"there is no case {name}{meant(name, CASES)}; warp-corot verify --list has all")
+    if args.json is not None:
+        check_output(args.json, ".json")
+    device = checked_device(args.device)
+    setup = Setup(str(device), full=args.full)
+    told: list[dict[str, Any]] = []
+    took = 0.0
+    print(HEAD + "source")
+    with compiling_said(device), hidden():
+        for name in names:
+            rows, seconds = run_case(name, setup)
+            for row in rows:
+                print(line(name, row) + CASES[name].source, flush=True)
+                told.append({"case": name, **asdict(row), "passes": row.passes, "source": CASES[name].source})
+            took += seconds
+    beyond = sum(not row["passes"] for row in told)
+    print(f"{len(told) - beyond} of {len(told)} rows pass on {device}, in {took:.0f} s")
+    if args.json is not None:
+        finite = [{key: _finite(value) for key, value in row.items()} for row in told]
+        head = {"schema": "warp-corot/verify", "schema_version": 1, "full": args.full, "seconds": round(took, 1)}
+        write_json(args.json, {**head, **environment(device), "rows": finite})
+    if beyond:
+        complain(f"{beyond} rows are beyond what is allowed")
+    return BEYOND if beyond else 0
+
+
+def line(name: str, row: Row) -> str:
+    """A row of the table, less its source."""
+    error, bound = (f"{100.0 * share:.2g} %" for share in (row.error, row.bound))
+    verdict = "" if row.passes else "FAILS "
+    return (
+        f"{name:18}{row.quantity:38}{row.result:11.5g}{row.reference:11.5g} {row.unit:6}{error:>9}{bound:>9}  {verdict}"
+    )
+
+
+def _finite(value: Any) -> Any:
+    """The value, or None for a number that JSON does not have."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
