@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from soft_blocks import DOWN, block, force_on, motion, weight
+from soft_blocks import DOWN, block, force_on, weight
 
 import warp_corot as wc
 
@@ -20,27 +20,6 @@ def test_a_block_that_falls_comes_to_rest_with_its_weight(device):
     assert body.contact_forces.numpy()[:, 2].sum() == pytest.approx(weight(body), rel=1e-3)
     assert sum(point.force[2] for point in sim.contacts()) == pytest.approx(weight(body), rel=1e-3)
     assert np.abs(body.velocities.numpy()).max() < 1e-4
-
-
-@pytest.mark.parametrize("share", [0.99, 1.01])
-def test_a_block_slips_at_the_angle_of_friction(device, share):
-    """At rest below arctan mu, and with the right acceleration above."""
-    mu = 0.3
-    angle = share * np.arctan(mu)
-    body = block(device, material=wc.Isotropic(young=1e5, poisson=0.3, density=1000.0))
-    gravity = 9.81 * np.array([np.sin(angle), 0.0, -np.cos(angle)])
-    contact = wc.Contact(friction=mu)
-    sim = wc.Simulation(body, obstacles=wc.Ground(), gravity=gravity, integrator=EULER, contact=contact)
-    sim.advance_steps(12)
-    start, before = motion(body)
-    sim.advance_steps(6)
-    end, after = motion(body)
-    if share < 1.0:
-        assert np.abs(after).max() < 1e-6
-        assert np.abs(end - start).max() < 1e-7
-    else:
-        acceleration = 9.81 * (np.sin(angle) - mu * np.cos(angle))
-        assert (after - before)[0] / (6 * EULER.dt) == pytest.approx(acceleration, rel=0.01)
 
 
 def test_nothing_passes_a_thin_plate(device):

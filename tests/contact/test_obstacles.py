@@ -33,31 +33,6 @@ def test_pressure_times_area_is_the_force(device):
     assert pushed[2] == pytest.approx(-force_on(ground)[2], rel=1e-3)
 
 
-@pytest.mark.parametrize("share", [0.99, 1.01])
-def test_a_block_slips_at_the_angle_of_friction(device, share):
-    """At rest below arctan mu, and with the right acceleration above."""
-    mu = 0.3
-    angle = share * np.arctan(mu)
-    body = block(device, material=wc.Isotropic(young=1e5, poisson=0.3, density=1000.0))
-    sim = wc.Simulation(
-        body,
-        obstacles=wc.Ground(),
-        gravity=9.81 * np.array([np.sin(angle), 0.0, -np.cos(angle)]),
-        integrator=CALM,
-        contact=wc.Contact(friction=mu),
-    )
-    sim.advance(0.2)
-    start, before = motion(body)
-    sim.advance(0.1)
-    end, after = motion(body)
-    if share < 1.0:
-        assert np.abs(after).max() < 1e-6
-        assert np.abs(end - start).max() < 1e-7
-    else:
-        acceleration = 9.81 * (np.sin(angle) - mu * np.cos(angle))
-        assert (after - before)[0] / 0.1 == pytest.approx(acceleration, rel=0.01)
-
-
 @pytest.mark.slow
 def test_a_block_rests_on_a_slope_for_ten_minutes(device):
     angle = 0.9 * np.arctan(0.3)

@@ -3,11 +3,20 @@
 import numpy as np
 import pytest
 import warp as wp
-from half_balls import CONTACT, DEPTH, FORCE, HALF, POISSON, RADIUS, YOUNG, boussinesq
 from organs import BALL, SOFT, ball_mesh, brick_mesh, crossing, fork_mesh, ground
 from soft_blocks import DOWN, force_on, weight
 
 import warp_corot as wc
+from warp_corot.experiments.verification.half_spaces import (
+    CONTACT,
+    DEPTH,
+    FORCE,
+    HALF,
+    POISSON,
+    RADIUS,
+    YOUNG,
+    boussinesq,
+)
 
 STEP = 0.01
 EULER = wc.BackwardEuler(dt=STEP)

@@ -3,10 +3,19 @@
 import numpy as np
 import pytest
 import warp as wp
-from half_balls import CONTACT, DEPTH, FORCE, HALF, POISSON, RADIUS, YOUNG, boussinesq
 from organs import BALL, SOFT, ball_mesh, brick_mesh, crossing, fork_mesh, ground
 
 import warp_corot as wc
+from warp_corot.experiments.verification.half_spaces import (
+    CONTACT,
+    DEPTH,
+    FORCE,
+    HALF,
+    POISSON,
+    RADIUS,
+    YOUNG,
+    boussinesq,
+)
 
 AXIS = (0.5, 0.5, 0.5, 0.5)
 

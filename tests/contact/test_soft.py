@@ -26,54 +26,6 @@ def test_a_block_on_a_block_carries_its_weight(device, alike):
 SLIDES = wc.SymplecticEuler(viscosity=2e-3)
 
 
-def pressure_loads(body, pressure):
-    """Consistent nodal forces of a pressure on the upper side."""
-    x, corners = body.mesh.points, body.surface_triangles
-    corners = corners[(x[corners][:, :, 2] > x[:, 2].max() - 1e-9).all(axis=1)]
-    sides = x[corners[:, 1:]] - x[corners[:, :1]]
-    forces = np.zeros_like(x)
-    np.add.at(
-        forces[:, 2], corners, -pressure / 6.0 * np.linalg.norm(np.cross(*np.moveaxis(sides, 1, 0)), axis=1)[:, None]
-    )
-    return forces
-
-
-@pytest.mark.parametrize(
-    ("cells", "level", "flat_edges", "error"),
-    [((2, 2, 1), 3, False, 1e-5), ((3, 3, 1), 3, False, 1e-4), ((3, 3, 2), 1, False, 0.05), ((3, 3, 2), 1, True, 1e-4)],
-)
-def test_pressure_goes_through_a_contact_evenly(device, cells, level, flat_edges, error):
-    """The patch test: uniaxial stress in both blocks. It is passed to rounding if non-negative forces at the places of
-    contact can represent an even pressure: wherever the flat edges of both meshes cross are such places, too. At nodes
-    alone they cannot on the last pair of meshes. The blocks begin at nine tenths of the answer: nothing holds them
-    sideways, and what they drift by while they settle sets their sides apart."""
-    pressure, young, poisson = 200.0, 2e4, 0.3
-    size = 0.04 / cells[0]
-    meshes = [
-        wc.TetForest.box(cells, size, level),
-        wc.TetForest.box((2, 2, 1), 0.02, 3, origin=(0, 0, cells[2] * size)),
-    ]
-    low, high = (wc.SoftBody(mesh, wc.Isotropic(young, poisson, 1000.0), device=device) for mesh in meshes)
-    high.load(np.arange(high.node_count), pressure_loads(high, pressure))
-    sim = wc.Simulation(
-        [low, high],
-        model=wc.Linear(),
-        obstacles=wc.Ground(),
-        contact=wc.Contact(friction=0.0, flat_edges=flat_edges),
-        gravity=(0.0, 0.0, 0.0),
-        integrator=wc.SymplecticEuler(viscosity=2e-3, damping=60.0),
-    )
-    for body in (low, high):
-        at = body.mesh.points - [0.02, 0.02, 0.0]
-        body.displacements = 0.9 * pressure / young * at * [poisson, poisson, -1.0]
-    sim.advance(0.3)
-    for body in (low, high):
-        np.testing.assert_allclose(sim.von_mises(body), pressure, rtol=error)
-        x, u = body.mesh.points, body.displacements.numpy().astype(float)
-        strained = u[:, 2] + pressure / young * x[:, 2]
-        assert np.ptp(strained) < error * pressure / young * 0.02
-
-
 @pytest.mark.parametrize("seconds", [1.0, pytest.param(120.0, marks=pytest.mark.slow)])
 def test_a_soft_block_rests_on_a_soft_slope(device, seconds):
     """At 0.95 of the angle of friction, on a mesh that differs from its own."""
@@ -112,32 +64,6 @@ def test_a_soft_block_slips_on_a_soft_slope(device, integrator, share):
     gained = shares @ high.velocities.numpy()[:, 0].astype(float) - began
     expected = max(gravity[0] + friction * gravity[2], 0.0)
     assert gained / 0.2 == pytest.approx(expected, abs=0.003 * 9.81)
-
-
-@pytest.mark.parametrize("count", [5, pytest.param(20, marks=pytest.mark.slow)])
-def test_a_stack_stands(device, count):
-    """Slabs with two sizes of elements, each a little to one side of the slab below it."""
-    beside = np.random.default_rng(0).uniform(-5e-4, 5e-4, (count, 2))
-    slabs = []
-    for k in range(count):
-        mesh = wc.TetForest.box((4, 4, 1), 0.01, k % 2, origin=(*beside[k], 0.01002 * k))
-        slabs.append(wc.SoftBody(mesh, wc.Isotropic(2e5, 0.3, 1000.0), device=device))
-    contact = wc.Contact(friction=0.5)
-    sim = wc.Simulation(
-        slabs,
-        obstacles=wc.Ground(),
-        contact=contact,
-        gravity=DOWN,
-        integrator=wc.SymplecticEuler(viscosity=1e-3, damping=2.0),
-    )
-    sim.advance(0.05 * count)
-    centres = [slab.positions.numpy().astype(float).mean(axis=0) for slab in slabs]
-    sim.advance(0.2)
-    for slab, mesh, centre in zip(slabs, (each.mesh for each in slabs), centres, strict=True):
-        now = slab.positions.numpy().astype(float).mean(axis=0)
-        assert force_on(slab)[2] == pytest.approx(weight(slab), rel=0.01)
-        assert np.abs(now - centre).max() < 1e-3
-        assert np.abs(now - mesh.points.mean(axis=0))[:2].max() < 2e-3
 
 
 def test_worlds_do_not_meet(device):

@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
-from half_balls import CONTACT, POISSON, RADIUS, YOUNG, half_ball
+from half_balls import half_ball
 from soft_surfaces import DOWN, block, folded, force_on, roof, weight
 
 import warp_corot as wc
+from warp_corot.experiments.verification.half_spaces import CONTACT, POISSON, RADIUS, YOUNG
 
 EULER = wc.BackwardEuler(dt=0.016)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import numpy.typing as npt
 
@@ -49,22 +51,13 @@ def faces_where(body: SoftBody, chosen: npt.NDArray[np.bool_]) -> npt.NDArray[np
     return body.surface_triangles[chosen[body.surface_triangles].all(axis=1)]
 
 
-def mapped_grid(shape: tuple[int, int, int], place: npt.NDArray[np.float64], around: bool = False) -> TetMesh:
-    """A general mesh of a grid of hexahedra, six tetrahedra each; its last axis may be closed to a ring.
-
-    Args:
-        shape: Numbers of hexahedra.
-        place: Points of the grid, [shape[0] + 1, shape[1] + 1, shape[2] + 1 or shape[2], 3].
-        around: Whether the last axis is closed.
-    """
-    numbers = np.arange(place[..., 0].size).reshape(place.shape[:3])
-    if around:
-        numbers = np.concatenate([numbers, numbers[..., :1]], axis=2)
-    n, m, k = shape
-    corners = [numbers[a : a + n, b : b + m, c : c + k].ravel() for a in (0, 1) for b in (0, 1) for c in (0, 1)]
-    ways = [(0, 1, 3, 7), (0, 3, 2, 7), (0, 2, 6, 7), (0, 6, 4, 7), (0, 4, 5, 7), (0, 5, 1, 7)]
-    tets = np.concatenate([np.stack([corners[node] for node in way], axis=1) for way in ways])
-    return TetMesh(place.reshape(-1, 3), tets)
+def mapped_grid(cells: tuple[int, int, int], place: Callable[[Array, Array, Array], list[Array]]) -> TetMesh:
+    """A general mesh: a grid of the unit cube, six tetrahedra each, whose points are moved to places [m]. Points that
+    come to the same place are one node."""
+    grid = TetForest.box(cells, 1.0, 0)
+    points = np.stack(place(*(grid.points / cells).T), axis=1)
+    _, first, node = np.unique(np.round(points, 9), axis=0, return_index=True, return_inverse=True)
+    return TetMesh(points[first], node.reshape(-1)[grid.tets])
 
 
 @case("patch", "homogeneous deformation; stress by the law's formula")
@@ -75,7 +68,7 @@ def patch(setup: Setup) -> list[Row]:
     """
     forest, young, poisson, stretch = TetForest.box((2, 2, 2), 0.05, 3), 1e4, 0.3, 1.3
     x = forest.points.copy()
-    inside = ((x > 1e-9) & (x < 0.1 - 1e-9)).all(axis=1)
+    inside = np.all((x > 1e-9) & (x < 0.1 - 1e-9), axis=1)
     x[inside] += np.random.default_rng(0).uniform(-4e-3, 4e-3, (int(inside.sum()), 3))
     mu, lam = 0.5 * young / (1.0 + poisson), young * poisson / (1.0 + poisson) / (1.0 - 2.0 * poisson)
     stresses = {
@@ -143,14 +136,16 @@ def pipe(setup: Setup) -> list[Row]:
     """A pipe with free ends, radii 1 : 2, under pressure inside, held nowhere; also nearly incompressible."""
     inner, outer, height, pressure, young = 0.05, 0.1, 0.02, 100.0, 1e5
     layers = 8 if setup.full else 4
-    turn = np.arange(12 * layers) * 2.0 * np.pi / (12 * layers)
-    heights, radii = np.linspace(0.0, height, layers // 2 + 1), np.linspace(inner, outer, layers + 1)
-    z, r, t = np.meshgrid(heights, radii, turn, indexing="ij")
-    mesh = mapped_grid((layers // 2, layers, 12 * layers), np.stack([r * np.cos(t), r * np.sin(t), z], -1), True)
+
+    def place(r: Array, t: Array, z: Array) -> list[Array]:
+        r = inner + (outer - inner) * r
+        return [r * np.cos(2.0 * np.pi * t), r * np.sin(2.0 * np.pi * t), height * z]
+
+    mesh = mapped_grid((layers, 12 * layers, layers // 2), place)
     rows = []
     for poisson in (0.3, 0.4999):
         body = SoftBody(mesh, Isotropic(young, poisson, 1e3), device=setup.device)
-        wall = np.isclose(np.hypot(*mesh.points[:, :2].T), inner)
+        wall = np.hypot(mesh.points[:, 0], mesh.points[:, 1]) < 1.001 * inner
         spread(body, faces_where(body, wall), -pressure)
         u = at_rest(body, Linear())
         grown = float(np.mean(np.sum(mesh.points[wall, :2] * u[wall, :2], axis=1))) / inner
@@ -164,10 +159,8 @@ def pipe(setup: Setup) -> list[Row]:
 @case("cook", "scikit-fem, quadratic tetrahedra, 45,387 unknowns")
 def cook(setup: Setup) -> list[Row]:
     """Cook's membrane, 48 x 44 to 16 x 10 mm, clamped on the left and sheared on the right, E = 100 kPa, 1 N."""
-    n = 32 if setup.full else 16
-    s, r, q = np.meshgrid(*(np.linspace(0.0, 1.0, k + 1) for k in (n, n, n // 4)), indexing="ij")
-    place = 1e-3 * np.stack([48.0 * s, 44.0 * s + r * (44.0 - 28.0 * s), 10.0 * q], axis=-1)
-    mesh = mapped_grid((n, n, n // 4), place)
+    n = 24 if setup.full else 12
+    mesh = mapped_grid((n, n, n // 4), lambda x, y, z: [0.048 * x, 0.044 * x + y * (0.044 - 0.028 * x), 0.010 * z])
     rows = []
     for poisson, reference in COOK.items():
         body = SoftBody(mesh, Isotropic(1e5, poisson, 1e3), device=setup.device)
@@ -177,7 +170,7 @@ def cook(setup: Setup) -> list[Row]:
         corner = np.argmin(np.linalg.norm(x - (0.048, 0.060, 0.005), axis=1))
         found = 1e3 * at_rest(body, Linear(dilatation="shared"))[corner, 1]
         setup.shown = [body], []
-        rows.append(row(f"upper corner, nu = {poisson:g}", found, reference, 0.06 if setup.full else 0.12, "mm"))
+        rows.append(row(f"upper corner, nu = {poisson:g}", found, reference, 0.08 if setup.full else 0.15, "mm"))
     return rows
 
 

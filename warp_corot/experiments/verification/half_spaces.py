@@ -125,38 +125,6 @@ def flat_punch(setup: Setup) -> list[Row]:
     return [row("force at rest", pressed(setup, mesh, force, punch), force, 0.03 if setup.full else 0.08, "N")]
 
 
-@case("hertz-balls", f"Hertz; {JOHNSON}, 4.2")
-def hertz_balls(setup: Setup) -> list[Row]:
-    """Two elastic balls with meshes that do not fit one another."""
-    radius = 4.0 * RADIUS
-    depth = CONTACT**2 / (0.5 * radius)
-    force = 4.0 / 3.0 * (0.5 * YOUNG / (1.0 - POISSON**2)) * np.sqrt(0.5 * radius) * depth**1.5
-    levels = (15, 12) if setup.full else (12, 9)
-    both = [half_ball(setup.device, level, radius, force, 0.5 * depth, 0.3 * k) for k, level in enumerate(levels)]
-    sim = Simulation(both, contact=Contact(friction=0.0), gravity=NONE, integrator=BackwardEuler(dt=0.02))
-    sim.advance_steps(12)
-    setup.shown = both, []
-    felt = both[1].contact_forces.numpy().astype(np.float64)[:, 2].sum()
-    return [row("force, implicit steps", felt, force, 0.03, "N")]
-
-
-def half_ball(device: str, finest: int, radius: float, force: float, nearer: float, turn: float) -> SoftBody:
-    """The part of an elastic ball around the place of contact: a half-space whose surface is curved there. It
-    approaches the other one by this distance [m], from below, or, if there is a rotation, rotated and from above."""
-    mesh = refined_block(finest)
-    x, edge = mesh.points.copy(), border(mesh.points)
-    moved = boussinesq(x[edge], force) + (0.0, 0.0, nearer)
-    away = np.minimum(np.linalg.norm(x[:, :2], axis=1), 2.0 * CONTACT)
-    x[:, 2] -= 0.5 * away**2 / radius * (1.0 + x[:, 2] / HALF)
-    if turn:
-        c, s = np.cos(turn), np.sin(turn)
-        over = np.array([[c, -s, 0.0], [-s, -c, 0.0], [0.0, 0.0, -1.0]])
-        x, moved = x @ over.T, moved @ over.T
-    body = SoftBody(TetMesh(x, mesh.tets), Isotropic(YOUNG, POISSON, 1000.0), device=device)
-    body.prescribe(edge, times=[0.0, 0.1], displacements=np.stack([0.0 * moved, moved]))
-    return body
-
-
 @case("cattaneo-mindlin", f"Cattaneo 1938, Mindlin 1949; {JOHNSON}, 7.2")
 def cattaneo_mindlin(setup: Setup) -> list[Row]:
     """A rigid ball is pressed in and then moved sideways: the rim of the contact slips, its middle sticks.
@@ -239,9 +207,10 @@ def hertz_cylinder(setup: Setup) -> list[Row]:
 
 @case("nafems-roller", "Konter, Advanced Finite Element Contact Benchmarks, NAFEMS 2006, no. 1")
 def nafems_roller(setup: Setup) -> list[Row]:
-    """A cylinder of 50 mm, E = 210 GPa, on a block of 70 GPa, 35 kN/mm, in plane strain; moduli and force here over 10^6.
+    """A cylinder of 50 mm, E = 210 GPa, on a block of 70 GPa under 35 kN/mm, in plane strain.
 
-    The two are moved together by a given way; the width is scaled to the benchmark's force, on whose root it depends.
+    Moduli and force are divided by a million. The bodies are moved together by a given way; the width is scaled to the
+    benchmark's force, on whose root it depends.
     """
     side, force, depth = 0.006, 35.0, 2.2e-3
     both = [
