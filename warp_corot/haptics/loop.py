@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import math
 import sys
@@ -102,6 +103,7 @@ class HapticLoop:
         self._missed = self._updates = 0
         self._is_to_stop = threading.Event()
         self._thread: threading.Thread | None = None
+        self._froze = False
         self.error: str | None = None
 
     # --- running ---------------------------------------------------------------------------------------------------
@@ -113,12 +115,19 @@ class HapticLoop:
     def start(self) -> None:
         """Connect the tool to the device, and start the thread.
 
+        Until ``stop``, Python's collector passes over all objects that exist now: a collection of them would hold up
+        all threads for a quarter of a second.
+
         Raises:
             InputError: The loop was started before; make another one.
         """
         if self._thread is not None:
             raise InputError("the haptic loop was started before; make another one")
         self.connect()
+        if not gc.get_freeze_count():
+            gc.collect()
+            gc.freeze()
+            self._froze = True
         self._thread = threading.Thread(target=self._run, name="haptics", daemon=True)
         self._thread.start()
 
@@ -140,6 +149,9 @@ class HapticLoop:
         self._is_to_stop.set()
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join()
+        if self._froze:
+            gc.unfreeze()
+            self._froze = False
         if self._exchange in self._sim.system.constraints:
             self._sim.system.constraints.remove(self._exchange)
             place = self._exchange.place
