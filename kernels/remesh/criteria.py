@@ -62,16 +62,21 @@ def nearness(element: ElementState, parameters: wp.array[wp.float32]):
 
     Parameters, all in metres: the box's centre, half its size along each axis, the radius of its rounding
     (for a ball the half sizes are zero), and a length added to the distance, which limits refinement
-    at contact.
+    at contact. Five more may follow, the box's rotation, (x, y, z, w), and a factor of the distance.
     """
     x = element.corner
     for n in range(4):
         x += 0.25 * (element.rest[n] + element.moved[n])
     centre = wp.vec3(parameters[0], parameters[1], parameters[2])
     half = wp.vec3(parameters[3], parameters[4], parameters[5])
-    outside = wp.length(wp.max(wp.abs(x - centre) - half, wp.vec3(0.0))) - parameters[6]
-    return longest_edge(element) / (wp.max(outside, 0.0) + parameters[7])
+    x -= centre
+    share = float(1.0)
+    if parameters.shape[0] > 8:
+        share = parameters[12]
+        x = wp.quat_rotate_inv(wp.quat(parameters[8], parameters[9], parameters[10], parameters[11]), x)
+    outside = wp.length(wp.max(wp.abs(x) - half, wp.vec3(0.0))) - parameters[6]
+    return longest_edge(element) / (share * wp.max(outside, 0.0) + parameters[7])
 
 
-#: Number of parameters of each criterion.
+#: Least number of parameters of each criterion.
 PARAMETER_COUNTS = {von_mises_stress: 1, strain: 1, nearness: 8}

@@ -286,7 +286,27 @@ def test_elements_turned_inside_out_cause_a_warning(device):
     sim = wc.Simulation(body, obstacles=tool, gravity=(0.0, 0.0, 0.0), integrator=wc.SymplecticEuler(viscosity=2e-3))
     with pytest.warns(wc.StabilityWarning, match=r"elements are turned inside out at t = .* NeoHookean") as said:
         sim.advance(0.03)
-    assert len(said) == 1
+    assert sum("inside out" in str(each.message) for each in said) == 1
+
+
+@pytest.mark.parametrize(("radius", "is_small"), [(0.02, False), (0.005, True)])
+def test_a_tool_smaller_than_the_elements_under_it_causes_a_warning(device, radius, is_small, recwarn):
+    """It names the size that would do; a body that is remeshed causes none."""
+    for remeshed in (False, True):
+        body = wc.SoftBody(
+            wc.TetForest.box((3, 3, 2), 0.02, 3, up_axis="Z"), wc.Isotropic(2e4, 0.4, 1000.0), device=device
+        )
+        body.fix("z == zmin")
+        tool = wc.Tool(wc.Sphere(radius))
+        tool.follow([0.0, 0.1], [(0.03, 0.03, 0.041 + radius), (0.03, 0.03, 0.03 + radius)])
+        remesh = wc.OnlineRemesh(near=tool) if remeshed else None
+        sim = wc.Simulation(body, obstacles=[tool], gravity=(0.0, 0.0, 0.0), remesh=remesh)
+        sim.advance(1e-3)
+    said = [str(each.message) for each in recwarn if issubclass(each.category, wc.StabilityWarning)]
+    assert len(said) == is_small
+    if is_small:
+        assert "sphere, 10 mm thick" in said[0]
+        assert "edges of 1.2 mm would do" in said[0]
 
 
 def test_overlaps_at_the_start_cause_a_warning(device):

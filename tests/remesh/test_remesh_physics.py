@@ -129,3 +129,44 @@ def test_the_stress_criterion_goes_by_the_bodys_stress(varied, device, rng):
     found = changing.forest.pools.marks.numpy()[: len(value)] == 1
     assert np.array_equal(found[clear], (value > threshold)[clear])
     assert clear.mean() > 0.9
+
+
+def test_elements_under_a_tool_are_as_fine_as_its_radius_asks(device, tmp_path):
+    """A capsule lies across the grid and moves along; its force comes near that of a finer mesh. A run that is loaded
+    follows it, too."""
+    along = np.array([0.0, np.sin(np.pi / 4), 0.0, np.cos(np.pi / 4)])
+    turn = np.array([0.0, 0.0, np.sin(0.3), np.cos(0.3)])
+    way = wp.quat(*turn) * wp.quat(*along)
+
+    def pressed(level, remeshed):
+        mesh = wc.TetForest.box((4, 4, 2), 0.01, level, up_axis="Z")
+        body = wc.SoftBody(mesh, wc.Isotropic(1e4, 0.4, 1000.0), device=device)
+        body.fix("z == zmin")
+        tool = wc.Tool(wc.Capsule(0.008, 0.01))
+        tool.follow([0.0, 0.05], [(0.021, 0.019, 0.028), (0.021, 0.019, 0.0255)], list(way))
+        remesh = wc.OnlineRemesh(near=tool, every=20) if remeshed else None
+        options = {"gravity": (0.0, 0.0, 0.0), "integrator": wc.SymplecticEuler(viscosity=5e-4, damping=20.0)}
+        sim = wc.Simulation(body, obstacles=[tool], contact=wc.Contact(friction=0.0), remesh=remesh, **options)
+        sim.advance(0.08)
+        return sim, float(tool.wrench.numpy()[0, 2])
+
+    (_, coarse), (_, fine), (sim, found) = pressed(0, False), pressed(6, False), pressed(0, True)
+    assert abs(coarse - fine) > 0.3 * fine
+    assert found == pytest.approx(fine, rel=0.1)
+    x = sim.bodies[0].mesh.points
+    axis = np.array(wp.quat_rotate(way, wp.vec3(0.0, 0.0, 1.0)))
+    middle = x[sim.bodies[0].mesh.tets].mean(axis=1) - (0.021, 0.019, 0.02)
+    off = np.linalg.norm(middle - np.clip(middle @ axis, -0.005, 0.005)[:, None] * axis, axis=1)
+    size = np.cbrt(6.0 * sim.bodies[0].mesh.volumes)
+    assert size[off < 0.002].max() < 0.3 * size[off > 0.02].max()
+    sim.save(tmp_path / "state.npz")
+    loaded = wc.Simulation.load(tmp_path / "state.npz")
+    assert loaded.remeshing.changing[0].options.near is loaded.obstacles[0]
+
+
+@pytest.mark.parametrize(("near", "says"), [(wc.Sphere(0.01), "near is"), (wc.Tool(wc.Ground()), "near is")])
+def test_only_tools_of_simple_shapes_can_be_near(near, says):
+    with pytest.raises(wc.InputError, match=says):
+        wc.OnlineRemesh(near=near)
+    with pytest.raises(wc.InputError, match="one of them must be None"):
+        wc.OnlineRemesh(near=wc.Tool(wc.Sphere(0.01)), criterion=strain, parameters=wp.ones(1))

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 Keys = tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]
 #: The default of the highest speed of a tool with given poses [m/s].
 SPEED = 1.0
+#: Longest edge of elements, over half the thickness of a tool, with which its force is right to a few per cent.
+FITTING = 0.25
 
 
 class Tool:
@@ -130,6 +132,11 @@ class Tool:
         """
         obstacles, number = self.place_among_obstacles()
         return obstacles.poses()[:, number]
+
+    @property
+    def is_free(self) -> bool:
+        """Whether no simulation has the tool."""
+        return self._bound is None
 
     def place_among_obstacles(self) -> tuple[Obstacles, int]:
         """The obstacles of the tool's simulation, and its number among them.

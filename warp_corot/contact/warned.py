@@ -1,9 +1,9 @@
-"""Warnings: of overlaps before anything moves, and of elements that tools turn inside out."""
+"""Warnings: of overlaps and of coarse elements before anything moves, and of elements that tools turn inside out."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,6 +20,7 @@ from warp_corot.solvers.halo import ALONE
 
 from .sampled import SignedDistance, TriangleMesh
 from .shapes import Capsule, Cylinder, Ground
+from .tool import FITTING
 
 if TYPE_CHECKING:
     from .contacts import Contacts
@@ -31,6 +32,8 @@ OVERLAP = 0.01
 ALONG = 9
 
 Floats = npt.NDArray[np.float64]
+#: Places of the surface nodes of a body [m], and its triangles.
+Surface = tuple[Floats, npt.NDArray[np.int32]]
 
 
 def warn_of_overlaps(contacts: Contacts, least: float) -> None:
@@ -55,10 +58,13 @@ def warn_of_overlaps(contacts: Contacts, least: float) -> None:
     axes = [(tool, _axis(tool, contacts.obstacles.poses()[0, k])) for k, tool in enumerate(contacts.obstacles.tools)]
     axes = [(tool, points) for tool, points in axes if len(points)]
     if len(contacts.surface.parts) > 1 or axes:
-        _warn_of_what_bodies_hold(contacts, axes, least, speed)
+        surfaces = list(_own_surfaces(contacts))
+        _warn_of_what_bodies_hold(contacts, surfaces, axes, least, speed)
+        for tool, points in axes:
+            _warn_of_coarse_elements(contacts, surfaces, tool, points)
 
 
-def _own_surfaces(contacts: Contacts) -> Iterator[tuple[Floats, npt.NDArray[np.int32]]]:
+def _own_surfaces(contacts: Contacts) -> Iterator[Surface]:
     """Where the surface nodes of each body are in its first world [m], and its triangles."""
     places = contacts.surface.arrays.x.numpy().astype(float)
     for body, part in zip(contacts.system.bodies, contacts.surface.parts, strict=True):
@@ -96,9 +102,29 @@ def warn_of_crushed(contacts: Contacts) -> bool:
 # --- pieces ----------------------------------------------------------------------------------------------------------
 
 
-def _warn_of_what_bodies_hold(contacts: Contacts, axes: list[tuple[Tool, Floats]], least: float, speed: str) -> None:
+def _warn_of_coarse_elements(contacts: Contacts, surfaces: Sequence[Surface], tool: Tool, points: Floats) -> None:
+    """Warn of a tool that moves and is smaller than the elements of the body nearest to it, where it is nearest."""
+    nearest = []
+    for body, (places, triangles) in zip(contacts.system.bodies, surfaces, strict=True):
+        corners = places[triangles]
+        away = np.linalg.norm(corners.mean(axis=1)[:, None] - points, axis=2).min(axis=1)
+        sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+        nearest.append((away.min(), float(np.median(sides[away <= away.min() + tool.shape.thickness])), body))
+    _, edge, body = min(nearest, key=lambda each: each[0])
+    size = tool.shape.thickness
+    if edge > size and body.changing is None and (tool.keys is not None or tool.is_sent):
+        fine = FITTING * size
+        _warn(
+            f"a {tool.shape!r}, {2e3 * size:.3g} mm thick, is small for the elements under it, whose edges are "
+            f"{1e3 * edge:.3g} mm: its force will be off by tens of per cent; edges of {1e3 * fine:.2g} mm would "
+            f"do, in all some {len(body.mesh.tets) * (edge / fine) ** 3:.0e} elements, or OnlineRemesh(near=tool)"
+        )
+
+
+def _warn_of_what_bodies_hold(
+    contacts: Contacts, surfaces: Sequence[Surface], axes: list[tuple[Tool, Floats]], least: float, speed: str
+) -> None:
     """Warn of nodes of bodies, and of axes of tools, that begin inside other bodies."""
-    surfaces = list(_own_surfaces(contacts))
     own = [points for points, _ in surfaces]
     ends = np.cumsum([0, *(len(points) for points in own), *(len(points) for _, points in axes)])
     points = np.concatenate(own + [each for _, each in axes])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from warp_corot.discretization.changing.survey import Survey
 from warp_corot.discretization.changing.transfer import Column
 from warp_corot.discretization.clock import Clock
 from warp_corot.errors import InputError
+from warp_corot.kernels.remesh.criteria import nearness
 from warp_corot.kernels.remesh.cut import Surface
 from warp_corot.kernels.remesh.mark import elongation, marking_kernel
 from warp_corot.kernels.remesh.state import MEAN_OF_CONTENTS
@@ -141,6 +143,9 @@ class Changing:
 
     def run(self) -> None:
         """Make one pass over the mesh, and update what depends on the mesh if it has changed."""
+        if self.options.near is not None:
+            assert self.options.parameters is not None
+            self.options.parameters.assign(self.options.place)
         self.change(self._launch, self._graph)
 
     def cut(self, surface: Surface | float) -> float:
@@ -327,6 +332,9 @@ def fitted(options: OnlineRemesh, body: SoftBody) -> OnlineRemesh:
         raise InputError(f"only a TetForest can be remeshed or cut; the mesh of this body is a {type(mesh).__name__}")
     if body.worlds > 1:
         raise InputError(f"worlds is {body.worlds}; only a body in one world can be remeshed or cut")
+    if options.near is not None:
+        place = wp.array(options.place, dtype=wp.float32, device=body.device)
+        options = replace(options, criterion=nearness, parameters=place)
     numbers = options.parameters
     if numbers is not None and numbers.device != body.device:
         raise InputError(f"parameters is on {numbers.device}; it must be on the body's device, {body.device}")

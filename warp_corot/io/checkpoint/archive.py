@@ -203,6 +203,7 @@ def _rebuilt_simulation(
         bodies.append(rebuilt_body(described, f"body{number}.", arrays, header["worlds"], place))
         models.append(rebuilt(described["model"], MODELS))
     integrator = rebuilt(header["integrator"], INTEGRATORS)
+    touching = obstacles_of(header["contact"], arrays)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", StabilityWarning)  # the warning was shown when the simulation was made
         sim = Simulation(
@@ -211,9 +212,9 @@ def _rebuilt_simulation(
             integrator=integrator,
             gravity=header["gravity"],
             deterministic=header["deterministic"],
-            remesh=remesh_options(header["bodies"], arrays, place, remesh),
+            remesh=remesh_options(header["bodies"], arrays, place, remesh, touching.get("obstacles", ())),
             cuts=blades_of(header["cuts"], arrays),
-            **obstacles_of(header["contact"], arrays),
+            **touching,
         )
     sim.steps_before_reset, sim.time_before_reset = header["steps_before_reset"], header["time_before_reset"]
     if header["stable_dt"] is not None:

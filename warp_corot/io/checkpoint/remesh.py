@@ -23,6 +23,7 @@ from warp_corot.remesh.keyframes import Row
 from warp_corot.remesh.online import OnlineRemesh
 
 if TYPE_CHECKING:
+    from warp_corot.contact.tool import Tool
     from warp_corot.remesh.changing import Changing
 
 Arrays = dict[str, np.ndarray]
@@ -54,6 +55,7 @@ def pack_changing(changing: Changing, prefix: str, arrays: Arrays) -> dict[str, 
         "options": {name: getattr(options, name) for name in PLAIN},
         "criterion": None if options.criterion is None else _name_of(options.criterion),
         "parameters": parameters is not None,
+        "near": None if options.near is None else options.near.place_among_obstacles()[1],
         "conditions": sorted(conditions.kept),
         "rows": list(rows),
         "between": [[*ends, row] for ends, row in conditions.keyframes.between.items()],
@@ -104,6 +106,7 @@ def remesh_options(
     arrays: Arrays,
     device: str | wp.Device,
     given: OnlineRemesh | Sequence[OnlineRemesh | None] | None,
+    tools: Sequence[Tool],
 ) -> OnlineRemesh | Sequence[OnlineRemesh | None] | None:
     """The options with which the bodies of a checkpoint are remeshed.
 
@@ -112,6 +115,7 @@ def remesh_options(
         arrays: The checkpoint's arrays.
         device: The device of the resumed simulation.
         given: Options in place of the stored ones, except the capacity, which stays.
+        tools: The obstacles of the resumed simulation.
 
     Raises:
         InputError: The criterion is not known, and no options replace it.
@@ -119,7 +123,7 @@ def remesh_options(
     kept = [
         None
         if each["remesh"] is None or not each["remesh"]["is_remeshed"]
-        else _options(each["remesh"], f"body{number}.remesh.", arrays, device, given)
+        else _options(each["remesh"], f"body{number}.remesh.", arrays, device, given, tools)
         for number, each in enumerate(described)
     ]
     if given is None:
@@ -135,7 +139,11 @@ def remesh_options(
     return found
 
 
-def _options(described: dict[str, Any], prefix: str, arrays: Arrays, device: Any, given: Any) -> OnlineRemesh:
+def _options(
+    described: dict[str, Any], prefix: str, arrays: Arrays, device: Any, given: Any, tools: Sequence[Tool]
+) -> OnlineRemesh:
+    if described["near"] is not None:
+        return OnlineRemesh(**described["options"], near=tools[described["near"]])
     name = described["criterion"]
     criterion = None if name is None else _criterion(name)
     if name is not None and criterion is None and given is None:
