@@ -17,13 +17,17 @@ def gather_slots(
     # In
     starts: wp.array[wp.int32],
     order: wp.array[wp.int32],
+    clears: int,
+    # In and out
     slots: wp.array[wp.vec4],
     # Out
     f: wp.array[wp.vec4],
 ):
-    """Add each node's slots to its force."""
+    """Add each node's slots to its force; then they are zero if this ``clears`` them."""
     i = wp.tid()
     total = load_node(f, i)
     for at in range(starts[i], starts[i + 1]):
         total += load_node(slots, order[at])
+        if clears != 0:
+            store_node(slots, order[at], wp.vec3())
     store_node(f, i, total)

@@ -138,6 +138,15 @@ def step_symplectic_euler(
 
 
 @wp.kernel(enable_backward=False)
+def take_in_work(parts: wp.array2d[wp.float64], support_work: wp.array[wp.float64]):
+    """Add the work of supports in the parts of a step to that of the step, and empty them."""
+    for part in range(parts.shape[0]):
+        for k in range(2):
+            support_work[k] += parts[part, k]
+            parts[part, k] = wp.float64(0.0)
+
+
+@wp.kernel(enable_backward=False)
 def set_start(pace: Pace, world_starts: wp.array[wp.float64]):
     """Set the starting time of the only world to the present time."""
     world_starts[0] = time_after(pace, 0)

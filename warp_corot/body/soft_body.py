@@ -15,6 +15,7 @@ from warp_corot.discretization.elements import Mesh, repeated
 from warp_corot.discretization.nodal import vec3_view
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_count, checked_numbers, shown
+from warp_corot.inputs.cpu_threads import team_for
 from warp_corot.inputs.device import checked_device
 from warp_corot.inputs.loading import BODY, load
 from warp_corot.inputs.simulation_lock import SIMULATION_LOCK, under_lock
@@ -54,13 +55,16 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
             [worlds, 1]; or all, [worlds, T]. Functions of the rest position are evaluated at the elements' centroids.
         worlds: Number of copies.
         device: "cpu", "cuda:0", …; None for Warp's default.
+        threads: Most threads that step the body on the CPU; None: as many as this process may use cores. A body takes
+            one for every 2,048 elements at most, and one while it is remeshed. Each number has its own rounding, the
+            same in every run.
 
     A body that is remeshed (``Simulation(…, remesh=…)``) has other nodes after a pass that changed the mesh: read
     ``node_count`` and the arrays again; views from before raise ``StaleViewError``. Its ``node_`` arrays have room for
     the largest number of nodes, and more; only the first ``node_count`` entries are nodes.
 
     Attributes:
-        worlds, device: The arguments.
+        worlds, device, threads: The arguments.
         discretization: The mesh and the material on the device.
         sizes: Numbers of nodes and elements.
         state: Displacements, velocities and forces of the nodes.
@@ -72,14 +76,26 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
             elements in all.
     """
 
-    def __init__(self, mesh: Mesh, material: Material, *, worlds: int = 1, device: str | wp.Device | None = None):
+    def __init__(
+        self,
+        mesh: Mesh,
+        material: Material,
+        *,
+        worlds: int = 1,
+        device: str | wp.Device | None = None,
+        threads: int | None = None,
+    ):
         with SIMULATION_LOCK:
+            if threads is not None:
+                checked_count(threads, "threads", least=1)
+            self.threads = threads
             _check_made_of(mesh, material)
             self.worlds = checked_count(worlds, "worlds", least=1)
             self.device = checked_device(device)
             load(BODY, self.device)
             self.discretization: Discretization = self._discretized(mesh, material)
             self.sizes = self.discretization.sizes
+            self.discretization.team = team_for(threads, self.sizes.elements if self.device.is_cpu else 0, worlds)
             #: The remeshing that changes the mesh, or None.
             self.changing: MeshChanges | None = None
             self.state = State(self.sizes, self.rest_positions, self.device)

@@ -128,7 +128,7 @@ def make_body(body: RunBody, duration: float, *, alone: bool) -> None:
     if chosen is not None:
         rest = " of the others" if subject.labels else ""
         subject.notes.append(f"Young's modulus{rest} is {pressure(chosen)}, chosen for the weight (--young)")
-    body.soft = SoftBody(subject.mesh, material, device=args.device)
+    body.soft = SoftBody(subject.mesh, material, device=args.device, threads=args.threads)
     body.soft.fix(body.held.nodes)
     fixed = None if args.fix is None else body.held.nodes
     move_patches(body.soft, body.loads, body.patches, ramp_of(args, duration), fixed)

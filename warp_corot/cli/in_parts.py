@@ -123,7 +123,7 @@ def _simulation(args: argparse.Namespace, subject: InputMesh, duration: float) -
 
     loads, mesh = loads_of(args), subject.mesh
     comm = mpi.world()
-    body = SoftBody(mesh, material_in_parts(args, subject, comm), device=args.device)
+    body = SoftBody(mesh, material_in_parts(args, subject, comm), device=args.device, threads=1)
     held = args.fix or [str(subject.fix)]
     for expression in held:
         body.fix(expression)

@@ -90,7 +90,7 @@ def _tried_step(one: RunBody, damping: float, viscosity: float) -> float:
     model, remesh = one.model, one.remesh
     if remesh:
         # The body's own mesh must not change before the run begins.
-        tried, remesh = SoftBody(body.mesh, body.material, device=body.device), replace(remesh, every=1)
+        tried, remesh = SoftBody(body.mesh, body.material, device=body.device, threads=1), replace(remesh, every=1)
         tried.fix(body.constrained)
     integrator = SymplecticEuler(damping=damping, viscosity=viscosity)
     with as_options(ARGUMENTS):

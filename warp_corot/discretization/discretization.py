@@ -12,6 +12,7 @@ import warp as wp
 
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import check_float32
+from warp_corot.inputs.cpu_threads import Team, team_of
 from warp_corot.kernels.corotated.anisotropic import OrthotropicMaterial, vec9
 from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.materials.directional import Directional
@@ -49,6 +50,7 @@ class Discretization(ABC):
         activation: Active stress of elements [Pa], float32; one entry until a stress is set.
         has_activation: Whether an active stress was set.
         smallest_volume: The volume of the smallest element [m^3].
+        team: The threads of the CPU that compute forces; one on CUDA and for a mesh that changes.
         awaited: Nodes that other processes move, if some wait for them; else None.
         sums_by_subtrees: Whether deterministic forces are summed subtree by subtree, never in groups of subtrees
             (CUDA), so that they are the same bits in a part of the mesh.
@@ -67,6 +69,7 @@ class Discretization(ABC):
     activation: wp.array
     has_activation: bool
     smallest_volume: float
+    team: Team
     awaited: Awaited | None = None
     sums_by_subtrees: bool = False
     _levels: Levels | None = None
@@ -216,7 +219,7 @@ class FixedMesh(Discretization):
         return made
 
     def _fill_in(self, mesh: Mesh, mu: npt.ArrayLike, lam: npt.ArrayLike, worlds: int, device: wp.Device) -> None:
-        self._mesh, self.worlds, self.device = mesh, worlds, device
+        self._mesh, self.worlds, self.device, self.team = mesh, worlds, device, team_of(1)
         self.sizes = Sizes.of(worlds, len(mesh.points), len(mesh.tets))
         self.smallest_volume = float(np.min(mesh.volumes))
         self.element_kind = element_kind(mesh)

@@ -9,6 +9,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import InputError
+from warp_corot.inputs.cpu_threads import launch
 from warp_corot.kernels.elements.reproducible import gather_slots
 from warp_corot.kernels.plan.slots import find_starts, number_slots, order_slots
 
@@ -79,10 +80,17 @@ class Slots:
         slots = cls.of_nodes(nodes, units.size, units.size, node_count, worlds)
         return slots, in_worlds(numbers, worlds, units.size)
 
-    def gather(self, f: wp.array, values: wp.array | None = None) -> None:
-        """Add each node's slots to its force, vec4 [worlds * N]; ``values``, if given, replace those of the slots."""
-        inputs = [self.starts, self.order, self.values if values is None else values]
-        wp.launch(gather_slots, dim=len(f), inputs=inputs, outputs=[f], device=f.device)
+    def gather(self, f: wp.array, begin: int = 0, end: int | None = None, *, clears: bool = False) -> None:
+        """Add each node's slots to its force.
+
+        Args:
+            f: Forces [N], vec4 [worlds * N].
+            begin, end: The nodes.
+            clears: Whether these slots are zero afterwards.
+        """
+        end = len(f) if end is None else end
+        inputs = [self.starts[begin : end + 1], self.order, int(clears), self.values]
+        launch(gather_slots, end - begin, inputs, [f[begin:end]], device=f.device)
 
 
 def check_slots(count: int) -> None:

@@ -6,11 +6,12 @@ subtree, and eight of these subtrees under one ancestor form a group (CUDA). Oth
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import warp as wp
 
+from warp_corot.inputs.cpu_threads import part_of
 from warp_corot.kernels.elements.elements import ForestElements, Subtrees
 
 #: With at least this many leaves in groups, a launch for groups saves more time than it costs.
@@ -51,6 +52,11 @@ class Batch:
     unit: wp.array | None
     flagged: wp.array
     live: wp.array | None = None
+
+    def part(self, begin: int, end: int) -> Batch:
+        """Some of the subtrees, on the CPU; their leaves have own rotations."""
+        flags = wp.zeros(-(-(end - begin) // 8) * 8, dtype=wp.uint8, device="cpu")
+        return replace(self, count=end - begin, subtrees=part_of(self.subtrees, begin, end), flagged=flags)
 
     @property
     def flags_by_eights(self) -> wp.array:

@@ -47,7 +47,7 @@ class Part(SoftBody):
             self.numbers = dataclasses.replace(numbers, places=numbers.nodes, element_places=numbers.elements)
             material = part_of_material(material, elements, count)
         self.is_own = np.tile(self.numbers.owner == rank, whole.worlds)
-        super().__init__(mesh, material, worlds=whole.worlds, device=device or whole.device)
+        super().__init__(mesh, material, worlds=whole.worlds, device=device or whole.device, threads=1)
         of_whole = whole.mesh if isinstance(whole.mesh, DividedMesh) else whole.discretization
         self.discretization.smallest_volume = of_whole.smallest_volume
 

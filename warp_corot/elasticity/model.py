@@ -16,6 +16,7 @@ from warp_corot.discretization.members import Members
 from warp_corot.discretization.plan import FlatLeaves, Plan
 from warp_corot.discretization.subtrees import Batch, chosen
 from warp_corot.errors import InputError
+from warp_corot.inputs.cpu_threads import Regions, Team, launch
 from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.forces import (
@@ -27,6 +28,7 @@ from warp_corot.kernels.elements.forces import (
 )
 from warp_corot.kernels.elements.stiffness_products import law_differential
 
+from .paths.divided import DividedForces, Piece
 from .stiffness import ElementStiffness
 from .stress_law import StressLaw
 from .structs import Kept, isotropic_material
@@ -76,6 +78,7 @@ class ForceField(ABC):
     is_linear: bool = False
     shares_dilatation: ClassVar[bool] = False
     _dilating: Dilating | None = None
+    _divided: DividedForces | None = None
 
     def __init__(self, body: Discretized | Discretization, deterministic: bool = False):
         discretization = discretization_of(body)
@@ -90,6 +93,7 @@ class ForceField(ABC):
         self._isotropic = Kept(lambda *values: isotropic_material(list(values)))
         #: Leaves in no subtree, and copies of their Lamé's parameters.
         self._flat_lame: tuple[wp.array, list[wp.array]] | None = None
+        self._regions = Regions(discretization.team, self.device)
         self.plan = self.plan_of(discretization)
         self.elements, self.slots = self.plan.elements, self.plan.slots
 
@@ -100,9 +104,23 @@ class ForceField(ABC):
         """
         return None
 
+    def divide(self) -> None:
+        """Let the threads of the discretization's team add the forces from now on, if the field can divide them; not
+        while launches are recorded."""
+        team = self.discretization.team
+        pieces = self.pieces(team) if team.parts > 1 else []
+        count = self.discretization.sizes.launch_nodes
+        self._divided = DividedForces(team, pieces, count) if pieces else None
+
+    def pieces(self, team: Team) -> Sequence[Piece]:
+        """Parts of the field whose forces add up to this one's; none if it cannot be divided."""
+        return []
+
     def add_forces(self, u: wp.array, f: wp.array) -> None:
         """Add the elastic nodal forces [N] of displacements u to f; both vec4 [worlds * N]."""
-        if self.slots is None:
+        if self._divided is not None:
+            self._divided.add_forces(u, f)
+        elif self.slots is None:
             self.scatter_forces(u, f)
         else:
             self.slots.values.zero_()
@@ -289,7 +307,22 @@ class ForceField(ABC):
         return None
 
     def launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+        launch(kernel, dim, inputs, outputs, device=self.device)
+
+    def _launch_over_elements(
+        self, kernel: wp.Kernel, isotropic: IsotropicMaterial, u: wp.array, output: wp.array, *of_elements: wp.array
+    ) -> None:
+        """Launch a kernel that writes a number of each element, or adds to it."""
+        self._regions.launch_over(
+            kernel,
+            self.element_count,
+            lambda _, own: (
+                [own(self.elements), own(isotropic), u, *map(own, of_elements)],
+                [own(output)],
+            ),
+            u.ptr,
+            output.ptr,
+        )
 
     @property
     def isotropic(self) -> IsotropicMaterial:
@@ -404,7 +437,7 @@ class ElementField(ForceField):
         self._stiffness.add_diagonal(self.elements, self.isotropic, u, blocks)
 
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
-        self.launch(self._energies, self.element_count, [self.elements, self.isotropic, u], [energies])
+        self._launch_over_elements(self._energies, self.isotropic, u, energies)
 
     def write_von_mises(self, u: wp.array, stress: wp.array) -> None:
         self.launch(self._von_mises, self.element_count, [self.elements, self.isotropic_shown, u], [stress])

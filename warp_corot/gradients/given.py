@@ -36,7 +36,9 @@ def with_values(body: SoftBody, values: Values) -> SoftBody:
     """
     moduli = {name: given(values[name]) for name in ("young", "poisson", "density") if name in values}
     material = replace(body.material, **moduli) if moduli else body.material
-    copy = SoftBody(_mesh(body, values.get("rest")), material, worlds=body.worlds, device=body.device)
+    copy = SoftBody(
+        _mesh(body, values.get("rest")), material, worlds=body.worlds, device=body.device, threads=body.threads
+    )
     conditions, count = copy.conditions, body.sizes.nodes
     wp.copy(conditions.held, body.conditions.held, count=count)
     conditions.find_inverse_masses()

@@ -6,7 +6,6 @@ are those that every run of a kind launches; fields name the kernels that factor
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Iterable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
@@ -17,6 +16,7 @@ from typing import TypeAlias
 
 import warp as wp
 
+from .cpu_threads import core_count
 from .stopwatch import KERNELS, WATCH
 
 #: Modules of ``warp_corot.kernels`` for closed surfaces and for meshes of domains, the slowest to compile first.
@@ -112,5 +112,4 @@ def give_up(settled: bool = False) -> None:
 
 @cache
 def _threads() -> ThreadPoolExecutor:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return ThreadPoolExecutor(min(cores, 8), thread_name_prefix="compiling")
+    return ThreadPoolExecutor(min(core_count(), 8), thread_name_prefix="compiling")

@@ -9,6 +9,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import warp as wp
 
+from warp_corot.inputs.cpu_threads import core_count
+
 #: A kernel with fewer threads is not worth a second core.
 LEAST = 8192
 #: Parts for each core, because some take longer than others.
@@ -33,14 +35,6 @@ def in_parts(device: wp.Device, count: int, work: Callable[[int, int], None]) ->
     work(bounds[0], bounds[1])  # alone, because it may compile and load kernels
     for _ in _pool().map(work, bounds[1:-1], bounds[2:]):
         pass
-
-
-def core_count() -> int:
-    """Cores that this process may use."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:  # this system does not have it
-        return os.cpu_count() or 1
 
 
 @functools.cache

@@ -11,6 +11,7 @@ from warp_corot.discretization.changing.plan import DevicePlan
 from warp_corot.discretization.changing.pools import DeviceForest
 from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.levels import TreeNodes
+from warp_corot.inputs.cpu_threads import team_of
 from warp_corot.kernels.corotated.anisotropic import OrthotropicMaterial
 from warp_corot.materials.directional import Directional
 from warp_corot.mesh import TetForest
@@ -34,6 +35,7 @@ class ChangingMesh(Discretization):
     def __init__(self, former: Discretization, forest: DeviceForest, carried: CarriedMaterial):
         self._forest, self._carried = forest, carried
         self.worlds, self.device, self.sizes = former.worlds, former.device, former.sizes
+        self.team = team_of(1)
         self.element_kind, self.elements, self.fill = former.element_kind, former.elements, former.fill
         self.lame, self.mu, self.lam, self.material_stride = former.lame, former.mu, former.lam, former.material_stride
         self.activation, self.has_activation = former.activation, former.has_activation

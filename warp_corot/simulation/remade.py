@@ -102,7 +102,13 @@ def _copy_of(body: SoftBody, material: Material | None) -> SoftBody:
     conditions, changing = body.conditions, body.changing
     if changing is not None and conditions.trajectories:
         raise InputError("a body that is remeshed follows keyframes; its law, material and remeshing stay as they are")
-    copy = SoftBody(body.mesh, body.material if material is None else material, worlds=body.worlds, device=body.device)
+    copy = SoftBody(
+        body.mesh,
+        body.material if material is None else material,
+        worlds=body.worlds,
+        device=body.device,
+        threads=body.threads,
+    )
     if body.state.initial is not None and changing is None:
         displacements, velocities = (array.numpy()[: body.node_count, :3] for array in body.state.initial)
         copy.displacements, copy.velocities = displacements, velocities

@@ -149,6 +149,8 @@ class Simulation(Cutting):
         bound = zip(self.models, self.bodies, strict=True)
         self.fields = tuple(m.bind(body, deterministic=self.deterministic) for m, body in bound)
         self.remeshing.serve(self.fields)
+        for field in self.fields:
+            field.divide()
         self.system = System(self.bodies, self.fields, self.pace, self.gravity, self.ranks)
         loading = self._load_kernels(touches=touching is not None)
         stable = self._find_stable_steps()

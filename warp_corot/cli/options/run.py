@@ -294,9 +294,11 @@ class DeviceOptions:
 
     Attributes:
         device: where to compute: "cpu", "cuda:0", ... (default: a GPU if there is one)
+        threads (N): the most threads on the CPU (default: as many as there are cores)
     """
 
     device: str | None = None
+    threads: int | None = None
 
 
 @dataclass(kw_only=True)

@@ -12,6 +12,7 @@ from warp_corot.discretization.elements import Elements
 from warp_corot.discretization.plan import Plan, Units
 from warp_corot.elasticity.model import ForceField
 from warp_corot.elasticity.paths.dilating import Dilating
+from warp_corot.elasticity.paths.divided import InLanes
 from warp_corot.elasticity.paths.lanes import Lanes
 from warp_corot.elasticity.stiffness import ElementStiffness
 from warp_corot.elasticity.stress_law import StressLaw
@@ -232,7 +233,7 @@ class CorotatedField(ForceField):
 
     def _write(self, kernel: wp.Kernel, isotropic: IsotropicMaterial, u: wp.array, output: wp.array) -> None:
         if self._has_own_outputs:
-            self.launch(kernel, self.element_count, [self.elements, isotropic, u], [output])
+            self._launch_over_elements(kernel, isotropic, u, output)
             return
         self.extract_rotations(u)
         self._launch_with_rotations(kernel, isotropic, u, output)
@@ -272,8 +273,10 @@ class LeafField(CorotatedField):
             self._sharing()
 
 
-class LanesField(CorotatedField):
+class LanesField(InLanes, CorotatedField):
     """General elements on the CPU."""
+
+    _lanes: Lanes
 
     def __init__(self, discretization: Discretization, model: CorotatedOptions, deterministic: bool):
         super().__init__(discretization, model, deterministic)

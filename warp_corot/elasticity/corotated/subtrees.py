@@ -15,10 +15,12 @@ from warp_corot.discretization.plan import FlatLeaves
 from warp_corot.discretization.subtrees import Batch, Sharing
 from warp_corot.elasticity.paths.clusters import ChangingClusterScatter, ClusterScatter
 from warp_corot.elasticity.paths.dilating import Dilating
+from warp_corot.elasticity.paths.divided import InLanes
 from warp_corot.elasticity.paths.grouped import GroupedLanes
 from warp_corot.elasticity.paths.lanes import Lanes, as_general
 from warp_corot.elasticity.structs import Kept
 from warp_corot.elasticity.tangent import Tangent
+from warp_corot.inputs.cpu_threads import launch
 from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.clusters.laws import isotropic_law
 from warp_corot.kernels.corotated.algebraic import corotated_stress
@@ -52,7 +54,7 @@ LanesMaterial: TypeAlias = (
 )
 
 
-class SubtreeField(CorotatedField):
+class SubtreeField(InLanes, CorotatedField):
     """The fast path: complete subtrees in batches, leaf by leaf only what is left over."""
 
     takes_subtrees = True
@@ -80,7 +82,7 @@ class SubtreeField(CorotatedField):
         of_subtrees: list[LoadedKernel] = [(self._kernel(*kind), self._block) for kind in self.plan.kinds]
         if self._groups is not None:
             return [*of_subtrees, self._groups.kernel("corotated"), repair_elements]
-        if self._flat_lanes is not None:
+        if self._lanes is not None:
             return [*of_subtrees, scatter_law_elements("corotated"), repair_elements]
         of_leaves = [self._own if self.plan.flat.unit is None else self._forces] if len(self.plan.flat) else []
         return [*of_subtrees, *of_leaves]
@@ -148,7 +150,7 @@ class SubtreeField(CorotatedField):
         self._kernels = [self._kernel(batch.shape, batch.grouped, batch.sharing) for batch in plan.batches]
         self._materials = [self._material(batch) for batch in plan.batches]
         self._flat_rotated = Kept(rotated_material)
-        self._flat_lanes: Lanes | None = None
+        self._lanes: Lanes | None = None
         if len(plan.flat) and self._groups is None:
             self._prepare_flat(plan.flat)
 
@@ -156,7 +158,7 @@ class SubtreeField(CorotatedField):
         self._flat_material = self.isotropic_of(flat)
         if self.device.is_cpu and flat.unit is None:
             general = flat.general or as_general(flat.elements, rest_matrices, [flat.elements])
-            self._flat_lanes = general_lanes(general)
+            self._lanes = general_lanes(general)
 
     @property
     def _tolerance(self) -> float | None:
@@ -183,8 +185,8 @@ class SubtreeField(CorotatedField):
             self._groups.scatter_forces("corotated", u, f, repair_elements)
         elif len(flat):
             isotropic = self._flat_material
-            if self._flat_lanes is not None:
-                self._flat_lanes.scatter_forces(isotropic, u, f)
+            if self._lanes is not None:
+                self._lanes.scatter_forces(isotropic, u, f)
             elif flat.unit is not None:
                 rotated = self._flat_rotated(isotropic, self._rotations, flat.unit)
                 self.launch(self._forces, len(flat), [flat.elements, rotated, u], [f])
@@ -247,8 +249,8 @@ class SubtreeField(CorotatedField):
         else:
             threads = -(-batch.count // LANES)
             inputs = [batch.subtrees, batch.count, material(), u]
-        wp.launch(kernel, dim=threads, inputs=inputs, outputs=outputs, device=self.device, block_dim=self._block)
-        if self._left_out is not None:
+        launch(kernel, threads, inputs, outputs, device=self.device, block_dim=self._block)
+        if self._left_out is not None or not batch.count:
             return
         flags = batch.flags_by_eights
         inputs = [self.elements, self.isotropic, u]

@@ -143,6 +143,9 @@ class DilatationField(ForceField):
     def reset(self, chosen: wp.array) -> None:
         self.shear.reset(chosen)
 
+    def divide(self) -> None:
+        self.shear.divide()
+
     # --- forces ------------------------------------------------------------------------------------------------------
 
     def add_forces(self, u: wp.array, f: wp.array) -> None:
@@ -253,8 +256,8 @@ class DilatationField(ForceField):
         self._add_shared_energies(u, energies)
 
     def _add_shared_energies(self, u: wp.array, energies: wp.array) -> None:
-        inputs = [self.elements, self.isotropic, u, self._share(u, self._still)]
-        self.launch(kernels.add_energies(self.kind, self.of), self.element_count, inputs, [energies])
+        kernel, shared = kernels.add_energies(self.kind, self.of), self._share(u, self._still)
+        self._launch_over_elements(kernel, self.isotropic, u, energies, shared)
 
     @property
     def energy_count(self) -> int:
@@ -318,7 +321,13 @@ class DilatationField(ForceField):
         """Launch the second pass of ``kernels.elements.shared_dilatation`` for all elements."""
         shared, law = self._shared, law or kernels.law_at(self.of)
         measure = kernels.measure_elements(self.kind, self.of)
-        self.launch(measure, self.element_count, [self.elements, self._all, self._all, u, p], [shared])
+        self._regions.launch_over(
+            measure,
+            self.element_count,
+            lambda _, own: ([own(self.elements), self._all, self._all, u, p], [own(shared)]),
+            u.ptr,
+            p.ptr,
+        )
         kernel = kernels.share_in_groups(self.kind, law)
         for starts, members, live, count in self.batches_of_groups():
             self.launch(kernel, count, [starts, members, live, self.elements, self.isotropic], [shared])

@@ -7,8 +7,10 @@ from collections.abc import Callable
 import warp as wp
 
 from warp_corot.elasticity.structs import Kept
+from warp_corot.inputs.cpu_threads import Team
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import Dilatation
+from warp_corot.kernels.elements.dilatation_lanes import GROUPS
 from warp_corot.kernels.subtrees.cpu import DilatingMaterial
 
 from .grouped import GroupedLanes
@@ -36,6 +38,14 @@ class Dilating:
         """
         made: DilatingMaterial = self._made(isotropic, self._lam(), tolerance)
         return made
+
+    def parts(self, team: Team, worlds: int) -> list[Dilating]:
+        """The same, each with some of the groups of all worlds."""
+        groups = self.groups
+        if groups is None or not groups.count:
+            return [self] * team.parts
+        bounds = team.bounds(groups.count, GROUPS, worlds)
+        return [Dilating(self.of, self._lam, groups.part(*each)) for each in bounds]
 
     def derive(self, isotropic: IsotropicMaterial) -> None:
         """Launch the sorting of the groups' leaves; may be recorded."""

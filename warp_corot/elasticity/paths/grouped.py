@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import warp as wp
 
+from warp_corot.discretization.elements import copied
 from warp_corot.discretization.plan import Plan
 from warp_corot.elasticity.structs import isotropic_material
+from warp_corot.inputs.cpu_threads import launch
 from warp_corot.inputs.loading import load
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import Dilatation
@@ -79,6 +83,20 @@ class GroupedLanes:
         if not self.count:
             return
         inputs = [self._general, self.count, self._material, u]
-        wp.launch(self.kernel(law), -(-self.count // GROUPS), inputs, [f, self._left_out], device="cpu")
+        launch(self.kernel(law), -(-self.count // GROUPS), inputs, [f, self._left_out], device="cpu")
         if repair is not None:
-            wp.launch(repair, 1, [self._general, self._material.isotropic, u], [self._left_out, f], device="cpu")
+            launch(repair, 1, [self._general, self._material.isotropic, u], [self._left_out, f], device="cpu")
+
+    def part(self, begin: int, end: int) -> GroupedLanes:
+        """The launches of some of the groups, if the mesh does not change."""
+        part = copy(self)
+        part.count, part._material = end - begin, copied(self._material)
+        part._material.starts = self._material.starts[begin : end + 1]
+        part._left_out = wp.zeros_like(self._left_out)
+        return part
+
+    @property
+    def nodes(self) -> wp.array:
+        """The nodes of the elements, vec4i."""
+        starts = self._material.starts.numpy()
+        return self._general.nodes[int(starts[0]) : int(starts[-1])]

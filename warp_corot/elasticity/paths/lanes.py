@@ -5,6 +5,7 @@ from __future__ import annotations
 import warp as wp
 
 from warp_corot.discretization.elements import Elements
+from warp_corot.inputs.cpu_threads import launch, part_of
 from warp_corot.kernels.corotated.anisotropic import FibreMaterial
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.elements import GeneralElements
@@ -23,19 +24,31 @@ class Lanes:
 
     def __init__(self, elements: Elements, general: Elements, *, scatter: wp.Kernel, repair: wp.Kernel | None = None):
         self.count = len(elements.nodes)
-        self._elements = elements
+        self.elements = elements
         self._general = general
         self._scatter = scatter
         self._repair = repair
+        #: Which of the material's values are those of the elements; None: all.
+        self._bounds: tuple[int, int] | None = None
         #: How many, then which.
         self._left_out = wp.zeros(self.count + 1 if repair else 0, dtype=wp.int32, device="cpu")
 
     def scatter_forces(self, material: IsotropicMaterial | FibreMaterial, u: wp.array, f: wp.array) -> None:
-        """Add the forces of displacements u to f, both vec4 [N]; ``material`` is the struct that kernels read."""
+        """Add the forces of displacements u to f, both vec4 [N]; ``material`` is the struct of all elements that
+        kernels read."""
+        if self._bounds is not None:
+            material = part_of(material, *self._bounds)
         inputs = [self._general, self.count, material, u]
-        wp.launch(self._scatter, -(-self.count // LANES), inputs, [f, self._left_out], device="cpu")
+        launch(self._scatter, -(-self.count // LANES), inputs, [f, self._left_out], device="cpu")
         if self._repair is not None:
-            wp.launch(self._repair, 1, [self._elements, material, u], [self._left_out, f], device="cpu")
+            launch(self._repair, 1, [self.elements, material, u], [self._left_out, f], device="cpu")
+
+    def part(self, begin: int, end: int) -> Lanes:
+        """The launches of some of the elements."""
+        elements, general = (part_of(each, begin, end) for each in (self.elements, self._general))
+        part = Lanes(elements, general, scatter=self._scatter, repair=self._repair)
+        part._bounds = begin, end
+        return part
 
 
 def as_general(elements: Elements, kernel: wp.Kernel, inputs: list) -> GeneralElements:

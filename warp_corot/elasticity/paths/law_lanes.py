@@ -17,13 +17,14 @@ from warp_corot.kernels.subtrees.cpu import scatter_law_subtrees
 from warp_corot.mesh import TetForest
 
 from .dilating import Dilating
+from .divided import InLanes
 from .lanes import Lanes, as_general
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
 
 
-class LawLanesField(LawField):
+class LawLanesField(InLanes, LawField):
     """Complete subtrees of a forest as units of work, other elements one by one, eight of each in the lanes.
 
     Args:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
@@ -13,14 +14,14 @@ import warp as wp
 from warp_corot.elasticity.viscosity import Viscosity
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number
-from warp_corot.kernels.stepping.integrate import STEP_SYMPLECTIC_EULER
+from warp_corot.inputs.cpu_threads import Regions
+from warp_corot.kernels.stepping.integrate import STEP_SYMPLECTIC_EULER, take_in_work
 from warp_corot.solvers.integrator import Integrator, Stepper
 
 from .block import BlockSteps
 from .patches import PatchSteps
 
 if TYPE_CHECKING:
-    from warp_corot.body.soft_body import SoftBody
     from warp_corot.solvers.system import System
 
 
@@ -83,6 +84,9 @@ class SymplecticEulerStepper(Stepper):
                 for k, (body, field) in bound
             ]
         self._many = [_steps_in_one_launch(system, k) for k in range(len(system.bodies))]
+        shapes = [(body.discretization.team.parts, 2) for body in system.bodies]
+        self._work = [wp.zeros(shape, dtype=wp.float64, device=system.device) for shape in shapes]
+        self._regions = [Regions(body.discretization.team, system.device) for body in system.bodies]
 
     @property
     def many_a_launch(self) -> bool:
@@ -124,33 +128,29 @@ class SymplecticEulerStepper(Stepper):
             self.system.add_other_forces(offset, self.damping, one_by_one)
             for k in one_by_one:
                 body = self.system.bodies[k]
-                self._move(body, offset)
+                self._move(k, offset)
                 self.system.ranks.exchange(k, body.state.displacements, overlaps=True)
                 self.system.fields[k].complete_step(body.state.displacements, self.system.pace.arrays)
         self.system.ranks.wait()
 
-    def _move(self, body: SoftBody, offset: int) -> None:
-        """Launch the motion of the ``offset``-th step since the clock was last advanced."""
-        system = self.system
-        wp.launch(
-            STEP_SYMPLECTIC_EULER[body.conditions.loads.dtype],
-            dim=body.sizes.launch_nodes,
-            inputs=[
-                self.damping,
-                system.gravity,
-                body.conditions.mass,
-                body.conditions.inverse_mass,
-                int(body.conditions.has_loads),
-                body.conditions.loads,
-                system.pace.arrays,
-                offset,
-                body.state.forces,
-                body.state.displacements,
-                body.state.velocities,
-            ],
-            outputs=[body.state.reactions, system.support_work_of(body), system.bad_step],
-            device=body.device,
-        )
+    def _move(self, k: int, offset: int) -> None:
+        """Launch the motion of a body in the ``offset``-th step since the clock was last advanced."""
+        system, body = self.system, self.system.bodies[k]
+        regions, state, given = self._regions[k], body.state, body.conditions
+        # Work of supports is added up part by part, so that its sum does not depend on the threads.
+        is_one = regions.team.parts == 1
+        work = [system.support_work_of(body)] if is_one else self._work[k]
+
+        def arguments(part: int, own: Callable) -> tuple[list, list]:
+            inputs = [self.damping, system.gravity, own(given.mass), own(given.inverse_mass), int(given.has_loads)]
+            inputs += [own(given.loads) if given.has_loads else given.loads, system.pace.arrays, offset]
+            inputs += [own(state.forces), own(state.displacements), own(state.velocities)]
+            return inputs, [own(state.reactions), work[part], system.bad_step]
+
+        kernel = STEP_SYMPLECTIC_EULER[given.loads.dtype]
+        regions.launch_over(kernel, body.sizes.launch_nodes, arguments, offset)
+        if not is_one:
+            wp.launch(take_in_work, 1, [work], [system.support_work], device=body.device)
 
 
 def _steps_in_one_launch(system: System, k: int) -> BlockSteps | PatchSteps | None:

@@ -1,0 +1,100 @@
+"""Elastic forces on the CPU in parts that threads compute side by side, without a place that two of them write to."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import replace
+from typing import Any, Protocol
+
+import numpy as np
+import warp as wp
+
+from warp_corot.discretization.slots import Slots
+from warp_corot.inputs.cpu_threads import Regions, Team
+from warp_corot.kernels.elements.lanes import LANES
+
+from .dilating import Dilating
+from .lanes import Lanes
+
+
+class Piece(Protocol):
+    """The forces of some elements; launches go through ``inputs.cpu_threads.launch``."""
+
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None: ...
+
+    @property
+    def nodes(self) -> list[wp.array]:
+        """The nodes of these elements, in arrays of any shape."""
+        ...
+
+
+class InLanes:
+    """A field of subtrees and other elements in lanes on the CPU, which can be divided."""
+
+    plan: Any
+    discretization: Any
+    _lanes: Lanes | None
+    _dilating: Dilating | None
+
+    def pieces(self, team: Team) -> list[Piece]:
+        """See ``ForceField``: copies of the field, each with some of the subtrees and of the other elements."""
+        if self.plan.counts is not None or self.plan.units is not None:
+            return []
+
+        worlds = self.discretization.worlds
+
+        def parts_of(whole: Any) -> list[Any]:
+            return [whole.part(*bounds) for bounds in team.bounds(whole.count, LANES, worlds)]
+
+        batches = [parts_of(batch) for batch in self.plan.batches]
+        dilating, lanes = self._dilating and self._dilating.parts(team, worlds), self._lanes and parts_of(self._lanes)
+        pieces: list[Any] = [copy(self) for _ in range(team.parts)]
+        for part, piece in enumerate(pieces):
+            piece.plan = replace(self.plan, batches=tuple(batch[part] for batch in batches))
+            piece._dilating, piece._lanes = dilating and dilating[part], lanes and lanes[part]
+        return pieces
+
+    @property
+    def nodes(self) -> list[wp.array]:
+        """See ``Piece``."""
+        nodes = [batch.subtrees.nodes for batch in self.plan.batches]
+        groups = None if self._dilating is None else self._dilating.groups
+        if groups is not None:
+            return [*nodes, groups.nodes] if groups.count else nodes
+        return nodes if self._lanes is None else [*nodes, self._lanes.elements.nodes]
+
+
+class DividedForces:
+    """Forces of the pieces of a field.
+
+    Each piece adds its forces to an array of its own, so that their order never depends on the threads. Then each
+    thread adds up those of some nodes, in the order of the pieces.
+
+    Args:
+        team: As many threads as there are pieces.
+        pieces: The pieces.
+        count: Number of nodes.
+    """
+
+    def __init__(self, team: Team, pieces: Sequence[Piece], count: int):
+        self._pieces, self._bounds = pieces, team.bounds(count)
+        touched = np.zeros((len(pieces), count), bool)
+        for of_piece, piece in zip(touched, pieces, strict=True):
+            for nodes in piece.nodes:
+                of_piece[nodes.numpy().ravel()] = True
+        starts = np.concatenate([[0], np.cumsum(touched.sum(axis=0))])
+        piece_of, node_of = np.nonzero(touched.T)[::-1]
+        order = piece_of * count + node_of
+        begins, places = (wp.array(each, dtype=wp.int32, device="cpu") for each in (starts, order))
+        values = wp.zeros((len(pieces), count), dtype=wp.vec4, device="cpu")
+        self._values, self._slots = values, Slots(begins, places, values.flatten(), count * len(pieces))
+        self._regions = Regions(team, values.device)
+
+    def add_forces(self, u: wp.array, f: wp.array) -> None:
+        """Add the forces [N] of displacements u to f; both vec4 [N]."""
+        self._regions.launch(
+            (u.ptr, f.ptr),
+            lambda part: self._pieces[part].scatter_forces(u, self._values[part]),
+            lambda part: self._slots.gather(f, *self._bounds[part], clears=True),
+        )
