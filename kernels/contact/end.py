@@ -24,7 +24,7 @@ def end_contact(
     count: int,
     place_start: int,
     places: int,
-    first: int,
+    shift: int,
     buffer: int,
     grain: float,
     nodes: Surface,
@@ -51,7 +51,7 @@ def end_contact(
     Args:
         start, count: The first of the ``nodes``, which are places or bear them, and how many there are.
         place_start, places: The first place, and how many of them to follow.
-        first, buffer: The number of the first of the nodes in the sums, and the buffer of these.
+        shift, buffer: How much larger the numbers of nodes in the sums are, and the buffer of these.
         counts: Whether the work of contact is counted here.
     """
     k = wp.tid()
@@ -60,12 +60,13 @@ def end_contact(
         i = nodes.node[s]
         if i >= 0:
             force = wp.vec3()
-            if watch.awake[0] != 0 and sums.touched[first + k] != 0:
-                force = force_of(sums.forces[buffer, first + k], grain)
-                sums.touched[first + k] = 0
+            n = s + shift
+            if watch.awake[0] != 0 and sums.touched[n] != 0:
+                force = force_of(sums.forces[buffer, n], grain)
+                sums.touched[n] = 0
                 for other in range(2):
-                    sums.weights[other, first + k] = 0
-                    sums.forces[other, first + k] = wp.vec3l()
+                    sums.weights[other, n] = 0
+                    sums.forces[other, n] = wp.vec3l()
             store_node(contact_forces, i, force)
             if wp.dot(force, force) > 0.0:
                 total = load_node(f, i) + force

@@ -12,6 +12,7 @@ iterations of a step in one launch.
 
 import warp as wp
 
+from warp_corot.kernels.elements.lanes import on_cpu
 from warp_corot.kernels.stepping.pace import DT, Pace
 from warp_corot.kernels.stepping.threads import spread_thread, synchronize_blocks, synchronize_grid
 
@@ -47,6 +48,7 @@ class Sums:
     forces: wp.array2d[wp.vec3l]  # [2, S + B] in multiples of ``Law.grain``
     live: wp.array[wp.int32]  # contacts that may act in this step, by their numbers
     live_count: wp.array[wp.int32]  # [2] how many in this step while forces are found, and in the last one
+    is_shared: int  # whether several threads of the CPU add at the same time
     # [2] blocks at the barrier for all of them, ever; and in this step at that for blocks with contacts that may act
     arrived: wp.array[wp.uint64]
 
@@ -219,14 +221,34 @@ def share_of(weight: float):
     return wp.max(int(SHARES * wp.abs(weight)), 1)
 
 
+_ADD_INTEGERS = on_cpu(
+    """
+    auto* to = reinterpret_cast<Integer*>(&wp::index(a, i, j));
+    const auto* from = reinterpret_cast<const Integer*>(&value);
+    for (int k = 0; k < sizeof(value) / sizeof(Integer); ++k)
+        if (is_shared) __atomic_fetch_add(to + k, from[k], __ATOMIC_RELAXED);
+        else to[k] += from[k];
+""",
+    otherwise="wp::atomic_add(a, i, j, value);\n",
+)
+
+
+@wp.func_native(_ADD_INTEGERS.replace("Integer", "int"))
+def add_integers(a: wp.array2d[wp.int32], i: int, j: int, value: int, is_shared: int): ...
+
+
+@wp.func_native(_ADD_INTEGERS.replace("Integer", "long long"))
+def add_integers(a: wp.array2d[wp.vec3l], i: int, j: int, value: wp.vec3l, is_shared: int): ...
+
+
 @wp.func
 def add_at(n: int, weight: float, times: int, force: wp.vec3, buffer: int, grain: float, sums: Sums):
     """Add a contact's part at a node; see ``add``."""
     if times != 0:
         sums.touched[n] = 1
-        wp.atomic_add(sums.weights, buffer, n, times * share_of(weight))
+        add_integers(sums.weights, buffer, n, times * share_of(weight), sums.is_shared)
     if wp.dot(force, force) > 0.0:
-        wp.atomic_add(sums.forces, buffer, n, grains_of(weight * force, grain))
+        add_integers(sums.forces, buffer, n, grains_of(weight * force, grain), sums.is_shared)
 
 
 @wp.func
@@ -345,6 +367,7 @@ def iterate(contact: Contact, before: int, law: Law, surface: Surface, sums: Sum
 def solve_contacts(
     # In
     threads: int,
+    begin: int,
     first: int,
     last: int,
     iterations: int,
@@ -361,12 +384,13 @@ def solve_contacts(
 
     Args:
         threads: The number of threads, of blocks that are all resident on CUDA.
+        begin: The number of the launch's first thread; on the CPU each is a launch of its own.
         first, last: The phases, from 0 to ``iterations`` + 1.
         awake: Whether contact is awake, [1]; there are no contacts if it is not.
         are_separate: Whether no two contacts share a node: places that are nodes, and one obstacle. Then a thread goes
             through all phases of a place by itself.
     """
-    thread = wp.tid()
+    thread = begin + wp.tid()
     if awake[0] == 0:
         return
     dt = float(pace.seconds[DT])

@@ -21,7 +21,7 @@ wp.set_module_options({"enable_backward": False})
     start = __shfl_sync(0xffffffffu, start, first);
     if (is_live != 0) wp::index(live, start + __popc(those & ((1u << lane) - 1u))) = row;
 #else
-    if (is_live != 0) wp::index(live, wp::index(count, 0)++) = row;
+    if (is_live != 0) wp::index(live, __atomic_fetch_add(&wp::index(count, 0), 1, __ATOMIC_RELAXED)) = row;
 #endif
 """)
 def list_by_warp(live: wp.array[wp.int32], count: wp.array[wp.int32], row: int, is_live: int):

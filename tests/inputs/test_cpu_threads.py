@@ -187,3 +187,26 @@ def test_threads_take_whole_worlds_each_of_which_moves_as_it_would_alone(poisson
         sim.advance(0.03)
         found.append(body.displacements.numpy().reshape(worlds, -1))
     np.testing.assert_array_equal(found[1], np.repeat(found[0], 11, axis=0))
+
+
+@pytest.mark.parametrize("pairs", [False, True])
+def test_explicit_contact_does_not_depend_on_the_number_of_threads(pairs):
+    """Threads add contact forces up in any order, as integers."""
+
+    def pressed(threads):
+        meshes = [
+            wc.TetForest.box(cells=(2, 1, 2), cell_size=0.03, level=8, origin=(0.0, y, 0.0)) for y in (0.0, 0.0305)
+        ]
+        material = wc.Isotropic(young=5e3, poisson=0.3, density=1000.0)
+        bodies = [wc.SoftBody(mesh, material, device="cpu", threads=threads) for mesh in meshes[: 1 + pairs]]
+        ball = wc.Tool(wc.Sphere(0.01, position=(0.03, 0.0402 + 0.0305 * pairs, 0.03)))
+        ball.follow([0.0, 0.02], [(0.03, 0.0402 + 0.0305 * pairs, 0.03), (0.04, 0.035 + 0.0305 * pairs, 0.03)])
+        obstacles = [wc.Ground((0.0, 1.0, 0.0), 0.0), ball]
+        sim = wc.Simulation(bodies, obstacles=obstacles, gravity=(0.0, -9.8, 0.0), contact=wc.Contact(friction=0.3))
+        sim.advance(0.02)
+        assert np.abs(sim.contact.obstacles.wrenches.numpy()).max(axis=(1, 2)).min() > 0.0
+        return np.concatenate([body.displacements.numpy() for body in bodies])
+
+    one, three, again = (pressed(threads) for threads in (1, 3, 3))
+    np.testing.assert_array_equal(three, again)
+    np.testing.assert_allclose(three, one, rtol=0, atol=1e-3 * np.abs(one).max())

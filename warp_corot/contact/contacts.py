@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
+from itertools import chain
 
 import numpy as np
 import warp as wp
 
+from warp_corot.inputs.cpu_threads import Regions, launch, team_of
 from warp_corot.kernels.contact import bearing, motion, sums
 from warp_corot.kernels.contact.begin import BEGIN_STEP, BLOCK
 from warp_corot.kernels.contact.end import END_CONTACT
@@ -101,7 +103,9 @@ class Contacts:
         self.rigid: RigidForces | None = None
         if self.obstacles.count:
             self.rigid = RigidForces(self.surface, self.obstacles, self.search, self.law)
-        given = (self.surface, self.search, self.law, system.pace.arrays, self._shared, self.rigid, self.pairs)
+        team = team_of(max(body.discretization.team.parts for body in system.bodies))
+        self._regions = Regions(team, self.device)
+        given = (self.surface, self.search, self.law, system.pace.arrays, self._shared, self.rigid, self.pairs, team)
         #: The forces of explicit steps.
         self.split = MassSplit(*given)
         self._is_explicit = False
@@ -200,9 +204,7 @@ class Contacts:
                 # Grasps add to the forces of nodes that bear nothing, too.
                 state.contact_forces.zero_()
             start, count, arrays = self.surface.nodes_of(k)
-            places = self._count(k) if follows else 0
-            inputs: list = [start, count, part.start, places, self.split.first(k), self.split.buffer, self.law.grain]
-            inputs += [arrays, surface.arrays]
+            inputs: list = [self.split.first(k) - start, self.split.buffer, self.law.grain, arrays, surface.arrays]
             inputs += [int(counts), damping, system.gravity, conditions.inverse_mass, int(conditions.has_loads)]
             inputs += [conditions.loads, system.pace.arrays, offset, state.velocities]
             outputs = [
@@ -212,7 +214,8 @@ class Contacts:
                 accounts[0] if counts else None,
                 state.contact_forces,
             ]
-            self._launch(END_CONTACT[conditions.loads.dtype], max(count, places), inputs, outputs, BLOCK)
+            ranges = (start, count), (part.start, self._count(k) if follows else 0)
+            self._launch_ranges(END_CONTACT[conditions.loads.dtype], ranges, inputs, outputs, (k, offset))
         if surface.is_whole:
             self.split.launch_clear()
             self.search.launch_after()
@@ -358,20 +361,22 @@ class Contacts:
             start, count, arrays = self.surface.nodes_of(k)
             borne = self._count(k) if part.bearers and finds_borne else 0
             moved = system.worlds * obstacles.count if moves and k == 0 else 0
-            inputs = [start, count, part.start, borne, damping, system.gravity, conditions.inverse_mass]
+            inputs = [damping, system.gravity, conditions.inverse_mass]
             inputs += [int(conditions.has_loads), conditions.loads, system.pace.arrays, offset]
             inputs += [state.rest, state.forces, state.displacements, state.velocities, surface.bearers]
             frames = system.worlds if begins and k == 0 else 0
-            inputs += [frames, moved, obstacles.motions, world_starts, int(moves)]
-            outputs = [self.search.watch, arrays, surface.arrays]
-            self._launch(BEGIN_STEP[conditions.loads.dtype], max(count, borne, moved, frames), inputs, outputs, BLOCK)
+            inputs += [obstacles.motions, world_starts, int(moves)]
+            outputs, ranges = [self.search.watch, arrays, surface.arrays], ((start, count), (part.start, borne))
+            kernel, key = BEGIN_STEP[conditions.loads.dtype], (k, offset, begins, moves)
+            self._launch_ranges(kernel, ranges, inputs, outputs, key, once=(frames, moved))
         if isinstance(surface, WholeSurface):
             surface.complete()
         elif self.rigid is not None and self.rigid.have_edges:
             self._shared.exchange(surface.arrays.d)
         for k, part in enumerate(surface.parts):
             if part.bearers and not finds_borne:
-                self._launch(bearing.place_borne, self._count(k), [part.start, surface.bearers, surface.arrays], [])
+                inputs = [part.start, surface.bearers, surface.arrays]
+                self._regions.launch_from(bearing.place_borne, self._count(k), inputs, [], k)
 
     def _make_arrays(self) -> None:
         surface, device = self.surface, self.device
@@ -402,5 +407,28 @@ class Contacts:
         """Number of places of a body in all worlds."""
         return self.system.worlds * self.surface.parts[k].nodes
 
-    def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list, block: int = 256) -> None:
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block)
+    def _launch_ranges(
+        self,
+        kernel: wp.Kernel,
+        ranges: Sequence[tuple[int, int]],
+        inputs: list,
+        outputs: list,
+        key: tuple,
+        once: Sequence[int] = (),
+    ) -> None:
+        """Launch a kernel in parts. Its first arguments are the beginning and the length of each range, and then
+        numbers of things that the first part does ``once``."""
+        bounds = [self._regions.team.bounds(count) for _, count in ranges]
+
+        def phase(part: int) -> None:
+            own = [
+                (start + of[part][0], of[part][1] - of[part][0]) for (start, _), of in zip(ranges, bounds, strict=True)
+            ]
+            first = [number if part == 0 else 0 for number in once]
+            dim = max(*(count for _, count in own), *first)
+            launch(kernel, dim, [*chain(*own), *first, *inputs], outputs, device=self.device, block_dim=BLOCK)
+
+        self._regions.launch((kernel, *key), phase)
+
+    def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)

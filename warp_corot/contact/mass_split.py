@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import warp as wp
 
+from warp_corot.inputs.cpu_threads import Regions, Team, launch
 from warp_corot.kernels.contact import mass_split as kernels
 from warp_corot.kernels.contact.law import Law
 from warp_corot.kernels.contact.rows import Meeting, Rows
@@ -37,6 +40,7 @@ class MassSplit:
         shared: The exchange with ranks that move the other nodes of the triangles here.
         rigid: Contact with obstacles; None without.
         pairs: Contact between soft surfaces; None if they cannot touch.
+        team: The threads of the CPU that share the contacts.
 
     Attributes:
         sums: What contacts add up at nodes, as a struct for kernels.
@@ -52,10 +56,12 @@ class MassSplit:
         shared: SurfaceHalo,
         rigid: RigidForces | None,
         pairs: Pairs | None,
+        team: Team,
     ):
         self.surface, self.device = surface, surface.device
         self._search, self._law, self._pace, self._shared = search, law, pace, shared
         self._rigid, self._pairs, self._taken = rigid, pairs, (-1, -1)
+        self._regions = Regions(team, self.device)
         alone = pairs is None and not surface.is_borne and (rigid is None or rigid.is_separate)
         self._are_separate, self.iterations = alone, EXACT if alone else ITERATIONS
         self.follow()
@@ -79,7 +85,8 @@ class MassSplit:
         self.sums.live_count = wp.zeros(2, dtype=wp.int32, device=device)
         self.sums.arrived = wp.zeros(2, dtype=wp.uint64, device=device)
         #: Whether one launch makes all phases, and its threads, or those of a launch for each phase.
-        self._is_one, self._threads = True, 1
+        self._is_one, self._threads = self._are_separate or self._regions.team.parts == 1, self._regions.team.parts
+        self.sums.is_shared = int(self._regions.team.parts > 1)
         if device.is_cuda:
             blocks, each = max(-(-contacts // BLOCK), 1), device.sm_count
             self._is_one = self._are_separate or blocks <= MOST_TURNS * each
@@ -103,12 +110,12 @@ class MassSplit:
         """Launch all phases of a step."""
         last = self.iterations + 1
         if self._shared.ranks.is_alone:
-            for first, end in [(0, last)] if self._is_one else [(phase, phase) for phase in range(last + 1)]:
-                self._launch(first, end)
+            spans = [(0, last)] if self._is_one else [(phase, phase) for phase in range(last + 1)]
+            self._regions.launch(kernels.solve_contacts, *(partial(self._launch, *span) for span in spans))
             return
         self._shared.exchange(self.surface.arrays.yielding)
         for phase in range(last + 1):
-            self._launch(phase, phase)
+            self._launch(phase, phase, 0)
             for buffer in (0, 1) if phase == 0 else (phase % 2,):
                 self._shared.exchange(self.sums.weights[buffer])
                 self._shared.exchange(self.sums.forces[buffer])
@@ -133,7 +140,7 @@ class MassSplit:
         inputs = [self._law.grain, totals, forces]
         wp.launch(kernels.place_forces, self.surface.count, inputs, [arrays], device=self.device, block_dim=BLOCK)
 
-    def _launch(self, first: int, last: int) -> None:
+    def _launch(self, first: int, last: int, part: int) -> None:
         contacts = kernels.Contacts()
         contacts.first_triangle, contacts.first_pair = self._at_places, self._at_places + self._at_triangles
         contacts.triangles, contacts.touches = self.surface.triangles, Touches()
@@ -146,13 +153,14 @@ class MassSplit:
         if self._pairs is not None:
             contacts.meeting, contacts.rows = self._pairs.meeting, self._pairs.rows
         search = self._search
-        inputs = [self._threads, first, last, self.iterations, int(self._are_separate)]
+        inputs: list = [self._threads, part, first, last, self.iterations, int(self._are_separate)]
         inputs += [search.watch.awake, search.near, self._pace]
-        wp.launch(
+        dim = 1 if self.device.is_cpu else self._threads
+        launch(
             kernels.solve_contacts,
-            self._threads,
+            dim,
             inputs,
             [contacts, self.sums],
             device=self.device,
-            block_dim=min(self._threads, BLOCK),
+            block_dim=min(dim, BLOCK),
         )
