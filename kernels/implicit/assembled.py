@@ -6,7 +6,8 @@ are stored transposed, as in ``multigrid.values``. Nodes that obstacles hold mov
 
 import warp as wp
 
-from warp_corot.kernels.elements.lanes import constants, native
+from warp_corot.kernels.elements.lanes import constants, headers, native, on_cpu
+from warp_corot.kernels.modules import unique_kernel
 
 from .conjugate_gradients import BEGAN, BROKEN, CONVERGED, END, LIMIT, NEGATIVE, RR, RUNNING, WITHIN
 from .multigrid.cycle import Rows
@@ -21,6 +22,8 @@ wp.set_module_options({"enable_backward": False})
 CLOSER, SETTLED = 0.03, 10.0
 #: Maximum number of nodes that bear a contact: four for each of the four places of a pair of soft surfaces.
 PLACES = 16
+#: Sums of parts on the CPU are so many places apart, in cache lines of their own.
+LINE = 8
 
 
 @wp.struct
@@ -35,6 +38,16 @@ class Couplings:
     projectors: wp.array[wp.mat33]  # S, by node
     drag: wp.array[wp.mat33]  # the derivative of friction at nodes that are held, by node [N/m]
     first: int  # the first node of the body whose contacts are added
+
+
+@wp.struct
+class Division:
+    """How threads of the CPU share the rows of a world in parts; see ``native/ssor_cg.h``."""
+
+    nodes: wp.array[wp.int32]  # by row
+    rows: wp.array[wp.int32]  # by node
+    parts: wp.array[wp.int32]  # the part of each row
+    spans: wp.array2d[wp.vec2i]  # [levels * parts, pieces] the rows of each level and part, from and to
 
 
 # --- the matrix -------------------------------------------------------------------------------------------------------
@@ -57,8 +70,10 @@ def lay_out(entries: int, blocks: wp.array[wp.mat33], planes: wp.array[wp.float3
 @wp.kernel(enable_backward=False)
 def finish_matrix(
     # In
+    begin: int,
     count: int,
     entries: int,
+    nodes: wp.array[wp.int32],
     diagonal: wp.array[wp.int32],
     plain: wp.array[wp.mat33],
     couplings: Couplings,
@@ -68,19 +83,22 @@ def finish_matrix(
     inverses: wp.array[wp.mat33],
     planes: wp.array[wp.float32],
 ):
-    """The diagonal with friction; the same with contacts, in the range of S; and the inverse of that there."""
+    """From the row ``begin`` on: the diagonal with friction; the same with contacts, in the range of S; and the inverse
+    of that there."""
     world, k = wp.tid()
+    k += begin
     i = world * count + k
-    own = plain[i]
+    node = world * count + nodes[k]
+    own = plain[node]
     inverse = wp.mat33()
     whole = wp.mat33()
     if wp.trace(own) > 0.0:
-        if couplings.projected[i] != 0:
-            own += couplings.drag[i]
-        whole = own + couplings.blocks[i]
+        if couplings.projected[node] != 0:
+            own += couplings.drag[node]
+        whole = own + couplings.blocks[node]
         whole = 0.5 * (whole + wp.transpose(whole))
-        if couplings.projected[i] != 0:
-            s = couplings.projectors[i]
+        if couplings.projected[node] != 0:
+            s = couplings.projectors[node]
             away = (wp.trace(whole) / 3.0) * (wp.identity(n=3, dtype=float) - s)
             whole = s * whole * s
             inverse = s * inverse_block(whole + away) * s
@@ -95,10 +113,16 @@ def finish_matrix(
 
 @wp.kernel(enable_backward=False)
 def keep_diagonal(
-    count: int, entries: int, diagonal: wp.array[wp.int32], blocks: wp.array[wp.mat33], plain: wp.array[wp.mat33]
+    count: int,
+    entries: int,
+    nodes: wp.array[wp.int32],
+    diagonal: wp.array[wp.int32],
+    blocks: wp.array[wp.mat33],
+    plain: wp.array[wp.mat33],
 ):
+    """Keep the diagonal by node."""
     world, k = wp.tid()
-    plain[world * count + k] = blocks[world * entries + diagonal[k]]
+    plain[world * count + nodes[k]] = blocks[world * entries + diagonal[k]]
 
 
 # --- contacts ---------------------------------------------------------------------------------------------------------
@@ -172,17 +196,13 @@ _NUMBERS = constants(
     SETTLED=SETTLED,
     CLOSER=CLOSER,
     PLACES=PLACES,
+    LINE=LINE,
 )
 
 
-@wp.func_native(f"""
-#if defined(__CUDA_ARCH__)
-{_NUMBERS}{native("persistent_cg")}
-#else
-#pragma clang fp contract(fast)
-{_NUMBERS}{native("ssor_cg")}
-#endif
-""")
+@wp.func_native(
+    on_cpu(_NUMBERS, "const address team = team_at;\n", native("ssor_cg"), otherwise=_NUMBERS + native("persistent_cg"))
+)
 def solve_rows(
     world: int,
     worlds: int,
@@ -209,10 +229,12 @@ def solve_rows(
     added: wp.array[wp.vec4],
     parts: wp.array[wp.float64],
     barriers: wp.array[wp.uint32],
+    division: Division,
+    team_at: wp.uint64,
 ): ...
 
 
-@wp.kernel(enable_backward=False)
+@unique_kernel(native=headers("team"))
 def solve(
     # In
     worlds: int,
@@ -242,9 +264,12 @@ def solve(
     added: wp.array[wp.vec4],
     parts: wp.array[wp.float64],
     barriers: wp.array[wp.uint32],
+    # On the CPU
+    division: Division,
+    team_at: wp.uint64,
 ):
-    """Iterate from the residual r of x until it is small enough: on the CPU a thread for each world, on CUDA resident
-    blocks.
+    """Iterate from the residual r of x until it is small enough: on the CPU in one thread, which shares the work with
+    its team, on CUDA by resident blocks.
     """
     solve_rows(
         wp.tid(),
@@ -272,4 +297,6 @@ def solve(
         added,
         parts,
         barriers,
+        division,
+        team_at,
     )

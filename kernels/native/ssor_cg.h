@@ -1,14 +1,28 @@
-// Conjugate gradients for one world by one thread, preconditioned by a symmetric sweep (SSOR) over block rows.
+// Conjugate gradients for all worlds, preconditioned by a symmetric sweep (SSOR) over block rows. Threads share the rows
+// of a world, or the worlds if there are at least as many.
 //
 // The matrix with contacts is A; L and U are the parts of its rows below and above the diagonal, without contacts, and
 // P is its diagonal with them. With M = (P + L) P^-1 (P + U) the iteration runs in (P + L)^-1 r, so that a product and its preconditioner together read each block
 // once (Eisenstat 1981): with t = (P + U)^-1 p, (P + L)^-1 A t = t + (P + L)^-1 (p + (A - L - U - 2 P) t).
-// In: world, count, entries, rows, diagonal, inverses, pivots, couplings, most.
-// In and out: x, r, scalars, status. Out: iterations. Work: u, p, q, s.
-typedef float four __attribute__((vector_size(16), aligned(4)));
+//
+// Rows stand level after level, and in each part after part; those of a level are coupled with no other part's of the
+// same level. So threads sweep over the parts of a level side by side, level after level.
+// In: team.h; team, per_team, the number of parts; worlds, count, entries, rows, diagonal, division, inverses, pivots,
+// couplings, most. In and out: x, r, by node; scalars, status. Out: iterations. Work: u, p, q, s; parts, sums of parts.
 const int* starts = rows.starts.data;
 const int* columns = rows.columns.data;
 const int* own = diagonal.data;
+const int *node_of = division.nodes.data, *row_of = division.rows.data;
+const bool shares_rows = worlds < per_team;
+const int levels = shares_rows ? division.spans.shape[0] / per_team : 1, pieces = shares_rows ? division.spans.shape[1] : 1;
+const auto span_of = [&](int level, int part, int piece) {
+    return shares_rows ? division.spans.data[(per_team * level + part) * pieces + piece] : wp::vec2i(0, count);
+};
+const auto in_parts = [&](const auto& work) {
+    if (shares_rows) share_work(team, per_team, work);
+    else work(0);
+};
+const auto solve_world = [&](int world) {
 const long long first = (long long)world * count;
 const float* blocks = &rows.blocks.data[(long long)world * entries].data[0][0];
 const float* inverse = &inverses.data[first].data[0][0];
@@ -38,67 +52,114 @@ const auto sum = [&](const four* v, int begin, int end) {
 const auto dot = [](const four& a, const four& b) {
     return (double)a[0] * b[0] + (double)a[1] * b[1] + (double)a[2] * b[2];
 };
-// (P + L)^-1 of v
-const auto forward = [&](const four* v, four* to) {
-    for (int i = 0; i < count; ++i) to[i] = times(inverse + 9ll * i, v[i] - sum(to, starts[i], own[i]));
+// These call ``work`` with rows and return the sum of what it returns, part by part: with all; with one level after
+// another, in which a row may read what earlier ones have got; and the same backwards.
+double* sums = parts.data + (shares_rows ? 0 : LINE * world);
+const auto total = [&]() {
+    double found = 0.0;
+    for (int part = 0; part < (shares_rows ? per_team : 1); ++part) found += sums[LINE * part];
+    return found;
+};
+const auto for_rows = [&](const auto& work) {
+    in_parts([&](int part) {
+        double found = 0.0;
+        for (int level = 0; level < levels; ++level)
+            for (int piece = 0; piece < pieces; ++piece) {
+                const auto span = span_of(level, part, piece);
+                for (int i = span[0]; i < span[1]; ++i) found += work(i);
+            }
+        sums[LINE * part] = found;
+    });
+    return total();
+};
+const auto sweep = [&](const auto& work) {
+    for (int level = 0; level < levels; ++level)
+        in_parts([&](int part) {
+            double found = level > 0 ? sums[LINE * part] : 0.0;
+            for (int piece = 0; piece < pieces; ++piece) {
+                const auto span = span_of(level, part, piece);
+                for (int i = span[0]; i < span[1]; ++i) found += work(i);
+            }
+            sums[LINE * part] = found;
+        });
+    return total();
+};
+const auto sweep_back = [&](const auto& work) {
+    for (int level = levels - 1; level >= 0; --level)
+        in_parts([&](int part) {
+            for (int piece = pieces - 1; piece >= 0; --piece) {
+                const auto span = span_of(level, part, piece);
+                for (int i = span[1] - 1; i >= span[0]; --i) work(i);
+            }
+        });
 };
 // |(P + L) half|^2, the residual's
 const auto residual = [&]() {
-    double total = 0.0;
-    for (int i = 0; i < count; ++i) {
+    return for_rows([&](int i) {
         four v = sum(half, starts[i], own[i]);
-        if (couplings.projected.data[first + i]) v = times(&couplings.projectors.data[first + i].data[0][0], v);
+        const long long node = first + node_of[i];
+        if (couplings.projected.data[node]) v = times(&couplings.projectors.data[node].data[0][0], v);
         v += times(pivot + 9ll * i, half[i]);
-        total += dot(v, v);
-    }
-    return total;
+        return dot(v, v);
+    });
 };
 if (status.data[world] != RUNNING) return;
 const bool is_last = !(numbers[END] > numbers[WITHIN] && numbers[BEGAN] > SETTLED * SETTLED * numbers[WITHIN]);
 const double end = is_last ? CLOSER * numbers[END] : numbers[END];
-forward(rest, half);
-double product = 0.0, now = numbers[RR];
-for (int i = 0; i < count; ++i) {
-    direction[i] = times(pivot + 9ll * i, half[i]);
-    product += dot(half[i], direction[i]);
-}
+double now = numbers[RR];
+float beta = 0.0f;
+sweep([&](int i) {
+    half[i] = times(inverse + 9ll * i, rest[node_of[i]] - sum(half, starts[i], own[i]));
+    return 0.0;
+});
+double product = for_rows([&](int i) { return dot(half[i], times(pivot + 9ll * i, half[i])); });
+const int room = couplings.nodes.shape[0], contacts = couplings.count.data[0] < room ? couplings.count.data[0] : room;
 int found = RUNNING, done = 0;
 if (!(product > 0.0)) found = BROKEN;
 while (found == RUNNING) {
     ++done;
-    for (int i = count - 1; i >= 0; --i)
-        turned[i] = times(inverse + 9ll * i, direction[i] - sum(turned, own[i] + 1, starts[i + 1]));
-    for (int i = 0; i < count; ++i)
-        image[i] = direction[i] + times(blocks + 9ll * own[i], turned[i]) - times(pivot + 9ll * i, turned[i]) * 2.0f;
-    const int contacts = couplings.count.data[0] < couplings.nodes.shape[0] ? couplings.count.data[0] : couplings.nodes.shape[0];
-    for (int c = 0; c < contacts; ++c) {
-        const int* node = &wp::index(couplings.nodes, c, 0);
-        const four* part = reinterpret_cast<const four*>(&wp::index(couplings.parts, c, 0));
-        if (node[0] < first || node[0] >= first + count) continue;
-        four along = {0.0f, 0.0f, 0.0f, 0.0f};
-        for (int k = 0; k < PLACES && node[k] >= 0; ++k) along += part[k] * turned[node[k] - first];
-        const float size = along[0] + along[1] + along[2];
-        for (int k = 0; k < PLACES && node[k] >= 0; ++k) image[node[k] - first] += part[k] * size;
-    }
-    double curvature = 0.0;
-    for (int i = 0; i < count; ++i) {
+    sweep_back([&](int i) {
+        four along = times(pivot + 9ll * i, half[i]);
+        if (done > 1) along += direction[i] * beta;
+        const four t = times(inverse + 9ll * i, along - sum(turned, own[i] + 1, starts[i + 1]));
+        direction[i] = along;
+        turned[i] = t;
+        image[i] = along + times(blocks + 9ll * own[i], t) - times(pivot + 9ll * i, t) * 2.0f;
+    });
+    if (contacts > 0) in_parts([&](int part) {
+        for (int c = 0; c < contacts; ++c) {
+            const int* node = &wp::index(couplings.nodes, c, 0);
+            const four* weight = reinterpret_cast<const four*>(&wp::index(couplings.parts, c, 0));
+            if (node[0] < first || node[0] >= first + count) continue;
+            four along = {0.0f, 0.0f, 0.0f, 0.0f};
+            for (int k = 0; k < PLACES && node[k] >= 0; ++k) along += weight[k] * turned[row_of[node[k] - first]];
+            const float size = along[0] + along[1] + along[2];
+            for (int k = 0; k < PLACES && node[k] >= 0; ++k) {
+                const int row = row_of[node[k] - first];
+                if (!shares_rows || division.parts.data[row] == part) image[row] += weight[k] * size;
+            }
+        }
+    });
+    const double curvature = sweep([&](int i) {
         image[i] = times(inverse + 9ll * i, image[i] - sum(image, starts[i], own[i]));
         // What follows needs the sum; the sweep needs this part alone.
-        curvature += dot(direction[i], image[i] + turned[i]);
-    }
+        return dot(direction[i], image[i] + turned[i]);
+    });
     if (!(curvature > 0.0)) {
         found = curvature <= 0.0 ? NEGATIVE : BROKEN;
         if (done == 1 && found == NEGATIVE)
-            for (int i = 0; i < count; ++i) solution[i] += turned[i];
+            for_rows([&](int i) {
+                solution[node_of[i]] += turned[i];
+                return 0.0;
+            });
         break;
     }
     const float alpha = (float)(product / curvature);
-    double after = 0.0;
-    for (int i = 0; i < count; ++i) {
-        solution[i] += turned[i] * alpha;
+    const double after = for_rows([&](int i) {
+        solution[node_of[i]] += turned[i] * alpha;
         half[i] -= (image[i] + turned[i]) * alpha;
-        after += dot(half[i], times(pivot + 9ll * i, half[i]));
-    }
+        return dot(half[i], times(pivot + 9ll * i, half[i]));
+    });
     // The residual's own norm costs half a product, so it is asked for rarely until the end is near.
     if (done % 4 == 0 || done >= most || !(after > 0.0)) {
         now = residual();
@@ -106,11 +167,16 @@ while (found == RUNNING) {
         else if (now <= end) found = CONVERGED;
         else if (done >= most) found = now <= numbers[END] ? CONVERGED : LIMIT;
     }
-    const float beta = (float)(after / product);
-    for (int i = 0; i < count; ++i)
-        direction[i] = times(pivot + 9ll * i, half[i]) + direction[i] * beta;
+    beta = (float)(after / product);
     product = after;
 }
 numbers[RR] = now;
 status.data[world] = found;
 iterations.data[world] = done;
+};
+if (shares_rows)
+    for (int world = 0; world < worlds; ++world) solve_world(world);
+else
+    share_work(team, per_team, [&](int part) {
+        for (long long world = part; world < worlds; world += per_team) solve_world(world);
+    });

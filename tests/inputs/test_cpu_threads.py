@@ -9,10 +9,13 @@ import time
 import numpy as np
 import pytest
 import warp as wp
+from scipy.sparse import identity
+from scipy.spatial import cKDTree
 
 import warp_corot as wc
 from warp_corot.errors import InputError
 from warp_corot.inputs.cpu_threads import LEAST_ELEMENTS, Region, core_count, launch, team_for, team_of
+from warp_corot.solvers.implicit.dissection import dissected
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="bodies take one thread there")
 
@@ -171,6 +174,20 @@ def test_the_number_of_threads_is_checked():
         wc.SoftBody(mesh, wc.Isotropic(young=1e3, poisson=0.3, density=1e3), threads=0)
 
 
+@pytest.mark.parametrize(("poisson", "lies", "tolerance"), [(0.49, False, 1e-4), (0.3, True, 0.01)])
+def test_implicit_steps_do_not_depend_on_the_number_of_threads(poisson, lies, tolerance):
+    """Rows are in another order, so that solves end elsewhere within their tolerance; and the first steps on a ground
+    end before they are solved for, with other contacts at a few nodes."""
+    options = {"obstacles": wc.Ground((0.0, 1.0, 0.0), -0.001)} if lies else {}
+    integrator = wc.BackwardEuler(dt=0.01, linear_tolerance=1e-5)
+    runs = [falling(n, poisson=poisson, integrator=integrator, **options) for n in (1, 4, 4)]
+    x, y, z = (body.displacements.numpy() for body, _ in runs)
+    np.testing.assert_array_equal(y, z)
+    assert np.linalg.norm(y - x) < tolerance * np.linalg.norm(x)
+    one, four, _ = (sim.stepper.totals.numpy()[2] for _, sim in runs)
+    assert four < 1.2 * one
+
+
 @pytest.mark.parametrize("poisson", [0.3, 0.49])
 @pytest.mark.parametrize("integrator", [None, wc.BackwardEuler(dt=0.01)])
 def test_threads_take_whole_worlds_each_of_which_moves_as_it_would_alone(poisson, integrator):
@@ -210,3 +227,21 @@ def test_explicit_contact_does_not_depend_on_the_number_of_threads(pairs):
     one, three, again = (pressed(threads) for threads in (1, 3, 3))
     np.testing.assert_array_equal(three, again)
     np.testing.assert_allclose(three, one, rtol=0, atol=1e-3 * np.abs(one).max())
+
+
+@pytest.mark.parametrize("parts", [2, 7])
+def test_rows_of_one_level_are_not_coupled_between_parts(parts):
+    n = 14
+    points = np.stack(np.meshgrid(*[np.arange(n)] * 3, indexing="ij"), axis=-1).reshape(-1, 3).astype(float)
+    near = cKDTree(points).sparse_distance_matrix(cKDTree(points), 1.8, output_type="coo_matrix").tocsr()
+    near = (near + identity(n**3)).tocsr()
+    rows = dissected(points, near.indptr, near.indices, parts)
+    np.testing.assert_array_equal(np.sort(np.concatenate(rows)), np.arange(n**3))
+    place = np.zeros(n**3, int)
+    for k, nodes in enumerate(rows):
+        place[nodes] = k
+    coupled = near.tocoo()
+    level, other = place[coupled.row], place[coupled.col]
+    assert not ((level // parts == other // parts) & (level != other)).any()
+    longest = sum(max(map(len, rows[k : k + parts])) for k in range(0, len(rows), parts))
+    assert longest < (1.05 if parts == 2 else 1.5) * n**3 / parts

@@ -1,5 +1,5 @@
 """The entries off the diagonal of the finest matrix on the CPU: those of ``values.gather_leaves``, one thread for each
-world. A column of a block is a vector register, so that a contribution takes some forty instructions.
+world, in parts. A column of a block is a vector register, so that a contribution takes some forty instructions.
 """
 
 import warp as wp
@@ -27,8 +27,9 @@ wp.set_module_options({"enable_backward": False})
         const four x = {q[0], q[3], q[6], 0.0f}, y = {q[1], q[4], q[7], 0.0f}, z = {q[2], q[5], q[8], 0.0f};
         return x * g[0] + y * g[1] + z * g[2];
     };
-    const int count = upper.shape[0];
-    for (int u = 0; u < count; ++u) {
+    const long long count = upper.shape[0];
+    const int last = count * (number + 1) / parts;
+    for (int u = count * number / parts; u < last; ++u) {
         four c[3] = {};
         if (upper.data[u][0] == upper.data[u][1]) {
             if (more.shape[0] <= 1) continue;
@@ -74,6 +75,8 @@ wp.set_module_options({"enable_backward": False})
     )
 )
 def gather_entries(
+    number: int,
+    parts: int,
     world: int,
     leaves: Leaves,
     scales: wp.array[float],
@@ -87,6 +90,8 @@ def gather_entries(
 @wp.kernel(enable_backward=False)
 def gather_leaves_on_cpu(
     # In
+    number: int,
+    parts: int,
     leaves: Leaves,
     scales: wp.array[float],
     stiffening: float,
@@ -95,5 +100,5 @@ def gather_leaves_on_cpu(
     blocks: wp.array[wp.mat33],
     more: wp.array[wp.mat33],
 ):
-    """As ``values.gather_leaves``."""
-    gather_entries(wp.tid(), leaves, scales, stiffening, most_lambda, blocks, more)
+    """As ``values.gather_leaves``, for one of so many parts of the entries."""
+    gather_entries(number, parts, wp.tid(), leaves, scales, stiffening, most_lambda, blocks, more)

@@ -86,12 +86,14 @@ def kept_share(lam: float, mu: float, most: float):
 
 @OF_MATRIX.member
 def write_rows(of: Dilatation) -> wp.Kernel:
-    """Write the rows at displacements u, with w - 1 in the fourth lane; lambda counts as ``most`` mu at most."""
+    """Write the rows of groups from ``begin`` on at displacements u, with w - 1 in the fourth lane; lambda counts as
+    ``most`` mu at most."""
     measure, curvature_of = of.measure, of.curvature
 
     @OF_MATRIX.kernel()
     def write_rows(
         # In
+        begin: int,
         world_elements: int,
         entries: int,
         groups: GroupNodes,
@@ -105,6 +107,7 @@ def write_rows(of: Dilatation) -> wp.Kernel:
         rows: wp.array[wp.vec4],
     ):
         world, g = wp.tid()
+        g += begin
         first = world * entries + first_entry(groups.ends, g)
         end = world * entries + groups.ends[g]
         for k in range(first, end):
@@ -161,6 +164,7 @@ def add_held_blocks(of: Dilatation) -> wp.Kernel:
         lam: wp.array[float],
         stride: int,
         scales: wp.array[float],
+        rank: wp.array[wp.int32],
         starts: wp.array[wp.int32],
         columns: wp.array[wp.int32],
         # In and out
@@ -177,10 +181,10 @@ def add_held_blocks(of: Dilatation) -> wp.Kernel:
         factor = scales[2] * curvature * lam[t * stride] / rest_volume(elements, t)
         nodes = elements.nodes[t]
         for m in range(4):
-            i = nodes[m] - world * count
+            i = rank[nodes[m] - world * count]
             for n in range(4):
                 if n != m:
-                    j = nodes[n] - world * count
+                    j = rank[nodes[n] - world * count]
                     for k in range(starts[i], starts[i + 1]):
                         if columns[k] == j:
                             wp.atomic_add(blocks, world * entries + k, factor * wp.outer(f[n], f[m]))

@@ -185,6 +185,7 @@ def semidefinite(a: wp.mat33):
 @wp.kernel(enable_backward=False)
 def finish_leaves(
     # In
+    begin: int,
     ranks: int,
     mesh_nodes: int,
     entries: int,
@@ -202,10 +203,12 @@ def finish_leaves(
     # Out
     inverses: wp.array[wp.mat33],
 ):
-    """Find the finest level's diagonal: stiffness, from the row's sum of blocks, which is zero because a translation
-    causes no force; mass; and blocks of other forces, if there are any. Held nodes have zeros.
+    """Find the finest level's diagonal, from the row ``begin`` on: stiffness, from the row's sum of blocks, which is
+    zero because a translation causes no force; mass; and blocks of other forces, if there are any. Held nodes have
+    zeros.
     """
     world, i = wp.tid()
+    i += begin
     first = world * entries
     own = diagonal[i]
     is_free = free[world * ranks + i] != wp.uint8(0)

@@ -12,6 +12,7 @@ import warp as wp
 
 from warp_corot.elasticity.corotated.elements import CorotatedField
 from warp_corot.elasticity.dilatation.field import DilatationField
+from warp_corot.inputs.cpu_threads import Regions
 from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.implicit import assembled as kernels
@@ -19,6 +20,7 @@ from warp_corot.kernels.implicit.multigrid import values
 from warp_corot.kernels.implicit.multigrid.cycle import Rows
 from warp_corot.materials.directional import Directional
 
+from .dissection import dissected
 from .multigrid.leaf_matrix import LeafMatrix
 from .multigrid.pattern import Pattern, PatternFinder
 from .tangent import TangentOperator
@@ -56,8 +58,9 @@ class _BodyMatrix:
 
     operator: TangentOperator
     leaves: LeafMatrix
-    nodes: wp.array
+    nodes: wp.array  # by row
     free: wp.array
+    edges: np.ndarray  # where the rows of each level and thread begin
 
     @property
     def pattern(self) -> Pattern:
@@ -85,6 +88,8 @@ class AssembledSolve:
     def __init__(self, operators: Sequence[TangentOperator], blocks: VectorBlocks, *, together: bool, touches: bool):
         self._operators, self.blocks, self._together, self.touches = list(operators), blocks, together, touches
         self.device, self._versions = operators[0].device, [-1]
+        teams = [operator.body.discretization.team for operator in operators]
+        self._regions = Regions(max(teams, key=lambda team: team.parts), self.device)
         self.follow()
 
     def follow(self) -> None:
@@ -94,9 +99,15 @@ class AssembledSolve:
         if self._versions == versions:
             return
         self._versions = versions
-        self._bodies = [self._body_matrix(operator) for operator in self._operators]
-        self._find_rows()
-        count, nodes = self._count, self.blocks.count
+        nodes, parts = self.blocks.count, self._regions.team.parts
+        self._worlds, self._count = 1, nodes
+        if not self._together:
+            (operator,) = self._operators
+            self._worlds, self._count = operator.worlds, operator.node_count
+        # With as many worlds, each thread solves for some of them.
+        parts = parts if self._worlds < parts else 1
+        self._bodies = [self._body_matrix(operator, parts) for operator in self._operators]
+        self._find_rows(parts)
         # One more, since products read past the last.
         self.diagonal, self._inverses, self._pivots = (
             wp.zeros(nodes + 1, dtype=wp.mat33, device=device) for _ in range(3)
@@ -106,41 +117,48 @@ class AssembledSolve:
         self._planes = wp.zeros(planes, dtype=wp.float32, device=device)
         self._vectors = [wp.zeros(nodes, dtype=wp.vec4, device=device) for _ in range(5)]
         self._make_couplings(nodes)
-        self._find_launch(count, self._worlds)
+        self._find_launch(self._count, self._worlds)
 
-    def _body_matrix(self, operator: TangentOperator) -> _BodyMatrix:
-        count, device = operator.node_count, self.device
-        members, sizes = operator.field.find_members, operator.body.discretization.sizes
-        nodes = wp.array(np.arange(count), dtype=wp.int32, device=device)
+    def _body_matrix(self, operator: TangentOperator, parts: int) -> _BodyMatrix:
+        count, device, discretization = operator.node_count, self.device, operator.body.discretization
+        members = operator.field.find_members
         free = wp.zeros(count * operator.worlds, dtype=wp.uint8, device=device)
         finder = PatternFinder(wp.zeros(count, dtype=wp.vec2i, device=device))
-        groups = None if members is None else members(sizes.world_elements)
-        leaves = LeafMatrix(operator.body.discretization, finder, nodes, nodes, count, free, groups)
-        return _BodyMatrix(operator, leaves, nodes, free)
+        groups = None if members is None else members(discretization.sizes.world_elements)
 
-    def _find_rows(self) -> None:
-        """Find the rows of the whole matrix, and where the entries of each body are in it."""
+        def matrix(rows: list[np.ndarray]) -> _BodyMatrix:
+            order = np.concatenate(rows)
+            nodes, rank = (wp.array(each, dtype=wp.int32, device=device) for each in (order, np.argsort(order)))
+            leaves = LeafMatrix(discretization, finder, nodes, rank, count, free, groups)
+            return _BodyMatrix(operator, leaves, nodes, free, np.cumsum([0, *map(len, rows)]))
+
+        found = matrix([np.arange(count)])
+        if parts == 1:
+            return found
+        starts, columns = found.pattern.starts.numpy()[: count + 1], found.pattern.columns.numpy()
+        return matrix(dissected(operator.body.rest_positions[:count], starts, columns, parts))
+
+    def _find_rows(self, parts: int) -> None:
+        """Find the rows of the whole matrix, where the entries of each body are in it, and how threads share it."""
         self._rows = Rows()
-        if not self._together:
-            (body,) = self._bodies
-            found, self._worlds, self._count = body.pattern, body.operator.worlds, body.operator.node_count
-            self._rows.starts, self._rows.columns, self._diagonal = found.starts, found.columns, found.diagonal
-            self._entries, self._firsts = found.entries, [0]
-            return
-        self._worlds, self._count = 1, self.blocks.count
-        starts, columns, self._firsts, first = [], [], [], 0
-        diagonal = np.zeros(self._count, np.int64)
+        starts, columns, spans, self._firsts, first = [], [], [], [], 0
+        diagonal, thread, nodes = *np.zeros((2, self._count), np.int64), np.arange(self._count)
+        levels = max((len(body.edges) - 1) // parts for body in self._bodies)
         for body, at, end in zip(self._bodies, self.blocks.starts, self.blocks.ends, strict=True):
             found, count = body.pattern, body.operator.node_count
+            edges = np.pad(body.edges, (0, levels * parts + 1 - len(body.edges)), "edge")
             self._firsts.append(first)
-            for world in range(body.operator.worlds):
+            for world in range(body.operator.worlds if self._together else 1):
                 row = at + world * count
                 starts.append(first + found.starts.numpy()[:count])
                 columns.append(row + found.columns.numpy()[: found.entries])
                 diagonal[row : row + count] = first + found.diagonal.numpy()[:count]
+                nodes[row : row + count] = row + body.nodes.numpy()
+                thread[row : row + count] = np.repeat(np.arange(levels * parts) % parts, np.diff(edges))
+                spans.append(row + np.stack([edges[:-1], edges[1:]], axis=1))
                 first += found.entries
             # Rows of nodes that there may be later have a zero.
-            spare = np.arange(row + count, end)
+            spare = np.arange(row + count, end if self._together else row + count)
             starts.append(first + np.arange(len(spare)))
             columns.append(spare)
             diagonal[spare] = starts[-1]
@@ -151,6 +169,10 @@ class AssembledSolve:
             wp.array(each, dtype=wp.int32, device=self.device)
             for each in (np.concatenate(starts), np.concatenate(columns), diagonal)
         )
+        self._division = kernels.Division()
+        for name, numbers in {"nodes": nodes, "rows": np.argsort(nodes), "parts": thread}.items():
+            setattr(self._division, name, wp.array(numbers, dtype=wp.int32, device=self.device))
+        self._division.spans = wp.array(np.stack(spans, axis=1), dtype=wp.vec2i, device=self.device)
 
     def _make_couplings(self, nodes: int) -> None:
         self.couplings, room = kernels.Couplings(), max(ROOM * nodes, LEAST_ROOM) if self.touches else 1
@@ -175,7 +197,7 @@ class AssembledSolve:
     def _find_launch(self, count: int, worlds: int) -> None:
         """Find how blocks share the worlds, and threads the rows."""
         if self.device.is_cpu:
-            self._dim, self._per_team, self._lanes, self._block, teams = worlds, 1, 1, 256, 1
+            self._dim, self._per_team, self._lanes, self._block, teams = 1, self._regions.team.parts, 1, 256, 1
         else:
             blocks = self.device.sm_count
             # A block with few nodes mostly waits for the others.
@@ -188,7 +210,8 @@ class AssembledSolve:
             while self._lanes < MOST_LANES and 2 * self._lanes * own <= THREADS:
                 self._lanes *= 2
             self._dim = teams * self._per_team * THREADS
-        self._parts = wp.zeros(3 * teams * self._per_team, dtype=wp.float64, device=self.device)
+        sums = kernels.LINE * max(worlds, self._per_team) if self.device.is_cpu else 3 * teams * self._per_team
+        self._parts = wp.zeros(sums, dtype=wp.float64, device=self.device)
         self._barriers = wp.zeros(STRIDE * teams, dtype=wp.uint32, device=self.device)
 
     @property
@@ -208,7 +231,7 @@ class AssembledSolve:
             wp.launch(values.find_free, dim, inputs, [body.free], device=self.device)
             blocks = self._rows.blocks[first : first + operator.worlds * body.pattern.entries + 1]
             body.leaves.gather(operator, blocks, self._inverses[at:], holds=True)
-        inputs = [self._count, self._entries, self._diagonal, self._rows.blocks]
+        inputs = [self._count, self._entries, self._division.nodes, self._diagonal, self._rows.blocks]
         self._launch(kernels.keep_diagonal, self._count, inputs, [self.diagonal])
         if self.device.is_cuda:
             self._launch(kernels.lay_out, self._entries, [self._entries, self._rows.blocks], [self._planes])
@@ -227,12 +250,13 @@ class AssembledSolve:
 
     def iterate(self, solver: ConjugateGradients, x: wp.array) -> None:
         """Launch iterations from the residual of x that a solve has begun with, in the worlds that run."""
-        if self._per_team > 1:
+        if self.device.is_cuda and self._per_team > 1:
             self._barriers.zero_()
         inputs = [self._worlds, self._count, self._entries, self._per_team, self._lanes, solver.most, self._rows]
         inputs += [self._planes, self._diagonal, self._inverses, self._pivots, self.couplings]
         outputs = [x, solver.r, solver.scalars, solver.status, solver.iterations]
-        outputs += [*self._vectors, self._parts, self._barriers]
+        outputs += [*self._vectors, self._parts, self._barriers, self._division]
+        outputs += [self._regions.team.address]
         wp.launch(kernels.solve, self._dim, inputs, outputs, device=self.device, block_dim=self._block)
 
     # --- on the host -------------------------------------------------------------------------------------------------
@@ -261,9 +285,9 @@ class AssembledSolve:
         self.couplings.projected.zero_()
 
     def _finish(self) -> None:
-        inputs = [self._count, self._entries, self._diagonal, self.diagonal, self.couplings]
+        inputs = [0, self._count, self._entries, self._division.nodes, self._diagonal, self.diagonal, self.couplings]
         outputs = [self._rows.blocks, self._pivots, self._inverses, self._planes]
-        self._launch(kernels.finish_matrix, self._count, inputs, outputs)
+        self._regions.launch_from(kernels.finish_matrix, (self._worlds, self._count), inputs, outputs)
 
     def _launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any]) -> None:
         """Launch a kernel with ``count`` threads for each world of the matrix."""

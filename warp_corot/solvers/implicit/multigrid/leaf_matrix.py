@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from typing import Any, cast
 
 import numpy as np
@@ -9,6 +10,7 @@ import warp as wp
 
 from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.members import Members
+from warp_corot.inputs.cpu_threads import Regions, launch
 from warp_corot.kernels.elements.dilatation import not_held
 from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.implicit.multigrid import shared, values
@@ -51,8 +53,9 @@ class LeafMatrix:
         is_bounded: bool = False,
     ):
         self._discretization, self.device, sizes = discretization, discretization.device, discretization.sizes
-        self._nodes, self._mesh_nodes, self._free, self._members = nodes, mesh_nodes, free, members
+        self._nodes, self._rank, self._mesh_nodes, self._free, self._members = nodes, rank, mesh_nodes, free, members
         self._write_frames = values.write_frames(is_turned)
+        self._regions = Regions(discretization.team, self.device)
         self.pattern, self._pairs = finder.of_leaves(self._elements.nodes, sizes.world_elements, rank, members)
         self._frames = wp.zeros(sizes.elements, dtype=wp.mat33, device=self.device)
         weights = np.swapaxes(np.array(GRADIENT), 1, 2).reshape(12, 3)
@@ -96,23 +99,36 @@ class LeafMatrix:
         body, members, found, count = self._discretization, self._members, self.pattern, len(self._nodes)
         sizes, elements, u, scales = body.sizes, self._elements, operator.displacements, operator.scales
         others = operator.other_blocks()
-        wp.launch(self._write_frames, sizes.elements, [elements, u], [self._frames], device=self.device)
+        self._regions.launch_over(
+            self._write_frames, sizes.elements, lambda _, own: ([own(elements), u], [own(self._frames)]), u.ptr
+        )
         if members is not None:
             inputs: list[Any] = [sizes.world_elements, members.entries, members.arrays, elements, u]
             inputs += [body.mu, body.lam, body.material_stride, most_shared]
-            self._launch(shared.write_rows(members.law), members.count, inputs, [self._rows])
+            self._launch(shared.write_rows(members.law), members.count, inputs, [self._rows], u.ptr, most_shared)
         inputs = [self._leaves(), scales, stiffening, most_lambda if members is None else 0.0]
         if self.device.is_cpu:
-            wp.launch(gather_leaves_on_cpu, sizes.worlds, inputs, [blocks, self._more], device=self.device)
+            parts, outputs = self._regions.team.parts, [blocks, self._more]
+            self._regions.launch(
+                (blocks.ptr, scales.ptr, stiffening, most_lambda),
+                lambda part: launch(gather_leaves_on_cpu, sizes.worlds, [part, parts, *inputs], outputs, device="cpu"),
+            )
         else:
-            self._launch(values.gather_leaves, len(found.upper), inputs, [blocks, self._more])
+            wp.launch(
+                values.gather_leaves,
+                (sizes.worlds, len(found.upper)),
+                inputs,
+                [blocks, self._more],
+                device=self.device,
+            )
         if holds and members is not None and members.law.holding is not not_held:
             inputs = [sizes.world_elements, count, found.entries, elements, u, body.lam, body.material_stride]
-            inputs += [scales, found.starts, found.columns]
+            inputs += [scales, self._rank, found.starts, found.columns]
             wp.launch(shared.add_held_blocks(members.law), sizes.elements, inputs, [blocks], device=self.device)
         inputs = [count, self._mesh_nodes, found.entries, self._nodes, operator.inverse_mass, scales, self._free]
         inputs += [found.starts, found.columns, found.diagonal, others, self._more]
-        self._launch(values.finish_leaves, count, inputs, [blocks, inverses])
+        key = [blocks.ptr, others.ptr, scales.ptr, operator.inverse_mass.ptr]
+        self._launch(values.finish_leaves, count, inputs, [blocks, inverses], *key)
 
     def _leaves(self) -> values.Leaves:
         body, found, leaves = self._discretization, self.pattern, values.Leaves()
@@ -125,7 +141,6 @@ class LeafMatrix:
         leaves.pairs, leaves.rows = self._pairs, self._rows
         return leaves
 
-    def _launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any]) -> None:
-        """Launch a kernel with ``count`` threads for each world."""
-        dim = (self._discretization.sizes.worlds, count)
-        wp.launch(kernel, dim, inputs, outputs, device=self.device)
+    def _launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any], *key: Hashable) -> None:
+        """Launch a kernel with ``count`` threads for each world, in parts."""
+        self._regions.launch_from(kernel, (self._discretization.sizes.worlds, count), [0, *inputs], outputs, *key)
