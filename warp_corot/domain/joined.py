@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
+from warp_corot.inputs.cpu_threads import launch_side_by_side
 from warp_corot.kernels.meshing import measuring as kernels
-from warp_corot.mesh.side_by_side import in_parts
 
 from .winding import SurfaceParts, linked, part_volumes
 
@@ -68,12 +68,12 @@ def _crossings(closed: ClosedSurface, device: wp.Device) -> np.ndarray:
     of_edges = [wp.array(edges.astype(np.int32), dtype=wp.vec2i, device=device)]
     of_edges += [wp.array(own, dtype=wp.int32, device=device)]
     of_triangles = [mesh.id, wp.array(closed.parts, dtype=wp.int32, device=device)]
-
-    def find(start: int, stop: int) -> None:
-        inputs = [placed, *(array[start:stop] for array in of_edges), *of_triangles]
-        wp.launch(kernels.find_crossed_parts, stop - start, inputs, [crossed[start:stop]], device=device)
-
-    in_parts(device, len(edges), find)
+    launch_side_by_side(
+        kernels.find_crossed_parts,
+        len(edges),
+        lambda own: ([placed, *map(own, of_edges), *of_triangles], [own(crossed)]),
+        device,
+    )
     other = crossed.numpy()
     return _different(own[other >= 0], other[other >= 0])
 

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
+from warp_corot.inputs.cpu_threads import launch_side_by_side
 from warp_corot.kernels.meshing import domain as kernels
 from warp_corot.kernels.meshing import measuring
 from warp_corot.kernels.meshing.windings import Lines
-from warp_corot.mesh.side_by_side import in_parts
 
 from .edges import Edges
 from .winding import linked
@@ -181,13 +181,12 @@ def _pinched(triangles: np.ndarray, one: np.ndarray, other: np.ndarray, count: i
 def _touched(edges: np.ndarray, mesh: wp.Mesh) -> np.ndarray:
     touched = wp.empty(len(edges), dtype=wp.int32, device=mesh.device)
     given = wp.array(edges.astype(np.int32), dtype=wp.vec2i, device=mesh.device)
-
-    def find(start: int, stop: int) -> None:
-        inputs = [mesh.points, given[start:stop], mesh.id, mesh.indices]
-        outputs = [touched[start:stop]]
-        wp.launch(measuring.find_touched_triangles, stop - start, inputs, outputs, device=mesh.device)
-
-    in_parts(mesh.device, len(edges), find)
+    launch_side_by_side(
+        measuring.find_touched_triangles,
+        len(edges),
+        lambda own: ([mesh.points, own(given), mesh.id, mesh.indices], [own(touched)]),
+        mesh.device,
+    )
     return touched.numpy()
 
 

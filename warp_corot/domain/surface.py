@@ -13,11 +13,11 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import InputError
+from warp_corot.inputs.cpu_threads import launch_side_by_side
 from warp_corot.inputs.loading import SURFACES, load
 from warp_corot.io.read.surfaces import UP_AXES, LoadedSurface, load_surface
 from warp_corot.kernels.meshing import domain as kernels
 from warp_corot.kernels.meshing import windings
-from warp_corot.mesh.side_by_side import in_parts
 
 from .joined import joined_parts
 from .sides import corner_points, sides_of
@@ -76,12 +76,9 @@ class SurfaceDomain(SignedFunction):
         phi = wp.empty(points.size, wp.float32, device=points.device)
         mesh = self._mesh(points.device)
         inputs = [mesh.id, mesh.indices, self.lines, *self._sides_on(points.device)]
-
-        def evaluate(start: int, stop: int) -> None:
-            part = [points[start:stop], *inputs]
-            wp.launch(kernels.evaluate_surface, stop - start, part, [phi[start:stop]], device=points.device)
-
-        in_parts(points.device, points.size, evaluate)
+        launch_side_by_side(
+            kernels.evaluate_surface, points.size, lambda own: ([own(points), *inputs], [own(phi)]), points.device
+        )
         return phi
 
     def holds(self, points: npt.ArrayLike) -> np.ndarray:
@@ -94,13 +91,12 @@ class SurfaceDomain(SignedFunction):
         given, along = self._on_device(starts), self._on_device(ends - starts)
         shares, normals = (wp.empty(given.size, kind, device=self.device) for kind in (wp.float32, wp.vec3))
         mesh, sides = self._mesh(self.device), self._sides_on(self.device)[0]
-
-        def find(start: int, stop: int) -> None:
-            part = [given[start:stop], along[start:stop], mesh.id, sides]
-            outputs = [shares[start:stop], normals[start:stop]]
-            wp.launch(kernels.find_exits, stop - start, part, outputs, device=self.device)
-
-        in_parts(self.device, given.size, find)
+        launch_side_by_side(
+            kernels.find_exits,
+            given.size,
+            lambda own: ([own(given), own(along), mesh.id, sides], [own(shares), own(normals)]),
+            self.device,
+        )
         found = shares.numpy().astype(np.float64)
         return np.where(found < 0.0, np.nan, found), normals.numpy().astype(np.float64)
 
@@ -122,24 +118,24 @@ class SurfaceDomain(SignedFunction):
         # A little inside, so that a ray does not hit the surface on which it starts.
         start = wp.array(points.numpy() + START * reach * along.numpy(), dtype=wp.vec3, device=points.device)
         mesh = self._mesh(points.device)
-
-        def evaluate(first: int, stop: int) -> None:
-            part = [start[first:stop], along[first:stop], reach, side, mesh.id]
-            wp.launch(kernels.evaluate_thickness, stop - first, part, [found[first:stop]], device=points.device)
-
-        in_parts(points.device, points.size, evaluate)
+        launch_side_by_side(
+            kernels.evaluate_thickness,
+            points.size,
+            lambda own: ([own(start), own(along), reach, side, mesh.id], [own(found)]),
+            points.device,
+        )
         return np.minimum(found.numpy() + START * reach, reach)
 
     def lengths_inside(self, starts: np.ndarray) -> np.ndarray:
         """The length inside the body of the lines from points below it [m], float64 [n]; see `lines`."""
         placed, mesh = self._on_device(starts), self._mesh(self.device)
         lengths = wp.empty(placed.size, wp.float64, device=self.device)
-
-        def measure(start: int, stop: int) -> None:
-            inputs = [placed[start:stop], mesh.id, mesh.indices, self.lines]
-            wp.launch(windings.measure_lines, stop - start, inputs, [lengths[start:stop]], device=self.device)
-
-        in_parts(self.device, placed.size, measure)
+        launch_side_by_side(
+            windings.measure_lines,
+            placed.size,
+            lambda own: ([own(placed), mesh.id, mesh.indices, self.lines], [own(lengths)]),
+            self.device,
+        )
         return lengths.numpy()
 
     def _sides_on(self, device: wp.Device) -> list[wp.array]:
@@ -256,12 +252,12 @@ def lines_through(bounds: np.ndarray) -> windings.Lines:
 def windings_of(mesh: wp.Mesh, lines: windings.Lines, points: wp.array) -> np.ndarray:
     """Winding numbers of a closed surface around points, int32 [n]."""
     found = wp.empty(points.size, wp.int32, device=points.device)
-
-    def find(start: int, stop: int) -> None:
-        inputs = [points[start:stop], mesh.id, mesh.indices, lines]
-        wp.launch(windings.find_windings, stop - start, inputs, [found[start:stop]], device=points.device)
-
-    in_parts(points.device, points.size, find)
+    launch_side_by_side(
+        windings.find_windings,
+        points.size,
+        lambda own: ([own(points), mesh.id, mesh.indices, lines], [own(found)]),
+        points.device,
+    )
     return found.numpy()
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import scipy.ndimage
 import warp as wp
 
+from warp_corot.inputs.cpu_threads import launch_side_by_side
 from warp_corot.kernels.meshing import voxel_distances as kernels
-from warp_corot.mesh.side_by_side import in_parts
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -60,12 +60,7 @@ def _nearest_of(inside: wp.array, wanted: int, ratios: np.ndarray) -> list[wp.ar
 
 def _on_lines(kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[wp.array]) -> None:
     """Launch a kernel with a thread for each line of voxels."""
-    cpu = wp.get_device("cpu")
-
-    def work(start: int, stop: int) -> None:
-        wp.launch(kernel, stop - start, [*inputs, start], outputs, device=cpu)
-
-    in_parts(cpu, count, work)
+    launch_side_by_side(kernel, count, lambda own: ([*inputs, -own(0)], outputs), wp.get_device("cpu"))
 
 
 def steepest_slope(phi: np.ndarray, spacing: np.ndarray) -> float:

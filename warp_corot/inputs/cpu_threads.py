@@ -23,11 +23,13 @@ from warp_corot.kernels.stepping import team as kernels
 Arguments = Callable[[int, Callable[[Any], Any]], tuple[list, list]]
 #: With fewer elements for each thread, waiting for one another takes longer than they save.
 LEAST_ELEMENTS = 2048
+#: Launches for things that differ in cost have so many parts for each core; fewer things are not worth a second core.
+PARTS, LEAST_THINGS = 4, 8192
 #: The most threads, and the lines of their words; see ``kernels/native/team.h``.
 MOST = 1023
 _LOCK, _STOP, _CALLS, _PIPE, _OWN = 4, 6, slice(7, 10), 10, 11
-#: The launches of the part that is being recorded.
-_recording: list[list[wp.Launch]] = []
+#: In ``launches``, those of the part that the thread records.
+_recording = threading.local()
 
 
 def core_count() -> int:
@@ -44,10 +46,11 @@ def core_count() -> int:
 
 def launch(kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, outputs: Sequence = (), **options: Any) -> None:
     """``wp.launch``, or, inside a phase of a ``Region``, one launch of the part."""
-    if not _recording:
+    launches = getattr(_recording, "launches", None)
+    if launches is None:
         wp.launch(kernel, dim, inputs, outputs, **options)
     elif dim:
-        _recording[-1].append(wp.launch(kernel, dim, inputs, outputs, record_cmd=True, **options))
+        launches.append(wp.launch(kernel, dim, inputs, outputs, record_cmd=True, **options))
 
 
 class _Threads:
@@ -101,16 +104,17 @@ class Team:
 
     Args:
         parts: Number of parts, at most ``MOST``.
+        threads: Number of threads; None: as many as parts.
 
     Attributes:
         parts: As given.
         address: Of the words in ``kernels/native/team.h``; 0 if there is one part.
     """
 
-    def __init__(self, parts: int):
+    def __init__(self, parts: int, threads: int | None = None):
         self.parts, self.address = parts, 0
         if parts > 1:
-            _threads().grow(parts)
+            _threads().grow(threads or parts)
             self.address = _threads().address
 
     def bounds(self, count: int, step: int = 1, worlds: int = 1) -> list[tuple[int, int]]:
@@ -216,8 +220,24 @@ class Regions:
         self.launch((kernel, *key), phase)
 
 
+def launch_side_by_side(
+    kernel: wp.Kernel,
+    count: int,
+    arguments: Callable[[Callable[[Any], Any]], tuple[list, list]],
+    device: wp.Device,
+) -> None:
+    """Launch a kernel with a thread for each of ``count`` things, on all cores if ``device`` is the CPU; ``arguments``
+    as for ``Regions.launch_over``, without the part's number."""
+    cores = core_count() if device.is_cpu and count >= LEAST_THINGS and sys.platform != "win32" else 1
+    team = team_of(1) if cores == 1 else team_of(min(PARTS * cores, MOST), cores)
+    Regions(team, device).launch_over(kernel, count, lambda _, own: arguments(own))
+
+
 def part_of(whole: Any, begin: int, end: int) -> Any:
-    """Some entries of an array, or of the arrays of a struct that have one for each element, as views."""
+    """Some entries of an array, or of the arrays of a struct that have one for each element, as views; or the number of
+    a thing, counted from ``begin``."""
+    if isinstance(whole, (int, np.integer)):
+        return whole - begin
     if isinstance(whole, wp.array):
         return whole if begin == 0 and end == len(whole) else whole[begin:end]
     part = type(whole)()
@@ -246,11 +266,11 @@ def team_for(threads: int | None, elements: int, worlds: int = 1) -> Team:
 
 def _recorded(phase: Callable[[int], None], part: int) -> list[wp.Launch]:
     launches: list[wp.Launch] = []
-    _recording.append(launches)
+    _recording.launches = launches
     try:
         phase(part)
     finally:
-        _recording.pop()
+        del _recording.launches
     return launches
 
 

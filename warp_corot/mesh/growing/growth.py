@@ -8,9 +8,9 @@ import numpy as np
 import warp as wp
 
 from warp_corot.errors import InputError
+from warp_corot.inputs.cpu_threads import launch_side_by_side
 from warp_corot.kernels.meshing import growth as kernels
 from warp_corot.mesh.lattice import LATTICE_BITS, MAX_LEVEL
-from warp_corot.mesh.side_by_side import in_parts
 from warp_corot.mesh.tree import Tree
 
 #: Slots of the hash table per node, at least.
@@ -123,14 +123,14 @@ class Growth:
         Before ``first_new`` only those whose edges got an active midpoint since the last call.
         """
         flags = wp.empty(self.element_count, dtype=wp.int32, device=self.device)
-        own = [self.tets, self.first_child, self.wished, self.bound]
+        of_elements = [self.tets, self.first_child, self.wished, self.bound]
         shared = [self._keys, self._values, self.active, self.touched]
-
-        def flag(start: int, stop: int) -> None:
-            inputs = [*(array[start:stop] for array in own), *shared, first_new - start]
-            self.launch(kernels.flag_hanging, stop - start, inputs, [flags[start:stop]])
-
-        in_parts(self.device, self.element_count, flag)
+        launch_side_by_side(
+            kernels.flag_hanging,
+            self.element_count,
+            lambda own: ([*map(own, of_elements), *shared, own(first_new)], [own(flags)]),
+            self.device,
+        )
         self.touched.zero_()
         return self.flagged(flags)
 

@@ -10,11 +10,11 @@ import numpy as np
 import warp as wp
 
 from warp_corot.errors import InputError
+from warp_corot.inputs.cpu_threads import launch_side_by_side
 from warp_corot.kernels.meshing import elements as kernels
 from warp_corot.kernels.meshing import leaves
 from warp_corot.kernels.tables.shapes import CIRCUMRADIUS, EDGE_LENGTHS
 from warp_corot.mesh.lattice import LATTICE_BITS, MAX_LEVEL
-from warp_corot.mesh.side_by_side import in_parts
 from warp_corot.mesh.tree import LIVE
 
 from .growth import Growth, lattice_spacing, with_room
@@ -196,12 +196,16 @@ class Judge:
         shared = [values, growth.tets, growth.level, self.phi, growth.lattice]
         shared += [self.origin, self.spacing, self.circumradius, lipschitz, *limits]
 
-        def judge(start: int, stop: int) -> None:
-            inputs = [elements[start:stop], first, slots[6 * start : 6 * stop], *shared]
-            own = [array[start:stop] for array in (unsure, probes, expected, deviations)]
-            growth.launch(kernels.judge_by_edges, stop - start, inputs, outputs + own)
-
-        in_parts(self.device, count, judge)
+        six = slots[: 6 * count].reshape((count, 6))
+        launch_side_by_side(
+            kernels.judge_by_edges,
+            count,
+            lambda own: (
+                [own(elements), first, own(six).flatten(), *shared],
+                [*outputs, *map(own, (unsure, probes, expected, deviations))],
+            ),
+            self.device,
+        )
         chosen = growth.flagged(unsure)
         if len(chosen):
             found = self.domain.phi(probes[chosen].contiguous())

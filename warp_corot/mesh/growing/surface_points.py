@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from warp_corot.inputs.cpu_threads import launch_side_by_side
 from warp_corot.kernels.meshing.surface_points import find_surface_points
-from warp_corot.mesh.side_by_side import in_parts
 
 
 def surface_points(
@@ -27,10 +27,7 @@ def surface_points(
     points, inward = (wp.empty(len(tets), dtype=wp.vec3d, device=device) for _ in range(2))
     shared = [lattice, phi, wp.vec3d(*origin), wp.float64(spacing)]
     given = wp.array(tets, dtype=wp.vec4i, device=device)
-
-    def find(start: int, stop: int) -> None:
-        outputs = [points[start:stop], inward[start:stop]]
-        wp.launch(find_surface_points, stop - start, [given[start:stop], *shared], outputs, device=device)
-
-    in_parts(device, len(tets), find)
+    launch_side_by_side(
+        find_surface_points, len(tets), lambda own: ([own(given), *shared], [own(points), own(inward)]), device
+    )
     return points.numpy(), inward.numpy()
