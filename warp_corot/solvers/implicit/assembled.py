@@ -70,8 +70,8 @@ class _BodyMatrix:
 class AssembledSolve:
     """The matrices of operators as one, and conjugate gradients with it in one launch.
 
-    On the CPU a thread solves a world, with a symmetric sweep over the rows as preconditioner (SSOR); on CUDA resident
-    blocks do, with the inverses of diagonal blocks.
+    On the CPU threads share the worlds or the rows of each, with a symmetric sweep over the rows as preconditioner
+    (SSOR); on CUDA resident blocks solve a world, with the inverses of diagonal blocks.
 
     Args:
         operators: Operators that ``suit``, of bodies whose vectors are the ``blocks`` of one.
@@ -215,10 +215,15 @@ class AssembledSolve:
         self._barriers = wp.zeros(STRIDE * teams, dtype=wp.uint32, device=self.device)
 
     @property
+    def threads(self) -> int:
+        """Number of threads of the CPU that share a solve."""
+        return self._regions.team.parts
+
+    @property
     def kernels(self) -> list[LoadedKernel]:
         """Kernels that it launches, beside those of ``loading.IMPLICIT``."""
         found: list[LoadedKernel] = [kernel for body in self._bodies for kernel in body.leaves.kernels]
-        return [*found, *([(kernels.solve, self._block)] if self.device.is_cuda else [])]
+        return [*found, (kernels.solve, self._block)]
 
     # --- launches ----------------------------------------------------------------------------------------------------
 

@@ -64,7 +64,8 @@ class ChosenSolve:
         self._counts = wp.zeros(kernels.COUNTS, dtype=wp.int32, device=self.device)
         self.is_open = True
         on_cpu = (SHARED_ON_CPU if shares else COST_ON_CPU) * (WITH_CONTACT if assembled.touches else 1)
-        self._cost = on_cpu if self.device.is_cpu else COST
+        # Threads share assembled solves, but not the cycles of multigrid.
+        self._cost = on_cpu * assembled.threads if self.device.is_cpu else COST
 
     @property
     def diagonal(self) -> wp.array:
