@@ -162,6 +162,16 @@ def test_the_work_of_moving_supports_is_the_same():
     assert work[0] != 0.0
 
 
+def test_a_run_resumes_with_its_threads(tmp_path):
+    _, sim = falling(3)
+    sim.save(tmp_path / "run.npz")
+    resumed = wc.Simulation.load(tmp_path / "run.npz")
+    for each in (sim, resumed):
+        each.advance(0.02)
+    assert resumed.body.threads == 3
+    np.testing.assert_array_equal(sim.body.displacements.numpy(), resumed.body.displacements.numpy())
+
+
 def test_a_small_body_takes_one_thread():
     assert team_for(8, LEAST_ELEMENTS - 1).parts == 1
     assert team_for(8, 3 * LEAST_ELEMENTS).parts == 3

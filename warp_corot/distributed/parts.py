@@ -48,6 +48,7 @@ class Part(SoftBody):
             material = part_of_material(material, elements, count)
         self.is_own = np.tile(self.numbers.owner == rank, whole.worlds)
         super().__init__(mesh, material, worlds=whole.worlds, device=device or whole.device, threads=1)
+        self.threads = whole.threads  # for checkpoints
         of_whole = whole.mesh if isinstance(whole.mesh, DividedMesh) else whole.discretization
         self.discretization.smallest_volume = of_whole.smallest_volume
 

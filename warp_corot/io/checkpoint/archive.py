@@ -116,6 +116,7 @@ def pack_body(
         "model": described_of(model, MODELS),
         "mesh": pack_mesh(mesh, prefix, arrays) if with_mesh else None,
         "material": _name_of(material, MATERIALS),
+        "threads": body.threads,
         "trajectories": 0,
         "activations": len(body.conditions.activations),
         "field": sorted(field.state),
@@ -250,7 +251,7 @@ def rebuilt_body(
     mesh = unpack_mesh(described["mesh"], prefix, arrays) if mesh is None else mesh
     material_kind = MATERIALS[described["material"]]
     material = material_kind(*(arrays[prefix + f.name][()] for f in dataclasses.fields(material_kind)))
-    body = SoftBody(mesh, material, worlds=worlds, device=device)
+    body = SoftBody(mesh, material, worlds=worlds, device=device, threads=described.get("threads"))
     if described["remesh"] is None:
         _unpack_state(body, described, prefix, arrays)
     elif described["remesh"]["loads"]:
