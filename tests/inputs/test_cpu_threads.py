@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
@@ -94,6 +95,28 @@ def test_launches_that_cannot_be_made_leave_the_team_as_it_was():
         Region(team_of(2), [lambda part: launch(shift, 10, [0], [x], device="cpu")])
     rotations(team_of(2), x, wp.zeros_like(x)).launch()
     np.testing.assert_array_equal(x.numpy(), np.roll(np.arange(100), -2))
+
+
+def test_two_callers_at_once_do_not_wait_for_one_another():
+    arrays = [wp.array(np.arange(n), dtype=float, device="cpu") for n in (1000, 77)]
+    regions = [rotations(team_of(3), x, wp.zeros_like(x)) for x in arrays]
+
+    def call(region):
+        for _ in range(200):
+            region.launch()
+
+    callers = [threading.Thread(target=call, args=(region,)) for region in regions]
+    for each in callers:
+        each.start()
+    for each in callers:
+        each.join()
+    for x in arrays:
+        np.testing.assert_array_equal(x.numpy(), np.roll(np.arange(len(x)), -400))
+
+
+def test_a_process_bound_to_one_core_takes_one_thread(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {3}, raising=False)
+    assert team_for(None, 10**9).parts == 1
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
