@@ -68,7 +68,9 @@ def box(
         cut.tree,
         up_axis,
         leaf_groups=(here[1] >> SUBTREE_DEPTH).astype(np.int32),
-        numbers=numbers,
-        element_count=count,
-        bounds=np.array([origin, np.asarray(origin) + highest]),
+        of_whole={
+            "numbers": numbers,
+            "element_count": count,
+            "bounds": np.array([origin, np.asarray(origin) + highest]),
+        },
     )

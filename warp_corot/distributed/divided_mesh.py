@@ -68,18 +68,13 @@ class DividedMesh:
     is_embedded: bool = False
     points: npt.NDArray[np.float64]
     tets: Ints
+    volumes: npt.NDArray[np.float64]
 
-    def _belong(
-        self,
-        numbers: Numbers,
-        element_count: int,
-        bounds: npt.NDArray[np.float64],
-        smallest_volume: float,
-        outer: Ints | None,
-    ) -> None:
-        """Set this part's place in the whole mesh."""
-        self.__dict__.update(numbers=numbers, element_count=element_count, bounds=bounds)
-        self.__dict__.update(smallest_volume=smallest_volume, outer=outer)
+    def _belong(self, of_whole: dict[str, Any]) -> None:
+        """Set this part's place in the whole mesh: the attributes above."""
+        self.__dict__.update({"outer": None} | of_whole)
+        if "smallest_volume" not in of_whole:
+            self.__dict__["smallest_volume"] = float(np.min(self.volumes))
 
     @property
     def is_box(self) -> bool:
@@ -119,21 +114,9 @@ class DividedMesh:
 class DividedForest(DividedMesh, TetForest):
     """A rank's part of a forest."""
 
-    def __init__(
-        self,
-        *arrays: Any,
-        numbers: Numbers,
-        element_count: int,
-        bounds: npt.NDArray[np.float64],
-        smallest_volume: float | None = None,
-        outer: Ints | None = None,
-        is_embedded: bool = False,
-        **others: Any,
-    ):
+    def __init__(self, *arrays: Any, of_whole: dict[str, Any], **others: Any):
         TetForest.__init__(self, *arrays, **others)
-        smallest_volume = float(np.min(self.volumes)) if smallest_volume is None else smallest_volume
-        self._belong(numbers, element_count, bounds, smallest_volume, outer)
-        self.__dict__["is_embedded"] = is_embedded
+        self._belong(of_whole)
 
     def refine(self, leaves: npt.ArrayLike) -> TetForest:
         """A forest in parts cannot be refined, because a rank would bisect without its neighbours.
@@ -154,19 +137,7 @@ class DividedForest(DividedMesh, TetForest):
 class DividedTetMesh(DividedMesh, TetMesh):
     """A rank's part of a general mesh."""
 
-    def __init__(
-        self,
-        points: npt.NDArray[np.float64],
-        tets: Ints,
-        *,
-        numbers: Numbers,
-        element_count: int,
-        bounds: npt.NDArray[np.float64],
-        smallest_volume: float,
-        outer: Ints,
-        element_groups: Ints | None = None,
-        **others: Any,
-    ):
-        TetMesh.__init__(self, points, tets, **others)
+    def __init__(self, *arrays: Any, of_whole: dict[str, Any], element_groups: Ints, **others: Any):
+        TetMesh.__init__(self, *arrays, **others)
         self.element_groups = element_groups
-        self._belong(numbers, element_count, bounds, smallest_volume, outer)
+        self._belong(of_whole)

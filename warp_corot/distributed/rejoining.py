@@ -30,13 +30,7 @@ def pack_part(mesh: DividedForest | DividedTetMesh, arrays: Arrays) -> dict[str,
     elif isinstance(mesh, DividedForest):
         assert numbers.tree is not None
         assert numbers.lattice is not None
-        tree, points = mesh.tree, numbers.lattice
-        first_child = tree.first_child.copy()
-        first_child[first_child < 0] = VOID
-        first_child[tree.leaves[counted]] = LIVE
-        found |= {"points": points, "lattice": mesh.lattice, "ends": _numbered(mesh.node_ends, points)}
-        found |= {"rows": numbers.tree, "tets": points[tree.tets], "level": tree.level}
-        found |= {"parent": _numbered(tree.parent, numbers.tree), "child": _numbered(first_child, numbers.tree)}
+        found |= pack_tree(mesh, mesh.tree.leaves[counted], numbers.tree, numbers.lattice)
         if mesh.fill is not None:
             found["fill"] = mesh.fill[counted]
     else:
@@ -67,12 +61,36 @@ def rejoined(described: dict[str, Any], parts: Sequence[Arrays]) -> TetForest | 
     place = described["cells"], described["cell_size"], described["origin"]
     if "level" in described:
         return TetForest.box(*place[:2], described["level"], origin=place[2], up_axis=up_axis)
-    lattice, ends, tree = _tree_of(parts)
+    lattice, ends, tree = joined_trees(parts)
     return TetForest(*place, lattice, ends, tree, up_axis, fill=fill, labels=labels, label_names=names)
 
 
-def _tree_of(parts: Sequence[Arrays]) -> tuple[npt.NDArray[Any], npt.NDArray[Any], Tree]:
-    """The lattice points, their ends, and the tree with the tetrahedra that any part has."""
+def pack_tree(forest: TetForest, live: npt.NDArray[Any], rows: npt.NDArray[Any], points: npt.NDArray[Any]) -> Arrays:
+    """The arrays of a forest's tree and lattice points.
+
+    Args:
+        forest: The forest.
+        live: Those of its leaves that count; others become void.
+        rows, points: The numbers of its tetrahedra of all levels, and of its lattice points, in the whole one.
+    """
+    tree, child = forest.tree, forest.tree.first_child.copy()
+    child[child < 0] = VOID
+    child[live] = LIVE
+    return {
+        "points": points,
+        "lattice": forest.lattice,
+        "ends": _numbered(forest.node_ends, points),
+        "rows": rows,
+        "tets": points[tree.tets],
+        "level": tree.level,
+        "parent": _numbered(tree.parent, rows),
+        "child": _numbered(child, rows),
+    }
+
+
+def joined_trees(parts: Sequence[Arrays]) -> tuple[npt.NDArray[Any], npt.NDArray[Any], Tree]:
+    """The lattice points, their ends, and the tree with the tetrahedra that any part has, each in the order of the
+    numbers in the whole forest."""
     rows = np.unique(np.concatenate([part["rows"] for part in parts]))
     points = np.unique(np.concatenate([part["points"] for part in parts]))
     tets, level = np.zeros((len(rows), 4), np.int32), np.zeros(len(rows), np.int32)
@@ -99,9 +117,9 @@ def _of_elements(parts: Sequence[Arrays], name: str, count: int) -> npt.NDArray[
     return found
 
 
-def _numbered(values: npt.NDArray[Any], numbers: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
+def _numbered(values: npt.NDArray[Any], numbers: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Numbers in the whole mesh in place of those in a part; negative values stay."""
-    return np.where(values < 0, values, numbers[values]).astype(np.int32)
+    return np.where(values < 0, values, numbers[values])
 
 
 def _places(values: npt.NDArray[Any], numbers: npt.NDArray[Any]) -> npt.NDArray[np.int32]:

@@ -15,7 +15,7 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.checks import shown
 from warp_corot.io.checkpoint.mesh import box_level
 from warp_corot.mesh import TetForest, TetMesh
-from warp_corot.mesh.surfaces.boundary import boundary_faces, signed_volumes
+from warp_corot.mesh.surfaces.boundary import boundary_faces
 from warp_corot.mesh.uniform_part import SUBTREE_DEPTH
 
 from . import mpi
@@ -125,13 +125,10 @@ def pieces_of(mesh: Mesh, division: Partition, costs: npt.ArrayLike | None = Non
     level = box_level(mesh) if isinstance(mesh, TetForest) else None
     outer = boundary_faces(mesh.tets)[0]
     used = mesh.points[np.unique(mesh.tets)]
-    volumes = mesh.volumes if isinstance(mesh, TetForest) else signed_volumes(mesh.points, mesh.tets)
-    whole = {
+    whole: dict[str, Any] = {
         "element_count": len(mesh.tets),
         "bounds": np.stack([used.min(axis=0), used.max(axis=0)]),
-        "smallest_volume": float(np.min(volumes)),
-        "label_names": mesh.label_names,
-        "up_axis": mesh.up_axis,
+        "smallest_volume": float(np.min(mesh.volumes)),
     }
     for rank in range(1 + int(division.rank_of_element.max())):
         part, elements, numbers = numbered_part(mesh, division, rank, prunes=True)
@@ -140,20 +137,19 @@ def pieces_of(mesh: Mesh, division: Partition, costs: npt.ArrayLike | None = Non
             like = {"origin": mesh.origin, "up_axis": mesh.up_axis, "costs": costs}
             yield (box, (mesh.cells, mesh.cell_size, level), like), numbers
             continue
-        given: dict[str, Any] = {
-            "numbers": numbers,
-            "outer": _here(outer, numbers.nodes, len(mesh.points)),
-            "labels": None if mesh.labels is None else mesh.labels[elements],
-        }
+        own = {"numbers": numbers, "outer": _here(outer, numbers.nodes, len(mesh.points))}
+        given: dict[str, Any] = {"up_axis": mesh.up_axis, "label_names": mesh.label_names}
+        given["labels"] = None if mesh.labels is None else mesh.labels[elements]
         if isinstance(part, TetForest):
             place: tuple[Any, ...] = (part.cells, part.cell_size, part.origin, part.lattice, part.node_ends, part.tree)
-            given |= {"fill": part.fill, "leaf_groups": part.leaf_groups, "is_embedded": has_own_surface(mesh)}
-            yield (DividedForest, place, whole | given), numbers
+            given |= {"fill": part.fill, "leaf_groups": part.leaf_groups}
+            given["of_whole"] = whole | own | {"is_embedded": has_own_surface(mesh)}
+            yield (DividedForest, place, given), numbers
         else:
             assert isinstance(mesh, TetMesh)
             sets = {name: mask[numbers.nodes] for name, mask in mesh.node_sets.items()}
-            given |= {"element_groups": part.element_groups, "node_sets": sets}
-            yield (DividedTetMesh, (part.points, part.tets), whole | given), numbers
+            given |= {"element_groups": part.element_groups, "node_sets": sets, "of_whole": whole | own}
+            yield (DividedTetMesh, (part.points, part.tets), given), numbers
 
 
 def _here(faces: npt.NDArray[np.int32], nodes: npt.NDArray[np.integer], count: int) -> npt.NDArray[np.int32]:
