@@ -9,7 +9,7 @@ import warp_corot as wc
 from warp_corot.distributed import boxes
 from warp_corot.distributed.cutting import cut_box
 from warp_corot.distributed.partition import Partition
-from warp_corot.distributed.parts import part_of_mesh
+from warp_corot.distributed.parts import numbered_part
 from warp_corot.distributed.root_cube_partition import numbered_points
 from warp_corot.mesh.lattice import LATTICE_BITS
 from warp_corot.mesh.tree import Tree
@@ -33,7 +33,8 @@ def test_parts_are_those_of_the_whole(cells, level, ranks, costs):
     dealt, first = Partition.of(mesh, ranks, costs), 0
     for rank in range(ranks):
         kept = dealt.needed(mesh, rank)
-        part, nodes = part_of_mesh(mesh, kept, dealt)
+        part, _, there = numbered_part(mesh, dealt, rank)
+        nodes = there.nodes
         cut = cut_box(cells, level, ranks, rank, costs)
         np.testing.assert_array_equal(cut.elements, np.flatnonzero(kept))
         np.testing.assert_array_equal(cut.counted, dealt.rank_of_element[kept] == rank)
@@ -104,7 +105,7 @@ def test_copies_get_their_numbers_from_the_ranks_that_move_them():
 
         comm = SimpleNamespace(rank=rank, size=3, allgather=lambda _: counts, alltoall=alltoall)
         numbers, count = numbered_points(cut.owner, cut.keys, comm)
-        _, nodes = part_of_mesh(mesh, dealt.needed(mesh, rank), dealt)
+        nodes = numbered_part(mesh, dealt, rank)[2].nodes
         np.testing.assert_array_equal(numbers, nodes)
         assert count == len(mesh.points)
 

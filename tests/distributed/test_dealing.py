@@ -15,7 +15,7 @@ from warp_corot.discretization.awaited import Awaited
 from warp_corot.discretization.groups import group_numbers
 from warp_corot.discretization.planning.fixed import ForcePlan
 from warp_corot.distributed.partition import Partition
-from warp_corot.distributed.parts import Part, numbered_part, part_of_mesh
+from warp_corot.distributed.parts import Part, numbered_part
 from warp_corot.distributed.places import Places
 from warp_corot.distributed.rejoining import pack_part, rejoined
 from warp_corot.distributed.reproducible_sums import reproducible_sums
@@ -73,7 +73,7 @@ def test_rotations_are_shared_within_ranks(level):
         needed = dealt.needed(mesh, rank)
         assert not np.isin(above[needed], above[~needed]).any()
         assert not np.isin(dealt.sharing[needed], dealt.sharing[~needed]).any()
-        part, _ = part_of_mesh(mesh, needed, dealt)
+        part, _, _ = numbered_part(mesh, dealt, rank)
         np.testing.assert_array_equal(part.ancestors(level), above[needed])
 
 

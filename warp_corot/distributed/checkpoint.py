@@ -4,7 +4,6 @@ resume, and one process."""
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
 from os import PathLike
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -33,16 +32,6 @@ MADE_WITH = ("models", "integrator", "gravity", "deterministic")
 RESUMED = ("stable_dt", "steps_before_reset", "time_before_reset")
 
 
-@dataclass(frozen=True, eq=False)
-class Values:
-    """Numbers in place of an array on a device."""
-
-    values: Any
-
-    def numpy(self) -> Any:
-        return self.values
-
-
 def save(path: str | PathLike[str], parts: PartSimulation, syncs: list[PartSync], comm: Any) -> None:
     """Write a checkpoint on rank 0, which gets the whole bodies for that; all ranks must call this, with bodies in
     which all nodes are up to date if every rank holds them.
@@ -60,7 +49,9 @@ def save(path: str | PathLike[str], parts: PartSimulation, syncs: list[PartSync]
     kept = {}
     for name, array in parts.kept.items():
         k, values = body_of(name, parts), array.numpy()
-        kept[name] = Values(values) if k is None else Values(syncs[k].gather_part(values))
+        found = values if k is None else syncs[k].gather_part(values)
+        if found is not None:
+            kept[name] = wp.array(found, device="cpu")
     contact = None if parts.contact is None else gathered_contact(parts, syncs, wholes, comm)
     guard = parts.guard.state
 
@@ -105,7 +96,7 @@ def load_in_parts(path: str | PathLike[str], device: str | wp.Device, comm: Any)
         kept = {}
         for name, array in sim.kept.items():
             k, values = body_of(name, sim), array.numpy()
-            kept[name] = Values(values if k is None else values[nodes[k]])
+            kept[name] = values if k is None else values[nodes[k]]
         given = {name: getattr(sim, name) for name in (*MADE_WITH, *RESUMED)}
         here = SimpleNamespace(**given, kept=kept, contact=None, obstacles=None)
         here.guard, here.running = (SimpleNamespace(state=each.state) for each in (sim.guard, sim.running))
@@ -146,7 +137,8 @@ def resume(loaded: Simulation | SimpleNamespace, parts: PartSimulation, syncs: l
         syncs: The ``PartSync`` of each body.
     """
     for name, array in parts.kept.items():
-        k, values = body_of(name, parts), loaded.kept[name].numpy()
+        k, values = body_of(name, parts), loaded.kept[name]
+        values = values if isinstance(values, np.ndarray) else values.numpy()
         array.assign(values if k is None else syncs[k].part_values(values))
     for name in RESUMED:
         setattr(parts, name, getattr(loaded, name))

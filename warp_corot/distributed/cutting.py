@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_corot.errors import InputError
-from warp_corot.mesh.around import first_subtree, subtrees_around
+from warp_corot.mesh.around import subtrees_around
 from warp_corot.mesh.tree import Tree
 from warp_corot.mesh.uniform import halvings
 from warp_corot.mesh.uniform_part import SUBTREE_DEPTH, uniform_part, vertices_of
@@ -42,7 +42,7 @@ class Cut:
 
 
 def cut_box(cells: tuple[int, int, int], level: int, ranks: int, rank: int, costs: npt.ArrayLike | None = None) -> Cut:
-    """The part that ``Partition`` and ``part_of_mesh`` make of ``TetForest.box``, with the same order.
+    """The part that ``Partition`` and ``numbered_part`` make of ``TetForest.box``, with the same order.
 
     The leaves are divided in subtrees of eight along the order of the tree. A node is moved by the rank of the first
     leaf around it in this order.
@@ -70,7 +70,9 @@ def cut_box(cells: tuple[int, int, int], level: int, ranks: int, rank: int, cost
     keys = keys_of(nodes, cells, intervals)
     owner = np.full(len(nodes), rank, np.int32)
     ghosts = np.flatnonzero(~np.isin(keys, keys_of(vertices[~is_others], cells, intervals)))
-    of_first = first_subtree(nodes[ghosts], cells, intervals, depth)
+    place, subtree = subtrees_around(nodes[ghosts], cells, intervals, depth, (0, 0))
+    of_first = np.full(len(ghosts), starts[-1])
+    np.minimum.at(of_first, place, subtree)
     owner[ghosts] = np.searchsorted(starts, of_first, side="right") - 1
     elements = ((needed << SUBTREE_DEPTH)[:, None] + np.arange(1 << SUBTREE_DEPTH)).ravel()
     counted = np.repeat(needed < end, 1 << SUBTREE_DEPTH)

@@ -98,24 +98,15 @@ def numbered_part(mesh: Mesh, division: Partition, rank: int, *, prunes: bool = 
         forest, order, stays = part_of_forest(mesh, kept, division.sharing[kept], prunes)
         part, nodes, others = forest, order[: forest.node_count], {"tree": stays, "lattice": order}
     else:
-        part, nodes = part_of_mesh(mesh, kept, division)
+        nodes = np.unique(mesh.tets[kept]).astype(np.int32)
+        number = np.full(len(mesh.points), -1, np.int32)
+        number[nodes] = np.arange(len(nodes), dtype=np.int32)
+        part = TetMesh(mesh.points[nodes], number[mesh.tets[kept]], up_axis=mesh.up_axis)
+        part.element_groups = division.sharing[kept]
     here = [np.arange(len(each), dtype=np.int32) for each in (nodes, elements)]
     counted = division.rank_of_element[elements] == rank
     numbers = Numbers(nodes, elements, division.rank_of_node[nodes], counted, len(mesh.points), *here, **others)
     return part, elements, numbers
-
-
-def part_of_mesh(mesh: Mesh, kept: npt.NDArray[np.bool_], partition: Partition) -> tuple[Mesh, Ints]:
-    """The mesh of some elements, bool [T], in their order; and its nodes' numbers in the whole mesh."""
-    if isinstance(mesh, TetForest):
-        forest, order, _ = part_of_forest(mesh, kept, partition.sharing[kept], False)
-        return forest, order[: forest.node_count]
-    nodes = np.unique(mesh.tets[kept]).astype(np.int32)
-    number = np.full(len(mesh.points), -1, np.int32)
-    number[nodes] = np.arange(len(nodes), dtype=np.int32)
-    part = TetMesh(mesh.points[nodes], number[mesh.tets[kept]], up_axis=mesh.up_axis)
-    part.element_groups = partition.sharing[kept]
-    return part, nodes
 
 
 def part_of_forest(

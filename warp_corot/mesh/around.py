@@ -47,32 +47,6 @@ def subtrees_around(
     return nodes, subtrees
 
 
-def first_subtree(points: Ints, cells: tuple[int, int, int], intervals: int, depth: int) -> Longs:
-    """The first subtree in tree order that holds each point, int64 [n]; arguments as for ``subtrees_around``."""
-    found = np.empty(len(points), np.int64)
-    for start in range(0, len(points), CHUNK):
-        part = points[start : start + CHUNK]
-        # The lowest cube around a point comes first.
-        cube = np.maximum((part - 1) // intervals, 0)
-        element = 6 * (cube @ np.array([cells[1] * cells[2], cells[2], 1], np.int64))
-        weights, left = np.empty((len(part), 4), np.int32), np.ones(len(part), bool)
-        for walk, axes in enumerate(itertools.permutations(range(3))):
-            own = _weights(part - intervals * cube, axes, intervals)
-            here = left & (own >= 0).all(axis=1)
-            element[here] += walk
-            weights[here] = own[here]
-            left &= ~here
-        for level in range(depth):
-            k = far_end(level % 3)
-            in_second = weights[:, 0] < weights[:, k]
-            second = _second(weights[in_second], k)
-            weights = _first(weights, k)
-            weights[in_second] = second
-            element = 2 * element + in_second
-        found[start : start + CHUNK] = element
-    return found
-
-
 def _in_roots(points: Ints, cells: tuple[int, int, int], intervals: int) -> Iterator[tuple[Longs, Longs, Ints]]:
     """Each point with each root that holds it: places of the points, the roots, and the weights there."""
     strides = np.array([cells[1] * cells[2], cells[2], 1], np.int64)
