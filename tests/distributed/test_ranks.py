@@ -148,6 +148,17 @@ def test_ranks_write_pieces_of_one_stage(runs):
     assert f"rank {size - 1} of {size}" in str(runs[size]["recorded"])
 
 
+def test_rank_0_draws_obstacles(runs):
+    from pxr import Usd, UsdGeom
+
+    stage = Usd.Stage.Open(str(runs["folder"] / "touches.3.usda"))
+    tool = stage.GetPrimAtPath("/SoftBody/rank_0000/obstacles/tool_1")
+    heights = [UsdGeom.Xformable(tool).ComputeLocalToWorldTransform(k).ExtractTranslation()[1] for k in (0.0, 1.0)]
+    # It comes down from 0.047 m at 0.02 s to 0.03 m at 0.05 s; frames begin at 0.04 s.
+    np.testing.assert_allclose(heights, [0.03 + 0.017 / 3.0, 0.03], atol=1e-6)
+    assert not stage.GetPrimAtPath("/SoftBody/rank_0001/obstacles")
+
+
 def test_any_run_is_the_same_to_rounding(runs):
     """Runs differ only by rounding and by the steps that rounding changes; the beams have moved by some centimetres."""
     np.testing.assert_allclose(runs[3]["forest.False.x"], runs[1]["forest.True.x"], atol=1e-5)

@@ -269,14 +269,17 @@ def resumed(path: Path) -> dict[str, np.ndarray | None]:
 
 
 def touched_in_parts(kept: Path) -> np.ndarray | None:
-    """The run "touched" with a mesh of which each rank holds a part, saved; the positions of all nodes on rank 0."""
+    """The run "touched" with a mesh of which each rank holds a part, saved, and recorded afterwards; the positions of
+    all nodes on rank 0."""
     import warp_corot.distributed as wd
 
     body = touched(wd.box((1, 1, 2), 0.05, level=4))
     sim = wd.Simulation(body, deterministic=True, obstacles=obstacles_of("touched"))
     moved(sim, body)
     sim.save(kept)
-    return wd.gather(body.positions)
+    x = wd.gather(body.positions)
+    wd.record(sim, kept.with_suffix(".usda"), duration=0.01, fps=100)
+    return x
 
 
 def forest_divided(kept: Path) -> np.ndarray | None:

@@ -33,10 +33,10 @@ def record(
     """Advance a simulation and write ``fps`` frames a second, the current state first; all ranks must call this.
 
     ``beam.usd`` becomes a small stage that refers to ``beam.ranks/rank-0000.usdc`` and so on: every rank writes the
-    elements that it counts and their faces on the surface, and no rank gathers the whole body. All pieces have the same
-    range of colours. Bodies made from a domain are drawn by their tetrahedra. Of a body that is remeshed, each frame
-    shows the current mesh, and the pieces are those of its present division. If the run is interrupted, all but the
-    last few seconds of frames are kept.
+    elements that it counts and their faces on the surface, and no rank gathers the whole body. Rank 0 writes obstacles
+    and tools, too. All pieces have the same range of colours. Bodies made from a domain are drawn by their tetrahedra.
+    Of a body that is remeshed, each frame shows the current mesh, and the pieces are those of its present division. If
+    the run is interrupted, all but the last few seconds of frames are kept.
 
     Args:
         sim: The simulation; it continues from its current state.
@@ -95,6 +95,8 @@ class _Pieces:
                 tets=tets,
                 changing=sim.remeshing is not None,
                 gravity=sim.gravity if sim.rank == 0 else None,
+                obstacles=sim.obstacles if sim.rank == 0 else (),
+                world=world,
             )
 
         self._writer = all_or_none(made, self._comm)
