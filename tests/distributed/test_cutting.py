@@ -33,7 +33,7 @@ def test_parts_are_those_of_the_whole(cells, level, ranks, costs):
     dealt, first = Partition.of(mesh, ranks, costs), 0
     for rank in range(ranks):
         kept = dealt.needed(mesh, rank)
-        part, _, there = numbered_part(mesh, dealt, rank)
+        part, there = numbered_part(mesh, dealt, rank)
         nodes = there.nodes
         cut = cut_box(cells, level, ranks, rank, costs)
         np.testing.assert_array_equal(cut.elements, np.flatnonzero(kept))
@@ -105,7 +105,7 @@ def test_copies_get_their_numbers_from_the_ranks_that_move_them():
 
         comm = SimpleNamespace(rank=rank, size=3, allgather=lambda _: counts, alltoall=alltoall)
         numbers, count = numbered_points(cut.owner, cut.keys, comm)
-        nodes = numbered_part(mesh, dealt, rank)[2].nodes
+        nodes = numbered_part(mesh, dealt, rank)[1].nodes
         np.testing.assert_array_equal(numbers, nodes)
         assert count == len(mesh.points)
 

@@ -73,7 +73,7 @@ def test_rotations_are_shared_within_ranks(level):
         needed = dealt.needed(mesh, rank)
         assert not np.isin(above[needed], above[~needed]).any()
         assert not np.isin(dealt.sharing[needed], dealt.sharing[~needed]).any()
-        part, _, _ = numbered_part(mesh, dealt, rank)
+        part, _ = numbered_part(mesh, dealt, rank)
         np.testing.assert_array_equal(part.ancestors(level), above[needed])
 
 
@@ -124,8 +124,8 @@ def test_nodes_of_parts_sum_what_they_sum_in_the_whole(make):
     def differ(grouped):
         whole, count = terms_of(mesh, grouped, np.arange(len(mesh.tets))), 0
         for rank in range(3):
-            part, elements, numbers = numbered_part(mesh, division, rank)
-            here = terms_of(part, grouped, elements)
+            part, numbers = numbered_part(mesh, division, rank)
+            here = terms_of(part, grouped, numbers.elements)
             count += sum(here[k] != whole[numbers.nodes[k]] for k in np.flatnonzero(numbers.owner == rank))
         return count
 

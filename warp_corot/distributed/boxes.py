@@ -56,8 +56,7 @@ def box(
         raise InputError(f"level is {level}, which gives {count} tetrahedra; there must be at most {MOST_ELEMENTS}")
     cut = cut_box(cells, level, comm.size, comm.rank, costs)
     nodes, node_count = numbered_points(cut.owner, cut.keys, comm)
-    here = tuple(np.arange(n, dtype=np.int32) for n in (len(nodes), len(cut.elements)))
-    numbers = Numbers(nodes, cut.elements, cut.owner, cut.counted, node_count, *here)
+    numbers = Numbers(nodes, cut.elements, cut.owner, cut.counted, node_count)
     highest = (np.array(cells) << LATTICE_BITS) * (cell_size / 2**LATTICE_BITS)
     return DividedForest(
         cells,
@@ -67,7 +66,7 @@ def box(
         cut.ends,
         cut.tree,
         up_axis,
-        leaf_groups=(here[1] >> SUBTREE_DEPTH).astype(np.int32),
+        leaf_groups=np.arange(len(cut.elements), dtype=np.int32) >> SUBTREE_DEPTH,
         of_whole={
             "numbers": numbers,
             "element_count": count,

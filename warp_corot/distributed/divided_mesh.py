@@ -24,8 +24,6 @@ class Numbers:
         owner: The rank that moves each of the nodes, int32 [n].
         counted: Whether this rank counts the element's energy, bool [t].
         node_count: Number of nodes of the whole mesh.
-        places, element_places: Places of the nodes and elements in the body that this rank holds, int32 [n] and [t]:
-            the same numbers, or those of its own part if no rank holds the whole mesh.
         tree, lattice: The numbers that the tetrahedra of all levels and the lattice points of a forest have in the
             whole one, int32; None: they are not known.
     """
@@ -35,8 +33,6 @@ class Numbers:
     owner: Ints
     counted: npt.NDArray[np.bool_]
     node_count: int
-    places: Ints
-    element_places: Ints
     tree: Ints | None = None
     lattice: Ints | None = None
 

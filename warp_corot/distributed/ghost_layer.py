@@ -3,7 +3,6 @@ nodes."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -96,10 +95,8 @@ def _together(own: TetForest, branches: list[Arrays], *, node_count: int, **whol
         if name in branches[0]
     }
     nodes, elements = order[: int(tree.leaf_tets.max()) + 1], joined["elements"]
-    here = (np.arange(len(each), dtype=np.int32) for each in (nodes, elements))
     counted = np.arange(len(elements)) < len(own.tets)
-    numbers = Numbers(points[nodes], elements, owner[nodes], counted, node_count, *here)
-    numbers = replace(numbers, tree=rows, lattice=points[order])
+    numbers = Numbers(points[nodes], elements, owner[nodes], counted, node_count, rows, points[order])
     return DividedForest(
         own.cells,
         own.cell_size,

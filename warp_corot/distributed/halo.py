@@ -78,7 +78,7 @@ class OwnedPart(Owned):
         self.whole, self._part = whole, part
         worlds, own = part.worlds, part.numbers
         self.numbers, self.node_count = own.in_worlds(worlds), worlds * own.node_count
-        self.places, self.nodes = in_worlds(own.places, worlds, whole.world_node_count), part.is_own
+        self.places, self.nodes = in_worlds(part.places, worlds, whole.world_node_count), part.is_own
         self._elements = np.tile(own.counted, worlds)
         self._ghosts, self._copies = (
             wp.array(np.flatnonzero(~each).astype(np.int32), dtype=wp.int32, device=part.device)

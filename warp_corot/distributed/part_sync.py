@@ -40,14 +40,14 @@ class PartSync:
     def __init__(self, whole: SoftBody, part: Part, comm: Any):
         self.whole, self.part, self._comm = whole, part, comm
         n, count, worlds = len(part.numbers.nodes), whole.world_node_count, whole.worlds
-        everywhere = in_worlds(part.numbers.places, worlds, count)
+        everywhere = in_worlds(part.places, worlds, count)
         own = np.tile(part.numbers.owner == comm.rank, worlds)
         #: This rank's nodes among those of all worlds of the whole body, int32, and of its part.
         self.own_nodes = everywhere[own]
         devices = whole.device, part.device
         self._all = Places(everywhere, np.arange(worlds * n, dtype=np.int32), *devices)
         self._own = Places(self.own_nodes, np.flatnonzero(own).astype(np.int32), *devices)
-        elements = in_worlds(part.numbers.element_places, worlds, whole.world_element_count)
+        elements = in_worlds(part.element_places, worlds, whole.world_element_count)
         self._elements = Places(elements, np.arange(len(elements), dtype=np.int32), *devices)
         #: The numbers of this rank's nodes in the whole mesh, int64; and the number of nodes of the whole mesh.
         self.numbers = part.numbers.in_worlds(worlds)[own]

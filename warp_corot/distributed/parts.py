@@ -33,6 +33,11 @@ class Part(SoftBody):
         partition: The division of its mesh; None if this rank holds only its part.
         rank: The rank of the part.
         device: The device of the part; None: that of the body.
+
+    Attributes:
+        numbers: The numbers of its nodes and elements in the whole mesh.
+        places, element_places: Their places in ``whole``, int32 [n] and [t].
+        is_own: Whether this rank moves each node, bool [worlds * n].
     """
 
     def __init__(self, whole: SoftBody, partition: Partition | None, rank: int, device: wp.Device | None = None):
@@ -43,9 +48,13 @@ class Part(SoftBody):
         else:
             assert partition is not None
             count = len(mesh.tets)
-            mesh, elements, numbers = numbered_part(mesh, partition, rank)
-            self.numbers = dataclasses.replace(numbers, places=numbers.nodes, element_places=numbers.elements)
-            material = part_of_material(material, elements, count)
+            mesh, self.numbers = numbered_part(mesh, partition, rank)
+            material = part_of_material(material, self.numbers.elements, count)
+        numbers = self.numbers.nodes, self.numbers.elements
+        is_whole = mesh is not whole.mesh
+        self.places, self.element_places = (
+            (each if is_whole else np.arange(len(each))).astype(np.int32) for each in numbers
+        )
         self.is_own = np.tile(self.numbers.owner == rank, whole.worlds)
         super().__init__(mesh, material, worlds=whole.worlds, device=device or whole.device, threads=1)
         self.threads = whole.threads  # for checkpoints
@@ -80,16 +89,16 @@ class Part(SoftBody):
         triangles, parents = self._whole.surface_faces
         number = np.full(self._whole.world_node_count, -1, np.int32)
         own = self.is_own[: len(self.numbers.nodes)]
-        number[self.numbers.places[own]] = 1
+        number[self.places[own]] = 1
         here = np.flatnonzero((number[triangles] >= 0).any(axis=1)).astype(np.int32)
-        number[self.numbers.places] = np.arange(len(self.numbers.nodes), dtype=np.int32)
-        elements = np.searchsorted(self.numbers.element_places, parents[here]).astype(np.int32)
+        number[self.places] = np.arange(len(self.numbers.nodes), dtype=np.int32)
+        elements = np.searchsorted(self.element_places, parents[here]).astype(np.int32)
         return here, number[triangles[here]], elements
 
 
-def numbered_part(mesh: Mesh, division: Partition, rank: int, *, prunes: bool = False) -> tuple[Mesh, Ints, Numbers]:
-    """A rank's part of a mesh: the elements that it needs, in their order; their numbers, int32 [t]; and all numbers in
-    the whole mesh. The places are those in the part. ``prunes``: see ``part_of_forest``."""
+def numbered_part(mesh: Mesh, division: Partition, rank: int, *, prunes: bool = False) -> tuple[Mesh, Numbers]:
+    """A rank's part of a mesh: the elements that it needs, in their order; and the numbers in the whole mesh.
+    ``prunes``: see ``part_of_forest``."""
     kept = division.needed(mesh, rank)
     elements = np.flatnonzero(kept).astype(np.int32)
     others: dict[str, Ints] = {}
@@ -103,10 +112,8 @@ def numbered_part(mesh: Mesh, division: Partition, rank: int, *, prunes: bool = 
         number[nodes] = np.arange(len(nodes), dtype=np.int32)
         part = TetMesh(mesh.points[nodes], number[mesh.tets[kept]], up_axis=mesh.up_axis)
         part.element_groups = division.sharing[kept]
-    here = [np.arange(len(each), dtype=np.int32) for each in (nodes, elements)]
     counted = division.rank_of_element[elements] == rank
-    numbers = Numbers(nodes, elements, division.rank_of_node[nodes], counted, len(mesh.points), *here, **others)
-    return part, elements, numbers
+    return part, Numbers(nodes, elements, division.rank_of_node[nodes], counted, len(mesh.points), **others)
 
 
 def part_of_forest(
@@ -146,7 +153,7 @@ def part_of_forest(
     return made, order.astype(np.int32), stays.astype(np.int32)
 
 
-def part_of_material(material: M, elements: Ints, count: int) -> M:
+def part_of_material(material: M, elements: npt.NDArray[np.integer], count: int) -> M:
     """The material of some of ``count`` elements."""
     found: dict[str, Any] = {}
     for field in dataclasses.fields(material):  # type: ignore[arg-type]

@@ -79,7 +79,7 @@ class Piece:
         for each, nodes in zip(self._syncs, self._nodes, strict=True):
             first = self._world * each.whole.world_node_count
             values = getattr(each.whole.conditions, name).numpy()
-            found.append(values[first + each.part.numbers.places[nodes]])
+            found.append(values[first + each.part.places[nodes]])
         return np.concatenate(found)
 
     def _property(self, name: str) -> float | npt.NDArray[np.float64]:
@@ -108,9 +108,9 @@ def _outer_faces(sync: PartSync) -> Ints:
         own = numbers.counted[parents] & whole.mesh.are_outer(triangles)
         return triangles[own]
     is_own = np.zeros(whole.world_element_count, bool)
-    is_own[numbers.element_places[numbers.counted]] = True
+    is_own[sync.part.element_places[numbers.counted]] = True
     number = np.full(whole.world_node_count, -1, np.int32)
-    number[numbers.places] = np.arange(len(numbers.places), dtype=np.int32)
+    number[sync.part.places] = np.arange(len(sync.part.places), dtype=np.int32)
     return number[triangles[is_own[parents]]]
 
 

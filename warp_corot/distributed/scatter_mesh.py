@@ -131,7 +131,7 @@ def pieces_of(mesh: Mesh, division: Partition, costs: npt.ArrayLike | None = Non
         "smallest_volume": float(np.min(mesh.volumes)),
     }
     for rank in range(1 + int(division.rank_of_element.max())):
-        part, elements, numbers = numbered_part(mesh, division, rank, prunes=True)
+        part, numbers = numbered_part(mesh, division, rank, prunes=True)
         if level is not None and level >= SUBTREE_DEPTH:
             assert isinstance(mesh, TetForest)
             like = {"origin": mesh.origin, "up_axis": mesh.up_axis, "costs": costs}
@@ -139,7 +139,7 @@ def pieces_of(mesh: Mesh, division: Partition, costs: npt.ArrayLike | None = Non
             continue
         own = {"numbers": numbers, "outer": _here(outer, numbers.nodes, len(mesh.points))}
         given: dict[str, Any] = {"up_axis": mesh.up_axis, "label_names": mesh.label_names}
-        given["labels"] = None if mesh.labels is None else mesh.labels[elements]
+        given["labels"] = None if mesh.labels is None else mesh.labels[numbers.elements]
         if isinstance(part, TetForest):
             place: tuple[Any, ...] = (part.cells, part.cell_size, part.origin, part.lattice, part.node_ends, part.tree)
             given |= {"fill": part.fill, "leaf_groups": part.leaf_groups}
