@@ -16,7 +16,7 @@ from warp_corot.body.soft_body import SoftBody
 from warp_corot.io.checkpoint.archive import load_checkpoint, save_checkpoint
 from warp_corot.io.checkpoint.contact import obstacles_of, pack_obstacles
 
-from .contact_checkpoint import SurfaceShare, gathered_contact, packed, resume_contact
+from .contact_checkpoint import gathered_contact, packed, resume_contact
 from .mpi import all_or_none
 from .part_simulation import PartSimulation
 from .part_sync import PartSync
@@ -103,7 +103,7 @@ def load_in_parts(path: str | PathLike[str], device: str | wp.Device, comm: Any)
         if sim.contact is not None:
             arrays: dict[str, Any] = {}
             here.obstacles = pack_obstacles(sim.contact, arrays), arrays
-            here.contact = packed(sim.contact, SurfaceShare.of(sim.body)).at(nodes[0])
+            here.contact = packed(sim.contact).at(nodes[0])
         return here
 
     def bodies() -> list[SoftBody]:

@@ -29,34 +29,6 @@ MOTIONS, LAW = ("now", "later", "target"), ("tolerance", "recovery", "whole", "g
 
 
 @dataclass(frozen=True, eq=False)
-class SurfaceShare:
-    """What a rank knows of the surface of a body.
-
-    Attributes:
-        own: The nodes that it moves, bool [worlds * n].
-        triangles: The triangles around these, by the ascending numbers of their nodes in the whole mesh, int64 [f, 3].
-        worlds: Number of copies of the body.
-    """
-
-    own: npt.NDArray[np.bool_]
-    triangles: npt.NDArray[np.int64]
-    worlds: int
-
-    @classmethod
-    def of(cls, body: SoftBody) -> SurfaceShare:
-        """That of a part, or of a whole body."""
-        faces = body.surface_faces[0]
-        if isinstance(body, Part):
-            return cls(body.is_own, np.sort(body.numbers.nodes[faces], axis=1).astype(np.int64), body.worlds)
-        return cls(np.ones(body.node_count, bool), np.sort(faces, axis=1).astype(np.int64), body.worlds)
-
-    def places(self, here: Contacts) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.bool_]]:
-        """The node at each place of the surface, -1 if there is none; and whether this rank moves it."""
-        node = here.surface.arrays.node.numpy()
-        return node, (node >= 0) & self.own[node]
-
-
-@dataclass(frozen=True, eq=False)
 class Touch:
     """What one step leaves for the next.
 
@@ -74,44 +46,45 @@ class Touch:
         return replace(self, nodal={name: values[nodes] for name, values in self.nodal.items()})
 
 
-def packed(here: Contacts, share: SurfaceShare) -> Touch:
-    """That of the nodes that a rank moves."""
+def packed(here: Contacts) -> Touch:
+    """That of contact of a body; of this rank's part of one, that of the nodes that it moves."""
     assert here.rigid is not None
-    node, chosen = share.places(here)
-    nodal: Arrays = {"body": here.system.bodies[0].state.contact_forces.numpy()[: len(share.own)][share.own]}
-    triangles: Arrays = {"triangles": share.triangles}
+    body = here.system.bodies[0]
+    own, faces = _surface_of(body)
+    node, chosen = _places_of(here, own)
+    nodal: Arrays = {"body": body.state.contact_forces.numpy()[: len(own)][own]}
     for name in NODAL:
         values = np.moveaxis(getattr(here.rigid, name).numpy(), 0, 1)
-        of_nodes = np.zeros((len(share.own), *values.shape[1:]), values.dtype)
+        of_nodes = np.zeros((len(own), *values.shape[1:]), values.dtype)
         of_nodes[node[chosen]] = values[chosen]
-        nodal[name] = of_nodes[share.own]
-    count = len(share.triangles)
+        nodal[name] = of_nodes[own]
+    triangles: Arrays = {"triangles": faces}
     for name in OF_TRIANGLES:
-        values = getattr(here.rigid.touches, name).numpy()[:, : share.worlds * count]
-        shape = (len(values), share.worlds, count, 3)
+        values = getattr(here.rigid.touches, name).numpy()[:, : body.worlds * len(faces)]
+        shape = (len(values), body.worlds, len(faces), 3)
         triangles[name] = np.moveaxis(values.reshape(shape), 2, 0) if values.size else np.zeros(0)
     return Touch(nodal, triangles, common_of(here))
 
 
-def take(here: Contacts, share: SurfaceShare, nodal: Arrays, pieces: Sequence[Arrays]) -> None:
+def take(here: Contacts, nodal: Arrays, pieces: Sequence[Arrays]) -> None:
     """Continue from what was packed.
 
     Args:
         here: Contact of a body, or of this rank's part of it.
-        share: Its share.
         nodal: Arrays of all nodes here.
         pieces: The arrays of triangles of all ranks that packed.
     """
     assert here.rigid is not None
-    node, chosen = share.places(here)
+    worlds, (own, faces) = here.system.bodies[0].worlds, _surface_of(here.system.bodies[0])
+    node, chosen = _places_of(here, own)
     used = chosen if here.system.is_implicit else node >= 0
     for name in NODAL:
         array = getattr(here.rigid, name)
         values = array.numpy()
         values[:, used] = np.moveaxis(nodal[name][node[used]], 1, 0)
         array.assign(values)
-    count = len(share.triangles)
-    given = np.concatenate([share.triangles, *(piece["triangles"] for piece in pieces)])
+    count = len(faces)
+    given = np.concatenate([faces, *(piece["triangles"] for piece in pieces)])
     _, number = np.unique(given, axis=0, return_inverse=True)
     number = number.ravel()
     place = np.full(number.max(initial=-1) + 1, -1)
@@ -121,9 +94,24 @@ def take(here: Contacts, share: SurfaceShare, nodal: Arrays, pieces: Sequence[Ar
         values = array.numpy()
         if values.size:
             theirs = np.concatenate([piece[name] for piece in pieces])[place[number[:count]]]
-            values[:, : share.worlds * count] = np.moveaxis(theirs, 0, 2).reshape(len(values), -1, 3)
+            values[:, : worlds * count] = np.moveaxis(theirs, 0, 2).reshape(len(values), -1, 3)
             array.assign(values)
     here.search.forget()
+
+
+def _surface_of(body: SoftBody) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.int64]]:
+    """The nodes of a body, or of a part of one, that this rank moves, bool [worlds * n]; and the triangles of the
+    surface around them, by the ascending numbers of their nodes in the whole mesh, int64 [f, 3]."""
+    faces, own = body.surface_faces[0], np.ones(body.node_count, bool)
+    if isinstance(body, Part):
+        faces, own = body.numbers.nodes[faces], body.is_own
+    return own, np.sort(faces, axis=1).astype(np.int64)
+
+
+def _places_of(here: Contacts, own: npt.NDArray[np.bool_]) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.bool_]]:
+    """The node at each place of the surface, -1 if there is none; and whether this rank moves it."""
+    node = here.surface.arrays.node.numpy()
+    return node, (node >= 0) & own[node]
 
 
 def gathered_contact(
@@ -145,7 +133,7 @@ def gathered_contact(
         kept = copy.copy(here)
         kept.system = SimpleNamespace(bodies=wholes)  # type: ignore[assignment]
         return kept if comm.rank == 0 else None
-    touch = packed(here, SurfaceShare.of(everything[0].part))
+    touch = packed(here)
     given = comm.gather((everything[0].numbers, touch), root=0)
     if given is None:
         return None
@@ -156,7 +144,7 @@ def gathered_contact(
             nodal.setdefault(name, np.zeros((body.node_count, *values.shape[1:]), values.dtype))[nodes] = values
     system = System([body], (), parts.pace, parts.gravity)
     whole = Contacts(system, of_their_own(here.obstacles.given), here.options, stable_dt=parts.stable_dt)
-    take(whole, SurfaceShare.of(body), nodal, [each.triangles for _, each in given])
+    take(whole, nodal, [each.triangles for _, each in given])
     body.state.contact_forces.assign(nodal["body"])
     _take_common(whole, touch.common)
     return whole
@@ -181,8 +169,8 @@ def resume_contact(loaded: Contacts | Touch, parts: PartSimulation, everything: 
             each.take_contact_forces()
     else:
         if isinstance(loaded, Contacts):
-            loaded = packed(loaded, SurfaceShare.of(everything[0].whole)).at(part.numbers.in_worlds(part.worlds))
-        take(here, SurfaceShare.of(part), loaded.nodal, [loaded.triangles])
+            loaded = packed(loaded).at(part.numbers.in_worlds(part.worlds))
+        take(here, loaded.nodal, [loaded.triangles])
         part.state.contact_forces.assign(np.where(part.is_own[:, None], loaded.nodal["body"], 0.0))
         common = loaded.common
     _take_common(here, common)
