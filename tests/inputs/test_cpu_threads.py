@@ -212,7 +212,7 @@ def test_implicit_steps_do_not_depend_on_the_number_of_threads(poisson, lies, to
     """Rows are in another order, so that solves end elsewhere within their tolerance; and the first steps on a ground
     end before they are solved for, with other contacts at a few nodes."""
     options = {"obstacles": wc.Ground((0.0, 1.0, 0.0), -0.001)} if lies else {}
-    integrator = wc.BackwardEuler(dt=0.01, linear_tolerance=1e-5)
+    integrator = wc.BackwardEuler(dt=0.003, linear_tolerance=1e-5)
     runs = [falling(n, poisson=poisson, integrator=integrator, **options) for n in (1, 4, 4)]
     x, y, z = (body.displacements.numpy() for body, _ in runs)
     np.testing.assert_array_equal(y, z)

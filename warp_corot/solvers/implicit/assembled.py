@@ -99,15 +99,13 @@ class AssembledSolve:
         if self._versions == versions:
             return
         self._versions = versions
-        nodes, parts = self.blocks.count, self._regions.team.parts
+        nodes = self.blocks.count
         self._worlds, self._count = 1, nodes
         if not self._together:
             (operator,) = self._operators
             self._worlds, self._count = operator.worlds, operator.node_count
-        # With as many worlds, each thread solves for some of them.
-        parts = parts if self._worlds < parts else 1
-        self._bodies = [self._body_matrix(operator, parts) for operator in self._operators]
-        self._find_rows(parts)
+        self._bodies = [self._body_matrix(operator, self.threads) for operator in self._operators]
+        self._find_rows(self.threads)
         # One more, since products read past the last.
         self.diagonal, self._inverses, self._pivots = (
             wp.zeros(nodes + 1, dtype=wp.mat33, device=device) for _ in range(3)
@@ -216,8 +214,9 @@ class AssembledSolve:
 
     @property
     def threads(self) -> int:
-        """Number of threads of the CPU that share a solve."""
-        return self._regions.team.parts
+        """Number of threads of the CPU that share the rows of a world; one if they take whole worlds."""
+        parts = self._regions.team.parts
+        return parts if self._worlds < parts else 1
 
     @property
     def kernels(self) -> list[LoadedKernel]:

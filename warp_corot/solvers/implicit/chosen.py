@@ -64,7 +64,7 @@ class ChosenSolve:
         self._counts = wp.zeros(kernels.COUNTS, dtype=wp.int32, device=self.device)
         self.is_open = True
         on_cpu = (SHARED_ON_CPU if shares else COST_ON_CPU) * (WITH_CONTACT if assembled.touches else 1)
-        # Threads share assembled solves, but not the cycles of multigrid.
+        # Threads share assembled solves, but not cycles of multigrid.
         self._cost = on_cpu * assembled.threads if self.device.is_cpu else COST
 
     @property
