@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 import warp_corot as wc
 from warp_corot.errors import InputError
+from warp_corot.inputs import cpu_threads
 from warp_corot.inputs.cpu_threads import LEAST_ELEMENTS, Region, core_count, launch, team_for, team_of
 from warp_corot.solvers.implicit.dissection import dissected
 
@@ -117,6 +118,18 @@ def test_two_callers_at_once_do_not_wait_for_one_another():
 def test_a_process_bound_to_one_core_takes_one_thread(monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {3}, raising=False)
     assert team_for(None, 10**9).parts == 1
+
+
+def test_processes_share_the_cores(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
+    for name in ("process_cpu_count", "cpu_count"):
+        monkeypatch.setattr(os, name, lambda: 8, raising=False)
+    monkeypatch.setattr(cpu_threads, "_processes", [1])
+    whole = core_count()
+    cpu_threads.share_cores(4)
+    assert core_count() == max(whole // 4, 1)
+    monkeypatch.setenv("PMI_SIZE", "8")
+    assert core_count() == 1
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")

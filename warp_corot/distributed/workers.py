@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
@@ -14,6 +13,7 @@ import warp as wp
 
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_count
+from warp_corot.inputs.cpu_threads import core_count, share_cores
 from warp_corot.inputs.starting import start_warp
 
 #: Number of runs given at a time to a user's engine, whose size is not known.
@@ -26,15 +26,14 @@ def worker_count(workers: int | None, runs: int, executor: Executor | None) -> i
         return checked_count(workers, "workers", least=1)
     if executor is not None:
         return HANDED_OVER
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(min(wp.get_cuda_device_count() or cores, runs), 1)
+    return max(min(wp.get_cuda_device_count() or core_count(), runs), 1)
 
 
 def local_executor(workers: int) -> ProcessPoolExecutor:
     """New processes, because CUDA and Warp do not work in forked ones."""
     context = multiprocessing.get_context("spawn")
     turn = context.Value("i", 0)
-    return ProcessPoolExecutor(workers, mp_context=context, initializer=_begin, initargs=(turn,))
+    return ProcessPoolExecutor(workers, mp_context=context, initializer=_begin, initargs=(turn, workers))
 
 
 def timed(function: Callable[..., Any], together: bool, runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -71,8 +70,9 @@ def _checked(value: Any, name: str, run: Mapping[str, Any]) -> Any:
     return value
 
 
-def _begin(turn: Any) -> None:
-    """Choose a card for this process, if there are cards."""
+def _begin(turn: Any, workers: int) -> None:
+    """Choose a card for this process, if there are cards, and its share of the cores."""
+    share_cores(workers)
     with turn.get_lock():
         number, turn.value = turn.value, turn.value + 1
     wp.config.log_level = wp.LOG_ERROR

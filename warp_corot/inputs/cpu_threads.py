@@ -19,6 +19,8 @@ from warp._src import context
 
 from warp_corot.kernels.stepping import team as kernels
 
+from .processes import process_count
+
 #: Inputs and outputs of a part's launch, from its number and a function that takes its entries.
 Arguments = Callable[[int, Callable[[Any], Any]], tuple[list, list]]
 #: With fewer elements for each thread, waiting for one another takes longer than they save.
@@ -28,20 +30,29 @@ PARTS, LEAST_THINGS = 4, 8192
 #: The most threads, and the lines of their words; see ``kernels/native/team.h``.
 MOST = 1023
 _LOCK, _STOP, _CALLS, _PIPE, _OWN = 4, 6, slice(7, 10), 10, 11
+#: At the end, how many processes share the cores.
+_processes = [1]
 #: In ``launches``, those of the part that the thread records.
 _recording = threading.local()
 
 
 def core_count() -> int:
-    """Cores that this process may use, by its affinity and by the quota of its container."""
+    """Cores that this process may use, by its affinity and by the quota of its container; MPI's processes and those of
+    a sweep share them."""
     allowed = getattr(os, "process_cpu_count", os.cpu_count)() or 1
     if hasattr(os, "sched_getaffinity"):
         allowed = min(allowed, len(os.sched_getaffinity(0)))
     try:
         quota, period = Path("/sys/fs/cgroup/cpu.max").read_text(encoding="ascii").split()
-        return min(allowed, max(int(quota) // int(period), 1))
+        allowed = min(allowed, int(quota) // int(period))
     except (OSError, ValueError):  # another system, or "max"
-        return allowed
+        pass
+    return max(allowed // max(process_count(), _processes[-1]), 1)
+
+
+def share_cores(processes: int) -> None:
+    """Let so many processes share the cores, this one among them."""
+    _processes.append(processes)
 
 
 def launch(kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, outputs: Sequence = (), **options: Any) -> None:
