@@ -148,22 +148,11 @@ class Region:
     """
 
     def __init__(self, team: Team, phases: Sequence[Callable[[int], None]]):
-        self._team, self._calls = (
-            team,
-            [
-                [_call_of(command) for command in _recorded(phase, part)]
-                for phase in phases
-                for part in range(team.parts)
-            ],
-        )
-        lengths = [3 * len(calls) for calls in self._calls]
-        starts = 3 + len(lengths) + np.concatenate([[0], np.cumsum(lengths)]).astype(int)
-        entries = [
-            (entry, ctypes.addressof(bounds), ctypes.addressof(arguments))
-            for calls in self._calls
-            for entry, bounds, arguments in calls
-        ]
-        self._table = np.array([len(phases), team.parts, *starts, *np.ravel(np.array(entries, np.uint64))], np.uint64)
+        self._team, each = team, [_recorded(phase, part) for phase in phases for part in range(team.parts)]
+        starts = 3 + len(each) + 3 * np.cumsum([0, *map(len, each)])
+        self._calls = [_call_of(command) for commands in each for command in commands]
+        words = [word for entry, *given in self._calls for word in (entry, *map(ctypes.addressof, given))]
+        self._table = np.array([len(phases), team.parts, *starts, *words], np.uint64)
 
     def launch(self) -> None:
         """Launch all parts, recorded or at once. The region must exist as long as the recording."""
