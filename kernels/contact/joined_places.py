@@ -57,13 +57,15 @@ def find_strays(
     joined: Joined,
     carriers: Carriers,
     searches: wp.array[wp.int32],
+    rounds: wp.array[wp.int32],
+    most: int,
     # Out
     watch: Watch,
     surface: Surface,
     again: wp.array[wp.int32],
 ):
     """Ask for another search along the way of motions d if places have strayed beyond their reach, where pairs may be
-    missing."""
+    missing, unless the step has had its ``most`` solves."""
     s = wp.tid()
     if surface.node[s] < 0:
         return
@@ -73,7 +75,7 @@ def find_strays(
     far = wp.length(way - watch.ahead[s] - watch.drift[surface.world[s]])
     watch.strayed[s] = wp.max(far, FADING * watch.strayed[s])
     if far > watch.reach[s]:
-        if searches[0] < SEARCHES:
+        if searches[0] < SEARCHES and rounds[0] < most:
             again[0] = 1
             wake(watch)
         else:
@@ -154,8 +156,9 @@ def locate(
             joined.target[row] = kept_gap(rows.gap[row] + allowed, pushed, law, dt) - allowed
         else:
             joined.base[row] = opened
-            # What is deeper than the two have gone in the step began as an overlap.
-            began = rows.gap[row] + wp.length(opened + given) + allowed
+            # What began deeper than the two have gone sideways in the step began as an overlap.
+            gone = opened + given
+            began = rows.gap[row] - wp.dot(n, gone) + wp.length(across(gone, n)) + allowed
             joined.target[row] = wp.min(joined.target[row], least_gap(began, law, dt) - allowed)
     push = wp.max(wp.dot(was, n), 0.0)
     joined.multiplier[row] = push * n + held_back(across(was, n), push, meeting.friction)

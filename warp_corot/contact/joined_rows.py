@@ -143,16 +143,17 @@ class JoinedRows:
         self._searches.zero_()
         self._pairs.search.launch(offset, follows=True)
 
-    def launch_searched_again(self, d: wp.array, again: wp.array) -> None:
+    def launch_searched_again(self, d: wp.array, rounds: wp.array, most: int, again: wp.array) -> None:
         """Launch another search along the way of motions d if they have strayed from the way of the last one.
 
         Args:
             d: Motions [m], vec4.
+            rounds, most: The number of solves in the step, int32 [1], and its maximum.
             again: Nonzero afterwards if so; then it must be solved again, int32 [1].
         """
         again.zero_()
         surface = self._pairs.surface
-        inputs = [d, self._joined, self._carriers.arrays, self._searches]
+        inputs = [d, self._joined, self._carriers.arrays, self._searches, rounds, most]
         outputs = [self._pairs.search.watch, surface.arrays, again]
         wp.launch(finding.find_strays, surface.count, inputs, outputs, device=self.device)
         wp.capture_if(again, self._search_again, d=d)

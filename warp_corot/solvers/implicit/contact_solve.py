@@ -115,7 +115,7 @@ class ContactSolve:
         self._going.fill_(1)
         wp.capture_while(self._going, self._round)
         if self.system.soft is not None:
-            self.system.soft.launch_searched_again(self.system.x, self._again)
+            self.system.soft.launch_searched_again(self.system.x, self._rounds, ROUNDS, self._again)
 
     def _round(self) -> None:
         system, soft, d = self.system, self.system.soft, self.system.x
