@@ -31,6 +31,12 @@ WIDE = wp.constant(0.2)
 
 
 @wp.func
+def is_done(which: int, spans: Spans):
+    """Whether nothing is to be found: contacts are not located again before the next solve, or no step is to end."""
+    return (which == AGAIN and spans.due[0] == 0) or (which == MISSING and spans.goes[0] != 0)
+
+
+@wp.func
 def take_span(
     o: int,
     t: int,
@@ -121,9 +127,11 @@ def locate_spans(
 
     If a motion is fast, its path may lead through the obstacle, so the span stays where the step begins.
     """
+    if is_done(which, spans):
+        return
     t = start + wp.tid()
     corners = triangles[t]
-    if corners[0] < 0 or (which == AGAIN and spans.due[0] == 0):
+    if corners[0] < 0:
         return
     world = surface.world[corners[0]]
     way = float(0.0)
@@ -202,8 +210,10 @@ def locate_points(
     changed: wp.array[wp.int32],
 ):
     """The same at a body's places that nodes bear; nothing sinks in there."""
+    if is_done(which, spans):
+        return
     s = start + wp.tid()
-    if points[s][0] < 0 or (which == AGAIN and spans.due[0] == 0) or is_held_at(s, surface, carriers):
+    if points[s][0] < 0 or is_held_at(s, surface, carriers):
         return
     world = surface.world[s]
     x = surface.x[s]

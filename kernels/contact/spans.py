@@ -3,7 +3,7 @@
 A span is an obstacle at a point of an item: one that is closer to a triangle than to its corners, or to a place between
 nodes, which counts as a triangle whose corners are all there. See ``springs`` for its force, with a stiffness like that
 of the corners. Each time the step has been solved for, points and normals are found again, and forces become the
-multipliers; in between, spans that are missing are added.
+multipliers; before the step ends, spans that are missing are added.
 """
 
 import warp as wp
@@ -39,6 +39,7 @@ class Spans:
     list: wp.array[wp.int32]  # [O * T] those of these items, as o * T + t
     length: wp.array[wp.int32]  # [1] how many
     due: wp.array[wp.int32]  # [1] whether all are to be found again
+    goes: wp.array[wp.int32]  # [1] whether another solve follows anyway
     solves: wp.array[wp.int32]  # [1] how many linear solves the step has had so far
     stiff: float  # the stiffness of a span over that of its point
     are_borne: int  # whether nodes bear the corners
@@ -107,6 +108,7 @@ def push_corners(
 def judge_spans(
     # In
     locates: wp.array[wp.int32],
+    changed: wp.array[wp.int32],
     count: wp.array[wp.int32],
     rounds: wp.array[wp.int32],
     most: int,
@@ -119,7 +121,7 @@ def judge_spans(
     had just been found again, or there are none.
     """
     solves[0] = rounds[0]
-    if going[0] == 0 and due[0] == 0 and count[0] > 0:
+    if changed[0] != 0 or (due[0] == 0 and count[0] > 0):
         going[0] = 1
     due[0] = locates[0]
     if going[0] == 0 or rounds[0] >= most:

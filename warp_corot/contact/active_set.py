@@ -158,19 +158,18 @@ class ActiveSet:
         wp.launch(kernels.count_round, 1, [self._rounds], device=self.device)
         self._find_bounds(d, int(kernels.THOSE_TOUCHED), at_end=True)
         self._hold()
-        if self._spans is not None:
-            self._locate(spans.MISSING, d)
 
-    def launch_going(self, locates: wp.array, rounds: wp.array, most: int, going: wp.array) -> None:
+    def launch_going(self, d: wp.array, locates: wp.array, rounds: wp.array, most: int, going: wp.array) -> None:
         """Launch the decision whether obstacles between nodes are looked for again, and another solve follows for that.
 
         Args:
+            d: The motion [m].
             locates: Whether contacts are to be located again, int32 [1].
             rounds, most: The number of solves in the step, int32 [1], and its maximum.
             going: Whether another solve follows, int32 [1].
         """
         if self._spans is not None:
-            self._spans.launch_judgement(locates, rounds, most, going)
+            self._spans.launch_judgement(d, self.changed, locates, rounds, most, going)
 
     def launch_end(self, d: wp.array) -> None:
         """Launch the results of contact for users."""

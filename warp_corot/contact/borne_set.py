@@ -80,10 +80,9 @@ class BorneSet:
     def launch_judgement(self, b: wp.array, q: wp.array, d: wp.array) -> None:
         self.changed.zero_()
         self._spans.update(d, is_solved=True)
-        self._spans.launch_located(kernels.MISSING, d, self.changed)
 
-    def launch_going(self, locates: wp.array, rounds: wp.array, most: int, going: wp.array) -> None:
-        self._spans.launch_judgement(locates, rounds, most, going)
+    def launch_going(self, d: wp.array, locates: wp.array, rounds: wp.array, most: int, going: wp.array) -> None:
+        self._spans.launch_judgement(d, self.changed, locates, rounds, most, going)
 
     def launch_end(self, d: wp.array) -> None:
         self._spans.update(d)

@@ -90,7 +90,9 @@ class Spans:
         part, device = surface.parts[self._k], self.device
         self._is_borne = part.bearers > 0
         self._carriers.follow()
-        self._count, self._due, self._solves = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(3))
+        self._count, self._due, self._goes, self._solves = (
+            wp.zeros(1, dtype=wp.int32, device=device) for _ in range(4)
+        )
         self._items: list[Items] = []
         if rigid.have_edges:
             spans, count = self._made(rigid.touches), surface.worlds * part.triangles
@@ -131,9 +133,14 @@ class Spans:
         for each in self._items:
             self._on_listed(finding.stiffen_spans, each, [*self._places(each), each.touches, each.spans])
 
-    def launch_judgement(self, locates: wp.array, rounds: wp.array, most: int, going: wp.array) -> None:
-        """Launch the decision whether they are found again; see ``kernels.judge_spans``."""
-        inputs = [locates, self._count, rounds, most]
+    def launch_judgement(
+        self, d: wp.array, changed: wp.array, locates: wp.array, rounds: wp.array, most: int, going: wp.array
+    ) -> None:
+        """Launch the decision whether they are found again after motions d; see ``kernels.judge_spans``. Those that are
+        missing are looked for if the step would end, which sets ``changed``."""
+        wp.copy(self._goes, going)
+        self.launch_located(finding.MISSING, d, changed)
+        inputs = [locates, changed, self._count, rounds, most]
         wp.launch(kernels.judge_spans, 1, [*inputs, self._due, self._solves, going], device=self.device)
 
     def update(self, d: wp.array, *, is_solved: bool = False) -> None:
@@ -193,7 +200,7 @@ class Spans:
         spans = kernels.Spans()
         for name, dtype in FIELDS.items():
             setattr(spans, name, wp.zeros(touches.force.shape, dtype=dtype, device=self.device))
-        spans.count, spans.due, spans.solves = self._count, self._due, self._solves
+        spans.count, spans.due, spans.goes, spans.solves = self._count, self._due, self._goes, self._solves
         spans.list = wp.zeros(touches.force.size, dtype=wp.int32, device=self.device)
         spans.length = wp.zeros(1, dtype=wp.int32, device=self.device)
         spans.stiff = STIFF

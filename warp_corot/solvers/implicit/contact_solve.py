@@ -159,8 +159,8 @@ class ContactSolve:
         inputs = [solver.scalars, solver.iterations, self._changed, total]
         outputs = [locates, self._outer, self._rounds, self.iterations, solves, self._going]
         wp.launch(kernels.judge_round, 1, inputs, outputs, device=self.device)
-        for contact, () in self._each():
-            contact.launch_going(locates, self._rounds, ROUNDS, self._going)
+        for contact, (own,) in self._each(d):
+            contact.launch_going(own, locates, self._rounds, ROUNDS, self._going)
         if not self._is_alone:
             self._changed.zero_()
         wp.launch(kernels.end_rounds, 1, [self._rounds, ROUNDS], [self._going, solver.status], device=self.device)
