@@ -12,7 +12,7 @@ from .nearest_span import Found, find_span
 from .rolling import tilted
 from .shapes import GROUND, Shapes, carried, distance_to
 from .spans import Spans, list_span, span_at
-from .springs import kept_gap
+from .springs import QUARTERED, kept_gap
 from .supports import left_at_triangle, loose_at_triangle, loose_part
 from .touches import SKEWERED, Touches
 from .vertices import across
@@ -34,6 +34,20 @@ WIDE = wp.constant(0.2)
 def is_done(which: int, spans: Spans):
     """Whether nothing is to be found: contacts are not located again before the next solve, or no step is to end."""
     return (which == AGAIN and spans.due[0] == 0) or (which == MISSING and spans.goes[0] != 0)
+
+
+@wp.func
+def halfway(o: int, t: int, found: Found, e: wp.mat33, touches: Touches, spans: Spans):
+    """A span halfway between where it was and where it is found after motions e of the corners.
+
+    Forces turn with the normal, and may come and go between two normals from one time that spans are found to the next.
+    """
+    n = touches.normal[o, t]
+    gone = wp.dot(n, touches.shares[o, t] * e - touches.moved[o, t])
+    found.gap = 0.5 * (found.gap + touches.gap[o, t] + gone - spans.base[o, t])
+    found.shares = 0.5 * (found.shares + touches.shares[o, t])
+    found.normal = wp.normalize(found.normal + n)
+    return found
 
 
 @wp.func
@@ -158,6 +172,9 @@ def locate_spans(
         found = find_span(
             o, pose, at[0], at[1], at[2], far, was, touches.normal[o, t], touches.shares[o, t], shapes, law
         )
+        is_late = which == AGAIN and spans.solves[0] >= QUARTERED
+        if is_late and is_at_end and found.is_near and spans.listed[o, t] != 0:
+            found = halfway(o, t, found, e, touches, spans)
         found.moved = carried(now, later, found.shares * x)
         found.opened = wp.dot(found.normal, found.shares * e - found.moved)
         found.is_at_end = is_at_end
