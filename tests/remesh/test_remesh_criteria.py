@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from remesh_cases import CUBE, DENSITY, PAIRS, assert_sound, leaf_list, momentum, random_marks
+from remesh_cases import CUBE, DENSITY, PAIRS, assert_sound, leaf_list, momentum, random_marks, set_nodes
 
 import warp_corot as wc
 from warp_corot.discretization.changing.passes import RemeshPass
@@ -30,7 +30,7 @@ def test_elongation_of_the_longest_edge_decides(device, rng):
     above = longest_edges(forest, parents, forest.points + u)
     assert np.abs(np.stack([ratio, above])[..., None] - (1.3, 1.1)).min() > 1e-6
     adaptive = DeviceForest(forest, 50000, device=device)
-    adaptive.carriage.set_nodes(displacements=u)
+    set_nodes(adaptive.carriage, displacements=u)
     RemeshPass(adaptive, refine_above=1.3, simplify_below=1.1).run()
     expected = np.where(ratio > 1.3, 1, np.where((ratio < 1.1) & (above < 1.3), -1, 0))
     assert ((ratio < 1.1) & (above > 1.3)).any()
@@ -46,7 +46,7 @@ def test_a_body_at_rest_stays_as_it_is(stretch, device):
     """Under uniform stretch passes end, even if the thresholds are close to each other."""
     forest = wc.TetForest.box((1, 1, 1), CUBE, 3)
     adaptive = DeviceForest(forest, 50_000, device=device)
-    adaptive.carriage.set_nodes(displacements=forest.points * [stretch - 1.0, 0.0, 0.0])
+    set_nodes(adaptive.carriage, displacements=forest.points * [stretch - 1.0, 0.0, 0.0])
     remesh = RemeshPass(adaptive, refine_above=1.16, simplify_below=1.15, max_level=9)
     counts = []
     for _ in range(12):
@@ -98,7 +98,7 @@ def test_a_users_criterion_follows_a_tool(device):
 def test_forests_of_domains_refine_and_simplify(device, rng):
     forest = wc.TetForest.from_domain(wc.Domain.sphere(0.05), 0.04, max_level=6, surface_error=1e-3)
     adaptive = DeviceForest(forest, 20000, density=DENSITY, device=device)
-    adaptive.carriage.set_nodes(velocities=rng.normal(size=forest.points.shape))
+    set_nodes(adaptive.carriage, velocities=rng.normal(size=forest.points.shape))
     remesh = RemeshPass(adaptive)
     p, size = momentum(adaptive)
     for chances in [(0.2, 0.1), (0.2, 0.1), (0.02, 0.95), (0.0, 1.0), (0.0, 1.0), (0.1, 0.5)]:

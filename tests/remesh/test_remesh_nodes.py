@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from remesh_cases import CUBE, DENSITY, assert_sound, leaf_list, moving, random_marks
+from remesh_cases import CUBE, DENSITY, assert_sound, leaf_list, moving, random_marks, set_nodes
 
 import warp_corot as wc
 from warp_corot.discretization.changing.fields import CARRIED_BY_NODES, CARRIED_BY_TETRAHEDRA, OF_NODES, OF_TETRAHEDRA
@@ -128,7 +128,7 @@ def test_new_held_nodes_follow_the_row_that_both_ends_follow(device, rng):
     held = forest.points[:, 0] < 0.6 * CUBE
     row = np.where(held, np.digitize(forest.points[:, 1], [0.3 * CUBE, 0.6 * CUBE]) - 1, -1)
     adaptive = DeviceForest(forest, 20000, device=device)
-    adaptive.carriage.set_nodes(held=held, rows=row)
+    set_nodes(adaptive.carriage, held=held, rows=row)
     remesh = RemeshPass(adaptive)
     for chances in [(0.3, 0.0), (0.3, 0.0), (0.3, 0.3)]:
         remesh.apply(random_marks(adaptive, rng, *chances))

@@ -5,6 +5,7 @@ import functools
 import numpy as np
 import pytest
 import warp as wp
+from remesh_cases import set_nodes
 from studies import study
 
 import warp_corot as wc
@@ -72,7 +73,7 @@ def test_a_released_bar_is_coarse_again(device):
 def marked(forest, gradient, criterion, parameters, threshold, device):
     """The leaves where a criterion is above a threshold, at a uniform deformation gradient."""
     adaptive = DeviceForest(forest, len(forest.tets), device=device)
-    adaptive.carriage.set_nodes(displacements=forest.points @ (gradient - np.eye(3)).T)
+    set_nodes(adaptive.carriage, displacements=forest.points @ (gradient - np.eye(3)).T)
     numbers = wp.array(parameters, dtype=wp.float32, device=device)
     mark = RemeshPass(adaptive, criterion=criterion, refine_above=threshold, simplify_below=0.0, parameters=numbers)
     mark.run()

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from remesh_cases import CUBE, DENSITY, assert_sound, momentum, moving, random_marks
+from remesh_cases import CUBE, DENSITY, assert_sound, momentum, moving, random_marks, set_nodes
 
 import warp_corot as wc
 from warp_corot.discretization.changing.passes import RemeshPass
@@ -83,7 +83,7 @@ def test_supports_account_for_the_momentum_that_held_nodes_cannot_take(device, r
 def test_nodes_between_held_ones_are_held(device):
     forest = wc.TetForest.box((1, 1, 1), CUBE, 3)
     adaptive = DeviceForest(forest, 5000, device=device)
-    adaptive.carriage.set_nodes(held=forest.points[:, 0] == 0)
+    set_nodes(adaptive.carriage, held=forest.points[:, 0] == 0)
     remesh = RemeshPass(adaptive)
     for _ in range(3):
         remesh.apply(np.ones(adaptive.leaf_count, int))
@@ -98,7 +98,7 @@ def test_different_densities_become_one_and_keep_mass_and_momentum(device, rng):
     density = rng.uniform(100.0, 3000.0, len(forest.tets))
     stiffness = rng.uniform(1.0, 2.0, len(forest.tets))
     adaptive = DeviceForest(forest, 20000, density=density, values={"mu": stiffness}, device=device)
-    adaptive.carriage.set_nodes(velocities=rng.normal(size=forest.points.shape))
+    set_nodes(adaptive.carriage, velocities=rng.normal(size=forest.points.shape))
     remesh = RemeshPass(adaptive)
     total, (p, size) = adaptive.carriage.arrays.mass.numpy().sum(), momentum(adaptive)
     for marks in (0.0, 0.3, 0.0, 0.0, 0.3):
@@ -146,7 +146,7 @@ def test_a_new_node_takes_what_leaves_of_any_density_lose(device, rng):
     assert ring.sum() > 3
     adaptive = DeviceForest(forest, 1000, density=density, device=device)
     velocities = rng.normal(size=forest.points.shape)
-    adaptive.carriage.set_nodes(velocities=velocities)
+    set_nodes(adaptive.carriage, velocities=velocities)
     before = adaptive.carriage.arrays.mass.numpy().copy()
     (p, size), total = momentum(adaptive), before.sum()
     RemeshPass(adaptive).apply(np.arange(len(forest.tets)) == 17)

@@ -9,6 +9,7 @@ from sequential import Bisection
 
 from warp_corot.discretization.changing.fields import CARRIED_BY_NODES
 from warp_corot.discretization.changing.pools import DeviceForest
+from warp_corot.discretization.nodal import padded
 from warp_corot.kernels.tables.shapes import FRAME_SHIFT
 from warp_corot.mesh.lattice import LATTICE_BITS
 
@@ -136,12 +137,24 @@ def momentum(device):
     return p.sum(axis=0), np.abs(p).sum()
 
 
+def set_nodes(carriage, **given):
+    """Set displacements, velocities and loads, [n, 3], and held and rows, [n], of the first nodes."""
+    names = {"displacements": "u", "velocities": "v", "loads": "load", "held": "held", "rows": "row"}
+    for name, values in given.items():
+        array, values = getattr(carriage.arrays, names[name]), np.asarray(values)
+        whole = array.numpy().copy()
+        whole[: len(values)] = padded(values.astype(np.float64)) if values.ndim == 2 else values
+        array.assign(whole)
+    if "held" in given:
+        carriage.update_inverse_mass()
+
+
 def moving(forest, device, rng, **options):
     """A forest on the device with random displacements and velocities."""
     made = DeviceForest(forest, options.pop("capacity", 20000), density=options.pop("density", DENSITY), device=device)
     n = len(forest.points)
     shape = (n, 3)
-    made.carriage.set_nodes(displacements=1e-3 * rng.normal(size=shape), velocities=rng.normal(size=shape), **options)
+    set_nodes(made.carriage, displacements=1e-3 * rng.normal(size=shape), velocities=rng.normal(size=shape), **options)
     return made
 
 

@@ -112,52 +112,7 @@ class Carriage:
         arrays.cut_area = wp.zeros(1, dtype=wp.float64, device=self.device)
         arrays.impulse = wp.zeros(1, dtype=wp.vec3d, device=self.device)
         self.arrays = arrays
-        self._update_inverse_mass()
-
-    def set_nodes(
-        self,
-        *,
-        displacements: npt.ArrayLike | None = None,
-        velocities: npt.ArrayLike | None = None,
-        loads: npt.ArrayLike | None = None,
-        held: npt.ArrayLike | None = None,
-        rows: npt.ArrayLike | None = None,
-        nodes: npt.ArrayLike | None = None,
-    ) -> None:
-        """Set the state of nodes.
-
-        Args:
-            displacements, velocities, loads: [n, 3] [m], [m/s], [N].
-            held: Mask of fixed and prescribed nodes, bool [n].
-            rows: The row of keyframes that each held node follows, -1 for none, int32 [n]. A node that is made between
-                two held
-                ones has the row of both; -2 if they follow different ones.
-            nodes: Places in the pool [n]; None: the nodes of the original forest, before any pass.
-
-        Raises:
-            InputError: An array has the wrong shape.
-        """
-        places = np.arange(self._first_nodes) if nodes is None else np.asarray(nodes)
-        for name, given in (("u", displacements), ("v", velocities), ("load", loads)):
-            if given is not None:
-                found = np.asarray(given, dtype=np.float64)
-                if found.shape != (len(places), 3):
-                    raise InputError(f"the state has shape {found.shape}; it must be [{len(places)}, 3]")
-                array = getattr(self.arrays, name)
-                whole = array.numpy().copy()
-                whole[places] = padded(found)
-                array.assign(whole)
-        for name, given in (("held", held), ("row", rows)):
-            if given is not None:
-                found = np.asarray(given)
-                if found.shape != (len(places),):
-                    raise InputError(f"{name} has shape {found.shape}; it must be [{len(places)}]")
-                array = getattr(self.arrays, name)
-                whole = array.numpy().copy()
-                whole[places] = found
-                array.assign(whole)
-        if held is not None:
-            self._update_inverse_mass()
+        self.update_inverse_mass()
 
     def values(self, name: str) -> npt.NDArray[np.float32]:
         """A quantity at all places for tetrahedra; only the values of leaves count."""
@@ -168,7 +123,8 @@ class Carriage:
         """Impulse of the supports in all passes, as mass came to and left held nodes [N s], float64 [3]."""
         return self.arrays.impulse.numpy()[0]
 
-    def _update_inverse_mass(self) -> None:
+    def update_inverse_mass(self) -> None:
+        """Find the inverse masses again, which are zero where nodes are held."""
         masses, held = self.arrays.mass.numpy(), self.arrays.held.numpy() != 0
         free = ~held & (masses > 0)
         inverse = np.zeros(len(masses))
