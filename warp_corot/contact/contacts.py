@@ -37,8 +37,9 @@ from .whole_surface import WholeSurface
 
 #: Gaps that come from rounding, in roundings of the largest coordinate.
 ROUNDINGS = 16.0
-#: Overlapping surfaces are pushed apart at this fraction of the speed of waves.
-RECOVERY = 0.05
+#: Overlapping surfaces are pushed apart at this fraction of the speed of waves, and at most by the size of the smallest
+#: element in this time [s]: explicit steps keep the speed, and stiff bodies would be thrown.
+RECOVERY, UNHURRIED = 0.05, 0.01
 #: Steps of less than this fraction of the stable one close less of a gap.
 WHOLE = 0.5
 #: Gaps at bodies' own surfaces of up to this fraction of the smallest element may stay as they are in implicit steps:
@@ -336,7 +337,7 @@ class Contacts:
         law = Law()
         law.settling, law.whole = float(SETTLING), WHOLE * stable_dt if np.isfinite(stable_dt) else 0.0
         law.tolerance = ROUNDINGS * 2.0**-24 * max(*points, 1e-3)
-        law.recovery = RECOVERY * self.smallest / stable_dt if np.isfinite(stable_dt) else 0.1
+        law.recovery = min(RECOVERY / stable_dt, 1.0 / UNHURRIED) * self.smallest if np.isfinite(stable_dt) else 0.1
         heaviest = self.system.ranks.max(max(float(body.masses.max()) for body in self.system.bodies))
         step = stable_dt if np.isfinite(stable_dt) else 1.0
         law.slack = SLACK * self.smallest if self.surface.is_borne else 0.0
