@@ -6,8 +6,7 @@ from dataclasses import replace
 import pytest
 
 from warp_corot.cli import main
-from warp_corot.experiments.verification import CASES, Setup, run_case
-from warp_corot.experiments.verification.case import row
+from warp_corot.experiments.verification import CASES, Row, Setup, run_case
 
 
 @pytest.mark.parametrize("full", [False, pytest.param(True, marks=pytest.mark.slow)])
@@ -28,10 +27,10 @@ def test_halving_elements_divides_the_error(name, least, device):
 
 
 def test_errors_are_relative_to_the_reference_or_a_scale():
-    assert row("force", 1.1, 1.0, 0.2).passes
-    assert not row("force", 1.1, 1.0, 0.05).passes
-    assert not row("force", -1.0, 1.0, 0.5).passes
-    assert row("gap", 0.1, 0.0, 0.02, scale=10.0).error == pytest.approx(0.01)
+    assert Row("force", 1.1, 1.0, 0.2).passes
+    assert not Row("force", 1.1, 1.0, 0.05).passes
+    assert not Row("force", -1.0, 1.0, 0.5).passes
+    assert Row("gap", 0.1, 0.0, 0.02, scale=10.0).error == pytest.approx(0.01)
 
 
 def test_the_command_prints_a_table_and_writes_json(tmp_path, capsys):
@@ -47,7 +46,7 @@ def test_the_command_prints_a_table_and_writes_json(tmp_path, capsys):
 
 def test_a_row_beyond_its_bound_is_said(tmp_path, capsys, monkeypatch):
     def wrong(setup):
-        return [row("weight", float("nan"), 1.0, 0.1, "N")]
+        return [Row("weight", float("nan"), 1.0, 0.1, "N")]
 
     monkeypatch.setitem(CASES, "slope", replace(CASES["slope"], run=wrong))
     path = tmp_path / "rows.json"

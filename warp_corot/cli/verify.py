@@ -54,12 +54,13 @@ def run(args: argparse.Namespace) -> int:
             rows, seconds = run_case(name, setup)
             for row in rows:
                 print(line(name, row) + CASES[name].source, flush=True)
-                told.append({"case": name, **asdict(row), "passes": row.passes, "source": CASES[name].source})
+                more = {"error": float(row.error), "passes": bool(row.passes), "source": CASES[name].source}
+                told.append({"case": name, **asdict(row), **more})
             took += seconds
     beyond = sum(not row["passes"] for row in told)
     print(f"{len(told) - beyond} of {len(told)} rows pass on {device}, in {took:.0f} s")
     if args.json is not None:
-        finite = [{key: _finite(value) for key, value in row.items()} for row in told]
+        finite = [{key: _plain(value) for key, value in row.items()} for row in told]
         head = {"schema": "warp-corot/verify", "schema_version": 1, "full": args.full, "seconds": round(took, 1)}
         write_json(args.json, {**head, **environment(device), "rows": finite})
     if beyond:
@@ -76,6 +77,8 @@ def line(name: str, row: Row) -> str:
     )
 
 
-def _finite(value: Any) -> Any:
-    """The value, or None for a number that JSON does not have."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def _plain(value: Any) -> Any:
+    """The value without NumPy's types; None for a number that JSON does not have."""
+    if value is None or isinstance(value, str | bool):
+        return value
+    return float(value) if math.isfinite(value) else None

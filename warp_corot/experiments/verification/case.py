@@ -17,30 +17,27 @@ class Row:
 
     Attributes:
         quantity: What it is.
-        unit: Its unit; empty for a ratio.
-        result, reference: Both in this unit.
+        result, reference: Both in the unit.
         bound: The largest error with which the case passes.
-        error: Their difference over the reference, or over a scale where the reference is zero.
+        unit: Empty for a ratio.
+        scale: What errors are relative to; None: the reference.
     """
 
     quantity: str
-    unit: str
     result: float
     reference: float
     bound: float
-    error: float
+    unit: str = ""
+    scale: float | None = None
+
+    @property
+    def error(self) -> float:
+        """The difference over the scale."""
+        return (self.result - self.reference) / abs(self.reference if self.scale is None else self.scale)
 
     @property
     def passes(self) -> bool:
         return abs(self.error) <= self.bound
-
-
-def row(
-    quantity: str, result: float, reference: float, bound: float, unit: str = "", scale: float | None = None
-) -> Row:
-    """A row; the error is relative to ``scale``, or to the reference if it is None."""
-    error = (float(result) - float(reference)) / abs(float(reference) if scale is None else float(scale))
-    return Row(quantity, unit, float(result), float(reference), bound, error)
 
 
 @dataclass
@@ -96,5 +93,5 @@ def run_case(name: str, setup: Setup) -> tuple[list[Row], float]:
     try:
         rows = CASES[name].run(setup)
     except (UnstableError, ConvergenceError) as error:
-        rows = [Row(f"ended: {error}", "", math.nan, math.nan, 0.0, math.nan)]
+        rows = [Row(f"ended: {error}", math.nan, 1.0, 0.0)]
     return rows, perf_counter() - began

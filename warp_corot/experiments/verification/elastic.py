@@ -15,7 +15,7 @@ from warp_corot.mesh import TetForest, TetMesh
 from warp_corot.simulation.simulation import Simulation
 from warp_corot.simulation.static import solve_static
 
-from .case import Row, Setup, case, row
+from .case import Row, Setup, case
 
 Array = npt.NDArray[np.float64]
 
@@ -89,8 +89,8 @@ def patch(setup: Setup) -> list[Row]:
         end = np.isclose(x[:, 0], 0.1)
         forces = Simulation(body, model=model, gravity=NONE).forces().numpy().astype(np.float64)[end].sum(axis=0)
         along = -forces @ gradient[:, 0] / stretch / 0.1**2
-        rows.append(row(f"stress, {type(model).__name__}", along, stress, 1e-4, "Pa"))
-    return [row("nodes inside, off their places", 1e3 * off, 0.0, 1e-5, "mm", scale=30.0), *rows]
+        rows.append(Row(f"stress, {type(model).__name__}", along, stress, 1e-4, "Pa"))
+    return [Row("nodes inside, off their places", 1e3 * off, 0.0, 1e-5, "mm", scale=30.0), *rows]
 
 
 @case("cantilever", "Reissner's beam theory (1972): a beam that stretches and shears")
@@ -105,7 +105,7 @@ def cantilever(setup: Setup) -> list[Row]:
     spread(body, faces_where(body, end), (load / side**2, 0.0, 0.0))
     moved = at_rest(body, StVenantKirchhoff(dilatation="element"))[end].mean(axis=0)
     setup.shown = [body], []
-    return [row("deflection of the end", moved[0], REISSNER, 0.025 if setup.full else 0.1, "m")]
+    return [Row("deflection of the end", moved[0], REISSNER, 0.025 if setup.full else 0.1, "m")]
 
 
 @case("torsion", "Saint-Venant: J = 0.14058 side^4")
@@ -128,7 +128,7 @@ def torsion(setup: Setup) -> list[Row]:
 
     rate = (twist(3.0 * side) - twist(side)) / (2.0 * side)
     long = 0.5 * young / (1.0 + poisson) * 0.1405770 * side**4 * rate
-    return [row("torque", 1e3 * torque, 1e3 * long, 0.03 if setup.full else 0.1, "N mm")]
+    return [Row("torque", 1e3 * torque, 1e3 * long, 0.03 if setup.full else 0.1, "N mm")]
 
 
 @case("pipe", "Lamé")
@@ -152,7 +152,7 @@ def pipe(setup: Setup) -> list[Row]:
         square = inner**2 / (outer**2 - inner**2)
         exact = pressure * square / young * ((1.0 - poisson) * inner + (1.0 + poisson) * outer**2 / inner)
         bound = 0.01 if setup.full else 0.03
-        rows.append(row(f"growth of the inner radius, nu = {poisson:g}", 1e6 * grown, 1e6 * exact, bound, "um"))
+        rows.append(Row(f"growth of the inner radius, nu = {poisson:g}", 1e6 * grown, 1e6 * exact, bound, "um"))
     return rows
 
 
@@ -170,7 +170,7 @@ def cook(setup: Setup) -> list[Row]:
         corner = np.argmin(np.linalg.norm(x - (0.048, 0.060, 0.005), axis=1))
         found = 1e3 * at_rest(body, Linear(dilatation="shared"))[corner, 1]
         setup.shown = [body], []
-        rows.append(row(f"upper corner, nu = {poisson:g}", found, reference, 0.08 if setup.full else 0.15, "mm"))
+        rows.append(Row(f"upper corner, nu = {poisson:g}", found, reference, 0.08 if setup.full else 0.15, "mm"))
     return rows
 
 

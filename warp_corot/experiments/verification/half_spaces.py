@@ -19,7 +19,7 @@ from warp_corot.simulation.simulation import Simulation
 from warp_corot.simulation.static import solve_static
 from warp_corot.solvers import BackwardEuler, SymplecticEuler
 
-from .case import Row, Setup, case, row
+from .case import Row, Setup, case
 
 Array = npt.NDArray[np.float64]
 
@@ -111,8 +111,8 @@ def hertz_sphere(setup: Setup) -> list[Row]:
     rest = pressed(setup, mesh, FORCE, Sphere(RADIUS, position=(0.0, 0.0, RADIUS - DEPTH)))
     bound = 0.02 if setup.full else 0.035
     return [
-        row("force at rest", rest, FORCE, bound, "N"),
-        row("force, explicit steps", steps, FORCE, bound, "N"),
+        Row("force at rest", rest, FORCE, bound, "N"),
+        Row("force, explicit steps", steps, FORCE, bound, "N"),
     ]
 
 
@@ -122,7 +122,7 @@ def flat_punch(setup: Setup) -> list[Row]:
     mesh, depth, length = refined_block(12, 18 if setup.full else 15), 2e-4, 0.01
     force = 2.0 * CONTACT * YOUNG / (1.0 - POISSON**2) * depth
     punch = Cylinder(CONTACT, length, position=(0.0, 0.0, 0.5 * length - depth))
-    return [row("force at rest", pressed(setup, mesh, force, punch), force, 0.03 if setup.full else 0.08, "N")]
+    return [Row("force at rest", pressed(setup, mesh, force, punch), force, 0.03 if setup.full else 0.08, "N")]
 
 
 @case("cattaneo-mindlin", f"Cattaneo 1938, Mindlin 1949; {JOHNSON}, 7.2")
@@ -158,9 +158,9 @@ def cattaneo_mindlin(setup: Setup) -> list[Row]:
         if np.linalg.norm(point.friction_force) < 0.99 * friction * point.normal_force
     ]
     return [
-        row("force down", felt[2], push, 0.03, "N"),
-        row("force sideways", -felt[0], drag, 0.08, "N"),
-        row("radius that sticks", 1e3 * max(sticks, default=0.0), 1e3 * CONTACT * (1.0 - share) ** (1 / 3), 0.1, "mm"),
+        Row("force down", felt[2], push, 0.03, "N"),
+        Row("force sideways", -felt[0], drag, 0.08, "N"),
+        Row("radius that sticks", 1e3 * max(sticks, default=0.0), 1e3 * CONTACT * (1.0 - share) ** (1 / 3), 0.1, "mm"),
     ]
 
 
@@ -202,7 +202,7 @@ def hertz_cylinder(setup: Setup) -> list[Row]:
     setup.shown = [body], [roller]
     force = float(roller.wrench.numpy()[0, 2]) / side
     exact = np.sqrt(4.0 * force * radius * (1.0 - POISSON**2) / (np.pi * YOUNG))
-    return [row("half the width of contact", 1e3 * half_width(body, side), 1e3 * exact, 0.03, "mm")]
+    return [Row("half the width of contact", 1e3 * half_width(body, side), 1e3 * exact, 0.03, "mm")]
 
 
 @case("nafems-roller", "Konter, Advanced Finite Element Contact Benchmarks, NAFEMS 2006, no. 1")
@@ -230,6 +230,6 @@ def nafems_roller(setup: Setup) -> list[Row]:
     felt = both[1].contact_forces.numpy().astype(np.float64)[:, 2].sum() / side
     width = half_width(both[0], side) * np.sqrt(force / felt)
     return [
-        row("half the width of contact", 1e3 * width, 6.21, 0.03, "mm"),
-        row("largest pressure", 2.0 * force / (np.pi * width), 3585.37, 0.03, "MPa"),
+        Row("half the width of contact", 1e3 * width, 6.21, 0.03, "mm"),
+        Row("largest pressure", 2.0 * force / (np.pi * width), 3585.37, 0.03, "MPa"),
     ]

@@ -17,7 +17,7 @@ from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import BackwardEuler, SymplecticEuler
 from warp_corot.solvers.integrator import Integrator
 
-from .case import Row, Setup, case, row
+from .case import Row, Setup, case
 from .elastic import faces_where, mapped_grid, spread
 
 Array = npt.NDArray[np.float64]
@@ -62,10 +62,10 @@ def slope(setup: Setup) -> list[Row]:
             sim.advance(1.0 if setup.full else 0.1)
             gained = mean_velocity(body)[0] - began
             if share < 1.0:
-                rows.append(row(f"speed at 0.99, {name}", 1e3 * (began + gained), 0.0, 1e-5, "mm/s", scale=1e3))
+                rows.append(Row(f"speed at 0.99, {name}", 1e3 * (began + gained), 0.0, 1e-5, "mm/s", scale=1e3))
             else:
                 slides = float(GRAVITY * (np.sin(angle) - friction * np.cos(angle)))
-                rows.append(row(f"acceleration at 1.01, {name}", gained / (sim.time - time), slides, 0.01, "m/s2"))
+                rows.append(Row(f"acceleration at 1.01, {name}", gained / (sim.time - time), slides, 0.01, "m/s2"))
     return rows
 
 
@@ -105,7 +105,7 @@ def contact_patch(setup: Setup) -> list[Row]:
         sim.advance(0.3)
         stresses = np.concatenate([np.asarray(sim.von_mises(body), dtype=np.float64) for body in both])
         worst = stresses[np.abs(stresses - pressure).argmax()]
-        rows.append(row(f"stress farthest off, {name}", float(worst), pressure, bound, "Pa"))
+        rows.append(Row(f"stress farthest off, {name}", float(worst), pressure, bound, "Pa"))
         setup.shown = both, []
     return rows
 
@@ -133,9 +133,9 @@ def stack(setup: Setup) -> list[Row]:
     borne = np.array([force_on(slab)[2] for slab in slabs]) / weights
     setup.shown = slabs, [ground]
     return [
-        row("force on a slab over its weight", borne[np.abs(borne - 1.0).argmax()], 1.0, 0.01),
-        row("force on the ground", -float(ground.wrench.numpy()[0, 2]), weights.sum(), 0.01, "N"),
-        row("motion in 0.2 s", 1e3 * float(np.abs(moved).max()), 0.0, 0.05, "mm", scale=10.0),
+        Row("force on a slab over its weight", borne[np.abs(borne - 1.0).argmax()], 1.0, 0.01),
+        Row("force on the ground", -float(ground.wrench.numpy()[0, 2]), weights.sum(), 0.01, "N"),
+        Row("motion in 0.2 s", 1e3 * float(np.abs(moved).max()), 0.0, 0.05, "mm", scale=10.0),
     ]
 
 
@@ -154,11 +154,11 @@ def bar(setup: Setup) -> list[Row]:
         felt.append(force_on(body)[2])
     force = density * wave * speed * side**2
     return [
-        row(
+        Row(
             "duration of contact", 1e3 * every * np.count_nonzero(np.array(felt) > 0.1 * force), 1e3 * lasts, 0.05, "ms"
         ),
-        row("impulse", 1e3 * every * sum(felt), 2e3 * speed * body.masses.sum(), 0.03, "N ms"),
-        row("speed after", mean_velocity(body)[2], speed, 0.05, "m/s"),
+        Row("impulse", 1e3 * every * sum(felt), 2e3 * speed * body.masses.sum(), 0.03, "N ms"),
+        Row("speed after", mean_velocity(body)[2], speed, 0.05, "m/s"),
     ]
 
 
@@ -180,8 +180,8 @@ def rebound(setup: Setup) -> list[Row]:
     weight = GRAVITY * body.masses.sum()
     setup.shown = [body], [ground]
     return [
-        row("energy gained, of the fall's", (given - began) / (weight * fall), 0.0, 0.01, scale=1.0),
-        row("below the ground", 1e3 * max(-float(lowest), 0.0), 0.0, 1e-3, "mm", scale=1e3 * radius),
+        Row("energy gained, of the fall's", (given - began) / (weight * fall), 0.0, 0.01, scale=1.0),
+        Row("below the ground", 1e3 * max(-float(lowest), 0.0), 0.0, 1e-3, "mm", scale=1e3 * radius),
     ]
 
 
@@ -206,8 +206,8 @@ def ironing(setup: Setup) -> list[Row]:
     sideways, down = np.array(felt).T
     setup.shown = [body], [roller]
     return [
-        row("force along over force down", -sideways.sum() / down.sum(), friction, 0.05),
-        row("ripple of the force down", float(down.std() / down.mean()), 0.0, 0.06, scale=1.0),
+        Row("force along over force down", -sideways.sum() / down.sum(), friction, 0.05),
+        Row("ripple of the force down", float(down.std() / down.mean()), 0.0, 0.06, scale=1.0),
     ]
 
 
@@ -245,7 +245,7 @@ def ring(setup: Setup) -> list[Row]:
         deepest = max(deepest, float(-depth(body.positions.numpy().astype(np.float64)).min()))
     setup.shown = [body], [torus]
     return [
-        row("force that draws over force on the ring", held / felt, 1.0, 0.03),
-        row("largest friction over pressure", most, friction, 1e-3),
-        row("deepest in the ring", 1e3 * deepest, 0.0, 0.03, "mm", scale=3.0),
+        Row("force that draws over force on the ring", held / felt, 1.0, 0.03),
+        Row("largest friction over pressure", most, friction, 1e-3),
+        Row("deepest in the ring", 1e3 * deepest, 0.0, 0.03, "mm", scale=3.0),
     ]
