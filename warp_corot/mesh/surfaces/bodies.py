@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -13,7 +14,7 @@ from warp_corot.mesh.forest_arrays import ForestArrays
 from warp_corot.mesh.growing.detail import Detail
 from warp_corot.mesh.numbering import in_order_of_leaves, live_or_void, renumbered, with_virtual
 from warp_corot.mesh.pieces import pieces_of
-from warp_corot.mesh.tree import LIVE
+from warp_corot.mesh.tree import VOID
 
 from .bound import SurfaceMesh
 from .boundary import boundary_faces
@@ -29,7 +30,7 @@ def surface(forest: ForestArrays) -> SurfaceMesh:
     if forest.phi is None:
         return _snapped(forest, boundary_surface(forest))
     if forest.tree.cut is not None:
-        marched_surface = marched_cut(forest.lattice_points, _away_from_cuts(forest), forest.phi)
+        marched_surface = marched_cut(forest.lattice_points, _cut_apart(forest), forest.phi)
         found = _snapped(forest, _on_nodes(forest, marched_surface))
     elif forest.detail is not None:
         found = _embedded(forest, forest.detail.surface())
@@ -104,16 +105,26 @@ def _all_cut(forest: ForestArrays) -> np.ndarray:
     return tets[(forest.phi[tets] < 0).any(axis=1)]
 
 
-def _away_from_cuts(forest: ForestArrays) -> np.ndarray:
-    """As `_all_cut`, without leaves that were left out beside a cut: they are on no side of it."""
-    _, place, count = np.unique(forest.lattice, axis=0, return_inverse=True, return_counts=True)
-    is_beside = np.zeros(len(forest.lattice), bool)
-    is_beside[forest.tets[(count[place.ravel()] > 1)[forest.tets].any(axis=1)]] = True
-    tree = forest.tree
-    whole = (tree.first_child == LIVE) | ((tree.first_child < 0) & ~is_beside[tree.tets].any(axis=1))
-    tets = tree.tets[whole]
+def _cut_apart(forest: ForestArrays) -> np.ndarray:
+    """As `_all_cut`, but for leaves that were left out and have nodes inside that no element joins: a cut may be
+    between them."""
     assert forest.phi is not None
-    return tets[(forest.phi[tets] < 0).any(axis=1)]
+    is_inside = forest.phi < 0
+    left_out = forest.tree.tets[forest.tree.first_child == VOID]
+    left_out = left_out[is_inside[left_out].any(axis=1)]
+    pairs = np.array(list(itertools.combinations(range(4), 2)))
+    edges, asked = (np.sort(tets[:, pairs].astype(np.int64), axis=2) for tets in (forest.tets, left_out))
+    joined = np.isin(asked[..., 0] << 32 | asked[..., 1], np.unique(edges[..., 0] << 32 | edges[..., 1]))
+    whole = (joined | ~is_inside[asked].all(axis=2)).all(axis=1)
+    whole &= ~(is_inside[left_out] & (left_out >= forest.node_count)).any(axis=1)
+    return np.concatenate([forest.tets[is_inside[forest.tets].any(axis=1)], left_out[whole]])
+
+
+def _elements_at(forest: ForestArrays, nodes: np.ndarray) -> np.ndarray:
+    """An element around each node."""
+    element = np.zeros(forest.node_count, np.int64)
+    element[forest.tets] = np.arange(len(forest.tets))[:, None]
+    return element[nodes]
 
 
 def _snapped(forest: ForestArrays, found: SurfaceMesh) -> SurfaceMesh:
@@ -130,7 +141,10 @@ def _snapped(forest: ForestArrays, found: SurfaceMesh) -> SurfaceMesh:
     pairs = np.array([(a, b) for a in range(4) for b in range(4)])
     edges = np.sort(forest.tets[:, pairs], axis=2).reshape(-1, 2).astype(np.int64)
     keys, first = np.unique(edges[:, 0] << 32 | edges[:, 1], return_index=True)
-    elements = first[np.searchsorted(keys, ends[:, 0] << 32 | ends[:, 1])] // len(pairs)
+    asked = ends[:, 0] << 32 | ends[:, 1]
+    place = np.minimum(np.searchsorted(keys, asked), len(keys) - 1)
+    # Edges of leaves that were left out are of no element.
+    elements = np.where(keys[place] == asked, first[place] // len(pairs), _elements_at(forest, found.nodes[points, 0]))
     x, nodes, weights = found.points.copy(), found.nodes.copy(), found.weights.copy()
     x[points] += moves[points]
     nodes[points] = forest.tets[elements]
@@ -158,6 +172,12 @@ def _on_nodes(forest: ForestArrays, found: SurfaceMesh) -> SurfaceMesh:
     weights = found.weights.copy()
     if len(lost):
         elements, weights[lost] = embed(forest, found.points[lost])
+        if forest.tree.cut is not None:
+            # The nearest element may be across a cut; one at the inner end of the point's edge is not.
+            inner = found.nodes[lost, 0]
+            known = inner < forest.node_count
+            elements[known] = _elements_at(forest, inner[known])
+            weights[lost] = barycentric(forest, elements, found.points[lost])
         nodes[lost] = forest.tets[elements]
     return replace(found, nodes=nodes.astype(np.int32), weights=weights)
 
