@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import trimesh
@@ -181,13 +182,15 @@ class RandomBlades:
         np.testing.assert_allclose(mesh.volumes.sum(), self.volume, rtol=1e-9)
         np.testing.assert_allclose(momentum(self.body)[0], self.mass, rtol=1e-9)
         if self.has_surface:
-            np.testing.assert_allclose(self._inside(), self.inside, rtol=0.1)
+            np.testing.assert_allclose(self._inside(), self.inside, rtol=0.03)
 
     def _inside(self):
-        """The volume that the closed surface has inside."""
+        """The volume that the surface has inside, without moves of its points to cuts; both are closed."""
         if not self.has_surface:
             return 0.0
-        surface = self.body.mesh.surface()
+        mesh = self.body.mesh
+        assert_closed(mesh.surface().triangles)
+        surface = replace(mesh, snap=None).surface()
         assert_closed(surface.triangles)
         a, b, c = np.moveaxis(surface.points[surface.triangles].astype(float), 1, 0)
         return np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0

@@ -28,10 +28,11 @@ Forest = TypeVar("Forest", bound=ForestArrays)
 def surface(forest: ForestArrays) -> SurfaceMesh:
     """See `TetForest.surface`."""
     if forest.phi is None:
-        return _snapped(forest, boundary_surface(forest))
+        found = boundary_surface(forest)
+        return _snapped(forest, found, found)
     if forest.tree.cut is not None:
         marched_surface = marched_cut(forest.lattice_points, _cut_apart(forest), forest.phi)
-        found = _snapped(forest, _on_nodes(forest, marched_surface))
+        found = _snapped(forest, _on_nodes(forest, marched_surface), marched_surface)
     elif forest.detail is not None:
         found = _embedded(forest, forest.detail.surface())
     else:
@@ -127,11 +128,17 @@ def _elements_at(forest: ForestArrays, nodes: np.ndarray) -> np.ndarray:
     return element[nodes]
 
 
-def _snapped(forest: ForestArrays, found: SurfaceMesh) -> SurfaceMesh:
-    """The surface with points on cuts where the cuts went, bound to an element on their side."""
+def _snapped(forest: ForestArrays, found: SurfaceMesh, edges_of: SurfaceMesh) -> SurfaceMesh:
+    """The surface with points on cuts where the cuts went, bound to an element on their side.
+
+    Args:
+        forest: The mesh.
+        found: The surface.
+        edges_of: The same surface, its points bound to the ends of their edges.
+    """
     if forest.snap is None:
         return found
-    moves = np.einsum("vn,vnc->vc", found.weights, forest.snap[found.nodes].astype(np.float64))
+    moves = np.einsum("vn,vnc->vc", edges_of.weights, forest.snap[edges_of.nodes].astype(np.float64))
     points = np.flatnonzero(np.abs(moves).max(axis=1) > 0.0)
     if not len(points):
         return found
@@ -147,9 +154,28 @@ def _snapped(forest: ForestArrays, found: SurfaceMesh) -> SurfaceMesh:
     elements = np.where(keys[place] == asked, first[place] // len(pairs), _elements_at(forest, found.nodes[points, 0]))
     x, nodes, weights = found.points.copy(), found.nodes.copy(), found.weights.copy()
     x[points] += moves[points]
+    if forest.phi is not None:
+        rim = points[edges_of.nodes[points, 0] != edges_of.nodes[points, 1]]
+        x[rim] = _on_rim(forest, x[rim], moves[rim])
     nodes[points] = forest.tets[elements]
     weights[points] = barycentric(forest, elements, x[points])
     return replace(found, points=x, nodes=nodes, weights=weights)
+
+
+def _on_rim(forest: ForestArrays, x: np.ndarray, moves: np.ndarray) -> np.ndarray:
+    """Points of the body's surface that were moved to a cut [n, 3], moved along the cut to the body's surface again."""
+    elements, weights = embed(forest, x)
+    corners = forest.tets[elements]
+    values = np.asarray(forest.phi, np.float64)[corners]
+    edges = forest.points[corners[:, 1:]] - forest.points[corners[:, :1]]
+    slope = np.linalg.solve(edges, (values[:, 1:] - values[:, :1])[..., None])[..., 0]
+    across = moves / np.linalg.norm(moves, axis=1, keepdims=True)
+    slope -= np.einsum("nc,nc->n", slope, across)[:, None] * across
+    steep = np.einsum("nc,nc->n", slope, slope)
+    way = np.einsum("nv,nv->n", values, weights) / np.where(steep > 0.0, steep, np.inf)
+    back = way[:, None] * slope
+    far, most = np.linalg.norm(back, axis=1), np.linalg.norm(moves, axis=1)
+    return x - back * np.where(far > most, most / np.where(far > 0.0, far, 1.0), 1.0)[:, None]
 
 
 def _embedded(forest: ForestArrays, found: SurfaceMesh) -> SurfaceMesh:
