@@ -28,6 +28,7 @@ EACH = 5
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--blades", type=int, default=1000, help="number of blades")
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="end after about this time")
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--body", choices=BODIES, help="only this body")
     parser.add_argument("--device", default="cpu", help="cpu or cuda:0")
@@ -37,8 +38,10 @@ def main() -> int:
     names = [args.body] if args.body else list(BODIES)
     done, failed = Counter(), []
     begin, seed = time.perf_counter(), args.first
-    while done.total() < args.blades:
+    while done.total() < args.blades and time.perf_counter() - begin < args.seconds:
         for name in names:
+            if time.perf_counter() - begin > args.seconds:
+                break
             number = 0
             try:
                 blades = RandomBlades(name, seed, args.device)
