@@ -33,7 +33,7 @@ MOST_PASSED = wp.constant(8)
 PASSED = wp.constant(1.0e-4)
 
 
-@wp.kernel(enable_backward=False)
+@unique_kernel()
 def evaluate_sphere(
     # In
     points: wp.array[wp.vec3],
@@ -53,7 +53,7 @@ def box_distance(p: wp.vec3, lower: wp.vec3, upper: wp.vec3):
     return wp.length(wp.max(beyond, wp.vec3(0.0))) + wp.min(wp.max(beyond), 0.0)
 
 
-@wp.kernel(enable_backward=False)
+@unique_kernel()
 def evaluate_box(
     # In
     points: wp.array[wp.vec3],
@@ -66,7 +66,7 @@ def evaluate_box(
     phi[i] = box_distance(points[i], lower, upper)
 
 
-@wp.kernel(enable_backward=False)
+@unique_kernel()
 def evaluate_torus(
     # In
     points: wp.array[wp.vec3],
@@ -83,7 +83,7 @@ def evaluate_torus(
     phi[i] = wp.length(wp.vec2(wp.length(p - height * axis) - major, height)) - minor
 
 
-@wp.kernel(enable_backward=False)
+@unique_kernel()
 def evaluate_capsule(
     # In
     points: wp.array[wp.vec3],
@@ -99,7 +99,7 @@ def evaluate_capsule(
     phi[i] = wp.length(p - along * wp.clamp(wp.dot(p, along) / wp.dot(along, along), 0.0, 1.0)) - radius
 
 
-@wp.kernel(enable_backward=False)
+@unique_kernel()
 def clip_to_box(
     # In
     points: wp.array[wp.vec3],
@@ -210,7 +210,7 @@ def count_windings(
     above[i] = count
 
 
-@wp.kernel(enable_backward=False)
+@unique_kernel()
 def evaluate_voxels(
     # In
     points: wp.array[wp.vec3],
@@ -249,7 +249,7 @@ def evaluate_voxels(
     phi[i] = value
 
 
-@wp.kernel(enable_backward=False)
+@unique_kernel()
 def read_voxels(
     # In
     points: wp.array[wp.vec3],
@@ -268,7 +268,7 @@ def read_voxels(
     labels[i] = int(values[a, b, c])
 
 
-@wp.kernel(enable_backward=False)
+@unique_kernel()
 def combine(
     # In
     outer: float,
@@ -284,7 +284,7 @@ def combine(
     phi[i] = outer * wp.max(outer * first[i], inner * second[i])
 
 
-@wp.kernel(enable_backward=False)
+@unique_kernel()
 def choose_labels(
     # In
     first: wp.array[wp.float32],
@@ -307,7 +307,7 @@ def choose_labels(
         labels[i] = wp.where(first[i] < second[i], a, b)
 
 
-@wp.kernel(enable_backward=False)
+@unique_kernel()
 def clear_labels_outside(
     # In
     phi: wp.array[wp.float32],

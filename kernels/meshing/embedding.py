@@ -10,7 +10,7 @@ from .growth import VOID
 wp.set_module_options({"enable_backward": False})
 
 
-@wp.kernel(enable_backward=False)
+@unique_kernel()
 def move_points(
     # In
     rest: wp.array[wp.vec3],
@@ -28,7 +28,7 @@ def move_points(
     positions[i] = rest[i] + u
 
 
-@wp.kernel(enable_backward=False)
+@unique_kernel()
 def add_triangle_normals(
     # In
     positions: wp.array[wp.vec3],
@@ -44,7 +44,7 @@ def add_triangle_normals(
         wp.atomic_add(normals, tri[n], normal)
 
 
-@wp.kernel(enable_backward=False)
+@unique_kernel()
 def normalize_all(
     # In and out
     normals: wp.array[wp.vec3],
@@ -91,21 +91,6 @@ def descend(
     leaves[i] = wp.where(first_child[element] == VOID, -1, element)
 
 
-@wp.kernel(enable_backward=False)
-def nearest_faces(
-    # In
-    points: wp.array[wp.vec3],
-    mesh: wp.uint64,
-    far: float,
-    # Out
-    faces: wp.array[wp.int32],
-):
-    """The triangle closest to each point, -1 if none is within ``far``."""
-    i = wp.tid()
-    found = wp.mesh_query_point_no_sign(mesh, points[i], far)
-    faces[i] = wp.where(found.result, found.face, -1)
-
-
 @unique_kernel()
 def find_holders(
     # In
@@ -131,13 +116,3 @@ def find_holders(
             best = least
             holder = candidate
     holders[i] = holder
-
-
-@wp.kernel(enable_backward=False)
-def find_distances(points: wp.array[wp.vec3], mesh: wp.uint64, far: float, distances: wp.array[wp.float32]):
-    """The distance of each point from a surface, at most ``far`` [m]."""
-    i = wp.tid()
-    distances[i] = far
-    found = wp.mesh_query_point_no_sign(mesh, points[i], far)
-    if found.result:
-        distances[i] = wp.length(points[i] - wp.mesh_eval_position(mesh, found.face, found.u, found.v))

@@ -17,21 +17,22 @@ ENDS = wp.constant(1.0e-4)
 
 
 @wp.kernel(enable_backward=False)
-def measure_distances(
+def find_nearest(
     # In
     points: wp.array[wp.vec3],
     mesh: wp.uint64,
     far: float,
     # Out
+    faces: wp.array[wp.int32],
     distances: wp.array[wp.float32],
 ):
-    """Distance of each point to the closest triangle, ``far`` if none is closer."""
+    """The triangle closest to each point and its distance; -1 and ``far`` if none is closer than that."""
     i = wp.tid()
     found = wp.mesh_query_point_no_sign(mesh, points[i], far)
-    distance = far
+    faces[i] = wp.where(found.result, found.face, -1)
+    distances[i] = far
     if found.result:
-        distance = wp.length(wp.mesh_eval_position(mesh, found.face, found.u, found.v) - points[i])
-    distances[i] = distance
+        distances[i] = wp.length(wp.mesh_eval_position(mesh, found.face, found.u, found.v) - points[i])
 
 
 @unique_kernel()

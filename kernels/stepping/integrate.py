@@ -12,6 +12,7 @@ from typing import Any
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
+from warp_corot.kernels.modules import unique_kernel
 
 from .keyframes import key_before
 from .pace import DONE, DT, Pace, length_before, time_after
@@ -84,7 +85,7 @@ def count_support_work(elastic: wp.vec3, moved: wp.vec3, i: int, work: wp.array[
         wp.atomic_add(work, count + i % count, wp.abs(added))
 
 
-@wp.kernel(enable_backward=False)
+@unique_kernel()
 def step_symplectic_euler(
     # In
     damping: float,
@@ -146,13 +147,13 @@ def take_in_work(parts: wp.array2d[wp.float64], support_work: wp.array[wp.float6
             parts[part, k] = wp.float64(0.0)
 
 
-@wp.kernel(enable_backward=False)
+@unique_kernel()
 def set_start(pace: Pace, world_starts: wp.array[wp.float64]):
     """Set the starting time of the only world to the present time."""
     world_starts[0] = time_after(pace, 0)
 
 
-@wp.kernel(enable_backward=False)
+@unique_kernel()
 def follow_trajectory(
     # In
     nodes: wp.array[wp.int32],
@@ -221,7 +222,7 @@ def adopt_positions(
         store_node(u, i, p - x)
 
 
-@wp.kernel(enable_backward=False)
+@unique_kernel()
 def reset_nodes(
     # In
     chosen: wp.array[wp.int32],

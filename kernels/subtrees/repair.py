@@ -10,7 +10,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_corot.kernels.corotated.algebraic import FLAT, stretch_stress, turned_stress
+from warp_corot.kernels.corotated.algebraic import corotated_stress
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, rotated_stress
 from warp_corot.kernels.elements.elements import (
     ForestElements,
@@ -22,7 +22,7 @@ from warp_corot.kernels.elements.elements import (
 )
 from warp_corot.kernels.elements.merging import add_four_forces
 from warp_corot.kernels.math.matrices import identity3
-from warp_corot.kernels.math.quaternion import robust_rotation
+from warp_corot.kernels.math.rotation import rotation_out_of_line
 from warp_corot.kernels.modules import unique_kernel
 
 from .left_out import LEAVES, LIST_BLOCK, LISTS, WARP, LeftOut, any_left_out, entry_count, leave, leaves_of_entries
@@ -58,6 +58,11 @@ def scatter_turned(
     scatter_stress(elements, t, rotated_stress(local_gradient(elements, t, u), q, r * q, m, k), f)
 
 
+@wp.func(inline=False)
+def stress_out_of_line(w: wp.mat33, mu: float, lam: float):
+    return corotated_stress(w, mu, lam)
+
+
 @wp.func
 def own_stress(elements: Any, t: int, material: IsotropicMaterial, u: wp.array[wp.vec4]):
     """First Piola-Kirchhoff stress of element t with its own rotation, times Q, for any F."""
@@ -65,19 +70,13 @@ def own_stress(elements: Any, t: int, material: IsotropicMaterial, u: wp.array[w
     w = wp.transpose(q) * local_gradient(elements, t, u)
     m = material.mu[t * material.stride]
     k = material.lam[t * material.stride]
-    p = wp.mat33()
-    trusted = wp.determinant(identity3() + w) > FLAT
-    if trusted:
-        p, trusted = stretch_stress(w, m, k)
-    if not trusted:
-        p = turned_stress(identity3() + w, m, k)
-    return q * p
+    return q * stress_out_of_line(w, m, k)
 
 
 @wp.func
 def root_rotation(roots: ForestElements, s: int, u: wp.array[wp.vec4]):
     q = frame(roots, s)
-    return robust_rotation(q + local_gradient(roots, s, u)) * wp.transpose(q)
+    return rotation_out_of_line(q + local_gradient(roots, s, u)) * wp.transpose(q)
 
 
 # --- by a list ------------------------------------------------------------------------------------------------------
@@ -228,7 +227,7 @@ def turn_listed(
     ``corotated.kept_gradients``."""
     for i in range(listed[0]):
         t = listed[i + 1]
-        turn = robust_rotation(identity3() + local_gradient(elements, t, u))
+        turn = rotation_out_of_line(identity3() + local_gradient(elements, t, u))
         rows = elements.rest_inverse[t]
         root = wp.sqrt(elements.volume[t])
         for n in range(3):

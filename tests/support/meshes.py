@@ -4,12 +4,11 @@ import itertools
 
 import numpy as np
 import trimesh
-import warp as wp
 from bodies import ball, ring, turned_box
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from warp_corot.kernels.meshing.embedding import nearest_faces
+from warp_corot.mesh.surfaces.locating import nearest_faces
 
 PAIRS = list(itertools.combinations(range(4), 2))
 TURN = Rotation.from_rotvec([0.3, 0.5, 0.7]).as_matrix()
@@ -69,15 +68,9 @@ def farthest(surface, points, near=16):
     which in float32 may be next to the nearest, and from those with the nearest centres; so no distance is too small.
     """
     corners = surface.points[surface.triangles]
-    mesh = wp.Mesh(
-        wp.array(surface.points, dtype=wp.vec3, device="cpu"),
-        wp.array(surface.triangles.ravel(), dtype=wp.int32, device="cpu"),
-    )
-    found = wp.empty(len(points), dtype=wp.int32, device="cpu")
-    given = wp.array(points, dtype=wp.vec3, device="cpu")
-    wp.launch(nearest_faces, len(points), [given, mesh.id, 1e15], [found], device="cpu")
+    found = nearest_faces(surface.points, surface.triangles, points, 1e15)
     _, faces = cKDTree(corners.mean(axis=1)).query(points, k=near)
-    faces = np.column_stack([faces, found.numpy()])
+    faces = np.column_stack([faces, found])
     closest = trimesh.triangles.closest_point(corners[faces.ravel()], np.repeat(points, near + 1, axis=0))
     distance = np.linalg.norm(closest.reshape(*faces.shape, 3) - points[:, None], axis=2)
     return distance.min(axis=1).max()

@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import warp as wp
 
-from warp_corot.kernels.meshing import measuring as kernels
 from warp_corot.mesh.surfaces.bodies import boundary_surface
+from warp_corot.mesh.surfaces.locating import distances_from
 
 from .domain import Domain
 from .reference import reference_of, spread_points
@@ -169,7 +168,7 @@ def fidelity(
     if surface is None:
         surface = mesh.surface() if hasattr(mesh, "surface") else boundary_surface(mesh)
     forth = np.abs(np.asarray(domain.phi(spread_points(surface.points, surface.triangles, samples)[0]), np.float64))
-    back = _distances(surface, given.points, domain.device)
+    back = distances_from(surface.points, surface.triangles, given.points, 1.0e15, domain.device).astype(np.float64)
     lost = tuple(n for n in domain.label_names if not (n in _labels(mesh) and mesh.elements_of(n).any()))
     found = Fidelity(
         volume=float(held_volumes(mesh).sum()),
@@ -249,20 +248,6 @@ def smallest_dihedral(mesh: TetForest | TetMesh) -> float:
 
 def _labels(mesh: Any) -> tuple[str, ...]:
     return tuple(getattr(mesh, "label_names", ()))
-
-
-def _distances(surface: SurfaceMesh, points: np.ndarray, device: wp.Device) -> np.ndarray:
-    """Distances of points from a surface [m], float64 [n]."""
-    # About the centre of the surface, because float32 keeps few digits far from zero.
-    middle = surface.points.mean(axis=0)
-    mesh = wp.Mesh(
-        wp.array(surface.points - middle, dtype=wp.vec3, device=device),
-        wp.array(surface.triangles.astype(np.int32).ravel(), dtype=wp.int32, device=device),
-    )
-    placed = wp.array(points - middle, dtype=wp.vec3, device=device)
-    found = wp.empty(len(points), dtype=wp.float32, device=device)
-    wp.launch(kernels.measure_distances, len(points), [placed, mesh.id, 1.0e15], [found], device=device)
-    return found.numpy().astype(np.float64)
 
 
 def _lost_pieces(mesh: Any, points: np.ndarray, piece: np.ndarray, distances: np.ndarray) -> int:

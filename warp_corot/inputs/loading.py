@@ -35,7 +35,7 @@ IMPLICIT = (
     *("implicit.steps", "implicit.multigrid.values", "implicit.multigrid.pattern", "plan.levels", "implicit.residual"),
     *("elements.shared_rows", "implicit.tangent", "implicit.turning", "implicit.multigrid.shared"),
     *("implicit.assembled", "implicit.conjugate_gradients", "implicit.multigrid.sweeps"),
-    *("implicit.multigrid.cycle", "implicit.lagged", "implicit.sums", "implicit.chosen"),
+    *("implicit.multigrid.cycle", "implicit.lagged", "implicit.sums", "implicit.chosen", "implicit.increments"),
 )
 #: Modules for explicit contact with obstacles.
 CONTACT = (

@@ -38,6 +38,7 @@ from warp_corot.inputs.simulation_lock import SIMULATION_LOCK, under_lock
 from warp_corot.kernels.contact.crushed import count_crushed
 from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.stepping.gauge import find_strains
+from warp_corot.kernels.stepping.integrate import STEP_SYMPLECTIC_EULER
 from warp_corot.remesh.online import OnlineRemesh
 from warp_corot.remesh.remeshing import Remeshing
 from warp_corot.solvers import Integrator, SymplecticEuler
@@ -184,7 +185,8 @@ class Simulation(Cutting):
             names = [*CONTACT, *names]
         if not explicit and any(body.discretization.element_kind is ForestElements for body in self.bodies):
             names += IMPLICIT
-        kernels: list[LoadedKernel] = [find_strains(body.discretization.element_kind) for body in self.bodies if chosen]
+        kernels: list[LoadedKernel] = [STEP_SYMPLECTIC_EULER[wp.vec4]] if explicit else []
+        kernels += [find_strains(body.discretization.element_kind) for body in self.bodies if chosen]
         kernels += [count_crushed(body.discretization.element_kind) for body in self.bodies if touches]
         kernels += [kernel for field in self.fields for kernel in field.kernels]
         # Explicit steps need the forces at once, to find their length.

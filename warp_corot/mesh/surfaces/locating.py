@@ -8,7 +8,8 @@ import warp as wp
 
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_numbers
-from warp_corot.kernels.meshing import embedding as kernels
+from warp_corot.kernels.meshing.embedding import find_holders
+from warp_corot.kernels.meshing.measuring import find_nearest
 
 from .boundary import boundary_faces
 
@@ -65,7 +66,7 @@ def embed_in_tets(nodes: np.ndarray, tets: np.ndarray, points: np.ndarray) -> tu
         wp.array(inverse, dtype=wp.mat33d, device=device),
     ]
     found = wp.empty(len(points), dtype=wp.int32, device=device)
-    wp.launch(kernels.find_holders, len(points), inputs, [found], device=device)
+    wp.launch(find_holders, len(points), inputs, [found], device=device)
     elements = found.numpy()
     outside = np.flatnonzero(elements < 0)
     if len(outside):
@@ -76,26 +77,26 @@ def embed_in_tets(nodes: np.ndarray, tets: np.ndarray, points: np.ndarray) -> tu
 
 
 def nearest_faces(nodes: np.ndarray, faces: np.ndarray, points: np.ndarray, far: float) -> np.ndarray:
-    """The triangle closest to each point, int32 [n]."""
-    device = wp.get_device("cpu")
+    """The triangle closest to each point, int32 [n]; -1 if none is closer than ``far`` [m]."""
+    return _nearest(nodes, faces, points, far, "cpu")[0]
+
+
+def distances_from(
+    nodes: np.ndarray, faces: np.ndarray, points: np.ndarray, far: float, device: wp.Device | str = "cpu"
+) -> np.ndarray:
+    """The distance of each point from a surface, at most ``far`` [m], float32 [n]."""
+    middle = nodes.mean(axis=0)  # float32 keeps few digits far from zero
+    return _nearest(nodes - middle, faces, points - middle, far, device)[1]
+
+
+def _nearest(
+    nodes: np.ndarray, faces: np.ndarray, points: np.ndarray, far: float, device: wp.Device | str
+) -> tuple[np.ndarray, np.ndarray]:
     mesh = wp.Mesh(
         wp.array(nodes, dtype=wp.vec3, device=device),
         wp.array(np.ascontiguousarray(faces, dtype=np.int32).ravel(), dtype=wp.int32, device=device),
     )
     given = wp.array(points, dtype=wp.vec3, device=device)
-    closest = wp.empty(len(points), dtype=wp.int32, device=device)
-    wp.launch(kernels.nearest_faces, len(points), [given, mesh.id, far], [closest], device=device)
-    return closest.numpy()
-
-
-def distances_from(nodes: np.ndarray, faces: np.ndarray, points: np.ndarray, far: float) -> np.ndarray:
-    """The distance of each point from a surface, at most ``far`` [m], float32 [n]."""
-    device, middle = wp.get_device("cpu"), nodes.mean(axis=0)
-    mesh = wp.Mesh(
-        wp.array(nodes - middle, dtype=wp.vec3, device=device),
-        wp.array(np.ascontiguousarray(faces, dtype=np.int32).ravel(), dtype=wp.int32, device=device),
-    )
-    given = wp.array(points - middle, dtype=wp.vec3, device=device)
-    found = wp.empty(len(points), dtype=wp.float32, device=device)
-    wp.launch(kernels.find_distances, len(points), [given, mesh.id, far], [found], device=device)
-    return found.numpy()
+    found = [wp.empty(len(points), dtype=dtype, device=device) for dtype in (wp.int32, wp.float32)]
+    wp.launch(find_nearest, len(points), [given, mesh.id, far], found, device=device)
+    return found[0].numpy(), found[1].numpy()
