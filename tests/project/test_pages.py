@@ -11,6 +11,7 @@ import re
 import shutil
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import command_line
@@ -146,6 +147,14 @@ def test_pictures_are_shown_and_thumbnails_are_small():
     pictures = [path for path in folder.rglob("*") if path.suffix in (".png", ".gif")]
     assert [path.name for path in pictures if f"images/{path.relative_to(folder).as_posix()})" not in text] == []
     assert all(path.stat().st_size <= 60_000 for path in pictures if path.parent.name == "gallery")
+
+
+@pytest.mark.parametrize("script", sorted((ROOT / "docs" / "images").glob("*.py")), ids=lambda script: script.stem)
+def test_scripts_that_draw_find_what_they_import(script):
+    lines = ast.walk(ast.parse(script.read_text(encoding="utf-8")))
+    for line in lines:
+        if isinstance(line, ast.ImportFrom) and line.module.startswith("warp_corot"):
+            assert all(hasattr(import_module(line.module), each.name) for each in line.names), ast.unparse(line)
 
 
 def test_the_reference_has_every_public_name():

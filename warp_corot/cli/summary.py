@@ -92,11 +92,15 @@ def wall_time() -> str:
     return f"{sum(WATCH.parts.values()):.2f} s: {', '.join(parts)}"
 
 
+def names_of(bodies: Sequence[RunBody]) -> str:
+    """The names of the first bodies, and the number of others."""
+    left = len(bodies) - NAMED
+    return ", ".join(body.subject.name for body in bodies[:NAMED]) + (f" and {left} more" if left > 0 else "")
+
+
 def title_of(bodies: Sequence[RunBody], gravity: Sequence[float]) -> str:
     """The title of a picture: the bodies, and what happens to them under this gravity [m/s^2]."""
-    names = [body.subject.name for body in bodies]
-    left = len(names) - NAMED
-    words = [", ".join(names[:NAMED]) + (f" and {left} more" if left > 0 else "")]
+    words = [names_of(bodies)]
     if not any(body.remesh for body in bodies):
         words.append(f"{sum(len(body.soft.mesh.tets) for body in bodies):,} elements")
     young = np.unique(np.concatenate([np.ravel(body.soft.material.isotropic.young) for body in bodies]))

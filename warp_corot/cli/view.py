@@ -24,7 +24,7 @@ from .loading import ramp_of
 from .pressing import press_patches
 from .run_file import bodies_of, write_run
 from .run_setup import RunSetup, set_up
-from .summary import title_of
+from .summary import names_of
 
 if TYPE_CHECKING:
     from warp_corot.simulation.simulation import Simulation
@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
             own=[body.subject.skin or body.subject.surface for body in ready.bodies],
             made=lambda sim: _carry_over(ready, asked[0], sim),
             run_file=lambda sim: run_text(asked, sim),
-            title=title_of(ready.bodies, ready.sim.gravity),
+            title=names_of(ready.bodies),  # stiffness and weight may change on the page
         )
     try:
         print(f"the page is at {page.address} (Ctrl-C ends it)", flush=True)
