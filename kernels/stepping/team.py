@@ -7,7 +7,8 @@ with others, which wait in ``serve``.
 import warp as wp
 
 from warp_corot.kernels.elements.lanes import headers, on_cpu
-from warp_corot.kernels.modules import unique_kernel
+
+wp.set_module_options({"enable_backward": False, "extra_build_options": headers("team")})
 
 
 @wp.func_native(
@@ -31,13 +32,13 @@ def run_phases(team: wp.uint64, table: wp.uint64): ...
 def serve_parts(team: wp.uint64, part: int): ...
 
 
-@unique_kernel(native=headers("team"))
+@wp.kernel(enable_backward=False)
 def run(team: wp.uint64, table: wp.uint64):
     """Compute all parts of a table, phase by phase."""
     run_phases(team, table)
 
 
-@unique_kernel(native=headers("team"))
+@wp.kernel(enable_backward=False)
 def serve(team: wp.uint64, part: int):
     """Compute parts of the team's work until none has come for some milliseconds; then the thread must read a byte from
     the pipe.

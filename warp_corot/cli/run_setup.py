@@ -15,6 +15,7 @@ from warp_corot.inputs.loading import (
     CONTACT,
     EXPLICIT,
     IMPLICIT,
+    IMPLICIT_ON_FORESTS,
     MESHING,
     STEPS,
     STEPS_ON_CPU,
@@ -136,7 +137,7 @@ def _modules(bodies: Sequence[RunBody], touches: bool, chooses: bool, device: wp
     explicit = not INTEGRATORS[integrator_name(bodies[0].args)].is_implicit
     names += [*BODY, *(CONTACT if touches and explicit else ()), *(STEPS_ON_CPU if device.is_cpu else STEPS)]
     if meshed and not touches and chooses and may_choose(bodies):
-        return [*names, *IMPLICIT]
+        return [*names, *IMPLICIT, *IMPLICIT_ON_FORESTS]
     return [*names, *(EXPLICIT if explicit else ())]
 
 

@@ -26,16 +26,19 @@ MESHING = (
     *("meshing.coarsening", "meshing.surface_points", "meshing.leaves"),
 )
 #: Modules for bodies, for all steps, and for explicit ones whose length is chosen.
-BODY = ("plan.lists", "plan.batches", "elements.general_cpu", "stepping.conditions")
+BODY = ("plan.lists", "plan.batches", "stepping.team", "elements.general_cpu", "stepping.conditions")
 STEPS = ("stepping.integrate", "stepping.balance", "stepping.pace")
 STEPS_ON_CPU = ("subtrees.repair", *STEPS, "stepping.subnormals")
 EXPLICIT = ("stepping.lanczos", "stepping.gauge")
-#: Modules for implicit steps of bodies on forests.
+#: Modules for implicit steps, and for those of bodies on forests.
 IMPLICIT = (
-    *("implicit.steps", "implicit.multigrid.values", "implicit.multigrid.pattern", "plan.levels", "implicit.residual"),
-    *("elements.shared_rows", "implicit.tangent", "implicit.turning", "implicit.multigrid.shared"),
-    *("implicit.assembled", "implicit.conjugate_gradients", "implicit.multigrid.sweeps"),
-    *("implicit.multigrid.cycle", "implicit.lagged", "implicit.sums", "implicit.chosen", "implicit.increments"),
+    *("implicit.steps", "implicit.residual", "elements.shared_rows", "implicit.tangent", "implicit.turning"),
+    *("implicit.conjugate_gradients", "implicit.sums", "implicit.increments", "elements.reproducible"),
+)
+IMPLICIT_ON_FORESTS = (
+    *("implicit.multigrid.values", "implicit.multigrid.pattern", "plan.levels", "implicit.multigrid.shared"),
+    *("implicit.assembled", "implicit.multigrid.sweeps", "implicit.multigrid.cycle", "implicit.lagged"),
+    "implicit.chosen",
 )
 #: Modules for explicit contact with obstacles.
 CONTACT = (

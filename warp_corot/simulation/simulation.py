@@ -27,6 +27,7 @@ from warp_corot.inputs.loading import (
     CONTACT,
     EXPLICIT,
     IMPLICIT,
+    IMPLICIT_ON_FORESTS,
     STEPS,
     STEPS_ON_CPU,
     LoadedKernel,
@@ -180,11 +181,11 @@ class Simulation(Cutting):
     def _load_kernels(self, touches: bool) -> list[Future]:
         """Load the kernels that steps are known to launch, several modules at a time; returns those to wait for."""
         explicit, chosen, on_cpu = not self.integrator.is_implicit, self.integrator.dt is None, self.device.is_cpu
-        names = [*(STEPS_ON_CPU if on_cpu else STEPS), *(EXPLICIT if chosen else ())]
+        names = [*(STEPS_ON_CPU if on_cpu else STEPS), *(EXPLICIT if chosen else ()), *(() if explicit else IMPLICIT)]
         if touches and explicit:
             names = [*CONTACT, *names]
         if not explicit and any(body.discretization.element_kind is ForestElements for body in self.bodies):
-            names += IMPLICIT
+            names += IMPLICIT_ON_FORESTS
         kernels: list[LoadedKernel] = [STEP_SYMPLECTIC_EULER[wp.vec4]] if explicit else []
         kernels += [find_strains(body.discretization.element_kind) for body in self.bodies if chosen]
         kernels += [count_crushed(body.discretization.element_kind) for body in self.bodies if touches]

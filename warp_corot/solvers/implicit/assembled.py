@@ -220,7 +220,7 @@ class AssembledSolve:
 
     @property
     def kernels(self) -> list[LoadedKernel]:
-        """Kernels that it launches, beside those of ``loading.IMPLICIT``."""
+        """Kernels that it launches, beside those of ``loading.IMPLICIT_ON_FORESTS``."""
         found: list[LoadedKernel] = [kernel for body in self._bodies for kernel in body.leaves.kernels]
         return [*found, (kernels.solve, self._block)]
 

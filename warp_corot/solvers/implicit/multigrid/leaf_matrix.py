@@ -67,7 +67,7 @@ class LeafMatrix:
 
     @property
     def kernels(self) -> list[wp.Kernel]:
-        """Kernels that it launches, beside those of ``loading.IMPLICIT``."""
+        """Kernels that it launches, beside those of ``loading.IMPLICIT_ON_FORESTS``."""
         found = [self._write_frames, gather_leaves_on_cpu if self.device.is_cpu else values.gather_leaves]
         return found if self._members is None else [*found, shared.write_rows(self._members.law)]
 
