@@ -42,3 +42,17 @@ def add_kept_product() -> wp.Kernel:
     """y += K p; a thread is eight elements."""
     call = "corot::add_kept_product(units, block, count, material, u, f)"
     return scatter_lanes(call, GeneralElements, KeptGradients, wp.int32, headers("tangents8"))
+
+
+@wp.func
+def keep_gradients(elements: GeneralElements, t: int, turn: wp.mat33, gradients: wp.array[wp.vec4]):
+    """Write the gradients of one element that has turned."""
+    rows = elements.rest_inverse[t]
+    root = wp.sqrt(elements.volume[t])
+    for n in range(3):
+        h = root * (turn * wp.vec3(rows[n, 0], rows[n, 1], rows[n, 2]))
+        for axis in range(3):
+            place = 18 * (t / 8) + 2 * (3 * n + axis) + (t % 8) / 4
+            four = gradients[place]
+            four[t % 4] = h[axis]
+            gradients[place] = four

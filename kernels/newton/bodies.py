@@ -25,3 +25,15 @@ def move_bodies(
         rotation = wp.quat_from_axis_angle(wp.normalize(spin), angle) * rotation
     centre = wp.transform_point(pose, body_com[b]) + elapsed * wp.spatial_top(twist)
     moved[b] = wp.transform(centre - wp.quat_rotate(rotation, body_com[b]), rotation)
+
+
+@wp.kernel(enable_backward=False)
+def add_wrenches(
+    # In
+    share: float,
+    a: wp.array[wp.spatial_vector],
+    # In and out
+    b: wp.array[wp.spatial_vector],
+):
+    i = wp.tid()
+    b[i] = b[i] + share * a[i]

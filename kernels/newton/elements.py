@@ -9,7 +9,7 @@ import functools
 
 import warp as wp
 
-from warp_corot.kernels.elements.constitutive import IsotropicMaterial, rotated_stress
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, rotated_stress, symmetric
 from warp_corot.kernels.elements.elements import GeneralElements, load_node, scatter_stress
 from warp_corot.kernels.elements.general_cuda import (
     PosedElements,
@@ -52,6 +52,13 @@ def corotated_stress(f: wp.mat33, r: wp.mat33, mu: float, lam: float):
 
 
 @wp.func
+def viscous_product(f: wp.mat33, rate_of_f: wp.mat33):
+    """F (dE/dt + tr(dE/dt) I) with Green's strain E."""
+    rate = symmetric(wp.transpose(f) * rate_of_f)
+    return f * (rate + wp.trace(rate) * identity3())
+
+
+@wp.func
 def viscous_stress(f: wp.mat33, rate_of_f: wp.mat33, k: float):
     """Viscous stress for k_damp [Pa s]: with Green's strain E, P = 3 / tr(F^T F) F (k dE/dt + k tr(dE/dt) I).
 
@@ -59,10 +66,7 @@ def viscous_stress(f: wp.mat33, rate_of_f: wp.mat33, k: float):
     k (dF/dt + tr(dF/dt) I) of Newton's solvers, which also damps rotation (and, in their form, translation). The factor
     keeps it from growing with the stretch.
     """
-    product = wp.transpose(f) * rate_of_f
-    rate = 0.5 * (product + wp.transpose(product))
-    scale = 3.0 * k / wp.max(wp.ddot(f, f), 1.0e-12)
-    return scale * (f * (rate + wp.trace(rate) * identity3()))
+    return (3.0 * k / wp.max(wp.ddot(f, f), 1.0e-12)) * viscous_product(f, rate_of_f)
 
 
 @wp.func

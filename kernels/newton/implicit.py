@@ -1,9 +1,9 @@
 """Implicit steps of a Newton model: the motions d of particles, and of the bodies that these touch, within a step.
 
-With v the velocities, f the forces on particles, and those of links at the end, backward Euler with one
+With v the velocities, f the forces on particles, and those of rows at the end, backward Euler with one
 linearisation of the elastic forces is
 
-    (M (1/dt^2 + damping/dt) + K + D/dt) d = M v/dt + f + links(d),      v_after = d/dt.
+    (M (1/dt^2 + damping/dt) + K + D/dt) d = M v/dt + f + rows(d),      v_after = d/dt.
 
 K is R K R^T with each element's rotation where free pieces are turned as they will turn in the step (``turning``). The
 forces f are those there plus K times the way to there. D is the viscosity midway, where a turn has none.
@@ -12,13 +12,18 @@ A vector has an entry for each particle, and two for each body, of its translati
 held, or moves as prescribed, are not free.
 """
 
+import functools
+from typing import Any
+
 import warp as wp
 
-from warp_corot.kernels.elements.elements import GeneralElements, add_force, load_node, store_node
+from warp_corot.kernels.corotated.kept_gradients import keep_gradients
+from warp_corot.kernels.elements.constitutive import hooke, symmetric
+from warp_corot.kernels.elements.elements import GeneralElements, load_node, store_node
 from warp_corot.kernels.math.rotation import byers_xu
 from warp_corot.kernels.stepping.integrate import is_finite
 
-from .elements import difference_gradient
+from .elements import difference_gradient, viscous_product
 from .particles import ACTIVE
 from .worlds import BAD_INPUT, SOUND, UNSTABLE, place_of
 
@@ -27,23 +32,20 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Linearised:
-    """Elements where a step is linearised; stiffness and viscosity times rest volumes."""
+    """Elements where a step is linearised."""
 
-    nodes: wp.array[wp.vec4i]  # [T] entries
-    rest_inverse: wp.array[wp.mat33]  # [T] [1/m]
+    mu: wp.array[wp.float32]  # [T] [Pa]
+    lam: wp.array[wp.float32]  # [T] [Pa]
     rotation: wp.array[wp.mat33]  # [T]
-    gradient: wp.array[wp.mat33]  # [T] F; empty where nothing is viscous
-    mu: wp.array[wp.float32]  # [T] [N m]
-    lam: wp.array[wp.float32]  # [T] [N m]
-    viscosity: wp.array[wp.float32]  # [T] over dt and |F|^2 / 3 [N m]
+    gradient: wp.array[wp.mat33]  # [T] F midway; empty where nothing is viscous
+    viscosity: wp.array[wp.float32]  # [T] over dt and |F|^2 / 3 [Pa]
+    kept: wp.array[wp.vec4]  # turned gradients, see ``kept_gradients``; empty on CUDA
 
 
 @wp.kernel(enable_backward=False)
 def linearise(
     # In
     elements: GeneralElements,
-    mu: wp.array[wp.float32],
-    lam: wp.array[wp.float32],
     k_damp: wp.array[wp.float32],
     dt: float,
     q: wp.array[wp.vec3],
@@ -53,71 +55,31 @@ def linearise(
 ):
     t = wp.tid()
     f = difference_gradient(elements, t, turned)
-    volume = elements.volume[t]
-    made.rotation[t] = byers_xu(f)
-    made.mu[t] = volume * mu[t]
-    made.lam[t] = volume * lam[t]
-    if made.gradient.shape[0] == made.rotation.shape[0]:
+    r = byers_xu(f)
+    made.rotation[t] = r
+    if made.kept.shape[0] > 0:
+        keep_gradients(elements, t, r, made.kept)
+    if made.gradient.shape[0] > 0:
         f = 0.5 * (f + difference_gradient(elements, t, q))
         made.gradient[t] = f
-        made.viscosity[t] = 3.0 * volume * k_damp[t] / (dt * wp.max(wp.ddot(f, f), 1.0e-12))
+        made.viscosity[t] = 3.0 * k_damp[t] / (dt * wp.max(wp.ddot(f, f), 1.0e-12))
 
 
-@wp.kernel(enable_backward=False)
-def add_element_products(made: Linearised, x: wp.array[wp.vec4], y: wp.array[wp.vec4]):
-    """y += (K + D/dt) x."""
-    t = wp.tid()
-    nodes = made.nodes[t]
-    x0 = load_node(x, nodes[0])
-    edges = wp.matrix_from_cols(load_node(x, nodes[1]) - x0, load_node(x, nodes[2]) - x0, load_node(x, nodes[3]) - x0)
-    inverse = made.rest_inverse[t]
-    change = edges * inverse
-    r = made.rotation[t]
-    a = wp.transpose(r) * change
-    unit = wp.identity(3, dtype=wp.float32)
-    p = r * (made.mu[t] * (a + wp.transpose(a)) + made.lam[t] * wp.trace(a) * unit)
-    if made.gradient.shape[0] == made.rotation.shape[0]:
-        f = made.gradient[t]
-        b = wp.transpose(f) * change
-        p += made.viscosity[t] * (f * (0.5 * (b + wp.transpose(b)) + wp.trace(b) * unit))
-    forces = p * wp.transpose(inverse)
-    f1 = wp.vec3(forces[0, 0], forces[1, 0], forces[2, 0])
-    f2 = wp.vec3(forces[0, 1], forces[1, 1], forces[2, 1])
-    f3 = wp.vec3(forces[0, 2], forces[1, 2], forces[2, 2])
-    add_force(y, nodes[0], -(f1 + f2 + f3))
-    add_force(y, nodes[1], f1)
-    add_force(y, nodes[2], f2)
-    add_force(y, nodes[3], f3)
+@functools.cache
+def linearised(is_elastic: bool, is_viscous: bool) -> wp.Function:
+    """The differential for ``elements.stiffness_products``, of one or both parts."""
 
+    @wp.func
+    def linearised(elements: Any, t: int, made: Linearised, u: wp.array[wp.vec4], dg: wp.mat33):
+        p = wp.mat33()
+        if wp.static(is_elastic):
+            r = made.rotation[t]
+            p += r * hooke(symmetric(wp.transpose(r) * dg), made.mu[t], made.lam[t])
+        if wp.static(is_viscous):
+            p += made.viscosity[t] * viscous_product(made.gradient[t], dg)
+        return p
 
-@wp.kernel(enable_backward=False)
-def add_element_blocks(made: Linearised, blocks: wp.array[wp.mat33]):
-    """Add the 3x3 blocks of K + D/dt on the diagonal."""
-    t = wp.tid()
-    inverse = made.rest_inverse[t]
-    nodes = made.nodes[t]
-    g1 = inverse[0]
-    g2 = inverse[1]
-    g3 = inverse[2]
-    r = made.rotation[t]
-    unit = wp.identity(3, dtype=wp.float32)
-    for k in range(4):
-        g = -(g1 + g2 + g3)
-        if k == 1:
-            g = g1
-        elif k == 2:
-            g = g2
-        elif k == 3:
-            g = g3
-        square = wp.dot(g, g)
-        turned = r * g
-        block = (made.mu[t] * square) * unit + (made.mu[t] + made.lam[t]) * wp.outer(turned, turned)
-        if made.gradient.shape[0] == made.rotation.shape[0]:
-            f = made.gradient[t]
-            stretched = f * g
-            of_rates = (0.5 * square) * (f * wp.transpose(f)) + 1.5 * wp.outer(stretched, stretched)
-            block += made.viscosity[t] * of_rates
-        wp.atomic_add(blocks, nodes[k], block)
+    return linearised
 
 
 @wp.kernel(enable_backward=False)
@@ -235,11 +197,11 @@ def finish_rows(
     # In and out
     y: wp.array[wp.vec4],
 ):
-    """y += M x at free entries, y = x at others."""
+    """y += M x at free entries, y = 0 at others."""
     k = wp.tid()
-    v = load_node(x, k)
+    v = wp.vec3()
     if free[k] > 0.0:
-        v = load_node(y, k) + inertia[k] * v
+        v = load_node(y, k) + inertia[k] * load_node(x, k)
     store_node(y, k, v)
 
 
@@ -253,43 +215,11 @@ def finish_blocks(free: wp.array[wp.float32], inertia: wp.array[wp.mat33], block
 
 
 @wp.kernel(enable_backward=False)
-def find_residual(
-    # In
-    free: wp.array[wp.float32],
-    b: wp.array[wp.vec4],
-    product: wp.array[wp.vec4],
-    # In and out
-    r: wp.array[wp.vec4],
-):
-    """r += b - A d at free entries, where r has the forces of links; r = 0 at others."""
+def clear_held(free: wp.array[wp.float32], a: wp.array[wp.vec4]):
+    """a = 0 at entries that are not free."""
     k = wp.tid()
-    rest = wp.vec3()
-    if free[k] > 0.0:
-        rest = load_node(r, k) + load_node(b, k) - load_node(product, k)
-    store_node(r, k, rest)
-
-
-@wp.kernel(enable_backward=False)
-def judge_round(
-    # In
-    iterations: wp.array[wp.int32],
-    most: int,
-    # In and out
-    rounds: wp.array[wp.int32],
-    total: wp.array[wp.int32],
-    # Out
-    going: wp.array[wp.int32],
-):
-    """Solve again unless the last solve had next to nothing to do; count iterations [worlds]."""
-    again = int(0)
-    for world in range(iterations.shape[0]):
-        total[world] = total[world] + iterations[world]
-        if iterations[world] > 1:
-            again = 1
-    rounds[0] = rounds[0] + 1
-    if rounds[0] >= most:
-        again = 0
-    going[0] = again
+    if free[k] == 0.0:
+        store_node(a, k, wp.vec3())
 
 
 @wp.kernel(enable_backward=False)

@@ -5,19 +5,28 @@ A vertex at the distance d from a triangle has the energy k (margin - d)^2 / 2 w
 positions only, and so adds no energy. Edges that are closest at their ends repeat this: their force is multiplied by a
 measure from 0 there to 1 in the middle. Surfaces of tetrahedra have an inside: there d becomes negative if the vertex
 or edge belongs to another body, so that what has sunk in is pushed out. Cloth has two sides. Loads are those of
-``touching``; a pair counts twice, because its two sides may move against one another. What is closer at
+``rows``; a pair counts twice, because its two sides may move against one another. What is closer at
 first than the margin has this distance as its margin, so that nothing starts with a push: between bodies no less than
 a fraction of the margin, to keep cloth apart.
 """
 
 import warp as wp
 
-from warp_corot.kernels.elements.elements import add_force, load_node
+from warp_corot.kernels.contact.closest import on_triangle
 
-from .closest import closest_weights
-from .contacts import ContactLaw, contact_force
-from .mobility import Mobility
-from .particles import ACTIVE
+from .explicit_rows import Mobility, contact_force
+from .rows import (
+    ContactLaw,
+    Particles,
+    add_load,
+    add_to_particles,
+    gap_of,
+    inverse_mass_of,
+    no_row,
+    pull_of,
+    share_of,
+    sum_of,
+)
 from .worlds import TOO_MANY_PAIRS, place_of
 
 wp.set_module_options({"enable_backward": False})
@@ -57,17 +66,6 @@ class PairLists:
     edges: wp.array[wp.int32]  # of each pair both edges
 
 
-@wp.struct
-class Pair:
-    """Two points that touch; x = sum of weights x_j is their difference, from the second to the first."""
-
-    nodes: wp.vec4i
-    weights: wp.vec4
-    normal: wp.vec3  # from the second to the first
-    gap: float  # distance less the margin [m]
-    measure: float
-
-
 @wp.func
 def outward_normal(surfaces: Surfaces, t: int, q: wp.array[wp.vec3]):
     """Normal of a triangle of tetrahedra, times twice its area."""
@@ -86,40 +84,37 @@ def margin_of(surfaces: Surfaces, i: int, j: int, margin: float, first: float):
 
 
 @wp.func
-def vertex_pair(surfaces: Surfaces, v: int, t: int, margin: float, q: wp.array[wp.vec3]):
+def vertex_row(surfaces: Surfaces, v: int, t: int, margin: float, q: wp.array[wp.vec3]):
     """A vertex and a triangle."""
-    pair = Pair()
-    pair.gap = 1.0
-    pair.measure = 1.0
+    row = no_row()
     i = surfaces.triangles[t, 0]
     j = surfaces.triangles[t, 1]
     k = surfaces.triangles[t, 2]
     if surfaces.exposed[v] == 0:
-        return pair
-    w = closest_weights(q[i], q[j], q[k], q[v])
+        return row
+    w = on_triangle(q[v], q[i], q[j], q[k])
     apart = q[v] - (w[0] * q[i] + w[1] * q[j] + w[2] * q[k])
     distance = wp.length(apart)
-    pair.nodes = wp.vec4i(v, i, j, k)
-    pair.weights = wp.vec4(1.0, -w[0], -w[1], -w[2])
     out = outward_normal(surfaces, t, q)
     sunk = bool(False)
     if surfaces.facing[t] != 0.0 and surfaces.part[v] != surfaces.part[i]:
         sunk = wp.dot(apart, out) < 0.0
         if sunk and wp.min(w) < INSIDE:
             # Beside the triangle: another one faces the vertex.
-            return pair
+            return row
+    row.measure = 1.0
+    row.nodes = wp.vec4i(v, i, j, k)
+    row.weights = wp.vec4(1.0, -w[0], -w[1], -w[2])
     x = surfaces.rest
-    w = closest_weights(x[i], x[j], x[k], x[v])
+    w = on_triangle(x[v], x[i], x[j], x[k])
     first = wp.length(x[v] - w[0] * x[i] - w[1] * x[j] - w[2] * x[k])
+    row.offset = margin_of(surfaces, v, i, margin, first)
+    row.normal = wp.normalize(out)
     if distance > COINCIDENT:
-        pair.normal = apart / distance
-    else:
-        pair.normal = wp.normalize(out)
+        row.normal = apart / distance
     if sunk:
-        pair.normal = -pair.normal
-        distance = -distance
-    pair.gap = distance - margin_of(surfaces, v, i, margin, first)
-    return pair
+        row.normal = -row.normal
+    return row
 
 
 @wp.func
@@ -134,11 +129,9 @@ def points_out(surfaces: Surfaces, e: int, direction: wp.vec3, q: wp.array[wp.ve
 
 
 @wp.func
-def edge_pair(surfaces: Surfaces, e: int, other: int, margin: float, parallel: float, q: wp.array[wp.vec3]):
+def edge_row(surfaces: Surfaces, e: int, other: int, margin: float, parallel: float, q: wp.array[wp.vec3]):
     """Two edges."""
-    pair = Pair()
-    pair.gap = 1.0
-    pair.measure = 1.0
+    row = no_row()
     i = surfaces.edges[e, 2]
     j = surfaces.edges[e, 3]
     k = surfaces.edges[other, 2]
@@ -149,75 +142,20 @@ def edge_pair(surfaces: Surfaces, e: int, other: int, margin: float, parallel: f
     apart = q[i] + s * (q[j] - q[i]) - q[k] - t * (q[m] - q[k])
     distance = wp.length(apart)
     if distance < COINCIDENT:
-        return pair
-    pair.measure = 16.0 * s * (1.0 - s) * t * (1.0 - t)
-    pair.nodes = wp.vec4i(i, j, k, m)
-    pair.weights = wp.vec4(1.0 - s, s, t - 1.0, -t)
-    pair.normal = apart / distance
+        return row
+    row.measure = 16.0 * s * (1.0 - s) * t * (1.0 - t)
+    row.nodes = wp.vec4i(i, j, k, m)
+    row.weights = wp.vec4(1.0 - s, s, t - 1.0, -t)
+    row.normal = apart / distance
     if surfaces.part[i] != surfaces.part[k]:
-        one = points_out(surfaces, e, -pair.normal, q)
-        two = points_out(surfaces, other, pair.normal, q)
+        one = points_out(surfaces, e, -row.normal, q)
+        two = points_out(surfaces, other, row.normal, q)
         if one + two < 0.0 and one <= 0.0 and two <= 0.0:
-            pair.normal = -pair.normal
-            distance = -distance
+            row.normal = -row.normal
     x = surfaces.rest
     first = wp.closest_point_edge_edge(x[i], x[j], x[k], x[m], parallel)[2]
-    pair.gap = distance - margin_of(surfaces, i, k, margin, first)
-    return pair
-
-
-@wp.func
-def add_pair_load(pair: Pair, load: wp.array[wp.float32]):
-    for n in range(4):
-        weight = 2.0 * pair.measure * wp.abs(pair.weights[n])
-        if weight > 0.0:
-            wp.atomic_add(load, pair.nodes[n], weight)
-
-
-@wp.func
-def add_pair_force(
-    pair: Pair,
-    law: ContactLaw,
-    dt: float,
-    load: wp.array[wp.float32],
-    flags: wp.array[wp.int32],
-    world: wp.array[wp.int32],
-    inverse_mass: wp.array[wp.float32],
-    qd: wp.array[wp.vec3],
-    gravity: wp.array[wp.vec3],
-    before: wp.array[wp.vec4],
-    f: wp.array[wp.vec4],
-):
-    velocity = wp.vec3()
-    pull = wp.vec3()
-    most = float(1.0)
-    m = Mobility()
-    for n in range(4):
-        i = pair.nodes[n]
-        weight = pair.weights[n]
-        velocity += weight * qd[i]
-        if weight != 0.0:
-            most = wp.max(most, load[i])
-            if (flags[i] & ACTIVE) != 0 and inverse_mass[i] > 0.0:
-                m.particle = wp.max(m.particle, inverse_mass[i] * load[i])
-                g = gravity[place_of(world[i], gravity.shape[0])]
-                pull += weight * dt * (inverse_mass[i] * load_node(before, i) + g)
-    stiffness = law.stiffness * wp.min(1.0, law.crowd / most)
-    force = pair.measure * contact_force(
-        pair.normal,
-        pair.gap,
-        velocity,
-        stiffness,
-        law.damping,
-        law.friction_slope,
-        law.friction,
-        pull,
-        m,
-        0.0,
-        dt,
-    )
-    for n in range(4):
-        add_force(f, pair.nodes[n], pair.weights[n] * force)
+    row.offset = margin_of(surfaces, i, k, margin, first)
+    return row
 
 
 @wp.func
@@ -242,18 +180,26 @@ def pair_count(lists: PairLists, n: int):
 
 
 @wp.func
-def listed_pair(surfaces: Surfaces, lists: PairLists, n: int, c: int, q: wp.array[wp.vec3]):
-    """The c-th pair in the rows of vertex n and edge n. Two edges are listed twice: the second has a gap above zero."""
+def listed_row(surfaces: Surfaces, lists: PairLists, law: ContactLaw, n: int, c: int, q: wp.array[wp.vec3]):
+    """The c-th pair in the rows of vertex n and edge n, if it touches, and its gap. Two edges are listed twice."""
     in_triangles = row_size(lists.triangle_starts, lists.triangle_counts, n)
+    row = no_row()
     if c < in_triangles:
         t = lists.triangles[2 * (lists.triangle_starts[n] + c) + 1]
-        return vertex_pair(surfaces, n, t, lists.margin, q)
-    other = lists.edges[2 * (lists.edge_starts[n] + c - in_triangles) + 1]
-    if n < other:
-        return edge_pair(surfaces, n, other, lists.margin, lists.parallel, q)
-    pair = Pair()
-    pair.gap = 1.0
-    return pair
+        row = vertex_row(surfaces, n, t, lists.margin, q)
+    else:
+        other = lists.edges[2 * (lists.edge_starts[n] + c - in_triangles) + 1]
+        if n < other:
+            row = edge_row(surfaces, n, other, lists.margin, lists.parallel, q)
+    gap = float(1.0)
+    if row.nodes[0] >= 0:
+        gap = gap_of(row, sum_of(row, q))
+    row.counted = 2.0 * row.measure
+    row.stiffness = law.stiffness
+    row.damping = law.damping
+    row.slope = law.slope
+    row.friction = law.friction
+    return row, gap
 
 
 @wp.kernel(enable_backward=False)
@@ -261,6 +207,7 @@ def count_pair_loads(
     # In
     surfaces: Surfaces,
     lists: PairLists,
+    law: ContactLaw,
     q: wp.array[wp.vec3],
     # In and out
     load: wp.array[wp.float32],
@@ -268,9 +215,9 @@ def count_pair_loads(
     """Add twice the weights of all pairs that touch."""
     n = wp.tid()
     for c in range(pair_count(lists, n)):
-        pair = listed_pair(surfaces, lists, n, c, q)
-        if pair.gap < 0.0:
-            add_pair_load(pair, load)
+        row, gap = listed_row(surfaces, lists, law, n, c, q)
+        if gap < 0.0:
+            add_load(row, load)
 
 
 @wp.kernel(enable_backward=False)
@@ -281,12 +228,9 @@ def scatter_pairs(
     law: ContactLaw,
     dt: float,
     load: wp.array[wp.float32],
-    flags: wp.array[wp.int32],
-    world: wp.array[wp.int32],
-    inverse_mass: wp.array[wp.float32],
+    particles: Particles,
     q: wp.array[wp.vec3],
     qd: wp.array[wp.vec3],
-    gravity: wp.array[wp.vec3],
     before: wp.array[wp.vec4],
     # Out
     f: wp.array[wp.vec4],
@@ -295,11 +239,16 @@ def scatter_pairs(
     """Forces of all pairs. A row that holds fewer pairs than were found marks the world."""
     n = wp.tid()
     if is_cut_short(lists.triangle_starts, lists.triangle_counts, n):
-        wp.atomic_max(trouble, place_of(world[n], trouble.shape[0]), TOO_MANY_PAIRS)
+        wp.atomic_max(trouble, place_of(particles.world[n], trouble.shape[0]), TOO_MANY_PAIRS)
     if is_cut_short(lists.edge_starts, lists.edge_counts, n):
         i = surfaces.edges[n, 2]
-        wp.atomic_max(trouble, place_of(world[i], trouble.shape[0]), TOO_MANY_PAIRS)
+        wp.atomic_max(trouble, place_of(particles.world[i], trouble.shape[0]), TOO_MANY_PAIRS)
     for c in range(pair_count(lists, n)):
-        pair = listed_pair(surfaces, lists, n, c, q)
-        if pair.gap < 0.0:
-            add_pair_force(pair, law, dt, load, flags, world, inverse_mass, qd, gravity, before, f)
+        row, gap = listed_row(surfaces, lists, law, n, c, q)
+        if gap < 0.0:
+            m = Mobility()
+            m.particle = inverse_mass_of(row, load, particles)
+            share = share_of(row, load, law.crowd)
+            pull = pull_of(row, dt, particles, before)
+            force = contact_force(row, gap, 0.0, sum_of(row, qd), pull, m, share, dt)
+            add_to_particles(row, force, f)

@@ -9,7 +9,7 @@ import warp as wp
 from warp_corot.kernels.elements.elements import load_node, store_node
 from warp_corot.kernels.stepping.integrate import is_finite
 
-from .worlds import BAD_INPUT, SOUND, UNSTABLE, place_of
+from .worlds import BAD_INPUT, NO_ROW, SOUND, UNSTABLE, place_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -52,6 +52,9 @@ def gather_particles(
     world: wp.array[wp.int32],
     rest: wp.array[wp.vec4],
     wrong: int,
+    # In and out
+    before: wp.array[wp.float32],
+    after: wp.array[wp.float32],
     # Out
     x: wp.array[wp.vec4],
     u: wp.array[wp.vec4],
@@ -61,8 +64,15 @@ def gather_particles(
     trouble: wp.array[wp.int32],
 ):
     """Gather positions, displacements from ``rest``, and copies into the arrays that are not empty; forces start with
-    the external ones [N]. A value that is not finite marks its world."""
+    the external ones [N]. A value that is not finite marks its world.
+
+    Args:
+        before, after: What particles had in the last step, which is replaced, and have in this one; see ``records``.
+    """
     i = wp.tid()
+    if after.shape[0] > 0:
+        before[i] = after[i]
+        after[i] = NO_ROW
     at = q[i]
     velocity = qd[i]
     force = external[i]

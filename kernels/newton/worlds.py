@@ -18,6 +18,9 @@ TOO_MANY_PAIRS = wp.constant(3)
 BAD_INPUT = wp.constant(4)
 REPORTS = 5
 
+#: What particles had in the last step, if not ``rows.Row.ease``: nobody knows; no row.
+UNKNOWN_BEFORE, NO_ROW = wp.constant(-2.0), wp.constant(-1.0)
+
 #: Newton's default for the largest speed of a particle [m/s]. Beyond it the state is a failure.
 RUNAWAY = wp.constant(1.0e5)
 
@@ -26,20 +29,6 @@ RUNAWAY = wp.constant(1.0e5)
 def place_of(world: int, count: int):
     """A world's entry in an array over worlds; the last one stands for no world."""
     return wp.where(world < 0, count - 1, world)
-
-
-@wp.kernel(enable_backward=False)
-def check_contact_count(
-    # In
-    count: wp.array[wp.int32],
-    most: int,
-    # Out
-    trouble: wp.array[wp.int32],
-):
-    """There are more contacts than the buffer holds: the worlds of the missing ones are unknown, so none is stepped."""
-    w = wp.tid()
-    if count[0] > most:
-        wp.atomic_max(trouble, w, TOO_MANY_CONTACTS)
 
 
 @wp.kernel(enable_backward=False)

@@ -11,6 +11,7 @@ from typing import Any
 import warp as wp
 
 from warp_corot.kernels.corotated.algebraic import corotated_stress
+from warp_corot.kernels.corotated.kept_gradients import keep_gradients
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, rotated_stress
 from warp_corot.kernels.elements.elements import (
     ForestElements,
@@ -228,15 +229,7 @@ def turn_listed(
     for i in range(listed[0]):
         t = listed[i + 1]
         turn = rotation_out_of_line(identity3() + local_gradient(elements, t, u))
-        rows = elements.rest_inverse[t]
-        root = wp.sqrt(elements.volume[t])
-        for n in range(3):
-            h = root * (turn * wp.vec3(rows[n, 0], rows[n, 1], rows[n, 2]))
-            for axis in range(3):
-                place = 18 * (t / 8) + 2 * (3 * n + axis) + (t % 8) / 4
-                four = gradients[place]
-                four[t % 4] = h[axis]
-                gradients[place] = four
+        keep_gradients(elements, t, turn, gradients)
     listed[0] = 0
 
 

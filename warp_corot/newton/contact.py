@@ -1,4 +1,4 @@
-"""Contacts of soft bodies with rigid bodies and with one another, and attachments to rigid bodies.
+"""Contacts of soft bodies with rigid bodies and with one another, and attachments to rigid bodies, as rows.
 
 Newton's pipeline finds the contacts: at particles, and on request at points of edges and triangles. Without these, a
 body smaller than the particles' spacing sinks in between them. Particles' radii should exceed a body's motion in a
@@ -8,48 +8,37 @@ contacts are found late, start with deep penetration, and can launch the body.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 import warp as wp
 
+from warp_corot.elasticity.structs import Kept
 from warp_corot.errors import InputError
-from warp_corot.kernels.newton.attachments import scatter_attachments
-from warp_corot.kernels.newton.contacts import ContactLaw, scatter_soft_contacts
+from warp_corot.kernels.newton import explicit_rows, records, rows
 from warp_corot.kernels.newton.pairs import PairLists
-from warp_corot.kernels.newton.worlds import check_contact_count
-from warp_corot.kernels.newton.yielding import gather_attachments, gather_soft_contacts, solve_yielding
+from warp_corot.kernels.newton.worlds import NO_ROW, UNKNOWN_BEFORE
 
 from .arguments import Step
 from .library import newton
 from .pairs import SoftPairs
-from .touching import CROWD, Loads, MeshRecords, has_surfaces
 
 #: ``newton.BodyFlags.KINEMATIC``, for bodies with prescribed motion.
 KINEMATIC = int(newton.BodyFlags.KINEMATIC)
-
 #: Number of iterations that find which contacts still hold after bodies have yielded.
 ROUNDS = 4
-
-
-class Touch(NamedTuple):
-    """The input of contact's launches in a substep.
-
-    Attributes:
-        state: The state of the particles.
-        of_bodies: The state of the bodies.
-        contacts: Contacts between particles and shapes; None if there can be none.
-        records: Their records; empty without contacts.
-        law: The law of contact.
-        dt: The length of the substep [s].
-    """
-
-    state: newton.State
-    of_bodies: newton.State
-    contacts: newton.Contacts | None
-    records: list[wp.array]
-    law: ContactLaw
-    dt: float
+#: The stiffness of all contacts that share a particle is at most this many times the stiffness of one.
+CROWD = 4.0
+#: Speed at which what was found too late is pushed out [m/s].
+RECOVERY = 0.25
+#: A model's names of the fields of kernels' structs.
+PARTICLES = {"inverse_mass": "particle_inv_mass", "gravity": "gravity"}
+PARTICLES |= {name: f"particle_{name}" for name in ("flags", "world")}
+SHAPES = {"body": "shape_body", "pose": "shape_transform", "scale": "shape_scale", "mesh": "shape_source_ptr"}
+SHAPES |= {"margin": "shape_margin", "stiffness": "shape_material_ke", "damping": "shape_material_kd"}
+SHAPES |= {"slope": "shape_material_kf", "friction": "shape_material_mu"}
+ATTACHMENTS = {name: name for name in ("particle", "body", "stiffness", "damping", "enabled")} | {"point": "body_point"}
+ATTACHMENTS = {name: f"attachment_particle_body_{given}" for name, given in ATTACHMENTS.items()}
 
 
 class Contacts:
@@ -58,40 +47,58 @@ class Contacts:
     Args:
         model: The model.
         margin: Distance at which soft bodies begin to push one another [m]; None: they do not.
+
+    Attributes:
+        rows: The rows of a step: those of its contacts with shapes, and then of attachments.
+        contact_count, count: Number of contacts, and of all rows.
+        law: The law of contact of a step.
+        reactions: Wrenches of the particles on the bodies in the last substep [N, N m], spatial_vector [B].
+        crowded: Whether contacts of edges and triangles have occurred.
     """
 
     def __init__(self, model: newton.Model, margin: float | None = None):
-        self.model = model
-        self.device = model.device
-        bodies = model.body_count
-        self._no_poses = wp.empty(0, dtype=wp.transform, device=self.device)
-        self._no_twists = wp.empty(0, dtype=wp.spatial_vector, device=self.device)
-        self._no_points = wp.empty(0, dtype=wp.vec3, device=self.device)
-        self._no_inertia = wp.empty(0, dtype=wp.mat33, device=self.device)
-        self._no_flags = wp.empty(0, dtype=wp.int32, device=self.device)
-        self._no_wrenches = wp.empty(0, dtype=wp.spatial_vectorf, device=self.device)
+        self.model, self.device, bodies = model, model.device, model.body_count
         #: Contacts of soft bodies with one another, if they have any.
         self.pairs = None if margin is None else SoftPairs(model, margin)
-        self._loads, self._records = Loads(model), MeshRecords(model)
-        #: Number of places at which each body is touched or held, int32 [B].
-        self._places = wp.zeros(bodies, dtype=wp.int32, device=self.device)
+        self.rows = wp.zeros(0, dtype=rows.Row, device=self.device)
+        self.contact_count = self.count = 0
+        self._lists: PairLists | None = None
+        #: Loads of particles; not needed if every contact has a particle of its own.
+        self._no_load = wp.empty(0, dtype=wp.float32, device=self.device)
+        self._load = self._no_load
         #: Forces on particles before contact forces [N], which friction uses.
         self._before = wp.empty(model.particle_count, dtype=wp.vec4, device=self.device)
-        self._no_numbers = wp.empty(0, dtype=wp.float32, device=self.device)
+        self._no_wrenches = wp.empty(0, dtype=wp.spatial_vectorf, device=self.device)
+        self._places = wp.zeros(bodies, dtype=wp.int32, device=self.device)
         #: Curvature and slope of springs on bodies, and how far these yield to them [m]; and twists, [B].
         self._curvature = wp.zeros(bodies, dtype=wp.spatial_matrixf, device=self.device)
-        self._slope = wp.zeros(bodies, dtype=wp.spatial_vectorf, device=self.device)
-        self._yielding = wp.zeros(bodies, dtype=wp.spatial_vectorf, device=self.device)
-        #: Wrenches of the particles on the bodies in the last substep [N, N m], spatial_vector [B].
-        self.reactions = wp.zeros(bodies, dtype=wp.spatial_vectorf, device=self.device)
-        #: Whether contacts of edges and triangles have occurred.
+        self._slope, self._yielding, self.reactions = (
+            wp.zeros(bodies, dtype=wp.spatial_vectorf, device=self.device) for _ in range(3)
+        )
+        self._bodies = Kept(self._made_bodies)
+        self._particles, self._shapes = _FromModel(rows.Particles, PARTICLES), _FromModel(records.Shapes, SHAPES)
+        self._attachments = _FromModel(records.Attachments, ATTACHMENTS)
+        self._nearest = wp.empty(0, dtype=wp.int64, device=self.device)
+        #: What particles had in the last step and have in this one, float32 [P]; see ``kernels.newton.rows``.
+        self._before_step, self._in_step = (
+            wp.zeros(model.particle_count, dtype=wp.float32, device=self.device) for _ in range(2)
+        )
+        self._last_dt = 0.0
+        self.forget()
         self.crowded = False
         self.refresh()
 
+    def forget(self) -> None:
+        """Forget which particles had contacts: these have jumped, or it was not asked."""
+        self._before_step.fill_(float(UNKNOWN_BEFORE))
+        self._in_step.fill_(float(NO_ROW))
+
     def has_surfaces(self, contacts: newton.Contacts) -> bool:
         """Whether contacts may be of edges and triangles while their stiffness is not counted yet."""
-        there = contacts.soft_contact_max and self.model.shape_count
-        return bool(there) and not self.crowded and has_surfaces(self.model, contacts)
+        if self.crowded or not self._can_touch(contacts):
+            return False
+        # This attribute is private to Newton. Without it, every model with triangles may have such records.
+        return bool(getattr(contacts, "_enable_rigid_soft_full_surface_contact", self.model.tri_count > 0))
 
     def refresh(self) -> None:
         """Check that attachments can be stepped, and find the stiffness of attachments and contacts.
@@ -135,10 +142,41 @@ class Contacts:
         touched &= (model.body_flags.numpy() & int(newton.BodyFlags.KINEMATIC)) == 0
         return float(model.body_inv_mass.numpy()[touched].max(initial=0.0))
 
-    def check_count(self, contacts: newton.Contacts | None, trouble: wp.array) -> None:
-        if contacts is not None and contacts.soft_contact_max:
-            inputs = [contacts.soft_contact_count, contacts.soft_contact_max]
-            wp.launch(check_contact_count, dim=len(trouble), inputs=inputs, outputs=[trouble], device=self.device)
+    # --- launches ----------------------------------------------------------------------------------------------------
+
+    def begin(self, step: Step, trouble: wp.array) -> None:
+        """Launch the rows of a step.
+
+        Args:
+            step: The step.
+            trouble: Failures of worlds.
+        """
+        model, state, found = self.model, step.state_in, step.contacts
+        touches = found is not None and self._can_touch(found)
+        self.contact_count = int(found.soft_contact_max) if found is not None and touches else 0
+        self.count = self.contact_count + int(model.attachment_particle_body_count)
+        self._lists = None if self.pairs is None or found is None else self.pairs.lists_of(found)
+        self.law = law = rows.ContactLaw()
+        law.stiffness, law.damping, law.slope = model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_kf
+        law.friction, law.adhesion, law.crowd = model.soft_contact_mu, model.particle_adhesion, CROWD
+        law.recovery = RECOVERY
+        if self._last_dt and not self.contact_count:
+            self.forget()
+        eased, self._last_dt = RECOVERY * self._last_dt, step.dt if self.contact_count else 0.0
+        if not self.count:
+            return
+        if len(self.rows) != self.count:
+            self.rows = wp.zeros(self.count, dtype=rows.Row, device=self.device)
+        those = self._records_of(found, step) if found is not None and touches else records.Records()
+        inputs = [self.contact_count, law, those, self._shapes.of(model), self._attachments.of(model)]
+        inputs += [model.particle_flags, model.particle_radius, state.particle_q, state.body_q]
+        inputs += [eased, self._before_step, self._in_step]
+        self._launch(records.fill_rows, self.count, inputs, [self.rows, trouble])
+
+    @property
+    def memory(self) -> list[wp.array]:
+        """What particles had in the last step and have in this one; empty without contacts."""
+        return [self._before_step, self._in_step] if self.contact_count else [self._no_load, self._no_load]
 
     def add_forces(
         self, substep: Step, of_bodies: newton.State, f: wp.array, trouble: wp.array, share: float = 1.0
@@ -153,123 +191,105 @@ class Contacts:
             trouble: Failures of worlds.
             share: The substep's share of the step, in the mean of ``reported``.
         """
-        state, _, _, contacts, dt, reported = substep
-        model = self.model
-        touching = self.touching(contacts)
-        attached = model.attachment_particle_body_count
-        law = self.law()
-        pairs = None if self.pairs is None or contacts is None else self.pairs.lists_of(contacts)
-        if touching is not None or pairs is not None:
+        model, state, dt, reported = self.model, substep.state_in, substep.dt, substep.reported
+        if self.contact_count or self._lists is not None:
             wp.copy(self._before, f)
-        records = self._records_of(touching, state, of_bodies)
-        touch = Touch(state, of_bodies, touching, records, law, dt)
-        self._count_loads(touch, pairs)
-        bodies = self._find_bodies(touch)
-        if touching is not None:
-            rows = self._no_wrenches if reported is None else reported
-            inputs = [law, dt, *self._found(touch), touching.soft_contact_body_vel]
-            inputs += [touching.soft_contact_normal, *self.shapes(), model.shape_material_kd]
-            inputs += [model.shape_material_kf, model.shape_material_mu, model.particle_flags, model.particle_world]
-            inputs += [model.particle_radius, model.particle_inv_mass, state.particle_q, state.particle_qd]
-            inputs += [model.gravity, self._before, *bodies, share, touching.rigid_contact_max]
-            self._launch(scatter_soft_contacts, touching.soft_contact_max, inputs, [f, self.reactions, rows])
-        if pairs is not None and self.pairs is not None:
-            self.pairs.add_forces(pairs, state, law, dt, self._loads.array, self._before, f, trouble)
-        if attached:
-            inputs = [dt, *self.attachments(), model.attachment_particle_body_damping]
-            inputs += [model.attachment_particle_body_enabled, model.particle_inv_mass]
-            inputs += [state.particle_q, state.particle_qd, *bodies]
-            self._launch(scatter_attachments, attached, inputs, [f, self.reactions])
-
-    def touching(self, contacts: newton.Contacts | None) -> newton.Contacts | None:
-        """Contacts between particles and shapes, if there can be any."""
-        return contacts if contacts is not None and contacts.soft_contact_max and self.model.shape_count else None
-
-    def count_loads(self, step: Step, of_bodies: newton.State) -> tuple[list[wp.array], wp.array]:
-        """Records of contacts with shapes, and the loads of particles that share them, float32 [P] or empty."""
-        touching = self.touching(step.contacts)
-        records = self._records_of(touching, step.state_in, of_bodies)
-        self._count_loads(Touch(step.state_in, of_bodies, touching, records, self.law(), step.dt), None)
-        return records, self._loads.array
-
-    def _records_of(
-        self, touching: newton.Contacts | None, state: newton.State, of_bodies: newton.State
-    ) -> list[wp.array]:
-        if touching is None:
-            return []
-        poses = of_bodies.body_q if self.model.body_count else self._no_poses
-        return self._records.records_of(touching, state.particle_q, poses)
-
-    def _count_loads(self, touch: Touch, pairs: PairLists | None) -> None:
-        """Find how many contacts share each particle, if several may."""
-        touching, q = touch.contacts, touch.state.particle_q
-        self._loads.begin((touching is not None and self.crowded) or pairs is not None)
-        if touching is not None and len(self._loads.array):
-            poses = touch.of_bodies.body_q if self.model.body_count else self._no_poses
-            shapes = [self.model.shape_body, self._margins(), self.model.particle_adhesion]
-            self._loads.count(touching, touch.records, shapes, q, poses)
-        if pairs is not None and self.pairs is not None:
-            self.pairs.count_loads(pairs, q, self._loads.array)
-
-    def _find_bodies(self, touch: Touch) -> list:
-        """The arguments of forces that describe bodies."""
-        model, of_bodies = self.model, touch.of_bodies
+        load, bodies = self.count_loads(state, of_bodies), self.bodies(of_bodies)
+        particles = self._particles.of(model)
+        motion = [state.particle_q, state.particle_qd, self._before]
         if model.body_count:
             self.reactions.zero_()
-            if touch.contacts is not None or model.attachment_particle_body_count:
-                self._find_yielding(touch)
-            masses = [model.body_flags, model.body_inv_mass, model.body_inv_inertia, self._places]
-            bodies = [of_bodies.body_q, of_bodies.body_qd, model.body_com, self._yielding]
-        else:
-            masses = [self._no_flags, self._no_numbers, self._no_inertia, self._places]
-            bodies = [self._no_poses, self._no_twists, self._no_points, self._no_twists]
-        return [KINEMATIC, *masses, *bodies]
+        if self.count:
+            if model.body_count:
+                self._find_yielding(state, bodies, load, dt)
+            first = substep.contacts.rigid_contact_max if substep.contacts is not None else 0
+            inputs = [dt, share, self.law, self.contact_count, first, self.rows, load, particles, bodies, *motion]
+            outputs = [f, self.reactions, self._no_wrenches if reported is None else reported]
+            self._launch(explicit_rows.scatter_rows, self.count, inputs, outputs)
+        if self._lists is not None and self.pairs is not None:
+            self.pairs.add_forces(self._lists, self.law, dt, load, [particles, *motion], f, trouble)
 
-    def _find_yielding(self, touch: Touch) -> None:
+    def count_loads(self, state: newton.State, of_bodies: newton.State) -> wp.array:
+        """Launch the count of how many contacts share each particle, if several may: float32 [P], or empty."""
+        if not ((self.contact_count and self.crowded) or self._lists is not None):
+            return self._no_load
+        if not len(self._load):
+            self._load = wp.empty(self.model.particle_count, dtype=wp.float32, device=self.device)
+        self._load.zero_()
+        if self.contact_count:
+            inputs = [self.law.adhesion, self.rows, self.bodies(of_bodies), state.particle_q]
+            self._launch(rows.count_loads, self.contact_count, inputs, [self._load])
+        if self._lists is not None and self.pairs is not None:
+            self.pairs.count_loads(self._lists, self.law, state.particle_q, self._load)
+        return self._load
+
+    def bodies(self, of_bodies: newton.State) -> rows.Bodies:
+        """Bodies in a state."""
+        return self._bodies(of_bodies.body_q, of_bodies.body_qd)
+
+    def _find_yielding(self, state: newton.State, bodies: rows.Bodies, load: wp.array, dt: float) -> None:
         """Find how far bodies yield to springs, and at how many places they are touched."""
-        model, touching, of_bodies, q = self.model, touch.contacts, touch.of_bodies, touch.state.particle_q
         self._places.zero_()
-        outputs = [self._places, self._curvature, self._slope]
-        bodies = [of_bodies.body_q, model.body_com]
-        for number in range(ROUNDS if touching is not None else 1):
-            if touching is not None:
-                inputs = [touch.law, *self._found(touch), touching.soft_contact_normal, *self.shapes()]
-                inputs += [model.particle_flags, model.particle_radius, q, KINEMATIC, model.body_flags, *bodies]
-                inputs += [self._yielding, number]
-                self._launch(gather_soft_contacts, touching.soft_contact_max, inputs, outputs)
-            if model.attachment_particle_body_count:
-                inputs = [*self.attachments(), model.attachment_particle_body_enabled, q, *bodies, number]
-                self._launch(gather_attachments, model.attachment_particle_body_count, inputs, outputs)
-            inputs = [touch.dt, KINEMATIC, model.body_flags, model.body_inv_mass, model.body_inv_inertia]
-            inputs += [of_bodies.body_q]
-            self._launch(solve_yielding, model.body_count, inputs, [self._curvature, self._slope, self._yielding])
+        for number in range(ROUNDS if self.contact_count else 1):
+            inputs = [number, self.law, self.rows, load, state.particle_q, bodies]
+            self._launch(explicit_rows.gather_springs, self.count, inputs, [self._curvature, self._slope])
+            inputs = [dt, bodies, self._curvature, self._slope]
+            self._launch(explicit_rows.solve_yielding, self.model.body_count, inputs, [])
 
-    def _found(self, touch: Touch) -> list[wp.array]:
-        touching = touch.contacts
-        assert touching is not None
-        return [*touch.records, self._loads.array, touching.soft_contact_shape, touching.soft_contact_body_pos]
+    def _can_touch(self, contacts: newton.Contacts) -> bool:
+        return bool(contacts.soft_contact_max and self.model.shape_count)
 
-    def shapes(self) -> list[wp.array]:
-        return [self.model.shape_body, self._margins(), self.model.shape_material_ke]
+    def _records_of(self, contacts: newton.Contacts, step: Step) -> records.Records:
+        made = records.Records()
+        made.count, made.particle = contacts.soft_contact_count, contacts.soft_contact_particle
+        made.nodes, made.weights = contacts.soft_contact_indices, contacts.soft_contact_barycentric
+        made.shape, made.place = contacts.soft_contact_shape, contacts.soft_contact_body_pos
+        made.velocity, made.normal = contacts.soft_contact_body_vel, contacts.soft_contact_normal
+        # These attributes are private to Newton; without features there are no records of meshes.
+        features = getattr(contacts, "_soft_contact_mesh_features", None)
+        data = getattr(contacts, "_soft_contact_mesh_data", None)
+        if features is None or data is None:
+            return made
+        made.features, made.vertices = features, len(data.rigid_features[0])
+        rivals = made.vertices + self.model.edge_count
+        if len(self._nearest) != rivals:
+            self._nearest = wp.empty(rivals, dtype=wp.int64, device=self.device)
+        self._nearest.fill_(int(records.FAR))
+        made.nearest = self._nearest
+        inputs = [self._shapes.of(self.model), step.state_in.particle_q, step.state_in.body_q, made]
+        self._launch(records.find_nearest, self.contact_count, inputs, [])
+        return made
 
-    def law(self) -> ContactLaw:
-        law, model = ContactLaw(), self.model
-        law.stiffness, law.damping = model.soft_contact_ke, model.soft_contact_kd
-        law.friction_slope, law.friction = model.soft_contact_kf, model.soft_contact_mu
-        law.adhesion, law.crowd = model.particle_adhesion, CROWD
-        return law
-
-    def _margins(self) -> wp.array:
-        return self._no_numbers if self.model.shape_margin is None else self.model.shape_margin
-
-    def attachments(self) -> list[wp.array]:
-        model = self.model
-        return [
-            model.attachment_particle_body_particle,
-            model.attachment_particle_body_body,
-            model.attachment_particle_body_body_point,
-            model.attachment_particle_body_stiffness,
-        ]
+    def _made_bodies(self, q: wp.array | None, qd: wp.array | None) -> rows.Bodies:
+        made, model = rows.Bodies(), self.model
+        made.fixed_flag, made.places, made.yielding = KINEMATIC, self._places, self._yielding
+        if model.body_count:
+            made.flags, made.inverse_mass, made.com = model.body_flags, model.body_inv_mass, model.body_com
+            made.inverse_inertia, made.q, made.qd = model.body_inv_inertia, q, qd
+        return made
 
     def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+
+
+class _FromModel(Kept[Any]):
+    """A struct of a model's arrays, by the names of its fields; those that the model lacks stay empty.
+
+    Args:
+        struct: The struct.
+        names: The model's name of each field.
+    """
+
+    def __init__(self, struct: Any, names: dict[str, str]):
+        super().__init__(self._made)
+        self._struct_type, self._names = struct, names
+
+    def of(self, model: newton.Model) -> Any:
+        return self(*(getattr(model, name) for name in self._names.values()))
+
+    def _made(self, *arrays: wp.array | None) -> Any:
+        made = self._struct_type()
+        for field, array in zip(self._names, arrays, strict=True):
+            if array is not None:
+                setattr(made, field, array)
+        return made

@@ -11,8 +11,8 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from warp_corot.errors import InputError
-from warp_corot.kernels.newton.contacts import ContactLaw
 from warp_corot.kernels.newton.pairs import PairLists, Surfaces, count_pair_loads, scatter_pairs
+from warp_corot.kernels.newton.rows import ContactLaw
 
 from .library import newton
 
@@ -72,27 +72,15 @@ class SoftPairs:
         lists.edges = data.edge_colliding_edges
         return lists
 
-    def count_loads(self, lists: PairLists, q: wp.array, load: wp.array) -> None:
+    def count_loads(self, lists: PairLists, law: ContactLaw, q: wp.array, load: wp.array) -> None:
         """Add to the loads of particles, float32 [P]."""
-        self._launch(count_pair_loads, [self._surfaces, lists, q], [load])
+        self._launch(count_pair_loads, [self._surfaces, lists, law, q], [load])
 
     def add_forces(
-        self,
-        lists: PairLists,
-        state: newton.State,
-        law: ContactLaw,
-        dt: float,
-        load: wp.array,
-        before: wp.array,
-        f: wp.array,
-        trouble: wp.array,
+        self, lists: PairLists, law: ContactLaw, dt: float, load: wp.array, motion: list, f: wp.array, trouble: wp.array
     ) -> None:
-        """Add forces [N] to f, vec4 [P]; ``before`` holds those before contacts'."""
-        model = self.model
-        inputs = [self._surfaces, lists, law, dt, load]
-        inputs += [model.particle_flags, model.particle_world, model.particle_inv_mass]
-        inputs += [state.particle_q, state.particle_qd, model.gravity, before]
-        self._launch(scatter_pairs, inputs, [f, trouble])
+        """Add forces [N] to f, vec4 [P]; ``motion``: particles, positions, velocities, and forces before contacts'."""
+        self._launch(scatter_pairs, [self._surfaces, lists, law, dt, load, *motion], [f, trouble])
 
     def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
         dim = max(self.model.particle_count, self.model.edge_count)

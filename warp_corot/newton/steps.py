@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
 from types import SimpleNamespace
 
 import warp as wp
 
 from warp_corot.kernels.newton import particles as kernels
 from warp_corot.kernels.newton import worlds as worlds
-from warp_corot.kernels.newton.bodies import move_bodies
-from warp_corot.kernels.newton.contacts import add_wrenches
+from warp_corot.kernels.newton.bodies import add_wrenches, move_bodies
 from warp_corot.solvers.subnormals import FlushedSubnormals
 
 from .arguments import Step
@@ -17,12 +17,15 @@ from .contact import Contacts
 from .following import RETRIES, Following
 from .library import newton
 from .others import Others
+from .replays import Replays
 from .report import Report
 from .state import attribute_of
 from .tetrahedra import Tetrahedra
 
 #: A particle speed [m/s] that is a failure for any step.
 RUNAWAY = float(worlds.RUNAWAY)
+#: Fewer substeps are not recorded.
+FEW = 8
 
 
 class Steps:
@@ -44,6 +47,8 @@ class Steps:
         self.damping = damping
         self.device = model.device
         self._flushed = FlushedSubnormals(self.device)
+        #: Bodies that others move go on in each substep, and other solvers may allocate memory.
+        self._can_replay = not others.has_particles and not model.body_count
         p, b = model.particle_count, model.body_count
         self._f = wp.zeros(p, dtype=wp.vec4, device=self.device)
         self.report = Report(model)
@@ -51,6 +56,7 @@ class Steps:
         types = (wp.vec3, wp.vec3)
         self._particles_before = [wp.empty(p, dtype=dtype, device=self.device) for dtype in types]
         self._nothing = [wp.empty(0, dtype=dtype, device=self.device) for dtype in types]
+        self._no_numbers = wp.empty(0, dtype=wp.float32, device=self.device)
         kept = p if others.has_particles else 0
         self._kept_particles = [wp.empty(kept, dtype=dtype, device=self.device) for dtype in types]
         self._body_f = wp.empty(b, dtype=wp.spatial_vector, device=self.device)
@@ -95,31 +101,48 @@ class Steps:
         if step.reported is not None:
             step.reported.zero_()
         before = self._launch_begin(step)
-        now = state_in
-        number, left, done, each = 0, count, 0.0, dt / count
+        replays = Replays(self.device)
+        now, number, left, done, each = state_in, 0, count, 0.0, dt / count
         while left:
-            copied = number == 0 and before[0] is self._particles_before
-            self._launch_gathering(now, state_in, number, copied)
-            if following is not None and following.is_due():
-                following.measure(now, dt - done, each)
-                if self.device.is_cpu and not self.device.is_capturing:
-                    left = following.count_for(dt - done)
-                    each = (dt - done) / left
-            substep = step._replace(state_in=now, dt=each)
-            self._launch_forces(substep, state_in, each / dt, done)
-            fastest = RUNAWAY if following is None else min(RUNAWAY, following.reach / each)
-            self._launch_motion(substep, fastest)
-            self._launch_undoing(state_out, *before)
+            due = following is not None and following.is_due()
+            if number and not due and left >= FEW and self._can_replay:
+                # All substeps until the next measurement are alike.
+                replays.launch(each, partial(self._launch_substep, step, now, each, before, following))
+            else:
+                copied = number == 0 and before[0] is self._particles_before
+                self._launch_gathering(now, state_in, number, copied)
+                if due and following is not None:
+                    following.measure(now, dt - done, each)
+                    if self.device.is_cpu and not self.device.is_capturing:
+                        left = following.count_for(dt - done)
+                        each = (dt - done) / left
+                self._launch_gathered(step, now, each, before, following, done)
             number, left, done = number + 1, left - 1, done + each
-            if not left:
-                self.tetrahedra.write_attributes(state_out)
             now = state_out
+        self.tetrahedra.write_attributes(state_out)
         if following is not None:
             following.made = number
         self.report.launch()
 
+    def _launch_substep(
+        self, step: Step, now: newton.State, each: float, before: tuple, following: Following | None
+    ) -> None:
+        """Launch a substep that is not the first one."""
+        self._launch_gathering(now, step.state_in, 1, False)
+        self._launch_gathered(step, now, each, before, following, 0.0)
+
+    def _launch_gathered(
+        self, step: Step, now: newton.State, each: float, before: tuple, following: Following | None, done: float
+    ) -> None:
+        """Launch a substep from gathered positions, after some time of the step [s]."""
+        substep = step._replace(state_in=now, dt=each)
+        self._launch_forces(substep, step.state_in, each / step.dt, done)
+        self._launch_motion(substep, RUNAWAY if following is None else min(RUNAWAY, following.reach / each))
+        self._launch_undoing(step.state_out, *before)
+
     def reset(self, state: newton.State, mask: wp.array, flags: int) -> None:
         model, bits = self.model, newton.StateFlags
+        self.contacts.forget()
         if flags & bits.PARTICLE:
             wanted = [int(bool(flags & bit)) for bit in (bits.PARTICLE_Q, bits.PARTICLE_QD)]
             inputs = [mask, model.particle_world, *wanted, model.particle_q, model.particle_qd]
@@ -158,7 +181,11 @@ class Steps:
             if _overlap(bodies, [state_out.body_q, state_out.body_qd]):
                 _copy(self._bodies_before, bodies)
                 bodies = self._bodies_before
-        self.contacts.check_count(step.contacts, self.report.trouble)
+        self.contacts.begin(step, self.report.trouble)
+        self._activation = model.tet_activations
+        if step.control is not None and step.control.tet_activations is not None:
+            self._activation = step.control.tet_activations
+        self.tetrahedra.look_at(self._activation)
         return particles, bodies
 
     def _bring_back(self, state_in: newton.State, state_out: newton.State) -> None:
@@ -179,7 +206,8 @@ class Steps:
         wrong = int(worlds.UNSTABLE if number else worlds.BAD_INPUT)
         inputs = [now.particle_q, now.particle_qd, state_in.particle_f, model.particle_world, tets.rest, wrong]
         copies = self._particles_before if copied else self._nothing
-        outputs = [tets.x, tets.u, self._f, *copies, self.report.trouble]
+        memory = self.contacts.memory if number == 0 else [self._no_numbers, self._no_numbers]
+        outputs = [*memory, tets.x, tets.u, self._f, *copies, self.report.trouble]
         self._launch(kernels.gather_particles, model.particle_count, inputs, outputs)
 
     def _bodies_after(self, done: float, substep: Step, given: newton.State) -> newton.State:
@@ -206,11 +234,8 @@ class Steps:
             share: The substep's share of the step.
             done: Time of the step that has passed [s].
         """
-        model, others, control = self.model, self.others, substep.control
-        activation = model.tet_activations
-        if control is not None and control.tet_activations is not None:
-            activation = control.tet_activations
-        self.tetrahedra.add_forces(substep.state_in, activation, self._f)
+        model, others = self.model, self.others
+        self.tetrahedra.add_forces(substep.state_in, self._activation, self._f)
         of_bodies = self._bodies_after(done, substep, given)
         self.contacts.add_forces(substep, of_bodies, self._f, self.report.trouble, share)
         if others.has_bodies:

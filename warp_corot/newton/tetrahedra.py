@@ -72,7 +72,7 @@ class Tetrahedra:
         self.mu, self.lam = self._materials[:2]
         self.groups: list[ForestGroup] = forest_groups(model, self.tets, rotation_level)
         #: Whether the elastic kernel of single tetrahedra includes activation and damping.
-        self._fused = self.device.is_cuda
+        self._fused, self._may_be_active = self.device.is_cuda, True
         single = np.ones(model.tet_count, bool)
         for group in self.groups:
             single[group.tets] = False
@@ -123,13 +123,17 @@ class Tetrahedra:
         self._seen = present
         return True
 
+    def look_at(self, activation: wp.array) -> None:
+        """Check, at the beginning of a step, whether elements may be active."""
+        # On the CPU a check costs less than launches; a recorded step must handle all cases.
+        looks = self.device.is_cpu and not self.device.is_capturing
+        self._may_be_active = not looks or bool(activation.numpy().any())
+
     def add_forces(self, state: newton.State, activation: wp.array, f: wp.array) -> None:
         """Add the forces [N] for a state, whose positions have been gathered, to f, vec4 [P]."""
         q, v = state.particle_q, state.particle_qd
         self._add_forces(self.x, self.u, activation, v, f)
-        # On the CPU a check costs less than a launch; a recorded step must handle all cases.
-        looks = self.device.is_cpu and not self.device.is_capturing and not self.damped
-        if looks and not activation.numpy().any():
+        if not (self.damped or self._may_be_active):
             return
         for part in self._others:
             inputs = [self.elements, *self._materials[2:], part.ids, part.first, part.count, activation, q, v]

@@ -1,0 +1,304 @@
+"""Forces of rows in explicit steps.
+
+Forces on particles and bodies are opposite, so momentum is exchanged exactly. Damping and friction do not reverse a
+relative velocity within a step, however light particle and body are: the part of the law that would do so is left out.
+A body that is touched in n places counts in each as a piece of 1/n of its mass and inertia, which bounds their total
+effect; particles in many contacts likewise, see ``rows``. If every contact has a particle of its own, one that touches
+several shapes is still slowed down by each.
+
+Together, the springs of many contacts are far too stiff for explicit steps of a light body. So they act
+on the body not at its position but at the one to which it would yield: their energy V becomes its Moreau envelope in
+the metric of the body's mass matrix M,
+
+    V'(x, b) = min over d of V(x, b + d) + d . M d / (2 dt^2),
+
+with particles x, the body b, and its small displacement and rotation d. The gradient is that of V at b + d: every
+spring still connects a particle and the body, only shorter. V' is an energy, so contacts that come and go add none;
+M^-1 times its curvature is below 1/dt^2 for any number and stiffness of springs; without stiff springs, d vanishes. At
+rest springs carry the same forces, with the body deeper by g dt^2. V is quadratic except for the set of closed
+contacts, so Newton's method finds d.
+"""
+
+import warp as wp
+
+from warp_corot.kernels.contact.law import held_back
+from warp_corot.kernels.contact.vertices import across
+
+from .rows import (
+    Bodies,
+    ContactLaw,
+    Particles,
+    Row,
+    add_to_particles,
+    ease_off,
+    gap_of,
+    inverse_mass_of,
+    is_attachment,
+    point_and_arm,
+    pull_of,
+    share_of,
+    sum_of,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+#: If a body yields entirely to springs, this fraction of the strongest damper acts, too: explicit steps return up
+#: to a quarter more energy than they took from a contact that lasts only a few of them.
+LOSS = wp.constant(0.5)
+#: More than any damping.
+NO_LIMIT = wp.constant(1.0e30)
+
+
+@wp.struct
+class Mobility:
+    """Response of a particle, and of a body's piece at a contact."""
+
+    particle: float  # 1/m [1/kg]
+    linear: float  # 1/m of the body's piece [1/kg]
+    angular: wp.mat33  # inverse inertia of the piece in world axes [1/(kg m^2)]
+    arm: wp.vec3  # from the body's centre of mass [m]
+
+
+@wp.func
+def body_point_velocity(twist: wp.spatial_vector, arm: wp.vec3):
+    """Velocity of a point of a body, at ``arm`` from its centre of mass."""
+    return wp.spatial_top(twist) + wp.cross(wp.spatial_bottom(twist), arm)
+
+
+@wp.func
+def body_mobility(m: Mobility, direction: wp.vec3):
+    """Inverse mass of the body's piece at the contact along a unit vector [1/kg]."""
+    a = wp.cross(m.arm, direction)
+    return m.linear + wp.dot(a, m.angular * a)
+
+
+@wp.func
+def largest_damping(w: float, dt: float):
+    """The damping that stops a relative velocity within a step, for an inverse mass [kg/s]."""
+    if w > 0.0:
+        return 1.0 / (w * dt)
+    return NO_LIMIT
+
+
+@wp.func
+def contact_force(
+    row: Row, gap: float, yielded: float, v: wp.vec3, pull: wp.vec3, m: Mobility, share: float, dt: float
+):
+    """Force on the particles [N]: spring and damper along the normal, regularised Coulomb friction across it.
+
+    Args:
+        gap: Gap after the body has yielded.
+        yielded: Fraction of the gap that yielding closes.
+        v: Velocity of the particles relative to the body's point.
+        pull: Change of this velocity by all other forces in this step [m/s].
+        share: The share of its stiffness that the contact has.
+    """
+    n = row.normal
+    towards = wp.dot(n, v)
+    push = -share * row.stiffness * gap
+    if gap < 0.0 and towards < 0.0:
+        largest = largest_damping(m.particle + body_mobility(m, n), dt)
+        push -= wp.min(row.damping + LOSS * yielded * largest, largest) * towards
+    # Implicit in the velocity that there would be without friction. With the current velocity, a force on a light
+    # particle would move it by one step's change of velocity in every step, however strong the friction.
+    sliding = across(v + pull, n)
+    speed = wp.length(sliding)
+    force = push * n
+    if speed > 0.0 and row.slope > 0.0:
+        largest = largest_damping(m.particle + body_mobility(m, sliding / speed), dt)
+        drag = sliding / (1.0 / row.slope + 1.0 / largest)
+        force -= held_back(drag, wp.max(push, 0.0), row.friction)
+    return row.measure * force
+
+
+@wp.kernel(enable_backward=False)
+def scatter_rows(
+    # In
+    dt: float,
+    share: float,
+    law: ContactLaw,
+    contacts: int,
+    first: int,
+    rows: wp.array[Row],
+    load: wp.array[wp.float32],
+    particles: Particles,
+    bodies: Bodies,
+    q: wp.array[wp.vec3],
+    qd: wp.array[wp.vec3],
+    before: wp.array[wp.vec4],
+    # Out
+    f: wp.array[wp.vec4],
+    body_f: wp.array[wp.spatial_vector],
+    reported: wp.array[wp.spatial_vector],
+):
+    """Forces on particles, and wrenches on bodies about their centres of mass.
+
+    Args:
+        share: The substep's share of the step, for the mean wrench of each contact on its shape's body [N, N m], about
+            the body's centre of mass or, for a fixed shape, the origin.
+        contacts: Number of contacts; attachments follow.
+        first: The entry of ``reported`` for the first contact; ``reported`` may be empty.
+    """
+    c = wp.tid()
+    row = rows[c]
+    if row.nodes[0] < 0:
+        return
+    ease_off(c, dt, law, rows)
+    body = row.body
+    point, arm = point_and_arm(row, bodies)
+    velocity = row.velocity
+    give = wp.vec3()
+    m = Mobility()
+    m.arm = arm
+    if body >= 0:
+        pose = bodies.q[body]
+        velocity = wp.transform_vector(pose, velocity) + body_point_velocity(bodies.qd[body], arm)
+        give = body_point_velocity(bodies.yielding[body], arm)
+        if (bodies.flags[body] & bodies.fixed_flag) == 0:
+            n = float(wp.max(bodies.places[body], 1))
+            turn = wp.quat_to_matrix(wp.transform_get_rotation(pose))
+            m.linear = n * bodies.inverse_mass[body]
+            m.angular = n * (turn * bodies.inverse_inertia[body] * wp.transpose(turn))
+    apart = sum_of(row, q) - point
+    v = sum_of(row, qd) - velocity
+    force = wp.vec3()
+    if is_attachment(row):
+        # The sum over three directions exceeds any single one.
+        w = particles.inverse_mass[row.nodes[0]] + body_mobility(m, wp.vec3(1.0, 0.0, 0.0))
+        w += body_mobility(m, wp.vec3(0.0, 1.0, 0.0)) + body_mobility(m, wp.vec3(0.0, 0.0, 1.0))
+        force = -row.stiffness * (apart - give) - wp.min(row.damping, largest_damping(w, dt)) * v
+    else:
+        gap = gap_of(row, apart)
+        less = wp.dot(row.normal, give)
+        if gap - less > law.adhesion:
+            return
+        yielded = float(0.0)
+        if gap < 0.0:
+            yielded = wp.clamp(less / gap, 0.0, 1.0)
+        m.particle = inverse_mass_of(row, load, particles)
+        pull = pull_of(row, dt, particles, before)
+        force = contact_force(row, gap - less, yielded, v, pull, m, share_of(row, load, law.crowd), dt)
+    add_to_particles(row, force, f)
+    wrench = -wp.spatial_vector(force, wp.cross(arm, force))
+    if body >= 0:
+        wp.atomic_add(body_f, body, wrench)
+    if c < contacts and reported.shape[0] > 0:
+        reported[first + c] += share * wrench
+
+
+# --- yielding --------------------------------------------------------------------------------------------------------
+
+
+@wp.func
+def spring_row(direction: wp.vec3, arm: wp.vec3):
+    """Velocity of a body's point at ``arm`` along a unit vector, as a row for the body's twist."""
+    return wp.spatial_vector(direction, wp.cross(arm, direction))
+
+
+@wp.kernel(enable_backward=False)
+def gather_springs(
+    # In
+    number: int,
+    law: ContactLaw,
+    rows: wp.array[Row],
+    load: wp.array[wp.float32],
+    q: wp.array[wp.vec3],
+    bodies: Bodies,
+    # In and out
+    curvature: wp.array[wp.spatial_matrix],
+    slope: wp.array[wp.spatial_vector],
+):
+    """Gather the data of rows for ``solve_yielding`` that hold after bodies have yielded so far; the first time, of
+    those that hold at the current positions, and the number of places where each body is touched."""
+    row = rows[wp.tid()]
+    body = row.body
+    if row.nodes[0] < 0 or body < 0:
+        return
+    if (bodies.flags[body] & bodies.fixed_flag) != 0:
+        return
+    point, arm = point_and_arm(row, bodies)
+    apart = sum_of(row, q) - point
+    k = row.stiffness
+    if is_attachment(row):
+        total = wp.spatial_matrix()
+        for axis in range(3):
+            direction = wp.vec3()
+            direction[axis] = 1.0
+            along = spring_row(direction, arm)
+            total += wp.outer(along, along)
+        wp.atomic_add(curvature, body, k * total)
+        wp.atomic_add(slope, body, k * spring_row(apart, arm))
+    else:
+        along = spring_row(row.normal, arm)
+        gap = gap_of(row, apart)
+        now = float(gap)
+        if number > 0:
+            now -= wp.dot(along, bodies.yielding[body])
+        if now > law.adhesion:
+            return
+        k *= row.measure * share_of(row, load, law.crowd)
+        wp.atomic_add(curvature, body, k * wp.outer(along, along))
+        wp.atomic_add(slope, body, k * gap * along)
+    if number == 0:
+        wp.atomic_add(bodies.places, body, 1)
+
+
+@wp.func
+def factor_of(a: wp.mat33):
+    """L with L L^T = a, symmetric and positive semi-definite."""
+    r = wp.mat33()
+    for j in range(3):
+        rest = a[j, j] - r[j, 0] * r[j, 0] - r[j, 1] * r[j, 1] - r[j, 2] * r[j, 2]
+        if rest > 1.0e-6 * a[j, j]:
+            r[j, j] = wp.sqrt(rest)
+            for i in range(j + 1, 3):
+                r[i, j] = (a[i, j] - r[i, 0] * r[j, 0] - r[i, 1] * r[j, 1] - r[i, 2] * r[j, 2]) / r[j, j]
+    return r
+
+
+@wp.kernel(enable_backward=False)
+def solve_yielding(
+    # In
+    dt: float,
+    # In and out
+    bodies: Bodies,
+    curvature: wp.array[wp.spatial_matrix],
+    slope: wp.array[wp.spatial_vector],
+):
+    """Solve for d of bodies: (K + M/dt^2) d = s with V = d . K d / 2 - s . d; K and s are reset to zero.
+
+    With M^-1 = L L^T, which may be singular, and d = dt L e this is (1 + dt^2 L^T K L) e = dt L^T s.
+    """
+    b = wp.tid()
+    k = curvature[b]
+    s = slope[b]
+    curvature[b] = wp.spatial_matrix()
+    slope[b] = wp.spatial_vector()
+    if (bodies.flags[b] & bodies.fixed_flag) != 0:
+        bodies.yielding[b] = wp.spatial_vector()
+        return
+    turn = wp.quat_to_matrix(wp.transform_get_rotation(bodies.q[b]))
+    angular = factor_of(turn * bodies.inverse_inertia[b] * wp.transpose(turn))
+    linear = wp.sqrt(bodies.inverse_mass[b])
+    factor = wp.spatial_matrix()
+    for i in range(3):
+        factor[i, i] = dt * linear
+        for j in range(3):
+            factor[3 + i, 3 + j] = dt * angular[i, j]
+    a = wp.transpose(factor) * k * factor
+    e = wp.transpose(factor) * s
+    for i in range(6):
+        a[i, i] += 1.0
+    # By elimination.
+    for i in range(6):
+        for j in range(i + 1, 6):
+            share = a[j, i] / a[i, i]
+            e[j] -= share * e[i]
+            for column in range(i, 6):
+                a[j, column] -= share * a[i, column]
+    for step in range(6):
+        i = 5 - step
+        for column in range(i + 1, 6):
+            e[i] -= a[i, column] * e[column]
+        e[i] /= a[i, i]
+    bodies.yielding[b] = factor * e
