@@ -20,7 +20,7 @@ import warp as wp
 from warp_corot.kernels.corotated.kept_gradients import keep_gradients
 from warp_corot.kernels.elements.constitutive import hooke, symmetric
 from warp_corot.kernels.elements.elements import GeneralElements, load_node, store_node
-from warp_corot.kernels.math.rotation import byers_xu
+from warp_corot.kernels.math.rotation import byers_xu, identity3
 from warp_corot.kernels.stepping.integrate import is_finite
 
 from .elements import difference_gradient, viscous_product
@@ -66,20 +66,39 @@ def linearise(
 
 
 @functools.cache
-def linearised(is_elastic: bool, is_viscous: bool) -> wp.Function:
-    """The differential for ``elements.stiffness_products``, of one or both parts."""
+def linearised(is_viscous: bool) -> wp.Function:
+    """The differential for ``elements.stiffness_products``."""
 
     @wp.func
     def linearised(elements: Any, t: int, made: Linearised, u: wp.array[wp.vec4], dg: wp.mat33):
-        p = wp.mat33()
-        if wp.static(is_elastic):
-            r = made.rotation[t]
-            p += r * hooke(symmetric(wp.transpose(r) * dg), made.mu[t], made.lam[t])
+        r = made.rotation[t]
+        p = r * hooke(symmetric(wp.transpose(r) * dg), made.mu[t], made.lam[t])
         if wp.static(is_viscous):
             p += made.viscosity[t] * viscous_product(made.gradient[t], dg)
         return p
 
     return linearised
+
+
+@wp.kernel(enable_backward=False)
+def add_element_blocks(elements: GeneralElements, made: Linearised, blocks: wp.array[wp.mat33]):
+    """Add the 3x3 blocks of K + D/dt on the diagonal; in closed form, at a sixth of the differentials' cost."""
+    t = wp.tid()
+    b = elements.rest_inverse[t]
+    volume = elements.volume[t]
+    first = -(b[0] + b[1] + b[2])
+    for k in range(4):
+        g = first
+        if k > 0:
+            g = b[k - 1]
+        square = wp.dot(g, g)
+        turned = made.rotation[t] * g
+        block = (made.mu[t] * square) * identity3() + (made.mu[t] + made.lam[t]) * wp.outer(turned, turned)
+        if made.gradient.shape[0] > 0:
+            f = made.gradient[t]
+            stretched = f * g
+            block += made.viscosity[t] * ((0.5 * square) * (f * wp.transpose(f)) + 1.5 * wp.outer(stretched, stretched))
+        wp.atomic_add(blocks, elements.nodes[t][k], volume * block)
 
 
 @wp.kernel(enable_backward=False)
@@ -223,6 +242,12 @@ def clear_held(free: wp.array[wp.float32], a: wp.array[wp.vec4]):
 
 
 @wp.kernel(enable_backward=False)
+def add_counts(first: wp.array[wp.int32], counts: wp.array[wp.int32]):
+    w = wp.tid()
+    counts[w] = counts[w] + first[w]
+
+
+@wp.kernel(enable_backward=False)
 def count_solves(
     # In
     iterations: wp.array[wp.int32],
@@ -240,7 +265,7 @@ def count_solves(
         if status[world] != good:
             unfinished = 1
     totals[0] = totals[0] + wp.int64(1)
-    totals[1] = totals[1] + wp.int64(rounds[0])
+    totals[1] = totals[1] + wp.int64(rounds[0] + 1)
     totals[2] = totals[2] + wp.int64(linear)
     totals[3] = totals[3] + wp.int64(unfinished)
 

@@ -124,7 +124,7 @@ def report_trouble(
     trouble: wp.array[wp.int32],
     # Out
     report: wp.array[wp.int32],
-    seen: wp.array[wp.int32],
+    seen: wp.array[wp.float64],
 ):
     """Record the failure and its world, and clear failures for the next step.
 
@@ -135,7 +135,7 @@ def report_trouble(
     wrong = trouble[w]
     if wrong != SOUND:
         wp.atomic_max(report, wrong, w + 1)
-        seen[0] = 1
+        seen[0] = wp.float64(1.0)
         trouble[w] = SOUND
 
 

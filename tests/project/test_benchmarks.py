@@ -352,11 +352,11 @@ def test_beam_of_sofa_bends(run):
 
 
 @pytest.mark.slow
-def test_newtons_hanging_bodies_are_timed(run):
+def test_newtons_examples_are_timed(run):
     pytest.importorskip("newton")
-    done = run("newton_hanging.py", "--frames", 12)
+    done = run("newton_examples.py", "--frames", 6, "--scenes", "hanging", "grasp")
     assert done.returncode == 0, done.stderr
-    assert done.stdout.count("Solver") == 3
+    assert done.stdout.count("SolverCorotated") == 4
 
 
 def test_implicit_steps_are_timed(run, tmp_path):

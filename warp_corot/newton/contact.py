@@ -2,8 +2,8 @@
 
 Newton's pipeline finds the contacts: at particles, and on request at points of edges and triangles. Without these, a
 body smaller than the particles' spacing sinks in between them. Particles' radii should exceed a body's motion in a
-step; the pipeline's ``soft_contact_gap`` should exceed a body's motion between two ``collide``, or
-contacts are found late, start with deep penetration, and can launch the body.
+step; the pipeline's ``soft_contact_gap`` should exceed a body's motion between two ``collide``, or contacts are found
+late, and what is deep then is let out slowly.
 """
 
 from __future__ import annotations

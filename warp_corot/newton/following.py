@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from warp_corot.elasticity import Corotated
 from warp_corot.kernels.newton import gauge as newton_gauge
 from warp_corot.kernels.stepping import gauge
+from warp_corot.solvers.guarding.mapped import Mapped
 from warp_corot.solvers.steps.gauge import REST_TURNS
 from warp_corot.solvers.steps.stable_step import PROBE
 
@@ -60,11 +61,7 @@ class Following:
         self._allowed = wp.zeros(1, dtype=wp.float64, device=self.device)
         self._turn = wp.zeros(1, dtype=wp.int32, device=self.device)
         self._excess = wp.zeros(1, dtype=wp.float32, device=self.device)
-        self._seen = wp.zeros(1, dtype=wp.float64, device="cpu", pinned=self.device.is_cuda)
-        self._seen_by_device = self._seen
-        if self.device.is_cuda:
-            # The same memory: a pinned array has the same address on host and device.
-            self._seen_by_device = wp.array(ptr=self._seen.ptr, shape=1, dtype=wp.float64, device=self.device)
+        self._seen = Mapped(1, self.device)
         self.share, self.made, self.was_recorded = 1.0, 1, False
         self.reach = _size(model, tetrahedra.tets)
         self._since, self._recording = INTERVAL, False
@@ -93,14 +90,14 @@ class Following:
         if not math.isfinite(stable):
             row[0] = self._longest = 1e30
         self._at_rest.assign(np.array([row]))
-        for array in (self._allowed, self._seen):
-            array.fill_(self._longest)
+        self._allowed.fill_(self._longest)
+        self._seen.values[0] = self._longest
         self._since = INTERVAL
 
     @property
     def substep(self) -> float:
         """The substep that the host would use now [s]; does not wait."""
-        return self.share * float(self._seen.numpy()[0])
+        return self.share * float(self._seen.values[0])
 
     @property
     def recorded_substep(self) -> float:
@@ -150,7 +147,7 @@ class Following:
         self._launch(newton_gauge.find_posed_strains, inputs, [self._found], looked_at)
         recorded = substep if self.device.is_capturing else 0.0
         inputs = [self._at_rest, wp.float64(recorded)]
-        outputs = [self._found, self._allowed, self._turn, self._excess, self._seen_by_device]
+        outputs = [self._found, self._allowed, self._turn, self._excess, self._seen.array]
         self._launch(newton_gauge.take_safe_substep, inputs, outputs, 1)
         self.recover()
 

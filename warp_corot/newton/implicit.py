@@ -70,7 +70,10 @@ class ImplicitSteps(Steps):
         self._system = BlockSystem(operators, [blocks], contacts=[self._rows], most=ITERATIONS)
         self._system.solver.tolerance.fill_(TOLERANCE)
         self._solve = ContactSolve(self._system, [])
-        self._fall, self._product, self._rest = (wp.zeros(count, dtype=wp.vec4, device=self.device) for _ in range(3))
+        self._change, self._product, self._rest, self._r = (
+            wp.zeros(count, dtype=wp.vec4, device=self.device) for _ in range(4)
+        )
+        self._first = wp.zeros(unknowns.worlds, dtype=wp.int32, device=self.device)
         self._search = LineSearch(unknowns.worlds, unknowns.count, self._rows, self.device)
         self._still = wp.zeros(model.particle_count, dtype=wp.vec3, device=self.device)
         self._replays = Replays(self.device, loops=True)
@@ -97,9 +100,9 @@ class ImplicitSteps(Steps):
             self._add_wrenches(share, given.body_f)
 
     def _launch_unknowns(self, substep: Step, of_bodies: newton.State, given: newton.State) -> None:
-        """Launch the right side, the inertia, the first motions, and how gravity changes these."""
+        """Launch the right side, the inertia, the first motions, and a guess of how gravity changes these."""
         model, now, dt, system = self.model, substep.state_in, substep.dt, self._system
-        outputs = [self._free, self._operator.inertia, system.b, system.x, self._fall]
+        outputs = [self._free, self._operator.inertia, system.b, system.x, self._change]
         inputs = [dt, self.damping, model.gravity, model.particle_inv_mass, model.particle_flags]
         inputs += [model.particle_world, self._f, now.particle_qd, self.report.trouble, self._unknowns.particle]
         self._launch(kernels.begin_particles, model.particle_count, inputs, outputs)
@@ -111,28 +114,30 @@ class ImplicitSteps(Steps):
         self._operator.take(now.particle_q, self._turned.positions, dt)
 
     def _launch_solve(self) -> None:
-        """Launch the solve for the motions, from the start that is best along gravity."""
+        """Launch the solve for the motions: with the contacts that act, and then until these are the right ones."""
         operator, system, rows, x = self._operator, self._system, self._rows, self._system.x
         operator.take_diagonal()
         operator.add_product(self._turned.way, system.b)
         self._launch(kernels.clear_held, len(x), [self._free], [system.b])
-        system.update()
         rows.launch_judgement(system.b, self._product, x)
+        system.update()
         operator.apply(x, self._product)
         self._launch(find_rest, len(x), [system.b, self._product], [self._rest])
-        operator.apply(self._fall, self._product)
-        self._search.launch(self._rest, self._product, self._fall, x)
+        wp.copy(self._r, self._rest)
+        rows.launch_friction(x, self._r)
+        system.solve(self._r, self._change, guessed=True, like=system.b)
         solver, iterations = system.solver, system.solver.iterations
         if rows.count:
+            operator.apply(self._change, self._product)
+            self._search.launch(self._rest, self._product, self._change, x)
+            wp.copy(self._first, iterations)
             self._solve.launch()
-            rows.launch_end(x)
             iterations = self._solve.iterations
+            self._launch(kernels.add_counts, len(iterations), [self._first], [iterations])
+            rows.launch_end(x)
         else:
-            operator.apply(x, self._product)
-            self._launch(find_rest, len(x), [system.b, self._product], [self._rest])
-            system.solve(self._rest, self._fall, like=system.b)
-            self._launch(add_vectors, len(x), [self._fall], [x])
-            rows.solves.fill_(1)
+            self._launch(add_vectors, len(x), [self._change], [x])
+            rows.solves.zero_()
         inputs = [iterations, rows.solves, solver.status, int(conjugate_gradients.CONVERGED)]
         self._launch(kernels.count_solves, 1, inputs, [self.totals])
 

@@ -9,6 +9,7 @@ import warp as wp
 
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.kernels.newton import worlds
+from warp_corot.solvers.guarding.mapped import Mapped
 
 from .following import RETRIES, Following
 from .library import newton
@@ -30,11 +31,7 @@ class Report:
         self.trouble = wp.zeros(max(int(model.world_count), 1) + 1, dtype=wp.int32, device=self._device)
         self._found = wp.zeros(worlds.REPORTS, dtype=wp.int32, device=self._device)
         #: Whether there is one, which the host can read without waiting.
-        self._seen = wp.zeros(1, dtype=wp.int32, device="cpu", pinned=self._device.is_cuda)
-        self._seen_by_device = self._seen
-        if self._device.is_cuda:
-            # The same memory: a pinned array has the same address on host and device.
-            self._seen_by_device = wp.array(ptr=self._seen.ptr, shape=1, dtype=wp.int32, device=self._device)
+        self._seen = Mapped(1, self._device)
 
     @property
     def may_be_wrong(self) -> bool:
@@ -54,7 +51,7 @@ class Report:
     def launch(self) -> None:
         """Launch the kernel that stores the failures of a step, at its end."""
         if self.may_be_wrong:
-            outputs = [self._found, self._seen_by_device]
+            outputs = [self._found, self._seen.array]
             wp.launch(worlds.report_trouble, len(self.trouble), [self.trouble], outputs, device=self._device)
 
     def check_earlier(self, following: Following | None) -> None:
@@ -62,7 +59,7 @@ class Report:
 
         If substeps follow the state, a world that failed continues with twice as many, and a warning says so.
         """
-        if self._device.is_cpu or self._device.is_capturing or not self._seen.numpy()[0]:
+        if self._device.is_cpu or self._device.is_capturing or not self._seen.values[0]:
             return
         try:
             self.check(None, following)
@@ -77,7 +74,7 @@ class Report:
         if not report.any():
             return
         self._found.zero_()
-        self._seen.zero_()
+        self._seen.values[0] = 0.0
         worst = int(np.flatnonzero(report)[-1])
         world = int(report[worst]) - 1
         where = f" in world {world}" if self._model.world_count > 1 and world < self._model.world_count else ""

@@ -43,8 +43,8 @@ class SolverCorotated(SolverBase, CouplingInterface):
     Newton's ``SolverSemiImplicit`` steps rigid bodies, joints, rigid contacts, and springs, triangles and bending edges
     with stiffness, on a view of the model without tetrahedra; reactions of soft contacts and
     attachments act on the bodies in the same step. Contacts come from ``newton.CollisionPipeline``, whose
-    ``soft_contact_gap`` should exceed any motion between two ``collide``: contacts found late start with deep
-    penetration and can launch light bodies. Soft bodies and cloth collide with one another only on request.
+    ``soft_contact_gap`` should exceed any motion between two ``collide``: what is found late, deep in a shape, is let
+    out at 0.25 m/s. Soft bodies and cloth collide with one another only on request.
 
     Substeps follow the state: every 64 substeps, two force evaluations find the current stiffness of the elements, and
     their strains and strain rates tell how soon it may change. All worlds share the substep. On the CPU a step uses

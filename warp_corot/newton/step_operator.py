@@ -8,7 +8,7 @@ from warp_corot.elasticity.structs import isotropic_material
 from warp_corot.kernels.corotated.kept_gradients import PLACES, KeptGradients, add_kept_product
 from warp_corot.kernels.elements.elements import GeneralElements
 from warp_corot.kernels.elements.lanes import LANES
-from warp_corot.kernels.elements.stiffness_products import add_stiffness_diagonal, add_stiffness_product
+from warp_corot.kernels.elements.stiffness_products import add_stiffness_product
 from warp_corot.kernels.newton import implicit as kernels
 from warp_corot.solvers.implicit.block_diagonal import BlockDiagonal
 
@@ -72,8 +72,7 @@ class StepOperator:
     def take_diagonal(self) -> None:
         """Launch the blocks of elements on the diagonal."""
         self._of_elements.zero_()
-        kernel = add_stiffness_diagonal(GeneralElements, kernels.Linearised, kernels.linearised(True, self.damped))
-        self._launch(kernel, 4 * self._count, [self._elements, self._made, self._none], [self._of_elements])
+        self._launch(kernels.add_element_blocks, self._count, [self._elements, self._made], [self._of_elements])
 
     def diagonal_blocks(self) -> wp.array:
         """Launch the blocks on the diagonal, with those of rows, mat33 [entries]."""
@@ -90,13 +89,12 @@ class StepOperator:
 
     def add_product(self, x: wp.array, y: wp.array) -> None:
         """Launch y += (K + D/dt) x."""
-        if self._lanes:
+        if self._lanes and not self.damped:
             inputs = [self._elements, self._count, self._kept, x]
             self._launch(add_kept_product(), self._lanes, inputs, [y, self._no_list])
-        if self.damped or not self._lanes:
-            differential = kernels.linearised(not self._lanes, self.damped)
-            kernel = add_stiffness_product(GeneralElements, kernels.Linearised, differential)
-            self._launch(kernel, self._count, [self._elements, self._made, self._none, x], [y])
+            return
+        kernel = add_stiffness_product(GeneralElements, kernels.Linearised, kernels.linearised(self.damped))
+        self._launch(kernel, self._count, [self._elements, self._made, self._none, x], [y])
 
     def _make_room_for_viscosity(self, count: int) -> None:
         self._made.gradient = wp.zeros(count, dtype=wp.mat33, device=self.device)
