@@ -31,7 +31,8 @@ ROUNDS = 4
 CROWD = 4.0
 #: Speed at which what was found too late is pushed out [m/s].
 RECOVERY = 0.25
-#: A model's names of the fields of kernels' structs.
+LAW = ("stiffness", "damping", "slope", "friction", "adhesion", "crowd", "recovery")
+#: A model's names of the fields of kernels' structs, and those of contacts.
 PARTICLES = {"inverse_mass": "particle_inv_mass", "gravity": "gravity"}
 PARTICLES |= {name: f"particle_{name}" for name in ("flags", "world")}
 SHAPES = {"body": "shape_body", "pose": "shape_transform", "scale": "shape_scale", "mesh": "shape_source_ptr"}
@@ -39,6 +40,10 @@ SHAPES |= {"margin": "shape_margin", "stiffness": "shape_material_ke", "damping"
 SHAPES |= {"slope": "shape_material_kf", "friction": "shape_material_mu"}
 ATTACHMENTS = {name: name for name in ("particle", "body", "stiffness", "damping", "enabled")} | {"point": "body_point"}
 ATTACHMENTS = {name: f"attachment_particle_body_{given}" for name, given in ATTACHMENTS.items()}
+
+RECORDS = {"nodes": "indices", "weights": "barycentric", "place": "body_pos", "velocity": "body_vel"}
+RECORDS |= {name: name for name in ("count", "particle", "shape", "normal")}
+RECORDS = {name: f"soft_contact_{given}" for name, given in RECORDS.items()}
 
 
 class Contacts:
@@ -77,7 +82,12 @@ class Contacts:
         )
         self._bodies = Kept(self._made_bodies)
         self._particles, self._shapes = _FromModel(rows.Particles, PARTICLES), _FromModel(records.Shapes, SHAPES)
-        self._attachments = _FromModel(records.Attachments, ATTACHMENTS)
+        self._attachments, self._records = (
+            _FromModel(records.Attachments, ATTACHMENTS),
+            _FromModel(records.Records, RECORDS),
+        )
+        self._no_records, self.law = records.Records(), rows.ContactLaw()
+        self._law_values: list[float] = []
         self._nearest = wp.empty(0, dtype=wp.int64, device=self.device)
         #: What particles had in the last step and have in this one, float32 [P]; see ``kernels.newton.rows``.
         self._before_step, self._in_step = (
@@ -156,19 +166,17 @@ class Contacts:
         self.contact_count = int(found.soft_contact_max) if found is not None and touches else 0
         self.count = self.contact_count + int(model.attachment_particle_body_count)
         self._lists = None if self.pairs is None or found is None else self.pairs.lists_of(found)
-        self.law = law = rows.ContactLaw()
-        law.stiffness, law.damping, law.slope = model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_kf
-        law.friction, law.adhesion, law.crowd = model.soft_contact_mu, model.particle_adhesion, CROWD
-        law.recovery = RECOVERY
         if self._last_dt and not self.contact_count:
             self.forget()
         eased, self._last_dt = RECOVERY * self._last_dt, step.dt if self.contact_count else 0.0
+        if self.count or self._lists is not None:
+            self._take_law()
         if not self.count:
             return
         if len(self.rows) != self.count:
             self.rows = wp.zeros(self.count, dtype=rows.Row, device=self.device)
-        those = self._records_of(found, step) if found is not None and touches else records.Records()
-        inputs = [self.contact_count, law, those, self._shapes.of(model), self._attachments.of(model)]
+        those = self._records_of(found, step) if found is not None and touches else self._no_records
+        inputs = [self.contact_count, self.law, those, self._shapes.of(model), self._attachments.of(model)]
         inputs += [model.particle_flags, model.particle_radius, state.particle_q, state.body_q]
         inputs += [eased, self._before_step, self._in_step]
         self._launch(records.fill_rows, self.count, inputs, [self.rows, trouble])
@@ -236,26 +244,34 @@ class Contacts:
             inputs = [dt, bodies, self._curvature, self._slope]
             self._launch(explicit_rows.solve_yielding, self.model.body_count, inputs, [])
 
+    def _take_law(self) -> None:
+        """Take the model's present values."""
+        model = self.model
+        values = [model.soft_contact_ke, model.soft_contact_kd, model.soft_contact_kf, model.soft_contact_mu]
+        values += [model.particle_adhesion, CROWD, RECOVERY]
+        if values != self._law_values:
+            self._law_values, self.law = values, rows.ContactLaw()
+            for name, value in zip(LAW, values, strict=True):
+                setattr(self.law, name, value)
+
     def _can_touch(self, contacts: newton.Contacts) -> bool:
         return bool(contacts.soft_contact_max and self.model.shape_count)
 
     def _records_of(self, contacts: newton.Contacts, step: Step) -> records.Records:
-        made = records.Records()
-        made.count, made.particle = contacts.soft_contact_count, contacts.soft_contact_particle
-        made.nodes, made.weights = contacts.soft_contact_indices, contacts.soft_contact_barycentric
-        made.shape, made.place = contacts.soft_contact_shape, contacts.soft_contact_body_pos
-        made.velocity, made.normal = contacts.soft_contact_body_vel, contacts.soft_contact_normal
+        made = self._records.of(contacts)
         # These attributes are private to Newton; without features there are no records of meshes.
         features = getattr(contacts, "_soft_contact_mesh_features", None)
         data = getattr(contacts, "_soft_contact_mesh_data", None)
         if features is None or data is None:
             return made
-        made.features, made.vertices = features, len(data.rigid_features[0])
+        if made.features is not features:
+            made.features, made.vertices = features, len(data.rigid_features[0])
         rivals = made.vertices + self.model.edge_count
         if len(self._nearest) != rivals:
             self._nearest = wp.empty(rivals, dtype=wp.int64, device=self.device)
+        if made.nearest is not self._nearest:
+            made.nearest = self._nearest
         self._nearest.fill_(int(records.FAR))
-        made.nearest = self._nearest
         inputs = [self._shapes.of(self.model), step.state_in.particle_q, step.state_in.body_q, made]
         self._launch(records.find_nearest, self.contact_count, inputs, [])
         return made
@@ -284,7 +300,7 @@ class _FromModel(Kept[Any]):
         super().__init__(self._made)
         self._struct_type, self._names = struct, names
 
-    def of(self, model: newton.Model) -> Any:
+    def of(self, model: newton.Model | newton.Contacts) -> Any:
         return self(*(getattr(model, name) for name in self._names.values()))
 
     def _made(self, *arrays: wp.array | None) -> Any:

@@ -24,8 +24,8 @@ from .tetrahedra import Tetrahedra
 
 #: A particle speed [m/s] that is a failure for any step.
 RUNAWAY = float(worlds.RUNAWAY)
-#: Fewer substeps are not recorded.
-FEW = 8
+#: Fewer substeps are not recorded, since recording one takes as long as several.
+FEW = 32
 
 
 class Steps:
