@@ -106,7 +106,7 @@ class RowForces:
     def launch_judgement(self, b: wp.array, q: wp.array, d: wp.array) -> None:
         self._update(d, is_solved=True)
 
-    def launch_going(self, locates: wp.array, rounds: wp.array, most: int, going: wp.array) -> None:
+    def launch_going(self, d: wp.array, locates: wp.array, rounds: wp.array, most: int, going: wp.array) -> None:
         wp.copy(self._rows.solves, rounds)
 
     def launch_end(self, d: wp.array) -> None:
