@@ -16,9 +16,8 @@ from typing import Any
 import warp as wp
 
 from warp_corot.kernels.elements.constitutive import corotated_strain, hooke, stretch_strain
-from warp_corot.kernels.elements.elements import frame, local_gradient, rest_volume
+from warp_corot.kernels.elements.elements import frame, local_gradient
 from warp_corot.kernels.math.rotation import cofactor, column, identity3, largest_entry
-from warp_corot.kernels.modules import unique_kernel
 
 wp.set_module_options({"enable_backward": False})
 
@@ -230,24 +229,10 @@ def fibre_cauchy(rotation: wp.Function) -> wp.Function:
     return fibre_cauchy
 
 
-@functools.cache
-def add_active_energies(Elements: type) -> wp.Kernel:
-    """Add the energy that each element's active stress s would have if s stayed constant: V s (|F d|^2 - 1) / 2."""
-
-    @unique_kernel()
-    def add_active_energies(
-        # In
-        elements: Elements,
-        material: FibreMaterial,
-        u: wp.array[wp.vec4],
-        # In and out
-        energies: wp.array[wp.float64],
-    ):
-        t = wp.tid()
-        m = axes_of(material.passive, t)
-        g, _turn = material_gradient(elements, t, m, u)
-        d = column(g, 0)
-        density = filled(material.passive, t) * material.activation[t] * wp.dot(column(m, 0) + 0.5 * d, d)
-        energies[t] = energies[t] + wp.float64(density) * wp.float64(rest_volume(elements, t))
-
-    return add_active_energies
+@wp.func
+def active_density(elements: Any, t: int, material: FibreMaterial, u: wp.array[wp.vec4]):
+    """Energy density that an element's active stress s would have if s stayed constant: s (|F d|^2 - 1) / 2."""
+    m = axes_of(material.passive, t)
+    g, _turn = material_gradient(elements, t, m, u)
+    d = column(g, 0)
+    return filled(material.passive, t) * material.activation[t] * wp.dot(column(m, 0) + 0.5 * d, d)

@@ -50,25 +50,20 @@ def rotation_differential(strain: wp.mat33, b: wp.mat33):
     return (scale / det) * (adjugate * axial(b))
 
 
-@functools.cache
-def own_differential(rotation: wp.Function) -> wp.Function:
-    """With the element's own rotation, held fixed."""
-
-    @wp.func
-    def own_differential(elements: Any, t: int, material: IsotropicMaterial, u: wp.array[wp.vec4], dg: wp.mat33):
-        i = t * material.stride
-        r = rotation(frame(elements, t) + local_gradient(elements, t, u))
-        return r * hooke(symmetric(wp.transpose(r) * dg), material.mu[i], material.lam[i])
-
-    return own_differential
-
-
 @wp.func
 def given_differential(elements: Any, t: int, material: RotatedMaterial, u: wp.array[wp.vec4], dg: wp.mat33):
     """With a given rotation, held fixed."""
     i = t * material.isotropic.stride
     r = material.rotations[material.unit[t]] * frame(elements, t)
     return r * hooke(symmetric(wp.transpose(r) * dg), material.isotropic.mu[i], material.isotropic.lam[i])
+
+
+@wp.func
+def differential_of(r: wp.mat33, strain: wp.mat33, dg: wp.mat33, mu: float, lam: float):
+    """With the rotation r of an element's F Q, and its change."""
+    b = wp.transpose(r) * dg
+    turning = wp.skew(rotation_differential(strain, b))
+    return r * (turning * hooke(strain, mu, lam) + hooke(symmetric(b - turning * strain), mu, lam))
 
 
 @functools.cache
@@ -78,15 +73,10 @@ def exact_differential(rotation: wp.Function) -> wp.Function:
     @wp.func
     def exact_differential(elements: Any, t: int, material: IsotropicMaterial, u: wp.array[wp.vec4], dg: wp.mat33):
         i = t * material.stride
-        mu = material.mu[i]
-        lam = material.lam[i]
         q = frame(elements, t)
         g = local_gradient(elements, t, u)
         r = rotation(q + g)
-        strain = corotated_strain(g, q, r)
-        b = wp.transpose(r) * dg
-        turning = wp.skew(rotation_differential(strain, b))
-        return r * (turning * hooke(strain, mu, lam) + hooke(symmetric(b - turning * strain), mu, lam))
+        return differential_of(r, corotated_strain(g, q, r), dg, material.mu[i], material.lam[i])
 
     return exact_differential
 
@@ -130,9 +120,4 @@ def kept_differential(elements: Any, t: int, material: KeptStrains, u: wp.array[
     """As ``exact_differential``, with the kept rotations and strains."""
     i = t * material.isotropic.stride
     mu = material.isotropic.mu[i]
-    lam = material.isotropic.lam[i]
-    r = material.rotations[t]
-    strain = material.strains[t]
-    b = wp.transpose(r) * dg
-    turning = wp.skew(rotation_differential(strain, b))
-    return r * (turning * hooke(strain, mu, lam) + hooke(symmetric(b - turning * strain), mu, lam))
+    return differential_of(material.rotations[t], material.strains[t], dg, mu, material.isotropic.lam[i])

@@ -47,7 +47,12 @@ class RotatedMaterial:
 
 @wp.func
 def hooke(strain: wp.mat33, mu: float, lam: float):
-    return (2.0 * mu) * strain + (lam * wp.trace(strain)) * identity3()
+    pressure = lam * wp.trace(strain)
+    stress = (2.0 * mu) * strain
+    stress[0, 0] += pressure
+    stress[1, 1] += pressure
+    stress[2, 2] += pressure
+    return stress
 
 
 @wp.func

@@ -1,7 +1,6 @@
-"""Shared dilatations on the CPU, eight elements to the lanes of vector registers.
+"""A dilatation that groups of elements share, on the CPU, eight elements to the lanes of vector registers.
 
-Where nodes share it, this file has the passes of ``shared_dilatation`` that loop over elements. Where groups share it,
-elements stand group after group, and one launch computes the law and the shared dilatation: a thread takes a few
+Elements stand group after group, and one launch computes the law and the shared dilatation: a thread takes a few
 groups.
 """
 
@@ -15,82 +14,11 @@ from .constitutive import IsotropicMaterial
 from .dilatation import MOST, Dilatation
 from .elements import GeneralElements, frame, rest_volume
 from .general_cpu import rest_inverse_of
-from .lanes import headers, on_cpu, scatter_lanes
+from .lanes import headers, scatter_lanes
 from .law_lanes import LawInLanes, elastic
 
 wp.set_module_options({"enable_backward": False})
 
-
-@functools.cache
-def measure_in_lanes(of: Dilatation) -> wp.Kernel:
-    """``measure_elements`` without a direction; a thread is eight elements."""
-    call = f"corot::measure_eight<corot::{of.lanes}>(units, block, count, places, live, u, shared);"
-
-    @wp.func_native(on_cpu(call))
-    def measure_eight(
-        units: GeneralElements,
-        block: int,
-        count: int,
-        places: wp.array[wp.int32],
-        live: wp.array[wp.int32],
-        u: wp.array[wp.vec4],
-        shared: wp.array[wp.vec4],
-    ): ...
-
-    @unique_kernel(native=headers("elements8"))
-    def measure_in_lanes(
-        # In
-        units: GeneralElements,
-        count: int,
-        places: wp.array[wp.int32],
-        live: wp.array[wp.int32],
-        u: wp.array[wp.vec4],
-        # Out
-        shared: wp.array[wp.vec4],
-    ):
-        measure_eight(units, wp.tid(), count, places, live, u, shared)
-
-    return measure_in_lanes
-
-
-@functools.cache
-def scatter_in_lanes(of: Dilatation) -> wp.Kernel:
-    """``scatter_pressures``; a thread is eight elements."""
-    call = f"""corot::scatter_pressures<corot::{of.lanes}>(
-        units, block, count, places, live, material.lam, material.stride, u, shared, f);"""
-
-    @wp.func_native(on_cpu(call))
-    def scatter_eight(
-        units: GeneralElements,
-        block: int,
-        count: int,
-        places: wp.array[wp.int32],
-        live: wp.array[wp.int32],
-        material: IsotropicMaterial,
-        u: wp.array[wp.vec4],
-        shared: wp.array[wp.vec4],
-        f: wp.array[wp.vec4],
-    ): ...
-
-    @unique_kernel(native=headers("elements8"))
-    def scatter_in_lanes(
-        # In
-        units: GeneralElements,
-        count: int,
-        places: wp.array[wp.int32],
-        live: wp.array[wp.int32],
-        material: IsotropicMaterial,
-        u: wp.array[wp.vec4],
-        shared: wp.array[wp.vec4],
-        # Out
-        f: wp.array[wp.vec4],
-    ):
-        scatter_eight(units, wp.tid(), count, places, live, material, u, shared, f)
-
-    return scatter_in_lanes
-
-
-# --- groups -----------------------------------------------------------------------------------------------------------
 
 #: Groups of a thread.
 GROUPS = 4

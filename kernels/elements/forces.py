@@ -31,14 +31,20 @@ def von_mises(s: wp.mat33):
 
 
 @wp.func
-def own_gradient(elements: ForestElements, t: int, u: wp.array[wp.vec4]):
-    """A = Q^T G: the displacement gradient of element t in its local frame, rows and columns."""
-    return wp.transpose(frame(elements, t)) * local_gradient(elements, t, u)
+def to_own_frame(elements: ForestElements, t: int, g: wp.mat33):
+    """Q^T G of a local gradient G."""
+    return wp.transpose(frame(elements, t)) * g
 
 
 @wp.func
-def own_gradient(elements: GeneralElements, t: int, u: wp.array[wp.vec4]):
-    return local_gradient(elements, t, u)
+def to_own_frame(elements: GeneralElements, t: int, g: wp.mat33):
+    return g
+
+
+@wp.func
+def own_gradient(elements: Any, t: int, u: wp.array[wp.vec4]):
+    """A = Q^T G: the displacement gradient of element t in its local frame, rows and columns."""
+    return to_own_frame(elements, t, local_gradient(elements, t, u))
 
 
 @wp.func
@@ -83,10 +89,10 @@ def law_value(function: wp.Function) -> wp.Function:
 
 
 @functools.cache
-def scatter_forces(Elements: type, Material: type, stress: wp.Function) -> wp.Kernel:
+def scatter_forces(Elements: type, Material: type, stress: wp.Function, kernel: Callable = unique_kernel) -> wp.Kernel:
     """Add the elastic nodal forces of a law to f; a thread an element."""
 
-    @unique_kernel()
+    @kernel()
     def scatter_forces(
         # In
         elements: Elements,
@@ -126,9 +132,11 @@ def repair_forces(Elements: type, Material: type, stress: wp.Function) -> wp.Ker
 
 @functools.cache
 def element_energies(
-    Elements: type, Material: type, density: wp.Function, kernel: Callable = unique_kernel
+    Elements: type, Material: type, density: wp.Function, kernel: Callable = unique_kernel, adds: bool = False
 ) -> wp.Kernel:
-    """Strain energy of each element [J], in float64 so that sums over millions keep their digits."""
+    """Strain energy of each element [J], in float64 so that sums over millions keep their digits; or add it to a known
+    one.
+    """
 
     @kernel()
     def element_energies(
@@ -136,32 +144,16 @@ def element_energies(
         elements: Elements,
         material: Material,
         u: wp.array[wp.vec4],
-        # Out
+        # Out, or in and out
         energies: wp.array[wp.float64],
     ):
         t = wp.tid()
-        energies[t] = wp.float64(density(elements, t, material, u)) * wp.float64(rest_volume(elements, t))
+        energy = wp.float64(density(elements, t, material, u)) * wp.float64(rest_volume(elements, t))
+        if wp.static(adds):
+            energy += energies[t]
+        energies[t] = energy
 
     return element_energies
-
-
-@functools.cache
-def add_energies(Elements: type, Material: type, density: wp.Function) -> wp.Kernel:
-    """Add the energy of each element [J] to a known one."""
-
-    @unique_kernel()
-    def add_energies(
-        # In
-        elements: Elements,
-        material: Material,
-        u: wp.array[wp.vec4],
-        # In and out
-        energies: wp.array[wp.float64],
-    ):
-        t = wp.tid()
-        energies[t] += wp.float64(density(elements, t, material, u)) * wp.float64(rest_volume(elements, t))
-
-    return add_energies
 
 
 @functools.cache

@@ -27,6 +27,8 @@ VISCOUS = NativeLaw("corot::viscous(material)", "added", True)
 
 #: The structs of isotropic laws by their names.
 LAWS = {"corotated": "Corotated", "linear": "Linear", "stvk": "StVenantKirchhoff", "neo-hookean": "NeoHookean"}
+#: No law, for what has a shared dilatation alone.
+STRESSLESS = "stressless"
 
 #: An isotropic law: a name, or the terms (share, alpha) of Ogden's.
 LawInLanes = str | tuple[tuple[float, float], ...]
@@ -34,6 +36,8 @@ LawInLanes = str | tuple[tuple[float, float], ...]
 
 def elastic(law: LawInLanes, material: str = "material") -> NativeLaw:
     """An isotropic law with an ``IsotropicMaterial``."""
+    if law == STRESSLESS:
+        return NativeLaw("corot::Stressless{}")
     if isinstance(law, str):
         return NativeLaw(f"corot::elastic(corot::{LAWS[law]}{{}}, {material})", leaves_out=law == "corotated")
     rows = []

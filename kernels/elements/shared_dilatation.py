@@ -18,7 +18,7 @@ from warp_corot.kernels.modules import Family, unique_kernel
 from .constitutive import IsotropicMaterial
 from .dilatation import Dilatation, mean_of, pressure_stress_of
 from .elements import add_nodal_forces, rest_volume
-from .forces import in_local_frame, own_gradient
+from .forces import element_energies, in_local_frame, own_gradient, scatter_forces, to_own_frame
 
 wp.set_module_options({"enable_backward": False})
 
@@ -145,9 +145,6 @@ def share_in_groups(Elements: type, law: wp.Function) -> wp.Kernel:
     return share_in_groups
 
 
-# --- the second pass: nodes -------------------------------------------------------------------------------------------
-
-
 # --- the third pass ---------------------------------------------------------------------------------------------------
 
 
@@ -184,74 +181,68 @@ def scatter_pressures(Elements: type, of: Dilatation) -> wp.Kernel:
     return scatter_pressures
 
 
+@wp.struct
+class DilatedMaterial:
+    """Lamé's parameters, and the numbers (w, w', …) of the dilatation that each element shares."""
+
+    isotropic: IsotropicMaterial
+    shared: wp.array[wp.vec4]
+    turning: float  # 0: without the change of d theta / dF, which leaves what is positive semidefinite; 1: with it
+
+
 @functools.cache
-def add_product(Elements: type, of: Dilatation) -> wp.Kernel:
-    """y += K p; without ``turning``, the part of K that is positive semidefinite."""
+def own_differential(of: Dilatation) -> wp.Function:
+    """The differential of an element's stress for ``stiffness_products``, the shared dilatation held fixed."""
     measure, turning_of, holding = of.measure, of.turning, of.holding
 
-    @unique_kernel()
-    def add_product(
-        # In
-        elements: Elements,
-        material: IsotropicMaterial,
-        u: wp.array[wp.vec4],
-        p: wp.array[wp.vec4],
-        shared: wp.array[wp.vec4],
-        turning: float,
-        # In and out
-        y: wp.array[wp.vec4],
-    ):
-        t = wp.tid()
+    @wp.func
+    def own_differential(elements: Any, t: int, material: DilatedMaterial, u: wp.array[wp.vec4], dg: wp.mat33):
         a = own_gradient(elements, t, u)
         theta, slope = measure(a)
         held = holding(theta)
-        d = own_gradient(elements, t, p)
-        change = shared[t][2] + held[2] * wp.ddot(slope, d)
-        stress = change * slope + (turning * (shared[t][1] + held[1])) * turning_of(a, d)
-        scatter(elements, elements.nodes[t], t, -material.lam[t * material.stride] * stress, y)
+        d = to_own_frame(elements, t, dg)
+        pressure = material.turning * (material.shared[t][1] + held[1])
+        stress = (held[2] * wp.ddot(slope, d)) * slope + pressure * turning_of(a, d)
+        return material.isotropic.lam[t * material.isotropic.stride] * in_local_frame(elements, t, stress)
 
-    return add_product
+    return own_differential
+
+
+@functools.cache
+def shared_density(of: Dilatation) -> wp.Function:
+    """An element's share of the energy density for ``forces``."""
+    measure, holding = of.measure, of.holding
+
+    @wp.func
+    def shared_density(elements: Any, t: int, material: DilatedMaterial, u: wp.array[wp.vec4]):
+        theta, _slope = measure(own_gradient(elements, t, u))
+        lam = material.isotropic.lam[t * material.isotropic.stride]
+        return lam * (material.shared[t][0] + holding(theta)[0])
+
+    return shared_density
+
+
+@functools.cache
+def unshared_stress(of: Dilatation) -> wp.Function:
+    """The stress for ``forces`` by which a dilatation of each element's own differs from the shared one."""
+    measure, slope_of = of.measure, of.slope
+
+    @wp.func
+    def unshared_stress(elements: Any, t: int, material: DilatedMaterial, u: wp.array[wp.vec4]):
+        theta, slope = measure(own_gradient(elements, t, u))
+        lam = material.isotropic.lam[t * material.isotropic.stride]
+        return in_local_frame(elements, t, (lam * (slope_of(theta) - material.shared[t][1])) * slope)
+
+    return unshared_stress
 
 
 @OF_ELEMENTS.member
 def add_energies(Elements: type, of: Dilatation) -> wp.Kernel:
     """Add each element's share of the energy [J]."""
-    measure, holding = of.measure, of.holding
-
-    @OF_ELEMENTS.kernel()
-    def add_energies(
-        # In
-        elements: Elements,
-        material: IsotropicMaterial,
-        u: wp.array[wp.vec4],
-        shared: wp.array[wp.vec4],
-        # In and out
-        energies: wp.array[wp.float64],
-    ):
-        t = wp.tid()
-        theta, _slope = measure(own_gradient(elements, t, u))
-        density = material.lam[t * material.stride] * (shared[t][0] + holding(theta)[0])
-        energy = wp.float64(density) * wp.float64(rest_volume(elements, t))
-        energies[t] = energies[t] + energy
-
-    return add_energies
+    return element_energies(Elements, DilatedMaterial, shared_density(of), OF_ELEMENTS.kernel, adds=True)
 
 
 @OF_ELEMENTS.member
 def unshare(Elements: type, of: Dilatation) -> wp.Kernel:
-    """Replace w' of the shared dilatation by the difference of an element's own w' and that."""
-    measure, slope_of = of.measure, of.slope
-
-    @OF_ELEMENTS.kernel()
-    def unshare(
-        # In
-        elements: Elements,
-        u: wp.array[wp.vec4],
-        # In and out
-        shared: wp.array[wp.vec4],
-    ):
-        t = wp.tid()
-        theta, _slope = measure(own_gradient(elements, t, u))
-        shared[t] = wp.vec4(0.0, slope_of(theta) - shared[t][1], 0.0, 0.0)
-
-    return unshare
+    """Change forces to those of separate dilatations."""
+    return scatter_forces(Elements, DilatedMaterial, unshared_stress(of), OF_ELEMENTS.kernel)

@@ -148,7 +148,7 @@ def add_row(rows: wp.array[wp.vec4], place: int, row: wp.vec3):
 @OF_GROUPS.member
 def write_rows(Elements: type, of: Dilatation) -> wp.Kernel:
     """A thread a group, which also leaves (lambda_e h'', w', 0, 0) to its elements: the first for
-    ``add_held``, the others as ``shared_dilatation`` and ``shared_diagonal`` take them."""
+    ``add_held``, the second for ``shared_dilatation.own_differential``."""
     measure, slope_of, curvature_of, holding = of.measure, of.slope, of.curvature, of.holding
 
     @OF_GROUPS.kernel()

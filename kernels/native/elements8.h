@@ -198,48 +198,4 @@ COROT_INLINE void scatter_posed(const Law& law, const Units& units, int block, i
     at.list_others(sound, missed);
 }
 
-// --- a shared dilatation by itself, in passes -------------------------------------------------------------------------
-
-// The place of an element among a mesh's, and how many of eight are in the mesh.
-template <class At, class Numbers> COROT_INLINE int place_of(const At& at, const Numbers& places, int lane) {
-    return places.shape[0] ? places.data[at.element(lane)] : at.element(lane);
-}
-
-template <class At, class Numbers> COROT_INLINE int present(const At& at, const Numbers& live) {
-    return live.shape[0] ? least_of(at.end, live.data[0] - at.first) : at.end;
-}
-
-// Writes theta of eight elements at their places.
-template <class Of, class Units, class Numbers, class Vectors>
-COROT_INLINE void measure_eight(const Units& units, int block, int count, const Numbers& places, const Numbers& live,
-        const Vectors& u, const Vectors& shared) {
-    const GeneralEight<Units> at(units, 8 * block, count);
-    triple<lanes8> a[3];
-    gradient_of(at, u, a);
-    const lanes8 theta = Of::theta(a, at.frame);
-    const int there = present(at, live);
-    for (int lane = 0; lane < there; ++lane) {
-        auto& to = shared.data[place_of(at, places, lane)];
-        to[0] = theta[lane];
-        to[1] = to[2] = to[3] = 0.0f;
-    }
-}
-
-// Adds the forces of a dilatation whose w' is the second number in ``shared``.
-template <class Of, class Units, class Numbers, class Values, class Vectors>
-COROT_INLINE void scatter_pressures(const Units& units, int block, int count, const Numbers& places, const Numbers& live,
-        const Values& lam, int stride, const Vectors& u, const Vectors& shared, const Vectors& f) {
-    const GeneralEight<Units> at(units, 8 * block, count);
-    triple<lanes8> a[3], p[3] = {nothing<lanes8>(), nothing<lanes8>(), nothing<lanes8>()}, force[4];
-    gradient_of(at, u, a);
-    const lanes8 k = stride ? gather_one([&](int lane) { return lam.data + place_of(at, places, lane); })
-        : spread<lanes8>(lam.data[0]);
-    const lanes8 slope = gather_one([&](int lane) { return &shared.data[place_of(at, places, lane)][1]; });
-    const lanes8 numbers = {0.0f, 1.0f, 2.0f, 3.0f, 4.0f, 5.0f, 6.0f, 7.0f};
-    const lanes8 weight = numbers < 1.0f * present(at, live) ? k * at.weight() : spread<lanes8>(0.0f);
-    add_pressure<Of>(deformation_of(a, at.frame), Of::theta(a, at.frame), slope, weight, p);
-    at.forces_of(p, force);
-    at.add_forces(force, f);
-}
-
 }  // namespace corot

@@ -5,8 +5,7 @@ thread takes a complete subtree, or some of its leaves if there are too few worl
 nodal forces to slots; then each thread sums up the slots of a node and moves it. There are no atomic additions, so runs
 are reproducible bit for bit. Only the final state leaves the multiprocessor.
 
-If the leaves of a subtree share their dilatation, its threads put their sums of it into shared memory, and add the
-forces of the pressure to their slots in a second pass.
+If the leaves of a subtree share their dilatation, its threads first put their sums of it into shared memory.
 
 CUDA only. ``tables.block_layout`` says which thread does what.
 """
@@ -16,16 +15,15 @@ import functools
 import warp as wp
 
 from warp_corot.kernels.corotated.algebraic import turned_stress
-from warp_corot.kernels.elements.constitutive import hooke, symmetric
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import VOLUME as VOLUME_CHANGE
 from warp_corot.kernels.elements.dilatation import mean_of
 from warp_corot.kernels.elements.elements import Subtrees, load_node, root_of, store_node
-from warp_corot.kernels.math.matrices import column, identity3
-from warp_corot.kernels.math.quaternion import robust_rotation
+from warp_corot.kernels.elements.shapes import columns_of, leaf_forces_of
+from warp_corot.kernels.math.matrices import column
 from warp_corot.kernels.modules import unique_kernel
-from warp_corot.kernels.subtrees.dilatation import dilatation_sums_of, dilating_forces_of, pressure_forces_of
-from warp_corot.kernels.subtrees.forces import columns_of, leaf_forces_of, mat10, own_forces, shared_forces
-from warp_corot.kernels.subtrees.laws import turn_in, turn_out
+from warp_corot.kernels.subtrees.dilatation import dilatation_sums_of, dilating_leaves
+from warp_corot.kernels.subtrees.forces import mat10, maubach_frame, own_forces, subtree_forces, turn_in, turn_out
 from warp_corot.kernels.tables.block_layout import (
     FIRST_SHIFT,
     FOLLOWING_SHIFT,
@@ -37,7 +35,7 @@ from warp_corot.kernels.tables.block_layout import (
     Layout,
 )
 from warp_corot.kernels.tables.shapes import VOLUME, fingerprint
-from warp_corot.kernels.tables.subtree import FRAMES, HANDEDNESS, LEAVES, POSITIONS
+from warp_corot.kernels.tables.subtree import HANDEDNESS, LEAVES, POSITIONS
 
 from .block_memory import (
     CLEAR,
@@ -135,7 +133,6 @@ def _left_out_of(layout: Layout, displacement: wp.Function, slot: wp.Function) -
     node_of, place_of = _table([list(leaf) for leaf in LEAVES[shape]]), _table(layout.places)
     handed = _table([[int(h)] for h in HANDEDNESS[shape]])
     rest_of = _vectors([[2.0 * c for c in point] for point in POSITIONS[shape]])
-    frame_of = _vectors([column for leaf in FRAMES[shape] for column in leaf])
     columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
     waiting, force = shared_list(room), shared_vectors(4 * room, "forces of single leaves")
 
@@ -163,10 +160,8 @@ def _left_out_of(layout: Layout, displacement: wp.Function, slot: wp.Function) -
         return (moved - origin) * inv_h + q * rest_of(k)
 
     @wp.func
-    def do_one(
-        body: BlockBody, i: int, mu: wp.array[wp.float32], lam: wp.array[wp.float32], material: int, stride: int
-    ):
-        """Find the forces of the i-th listed leaf, for any F; ``material`` is the world's first."""
+    def do_one(body: BlockBody, i: int, material: IsotropicMaterial, first: int):
+        """Find the forces of the i-th listed leaf, for any F; ``first`` is the place of the world's first material."""
         entry = waiting(wp.static(READ), i, 0)
         leaf = entry >> wp.static(LEAF_SHIFT)
         warp = (entry & wp.static((1 << LEAF_SHIFT) - 1)) // wp.static(WARP)
@@ -177,33 +172,19 @@ def _left_out_of(layout: Layout, displacement: wp.Function, slot: wp.Function) -
         words = vec3u(body.nodes[0, s], body.nodes[1, s], body.nodes[2, s])
         inv_h = 1.0 / h
         area = wp.static(VOLUME[shape]) * h * h
-        at = material + (body.subtrees.first[s] + leaf) * stride
-        m = area * mu[at]
-        k = area * lam[at]
+        at = first + (body.subtrees.first[s] + leaf) * material.stride
+        m = area * material.mu[at]
+        # A dilatation that leaves share has its own forces.
+        k = wp.static(0.0 if layout.dilating else 1.0) * area * material.lam[at]
         c0, c1, c2 = columns(
             position(words, node_of(leaf, 0), maubach, inv_h),
             position(words, node_of(leaf, 1), maubach, inv_h),
             position(words, node_of(leaf, 2), maubach, inv_h),
             position(words, node_of(leaf, 3), maubach, inv_h),
         )
-        p = wp.mat33()
-        if wp.static(layout.shared):
-            d0, d1, d2 = columns(
-                position(words, 0, maubach, inv_h),
-                position(words, 1, maubach, inv_h),
-                position(words, 2, maubach, inv_h),
-                position(words, 3, maubach, inv_h),
-            )
-            r = robust_rotation(wp.matrix_from_cols(d0, d1, d2 * mirror))
-            turned = wp.matrix_from_cols(column(r, 0), column(r, 1), column(r, 2) * mirror)
-            # R times the leaf's Maubach frame.
-            z = turned * wp.matrix_from_cols(frame_of(3 * leaf), frame_of(3 * leaf + 1), frame_of(3 * leaf + 2))
-            p = z * hooke(symmetric(wp.transpose(z) * wp.matrix_from_cols(c0, c1, c2)) - identity3(), m, k)
-        else:
-            hand = mirror * float(handed(leaf, 0))
-            p = turned_stress(wp.matrix_from_cols(c0, c1, c2 * hand), m, k)
-            p = wp.matrix_from_cols(column(p, 0), column(p, 1), hand * column(p, 2))
-        f0, f1, f2, f3 = leaf_forces(column(p, 0), column(p, 1), column(p, 2))
+        hand = mirror * float(handed(leaf, 0))
+        p = turned_stress(wp.matrix_from_cols(c0, c1, c2 * hand), m, k)
+        f0, f1, f2, f3 = leaf_forces(column(p, 0), column(p, 1), hand * column(p, 2))
         force(wp.static(STORE), 4 * i, f0)
         force(wp.static(STORE), 4 * i + 1, f1)
         force(wp.static(STORE), 4 * i + 2, f2)
@@ -233,25 +214,21 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
     """Symplectic Euler steps of the corotated model, a block a world; launch with blocks of ``layout.threads``.
 
     Args:
-        layout: Which thread does what. If leaves share their dilatation, ``lam`` is zero, and ``shared_lam`` [Pa] is
-            lambda of the dilatation.
+        layout: Which thread does what.
         load_vectors: The element type of the array of loads, vec3 or vec4.
     """
-    shape, shared, uniform, parts = layout.shape, layout.shared, layout.uniform, layout.parts
+    shape, uniform, parts, dilating = layout.shape, layout.uniform, layout.parts, layout.dilating
     capacity, threads, zero_slot = layout.subtrees, layout.threads, layout.slot_count
-    own = [own_forces(shape, uniform, layout.leaves(part)) for part in range(parts)]
-    turned = [shared_forces(shape, uniform, False, layout.leaves(part)) for part in range(parts)]
+    own = [own_forces(shape, uniform, chosen=layout.leaves(part)) for part in range(parts)]
     needs, places = [layout.needs(part) for part in range(parts)], layout.places
     displacement, velocity = shared_vectors(layout.nodes, "displacements"), shared_vectors(layout.nodes, "velocities")
     displacements = [_displacements_of(layout, part, displacement) for part in range(parts)]
     slot = shared_vectors(zero_slot + 1, "forces")
-    dilating, of = layout.dilating, VOLUME_CHANGE
-    slope_of = of.slope
-    measure = [dilatation_sums_of(shape, uniform, of, layout.leaves(part)) for part in range(parts)]
+    slope_of = VOLUME_CHANGE.slope
+    measure = [dilatation_sums_of(shape, uniform, VOLUME_CHANGE, layout.leaves(part)) for part in range(parts)]
     # Law and pressure are one pass, after a first pass for the sums if two threads share a subtree.
-    at_once = dilating and not shared
-    dilate = [dilating_forces_of(shape, uniform, layout.leaves(part)) for part in range(parts)]
-    press = [pressure_forces_of(shape, uniform, of, layout.leaves(part)) for part in range(parts)]
+    law = dilating_leaves(shape)
+    dilate = [subtree_forces(shape, uniform, law, layout.leaves(part)) for part in range(parts)]
     sums = shared_numbers(max(layout.sum_count, 1), "sums of dilatations")
     waiting, enlist, do_one, collect = _left_out_of(layout, displacement, slot)
 
@@ -265,10 +242,7 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
         steps: int,
         damping: float,
         gravity: wp.vec3,
-        mu: wp.array[wp.float32],
-        lam: wp.array[wp.float32],
-        shared_lam: wp.array[wp.float32],
-        stride: int,
+        material: IsotropicMaterial,
         mass: wp.array[wp.float32],
         inverse_mass: wp.array[wp.float32],
         has_load: int,
@@ -302,8 +276,8 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
         s = (warp // wp.static(parts)) * wp.static(WARP) + thread % wp.static(WARP)
         mine = wp.min(s, body.subtree_count - 1)
         h, q, mirror = root_of(body.subtrees, mine)
-        material_of_world = world * body.element_count * stride
-        material = material_of_world + body.subtrees.first[mine] * stride
+        first_of_world = world * body.element_count * material.stride
+        first = first_of_world + body.subtrees.first[mine] * material.stride
         damped = 1.0 / (1.0 + dt * damping)
         # Each thread keeps up to two nodes in registers from here on.
         words = vec3u()
@@ -316,13 +290,14 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
         step = int(0)
         while step < steps:
             left_out = int(0)
-            if wp.static(at_once and parts > 1):
+            if wp.static(dilating and parts > 1):
                 if s < body.subtree_count:
                     for p in range(wp.static(parts)):
                         if part == p:
                             x = wp.static(displacements[p])(words)
-                            y = turn_in(x, column(q, 0), column(q, 1), column(q, 2) * mirror, 1.0 / h)
-                            sum, weight = wp.static(measure[p])(y, shared_lam, material)
+                            q0, q1, q2 = maubach_frame(q, mirror)
+                            y = turn_in(x, q0, q1, q2, 1.0 / h)
+                            sum, weight = wp.static(measure[p])(y, material.lam, first)
                             sums(wp.static(STORE), wp.static(2 * p * capacity) + s, sum)
                             sums(wp.static(STORE), wp.static((2 * p + 1) * capacity) + s, weight)
                 synchronize_block()
@@ -330,66 +305,36 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
                 for p in range(wp.static(parts)):
                     if part == p:
                         x = wp.static(displacements[p])(words)
-                        if wp.static(dilating and not at_once):
-                            y = turn_in(x, column(q, 0), column(q, 1), column(q, 2) * mirror, 1.0 / h)
-                            sum, weight = wp.static(measure[p])(y, shared_lam, material)
-                            sums(wp.static(STORE), wp.static(2 * p * capacity) + s, sum)
-                            sums(wp.static(STORE), wp.static((2 * p + 1) * capacity) + s, weight)
                         g = mat10()
-                        if wp.static(at_once):
-                            q0 = column(q, 0)
-                            q1 = column(q, 1)
-                            q2 = column(q, 2) * mirror
+                        if wp.static(dilating):
+                            q0, q1, q2 = maubach_frame(q, mirror)
                             y = turn_in(x, q0, q1, q2, 1.0 / h)
                             sum = float(0.0)
                             weight = float(0.0)
                             if wp.static(parts == 1):
-                                sum, weight = wp.static(measure[p])(y, shared_lam, material)
+                                sum, weight = wp.static(measure[p])(y, material.lam, first)
                             else:
                                 for other in range(wp.static(parts)):
                                     sum += sums(wp.static(LOAD), wp.static(2 * other * capacity) + s, sum)
                                     weight += sums(wp.static(LOAD), wp.static((2 * other + 1) * capacity) + s, weight)
                             pressure = slope_of(mean_of(sum, weight))
-                            g, left_out = wp.static(dilate[p])(y, h, pressure, mu, shared_lam, material)
+                            g, left_out = wp.static(dilate[p])(y, h, material, pressure, first)
                             g = turn_out(g, q0, q1, q2)
-                        elif wp.static(shared):
-                            g, left_out = wp.static(turned[p])(x, q, h, mirror, wp.mat33(), mu, lam, material)
                         else:
-                            g, left_out = wp.static(own[p])(x, q, h, mirror, mu, lam, material)
+                            g, left_out = wp.static(own[p])(x, q, h, mirror, material, first)
                         for k in range(10):
                             if wp.static(places[p][k] >= 0):
                                 slot(wp.static(STORE), s + wp.static(places[p][k] * capacity), g[k])
             listed = enlist(thread, left_out)
             while synchronize_any(left_out) != 0:
                 if thread < waiting(wp.static(COUNT), 0, 0):
-                    do_one(body, thread, mu, lam, material_of_world, stride)
+                    do_one(body, thread, material, first_of_world)
                 synchronize_block()
                 left_out = collect(s, part, listed, left_out)
                 if thread == 0:
                     waiting(wp.static(CLEAR), 0, 0)
                 synchronize_block()
                 listed = enlist(thread, left_out)
-            if wp.static(dilating and not at_once):
-                if s < body.subtree_count:
-                    sum = float(0.0)
-                    weight = float(0.0)
-                    for p in range(wp.static(parts)):
-                        sum += sums(wp.static(LOAD), wp.static(2 * p * capacity) + s, sum)
-                        weight += sums(wp.static(LOAD), wp.static((2 * p + 1) * capacity) + s, weight)
-                    pressure = slope_of(mean_of(sum, weight))
-                    for p in range(wp.static(parts)):
-                        if part == p:
-                            x = wp.static(displacements[p])(words)
-                            q0 = column(q, 0)
-                            q1 = column(q, 1)
-                            q2 = column(q, 2) * mirror
-                            y = turn_in(x, q0, q1, q2, 1.0 / h)
-                            g = turn_out(wp.static(press[p])(y, h, pressure, shared_lam, material), q0, q1, q2)
-                            for k in range(10):
-                                if wp.static(places[p][k] >= 0):
-                                    at = s + wp.static(places[p][k] * capacity)
-                                    slot(wp.static(STORE), at, slot(wp.static(LOAD), at, g[k]) + g[k])
-                synchronize_block()
             task = thread
             while task < wp.static(layout.tasks):
                 if wp.static(layout.tasks > threads):

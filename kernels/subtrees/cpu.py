@@ -14,7 +14,7 @@ from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.kernels.elements.elements import Subtrees
 from warp_corot.kernels.elements.lanes import headers, scatter_lanes
-from warp_corot.kernels.elements.law_lanes import LawInLanes, NativeLaw, elastic
+from warp_corot.kernels.elements.law_lanes import STRESSLESS, LawInLanes, NativeLaw, elastic
 
 from .lanes import subtree_type
 
@@ -84,7 +84,7 @@ def scatter_subtrees_near(shape: int, shared: Dilatation | None = None) -> wp.Ke
     Otherwise every leaf has its own rotation, and the forces are bit for bit those of ``scatter_law_subtrees``. With a
     shared dilatation the material is a ``DilatingMaterial``.
     """
-    law, rest = elastic("corotated", "material.isotropic").code, "corot::Stressless{}"
+    law, rest = (elastic(name, "material.isotropic").code for name in ("corotated", STRESSLESS))
     if shared is not None:
         law, rest = (_DILATING.format(shared.lanes, code) for code in (law, rest))
     kind = f"corot::Type, {int(shared is not None)}"
@@ -95,10 +95,3 @@ def scatter_subtrees_near(shape: int, shared: Dilatation | None = None) -> wp.Ke
         headers("subtrees8", types=subtree_type(shape)),
     )
     return scatter_lanes(call, Subtrees, Material, wp.uint8, native)
-
-
-@functools.cache
-def scatter_dilatation_lanes(shape: int, of: Dilatation) -> wp.Kernel:
-    """Forces of the shared dilatation of subtrees alone; a thread is eight subtrees."""
-    code = f"corot::dilating<corot::{of.lanes}>(corot::Stressless{{}}, material.lam, material.stride)"
-    return scatter_subtrees(shape, IsotropicMaterial, NativeLaw(code))

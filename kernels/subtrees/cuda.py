@@ -76,7 +76,7 @@ def scatter_subtrees_own(shape: int, grouped: bool, uniform: bool, listed: bool)
         h, q, mirror = root_of(subtrees, s)
         x = load(subtrees, s, u)
         leaf = wp.where(wp.static(uniform), 0, subtrees.first[s])
-        g, mask = forces(x, q, h, mirror, material.mu, material.lam, leaf)
+        g, mask = forces(x, q, h, mirror, material, leaf)
         flagged[s] = wp.uint8(mask)
         reserved = int(0)
         if wp.static(listed):
@@ -101,8 +101,7 @@ def scatter_subtrees_shared(shape: int, grouped: bool, uniform: bool, given: boo
     def scatter_subtrees_shared(
         # In
         subtrees: Subtrees,
-        mu: wp.array[wp.float32],
-        lam: wp.array[wp.float32],
+        material: IsotropicMaterial,
         u: wp.array[wp.vec4],
         rotations: wp.array[wp.mat33],
         unit: wp.array[wp.int32],
@@ -117,7 +116,7 @@ def scatter_subtrees_shared(shape: int, grouped: bool, uniform: bool, given: boo
         turn = wp.mat33()
         if wp.static(given):
             turn = rotations[unit[s]] * q
-        g, mask = forces(x, q, h, mirror, turn, mu, lam, wp.where(wp.static(uniform), 0, subtrees.first[s]))
+        g, mask = forces(x, q, h, mirror, turn, material, wp.where(wp.static(uniform), 0, subtrees.first[s]))
         if wp.static(not given):
             flagged[s] = wp.uint8(mask)
         reserved = int(0)
@@ -144,8 +143,7 @@ def _scatter_subtree(shape: int, uniform: bool) -> wp.Function:
         subtrees: Subtrees,
         s: int,
         grouped: bool,
-        mu: wp.array[wp.float32],
-        lam: wp.array[wp.float32],
+        material: IsotropicMaterial,
         u: wp.array[wp.vec4],
         f: wp.array[wp.vec4],
     ):
@@ -155,8 +153,8 @@ def _scatter_subtree(shape: int, uniform: bool) -> wp.Function:
             x = load_group(subtrees.nodes, s // 8, wp.static(shape), u)
         if not grouped:
             x = load_single(subtrees, s, u)
-        material = wp.where(wp.static(uniform), 0, subtrees.first[s])
-        g, mask = forces(x, q, h, mirror, mu, lam, material)
+        first = wp.where(wp.static(uniform), 0, subtrees.first[s])
+        g, mask = forces(x, q, h, mirror, material, first)
         if grouped:
             merge_group(subtrees.targets, s // 8, wp.static(shape), g, f)
         else:
@@ -181,8 +179,7 @@ def scatter_stretches(uniform: bool) -> wp.Kernel:
         stretches: wp.array[Stretch],
         flat: ForestElements,
         flat_leaves: wp.array[wp.int32],
-        mu: wp.array[wp.float32],
-        lam: wp.array[wp.float32],
+        material: IsotropicMaterial,
         u: wp.array[wp.vec4],
         # Out
         f: wp.array[wp.vec4],
@@ -201,7 +198,9 @@ def scatter_stretches(uniform: bool) -> wp.Kernel:
             if wp.static(not uniform):
                 m = flat_leaves[s]
             u0, u1, u2, u3 = node_displacements(flat.nodes[s], u)
-            p, trusted = leaf_stress(gradient_of(flat, s, u0, u1, u2, u3), frame(flat, s), mu[m], lam[m])
+            p, trusted = leaf_stress(
+                gradient_of(flat, s, u0, u1, u2, u3), frame(flat, s), material.mu[m], material.lam[m]
+            )
             if not trusted:
                 p = wp.mat33()
             reserved = reserve(left_out, list_of(block), not trusted, stretches[k].count - s)
@@ -213,11 +212,11 @@ def scatter_stretches(uniform: bool) -> wp.Kernel:
         grouped = stretches[k].grouped != 0
         mask = int(0)
         if shape == 0:
-            mask = subtree0(subtrees, s, grouped, mu, lam, u, f)
+            mask = subtree0(subtrees, s, grouped, material, u, f)
         elif shape == 1:
-            mask = subtree1(subtrees, s, grouped, mu, lam, u, f)
+            mask = subtree1(subtrees, s, grouped, material, u, f)
         else:
-            mask = subtree2(subtrees, s, grouped, mu, lam, u, f)
+            mask = subtree2(subtrees, s, grouped, material, u, f)
         stretches[k].flagged[s] = wp.uint8(mask)
         to_come = stretches[k].count - s
         reserved = reserve(left_out, list_of(block), mask != 0, to_come)

@@ -9,17 +9,16 @@ import functools
 import warp as wp
 
 from warp_corot.kernels.corotated.algebraic import stretch_stress
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import VOLUME as VOLUME_CHANGE
 from warp_corot.kernels.elements.dilatation import Dilatation, mean_of, pressure_stress_of
 from warp_corot.kernels.elements.elements import Subtrees, root_of
-from warp_corot.kernels.elements.shapes import columns_of, leaf_forces_of
-from warp_corot.kernels.math.rotation import column
+from warp_corot.kernels.elements.shapes import columns_of
 from warp_corot.kernels.modules import unique_kernel
-from warp_corot.kernels.tables.shapes import VOLUME, fingerprint
+from warp_corot.kernels.tables.shapes import fingerprint
 from warp_corot.kernels.tables.subtree import LEAVES
 
-from .forces import mat10, turns_of
-from .laws import turn_in, turn_out
+from .forces import mat10, maubach_frame, subtree_forces, turn_in, turn_out, turns_of
 from .memory import memory_of
 
 wp.set_module_options({"enable_backward": False})
@@ -29,7 +28,7 @@ wp.set_module_options({"enable_backward": False})
 def dilatation_sums_of(shape: int, uniform: bool, of: Dilatation, chosen: range = range(8)) -> wp.Function:
     """The sums of lambda theta and of lambda over the chosen leaves, which have equal volumes.
 
-    The ten displacements are in the frame of ``laws.turn_in``.
+    The ten displacements are in the frame of ``forces.turn_in``.
     """
     measure, columns = of.measure, columns_of(shape)
     leaves, begin, end = LEAVES[shape], chosen.start, chosen.stop
@@ -59,112 +58,58 @@ def dilatation_sums_of(shape: int, uniform: bool, of: Dilatation, chosen: range 
 
 
 @functools.cache
-def pressure_forces_of(shape: int, uniform: bool, of: Dilatation, chosen: range = range(8)) -> wp.Function:
-    """Forces of the chosen leaves from ten displacements in the same frame, and from the slope of the energy at the
-    dilatation that all eight leaves share."""
-    stress, columns, leaf_forces = pressure_stress_of(of), columns_of(shape), leaf_forces_of(shape)
-    leaves, volume, begin, end = LEAVES[shape], VOLUME[shape], chosen.start, chosen.stop
+def pressure_leaves(shape: int, of: Dilatation) -> wp.Function:
+    """The law of leaves (``forces``) of the pressure alone; the leaves of a subtree share the pressure."""
+    stress = pressure_stress_of(of)
     into_leaf, out_of_leaf = turns_of(shape)
 
     @wp.func
-    def pressure_forces(y: mat10, h: float, pressure: float, lam: wp.array[wp.float32], first: int):
-        _generated_from = wp.static(fingerprint(leaves, begin, end))
-        k = lam[first]
-        # P V / h is the stress times this.
-        area = wp.static(volume) * h * h
-        g = mat10()
-        for leaf in range(wp.static(begin), wp.static(end)):
-            if wp.static(not uniform):
-                k = lam[first + leaf]
-            b0, b1, b2 = columns(
-                y[wp.static(leaves[leaf][0])],
-                y[wp.static(leaves[leaf][1])],
-                y[wp.static(leaves[leaf][2])],
-                y[wp.static(leaves[leaf][3])],
-            )
-            p = out_of_leaf(leaf, stress(into_leaf(leaf, wp.matrix_from_cols(b0, b1, b2)), pressure, k * area))
-            f0, f1, f2, f3 = leaf_forces(column(p, 0), column(p, 1), column(p, 2))
-            g[wp.static(leaves[leaf][0])] += f0
-            g[wp.static(leaves[leaf][1])] += f1
-            g[wp.static(leaves[leaf][2])] += f2
-            g[wp.static(leaves[leaf][3])] += f3
-        return g
+    def pressure_leaf(material: IsotropicMaterial, pressure: float, leaf: int, t: int, area: float, g: wp.mat33):
+        return out_of_leaf(leaf, stress(into_leaf(leaf, g), pressure, area * material.lam[t])), True, True
 
-    return pressure_forces
+    return pressure_leaf
 
 
 @functools.cache
-def dilating_forces_of(shape: int, uniform: bool, chosen: range = range(8)) -> wp.Function:
-    """Corotated forces and the forces of the pressure in one pass, and a mask of the leaves left out; otherwise the
-    same as ``pressure_forces_of``.
-
-    Leaves that the corotated law leaves out still add the forces of the pressure.
+def dilating_leaves(shape: int) -> wp.Function:
+    """The corotated law of leaves with the pressure, which a leaf has even if its corotated stress may not be trusted.
+    ``lam`` is that of the pressure.
     """
-    pressure_stress, columns, leaf_forces = pressure_stress_of(VOLUME_CHANGE), columns_of(shape), leaf_forces_of(shape)
-    leaves, volume, begin, end = LEAVES[shape], VOLUME[shape], chosen.start, chosen.stop
+    pressure_stress = pressure_stress_of(VOLUME_CHANGE)
     into_leaf, out_of_leaf = turns_of(shape)
 
     @wp.func
-    def dilating_forces(
-        y: mat10, h: float, pressure: float, mu: wp.array[wp.float32], lam: wp.array[wp.float32], first: int
-    ):
-        _generated_from = wp.static(fingerprint(leaves, begin, end))
-        # P V / h is the stress times this.
-        area = wp.static(volume) * h * h
-        m = area * mu[first]
-        k = area * lam[first]
-        g = mat10()
-        left_out = int(0)
-        for leaf in range(wp.static(begin), wp.static(end)):
-            if wp.static(not uniform):
-                m = area * mu[first + leaf]
-                k = area * lam[first + leaf]
-            b0, b1, b2 = columns(
-                y[wp.static(leaves[leaf][0])],
-                y[wp.static(leaves[leaf][1])],
-                y[wp.static(leaves[leaf][2])],
-                y[wp.static(leaves[leaf][3])],
-            )
-            a = into_leaf(leaf, wp.matrix_from_cols(b0, b1, b2))
-            sigma, trusted = stretch_stress(a, m, 0.0)
-            if not trusted:
-                sigma = wp.mat33()
-                left_out |= wp.static(1 << leaf)
-            p = out_of_leaf(leaf, sigma + pressure_stress(a, pressure, k))
-            f0, f1, f2, f3 = leaf_forces(column(p, 0), column(p, 1), column(p, 2))
-            g[wp.static(leaves[leaf][0])] += f0
-            g[wp.static(leaves[leaf][1])] += f1
-            g[wp.static(leaves[leaf][2])] += f2
-            g[wp.static(leaves[leaf][3])] += f3
-        return g, left_out
+    def dilating_leaf(material: IsotropicMaterial, pressure: float, leaf: int, t: int, area: float, g: wp.mat33):
+        a = into_leaf(leaf, g)
+        sigma, trusted = stretch_stress(a, area * material.mu[t], 0.0)
+        return out_of_leaf(leaf, sigma + pressure_stress(a, pressure, area * material.lam[t])), True, trusted
 
-    return dilating_forces
+    return dilating_leaf
 
 
 @functools.cache
 def scatter_dilatation(shape: int, grouped: bool, uniform: bool, of: Dilatation) -> wp.Kernel:
     """Add the forces of the shared dilatation of subtrees on CUDA. Launch with block_dim ``memory.BLOCK``."""
     load, add = memory_of(shape, grouped)
-    sums, forces, slope_of = dilatation_sums_of(shape, uniform, of), pressure_forces_of(shape, uniform, of), of.slope
+    sums, slope_of = dilatation_sums_of(shape, uniform, of), of.slope
+    forces = subtree_forces(shape, uniform, pressure_leaves(shape, of))
 
     @unique_kernel(grid_stride=False)
     def scatter_dilatation(
         # In
         subtrees: Subtrees,
-        lam: wp.array[wp.float32],
+        material: IsotropicMaterial,
         u: wp.array[wp.vec4],
         # Out
         f: wp.array[wp.vec4],
     ):
         s = wp.tid()
         h, q, mirror = root_of(subtrees, s)
-        q0 = column(q, 0)
-        q1 = column(q, 1)
-        q2 = column(q, 2) * mirror
+        q0, q1, q2 = maubach_frame(q, mirror)
         y = turn_in(load(subtrees, s, u), q0, q1, q2, 1.0 / h)
         first = wp.where(wp.static(uniform), 0, subtrees.first[s])
-        sum, weight = sums(y, lam, first)
-        g = forces(y, h, slope_of(mean_of(sum, weight)), lam, first)
+        sum, weight = sums(y, material.lam, first)
+        g, _left_out = forces(y, h, material, slope_of(mean_of(sum, weight)), first)
         add(subtrees, s, turn_out(g, q0, q1, q2), f)
 
     return scatter_dilatation

@@ -9,14 +9,16 @@ leaf k in tree order.
 import functools
 import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import warp as wp
 
 from warp_corot.kernels.corotated.algebraic import stretch_stress
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, linear_stress
 from warp_corot.kernels.elements.shapes import columns_of, leaf_forces_of
 from warp_corot.kernels.math.rotation import ITERATIONS, column, newton_rotation
 from warp_corot.kernels.tables.shapes import VOLUME, fingerprint
-from warp_corot.kernels.tables.subtree import FRAMES, LEAVES, POSITIONS
+from warp_corot.kernels.tables.subtree import FRAMES, HANDEDNESS, LEAVES, POSITIONS
 
 wp.set_module_options({"enable_backward": False})
 
@@ -48,6 +50,17 @@ def _products(matrices: Sequence[Sequence[Sequence[float]]]) -> wp.Function:
     return product
 
 
+@functools.cache
+def handedness_of(shape: int) -> wp.Function:
+    """A function for the determinant of a leaf's frame."""
+    numbers = ", ".join(f"{float(number)!r}f" for number in HANDEDNESS[shape])
+
+    @wp.func_native(f"static const float numbers[8] = {{{numbers}}};\nreturn numbers[leaf];")
+    def handedness(leaf: int) -> float: ...
+
+    return handedness
+
+
 @wp.func
 def leaf_stress(g: wp.mat33, q: wp.mat33, mu: float, lam: float):
     """First Piola-Kirchhoff stress of one leaf with its own rotation, times Q, and whether it may be trusted."""
@@ -56,85 +69,110 @@ def leaf_stress(g: wp.mat33, q: wp.mat33, mu: float, lam: float):
 
 
 @functools.cache
-def turned_forces_of(shape: int, uniform: bool, chosen: range, stress: wp.Function = stretch_stress) -> wp.Function:
-    """Forces of the chosen leaves, each on its own, and a mask of those left out; in the subtree's Maubach frame, or in
-    a frame that turns with the subtree.
+def always_trusted(stress: wp.Function) -> wp.Function:
+    @wp.func
+    def trusted_stress(a: wp.mat33, mu: float, lam: float):
+        return stress(a, mu, lam), True
 
-    ``y`` are ten displacements in that frame, in edge lengths h of a leaf; tables hold the leaves' frames B. ``stress``
-    is a law of the displacement gradient and Lamé's parameters; it also returns whether its result may be trusted.
-    """
-    columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
-    leaves, frames = LEAVES[shape], FRAMES[shape]
+    return trusted_stress
+
+
+@functools.cache
+def isotropic_leaves(shape: int, stress: wp.Function) -> wp.Function:
+    """The law of leaves of a ``stress`` of A and Lamé's parameters, which also says whether it may be trusted."""
     into_leaf, out_of_leaf = turns_of(shape)
-    begin, end = chosen.start, chosen.stop
-    volume = VOLUME[shape]
 
     @wp.func
-    def turned_forces(y: mat10, h: float, mu: wp.array[wp.float32], lam: wp.array[wp.float32], first: int):
-        _generated_from = wp.static(fingerprint(leaves, frames, begin, end))
-        # P V / h.
+    def isotropic_leaf(material: IsotropicMaterial, extra: float, leaf: int, t: int, area: float, g: wp.mat33):
+        p, trusted = stress(into_leaf(leaf, g), area * material.mu[t], area * material.lam[t])
+        return out_of_leaf(leaf, p), trusted, trusted
+
+    return isotropic_leaf
+
+
+@functools.cache
+def subtree_forces(shape: int, uniform: bool, law: wp.Function, chosen: range = range(8)) -> wp.Function:
+    """Forces of the chosen leaves under a law of leaves, and a mask of those that may not be trusted.
+
+    ``y`` are ten displacements in the subtree's Maubach frame, or one that turns with it, in edge lengths h of a leaf;
+    ``first`` is the place of the first leaf's material; unless ``uniform``, those of the other leaves follow.
+    """
+    columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
+    leaves, volume, begin, end = LEAVES[shape], VOLUME[shape], chosen.start, chosen.stop
+
+    @wp.func
+    def subtree_forces(y: mat10, h: float, material: Any, extra: Any, first: int):
+        _generated_from = wp.static(fingerprint(leaves, FRAMES[shape], begin, end))
+        # P V / h is the stress times this.
         area = wp.static(volume) * h * h
-        m = area * mu[first]
-        k = area * lam[first]
         g = mat10()
         left_out = int(0)
         for leaf in range(wp.static(begin), wp.static(end)):
-            if wp.static(not uniform):
-                m = area * mu[first + leaf]
-                k = area * lam[first + leaf]
             b0, b1, b2 = columns(
                 y[wp.static(leaves[leaf][0])],
                 y[wp.static(leaves[leaf][1])],
                 y[wp.static(leaves[leaf][2])],
                 y[wp.static(leaves[leaf][3])],
             )
-            # From the displacement gradient in the leaf's frame.
-            sigma, trusted = stress(into_leaf(leaf, wp.matrix_from_cols(b0, b1, b2)), m, k)
-            if trusted:
-                p = out_of_leaf(leaf, sigma)
+            t = first + wp.static(0 if uniform else leaf)
+            p, counts, trusted = law(material, extra, leaf, t, area, wp.matrix_from_cols(b0, b1, b2))
+            if counts:
                 f0, f1, f2, f3 = leaf_forces(column(p, 0), column(p, 1), column(p, 2))
                 g[wp.static(leaves[leaf][0])] += f0
                 g[wp.static(leaves[leaf][1])] += f1
                 g[wp.static(leaves[leaf][2])] += f2
                 g[wp.static(leaves[leaf][3])] += f3
-            else:
+            if not trusted:
                 left_out |= wp.static(1 << leaf)
         return g, left_out
 
-    return turned_forces
+    return subtree_forces
+
+
+@wp.func
+def maubach_frame(q: wp.mat33, mirror: float):
+    """The columns of a subtree's Maubach frame, whose third one is turned round if it is left-handed."""
+    return column(q, 0), column(q, 1), column(q, 2) * mirror
+
+
+@wp.func
+def turn_in(x: mat10, q0: wp.vec3, q1: wp.vec3, q2: wp.vec3, inv_h: float):
+    """Displacements relative to the first node's, in the frame with columns q and in edge lengths of a leaf."""
+    h0 = inv_h * q0
+    h1 = inv_h * q1
+    h2 = inv_h * q2
+    origin = x[0]
+    y = mat10()
+    for n in range(1, 10):
+        d = x[n] - origin
+        y[n] = wp.vec3(wp.dot(h0, d), wp.dot(h1, d), wp.dot(h2, d))
+    return y
+
+
+@wp.func
+def turn_out(g: mat10, q0: wp.vec3, q1: wp.vec3, q2: wp.vec3):
+    """Turn vectors from the frame with columns q into world space."""
+    x = mat10()
+    for n in range(10):
+        x[n] = g[n, 0] * q0 + g[n, 1] * q1 + g[n, 2] * q2
+    return x
 
 
 @functools.cache
-def own_forces(shape: int, uniform: bool, chosen: range = range(8)) -> wp.Function:
-    """Forces of the chosen leaves from ten displacements, each leaf with its own rotation, and a mask of those left
-    out.
+def own_forces(
+    shape: int, uniform: bool, stress: wp.Function = stretch_stress, chosen: range = range(8)
+) -> wp.Function:
+    """Forces of the chosen leaves from ten displacements under an isotropic law, and a mask of those left out.
 
-    ``q`` is the subtree's frame, ``h`` a leaf's edge length, ``first`` the place of the first leaf's material; unless
-    ``uniform``, those of the other leaves follow.
+    ``q`` is the subtree's frame, ``h`` a leaf's edge length, ``first`` the place of the first leaf's material.
     """
-    turned_forces = turned_forces_of(shape, uniform, chosen)
+    forces = subtree_forces(shape, uniform, isotropic_leaves(shape, stress), chosen)
 
     @wp.func
-    def own_forces(
-        x: mat10, q: wp.mat33, h: float, mirror: float, mu: wp.array[wp.float32], lam: wp.array[wp.float32], first: int
-    ):
-        q0 = column(q, 0)
-        q1 = column(q, 1)
-        q2 = column(q, 2) * mirror
-        inv_h = 1.0 / h
-        h0 = inv_h * q0
-        h1 = inv_h * q1
-        h2 = inv_h * q2
-        origin = x[0]
-        y = mat10()
-        for n in range(1, 10):
-            d = x[n] - origin
-            y[n] = wp.vec3(wp.dot(h0, d), wp.dot(h1, d), wp.dot(h2, d))
-        g, left_out = turned_forces(y, h, mu, lam, first)
-        for n in range(10):
-            force = g[n]
-            g[n] = force[0] * q0 + force[1] * q1 + force[2] * q2
-        return g, left_out
+    def own_forces(x: mat10, q: wp.mat33, h: float, mirror: float, material: IsotropicMaterial, first: int):
+        q0, q1, q2 = maubach_frame(q, mirror)
+        g, left_out = forces(turn_in(x, q0, q1, q2, 1.0 / h), h, material, 0.0, first)
+        return turn_out(g, q0, q1, q2), left_out
 
     return own_forces
 
@@ -179,45 +217,24 @@ def turned_back_of(shape: int) -> wp.Function:
 
 
 @functools.cache
-def shared_forces(shape: int, uniform: bool, given: bool, chosen: range = range(8)) -> wp.Function:
-    """Forces of the chosen leaves from ten displacements, all with one rotation, and a mask of those left out: none or
-    all.
+def shared_forces(shape: int, uniform: bool, given: bool) -> wp.Function:
+    """Forces from ten displacements of leaves that all have one rotation, and a mask of those left out: none or all.
 
     The rotation is that of the subtree's root, or a given one; ``turn`` is the given one times the subtree's frame
     ``q``. The ten displacements are turned back once; then the leaves are linear elements in the subtree's own frame.
     """
-    columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
-    leaves, frames, at = LEAVES[shape], FRAMES[shape], POSITIONS[shape]
-    into_leaf, out_of_leaf = turns_of(shape)
-    turned_back = turned_back_of(shape)
-    begin, end = chosen.start, chosen.stop
-    volume = VOLUME[shape]
+    columns, turned_back = columns_of(shape), turned_back_of(shape)
+    forces = subtree_forces(shape, uniform, isotropic_leaves(shape, always_trusted(linear_stress)))
 
     @wp.func
     def shared_forces(
-        x: mat10,
-        q: wp.mat33,
-        h: float,
-        mirror: float,
-        turn: wp.mat33,
-        mu: wp.array[wp.float32],
-        lam: wp.array[wp.float32],
-        first: int,
+        x: mat10, q: wp.mat33, h: float, mirror: float, turn: wp.mat33, material: IsotropicMaterial, first: int
     ):
-        _generated_from = wp.static(fingerprint(leaves, frames, at, begin, end))
-        left_out = int(0)
-        q0 = column(q, 0)
-        q1 = column(q, 1)
-        q2 = column(q, 2) * mirror
+        q0, q1, q2 = maubach_frame(q, mirror)
+        r0, r1, r2 = maubach_frame(turn, mirror)
         inv_h = 1.0 / h
-        r0 = wp.vec3()
-        r1 = wp.vec3()
-        r2 = wp.vec3()
-        if wp.static(given):
-            r0 = column(turn, 0)
-            r1 = column(turn, 1)
-            r2 = column(turn, 2) * mirror
-        else:
+        left_out = int(0)
+        if wp.static(not given):
             # The subtree's edge is two of a leaf's.
             c0, c1, c2 = columns(x[0], x[1], x[2], x[3])
             half = 0.5 * inv_h
@@ -226,48 +243,10 @@ def shared_forces(shape: int, uniform: bool, given: bool, chosen: range = range(
             r1 = wp.static(0.5**ITERATIONS) * z1
             r2 = wp.static(0.5**ITERATIONS) * z2
             if not trusted:
-                left_out = wp.static(sum(1 << leaf for leaf in chosen))
+                left_out = 255
         y = turned_back(x, inv_h, q0, q1, q2, r0, r1, r2)
-        m = mu[first]
-        k = lam[first]
-        area = wp.static(volume) * h * h
-        g = mat10()
-        for leaf in range(wp.static(begin), wp.static(end)):
-            if wp.static(not uniform):
-                m = mu[first + leaf]
-                k = lam[first + leaf]
-            b0, b1, b2 = columns(
-                y[wp.static(leaves[leaf][0])],
-                y[wp.static(leaves[leaf][1])],
-                y[wp.static(leaves[leaf][2])],
-                y[wp.static(leaves[leaf][3])],
-            )
-            e = into_leaf(leaf, wp.matrix_from_cols(b0, b1, b2))
-            double_mu = 2.0 * m * area
-            pressure = k * area * (e[0, 0] + e[1, 1] + e[2, 2])
-            s01 = m * area * (e[0, 1] + e[1, 0])
-            s02 = m * area * (e[0, 2] + e[2, 0])
-            s12 = m * area * (e[1, 2] + e[2, 1])
-            sigma = wp.mat33(
-                double_mu * e[0, 0] + pressure,
-                s01,
-                s02,
-                s01,
-                double_mu * e[1, 1] + pressure,
-                s12,
-                s02,
-                s12,
-                double_mu * e[2, 2] + pressure,
-            )
-            p = out_of_leaf(leaf, sigma)
-            f0, f1, f2, f3 = leaf_forces(column(p, 0), column(p, 1), column(p, 2))
-            g[wp.static(leaves[leaf][0])] += f0
-            g[wp.static(leaves[leaf][1])] += f1
-            g[wp.static(leaves[leaf][2])] += f2
-            g[wp.static(leaves[leaf][3])] += f3
-        for n in range(10):
-            force = g[n]
-            g[n] = force[0] * r0 + force[1] * r1 + force[2] * r2
+        g, _left_out = forces(y, h, material, 0.0, first)
+        g = turn_out(g, r0, r1, r2)
         if left_out != 0:
             g = mat10()
         return g, left_out

@@ -6,6 +6,8 @@ A byte for each subtree, with a bit for each leaf, says which these are. On CUDA
 reads the bytes of eight subtrees at a time, which are nearly always all zero, and processes their leaves in order.
 """
 
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import warp as wp
@@ -170,29 +172,38 @@ def repair_listed_shared(
 # --- by bytes, in order ---------------------------------------------------------------------------------------------
 
 
-@wp.kernel(enable_backward=False)
-def repair_own(
-    # In
-    flagged: wp.array[wp.uint64],
-    first: wp.array[wp.int32],
-    elements: ForestElements,
-    material: IsotropicMaterial,
-    u: wp.array[wp.vec4],
-    # Out
-    f: wp.array[wp.vec4],
-):
-    """Add the forces of flagged leaves, each with its own rotation."""
-    i = wp.tid()
-    flags = flagged[i]
-    if flags == wp.uint64(0):
-        return
-    leaf = int(0)
-    while leaf < SUBTREES * LEAVES:
-        if is_left_out(flags, leaf):
-            t = first[SUBTREES * i + leaf // LEAVES] + leaf % LEAVES
-            p = own_stress(elements, t, material, u)
-            scatter_stress(elements, t, p, f)
-        leaf += 1
+@functools.cache
+def repair_flagged(Material: type, stress: wp.Function, kernel: Callable = unique_kernel) -> wp.Kernel:
+    """Add the forces of flagged leaves under a law of ``elements.forces`` that is right for every F.
+
+    So many ``lanes`` share a word of 64 bits, one for each leaf of eight subtrees; nearly always all bits are zero. In
+    one lane leaves come in order.
+    """
+
+    @kernel()
+    def repair_flagged(
+        # In
+        lanes: int,
+        flagged: wp.array[wp.uint64],
+        first: wp.array[wp.int32],
+        elements: ForestElements,
+        material: Material,
+        u: wp.array[wp.vec4],
+        # Out
+        f: wp.array[wp.vec4],
+    ):
+        i = wp.tid() // lanes
+        flags = flagged[i]
+        if flags == wp.uint64(0):
+            return
+        leaf = wp.tid() % lanes
+        while leaf < SUBTREES * LEAVES:
+            if is_left_out(flags, leaf):
+                t = first[SUBTREES * i + leaf // LEAVES] + leaf % LEAVES
+                scatter_stress(elements, t, stress(elements, t, material, u), f)
+            leaf += lanes
+
+    return repair_flagged
 
 
 @wp.kernel(enable_backward=False)
@@ -261,3 +272,7 @@ def repair_shared(
                 scatter_turned(elements, t, rotation, material, u, f)
                 leaf += 1
         member += 1
+
+
+#: Of corotated leaves with own rotations.
+repair_own = repair_flagged(IsotropicMaterial, own_stress, functools.partial(wp.kernel, enable_backward=False))

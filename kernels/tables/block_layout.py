@@ -34,7 +34,6 @@ class Layout:
 
     Attributes:
         shape: Type of its subtrees.
-        shared: Whether leaves use their subtree root's rotation; otherwise their own.
         uniform: Whether all of a world is of one material.
         parts: Into how many parts the leaves of a subtree are dealt: 1 or 2 (4 was slower).
         subtrees: Room for subtrees, whole warps of them.
@@ -44,7 +43,6 @@ class Layout:
     """
 
     shape: int
-    shared: bool
     uniform: bool
     parts: int
     subtrees: int
@@ -105,8 +103,5 @@ class Layout:
         return places
 
     def needs(self, part: int) -> list[bool]:
-        """Which of a subtree's ten nodes a part reads: among them the first, to which all are relative, and for a
-        shared rotation the root's.
-        """
-        needs_root = self.shared
-        return [place >= 0 or node == 0 or (needs_root and node < 4) for node, place in enumerate(self.places[part])]
+        """Which of a subtree's ten nodes a part reads: among them the first, to which all are relative."""
+        return [place >= 0 or node == 0 for node, place in enumerate(self.places[part])]

@@ -9,11 +9,16 @@ import shared_dilatation as reference
 import warp as wp
 from cases import CUBE, jittered, mixed_forest
 from shortened import crossed
+from tangents import diagonal
 
 import warp_corot as wc
 from warp_corot.discretization.discretization import FixedMesh
-from warp_corot.discretization.shear_only import ShearOnly
+from warp_corot.discretization.shear_only import shear_only
+from warp_corot.elasticity.corotated.elements import LanesField
+from warp_corot.elasticity.corotated.subtrees import SubtreeField
 from warp_corot.elasticity.dilatation.field import DilatationField
+from warp_corot.elasticity.paths.cuda import LawCudaField
+from warp_corot.elasticity.paths.law_lanes import LawLanesField
 
 YOUNG, POISSON = 1e4, 0.4
 MODELS = {
@@ -80,7 +85,7 @@ def check_forces(law, kind, device, rng, u):
     mesh = make()
     lam = YOUNG * POISSON / ((1 + POISSON) * (1 - 2 * POISSON))
     body, field = bound(law, mesh, device)
-    shear = MODELS[law]().bind(ShearOnly(body.discretization))
+    shear = MODELS[law]().bind(shear_only(body.discretization))
     groups = groups_of(mesh)
     expected = reference.energy(law, mesh, groups, lam, u)
     found = field.elastic_energy(vec4(u, device)) - shear.elastic_energy(vec4(u, device))
@@ -115,37 +120,12 @@ def test_stiffness_is_minus_the_derivative_of_the_forces(law, kind, device, rng)
 
 
 @pytest.mark.parametrize(("law", "kind"), crossed(MODELS, ["level 3", "mixed levels", "general"], is_short))
-def test_kept_rows_give_the_stiffness(law, kind, device, rng):
-    """Products and diagonals from kept rows equal those computed directly, also where elements are held from turning
-    over."""
-    mesh = MESHES[kind][0]()
-    _, field = bound(law, mesh, device)
-    u = strained(mesh, rng) + mesh.points @ np.diag([0.4, 0.3, -0.05])
-    p = vec4(rng.uniform(-1.0, 1.0, u.shape), device)
-    for exact in (False, True) if law == "corotated" else (True,):
-        options = {"exact": exact} if law == "corotated" else {}
-        tangent = field.tangent(exact=exact)
-        tangent.prepare(vec4(u, device))
-        tangent.take(vec4(u, device))
-        found, expected = (wp.zeros(len(u), dtype=wp.vec4, device=device) for _ in range(2))
-        tangent.add_product(p, found)
-        field.add_stiffness(vec4(u, device), p, expected, **options)
-        assert np.abs(nodal(found) - nodal(expected)).max() < 1e-5 * np.abs(nodal(expected)).max()
-        found, expected = (wp.zeros(len(u), dtype=wp.mat33, device=device) for _ in range(2))
-        tangent.add_diagonal(found)
-        field.add_diagonal(vec4(u, device), expected, **options)
-        assert np.abs(found.numpy() - expected.numpy()).max() < 1e-5 * np.abs(expected.numpy()).max()
-
-
-@pytest.mark.parametrize(("law", "kind"), crossed(MODELS, ["level 3", "mixed levels", "general"], is_short))
 def test_diagonal(law, kind, device, rng):
     """The blocks are those of K where groups share a dilatation; elsewhere K has no more."""
     mesh = MESHES[kind][0]()
     _, field = bound(law, mesh, device)
     u, count = strained(mesh, rng, 0.02), len(mesh.points)
-    blocks = wp.zeros(count, dtype=wp.mat33, device=device)
-    field.add_diagonal(vec4(u, device), blocks)
-    blocks = blocks.numpy().astype(float)
+    blocks = diagonal(field, u).astype(float)
     for node in rng.choice(count, 5, replace=False):
         block = np.empty((3, 3))
         for axis in range(3):
@@ -222,7 +202,10 @@ def test_one_launch_gives_the_forces_of_several_passes(law, device, rng, monkeyp
     body = wc.SoftBody(mesh, material, device=device)
     u = vec4(rng.uniform(-0.02, 0.02, mesh.points.shape), device)
     together = nodal(MODELS[law](dilatation="shared").bind(body).elastic_forces(u))
-    monkeypatch.setattr(DilatationField, "join_launches", lambda field: field._others.follow())
+    for kind in (SubtreeField, LanesField, LawLanesField):
+        monkeypatch.setattr(kind, "share_dilatation", lambda *_: False)
+    for kind in (SubtreeField, LawCudaField):
+        monkeypatch.setattr(kind, "in_clusters", None)
     apart = nodal(MODELS[law](dilatation="shared").bind(body).elastic_forces(u))
     assert np.abs(together - apart).max() < 2e-5 * np.abs(apart).max()
 

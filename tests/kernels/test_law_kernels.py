@@ -16,11 +16,10 @@ from thousands import FORESTS, TOLERANCE, materials, meshed, turned
 import warp_corot as wc
 from warp_corot.discretization.planning.fixed import ForcePlan
 from warp_corot.elasticity.corotated.anisotropic import AnisotropicField
-from warp_corot.elasticity.corotated.anisotropic_general import GeneralAnisotropicField
-from warp_corot.elasticity.corotated.anisotropic_subtrees import as_bytes
-from warp_corot.elasticity.paths.clusters import ClusterScatter
+from warp_corot.elasticity.corotated.anisotropic_cuda import active_material, as_bytes
+from warp_corot.elasticity.paths.clusters import ClusterScatter, clustered
 from warp_corot.elasticity.structs import isotropic_material
-from warp_corot.kernels.clusters.laws import isotropic_law, reinforced_law
+from warp_corot.kernels.clusters.laws import ActiveMaterial, anisotropic_law, isotropic_law, reinforced_law
 from warp_corot.kernels.corotated.anisotropic import FibreMaterial, fibre_stress
 from warp_corot.kernels.corotated.definite import quaternions_of
 from warp_corot.kernels.elements import constitutive
@@ -33,6 +32,7 @@ from warp_corot.kernels.math.rotation import byers_xu, quick_rotation
 from warp_corot.kernels.subtrees.anisotropic import repair_leaves, scatter_anisotropic_subtrees, scatter_flat
 from warp_corot.kernels.subtrees.laws import scatter_subtrees
 from warp_corot.kernels.subtrees.memory import BLOCK
+from warp_corot.kernels.tables.cluster_layout import ANISOTROPIC
 
 LAWS = {
     "linear": constitutive.linear_stress,
@@ -79,6 +79,10 @@ OF_KINDS = [
 ]
 
 
+def isotropic_of(discretization):
+    return isotropic_material([discretization.mu, discretization.lam, discretization.material_stride])
+
+
 @pytest.mark.parametrize(("name", "law"), _of_subtrees(OF_LAWS, [*LAWS, "one material"]))
 def test_subtrees_one_by_one(name, law, device, rng):
     """All subtrees of a forest, without single leaves; with one material for the last of the laws."""
@@ -94,7 +98,7 @@ def test_subtrees_one_by_one(name, law, device, rng):
     for batch in plan.batches:
         by_node(batch.subtrees, body.device)
         kernel = scatter_subtrees(batch.shape, False, uniform, LAWS[law])
-        inputs = [batch.subtrees, body.discretization.mu, body.discretization.lam, on_device]
+        inputs = [batch.subtrees, isotropic_of(body.discretization), on_device]
         wp.launch(kernel, batch.count, inputs=inputs, outputs=[f], device=device, block_dim=BLOCK)
     inside = np.ones(len(mesh.tets), bool)
     inside[plan.flat.leaves.numpy()] = False
@@ -114,9 +118,7 @@ def test_general_elements(law, uniform, device, rng):
     on_device = wp.array(u, dtype=wp.vec4, device=device)
     f = wp.zeros_like(on_device)
     stress = LAWS.get(law) or corotated_law(quick_rotation)
-    material = isotropic_material(
-        [body.discretization.mu, body.discretization.lam, body.discretization.material_stride]
-    )
+    material = isotropic_of(body.discretization)
     add_forces(ClusterScatter(body.discretization.elements, isotropic_law(stress)), material, on_device, f)
     assert_right(f.numpy()[:, :3], oracle.evaluate(law, oracle_mesh(mesh), x, mu, lam)[1])
 
@@ -130,8 +132,7 @@ def test_anisotropic_subtrees_one_by_one(name, kind, device, rng):
     body = wc.SoftBody(mesh, material, device=device)
     on_device, active = strained(mesh, rng, device)
     whole = AnisotropicField(body.discretization, byers_xu, False)
-    axes = wp.empty(len(whole.material.axes), dtype=wp.quat, device=device)
-    wp.launch(quaternions_of, len(axes), inputs=[whole.material.axes], outputs=[axes], device=device)
+    axes = quaternions(whole)
     options = ("muscle" in kind, whole.material.axes_stride == 0, whole.material.stride == 0)
     plan = ForcePlan.of_forest(mesh, None, wp.get_device(device), grouped=False)
     f, flags, fibres = wp.zeros_like(on_device), 0, with_activation(whole, active)
@@ -139,9 +140,9 @@ def test_anisotropic_subtrees_one_by_one(name, kind, device, rng):
         by_node(batch.subtrees, body.device)
         left = wp.zeros(-(-batch.count // 8), dtype=wp.uint64, device=device)
         kernel = scatter_anisotropic_subtrees(batch.shape, False, *options)
-        inputs = [batch.subtrees, whole.material, axes, 1, active, on_device]
+        inputs = [batch.subtrees, active_material(whole.material, axes, 1, active), on_device]
         wp.launch(kernel, batch.count, inputs=inputs, outputs=[f, as_bytes(left)], device=device, block_dim=BLOCK)
-        inputs = [left, batch.subtrees.first, body.discretization.elements, fibres, on_device]
+        inputs = [8, left, batch.subtrees.first, body.discretization.elements, fibres, on_device]
         wp.launch(repair_leaves, 8 * len(left), inputs=inputs, outputs=[f], device=device)
         flags += np.unpackbits(as_bytes(left).numpy()).sum()
     flat = plan.flat
@@ -185,11 +186,18 @@ def test_anisotropic_general_elements(kind, device, rng):
     body = wc.SoftBody(mesh, material, device=device)
     on_device, active = strained(mesh, rng, device)
     f = wp.zeros_like(on_device)
-    field = GeneralAnisotropicField(body.discretization)
-    body.discretization.has_activation = True
-    body.discretization.activation = active
-    add_forces(field.scatter, field.active_material, on_device, f)
+    field = AnisotropicField(body.discretization, quick_rotation, False)
+    axes = quaternions(field)
+    law, chosen = anisotropic_law("muscle" in kind), clustered(body.discretization)
+    scatter = ClusterScatter(field.elements, law, ActiveMaterial, chosen=chosen, layout=ANISOTROPIC)
+    add_forces(scatter, active_material(field.material, axes, 1, active), on_device, f)
     assert_right(f.numpy()[:, :3], leaf_by_leaf(field, active, on_device))
+
+
+def quaternions(field):
+    axes = wp.empty(len(field.material.axes), dtype=wp.quat, device=field.device)
+    field.launch(quaternions_of, len(axes), [field.material.axes], [axes])
+    return axes
 
 
 def anisotropic(kind, mesh, rng):

@@ -13,6 +13,7 @@ from left_out_launches import Launches
 
 import warp_corot as wc
 from warp_corot.discretization.planning.fixed import ForcePlan
+from warp_corot.elasticity.structs import isotropic_material
 from warp_corot.kernels.subtrees.cuda import scatter_subtrees_shared
 from warp_corot.kernels.subtrees.left_out import LeftOut
 
@@ -75,11 +76,12 @@ def test_shared_rotations_by_subtrees(leaf_level, amount, device, rng):
         nodes = wp.array(np.ascontiguousarray(batch.subtrees.nodes.numpy().T), dtype=wp.int32, device=body.device)
         batch.subtrees.nodes = batch.subtrees.targets = nodes
     f = wp.zeros_like(body.state.displacements)
+    material = isotropic_material([body.discretization.mu, body.discretization.lam, 0])
     none = wp.empty(0, dtype=wp.mat33, device=body.device), wp.empty(0, dtype=wp.int32, device=body.device)
     wp.launch(
         scatter_subtrees_shared(batch.shape, False, True, False, False),
         dim=batch.count,
-        inputs=[batch.subtrees, body.discretization.mu, body.discretization.lam, body.state.displacements, *none],
+        inputs=[batch.subtrees, material, body.state.displacements, *none],
         outputs=[f, batch.flagged, LeftOut()],
         device=body.device,
         block_dim=128,

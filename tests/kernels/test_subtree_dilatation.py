@@ -1,4 +1,4 @@
-"""The dilatation that a subtree's leaves share, by CUDA's functions: all leaves at once, and two halves with one sum.
+"""The dilatation that a subtree's leaves share, by CUDA's functions: by itself, and with the law in two parts.
 
 Their arithmetic is the same on both devices.
 """
@@ -12,18 +12,14 @@ from cases import CUBE
 
 import warp_corot as wc
 from warp_corot.discretization.planning.fixed import ForcePlan
-from warp_corot.discretization.shear_only import ShearOnly
+from warp_corot.discretization.shear_only import shear_only
+from warp_corot.elasticity.structs import isotropic_material
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import VOLUME, mean_of
 from warp_corot.kernels.elements.elements import Subtrees, root_of
-from warp_corot.kernels.math.matrices import column
 from warp_corot.kernels.modules import unique_kernel
-from warp_corot.kernels.subtrees.dilatation import (
-    dilatation_sums_of,
-    dilating_forces_of,
-    pressure_forces_of,
-    scatter_dilatation,
-)
-from warp_corot.kernels.subtrees.laws import turn_in, turn_out
+from warp_corot.kernels.subtrees.dilatation import dilatation_sums_of, dilating_leaves, scatter_dilatation
+from warp_corot.kernels.subtrees.forces import maubach_frame, subtree_forces, turn_in, turn_out
 from warp_corot.kernels.subtrees.memory import BLOCK, add_single, load_single
 
 wp.set_module_options({"enable_backward": False})
@@ -34,48 +30,16 @@ slow = functools.partial(pytest.param, marks=pytest.mark.slow)
 
 
 @functools.cache
-def scatter_halves(shape, uniform):
-    """As ``scatter_dilatation``, with the leaves in two parts."""
-    first_sums, last_sums = (dilatation_sums_of(shape, uniform, VOLUME, part) for part in (range(4), range(4, 8)))
-    first_forces, last_forces = (pressure_forces_of(shape, uniform, VOLUME, part) for part in (range(4), range(4, 8)))
-
-    @unique_kernel(grid_stride=False)
-    def scatter_halves(
-        # In
-        subtrees: Subtrees,
-        lam: wp.array[wp.float32],
-        u: wp.array[wp.vec4],
-        # Out
-        f: wp.array[wp.vec4],
-    ):
-        s = wp.tid()
-        h, q, mirror = root_of(subtrees, s)
-        q0 = column(q, 0)
-        q1 = column(q, 1)
-        q2 = column(q, 2) * mirror
-        first = wp.where(wp.static(uniform), 0, subtrees.first[s])
-        y = turn_in(load_single(subtrees, s, u), q0, q1, q2, 1.0 / h)
-        sum, weight = first_sums(y, lam, first)
-        last_sum, last_weight = last_sums(y, lam, first)
-        pressure = mean_of(sum + last_sum, weight + last_weight)
-        add_single(subtrees, s, turn_out(first_forces(y, h, pressure, lam, first), q0, q1, q2), f)
-        add_single(subtrees, s, turn_out(last_forces(y, h, pressure, lam, first), q0, q1, q2), f)
-
-    return scatter_halves
-
-
-@functools.cache
 def scatter_at_once(shape, uniform):
     """The law and the pressure in one pass, with the leaves in two parts."""
-    sums = dilatation_sums_of(shape, uniform, VOLUME)
-    first_forces, last_forces = (dilating_forces_of(shape, uniform, part) for part in (range(3), range(3, 8)))
+    sums, law = dilatation_sums_of(shape, uniform, VOLUME), dilating_leaves(shape)
+    first_forces, last_forces = (subtree_forces(shape, uniform, law, part) for part in (range(3), range(3, 8)))
 
     @unique_kernel(grid_stride=False)
     def scatter_at_once(
         # In
         subtrees: Subtrees,
-        mu: wp.array[wp.float32],
-        lam: wp.array[wp.float32],
+        material: IsotropicMaterial,
         u: wp.array[wp.vec4],
         # Out
         f: wp.array[wp.vec4],
@@ -83,16 +47,14 @@ def scatter_at_once(shape, uniform):
     ):
         s = wp.tid()
         h, q, mirror = root_of(subtrees, s)
-        q0 = column(q, 0)
-        q1 = column(q, 1)
-        q2 = column(q, 2) * mirror
+        q0, q1, q2 = maubach_frame(q, mirror)
         first = wp.where(wp.static(uniform), 0, subtrees.first[s])
         y = turn_in(load_single(subtrees, s, u), q0, q1, q2, 1.0 / h)
-        sum, weight = sums(y, lam, first)
+        sum, weight = sums(y, material.lam, first)
         pressure = mean_of(sum, weight)
-        g, first_mask = first_forces(y, h, pressure, mu, lam, first)
+        g, first_mask = first_forces(y, h, material, pressure, first)
         add_single(subtrees, s, turn_out(g, q0, q1, q2), f)
-        g, last_mask = last_forces(y, h, pressure, mu, lam, first)
+        g, last_mask = last_forces(y, h, material, pressure, first)
         add_single(subtrees, s, turn_out(g, q0, q1, q2), f)
         left_out[s] = first_mask | last_mask
 
@@ -106,10 +68,15 @@ def test_forces_at_once(shape, uniform, device, rng):
     expected = wc.Corotated(dilatation="shared").bind(body).elastic_forces(displacements).numpy()
     found = wp.zeros_like(displacements)
     left_out = wp.zeros(count, dtype=wp.int32, device=device)
-    inputs = [subtrees, body.discretization.mu, body.discretization.lam, displacements]
+    inputs = [subtrees, material_of(body), displacements]
     wp.launch(scatter_at_once(shape, uniform), count, inputs, [found, left_out], device=device, block_dim=BLOCK)
     assert not left_out.numpy().any()
     assert np.abs(found.numpy() - expected)[:, :3].max() < 5e-6 * np.abs(expected).max()
+
+
+def material_of(body):
+    of = body.discretization
+    return isotropic_material([of.mu, of.lam, of.material_stride])
 
 
 def strained(shape, uniform, amount, device, rng):
@@ -131,17 +98,16 @@ def strained(shape, uniform, amount, device, rng):
 
 
 @pytest.mark.parametrize(
-    ("shape", "uniform", "halves"),
-    [*map(slow, (1, 0, 2, 0, 2), (False, True, False, False, True), (True, True, True, False, False))],
+    ("shape", "uniform"), [(1, False), *(slow(shape, uniform) for shape in (0, 2) for uniform in (False, True))]
 )
-def test_forces_of_pressure(shape, uniform, halves, device, rng):
+def test_forces_of_pressure(shape, uniform, device, rng):
     """Some leaves are beyond a quarter of their volume, and some turned over."""
     body, displacements, subtrees, count = strained(shape, uniform, 0.5, device, rng)
     both = wc.Corotated(dilatation="shared").bind(body).elastic_forces(displacements).numpy()
-    shear = wc.Corotated(dilatation="element").bind(ShearOnly(body.discretization))
+    shear = wc.Corotated(dilatation="element").bind(shear_only(body.discretization))
     expected = both - shear.elastic_forces(displacements).numpy()
-    kernel = scatter_halves(shape, uniform) if halves else scatter_dilatation(shape, False, uniform, VOLUME)
     found = wp.zeros_like(displacements)
-    inputs = [subtrees, body.discretization.lam, displacements]
+    kernel = scatter_dilatation(shape, False, uniform, VOLUME)
+    inputs = [subtrees, material_of(body), displacements]
     wp.launch(kernel, count, inputs, [found], device=device, block_dim=BLOCK)
     assert np.abs(found.numpy() - expected)[:, :3].max() < 5e-6 * np.abs(expected).max()

@@ -37,7 +37,8 @@ class Launches:
 
     def forces(self):
         body, flat = self.body, self.plan.flat
-        f = wp.zeros_like(body.state.displacements)
+        own, f = body.discretization, wp.zeros_like(body.state.displacements)
+        material = isotropic_material([own.mu, own.lam, own.material_stride])
         wp.launch(
             scatter_stretches(body.discretization.material_stride == 0),
             dim=self.blocks * BLOCK,
@@ -45,8 +46,7 @@ class Launches:
                 self.stretches,
                 flat.elements,
                 flat.leaves,
-                body.discretization.mu,
-                body.discretization.lam,
+                material,
                 body.state.displacements,
             ],
             outputs=[f, self.listed.own],
@@ -54,7 +54,5 @@ class Launches:
             block_dim=BLOCK,
         )
         self.count = int(self.listed.own.counts.numpy().sum())
-        own = body.discretization
-        material = isotropic_material([own.mu, own.lam, own.material_stride])
         self.listed.repair(body.discretization.elements, material, body.state.displacements, f)
         return f.numpy()[:, :3]

@@ -31,10 +31,18 @@ def product(field, u, p, *, places=None, **options):
     return found[:, :3]
 
 
+def tangent(field, u, *, places=None, **options):
+    """K at displacements u."""
+    made = field.tangent(**options)
+    for step in (made.prepare, made.take):
+        step(on_device(u, field, places))
+    return made
+
+
 def diagonal(field, u, *, places=None, **options):
     """The diagonal blocks of K(u) [n, 3, 3]."""
     blocks = wp.zeros(places or len(u), dtype=wp.mat33, device=field.device)
-    field.add_diagonal(on_device(u, field, places), blocks, **options)
+    tangent(field, u, places=places, **options).add_diagonal(blocks)
     return blocks.numpy()
 
 

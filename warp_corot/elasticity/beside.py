@@ -3,28 +3,30 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import warp as wp
 
 from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.elements import Elements
-from warp_corot.discretization.members import Members
 from warp_corot.discretization.plan import Plan
-from warp_corot.kernels.elements.forces import add_energies
+from warp_corot.kernels.elements.forces import element_energies
 from warp_corot.kernels.elements.law_lanes import NativeLaw
 
 from .model import ForceField, SmallForces
 from .paths.elements import ByElements
-from .stiffness import ElementMaterial, ElementStiffness
-from .tangent import Tangent
+from .stress_law import ElementMaterial
+from .structs import forwards
+from .tangent import ElementTangent, Tangent
 
 if TYPE_CHECKING:
-    from warp_corot.kernels.stepping.pace import Pace
+    pass
 
 
+@forwards("law", "shares_dilatation", "find_members", "rotation_level", "elapsed", "complete_step", "relax_fully")
+@forwards("law", "write_von_mises", "state", "reset", "load_kernels", "note", "derive", "take_material", "follow")
 class BesideField(ForceField):
     """The forces of a law and of an additional stress in all elements.
 
@@ -56,8 +58,8 @@ class BesideField(ForceField):
         super().__init__(discretization, law.deterministic)
         kind = discretization.element_kind
         self._forces = ByElements(discretization, self.plan, Material, stress, lanes)
-        self._energies = add_energies(kind, Material, density)
-        self._stiffness = ElementStiffness(discretization, differential, Material)
+        self._energies = element_energies(kind, Material, density, adds=True)
+        self._own_law = differential, lambda: self.material, Material
         #: Separate places for each element's forces, if sums must be reproducible.
         self._slotted = discretization.plan(subtrees=False, deterministic=True) if self.deterministic else None
 
@@ -92,24 +94,8 @@ class BesideField(ForceField):
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         raise NotImplementedError("add_forces does all")
 
-    def add_stiffness(self, u: wp.array, p: wp.array, y: wp.array, **options: Any) -> None:
-        self.law.add_stiffness(u, p, y, **options)
-        self.add_own_stiffness(u, p, y)
-
-    def add_own_stiffness(self, u: wp.array, p: wp.array, y: wp.array) -> None:
-        """Launch the kernel that adds the additional stress's part of ``add_stiffness``."""
-        self._stiffness.add_product(self.elements, self.material, u, p, y)
-
-    def add_diagonal(self, u: wp.array, blocks: wp.array, **options: Any) -> None:
-        self.law.add_diagonal(u, blocks, **options)
-        self.add_own_diagonal(u, blocks)
-
-    def add_own_diagonal(self, u: wp.array, blocks: wp.array) -> None:
-        """Launch the kernel that adds the additional stress's part of ``add_diagonal``."""
-        self._stiffness.add_diagonal(self.elements, self.material, u, blocks)
-
     def tangent(self, *, exact: bool = False) -> Tangent:
-        return BesideTangent(self, exact)
+        return SumTangent(self.law.tangent(exact=exact), ElementTangent(self, *self._own_law))
 
     @property
     def stiffest(self) -> SmallForces:
@@ -134,54 +120,6 @@ class BesideField(ForceField):
         with self.state_kept():
             yield
 
-    # --- as the law has it -------------------------------------------------------------------------------------------
-
-    @property
-    def shares_dilatation(self) -> bool:  # type: ignore[override]
-        """Whether the law's elements do."""
-        return self.law.shares_dilatation
-
-    @property
-    def find_members(self) -> Callable[[int], Members] | None:
-        return self.law.find_members
-
-    @property
-    def rotation_level(self) -> int | None:
-        """Level of the tree at which the law's rotations are shared, if they are."""
-        return getattr(self.law, "rotation_level", None)
-
-    @property
-    def elapsed(self) -> wp.array | None:
-        return self.law.elapsed
-
-    def complete_step(self, u: wp.array, pace: Pace) -> None:
-        self.law.complete_step(u, pace)
-
-    def relax_fully(self) -> None:
-        self.law.relax_fully()
-
-    @property
-    def state(self) -> dict[str, wp.array]:
-        return self.law.state
-
-    def reset(self, chosen: wp.array) -> None:
-        self.law.reset(chosen)
-
-    def load_kernels(self) -> None:
-        self.law.load_kernels()
-
-    def note(self) -> None:
-        self.law.note()
-
-    def derive(self) -> None:
-        self.law.derive()
-
-    def take_material(self) -> None:
-        self.law.take_material()
-
-    def follow(self) -> None:
-        self.law.follow()
-
 
 class Stiffest:
     """The forces of small displacements that bound the step: the law's stiffest ones, and those of the additional
@@ -200,32 +138,35 @@ class Stiffest:
         self._field.add_own_forces(u, f)
 
 
-class BesideTangent(Tangent):
-    """K of a field with an additional stress.
+class SumTangent(Tangent):
+    """The sum of two stiffnesses.
 
     Args:
-        field: The field.
-        exact: As for ``ForceField.tangent``.
+        first, second: They.
     """
 
-    field: BesideField
+    def __init__(self, first: Tangent, second: Tangent):
+        super().__init__(second.field)
+        self._both = first, second
 
-    def __init__(self, field: BesideField, exact: bool):
-        super().__init__(field)
-        self.law = field.law.tangent(exact=exact)
+    @property
+    def kernels(self) -> list[wp.Kernel]:
+        return [kernel for each in self._both for kernel in each.kernels]
 
     def prepare(self, u: wp.array) -> None:
         super().prepare(u)
-        self.law.prepare(u)
+        for each in self._both:
+            each.prepare(u)
 
     def take(self, u: wp.array) -> None:
         super().take(u)
-        self.law.take(u)
+        for each in self._both:
+            each.take(u)
 
     def add_product(self, p: wp.array, y: wp.array) -> None:
-        self.law.add_product(p, y)
-        self.field.add_own_stiffness(self.displacements, p, y)
+        for each in self._both:
+            each.add_product(p, y)
 
     def add_diagonal(self, blocks: wp.array) -> None:
-        self.law.add_diagonal(blocks)
-        self.field.add_own_diagonal(self.displacements, blocks)
+        for each in self._both:
+            each.add_diagonal(blocks)

@@ -9,11 +9,11 @@ import warp as wp
 
 from warp_corot.discretization.discretization import Discretization, discretization_of
 from warp_corot.discretization.plan import Plan
-from warp_corot.elasticity.stiffness import ElementStiffness
+from warp_corot.elasticity.stress_law import StressLaw
 from warp_corot.elasticity.structs import Kept
 from warp_corot.errors import InputError
 from warp_corot.kernels.clusters.laws import reinforced_law
-from warp_corot.kernels.corotated.anisotropic import OrthotropicMaterial, add_active_energies
+from warp_corot.kernels.corotated.anisotropic import FibreMaterial, OrthotropicMaterial, active_density
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import LOG_VOLUME
 from warp_corot.kernels.elements.fibres import (
@@ -30,9 +30,8 @@ from warp_corot.materials.reinforced import FibreReinforced
 from .corotated.anisotropic import fibre_material
 from .dilatation import AUTO, bind_law, check_dilatation
 from .model import ForceField, Model
-from .paths.clusters import ClusterScatter
+from .paths.clusters import divided
 from .paths.elements import ByElements
-from .paths.general import clustered
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretized
@@ -74,15 +73,10 @@ class ReinforcedField(ForceField):
     def __init__(self, discretization: Discretization, deterministic: bool):
         super().__init__(discretization, deterministic)
         kind = discretization.element_kind
-        #: On CUDA the elements of a mesh that never changes, if their forces may be summed in any order.
-        self._clusters: ClusterScatter | None = None
-        if self.device.is_cuda and self.plan.counts is None and not deterministic:
-            chosen = clustered(discretization)
-            self._clusters = ClusterScatter(self.elements, reinforced_law, ReinforcedMaterial, chosen=chosen)
+        _, self._clusters = divided(discretization, self.plan, reinforced_law, ReinforcedMaterial)
         self._forces = ByElements(discretization, self.plan, ReinforcedMaterial, reinforced_stress, FIBRES)
         self._energies = element_energies(kind, ReinforcedMaterial, reinforced_density)
         self._von_mises = element_von_mises(kind, ReinforcedMaterial, reinforced_cauchy)
-        self._stiffness = ElementStiffness(discretization, reinforced_differential, ReinforcedMaterial)
         self._fibres = discretization.anisotropic_material()
         self._made, self._active = Kept(_material), Kept(fibre_material)
 
@@ -95,11 +89,9 @@ class ReinforcedField(ForceField):
         else:
             self._forces(self.elements, self.element_count, self.material, u, f)
 
-    def add_stiffness(self, u: wp.array, p: wp.array, y: wp.array) -> None:
-        self._stiffness.add_product(self.elements, self.material, u, p, y)
-
-    def add_diagonal(self, u: wp.array, blocks: wp.array) -> None:
-        self._stiffness.add_diagonal(self.elements, self.material, u, blocks)
+    @property
+    def stress_law(self) -> StressLaw:
+        return StressLaw(reinforced_stress, reinforced_differential, self.material, ReinforcedMaterial)
 
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
         self.launch(self._energies, self.element_count, [self.elements, self.material, u], [energies])
@@ -107,7 +99,7 @@ class ReinforcedField(ForceField):
     def write_potentials(self, u: wp.array, energies: wp.array) -> None:
         self.write_energies(u, energies)
         if self.discretization.has_activation:
-            kernel = add_active_energies(self.discretization.element_kind)
+            kernel = element_energies(self.discretization.element_kind, FibreMaterial, active_density, adds=True)
             active = self._active(self._fibres, *self._activation)
             self.launch(kernel, self.element_count, [self.elements, active, u], [energies])
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from warp_corot.elasticity.paths.laws import Law, law_field
+from warp_corot.elasticity.paths.laws import law_field
 from warp_corot.kernels.elements.dilatation import Dilatation
 
 from .dilatation import AUTO, bind_law, check_dilatation
-from .model import ForceField, Model
+from .model import ForceField, Law, Model
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization, Discretized

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from warp_corot.elasticity.paths.laws import Law
+from warp_corot.elasticity.model import Law
 from warp_corot.kernels.elements.constitutive import (
     linear_cauchy,
     linear_differential,
@@ -32,7 +32,7 @@ class Linear(LawModel):
     """
 
     strained_safety: ClassVar[float] = 0.9  # its stiffness never changes
-    law = Law("linear", linear_stress, linear_differential, linear_energy, linear_cauchy)
+    law = Law(linear_stress, linear_differential, linear_energy, linear_cauchy, "linear")
     shared = SMALL
 
     def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:

@@ -20,6 +20,7 @@ from warp_corot.kernels.tables.shapes import EDGES
 from .dilatation import ELEMENT, refuse_shared
 from .model import ForceField, Model
 from .structs import isotropic_material
+from .tangent import Tangent
 
 
 @dataclass(frozen=True)
@@ -75,13 +76,13 @@ class MassSpringField(ForceField):
         edges = np.stack([unique // len(points), unique % len(points)], axis=1).astype(np.int32)
         rest = points[edges[:, 1]] - points[edges[:, 0]]
         stiffness = np.broadcast_to(stiffness, (worlds, len(edges))).ravel()
-        self._edges = wp.array(in_worlds(edges, worlds, len(points)), dtype=wp.vec2i, device=self.device)
-        self._targets = self._edges
+        self.edges = wp.array(in_worlds(edges, worlds, len(points)), dtype=wp.vec2i, device=self.device)
+        self._targets = self.edges
         if self.deterministic:
             self.slots, targets = Slots.of_units(edges, len(points), self.device, worlds)
             self._targets = wp.array(targets, dtype=wp.vec2i, device=self.device)
-        self._rest = wp.array(repeated(rest, worlds), dtype=wp.vec3, device=self.device)
-        self._stiffness = wp.array(stiffness, dtype=wp.float32, device=self.device)
+        self.rest = wp.array(repeated(rest, worlds), dtype=wp.vec3, device=self.device)
+        self.stiffness = wp.array(stiffness, dtype=wp.float32, device=self.device)
         # Lamé's parameters of E and nu = 1/4 are both 0.4 E.
         lame = 0.4 * (young if young.size == 1 else np.broadcast_to(young, (worlds, len(tets))))
         on_device = wp.array(lame.ravel(), dtype=wp.float32, device=self.device)
@@ -90,23 +91,34 @@ class MassSpringField(ForceField):
 
     @property
     def energy_count(self) -> int:
-        return len(self._edges)
+        return len(self.edges)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        inputs = [self._edges, self._targets, self._rest, self._stiffness, u]
-        self.launch(scatter_mass_spring, len(self._edges), inputs, [f])
+        inputs = [self.edges, self._targets, self.rest, self.stiffness, u]
+        self.launch(scatter_mass_spring, len(self.edges), inputs, [f])
 
-    def add_stiffness(self, u: wp.array, p: wp.array, y: wp.array) -> None:
-        inputs = [self._edges, self._rest, self._stiffness, u, p]
-        self.launch(add_mass_spring_product, len(self._edges), inputs, [y])
-
-    def add_diagonal(self, u: wp.array, blocks: wp.array) -> None:
-        inputs = [self._edges, self._rest, self._stiffness, u]
-        self.launch(add_mass_spring_diagonal, len(self._edges), inputs, [blocks])
+    def tangent(self, *, exact: bool = False) -> Tangent:
+        return SpringTangent(self)
 
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
-        inputs = [self._edges, self._rest, self._stiffness, u]
-        self.launch(mass_spring_energies, len(self._edges), inputs, [energies])
+        inputs = [self.edges, self.rest, self.stiffness, u]
+        self.launch(mass_spring_energies, len(self.edges), inputs, [energies])
 
     def write_von_mises(self, u: wp.array, stress: wp.array) -> None:
         self.launch(self._von_mises, self.element_count, [self.elements, self._hooke, u], [stress])
+
+
+class SpringTangent(Tangent):
+    """The exact K of the springs."""
+
+    field: MassSpringField
+
+    def add_product(self, p: wp.array, y: wp.array) -> None:
+        field = self.field
+        inputs = [field.edges, field.rest, field.stiffness, self.displacements, p]
+        field.launch(add_mass_spring_product, len(field.edges), inputs, [y])
+
+    def add_diagonal(self, blocks: wp.array) -> None:
+        field = self.field
+        inputs = [field.edges, field.rest, field.stiffness, self.displacements]
+        field.launch(add_mass_spring_diagonal, len(field.edges), inputs, [blocks])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from typing import TYPE_CHECKING, ClassVar, Protocol
+from typing import TYPE_CHECKING, ClassVar, NamedTuple, Protocol, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -26,13 +26,13 @@ from warp_corot.kernels.elements.forces import (
     law_value,
     scatter_forces,
 )
+from warp_corot.kernels.elements.law_lanes import LawInLanes
 from warp_corot.kernels.elements.stiffness_products import law_differential
 
 from .paths.divided import DividedForces, Piece
-from .stiffness import ElementStiffness
-from .stress_law import StressLaw
+from .stress_law import ElementMaterial, StressLaw
 from .structs import Kept, isotropic_material
-from .tangent import Tangent
+from .tangent import ElementTangent, Tangent
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
@@ -131,31 +131,28 @@ class ForceField(ABC):
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         """Launch the kernels that add the forces to the nodes, or to the slots if there are any."""
 
-    @abstractmethod
-    def add_stiffness(self, u: wp.array, p: wp.array, y: wp.array) -> None:
-        """Add K(u) p to y [N], K minus the derivative of the elastic forces at displacements u; all vec4 [worlds * N].
-
-        K is symmetric, and may be indefinite. The documentation of a field says if its K is not the exact derivative.
-        Products go element by element for all laws and meshes, and sums are atomic: on CUDA rounding differs from call
-        to call, even if forces are deterministic.
-
-        Args:
-            u: Displacements [m].
-            p: Displacements by which K is multiplied [m].
-            y: The array to which the product is added.
-        """
-
-    @abstractmethod
-    def add_diagonal(self, u: wp.array, blocks: wp.array) -> None:
-        """Add the 3x3 blocks on the diagonal of the same K(u) to those of the nodes [N/m], mat33 [worlds * N]."""
-
     def tangent(self, *, exact: bool = False) -> Tangent:
-        """The same K for many products at the same displacements.
+        """The stiffness K(u), minus the derivative of the elastic forces, for many products at the same displacements.
+
+        K is symmetric, and may be indefinite. Sums are atomic: on CUDA rounding differs from call to call, even if
+        forces are deterministic.
 
         Args:
             exact: Whether K must be the exact derivative, if the field has two stiffnesses; see ``CorotatedField``.
         """
-        return Tangent(self)
+        law = self.stress_law
+        assert law is not None
+        return ElementTangent(self, law.differential, lambda: cast("StressLaw", self.stress_law).material, law.Material)
+
+    def add_stiffness(self, u: wp.array, p: wp.array, y: wp.array, *, exact: bool = False) -> None:
+        """Add K(u) p to y [N], of displacements u and p [m]; all vec4 [worlds * N].
+
+        For many products at the same u, keep a ``tangent``.
+        """
+        tangent = self.tangent(exact=exact)
+        tangent.prepare(u)
+        tangent.take(u)
+        tangent.add_product(p, y)
 
     def plan_of(self, discretization: Discretization) -> Plan:
         """The plan of the field; by default the elements one by one."""
@@ -197,10 +194,8 @@ class ForceField(ABC):
         """
 
     def share_dilatation(self, dilating: Dilating) -> bool:
-        """Add from now on the forces of a dilatation that subtrees and groups share, if the field can; return whether
-        it can.
-
-        Called again when groups change.
+        """Add the forces of a dilatation that subtrees and groups share, too, from now on (CPU); return whether the
+        field can.
         """
         return False
 
@@ -310,16 +305,13 @@ class ForceField(ABC):
         launch(kernel, dim, inputs, outputs, device=self.device)
 
     def _launch_over_elements(
-        self, kernel: wp.Kernel, isotropic: IsotropicMaterial, u: wp.array, output: wp.array, *of_elements: wp.array
+        self, kernel: wp.Kernel, material: ElementMaterial, u: wp.array, output: wp.array
     ) -> None:
         """Launch a kernel that writes a number of each element, or adds to it."""
         self._regions.launch_over(
             kernel,
             self.element_count,
-            lambda _, own: (
-                [own(self.elements), own(isotropic), u, *map(own, of_elements)],
-                [own(output)],
-            ),
+            lambda _, own: ([own(self.elements), own(material), u], [own(output)]),
             u.ptr,
             output.ptr,
         )
@@ -409,8 +401,7 @@ class ElementField(ForceField):
         deterministic: bool = False,
     ):
         super().__init__(body, deterministic)
-        self._forces = forces
-        self._stiffness = ElementStiffness(self.discretization, differential)
+        self._forces, self._differential = forces, differential
         self._energies = energies
         self._von_mises = von_mises
         self._stress_function = stress
@@ -425,16 +416,13 @@ class ElementField(ForceField):
 
     @property
     def stress_law(self) -> StressLaw | None:
-        return self._stress_function and StressLaw(self._stress_function, self._stiffness.differential, self.isotropic)
+        return self._stress_function and StressLaw(self._stress_function, self._differential, self.isotropic)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         self.launch(self._forces, self.element_count, [self.elements, self.isotropic, u], [f])
 
-    def add_stiffness(self, u: wp.array, p: wp.array, y: wp.array) -> None:
-        self._stiffness.add_product(self.elements, self.isotropic, u, p, y)
-
-    def add_diagonal(self, u: wp.array, blocks: wp.array) -> None:
-        self._stiffness.add_diagonal(self.elements, self.isotropic, u, blocks)
+    def tangent(self, *, exact: bool = False) -> Tangent:
+        return ElementTangent(self, self._differential, lambda: self.isotropic)
 
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
         self._launch_over_elements(self._energies, self.isotropic, u, energies)
@@ -443,31 +431,38 @@ class ElementField(ForceField):
         self.launch(self._von_mises, self.element_count, [self.elements, self.isotropic_shown, u], [stress])
 
 
+class Law(NamedTuple):
+    """A constitutive law of each element's deformation gradient, functions of ``kernels.elements.constitutive``.
+
+    Attributes:
+        stress, differential, energy, cauchy: The functions.
+        lanes: The same law of ``kernels.elements.law_lanes``, for the CPU; None if it is not in C++.
+    """
+
+    stress: wp.Function
+    differential: wp.Function
+    energy: wp.Function
+    cauchy: wp.Function
+    lanes: LawInLanes | None = None
+
+
 class LawField(ElementField):
-    """Force field of a constitutive law in each element's deformation gradient.
+    """Force field of a constitutive law, element by element.
 
     Args:
         body, deterministic: As for every field.
-        stress, differential, energy, cauchy: The law, functions of ``kernels.elements.constitutive``.
+        law: The law.
     """
 
-    def __init__(
-        self,
-        body: Discretized | Discretization,
-        *,
-        stress: wp.Function,
-        differential: wp.Function,
-        energy: wp.Function,
-        cauchy: wp.Function,
-        deterministic: bool = False,
-    ):
+    def __init__(self, body: Discretized | Discretization, law: Law, *, deterministic: bool = False):
         kind = discretization_of(body).element_kind
+        self.law, stress = law, law_stress(law.stress)
         super().__init__(
             body,
             deterministic=deterministic,
-            forces=scatter_forces(kind, IsotropicMaterial, law_stress(stress)),
-            energies=element_energies(kind, IsotropicMaterial, law_value(energy)),
-            von_mises=element_von_mises(kind, IsotropicMaterial, law_value(cauchy)),
-            differential=law_differential(differential),
-            stress=law_stress(stress),
+            forces=scatter_forces(kind, IsotropicMaterial, stress),
+            energies=element_energies(kind, IsotropicMaterial, law_value(law.energy)),
+            von_mises=element_von_mises(kind, IsotropicMaterial, law_value(law.cauchy)),
+            differential=law_differential(law.differential),
+            stress=stress,
         )

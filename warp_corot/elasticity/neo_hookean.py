@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from warp_corot.elasticity.paths.laws import Law
+from warp_corot.elasticity.model import Law
 from warp_corot.kernels.elements.constitutive import (
     neo_hookean_cauchy,
     neo_hookean_differential,
@@ -34,5 +34,5 @@ class NeoHookean(LawModel):
             more in any element, and the material is isotropic.
     """
 
-    law = Law("neo-hookean", neo_hookean_stress, neo_hookean_differential, neo_hookean_energy, neo_hookean_cauchy)
+    law = Law(neo_hookean_stress, neo_hookean_differential, neo_hookean_energy, neo_hookean_cauchy, "neo-hookean")
     shared = LOG_VOLUME

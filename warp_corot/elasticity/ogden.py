@@ -14,8 +14,8 @@ from warp_corot.kernels.elements import ogden as kernels
 from warp_corot.kernels.elements.dilatation import LOG_VOLUME
 
 from .dilatation import AUTO, bind_law, check_dilatation
-from .model import ForceField, Model
-from .paths.laws import Law, law_field
+from .model import ForceField, Law, Model
+from .paths.laws import law_field
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization, Discretized
@@ -80,7 +80,7 @@ class Ogden(Model):
         return max(low), min(high)
 
     def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:
-        law = Law(self.terms, **kernels.ogden(self.terms))
+        law = Law(**kernels.ogden(self.terms), lanes=self.terms)
         return bind_law(partial(law_field, law), LOG_VOLUME, self.dilatation, body, deterministic)
 
 

@@ -137,14 +137,14 @@ class PronyField(BesideField):
         self._elapsed.fill_(math.inf)
 
     def note(self) -> None:
-        super().note()
+        self.law.note()
         forest, present = cast("DevicePlan", self.plan).forest, self.discretization.sizes.elements
         first = forest.carriage.names.index(self._carried[0])
         inputs = [forest.pools.leaves, self._known, first, len(self._carried), self._count]
         self.launch(kernels.carry_values, present, inputs, [forest.carriage.arrays.values])
 
     def derive(self) -> None:
-        super().derive()
+        self.law.derive()
         plan = cast("DevicePlan", self.plan)
         threads, first = plan.forest.threads, plan.values_row(self._carried[0])
         inputs = [threads, plan.arrays, first, len(self._carried), self._count]

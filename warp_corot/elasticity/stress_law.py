@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import warp as wp
 
-from warp_corot.kernels.elements.constitutive import IsotropicMaterial
+from warp_corot.kernels.corotated.anisotropic import FibreMaterial
+from warp_corot.kernels.corotated.tangent import KeptStrains
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
+from warp_corot.kernels.elements.fibres import ReinforcedMaterial
+from warp_corot.kernels.elements.prestress import Prestress
+from warp_corot.kernels.elements.prony import PronyMaterial
+from warp_corot.kernels.elements.shared_dilatation import DilatedMaterial
 
-from .stiffness import ElementMaterial
+#: Structs of materials.
+ElementMaterial: TypeAlias = (
+    "IsotropicMaterial | RotatedMaterial | KeptStrains | FibreMaterial | ReinforcedMaterial | PronyMaterial "
+    "| Prestress | DilatedMaterial"
+)
 
 
 @dataclass(frozen=True)

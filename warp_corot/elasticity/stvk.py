@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from warp_corot.elasticity.paths.laws import Law
+from warp_corot.elasticity.model import Law
 from warp_corot.kernels.elements.constitutive import (
     stvk_cauchy,
     stvk_differential,
@@ -29,5 +29,5 @@ class StVenantKirchhoff(LawModel):
             more in any element, and the material is isotropic.
     """
 
-    law = Law("stvk", stvk_stress, stvk_differential, stvk_energy, stvk_cauchy)
+    law = Law(stvk_stress, stvk_differential, stvk_energy, stvk_cauchy, "stvk")
     shared = GREEN

@@ -2,27 +2,33 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import warp as wp
+
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial
+from warp_corot.kernels.elements.stiffness_products import add_stiffness_diagonal, add_stiffness_product
+
+from .stress_law import ElementMaterial
 
 if TYPE_CHECKING:
     from .model import ForceField
 
 
-class Tangent:
+class Tangent(ABC):
     """K(u) of a force field, with the same u from one ``take`` to the next.
 
     Args:
         field: The field.
-        options: The options of ``add_stiffness`` and ``add_diagonal``.
 
     Attributes:
         displacements: u [m], vec4, with the length of the first one; ``take`` fills it.
     """
 
-    def __init__(self, field: ForceField, **options: Any):
-        self.field, self._options = field, options
+    def __init__(self, field: ForceField):
+        self.field = field
         self.displacements = wp.zeros(0, dtype=wp.vec4, device=field.device)
 
     @property
@@ -39,10 +45,40 @@ class Tangent:
         """Launch the update of K to displacements u."""
         wp.copy(self.displacements, u)
 
+    @abstractmethod
     def add_product(self, p: wp.array, y: wp.array) -> None:
         """Launch y += K p [N]; both vec4 [worlds * N]."""
-        self.field.add_stiffness(self.displacements, p, y, **self._options)
 
+    @abstractmethod
     def add_diagonal(self, blocks: wp.array) -> None:
         """Launch the addition of the 3x3 blocks on K's diagonal to those of the nodes [N/m], mat33 [worlds * N]."""
-        self.field.add_diagonal(self.displacements, blocks, **self._options)
+
+
+class ElementTangent(Tangent):
+    """K of a law, element by element on every path of forces; see ``kernels.elements.stiffness_products``.
+
+    Args:
+        field: The field.
+        differential: Device function (elements, t, material, u, dg) -> dP.
+        material: Gives the struct that it reads.
+        Material: The type of the struct.
+    """
+
+    def __init__(
+        self,
+        field: ForceField,
+        differential: wp.Function,
+        material: Callable[[], ElementMaterial],
+        Material: type = IsotropicMaterial,
+    ):
+        super().__init__(field)
+        self._material = material
+        self._generated_from = field.discretization.element_kind, Material, differential
+
+    def add_product(self, p: wp.array, y: wp.array) -> None:
+        inputs = [self.field.elements, self._material(), self.displacements, p]
+        self.field.launch(add_stiffness_product(*self._generated_from), self.field.element_count, inputs, [y])
+
+    def add_diagonal(self, blocks: wp.array) -> None:
+        inputs = [self.field.elements, self._material(), self.displacements]
+        self.field.launch(add_stiffness_diagonal(*self._generated_from), 4 * self.field.element_count, inputs, [blocks])

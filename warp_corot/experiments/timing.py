@@ -191,10 +191,6 @@ class _NoForces(ForceField):
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None: ...
 
-    def add_stiffness(self, u: wp.array, p: wp.array, y: wp.array) -> None: ...
-
-    def add_diagonal(self, u: wp.array, blocks: wp.array) -> None: ...
-
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
         energies.zero_()
 

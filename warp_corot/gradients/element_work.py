@@ -43,7 +43,7 @@ class ElementWork:
         if "lame" in names and law is not None and law.Material is not IsotropicMaterial:
             raise InputError("the material is anisotropic; derivatives with respect to its moduli do not exist yet")
         if "activation" in names and law is not None and law.Material is not FibreMaterial:
-            raise InputError("wrt has 'activation', but only anisotropic materials have active stress")
+            raise InputError("wrt has 'activation', but only anisotropic materials with Corotated have this derivative")
         count, nodes = field.element_count, field.discretization.sizes.launch_nodes
         self._of_mu, self._of_lam, self._of_activation = (
             wp.zeros(count if name in names else 0, dtype=wp.float64, device=self.device)

@@ -81,18 +81,6 @@ def test_solution_is_that_of_the_dense_matrix(model, device, rng):
     assert not x[~free].any()
 
 
-@pytest.mark.parametrize("exact", [False, True])
-def test_stored_rotations_equal_those_of_each_product(exact, device, rng):
-    mesh, _, operator = system("corotated", device, exact=exact)
-    u, p = (random_displacement(mesh, rng, 0.1) for _ in range(2))
-    field = operator.field
-    y, expected = (on_device(np.zeros_like(p), field) for _ in range(2))
-    operator.take(on_device(u, field))
-    operator.tangent.add_product(on_device(p, field), y)
-    field.add_stiffness(on_device(u, field), on_device(p, field), expected, exact=exact)
-    assert np.abs(y.numpy() - expected.numpy()).max() < 1e-5 * np.abs(expected.numpy()).max()
-
-
 def test_each_world_has_a_solve_of_its_own(device, rng):
     """The solution of a world is that of the world alone, and a world without a right side is done at once."""
     _, free, operator = system("linear", device, worlds=3)

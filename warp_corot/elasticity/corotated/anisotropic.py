@@ -9,13 +9,12 @@ import warp as wp
 from warp_corot.discretization.elements import E, copied
 from warp_corot.elasticity.model import ForceField
 from warp_corot.elasticity.paths.lanes import Lanes, as_general
-from warp_corot.elasticity.stiffness import ElementStiffness
 from warp_corot.elasticity.stress_law import StressLaw
 from warp_corot.elasticity.structs import Kept
 from warp_corot.kernels.corotated.anisotropic import (
     FibreMaterial,
     OrthotropicMaterial,
-    add_active_energies,
+    active_density,
     fibre_cauchy,
     fibre_density,
     fibre_stress,
@@ -58,18 +57,11 @@ class AnisotropicField(ForceField):
         self._forces = scatter_forces(kind, FibreMaterial, fibre_stress(rotation))
         self._energies = element_energies(kind, FibreMaterial, fibre_density(rotation))
         self._von_mises = element_von_mises(kind, FibreMaterial, fibre_cauchy(rotation))
-        self._stiffness = ElementStiffness(discretization, anisotropic_differential(rotation), FibreMaterial)
         self.material = discretization.anisotropic_material()
         self._fibres = Kept(fibre_material)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         self.launch(self._forces, self.element_count, [self.elements, self.fibres, u], [f])
-
-    def add_stiffness(self, u: wp.array, p: wp.array, y: wp.array) -> None:
-        self._stiffness.add_product(self.elements, self.fibres, u, p, y)
-
-    def add_diagonal(self, u: wp.array, blocks: wp.array) -> None:
-        self._stiffness.add_diagonal(self.elements, self.fibres, u, blocks)
 
     @property
     def stress_law(self) -> StressLaw | None:
@@ -82,7 +74,7 @@ class AnisotropicField(ForceField):
     def write_potentials(self, u: wp.array, energies: wp.array) -> None:
         self.write_energies(u, energies)
         if self.discretization.has_activation:
-            kernel = add_active_energies(self.discretization.element_kind)
+            kernel = element_energies(self.discretization.element_kind, FibreMaterial, active_density, adds=True)
             self.launch(kernel, self.element_count, [self.elements, self.fibres, u], [energies])
 
     def write_von_mises(self, u: wp.array, stress: wp.array) -> None:

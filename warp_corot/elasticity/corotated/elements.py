@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Protocol
+from typing import TYPE_CHECKING, ClassVar
 
 import warp as wp
 
@@ -14,11 +14,9 @@ from warp_corot.elasticity.model import ForceField
 from warp_corot.elasticity.paths.dilating import Dilating
 from warp_corot.elasticity.paths.divided import InLanes
 from warp_corot.elasticity.paths.lanes import Lanes
-from warp_corot.elasticity.stiffness import ElementStiffness
 from warp_corot.elasticity.stress_law import StressLaw
 from warp_corot.elasticity.structs import Kept
 from warp_corot.elasticity.tangent import Tangent
-from warp_corot.errors import InputError
 from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.corotated.corotated import (
     extract_rotations,
@@ -29,39 +27,19 @@ from warp_corot.kernels.corotated.corotated import (
     scatter_matrix_product,
 )
 from warp_corot.kernels.corotated.energy import own_energies, own_von_mises
-from warp_corot.kernels.corotated.tangent import exact_differential, given_differential, own_differential
+from warp_corot.kernels.corotated.tangent import exact_differential
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
 from warp_corot.kernels.elements.forces import element_energies, element_von_mises, scatter_forces
 from warp_corot.kernels.elements.general_cpu import scatter_law_elements
 from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.kernels.subtrees.repair import repair_elements
 
-from .tangents import ExactTangent, KeptExactTangent, KeptTangent, RotatedTangent
+from .tangents import ExactTangent, KeptTangent, RotatedTangent
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
 
-
-class CorotatedOptions(Protocol):
-    """The part of the model that fields read; see ``corotated.Corotated``."""
-
-    @property
-    def rotation_level(self) -> int | float | str | None: ...
-
-    @property
-    def level(self) -> int | None: ...
-
-    @property
-    def tolerance(self) -> float | None: ...
-
-    @property
-    def rotation(self) -> str: ...
-
-    @property
-    def own_rotation(self) -> wp.Function: ...
-
-    @property
-    def stiffness(self) -> str: ...
+    from .options import CorotatedOptions
 
 
 @dataclass(frozen=True)
@@ -156,66 +134,29 @@ class CorotatedField(ForceField):
             self.extract_rotations(u)
             self.add_rotated_forces(u, f)
 
-    def add_stiffness(self, u: wp.array, p: wp.array, y: wp.array, *, exact: bool = False) -> None:
-        """Add K(u) p to y [N], with the paper's K = R K R^T: the rotations that forces at u use, held fixed.
-
-        It is symmetric and positive semidefinite. The exact derivative of the forces also has the derivative of the
-        rotations, which vanishes if the body is not strained.
-
-        Args:
-            u, p, y: As for every field.
-            exact: Whether K is the exact derivative, which can be indefinite; only for own rotations. It is bounded if
-                the rotation of F is ill-defined (``kernels.corotated.tangent``).
-
-        Raises:
-            InputError: ``exact`` with shared rotations.
-        """
-        stiffness, material = self._tangent(u, exact)
-        stiffness.add_product(self.elements, material, u, p, y)
-
-    def add_diagonal(self, u: wp.array, blocks: wp.array, *, exact: bool = False) -> None:
-        """Add the 3x3 blocks on the diagonal of the same K(u) to those of the nodes [N/m]; see ``add_stiffness``."""
-        stiffness, material = self._tangent(u, exact)
-        stiffness.add_diagonal(self.elements, material, u, blocks)
-
     def tangent(self, *, exact: bool = False) -> Tangent:
-        """See ``ForceField.tangent``; rotations are found once. With shared rotations, K is never the exact
-        derivative.
+        """The paper's K = R K R^T, with the rotations that forces at u use, held fixed; it is positive semidefinite.
+
+        The exact derivative of the forces also has the derivative of the rotations, which vanishes if the body is not
+        strained. It can be indefinite, and is bounded if the rotation of F is ill-defined
+        (``kernels.corotated.tangent``). With shared rotations, K is never the exact derivative; with rotations within a
+        tolerance, K has each element's own.
         """
-        if exact and self.model.rotation_level is None:
-            if self.device.is_cpu and self.plan.counts is None:
-                return KeptExactTangent(self, self.model.own_rotation)
-            return ExactTangent(self, self.model.own_rotation)
-        own = self.model.level is None and self.model.tolerance is None
-        if own and self.device.is_cpu and self.plan.counts is None:
-            return KeptTangent(self)
-        return RotatedTangent(self)
+        if self.rotation_level is not None:
+            return RotatedTangent(self)
+        exact = exact and self.model.rotation_level is None
+        if self.device.is_cpu and self.plan.counts is None:
+            return KeptTangent(self, exact)
+        return ExactTangent(self, self.model.own_rotation) if exact else RotatedTangent(self)
 
     def write_rotations(self, u: wp.array, rotations: wp.array) -> None:
         """Write the rotation of every unit, mat33 [units]."""
         units = self._sharing().units
         self.launch(self._extract, units.count, [units.elements, u], [rotations])
 
-    def stiffness_with(self, rotations: wp.array) -> tuple[ElementStiffness, RotatedMaterial]:
-        """The stiffness with fixed rotations of the units, and the material that it reads."""
-        material = rotated_material(self.isotropic, rotations, self._sharing().units.unit)
-        return ElementStiffness(self.discretization, given_differential, RotatedMaterial), material
-
-    def used_rotations(self, u: wp.array) -> wp.array:
-        """The rotation of every unit, as forces use it."""
-        return self.extract_rotations(u)
-
-    def _tangent(self, u: wp.array, exact: bool) -> tuple[ElementStiffness, IsotropicMaterial | RotatedMaterial]:
-        """The stiffness at displacements u, and the material that it reads."""
-        isotropic = self.isotropic
-        if exact:
-            if self.model.rotation_level is not None:
-                level = self.model.rotation_level
-                raise InputError(f"rotation_level is {level!r}; for the exact stiffness it must be None")
-            return ElementStiffness(self.discretization, exact_differential(self.model.own_rotation)), isotropic
-        if self.model.rotation_level is None:
-            return ElementStiffness(self.discretization, own_differential(self.model.own_rotation)), isotropic
-        return self.stiffness_with(self.used_rotations(u))
+    def material_with(self, rotations: wp.array) -> RotatedMaterial:
+        """The material with these rotations of the units."""
+        return rotated_material(self.isotropic, rotations, self._sharing().units.unit)
 
     @property
     def stress_law(self) -> StressLaw | None:
@@ -284,8 +225,8 @@ class LanesField(InLanes, CorotatedField):
 
     @property
     def _force_kernels(self) -> list[LoadedKernel]:
-        groups = None if self._dilating is None else self._dilating.groups
-        forces = scatter_law_elements("corotated") if groups is None else groups.kernel("corotated")
+        dilating = self._dilating
+        forces = scatter_law_elements("corotated") if dilating is None else dilating.kernel("corotated")
         return [forces, repair_elements]
 
     def share_dilatation(self, dilating: Dilating) -> bool:
@@ -298,7 +239,7 @@ class LanesField(InLanes, CorotatedField):
             self._dilating.derive(self.isotropic)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        if self._dilating is None or self._dilating.groups is None:
+        if self._dilating is None:
             self._lanes.scatter_forces(self.isotropic, u, f)
         else:
-            self._dilating.groups.scatter_forces("corotated", u, f, repair_elements)
+            self._dilating.scatter_groups("corotated", u, f, repair_elements)

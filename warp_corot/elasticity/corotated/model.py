@@ -3,40 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from numbers import Integral
 from typing import TYPE_CHECKING
 
-import warp as wp
-
-from warp_corot.elasticity.dilatation import AUTO, bind_law, check_dilatation
-from warp_corot.elasticity.model import ForceField, Model
-from warp_corot.elasticity.paths.general import CorotatedGeneralField
-from warp_corot.elasticity.polar import METHODS, rotation_function
+from warp_corot.elasticity.dilatation import bind_law
+from warp_corot.elasticity.model import ForceField
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_choice, checked_count, checked_flag, shown
 from warp_corot.kernels.elements.dilatation import VOLUME
-from warp_corot.kernels.math.rotation import byers_xu, quick_rotation
+from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.materials.anisotropic import Anisotropic
 from warp_corot.mesh import TetForest
-from warp_corot.mesh.forest import MAX_LEVEL
 
 from .anisotropic import AnisotropicField, AnisotropicLanesField
-from .anisotropic_general import GeneralAnisotropicField
-from .anisotropic_subtrees import AnisotropicSubtreeField
+from .anisotropic_cuda import AnisotropicCudaField
 from .elements import CorotatedField, LanesField, LeafField
+from .general import CorotatedGeneralField
+from .options import CorotatedOptions
 from .subtrees import SubtreeField
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization, Discretized
 
-STIFFNESSES = ("factored", "sparse", "dense")
-#: The tolerance of "auto" [rad]. The end of the paper's beam, which sinks by 87 mm, then has an error of 0.24 mm; with
-#: a tolerance of 0.05 it is 0.04 mm, with 0.02 0.005 mm, and with level 3 0.47 mm.
-AUTO_TOLERANCE = 0.1
-
 
 @dataclass(frozen=True)
-class Corotated(Model):
+class Corotated(CorotatedOptions):
     """W = V (mu e:e + lambda/2 tr(e)^2) with e = sym(R^T F) - I and R the rotation of F.
 
     If every element has its own rotation, the force is the gradient of W and conserves linear and angular momentum.
@@ -69,36 +58,6 @@ class Corotated(Model):
     Raises:
         InputError: An option has another value.
     """
-
-    rotation_level: int | float | str | None = None
-    rotation: str = "byers-xu"
-    iterations: int | None = None
-    stiffness: str = "factored"
-    subtrees: bool = True
-    dilatation: str = AUTO
-
-    def __post_init__(self) -> None:
-        check_dilatation(self.dilatation)
-        _check_level(self.rotation_level)
-        checked_choice(self.rotation, "rotation", METHODS)
-        if self.iterations is not None:
-            rotation_function(self.rotation, checked_count(self.iterations, "iterations", 2))
-        checked_choice(self.stiffness, "stiffness", STIFFNESSES)
-        checked_flag(self.subtrees, "subtrees")
-
-    @property
-    def level(self) -> int | None:
-        """The level of the tree at which rotations are shared, if there is one."""
-        level = self.rotation_level
-        return level if isinstance(level, Integral) else None
-
-    @property
-    def tolerance(self) -> float | None:
-        """The largest angle between an ancestor's rotation and those of its leaves [rad], or None."""
-        level = self.rotation_level
-        if level is None or isinstance(level, Integral):
-            return None
-        return AUTO_TOLERANCE if level == "auto" else float(level)
 
     def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:
         return bind_law(self._bind, VOLUME, self.dilatation, body, deterministic)
@@ -133,31 +92,6 @@ class Corotated(Model):
                 raise InputError(f"{name} is {given!r}; with an anisotropic material it must be {wanted!r}")
         quick = self.own_rotation is quick_rotation
         if quick and discretization.device.is_cuda and not deterministic:
-            subtrees = discretization.prefers_subtrees
-            return (AnisotropicSubtreeField if subtrees else GeneralAnisotropicField)(discretization)
+            return AnisotropicCudaField(discretization)
         lanes = quick and discretization.device.is_cpu
         return (AnisotropicLanesField if lanes else AnisotropicField)(discretization, self.own_rotation, deterministic)
-
-    @property
-    def own_rotation(self) -> wp.Function:
-        """The device function that finds an element's own rotation."""
-        rotation = rotation_function(self.rotation, self.iterations)
-        return quick_rotation if rotation is byers_xu and self.subtrees else rotation
-
-
-def _check_level(level: int | float | str | None) -> None:
-    """Check a rotation level.
-
-    Raises:
-        InputError: It is not a rotation level.
-    """
-    if level is None or (isinstance(level, str) and level == "auto"):
-        return
-    if isinstance(level, Integral) and not isinstance(level, bool) and 0 <= level <= MAX_LEVEL:
-        return
-    if isinstance(level, float) and 0.0 < level <= 0.5:
-        return
-    raise InputError(
-        f"rotation_level is {shown(level)}; it must be None, a whole number from 0 to {MAX_LEVEL}, "
-        'a tolerance above 0 and up to 0.5 rad, or "auto"'
-    )

@@ -109,7 +109,7 @@ class OwnLaunches:
             wp.launch(
                 scatter_stretches(material.stride == 0),
                 dim=self._blocks * BLOCK,
-                inputs=[self._stretches, self._flat.elements, self._flat.leaves, material.mu, material.lam, u],
+                inputs=[self._stretches, self._flat.elements, self._flat.leaves, material, u],
                 outputs=[f, left_out],
                 device=self._device,
                 block_dim=BLOCK,

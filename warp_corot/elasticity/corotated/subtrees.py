@@ -16,7 +16,6 @@ from warp_corot.discretization.subtrees import Batch, Sharing
 from warp_corot.elasticity.paths.clusters import ChangingClusterScatter, ClusterScatter
 from warp_corot.elasticity.paths.dilating import Dilating
 from warp_corot.elasticity.paths.divided import InLanes
-from warp_corot.elasticity.paths.grouped import GroupedLanes
 from warp_corot.elasticity.paths.lanes import Lanes, as_general
 from warp_corot.elasticity.structs import Kept
 from warp_corot.elasticity.tangent import Tangent
@@ -24,9 +23,7 @@ from warp_corot.inputs.cpu_threads import launch
 from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.clusters.laws import isotropic_law
 from warp_corot.kernels.corotated.algebraic import corotated_stress
-from warp_corot.kernels.corotated.near_rotations import share_near_rotations
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
-from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.elements.general_cpu import rest_matrices, scatter_law_elements
 from warp_corot.kernels.elements.lanes import LANES
 from warp_corot.kernels.subtrees import cpu as subtree_cpu
@@ -35,7 +32,6 @@ from warp_corot.kernels.subtrees.repair import repair_elements, repair_own, repa
 
 from .elements import (
     CorotatedField,
-    CorotatedOptions,
     Rotations,
     general_lanes,
     rotated_material,
@@ -46,6 +42,8 @@ from .subtree_tangent import FEWEST, SubtreeTangent, subtrees_of
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
+
+    from .options import CorotatedOptions
 
 
 #: The structs that kernels of lanes read.
@@ -80,8 +78,8 @@ class SubtreeField(InLanes, CorotatedField):
         if self._own_launches is not None:
             return [*self._own_launches.kernels, LeftOutLeaves.kernel]
         of_subtrees: list[LoadedKernel] = [(self._kernel(*kind), self._block) for kind in self.plan.kinds]
-        if self._groups is not None:
-            return [*of_subtrees, self._groups.kernel("corotated"), repair_elements]
+        if self._dilating is not None:
+            return [*of_subtrees, self._dilating.kernel("corotated"), repair_elements]
         if self._lanes is not None:
             return [*of_subtrees, scatter_law_elements("corotated"), repair_elements]
         of_leaves = [self._own if self.plan.flat.unit is None else self._forces] if len(self.plan.flat) else []
@@ -92,15 +90,15 @@ class SubtreeField(InLanes, CorotatedField):
         kinds = () if one_launch else self.plan.kinds
         found: list[LoadedKernel] = [(self._kernel(*kind), self._block) for kind in kinds]
         found += [self._forces, self._own, self._extract, repair_own]
-        if self._groups is not None:
-            found += [self._groups.kernel("corotated"), repair_elements]
+        if self._dilating is not None:
+            found += [self._dilating.kernel("corotated"), repair_elements]
         elif self.device.is_cpu:
             found += [scatter_law_elements("corotated"), repair_elements]
         found += [LeftOutLeaves.kernel] if self._listed else []
         load((), self.device, [*found, *([OwnLaunches.later_kernel(self._uniform)] if one_launch else [])])
 
     def share_dilatation(self, dilating: Dilating) -> bool:
-        if self.device.is_cuda or any(sharing is not Sharing.OWN for _shape, _grouped, sharing in self.plan.kinds):
+        if any(sharing is not Sharing.OWN for _shape, _grouped, sharing in self.plan.kinds):
             return False
         self._dilating = dilating
         self.derive()
@@ -118,11 +116,6 @@ class SubtreeField(InLanes, CorotatedField):
     @property
     def in_clusters(self) -> tuple[ClusterScatter, Sequence[Batch]] | None:
         return None if self._own_launches is None else self._own_launches.in_clusters
-
-    @property
-    def _groups(self) -> GroupedLanes | None:
-        """The leaves outside subtrees, if they share their dilatation in groups."""
-        return None if self._dilating is None else self._dilating.groups
 
     @property
     def _block(self) -> int:
@@ -151,7 +144,7 @@ class SubtreeField(InLanes, CorotatedField):
         self._materials = [self._material(batch) for batch in plan.batches]
         self._flat_rotated = Kept(rotated_material)
         self._lanes: Lanes | None = None
-        if len(plan.flat) and self._groups is None:
+        if len(plan.flat) and self._dilating is None:
             self._prepare_flat(plan.flat)
 
     def _prepare_flat(self, flat: FlatLeaves) -> None:
@@ -181,8 +174,8 @@ class SubtreeField(InLanes, CorotatedField):
         for batch, kernel, material in zip(self.plan.batches, self._kernels, self._materials, strict=True):
             self._launch_batch(batch, kernel, material, u, f)
         flat = self.plan.flat
-        if self._groups is not None:
-            self._groups.scatter_forces("corotated", u, f, repair_elements)
+        if self._dilating is not None:
+            self._dilating.scatter_groups("corotated", u, f, repair_elements)
         elif len(flat):
             isotropic = self._flat_material
             if self._lanes is not None:
@@ -194,17 +187,6 @@ class SubtreeField(InLanes, CorotatedField):
                 self.launch(self._own, len(flat), [flat.elements, isotropic, u], [f])
         if self._left_out is not None:
             self._left_out.repair(self.elements, self.isotropic, u, f)
-
-    def used_rotations(self, u: wp.array) -> wp.array:
-        rotations = super().used_rotations(u)
-        if self._tolerance is None:
-            return rotations
-        for batch in self.plan.batches:
-            roots, subtrees = ForestElements(), batch.subtrees
-            roots.code, roots.frames, roots.size = subtrees.code, subtrees.frames, subtrees.size
-            inputs = [roots, subtrees.first, self.elements, self._tolerance, u]
-            self.launch(share_near_rotations(batch.shape), batch.count, inputs, [rotations])
-        return rotations
 
     def _kernel(self, shape: int, grouped: bool, sharing: Sharing) -> wp.Kernel:
         given = sharing is Sharing.ABOVE
@@ -235,7 +217,6 @@ class SubtreeField(InLanes, CorotatedField):
     def _launch_batch(
         self, batch: Batch, kernel: wp.Kernel, material: Callable[[], LanesMaterial], u: wp.array, f: wp.array
     ) -> None:
-        discretization = self.discretization
         own = batch.sharing is Sharing.OWN
         outputs = [f, batch.flagged]
         if self.device.is_cuda:
@@ -244,7 +225,7 @@ class SubtreeField(InLanes, CorotatedField):
                 inputs = [batch.subtrees, self.isotropic, u]
             else:
                 unit = self._no_unit if batch.unit is None else batch.unit
-                inputs = [batch.subtrees, discretization.mu, discretization.lam, u, self._rotations, unit]
+                inputs = [batch.subtrees, self.isotropic, u, self._rotations, unit]
             outputs.append(LeftOutLeaves.NONE if self._left_out is None else self._left_out.list_of(batch))
         else:
             threads = -(-batch.count // LANES)
@@ -255,7 +236,7 @@ class SubtreeField(InLanes, CorotatedField):
         flags = batch.flags_by_eights
         inputs = [self.elements, self.isotropic, u]
         if own:
-            self.launch(repair_own, len(flags), [flags, batch.subtrees.first, *inputs], [f])
+            self.launch(repair_own, len(flags), [1, flags, batch.subtrees.first, *inputs], [f])
         elif batch.sharing is Sharing.ROOT:
             self.launch(repair_shared, len(flags), [flags, batch.subtrees.first, batch.roots, *inputs], [f])
 

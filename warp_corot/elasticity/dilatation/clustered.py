@@ -8,12 +8,14 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.elasticity.paths.clusters import SUBTREE, ClusterScatter
+from warp_corot.elasticity.paths.clusters import ClusterScatter
 from warp_corot.elasticity.structs import Kept
 from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.clusters.sharing import SharingMaterial, measure_pairs, shared_pressure, sharing_law
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import Dilatation
+
+from .element_groups import group_numbers
 
 
 class ClusteredGroups:
@@ -23,8 +25,7 @@ class ClusteredGroups:
     Args:
         scatter: Adds the forces.
         elements: Number of elements of the mesh.
-        batches: Groups as ``kernels.elements.shared_dilatation.share_in_groups`` takes them, and their number;
-            together they have all elements that the clusters have.
+        groups: The elements of each group; together they have all elements that the clusters have.
         of: The shared dilatation.
         lam: Gives lambda [Pa] as the elements have it.
     """
@@ -33,18 +34,14 @@ class ClusteredGroups:
         self,
         scatter: ClusterScatter,
         elements: int,
-        batches: Sequence[tuple[wp.array, wp.array, wp.array, int]],
+        groups: Sequence[npt.NDArray[np.int32]],
         of: Dilatation,
         lam: Callable[[], wp.array],
     ):
         self._scatter, self._lam, self._device = scatter, lam, scatter.clusters.elements.device
-        parts = [_members_of(*batch) for batch in batches]
-        members, sizes = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-        group_of = np.zeros(elements, np.int32)
-        group_of[members] = np.repeat(np.arange(len(sizes)), sizes)
-        listed = group_of[scatter.clusters.elements.numpy()]
+        listed = group_numbers(groups, elements)[scatter.clusters.elements.numpy()]
         self._listed = wp.array(listed, dtype=wp.int32, device=self._device)
-        self._sums = wp.zeros(len(sizes), dtype=wp.vec4, device=self._device)
+        self._sums = wp.zeros(len(groups), dtype=wp.vec4, device=self._device)
         self._kernel = measure_pairs(scatter.Pairs, of, scatter.layout)
         made = Kept(_sharing_material)
         scatter.use_law(
@@ -66,16 +63,6 @@ class ClusteredGroups:
         inputs = [scatter.clusters, scatter.pairs, self._listed, stride, self._lam(), u]
         size = scatter.count * threads
         wp.launch(self._kernel, size, inputs, [self._sums], device=self._device, block_dim=threads)
-
-
-def _members_of(
-    starts: wp.array, members: wp.array, _live: wp.array, count: int
-) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
-    """The elements of this many groups, group after group, and the number of elements of each."""
-    begins = starts.numpy()
-    if len(members):
-        return members.numpy()[begins[0] : begins[count]], np.diff(begins[: count + 1])
-    return (begins[:count, None] + np.arange(SUBTREE, dtype=np.int32)).ravel(), np.full(count, SUBTREE, np.int32)
 
 
 def _sharing_material(isotropic: IsotropicMaterial, lam: wp.array, groups: wp.array, sums: wp.array) -> SharingMaterial:

@@ -13,27 +13,30 @@ from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.elements import with_targets
 from warp_corot.discretization.members import Members
 from warp_corot.discretization.plan import Plan
-from warp_corot.discretization.shear_only import ShearOnly
+from warp_corot.discretization.shear_only import shear_only
 from warp_corot.discretization.slots import Slots
 from warp_corot.discretization.subtrees import Batch
 from warp_corot.elasticity.model import ForceField, SmallForces
 from warp_corot.elasticity.paths.dilating import Dilating
+from warp_corot.elasticity.structs import forwards
 from warp_corot.elasticity.tangent import Tangent
 from warp_corot.inputs.loading import LoadedKernel, load
-from warp_corot.kernels.elements import shared_diagonal
 from warp_corot.kernels.elements import shared_dilatation as kernels
-from warp_corot.kernels.elements.dilatation import VOLUME, Dilatation
+from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.kernels.elements.lanes import LANES
+from warp_corot.kernels.elements.law_lanes import STRESSLESS
+from warp_corot.kernels.elements.shared_dilatation import DilatedMaterial
 from warp_corot.kernels.subtrees import dilatation as subtrees
-from warp_corot.kernels.subtrees.cpu import scatter_dilatation_lanes
+from warp_corot.kernels.subtrees.cpu import scatter_law_subtrees
 from warp_corot.kernels.subtrees.memory import BLOCK
 from warp_corot.mesh import TetForest
 
 from .clustered import ClusteredGroups
-from .others import Others
+from .element_groups import ElementGroups, elements_of, group_numbers
 from .tangent import SharedTangent
 
 
+@forwards("shear", "state", "reset", "energy_count", "divide")
 class DilatationField(ForceField):
     """A law's force field without lambda's part, and that part with a dilatation that elements share.
 
@@ -61,14 +64,19 @@ class DilatationField(ForceField):
         of: Dilatation,
         deterministic: bool = False,
     ):
-        self.shear = bind(ShearOnly(discretization))
+        self.shear = bind(shear_only(discretization))
         super().__init__(discretization, deterministic)
         self.of = of
         self._all, self._still = (wp.empty(0, dtype=kind, device=self.device) for kind in (wp.int32, wp.vec4))
-        self._others = Others(discretization, self.plan, of)
-        #: Whether the law's own launches add the forces of subtrees and groups, and whether clusters add theirs.
+        groups = self._groups = ElementGroups(discretization, self.plan)
+        #: Elements in groups on the CPU, and whether the law's own launches add the forces of subtrees and groups.
+        self._lanes: Dilating | None = None
         self._joined = False
-        self._clustered: ClusteredGroups | None = None
+        #: On CUDA, clusters that add their forces, and the subtrees outside them.
+        self._clustered: tuple[ClusteredGroups, Sequence[Batch]] | None = None
+        if self.device.is_cpu:
+            given = groups.starts, groups.members, groups.live
+            self._lanes = Dilating(of, lambda: self.discretization.lam, self.plan, self.kind, *given)
         self.join_launches()
         self._make_room()
         #: All elements, and slots for the forces of each by itself; the plan's own slots are those of its units.
@@ -85,66 +93,67 @@ class DilatationField(ForceField):
 
     def join_launches(self) -> None:
         """Let the law's own launches add all forces if they can."""
-        if self.plan is self.shear.plan:
-            dilating = Dilating(self.of, lambda: self.discretization.lam, self._others.grouped)
-            self._joined = self.shear.share_dilatation(dilating)
-        self._others.are_joined = self._joined and self._others.grouped is not None
-        self._others.follow()
-        self._clustered = self._join_clusters()
-
-    def _join_clusters(self) -> ClusteredGroups | None:
-        """Let the launch of elements in clusters add the forces of their shared dilatation, if there is one (CUDA)."""
+        if self._lanes is not None:
+            self._count_groups()
+            self._joined = self.plan is self.shear.plan and self.shear.share_dilatation(self._lanes)
+            if not self._joined:
+                self._lanes.derive(self.shear.isotropic)
+            return
         found = self.shear.in_clusters
-        if found is None or self.slots is not None:
-            return None
-        scatter, kept = found
-        there = [batch for batch in self.plan.batches if not any(batch is other for other in kept)]
-        self._kept, self._others.are_joined = kept, True
-        batches = self._of_subtrees(there) + self._others.groups
-        return ClusteredGroups(scatter, len(self.elements.nodes), batches, self.of, lambda: self.discretization.lam)
+        if found is not None and self.slots is None:
+            scatter, kept = found
+            there = [batch for batch in self.plan.batches if not any(batch is other for other in kept)]
+            batches = self._groups.of_subtrees(there) + self._groups.of_others
+            groups, lam = [group for batch in batches for group in elements_of(*batch)], lambda: self.discretization.lam
+            self._clustered = ClusteredGroups(scatter, self.element_count, groups, self.of, lam), kept
+
+    def _count_groups(self) -> None:
+        if self._lanes is not None:
+            self._lanes.count = sum(count for *_, count in self._groups.of_others)
 
     @property
     def _batches(self) -> Sequence[Batch]:
         """The subtrees whose forces of the dilatation are not added by the law's own launches."""
         if self._joined:
             return ()
-        return self.plan.batches if self._clustered is None else self._kept
+        return self.plan.batches if self._clustered is None else self._clustered[1]
 
     @property
     def kernels(self) -> list[LoadedKernel]:
         own: list[LoadedKernel] = [(self._kernel(batch.shape, batch.grouped), self._block) for batch in self._batches]
-        own += [] if self._clustered is None else [self._clustered.kernel]
-        in_groups = kernels.share_in_groups(self.kind, kernels.law_at(self.of))
-        own += [kernels.measure_elements(self.kind, self.of), in_groups, *self._others.kernels]
-        return [*self.shear.kernels, *own]
+        own += [] if self._clustered is None else [self._clustered[0].kernel]
+        return [*self.shear.kernels, *own, self._measure, self._share_in_groups, *self._of_others]
 
     def load_kernels(self) -> None:
         self.shear.load_kernels()
         kinds = [] if self._joined else self.plan.kinds
         own = [(self._kernel(shape, grouped), self._block) for shape, grouped, _sharing in kinds]
-        load((), self.device, [*own, *self._others.kernels])
+        load((), self.device, [*own, *self._of_others])
+
+    @property
+    def _of_others(self) -> list[LoadedKernel]:
+        """The kernels of forces outside subtrees that the law's own launches do not add."""
+        if self._joined or self._clustered is not None:
+            return []
+        if self._lanes is not None:
+            return [self._lanes.kernel(STRESSLESS)]
+        return [self._measure, self._share_in_groups, kernels.scatter_pressures(self.kind, self.of)]
 
     def derive(self) -> None:
-        self._others.derive()
+        self._groups.derive()
+        if self._lanes is not None and not self._joined:
+            self._lanes.derive(self.shear.isotropic)
         self.shear.derive()
 
     def take_material(self) -> None:
         self.shear.take_material()
+        if self._lanes is not None and not self._joined:
+            self._lanes.derive(self.shear.isotropic)
 
     def follow(self) -> None:
-        self._others.follow()
+        self._count_groups()
         self._make_room()
         self.shear.follow()
-
-    @property
-    def state(self) -> dict[str, wp.array]:
-        return self.shear.state
-
-    def reset(self, chosen: wp.array) -> None:
-        self.shear.reset(chosen)
-
-    def divide(self) -> None:
-        self.shear.divide()
 
     # --- forces ------------------------------------------------------------------------------------------------------
 
@@ -165,68 +174,50 @@ class DilatationField(ForceField):
 
     def _add_up(self, u: wp.array) -> None:
         if self._clustered is not None:
-            self._clustered.add_up(self.discretization.material_stride, u)
+            self._clustered[0].add_up(self.discretization.material_stride, u)
 
     def _scatter(self, u: wp.array, f: wp.array) -> None:
         for batch in self._batches:
-            kernel, subtree = self._kernel(batch.shape, batch.grouped), batch.subtrees
-            if self.device.is_cuda:
-                inputs = [subtree, self.discretization.lam, u]
-                wp.launch(kernel, batch.count, inputs, [f], device=self.device, block_dim=BLOCK)
+            kernel = self._kernel(batch.shape, batch.grouped)
+            if self._lanes is None:
+                inputs, outputs, threads = [batch.subtrees, self.isotropic, u], [f], batch.count
             else:
-                inputs = [subtree, batch.count, self.isotropic, u]
-                self.launch(kernel, -(-batch.count // LANES), inputs, [f, batch.flagged])
-        if self._others.count and not self._others.are_joined:
-            self._others.scatter(self.isotropic, u, self._shared, f)
+                material = self._lanes.material(self.shear.isotropic)
+                inputs, outputs = [batch.subtrees, batch.count, material, u], [f, batch.flagged]
+                threads = -(-batch.count // LANES)
+            wp.launch(kernel, threads, inputs, outputs, device=self.device, block_dim=self._block)
+        if self._lanes is None and self._clustered is None:
+            self._scatter_others(u, f)
+        elif self._lanes is not None and not self._joined:
+            self._lanes.scatter_groups(STRESSLESS, u, f)
+
+    def _scatter_others(self, u: wp.array, f: wp.array) -> None:
+        """Add the forces of elements outside subtrees, in three passes (CUDA)."""
+        plan, flat, isotropic = self.plan, self.plan.flat, self.isotropic
+        where, count = [self.elements, self._all, self._all], self.element_count
+        if plan.kinds or len(flat):
+            where, count = [flat.elements, flat.leaves, self._all if flat.live is None else flat.live], len(flat)
+        self.launch(self._measure, count, [*where, u, self._still], [self._shared])
+        for starts, members, live, groups in self._groups.of_others:
+            inputs = [starts, members, live, self.elements, isotropic]
+            self.launch(self._share_in_groups, groups, inputs, [self._shared])
+        pressures = kernels.scatter_pressures(self.kind, self.of)
+        self.launch(pressures, count, [*where, isotropic, u, self._shared], [f])
 
     def _kernel(self, shape: int, grouped: bool) -> wp.Kernel:
         if self.device.is_cuda:
             return subtrees.scatter_dilatation(shape, grouped, self.discretization.material_stride == 0, self.of)
-        return scatter_dilatation_lanes(shape, self.of)
+        return scatter_law_subtrees(shape, STRESSLESS, self.of)
 
     @property
     def _block(self) -> int:
         return BLOCK if self.device.is_cuda else 256
 
-    # --- stiffness ---------------------------------------------------------------------------------------------------
-
-    def add_stiffness(self, u: wp.array, p: wp.array, y: wp.array, *, exact: bool | None = None) -> None:
-        """Add K(u) p to y [N].
-
-        Args:
-            u, p, y: As for every field.
-            exact: None: the law's own K. For the corotated law this is the paper's, without the derivatives of the
-                rotations and of the gradient of J, which is positive semidefinite; True: the exact derivative.
-        """
-        self._law("add_stiffness", exact)(u, p, y)
-        inputs = [self.elements, self.isotropic, u, p, self._share(u, p), self.turning(exact)]
-        self.launch(kernels.add_product(self.kind, self.of), self.element_count, inputs, [y])
-
-    def add_diagonal(self, u: wp.array, blocks: wp.array, *, exact: bool | None = None) -> None:
-        """Add the 3x3 blocks on the diagonal of the same K(u) to those of the nodes [N/m]; see ``add_stiffness``."""
-        self._law("add_diagonal", exact)(u, blocks)
-        turning, shared = self.turning(exact), self._share(u, self._still)
-        kernel = shared_diagonal.add_diagonal_of_groups(self.kind, self.of)
-        for starts, members, live, count in self.batches_of_groups():
-            inputs = [starts, members, live, self.elements, self.isotropic, u, shared, turning]
-            self.launch(kernel, count, inputs, [blocks])
-
     def tangent(self, *, exact: bool = False) -> Tangent:
+        """See ``ForceField.tangent``. The K of the corotated law is the paper's unless it is ``exact``: then it has the
+        derivatives of the rotations and of the gradient of J, too, and may be indefinite.
+        """
         return SharedTangent(self, exact)
-
-    def _law(self, name: str, exact: bool | None) -> Callable[..., None]:
-        method = getattr(self.shear, name)
-        if exact is None or not self._has_rotations:
-            return method
-        return lambda *arrays: method(*arrays, exact=exact)
-
-    def turning(self, exact: bool | None) -> float:
-        return 0.0 if self._has_rotations and not exact else 1.0
-
-    @property
-    def _has_rotations(self) -> bool:
-        """Whether the law's K is the exact derivative only on request."""
-        return self.of is VOLUME
 
     @property
     def stiffest(self) -> SmallForces:
@@ -234,14 +225,11 @@ class DilatationField(ForceField):
 
     def unshare(self, u: wp.array, f: wp.array) -> None:
         """Change the forces f of displacements u to those of separate dilatations."""
-        shared = self._share(u, self._still)
-        self.launch(kernels.unshare(self.kind, self.of), self.element_count, [self.elements, u], [shared])
         elements, slots = self._by_itself
         if slots is not None:
             slots.values.zero_()
-        inputs = [elements, self._all, self._all, self.isotropic, u, shared]
-        outputs = [f if slots is None else slots.values]
-        self.launch(kernels.scatter_pressures(self.kind, self.of), self.element_count, inputs, outputs)
+        inputs, outputs = [elements, self._material_at(u), u], [f if slots is None else slots.values]
+        self.launch(self._unshared, self.element_count, inputs, outputs)
         if slots is not None:
             slots.gather(f)
 
@@ -256,12 +244,7 @@ class DilatationField(ForceField):
         self._add_shared_energies(u, energies)
 
     def _add_shared_energies(self, u: wp.array, energies: wp.array) -> None:
-        kernel, shared = kernels.add_energies(self.kind, self.of), self._share(u, self._still)
-        self._launch_over_elements(kernel, self.isotropic, u, energies, shared)
-
-    @property
-    def energy_count(self) -> int:
-        return self.shear.energy_count
+        self._launch_over_elements(self._energies, self._material_at(u), u, energies)
 
     def write_von_mises(self, u: wp.array, stress: wp.array) -> None:
         self.shear.write_von_mises(u, stress)
@@ -278,30 +261,11 @@ class DilatationField(ForceField):
 
     def groups(self) -> list[npt.NDArray[np.int32]]:
         """The elements of each group that shares a dilatation, of all worlds."""
-        found = []
-        for starts, members, live, count in self.batches_of_groups():
-            begins, of_groups = starts.numpy(), members.numpy()
-            # Launches over a mesh that changes go beyond its groups.
-            for g in range(min(count, int(live.numpy()[0])) if len(live) else count):
-                if len(of_groups):
-                    found.append(of_groups[begins[g] : begins[g + 1]])
-                else:
-                    found.append(np.arange(begins[g], begins[g] + 8, dtype=np.int32))
-        return found
+        return [group for batch in self._groups.all for group in elements_of(*batch)]
 
     def group_numbers(self) -> npt.NDArray[np.int32]:
         """The number of each element's group, int32 [T] of all worlds."""
-        groups = self.groups()
-        numbers = np.empty(self.element_count, np.int32)
-        numbers[np.concatenate(groups)] = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
-        return numbers
-
-    def batches_of_groups(self) -> list[tuple[wp.array, wp.array, wp.array, int]]:
-        """Subtrees and other groups in the form of ``kernels.share_in_groups``, and their numbers."""
-        return self._of_subtrees(self.plan.batches) + self._others.groups
-
-    def _of_subtrees(self, batches: Sequence[Batch]) -> list[tuple[wp.array, wp.array, wp.array, int]]:
-        return [(b.subtrees.first, self._all, b.live or self._all, b.count) for b in batches]
+        return group_numbers(self.groups(), self.element_count)
 
     @property
     def find_members(self) -> Callable[[int], Members]:
@@ -309,29 +273,49 @@ class DilatationField(ForceField):
 
     def members(self, below: int | None = None) -> Members:
         """The nodes of groups, of all elements or those below a number; waits for the device."""
-        return Members.of(self.of, self.batches_of_groups(), self.elements.nodes, below)
+        return Members.of(self.of, self._groups.all, self.elements.nodes, below)
 
     def share_weights(self, u: wp.array, p: wp.array) -> wp.array:
         """Data of the shared dilatation for derivatives with respect to elements' weights, vec4 [T]; see
         ``kernels.elements.shared_dilatation.weight_law_at``.
         """
-        return self._share(u, p, kernels.weight_law_at(self.of))
+        return self._share(u, p, kernels.share_in_groups(self.kind, kernels.weight_law_at(self.of)))
 
-    def _share(self, u: wp.array, p: wp.array, law: wp.Function | None = None) -> wp.array:
-        """Launch the second pass of ``kernels.elements.shared_dilatation`` for all elements."""
-        shared, law = self._shared, law or kernels.law_at(self.of)
-        measure = kernels.measure_elements(self.kind, self.of)
+    def _share(self, u: wp.array, p: wp.array, share_in_groups: wp.Kernel) -> wp.array:
+        """Launch the first two passes of ``kernels.elements.shared_dilatation`` for all elements."""
         self._regions.launch_over(
-            measure,
+            self._measure,
             self.element_count,
-            lambda _, own: ([own(self.elements), self._all, self._all, u, p], [own(shared)]),
+            lambda _, own: ([own(self.elements), self._all, self._all, u, p], [own(self._shared)]),
             u.ptr,
             p.ptr,
         )
-        kernel = kernels.share_in_groups(self.kind, law)
-        for starts, members, live, count in self.batches_of_groups():
-            self.launch(kernel, count, [starts, members, live, self.elements, self.isotropic], [shared])
-        return shared
+        for starts, members, live, count in self._groups.all:
+            inputs = [starts, members, live, self.elements, self.isotropic]
+            self.launch(share_in_groups, count, inputs, [self._shared])
+        return self._shared
+
+    def _material_at(self, u: wp.array) -> DilatedMaterial:
+        """The material at displacements u, whose dilatation is found by launches."""
+        material = DilatedMaterial()
+        material.isotropic, material.shared = self.isotropic, self._share(u, self._still, self._share_in_groups)
+        return material
+
+    @property
+    def _measure(self) -> wp.Kernel:
+        return kernels.measure_elements(self.kind, self.of)
+
+    @property
+    def _share_in_groups(self) -> wp.Kernel:
+        return kernels.share_in_groups(self.kind, kernels.law_at(self.of))
+
+    @property
+    def _unshared(self) -> wp.Kernel:
+        return kernels.unshare(self.kind, self.of)
+
+    @property
+    def _energies(self) -> wp.Kernel:
+        return kernels.add_energies(self.kind, self.of)
 
 
 def _with_slots(discretization: Discretization) -> tuple[Any, Slots]:

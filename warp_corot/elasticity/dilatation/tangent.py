@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from warp_corot.elasticity.tangent import Tangent
-from warp_corot.kernels.elements import shared_diagonal, shared_dilatation
+from warp_corot.elasticity.tangent import ElementTangent, Tangent
+from warp_corot.kernels.elements import shared_dilatation
 from warp_corot.kernels.elements import shared_rows as kernels
-from warp_corot.kernels.elements.dilatation import SMALL, not_held
+from warp_corot.kernels.elements.dilatation import SMALL, VOLUME, not_held
 
 if TYPE_CHECKING:
     from .field import DilatationField
@@ -27,12 +27,14 @@ class SharedTangent(Tangent):
 
     def __init__(self, field: DilatationField, exact: bool):
         super().__init__(field)
-        self.shear, self._exact = field.shear.tangent(exact=exact), exact
+        self.shear = field.shear.tangent(exact=exact)
         # The differential of the gradient of a dilatation acts in each element separately.
-        self._turns = bool(field.turning(exact)) and field.of is not SMALL
+        self._turns = (exact or field.of is not VOLUME) and field.of is not SMALL
+        own = shared_dilatation.own_differential(field.of), self._material, shared_dilatation.DilatedMaterial
+        self._of_elements = ElementTangent(field, *own)
         self._holds = field.of.holding is not not_held
         self._version = -1
-        self._shared, self._empty = (wp.zeros(0, dtype=kind, device=field.device) for kind in (wp.vec4, wp.int32))
+        self._shared = wp.zeros(0, dtype=wp.vec4, device=field.device)
 
     @property
     def kernels(self) -> list[wp.Kernel]:
@@ -41,6 +43,7 @@ class SharedTangent(Tangent):
     def prepare(self, u: wp.array) -> None:
         super().prepare(u)
         self.shear.prepare(u)
+        self._of_elements.displacements = self.displacements
         field, version = self.field, self.field.discretization.sizes.version
         if self._version != version:
             self._version = version
@@ -60,25 +63,25 @@ class SharedTangent(Tangent):
 
     def add_product(self, p: wp.array, y: wp.array) -> None:
         self.shear.add_product(p, y)
-        field, u = self.field, self.displacements
+        field = self.field
         lanes = kernels.THREADS if field.device.is_cuda else 1
         groups, count = [self._members.arrays, self._rows], self._members.count
         field.launch(kernels.add_row_products, lanes * count, [lanes, *groups, p], [y])
         if self._turns:
-            inputs = [field.elements, field.isotropic, u, p, self._shared, 1.0]
-            kernel = shared_dilatation.add_product(field.kind, field.of)
-            field.launch(kernel, field.element_count, inputs, [y])
+            self._of_elements.add_product(p, y)
         elif self._holds:
-            inputs = [field.elements, u, p, *groups, self._shared]
+            inputs = [field.elements, self.displacements, p, *groups, self._shared]
             field.launch(kernels.add_held(field.kind, field.of), count, inputs, [y])
 
     def add_diagonal(self, blocks: wp.array) -> None:
         self.shear.add_diagonal(blocks)
         field = self.field
-        inputs = [self._members.arrays, self._rows]
-        field.launch(kernels.add_row_blocks, self._members.count, inputs, [blocks])
+        field.launch(kernels.add_row_blocks, self._members.count, [self._members.arrays, self._rows], [blocks])
         if self._turns or self._holds:
-            inputs = [field.elements, self._empty, self._empty, field.isotropic, self.displacements, self._shared]
-            inputs += [float(self._turns)]
-            kernel = shared_diagonal.add_diagonal(field.kind, field.of)
-            field.launch(kernel, field.element_count, inputs, [blocks])
+            self._of_elements.add_diagonal(blocks)
+
+    def _material(self) -> shared_dilatation.DilatedMaterial:
+        material = shared_dilatation.DilatedMaterial()
+        material.isotropic, material.shared = self.field.isotropic, self._shared
+        material.turning = float(self._turns)
+        return material

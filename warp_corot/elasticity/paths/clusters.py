@@ -11,9 +11,9 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.discretization.clusters.pairs import pairs_in_clusters
-from warp_corot.discretization.clusters.single import axis_words, changing_clusters, find_tables
-from warp_corot.discretization.elements import Elements
-from warp_corot.discretization.plan import FlatLeaves, LeafCounts, Plan
+from warp_corot.discretization.clusters.single import axis_words, changing_clusters, find_tables, order_in_clusters
+from warp_corot.discretization.elements import Elements, in_worlds
+from warp_corot.discretization.plan import LeafCounts, Plan
 from warp_corot.discretization.subtrees import GROUPED_LEAVES, Batch
 from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.clusters.elements import AlignedElements, align_elements
@@ -34,6 +34,7 @@ from warp_corot.kernels.tables.cluster_layout import (
     ClusterLayout,
     PairLayout,
 )
+from warp_corot.mesh import TetForest
 
 from .lanes import as_general
 
@@ -58,24 +59,32 @@ def grouped_and_others(plan: Plan, fewest: int = GROUPED_LEAVES) -> tuple[list[B
     return batches, np.sort(leaves).astype(np.int32)
 
 
-def others_in_clusters(
+def clustered(discretization: Discretization) -> npt.NDArray[np.int32]:
+    """A body's elements, of all worlds, in the order of clusters: int32 [worlds * T]."""
+    mesh = discretization.mesh
+    if isinstance(mesh, TetForest):
+        return np.arange(discretization.worlds * len(mesh.tets), dtype=np.int32)
+    return in_worlds(order_in_clusters(mesh.points, mesh.tets), discretization.worlds, len(mesh.tets))
+
+
+def divided(
+    discretization: Discretization,
     plan: Plan,
     law: wp.Function,
     Material: type = IsotropicMaterial,
     layout: PairLayout | None = None,
-) -> tuple[list[Batch], FlatLeaves | None, ClusterScatter | None]:
-    """The batches of a plan that are launched as subtrees, the leaves that are launched one by one, and the launch of
-    all others.
+) -> tuple[list[Batch], ClusterScatter | None]:
+    """The batches of a plan that are launched as subtrees, and the launch of all other elements in clusters.
 
-    Clusters of pairs are found on the host, and their sums have any order. So the plan's batches and leaves remain as
-    they are if leaves change, if sums must have a fixed order, and on the CPU.
+    Clusters of pairs are found on the host, and their sums have any order. So there are none, and the plan's batches
+    and leaves remain as they are, if leaves change, if sums must have a fixed order, and on the CPU.
     """
-    if not len(plan.flat):
-        return list(plan.batches), None, None
-    if plan.counts is not None or plan.slots is not None or not plan.elements.nodes.device.is_cuda:
-        return list(plan.batches), plan.flat, None
-    batches, leaves = grouped_and_others(plan)
-    return batches, None, ClusterScatter(plan.elements, law, Material, chosen=leaves, layout=layout)
+    is_by_leaves = not plan.batches and not len(plan.flat)
+    fixed = plan.counts is None and plan.slots is None and plan.elements.nodes.device.is_cuda
+    if not fixed or not (is_by_leaves or len(plan.flat)):
+        return list(plan.batches), None
+    batches, elements = ([], clustered(discretization)) if is_by_leaves else grouped_and_others(plan)
+    return batches, ClusterScatter(plan.elements, law, Material, chosen=elements, layout=layout)
 
 
 class ClusterScatter:

@@ -59,9 +59,8 @@ class InLanes:
     def nodes(self) -> list[wp.array]:
         """See ``Piece``."""
         nodes = [batch.subtrees.nodes for batch in self.plan.batches]
-        groups = None if self._dilating is None else self._dilating.groups
-        if groups is not None:
-            return [*nodes, groups.nodes] if groups.count else nodes
+        if self._dilating is not None:
+            return [*nodes, self._dilating.nodes] if self._dilating.count else nodes
         return nodes if self._lanes is None else [*nodes, self._lanes.elements.nodes]
 
 

@@ -8,11 +8,10 @@ import warp as wp
 
 from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.plan import Plan
-from warp_corot.elasticity.model import LawField
+from warp_corot.elasticity.model import Law, LawField
 from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.elements.general_cpu import rest_matrices, scatter_law_elements
 from warp_corot.kernels.elements.lanes import LANES
-from warp_corot.kernels.elements.law_lanes import LawInLanes
 from warp_corot.kernels.subtrees.cpu import scatter_law_subtrees
 from warp_corot.mesh import TetForest
 
@@ -29,13 +28,14 @@ class LawLanesField(InLanes, LawField):
 
     Args:
         discretization: On the CPU.
-        law: A law of ``kernels.elements.law_lanes``.
-        functions: As for ``LawField``.
+        law: A law that is in C++.
+        deterministic: As for every field.
     """
 
-    def __init__(self, discretization: Discretization, *, law: LawInLanes, **functions: Any):
-        super().__init__(discretization, **functions)
-        self._law = law
+    def __init__(self, discretization: Discretization, law: Law, *, deterministic: bool = False):
+        super().__init__(discretization, law, deterministic=deterministic)
+        assert law.lanes is not None
+        self._law = law.lanes
         self._lanes: Lanes | None = None
         self._lanes_material = self.isotropic
         self.follow()
@@ -46,10 +46,8 @@ class LawLanesField(InLanes, LawField):
     @property
     def _force_kernels(self) -> list[LoadedKernel]:
         kernels = [self._kernel(shape) for shape, _grouped, _sharing in self.plan.kinds]
-        dilating, of_leaves = self._dilating, scatter_law_elements(self._law)
-        if dilating is not None and dilating.groups is not None:
-            of_leaves = dilating.groups.kernel(self._law)
-        return [*kernels, of_leaves]
+        dilating = self._dilating
+        return [*kernels, scatter_law_elements(self._law) if dilating is None else dilating.kernel(self._law)]
 
     def load_kernels(self) -> None:
         load((), self.device, self._force_kernels)
@@ -58,8 +56,6 @@ class LawLanesField(InLanes, LawField):
         return scatter_law_subtrees(shape, self._law, None if self._dilating is None else self._dilating.of)
 
     def share_dilatation(self, dilating: Dilating) -> bool:
-        if dilating.groups is None and not isinstance(self.discretization.mesh, TetForest):
-            return False
         self._dilating = dilating
         self.derive()
         self.follow()
@@ -78,13 +74,13 @@ class LawLanesField(InLanes, LawField):
             self.launch(self._kernel(batch.shape), threads, inputs, [f, batch.flagged])
         if self._lanes is not None:
             self._lanes.scatter_forces(self._lanes_material, u, f)
-        if self._dilating is not None and self._dilating.groups is not None:
-            self._dilating.groups.scatter_forces(self._law, u, f)
+        if self._dilating is not None:
+            self._dilating.scatter_groups(self._law, u, f)
 
     def follow(self) -> None:
         flat = self.plan.flat
         self._lanes = None
-        if self._dilating is not None and self._dilating.groups is not None:
+        if self._dilating is not None:
             return
         if not isinstance(self.discretization.mesh, TetForest):
             self._lanes = Lanes(self.elements, self.elements, scatter=scatter_law_elements(self._law))

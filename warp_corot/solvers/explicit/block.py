@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from warp_corot.discretization.plan import Batch, Sharing
+from warp_corot.discretization.plan import Batch
 from warp_corot.discretization.planning.fixed import ForcePlan
 from warp_corot.elasticity.corotated.subtrees import SubtreeField
 from warp_corot.elasticity.dilatation.field import law_of
@@ -38,9 +38,9 @@ class BlockSteps:
     ``of`` makes it if the body fits.
     """
 
-    def __init__(self, body: SoftBody, law: SubtreeField, batch: Batch, layout: Layout, slots: list[list[int]]):
+    def __init__(self, body: SoftBody, field: ForceField, batch: Batch, layout: Layout, slots: list[list[int]]):
         self.body = body
-        self._law = law
+        self._field = field
         tasks, numbers = _tasks(layout, slots)
         layout = dataclasses.replace(layout, tasks=len(tasks))
         device = body.device
@@ -61,25 +61,22 @@ class BlockSteps:
         if body.changing is not None or not body.device.is_cuda:
             return None
         law, sharing = law_of(field)
-        if not isinstance(law, SubtreeField) or not isinstance(body.mesh, TetForest):
+        if not isinstance(law, SubtreeField) or not isinstance(body.mesh, TetForest) or law.rotation_level is not None:
             return None
-        if not any(layout.fits for layout in _layouts(body, 0, False, len(body.mesh.tets) // 8)):
+        if not any(layout.fits for layout in _layouts(body, 0, len(body.mesh.tets) // 8)):
             return None
-        plan = ForcePlan.of_forest(
-            body.mesh, law.rotation_level, body.device, elements=body.discretization.elements, grouped=False
-        )
-        if len(plan.batches) != 1 or len(plan.flat) or plan.batches[0].sharing is Sharing.ABOVE:
+        plan = ForcePlan.of_forest(body.mesh, None, body.device, elements=body.discretization.elements, grouped=False)
+        if len(plan.batches) != 1 or len(plan.flat):
             return None
         batch = plan.batches[0]
-        by_root = batch.sharing is Sharing.ROOT
-        layouts = _layouts(body, batch.shape, by_root, batch.count, dilating=sharing is not None)
+        layouts = _layouts(body, batch.shape, batch.count, dilating=sharing is not None)
         layout = next((layout for layout in layouts if layout.fits), None)
         if layout is None:
             return None
         slots = _slots_by_node(layout, batch.subtrees.nodes.numpy(), body.world_node_count)
         if max(map(len, slots)) > MOST_SLOTS:
             return None
-        return cls(body, law, batch, layout, slots)
+        return cls(body, field, batch, layout, slots)
 
     #: Whether the device has all that a launch reads of the body's controls.
     is_prepared = True
@@ -96,10 +93,7 @@ class BlockSteps:
                 count,
                 damping,
                 system.gravity,
-                body.discretization.mu,
-                self._law.discretization.lam,
-                body.discretization.lam,
-                body.discretization.material_stride,
+                self._field.isotropic,
                 body.conditions.mass,
                 body.conditions.inverse_mass,
                 int(body.conditions.has_loads),
@@ -113,7 +107,7 @@ class BlockSteps:
         )
 
 
-def _layouts(body: SoftBody, shape: int, shared: bool, subtrees: int, *, dilating: bool = False) -> list[Layout]:
+def _layouts(body: SoftBody, shape: int, subtrees: int, *, dilating: bool = False) -> list[Layout]:
     """The layouts of a body in a block, the fastest first.
 
     A single world is fastest with the leaves of a subtree split between two threads. With more worlds than
@@ -123,7 +117,7 @@ def _layouts(body: SoftBody, shape: int, shared: bool, subtrees: int, *, dilatin
     capacity = -(-subtrees // WARP) * WARP
     uniform = body.discretization.is_uniform
     nodes = body.world_node_count
-    return [Layout(shape, shared, uniform, count, capacity, nodes, dilating=dilating) for count in parts]
+    return [Layout(shape, uniform, count, capacity, nodes, dilating=dilating) for count in parts]
 
 
 def _tasks(layout: Layout, slots: list[list[int]]) -> tuple[np.ndarray, np.ndarray]:

@@ -10,9 +10,9 @@ import numpy as np
 import warp as wp
 
 from warp_corot.body.trajectory import Trajectory
+from warp_corot.elasticity.corotated.general import CorotatedGeneralField
 from warp_corot.elasticity.corotated.subtrees import SubtreeField
 from warp_corot.elasticity.dilatation.field import law_of
-from warp_corot.elasticity.paths.general import CorotatedGeneralField
 from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.kernels.stepping.exchange import Exchange
 from warp_corot.kernels.stepping.patch_body import Layout, PatchBody

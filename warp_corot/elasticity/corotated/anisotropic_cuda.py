@@ -1,4 +1,4 @@
-"""The subtree kernels of anisotropic materials (CUDA)."""
+"""Anisotropic materials on CUDA: subtrees, clusters, and elements one by one."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import warp as wp
 
 from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.plan import Plan
-from warp_corot.elasticity.paths.clusters import others_in_clusters
+from warp_corot.elasticity.paths.clusters import divided
 from warp_corot.kernels.clusters.laws import ActiveMaterial, anisotropic_law
+from warp_corot.kernels.corotated.anisotropic import OrthotropicMaterial
 from warp_corot.kernels.corotated.definite import quaternions_of
 from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.kernels.subtrees.anisotropic import repair_leaves, scatter_anisotropic_subtrees, scatter_flat
@@ -18,17 +19,17 @@ from warp_corot.kernels.tables.cluster_layout import ANISOTROPIC
 from warp_corot.materials.anisotropic import TransverselyIsotropic
 
 from .anisotropic import AnisotropicField
-from .anisotropic_general import active_material
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
 
 
-class AnisotropicSubtreeField(AnisotropicField):
-    """Complete subtrees in batches; other leaves one by one or, if the mesh never changes, in clusters.
+class AnisotropicCudaField(AnisotropicField):
+    """Complete subtrees in batches; other elements one by one or, if the mesh never changes, in clusters. Forces may be
+    summed in any order.
 
     Args:
-        discretization: A forest with an ``Anisotropic`` material, on CUDA.
+        discretization: A mesh with an ``Anisotropic`` material, on CUDA.
     """
 
     def __init__(self, discretization: Discretization):
@@ -39,7 +40,7 @@ class AnisotropicSubtreeField(AnisotropicField):
         self.follow()
 
     def plan_of(self, discretization: Discretization) -> Plan:
-        return discretization.plan()
+        return discretization.plan(subtrees=discretization.prefers_subtrees)
 
     def load_kernels(self) -> None:
         for shape, grouped, _sharing in self.plan.kinds:
@@ -51,28 +52,37 @@ class AnisotropicSubtreeField(AnisotropicField):
         self.launch(quaternions_of, len(self._quaternions), [self.material.axes], [self._quaternions])
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        fibres, flat = self.fibres, self._flat
+        fibres, flat = self.fibres, self.plan.flat
+        active = active_material(self.material, self._quaternions, *self._activation)
         for batch, kernel, flags in zip(self._batches, self._kernels, self._flags, strict=True):
-            inputs = [batch.subtrees, self.material, self._quaternions, *self._activation, u]
-            outputs = [f, as_bytes(flags)]
+            inputs, outputs = [batch.subtrees, active, u], [f, as_bytes(flags)]
             wp.launch(kernel, batch.count, inputs=inputs, outputs=outputs, device=self.device, block_dim=BLOCK)
-            inputs = [flags, batch.subtrees.first, self.elements, fibres, u]
+            inputs = [8, flags, batch.subtrees.first, self.elements, fibres, u]
             self.launch(repair_leaves, 8 * len(flags), inputs, [f])
-        if flat is not None:
-            self.launch(scatter_flat, len(flat), [flat.elements, flat.leaves, fibres, u], [f])
         if self._clusters is not None:
-            self._clusters(active_material(self.material, self._quaternions, *self._activation), u, f)
+            self._clusters(active, u, f)
+        elif len(flat):
+            self.launch(scatter_flat, len(flat), [flat.elements, flat.leaves, fibres, u], [f])
 
     def follow(self) -> None:
-        self._batches, self._flat, self._clusters = others_in_clusters(
-            self.plan, anisotropic_law(self._transverse), ActiveMaterial, ANISOTROPIC
-        )
+        law = anisotropic_law(self._transverse)
+        self._batches, self._clusters = divided(self.discretization, self.plan, law, ActiveMaterial, ANISOTROPIC)
         self._kernels = [self._kernel(batch.shape, batch.grouped) for batch in self._batches]
         self._flags = [wp.zeros(-(-b.count // 8), dtype=wp.uint64, device=self.device) for b in self._batches]
 
     def _kernel(self, shape: int, grouped: bool) -> wp.Kernel:
         one_axes, one_stiffness = self.material.axes_stride == 0, self.material.stride == 0
         return scatter_anisotropic_subtrees(shape, grouped, self._transverse, one_axes, one_stiffness)
+
+
+def active_material(
+    passive: OrthotropicMaterial, axes: wp.array, is_active: int, activation: wp.array
+) -> ActiveMaterial:
+    """``kernels.clusters.laws.ActiveMaterial`` from its parts."""
+    material = ActiveMaterial()
+    material.passive, material.axes = passive, axes
+    material.is_active, material.activation = is_active, activation
+    return material
 
 
 def as_bytes(flags: wp.array) -> wp.array:
