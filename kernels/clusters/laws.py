@@ -12,7 +12,7 @@ from warp_corot.kernels.corotated.anisotropic import (
     turned_stress_of,
     vec9,
 )
-from warp_corot.kernels.corotated.definite import definite_law, definite_strain, is_definite, load_axes
+from warp_corot.kernels.corotated.well_conditioned import definite_law, definite_strain, is_definite, load_axes
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.fibres import ReinforcedMaterial, stress_in_axes
 from warp_corot.kernels.math.rotation import ITERATIONS, byers_xu, column, identity3, newton_rotation

@@ -12,7 +12,7 @@ iterations of a step in one launch.
 
 import warp as wp
 
-from warp_corot.kernels.elements.lanes import on_cpu
+from warp_corot.kernels.elements.simd8 import on_cpu
 from warp_corot.kernels.stepping.pace import DT, Pace
 from warp_corot.kernels.stepping.threads import spread_thread, synchronize_blocks, synchronize_grid
 

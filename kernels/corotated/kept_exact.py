@@ -1,4 +1,4 @@
-"""Products with the exact derivative of corotated forces on the CPU, rotations found once; see ``elements.lanes``.
+"""Products with the exact derivative of corotated forces on the CPU, rotations found once; see ``elements.simd8``.
 
 With gradients of hat functions turned by R and G' = dF R^T, the stress is [t]x sigma(e') + sigma(sym(G' - [t]x e')) of
 the turned strain e' = R e R^T, where t = R W R^T axial(G') and W is the matrix of ``tangent.rotation_differential``.
@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_corot.kernels.elements.constitutive import corotated_strain
 from warp_corot.kernels.elements.elements import GeneralElements, local_gradient
-from warp_corot.kernels.elements.lanes import headers, scatter_lanes
+from warp_corot.kernels.elements.simd8 import headers, scatter_simd8
 from warp_corot.kernels.math.matrices import identity3
 from warp_corot.kernels.modules import unique_kernel
 
@@ -69,4 +69,4 @@ def keep_elements(rotation: wp.Function) -> wp.Kernel:
 def add_exact_product() -> wp.Kernel:
     """y += K p; a thread is eight elements."""
     call = "corot::add_exact_product(units, block, count, material, u, f)"
-    return scatter_lanes(call, GeneralElements, KeptGradients, wp.int32, headers("tangents8"))
+    return scatter_simd8(call, GeneralElements, KeptGradients, wp.int32, headers("tangents8"))

@@ -1,4 +1,4 @@
-"""Products with the corotated R K R^T on the CPU, rotations found once; see ``elements.lanes``.
+"""Products with the corotated R K R^T on the CPU, rotations found once; see ``elements.simd8``.
 
 With rotations held fixed, K is the stiffness of linear elasticity with the gradients of hat functions turned by R.
 These gradients are kept, times the root of the volume, so that a product reads 36 bytes an element and does not
@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.elements import GeneralElements
-from warp_corot.kernels.elements.lanes import headers, scatter_lanes
+from warp_corot.kernels.elements.simd8 import headers, scatter_simd8
 
 wp.set_module_options({"enable_backward": False})
 
@@ -34,14 +34,14 @@ def turn_gradients() -> wp.Kernel:
     ``subtrees.repair.turn_listed`` writes these.
     """
     call = "corot::turn_gradients(units, block, count, u, f, missed)"
-    return scatter_lanes(call, GeneralElements, IsotropicMaterial, wp.int32, headers("tangents8"))
+    return scatter_simd8(call, GeneralElements, IsotropicMaterial, wp.int32, headers("tangents8"))
 
 
 @functools.cache
 def add_kept_product() -> wp.Kernel:
     """y += K p; a thread is eight elements."""
     call = "corot::add_kept_product(units, block, count, material, u, f)"
-    return scatter_lanes(call, GeneralElements, KeptGradients, wp.int32, headers("tangents8"))
+    return scatter_simd8(call, GeneralElements, KeptGradients, wp.int32, headers("tangents8"))
 
 
 @wp.func

@@ -13,7 +13,7 @@ theta_e is J - 1, W also has lambda_e V_e h(theta_e) for each element. h is zero
 h'' grows from 0 to 1 over ``RAMP``. Forces are exact derivatives: P_e = lambda_e (w'(theta) + h'(theta_e)) d theta_e /
 dF.
 
-Functions here take the displacement gradient A as ``constitutive`` has it. The kernels are in ``shared_dilatation``,
+Functions here take the displacement gradient A as ``constitutive`` has it. The kernels are in ``mean_dilatation``,
 those of subtrees' forces in ``subtrees.dilatation``.
 """
 

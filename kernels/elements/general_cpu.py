@@ -1,4 +1,4 @@
-"""Forces of tetrahedra one by one on the CPU, eight to the lanes of vector registers; see ``lanes``.
+"""Forces of tetrahedra one by one on the CPU, eight to the lanes of vector registers; see ``simd8``.
 
 For tetrahedra of a forest that are in no complete subtree, a rest matrix is worked out once. An element of which a law
 finds no rotation adds nothing and is put on a list, which ``forces.repair_forces`` goes through.
@@ -13,18 +13,18 @@ from warp_corot.kernels.modules import unique_kernel
 
 from .constitutive import IsotropicMaterial
 from .elements import ForestElements, GeneralElements, frame, gradient_of, rest_volume
-from .lanes import headers, on_cpu, scatter_lanes
-from .law_lanes import LawInLanes, NativeLaw, elastic
+from .native_laws import IsotropicLaw, NativeLaw, elastic
+from .simd8 import headers, on_cpu, scatter_simd8
 
 wp.set_module_options({"enable_backward": False})
 
 
 @functools.cache
-def scatter_law_elements(law: LawInLanes) -> wp.Kernel:
+def scatter_law_elements(law: IsotropicLaw) -> wp.Kernel:
     """Forces of general elements under an isotropic law; a thread is eight of them. Elements left out are listed."""
     of_law = elastic(law)
     call = f"corot::scatter_general({of_law.code}, units, block, count, u, f, missed)"
-    return scatter_lanes(call, GeneralElements, IsotropicMaterial, wp.int32, headers("elements8", of_law.header))
+    return scatter_simd8(call, GeneralElements, IsotropicMaterial, wp.int32, headers("elements8", of_law.header))
 
 
 @functools.cache

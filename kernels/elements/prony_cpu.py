@@ -1,4 +1,4 @@
-"""The relaxation of Maxwell elements on the CPU, in eight elements at a time; see ``lanes`` and ``prony``."""
+"""The relaxation of Maxwell elements on the CPU, in eight elements at a time; see ``simd8`` and ``prony``."""
 
 import functools
 
@@ -8,14 +8,14 @@ from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.stepping.pace import DT, Pace
 
 from .elements import ForestElements
-from .lanes import headers, on_cpu
 from .prony import PronyMaterial
+from .simd8 import headers, on_cpu
 
 wp.set_module_options({"enable_backward": False})
 
 
 @functools.cache
-def relax_eights(Elements: type) -> wp.Kernel:
+def relax_simd8(Elements: type) -> wp.Kernel:
     """Make the state at displacements u, after a step of the clock's length, the known one; a thread is eight
     elements."""
 
@@ -27,7 +27,7 @@ def relax_eights(Elements: type) -> wp.Kernel:
     ): ...
 
     @unique_kernel(native=headers("elements8", "added"))
-    def relax_eights(
+    def relax_simd8(
         # In
         elements: Elements,
         count: int,
@@ -41,4 +41,4 @@ def relax_eights(Elements: type) -> wp.Kernel:
         if block == 0:
             material.elapsed[0] = 0.0
 
-    return relax_eights
+    return relax_simd8

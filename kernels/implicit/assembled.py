@@ -6,7 +6,7 @@ are stored transposed, as in ``multigrid.values``. Nodes that obstacles hold mov
 
 import warp as wp
 
-from warp_corot.kernels.elements.lanes import constants, headers, native, on_cpu
+from warp_corot.kernels.elements.simd8 import constants, headers, native, on_cpu
 from warp_corot.kernels.modules import unique_kernel
 
 from .conjugate_gradients import BEGAN, BROKEN, CONVERGED, END, LIMIT, NEGATIVE, RR, RUNNING, WITHIN

@@ -53,12 +53,12 @@ template <class Material> struct Viscous {
         const auto& isotropic = material.isotropic;
         const lanes8 weight = material.seconds * at.weight();
         triple<lanes8> r[3], c[3];
-        const masks8 sound = rotation_of(d, r);
+        const masks8 valid = rotation_of(d, r);
         at.columns(velocities, c);
         viscous_stress(d.f, r, c, weight * at.value(isotropic.mu, isotropic.stride),
             weight * at.value(isotropic.lam, isotropic.stride), p);
-        for (int j = 0; j < 3; ++j) p[j] = chosen(sound, p[j], nothing<lanes8>());
-        return sound;
+        for (int j = 0; j < 3; ++j) p[j] = chosen(valid, p[j], nothing<lanes8>());
+        return valid;
     }
 };
 

@@ -144,12 +144,12 @@ constexpr float INDEFINITE = 1.0f;
 // What polynomials of the stretch S are made of. With t = tr S - 3, j = J - 1 and the invariants a, b, c of E, t is the
 // largest root of the quartic (Cayley-Hamilton for S; x = t + 3 is the largest eigenvalue of Horn's 4x4 matrix)
 //     t^4 + 12 t^3 + (48 - 2a) t^2 + (64 - 12a - 8j) t + a^2 - 20a - 24j - 4b = 0
-// whose slope is 4q, q = 2 (s1 + s2)(s1 + s3)(s2 + s3) of the principal stretches: no root is better defined. ``sound``
+// whose slope is 4q, q = 2 (s1 + s2)(s1 + s3)(s2 + s3) of the principal stretches: no root is better defined. ``valid``
 // where q and the root are good.
 template <class S> struct Stretch {
     Invariants<S> of;
     S t, q;
-    mask_of<S> sound;
+    mask_of<S> valid;
 };
 
 template <class S> COROT_INLINE Stretch<S> stretch_of(const S* e, const S& det) {
@@ -175,7 +175,7 @@ template <class S> COROT_INLINE Stretch<S> stretch_of(const S* e, const S& det) 
     }
     s.t = t;
     s.q = 16.0f + t * (24.0f + t * (9.0f + t)) - a * (3.0f + t) - 2.0f * j;
-    s.sound = inverted(open) & (s.q > INDEFINITE) & (a < 1000.0f);
+    s.valid = inverted(open) & (s.q > INDEFINITE) & (a < 1000.0f);
     return s;
 }
 
@@ -195,7 +195,7 @@ template <class D, class S> COROT_INLINE mask_of<S> rotation_of(const D& d, trip
     r[0] = added(r[0], v, cross(f[1], f[2]));
     r[1] = added(r[1], v, cross(f[2], f[0]));
     r[2] = added(r[2], v, last);
-    return s.sound;
+    return s.valid;
 }
 
 }  // namespace corot

@@ -129,9 +129,9 @@ template <class Of, class Law, class Values> struct Dilating {
     }
     template <class D, class At>
     COROT_INLINE masks8 stress(const D& d, const At& at, triple<lanes8>* p) const {
-        const masks8 sound = law.stress(d, at, p);
+        const masks8 valid = law.stress(d, at, p);
         add_pressure<Of>(d, Of::theta(d.a, d.frame), pressure, at.weight() * at.value(lam, stride), p);
-        return sound;
+        return valid;
     }
 };
 

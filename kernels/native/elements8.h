@@ -87,11 +87,11 @@ template <class Units_, bool LISTABLE> struct Eight {
             for (int n = 0; n < 4; ++n) add4(&f.data[to[n]][0], parts[lane][n]);
         }
     }
-    // Puts elements that are not ``sound`` on a list: how many, then which.
-    template <class List> COROT_INLINE void list_others(const masks8& sound, const List& list) const {
-        if (!any(inverted(sound))) return;
+    // Puts elements that are not ``valid`` on a list: how many, then which.
+    template <class List> COROT_INLINE void list_invalid(const masks8& valid, const List& list) const {
+        if (!any(inverted(valid))) return;
         for (int lane = 0; lane < end; ++lane)
-            if (!sound[lane]) list.data[++list.data[0]] = element(lane);
+            if (!valid[lane]) list.data[++list.data[0]] = element(lane);
     }
 };
 
@@ -164,10 +164,10 @@ COROT_INLINE void scatter_eight(const At& at, Law law, const Vectors& u, const V
     triple<lanes8> a[3], p[3], force[4];
     law.begin(at);
     gradient_of(at, u, a);
-    const masks8 sound = law.stress(deformation_of(a, at.frame), at, p);
+    const masks8 valid = law.stress(deformation_of(a, at.frame), at, p);
     at.forces_of(p, force);
     at.add_forces(force, f);
-    at.list_others(sound, missed);
+    at.list_invalid(valid, missed);
 }
 
 template <class Units, class Law, class Vectors, class List>
@@ -192,10 +192,10 @@ COROT_INLINE void scatter_posed(const Law& law, const Units& units, int block, i
     triple<lanes8> a[3], p[3], force[4];
     gradient_of(at, x, a);
     a[0].x -= 1.0f; a[1].y -= 1.0f; a[2].z -= 1.0f;
-    const masks8 sound = law.stress(deformation_of(a, at.frame), at, p);
+    const masks8 valid = law.stress(deformation_of(a, at.frame), at, p);
     at.forces_of(p, force);
     at.add_forces(force, f);
-    at.list_others(sound, missed);
+    at.list_invalid(valid, missed);
 }
 
 }  // namespace corot

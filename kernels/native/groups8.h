@@ -37,12 +37,12 @@ COROT_INLINE void scatter_groups(Law law, const Units& units, int block, int cou
         const auto d = deformation_of(gradients[eight], at.frame);
         triple<lanes8> p[3], force[4];
         law.begin(at);
-        const masks8 sound = law.stress(d, at, p);
+        const masks8 valid = law.stress(d, at, p);
         const lanes8 weight = at.weight() * at.value(material.lam, material.isotropic.stride);
         add_pressure<Of>(d, load8(thetas + 8 * eight), load8(pressures + 8 * eight), weight, p);
         at.forces_of(p, force);
         at.add_forces(force, f);
-        at.list_others(sound, missed);
+        at.list_invalid(valid, missed);
     }
 }
 

@@ -26,7 +26,7 @@ template <class Material> struct Fibres {
 
     template <class D, class At> COROT_INLINE masks8 stress(const D& d, const At& at, triple<lanes8>* p) const {
         const auto& fibres = material.fibres;
-        const masks8 sound = elastic(NeoHookean{}, material.matrix).stress(d, at, p);
+        const masks8 valid = elastic(NeoHookean{}, material.matrix).stress(d, at, p);
         lanes8 turn[9], numbers[4], c, s;
         gather_numbers<9>(at, [&](int t) { return fibres.axes.data[t].data[0]; }, fibres.axes_stride, turn);
         gather_numbers<4>(at, [&](int t) { return &fibres.stiffness.data[t][0]; }, fibres.stride, numbers);
@@ -38,7 +38,7 @@ template <class Material> struct Fibres {
         const masks8 have_two = angle > 0.0f;
         if (any(have_two)) add_family(d, numbers, along * c - beside * s, have_two ? held : spread<lanes8>(0.0f), p);
         if (material.is_active) pull(d, along, held * at.values_of(material.activation.data), p);
-        return sound;
+        return valid;
     }
 
     // phi' of a fibre strain.

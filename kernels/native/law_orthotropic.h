@@ -40,7 +40,7 @@ COROT_INLINE void scatter_orthotropic(const Units& units, int block, int count, 
     }
     for (int i = 0; i < 3; ++i) { sigma[i] += 1.0f - n0; strain[i] += n1 * ib - n2 * ic - n0; }
     times(c, sigma, r);
-    const masks8 sound = s.sound & (s.q * s.q > NEARLY_INDEFINITE * (3.0f + ia) * (3.0f + ia) * (3.0f + ia));
+    const masks8 valid = s.valid & (s.q * s.q > NEARLY_INDEFINITE * (3.0f + ia) * (3.0f + ia) * (3.0f + ia));
     if (any(~small)) {
         triple<lanes8> other[3];
         rotation_of(d, other);
@@ -75,10 +75,10 @@ COROT_INLINE void scatter_orthotropic(const Units& units, int block, int count, 
     p[1] = r[0] * (s01 - t2) + (r[1] * s1 + r[2] * (s12 + t0));
     p[2] = r[0] * (s02 + t1) + (r[1] * (s12 - t0) + r[2] * s2);
     p[0] = p[0] + c[0] * active;
-    for (int j = 0; j < 3; ++j) p[j] = chosen(sound, p[j] * at.weight(), nothing<lanes8>());
+    for (int j = 0; j < 3; ++j) p[j] = chosen(valid, p[j] * at.weight(), nothing<lanes8>());
     at.forces_of(p, force);
     at.add_forces(force, f);
-    at.list_others(sound, missed);
+    at.list_invalid(valid, missed);
 }
 
 }  // namespace corot

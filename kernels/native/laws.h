@@ -65,9 +65,9 @@ struct Corotated {
             p[0] = added(p[0], v, cross(f[1], f[2]));
             p[1] = added(p[1], v, cross(f[2], f[0]));
             p[2] = added(p[2], v, last);
-            for (int i = 0; i < 3; ++i) p[i] = chosen(s.sound, p[i], nothing<S>());
+            for (int i = 0; i < 3; ++i) p[i] = chosen(s.valid, p[i], nothing<S>());
         }
-        return s.sound;
+        return s.valid;
     }
 };
 
@@ -123,10 +123,10 @@ template <class Law, class Material> struct Elastic {
     template <class D, class At, class S = typename D::S>
     COROT_INLINE mask_of<S> stress(const D& d, const At& at, triple<S>* p) const {
         const S weight = at.weight();
-        const mask_of<S> sound = law.stress(d, weight * at.value(material.mu, material.stride),
+        const mask_of<S> valid = law.stress(d, weight * at.value(material.mu, material.stride),
             weight * at.value(material.lam, material.stride), p);
         for (int j = 0; j < 3; ++j) p[j] = chosen(at.done(), nothing<S>(), p[j]);
-        return sound;
+        return valid;
     }
 };
 
@@ -155,10 +155,10 @@ template <class First, class Second> struct Sum {
     template <class D, class At, class S = typename D::S>
     COROT_INLINE mask_of<S> stress(const D& d, const At& at, triple<S>* p) const {
         triple<S> more[3];
-        mask_of<S> sound = first.stress(d, at, p);
-        sound &= second.stress(d, at, more);
+        mask_of<S> valid = first.stress(d, at, p);
+        valid &= second.stress(d, at, more);
         for (int j = 0; j < 3; ++j) p[j] = p[j] + more[j];
-        return sound;
+        return valid;
     }
 };
 

@@ -1,5 +1,5 @@
 // Eight complete subtrees of a type, in the lanes of vector registers: ten displacements in, ten forces out. ``Type`` has the
-// tables of the type (subtrees/lanes.py): its SHAPE; NODES of each leaf; in the subtree's Maubach frame, rest positions AT of
+// tables of the type (subtrees/simd8_tables.py): its SHAPE; NODES of each leaf; in the subtree's Maubach frame, rest positions AT of
 // the nodes over a leaf's edge, and FRAME and HAND of each leaf; the different columns AXES of these frames, and which three
 // make the frame of a leaf (AXES_OF).
 #pragma once
@@ -84,22 +84,22 @@ template <class Type, class Units_> struct EightSubtrees {
         }
     }
     // Puts leaves that were left out on a list: how many, then which.
-    template <class List> COROT_INLINE void list_others(const masks8& left_out, const List& list) const {
-        if (!any(left_out)) return;
+    template <class List> COROT_INLINE void list_invalid(const masks8& degenerate, const List& list) const {
+        if (!any(degenerate)) return;
         for (int lane = 0; lane < end; ++lane)
             for (int number = 0; number < 8; ++number)
-                if (left_out[lane] >> number & 1) list.data[++list.data[0]] = starts[lane] + number;
+                if (degenerate[lane] >> number & 1) list.data[++list.data[0]] = starts[lane] + number;
     }
     // Says which leaves were left out, a byte a subtree.
-    template <class Bytes> COROT_INLINE void flag(const masks8& left_out, const Bytes& flags) const {
-        for (int lane = 0; lane < end; ++lane) flags.data[first + lane] = static_cast<unsigned char>(left_out[lane]);
+    template <class Bytes> COROT_INLINE void flag(const masks8& degenerate, const Bytes& flags) const {
+        for (int lane = 0; lane < end; ++lane) flags.data[first + lane] = static_cast<unsigned char>(degenerate[lane]);
     }
 };
 
 // Adds the forces of all leaves to those of the nodes, each under a law by itself, and a bit for each leaf that is left out;
 // the law does nothing in lanes that are ``done``.
 template <class Subtrees, class Law>
-COROT_INLINE void add_leaves(const Subtrees& subtrees, const Law& law, const masks8& done, triple<lanes8>* g, masks8& left_out) {
+COROT_INLINE void add_leaves(const Subtrees& subtrees, const Law& law, const masks8& done, triple<lanes8>* g, masks8& degenerate) {
 #if defined(__clang__)
 #pragma clang loop unroll(disable)
 #endif
@@ -107,8 +107,8 @@ COROT_INLINE void add_leaves(const Subtrees& subtrees, const Law& law, const mas
         const auto leaf = subtrees.leaf(number, done);
         triple<lanes8> a[3], p[3];
         leaf.columns(subtrees.x, a);
-        const masks8 sound = law.stress(deformation_of(a, leaf.frame), leaf, p);
-        left_out |= ~sound & ~done & (1 << number);
+        const masks8 valid = law.stress(deformation_of(a, leaf.frame), leaf, p);
+        degenerate |= ~valid & ~done & (1 << number);
         leaf.add_forces(p, g);
     }
 }
@@ -120,12 +120,12 @@ COROT_INLINE void scatter_subtrees(Law law, const Units& units, int block, int c
     const EightSubtrees<Type, Units> subtrees(units, block, count, u);
     triple<lanes8> g[10];
     for (int k = 0; k < 10; ++k) g[k] = nothing<lanes8>();
-    masks8 left_out = {};
+    masks8 degenerate = {};
     law.begin(subtrees);
-    add_leaves(subtrees, law, masks8{}, g, left_out);
+    add_leaves(subtrees, law, masks8{}, g, degenerate);
     subtrees.add_forces(g, f);
-    if constexpr (SOME && LISTED) subtrees.list_others(left_out, missed);
-    if constexpr (SOME && !LISTED) subtrees.flag(left_out, missed);
+    if constexpr (SOME && LISTED) subtrees.list_invalid(degenerate, missed);
+    if constexpr (SOME && !LISTED) subtrees.flag(degenerate, missed);
 }
 
 // --- corotated forces of all leaves with one rotation -----------------------------------------------------------------
@@ -267,12 +267,12 @@ template <class Type> COROT_INLINE masks8 are_near(const triple<lanes8>* y, floa
 // Corotated forces of eight subtrees with the root's rotation where it is near that of every leaf; elsewhere under
 // ``law``. ``rest`` is what the law adds to the corotated one, for all lanes; ``ADDS``: it adds something.
 template <class Type, bool ADDS, class Law, class Rest, class Units, class Material, class Vectors, class Bytes>
-COROT_INLINE void scatter_subtrees_near(Law law, Rest rest, const Units& units, int block, int count, const Material& isotropic,
+COROT_INLINE void scatter_subtrees_tolerance(Law law, Rest rest, const Units& units, int block, int count, const Material& isotropic,
         float tolerance, const Vectors& u, const Vectors& f, const Bytes& flags) {
     const EightSubtrees<Type, Units> subtrees(units, block, count, u);
     triple<lanes8> g[10];
     for (int k = 0; k < 10; ++k) g[k] = nothing<lanes8>();
-    masks8 left_out = {};
+    masks8 degenerate = {};
     const auto root = root_of(subtrees);
     const lanes8* e = root.e;
     // |U - I| <= 1/2 implies |U^2 - I| <= 5/4: beyond, nothing is near, and the rotation need not be found.
@@ -289,14 +289,14 @@ COROT_INLINE void scatter_subtrees_near(Law law, Rest rest, const Units& units, 
     }
     if (any(~done)) {
         law.begin(subtrees);
-        add_leaves(subtrees, law, done, g, left_out);
+        add_leaves(subtrees, law, done, g, degenerate);
     } else if (ADDS) {
         masks8 none = {};
         rest.begin(subtrees);
         add_leaves(subtrees, rest, masks8{}, g, none);
     }
     subtrees.add_forces(g, f);
-    subtrees.flag(left_out, flags);
+    subtrees.flag(degenerate, flags);
 }
 
 }  // namespace corot

@@ -13,7 +13,7 @@ COROT_INLINE void turn_gradients(const Units& units, int block, int count, const
     const GeneralEight<Units> at(units, 8 * block, count);
     triple<lanes8> a[3], turn[3];
     gradient_of(at, u, a);
-    const masks8 sound = rotation_of(deformation_of(a, at.frame), turn);
+    const masks8 valid = rotation_of(deformation_of(a, at.frame), turn);
     const lanes8 size = root(at.volume), *b = at.b;
     float* place = &to.data[18 * block][0];
     for (int n = 0; n < 3; ++n) {
@@ -22,7 +22,7 @@ COROT_INLINE void turn_gradients(const Units& units, int block, int count, const
         store8(place + 24 * n + 8, h.y);
         store8(place + 24 * n + 16, h.z);
     }
-    at.list_others(sound, missed);
+    at.list_invalid(valid, missed);
 }
 
 // Elements whose turned gradients are kept; forces are minus the product.

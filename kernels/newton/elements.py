@@ -18,8 +18,8 @@ from warp_corot.kernels.elements.general_cuda import (
     load_four,
     rest_inverse_of,
 )
-from warp_corot.kernels.elements.lanes import headers, scatter_lanes
-from warp_corot.kernels.elements.law_lanes import elastic
+from warp_corot.kernels.elements.native_laws import elastic
+from warp_corot.kernels.elements.simd8 import headers, scatter_simd8
 from warp_corot.kernels.math.rotation import byers_xu, cofactor, identity3
 from warp_corot.kernels.modules import unique_kernel
 
@@ -123,10 +123,10 @@ def scatter_posed(rotation: wp.Function, damped: bool, rounds: int = 1) -> wp.Ke
     return scatter_posed
 
 
-# --- the same on the CPU, eight elements in the lanes of vector registers; see ``elements.lanes`` ---------------------
+# --- the same on the CPU, eight elements in the lanes of vector registers; see ``elements.simd8`` ---------------------
 
 #: Corotated forces, each element with its own rotation.
-scatter_posed_lanes = scatter_lanes(
+scatter_posed_lanes = scatter_simd8(
     f"corot::scatter_posed({elastic('corotated').code}, units, block, count, u, f, missed)",
     GeneralElements,
     IsotropicMaterial,

@@ -137,13 +137,13 @@ def _left_out_of(layout: Layout, displacement: wp.Function, slot: wp.Function) -
     waiting, force = shared_list(room), shared_vectors(4 * room, "forces of single leaves")
 
     @wp.func
-    def enlist(thread: int, left_out: int):
+    def enlist(thread: int, degenerate: int):
         """List a thread's left-out leaves as far as there is room, and return the place of the first."""
         first = int(0)
-        if left_out != 0:
-            first = waiting(wp.static(RESERVE), 0, bit_count(left_out))
+        if degenerate != 0:
+            first = waiting(wp.static(RESERVE), 0, bit_count(degenerate))
             i = int(first)
-            left = int(left_out)
+            left = int(degenerate)
             while left != 0 and i < wp.static(room):
                 waiting(wp.static(WRITE), i, thread | (lowest_bit(left) << wp.static(LEAF_SHIFT)))
                 left = left & (left - 1)
@@ -191,10 +191,10 @@ def _left_out_of(layout: Layout, displacement: wp.Function, slot: wp.Function) -
         force(wp.static(STORE), 4 * i + 3, f3)
 
     @wp.func
-    def collect(s: int, part: int, first: int, left_out: int):
+    def collect(s: int, part: int, first: int, degenerate: int):
         """Add the forces of a thread's listed leaves to its slots, and return the leaves for which there was no
         room."""
-        left = int(left_out)
+        left = int(degenerate)
         i = int(first)
         while left != 0 and i < wp.static(room):
             leaf = lowest_bit(left)
@@ -289,7 +289,7 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
         numbers1 = body.slots[1, task]
         step = int(0)
         while step < steps:
-            left_out = int(0)
+            degenerate = int(0)
             if wp.static(dilating and parts > 1):
                 if s < body.subtree_count:
                     for p in range(wp.static(parts)):
@@ -318,23 +318,23 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
                                     sum += sums(wp.static(LOAD), wp.static(2 * other * capacity) + s, sum)
                                     weight += sums(wp.static(LOAD), wp.static((2 * other + 1) * capacity) + s, weight)
                             pressure = slope_of(mean_of(sum, weight))
-                            g, left_out = wp.static(dilate[p])(y, h, material, pressure, first)
+                            g, degenerate = wp.static(dilate[p])(y, h, material, pressure, first)
                             g = turn_out(g, q0, q1, q2)
                         else:
-                            g, left_out = wp.static(own[p])(x, q, h, mirror, material, first)
+                            g, degenerate = wp.static(own[p])(x, q, h, mirror, material, first)
                         for k in range(10):
                             if wp.static(places[p][k] >= 0):
                                 slot(wp.static(STORE), s + wp.static(places[p][k] * capacity), g[k])
-            listed = enlist(thread, left_out)
-            while synchronize_any(left_out) != 0:
+            listed = enlist(thread, degenerate)
+            while synchronize_any(degenerate) != 0:
                 if thread < waiting(wp.static(COUNT), 0, 0):
                     do_one(body, thread, material, first_of_world)
                 synchronize_block()
-                left_out = collect(s, part, listed, left_out)
+                degenerate = collect(s, part, listed, degenerate)
                 if thread == 0:
                     waiting(wp.static(CLEAR), 0, 0)
                 synchronize_block()
-                listed = enlist(thread, left_out)
+                listed = enlist(thread, degenerate)
             task = thread
             while task < wp.static(layout.tasks):
                 if wp.static(layout.tasks > threads):

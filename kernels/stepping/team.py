@@ -6,7 +6,7 @@ with others, which wait in ``serve``.
 
 import warp as wp
 
-from warp_corot.kernels.elements.lanes import headers, on_cpu
+from warp_corot.kernels.elements.simd8 import headers, on_cpu
 
 wp.set_module_options({"enable_backward": False, "extra_build_options": headers("team")})
 

@@ -3,7 +3,7 @@
 The law is that of ``corotated.anisotropic``. Each leaf is computed in its own frame, in which the columns of F - I are
 differences of displacements, and four unscaled iterations find its rotation. A leaf for which these find no rotation
 adds nothing; a bit flags it, and ``repair_leaves`` computes it. Leaves whose rotation is nearly indefinite are flagged,
-too: see ``corotated.anisotropic_cpu``.
+too: see ``corotated.anisotropic_simd8``.
 """
 
 import functools
@@ -12,7 +12,7 @@ import warp as wp
 
 from warp_corot.kernels.clusters.laws import ActiveMaterial
 from warp_corot.kernels.corotated.anisotropic import FibreMaterial, fibre_stress, filled, listed_stress
-from warp_corot.kernels.corotated.definite import definite_law, definite_strain, is_definite, load_axes
+from warp_corot.kernels.corotated.well_conditioned import definite_law, definite_strain, is_definite, load_axes
 from warp_corot.kernels.elements.elements import ForestElements, Subtrees, root_of, scatter_stress
 from warp_corot.kernels.math.rotation import ITERATIONS, byers_xu, column, identity3, newton_rotation, quick_rotation
 from warp_corot.kernels.modules import unique_kernel
@@ -85,8 +85,8 @@ def scatter_anisotropic_subtrees(
         shared = wp.matrix_from_cols(q0, q1, q2)
         if wp.static(one_axes):
             shared = wp.transpose(shared) * wp.quat_to_matrix(load_axes(material.axes, 0))
-        g, left_out = forces(y, h, material, shared, subtrees.first[s])
-        flagged[s] = wp.uint8(left_out)
+        g, degenerate = forces(y, h, material, shared, subtrees.first[s])
+        flagged[s] = wp.uint8(degenerate)
         add(subtrees, s, turn_out(g, q0, q1, q2), f)
 
     return scatter_anisotropic_subtrees

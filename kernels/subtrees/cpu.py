@@ -2,7 +2,7 @@
 
 A CPU core is fast only with vector instructions. So the ten nodes of eight subtrees of one type are gathered into
 arrays of lanes, a loop computes the eight leaves, and forces are scattered once at the end (``native/subtrees8.h``).
-The laws are those of ``elements.law_lanes``. A bit flags each leaf or subtree that the corotated law leaves out.
+The laws are those of ``elements.native_laws``. A bit flags each leaf or subtree that the corotated law leaves out.
 """
 
 import functools
@@ -13,16 +13,16 @@ from warp_corot.kernels.corotated.tangent import RotatedMaterial
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.kernels.elements.elements import Subtrees
-from warp_corot.kernels.elements.lanes import headers, scatter_lanes
-from warp_corot.kernels.elements.law_lanes import STRESSLESS, LawInLanes, NativeLaw, elastic
+from warp_corot.kernels.elements.native_laws import STRESSLESS, IsotropicLaw, NativeLaw, elastic
+from warp_corot.kernels.elements.simd8 import headers, scatter_simd8
 
-from .lanes import subtree_type
+from .simd8_tables import subtree_type
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.struct
-class NearMaterial:
+class ToleranceMaterial:
     """Lamé's parameters [Pa], and the tolerance within which leaves use the root's rotation [rad]."""
 
     isotropic: IsotropicMaterial
@@ -31,7 +31,7 @@ class NearMaterial:
 
 @wp.struct
 class DilatingMaterial:
-    """A material whose leaves share their dilatation; the tolerance is as in ``NearMaterial``.
+    """A material whose leaves share their dilatation; the tolerance is as in ``ToleranceMaterial``.
 
     ``lam`` [Pa] belongs to the shared dilatation; lambda is zero in ``isotropic``.
     """
@@ -54,10 +54,10 @@ def scatter_subtrees(shape: int, Material: type, law: NativeLaw, missed_type: ty
     kind = f"corot::Type, {int(law.leaves_out)}, {int(listed)}"
     call = f"corot::scatter_subtrees<{kind}>({law.code}, {_UNITS}, u, f, missed)"
     native = headers("subtrees8", law.header, types=subtree_type(shape))
-    return scatter_lanes(call, Subtrees, Material, missed_type, native)
+    return scatter_simd8(call, Subtrees, Material, missed_type, native)
 
 
-def scatter_law_subtrees(shape: int, law: LawInLanes = "corotated", shared: Dilatation | None = None) -> wp.Kernel:
+def scatter_law_subtrees(shape: int, law: IsotropicLaw = "corotated", shared: Dilatation | None = None) -> wp.Kernel:
     """The same under an isotropic law; with a shared dilatation the material is a ``DilatingMaterial``."""
     if shared is None:
         return scatter_subtrees(shape, IsotropicMaterial, elastic(law))
@@ -70,11 +70,11 @@ def scatter_subtrees_shared(shape: int, given: bool) -> wp.Kernel:
     """Corotated forces of subtrees with their root's rotation or a given one; a thread is eight subtrees."""
     kind = f"corot::Type, {int(given)}"
     call = f"corot::scatter_subtrees_shared<{kind}>({_UNITS}, material, u, f, missed)"
-    return scatter_lanes(call, Subtrees, RotatedMaterial, wp.uint8, headers("subtrees8", types=subtree_type(shape)))
+    return scatter_simd8(call, Subtrees, RotatedMaterial, wp.uint8, headers("subtrees8", types=subtree_type(shape)))
 
 
 @functools.cache
-def scatter_subtrees_near(shape: int, shared: Dilatation | None = None) -> wp.Kernel:
+def scatter_subtrees_tolerance(shape: int, shared: Dilatation | None = None) -> wp.Kernel:
     """Corotated forces of subtrees, with the root's rotation where it is near those of the leaves; a thread is eight
     subtrees.
 
@@ -89,9 +89,9 @@ def scatter_subtrees_near(shape: int, shared: Dilatation | None = None) -> wp.Ke
         law, rest = (_DILATING.format(shared.lanes, code) for code in (law, rest))
     kind = f"corot::Type, {int(shared is not None)}"
     material = "material.isotropic, material.tolerance"
-    call = f"corot::scatter_subtrees_near<{kind}>({law}, {rest}, {_UNITS}, {material}, u, f, missed)"
+    call = f"corot::scatter_subtrees_tolerance<{kind}>({law}, {rest}, {_UNITS}, {material}, u, f, missed)"
     Material, native = (
-        NearMaterial if shared is None else DilatingMaterial,
+        ToleranceMaterial if shared is None else DilatingMaterial,
         headers("subtrees8", types=subtree_type(shape)),
     )
-    return scatter_lanes(call, Subtrees, Material, wp.uint8, native)
+    return scatter_simd8(call, Subtrees, Material, wp.uint8, native)

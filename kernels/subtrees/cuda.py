@@ -27,20 +27,20 @@ from warp_corot.kernels.elements.elements import (
 from warp_corot.kernels.elements.merging import add_four_forces
 from warp_corot.kernels.modules import unique_kernel
 
+from .degenerate import DegenerateList, append, list_of, reserve
 from .forces import leaf_stress, mat10, own_forces, shared_forces
-from .left_out import LeftOut, append, list_of, reserve
 from .memory import BLOCK, add_single, group_memory, load_single, memory_of
 
 wp.set_module_options({"enable_backward": False})
 
 #: The number of blocks for which a multiprocessor's registers must have room, by type.
 RESIDENT = (5, 5, 5)
-#: ``Stretch.shape`` of leaves in no subtree.
+#: ``WorkRange.shape`` of leaves in no subtree.
 FLAT = 3
 
 
 @wp.struct
-class Stretch:
+class WorkRange:
     """Subtrees of one type, or leaves in none, that neighbouring thread blocks compute."""
 
     begin: int  # the first of these blocks
@@ -70,7 +70,7 @@ def scatter_subtrees_own(shape: int, grouped: bool, uniform: bool, listed: bool)
         # Out
         f: wp.array[wp.vec4],
         flagged: wp.array[wp.uint8],
-        left_out: LeftOut,
+        degenerate: DegenerateList,
     ):
         s = wp.tid()
         h, q, mirror = root_of(subtrees, s)
@@ -80,10 +80,10 @@ def scatter_subtrees_own(shape: int, grouped: bool, uniform: bool, listed: bool)
         flagged[s] = wp.uint8(mask)
         reserved = int(0)
         if wp.static(listed):
-            reserved = reserve(left_out, list_of(s // BLOCK), mask != 0, subtrees.code.shape[0] - s)
+            reserved = reserve(degenerate, list_of(s // BLOCK), mask != 0, subtrees.code.shape[0] - s)
         add(subtrees, s, g, f)
         if wp.static(listed):
-            append(left_out, list_of(s // BLOCK), reserved, subtrees.first[s], mask, subtrees.code.shape[0] - s)
+            append(degenerate, list_of(s // BLOCK), reserved, subtrees.first[s], mask, subtrees.code.shape[0] - s)
 
     return scatter_subtrees_own
 
@@ -108,7 +108,7 @@ def scatter_subtrees_shared(shape: int, grouped: bool, uniform: bool, given: boo
         # Out
         f: wp.array[wp.vec4],
         flagged: wp.array[wp.uint8],
-        left_out: LeftOut,
+        degenerate: DegenerateList,
     ):
         s = wp.tid()
         h, q, mirror = root_of(subtrees, s)
@@ -121,10 +121,10 @@ def scatter_subtrees_shared(shape: int, grouped: bool, uniform: bool, given: boo
             flagged[s] = wp.uint8(mask)
         reserved = int(0)
         if wp.static(listed and not given):
-            reserved = reserve(left_out, list_of(s // BLOCK), mask != 0, subtrees.code.shape[0] - s)
+            reserved = reserve(degenerate, list_of(s // BLOCK), mask != 0, subtrees.code.shape[0] - s)
         add(subtrees, s, g, f)
         if wp.static(listed and not given):
-            append(left_out, list_of(s // BLOCK), reserved, s, mask, subtrees.code.shape[0] - s)
+            append(degenerate, list_of(s // BLOCK), reserved, s, mask, subtrees.code.shape[0] - s)
 
     return scatter_subtrees_shared
 
@@ -134,7 +134,7 @@ def scatter_subtrees_shared(shape: int, grouped: bool, uniform: bool, given: boo
 
 @functools.cache
 def _scatter_subtree(shape: int, uniform: bool) -> wp.Function:
-    """One subtree of a stretch; all shapes use the same shared memory for groups."""
+    """One subtree of a one; all shapes use the same shared memory for groups."""
     load_group, merge_group = group_memory((0, 1, 2))
     forces = own_forces(shape, uniform)
 
@@ -165,7 +165,7 @@ def _scatter_subtree(shape: int, uniform: bool) -> wp.Function:
 
 
 @functools.cache
-def scatter_stretches(uniform: bool) -> wp.Kernel:
+def scatter_body(uniform: bool) -> wp.Kernel:
     """Corotated forces of all subtrees and other leaves of a body, every leaf with its own rotation.
 
     Launch with block_dim BLOCK and whole blocks.
@@ -174,25 +174,25 @@ def scatter_stretches(uniform: bool) -> wp.Kernel:
     add_neighbours = add_four_forces(2)
 
     @unique_kernel(grid_stride=False, launch_bounds=(BLOCK, min(RESIDENT)))
-    def scatter_stretches(
+    def scatter_body(
         # In
-        stretches: wp.array[Stretch],
+        ranges: wp.array[WorkRange],
         flat: ForestElements,
         flat_leaves: wp.array[wp.int32],
         material: IsotropicMaterial,
         u: wp.array[wp.vec4],
         # Out
         f: wp.array[wp.vec4],
-        left_out: LeftOut,
+        degenerate: DegenerateList,
     ):
         block = wp.tid() // BLOCK
-        k = int(stretches.shape[0] - 1)
-        while stretches[k].begin > block:
+        k = int(ranges.shape[0] - 1)
+        while ranges[k].begin > block:
             k -= 1
-        s = wp.tid() - stretches[k].begin * BLOCK
-        if s >= stretches[k].count:
+        s = wp.tid() - ranges[k].begin * BLOCK
+        if s >= ranges[k].count:
             return
-        shape = stretches[k].shape
+        shape = ranges[k].shape
         if shape == FLAT:
             m = int(0)
             if wp.static(not uniform):
@@ -203,13 +203,13 @@ def scatter_stretches(uniform: bool) -> wp.Kernel:
             )
             if not trusted:
                 p = wp.mat33()
-            reserved = reserve(left_out, list_of(block), not trusted, stretches[k].count - s)
+            reserved = reserve(degenerate, list_of(block), not trusted, ranges[k].count - s)
             f0, f1, f2, f3 = nodal_forces(flat, s, p)
             add_neighbours(f, flat.targets[s], f0, f1, f2, f3)
-            append(left_out, list_of(block), reserved, flat_leaves[s], wp.where(trusted, 0, 1), stretches[k].count - s)
+            append(degenerate, list_of(block), reserved, flat_leaves[s], wp.where(trusted, 0, 1), ranges[k].count - s)
             return
-        subtrees = stretches[k].subtrees
-        grouped = stretches[k].grouped != 0
+        subtrees = ranges[k].subtrees
+        grouped = ranges[k].grouped != 0
         mask = int(0)
         if shape == 0:
             mask = subtree0(subtrees, s, grouped, material, u, f)
@@ -217,9 +217,9 @@ def scatter_stretches(uniform: bool) -> wp.Kernel:
             mask = subtree1(subtrees, s, grouped, material, u, f)
         else:
             mask = subtree2(subtrees, s, grouped, material, u, f)
-        stretches[k].flagged[s] = wp.uint8(mask)
-        to_come = stretches[k].count - s
-        reserved = reserve(left_out, list_of(block), mask != 0, to_come)
-        append(left_out, list_of(block), reserved, subtrees.first[s], mask, to_come)
+        ranges[k].flagged[s] = wp.uint8(mask)
+        to_come = ranges[k].count - s
+        reserved = reserve(degenerate, list_of(block), mask != 0, to_come)
+        append(degenerate, list_of(block), reserved, subtrees.first[s], mask, to_come)
 
-    return scatter_stretches
+    return scatter_body

@@ -1,7 +1,7 @@
 """The dilatation that the eight leaves of a complete subtree share; see ``elements.dilatation``.
 
 This is the fast kernel for its forces on CUDA, where a thread takes a subtree, with ten displacements in and ten
-forces out; ``cpu`` has that for the CPU. ``elements.shared_dilatation`` computes everything else leaf by leaf.
+forces out; ``cpu`` has that for the CPU. ``elements.mean_dilatation`` computes everything else leaf by leaf.
 """
 
 import functools
@@ -109,7 +109,7 @@ def scatter_dilatation(shape: int, grouped: bool, uniform: bool, of: Dilatation)
         y = turn_in(load(subtrees, s, u), q0, q1, q2, 1.0 / h)
         first = wp.where(wp.static(uniform), 0, subtrees.first[s])
         sum, weight = sums(y, material.lam, first)
-        g, _left_out = forces(y, h, material, slope_of(mean_of(sum, weight)), first)
+        g, _degenerate = forces(y, h, material, slope_of(mean_of(sum, weight)), first)
         add(subtrees, s, turn_out(g, q0, q1, q2), f)
 
     return scatter_dilatation

@@ -106,7 +106,7 @@ def subtree_forces(shape: int, uniform: bool, law: wp.Function, chosen: range = 
         # P V / h is the stress times this.
         area = wp.static(volume) * h * h
         g = mat10()
-        left_out = int(0)
+        degenerate = int(0)
         for leaf in range(wp.static(begin), wp.static(end)):
             b0, b1, b2 = columns(
                 y[wp.static(leaves[leaf][0])],
@@ -123,8 +123,8 @@ def subtree_forces(shape: int, uniform: bool, law: wp.Function, chosen: range = 
                 g[wp.static(leaves[leaf][2])] += f2
                 g[wp.static(leaves[leaf][3])] += f3
             if not trusted:
-                left_out |= wp.static(1 << leaf)
-        return g, left_out
+                degenerate |= wp.static(1 << leaf)
+        return g, degenerate
 
     return subtree_forces
 
@@ -171,8 +171,8 @@ def own_forces(
     @wp.func
     def own_forces(x: mat10, q: wp.mat33, h: float, mirror: float, material: IsotropicMaterial, first: int):
         q0, q1, q2 = maubach_frame(q, mirror)
-        g, left_out = forces(turn_in(x, q0, q1, q2, 1.0 / h), h, material, 0.0, first)
-        return turn_out(g, q0, q1, q2), left_out
+        g, degenerate = forces(turn_in(x, q0, q1, q2, 1.0 / h), h, material, 0.0, first)
+        return turn_out(g, q0, q1, q2), degenerate
 
     return own_forces
 
@@ -233,7 +233,7 @@ def shared_forces(shape: int, uniform: bool, given: bool) -> wp.Function:
         q0, q1, q2 = maubach_frame(q, mirror)
         r0, r1, r2 = maubach_frame(turn, mirror)
         inv_h = 1.0 / h
-        left_out = int(0)
+        degenerate = int(0)
         if wp.static(not given):
             # The subtree's edge is two of a leaf's.
             c0, c1, c2 = columns(x[0], x[1], x[2], x[3])
@@ -243,12 +243,12 @@ def shared_forces(shape: int, uniform: bool, given: bool) -> wp.Function:
             r1 = wp.static(0.5**ITERATIONS) * z1
             r2 = wp.static(0.5**ITERATIONS) * z2
             if not trusted:
-                left_out = 255
+                degenerate = 255
         y = turned_back(x, inv_h, q0, q1, q2, r0, r1, r2)
-        g, _left_out = forces(y, h, material, 0.0, first)
+        g, _degenerate = forces(y, h, material, 0.0, first)
         g = turn_out(g, r0, r1, r2)
-        if left_out != 0:
+        if degenerate != 0:
             g = mat10()
-        return g, left_out
+        return g, degenerate
 
     return shared_forces

@@ -32,7 +32,7 @@ def scatter_subtrees(shape: int, grouped: bool, uniform: bool, stress: wp.Functi
         s = wp.tid()
         h, q, mirror = root_of(subtrees, s)
         first = wp.where(wp.static(uniform), 0, subtrees.first[s])
-        g, _left_out = forces(load(subtrees, s, u), q, h, mirror, material, first)
+        g, _degenerate = forces(load(subtrees, s, u), q, h, mirror, material, first)
         add(subtrees, s, g, f)
 
     return scatter_subtrees

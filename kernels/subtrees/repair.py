@@ -2,8 +2,9 @@
 for every F.
 
 A byte for each subtree, with a bit for each leaf, says which these are. On CUDA the subtrees that have any are in lists
-(``LeftOut``), which one launch of a fixed size processes. On the CPU, and where sums must have a fixed order, a thread
-reads the bytes of eight subtrees at a time, which are nearly always all zero, and processes their leaves in order.
+(``DegenerateList``), which one launch of a fixed size processes. On the CPU, and where sums must have a fixed order, a
+thread reads the bytes of eight subtrees at a time, which are nearly always all zero, and processes their leaves in
+order.
 """
 
 import functools
@@ -28,7 +29,17 @@ from warp_corot.kernels.math.matrices import identity3
 from warp_corot.kernels.math.rotation import rotation_out_of_line
 from warp_corot.kernels.modules import unique_kernel
 
-from .left_out import LEAVES, LIST_BLOCK, LISTS, WARP, LeftOut, any_left_out, entry_count, leave, leaves_of_entries
+from .degenerate import (
+    LEAVES,
+    LIST_BLOCK,
+    LISTS,
+    WARP,
+    DegenerateList,
+    any_degenerate,
+    entry_count,
+    leave,
+    leaves_of_entries,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -40,7 +51,7 @@ add_pairs = add_four_forces(1)
 
 
 @wp.func
-def is_left_out(flags: wp.uint64, leaf: int):
+def is_degenerate(flags: wp.uint64, leaf: int):
     """Whether the ``leaf``-th of the 64 leaves of eight subtrees was left out."""
     return ((flags >> wp.uint64(leaf)) & wp.uint64(1)) != wp.uint64(0)
 
@@ -93,7 +104,7 @@ def repair_listed_own(
     material: IsotropicMaterial,
     u: wp.array[wp.vec4],
     # In and out
-    listed: LeftOut,
+    listed: DegenerateList,
     # Out
     f: wp.array[wp.vec4],
 ):
@@ -102,7 +113,7 @@ def repair_listed_own(
     Forces of neighbours are added up before they go to memory. Launch with block_dim LIST_BLOCK and ``threads``
     threads, a multiple of LIST_BLOCK, or one.
     """
-    if not any_left_out(listed):
+    if not any_degenerate(listed):
         return
     lanes = wp.min(threads, WARP)
     warps = threads // lanes
@@ -145,7 +156,7 @@ def repair_listed_shared(
     material: IsotropicMaterial,
     u: wp.array[wp.vec4],
     # In and out
-    listed: LeftOut,
+    listed: DegenerateList,
     # Out
     f: wp.array[wp.vec4],
 ):
@@ -153,7 +164,7 @@ def repair_listed_shared(
 
     Launch it like ``repair_listed_own``.
     """
-    if not any_left_out(listed):
+    if not any_degenerate(listed):
         return
     at_a_time = wp.min(threads, LISTS)
     list = wp.tid() % at_a_time
@@ -198,7 +209,7 @@ def repair_flagged(Material: type, stress: wp.Function, kernel: Callable = uniqu
             return
         leaf = wp.tid() % lanes
         while leaf < SUBTREES * LEAVES:
-            if is_left_out(flags, leaf):
+            if is_degenerate(flags, leaf):
                 t = first[SUBTREES * i + leaf // LEAVES] + leaf % LEAVES
                 scatter_stress(elements, t, stress(elements, t, material, u), f)
             leaf += lanes
@@ -263,7 +274,7 @@ def repair_shared(
         return
     member = int(0)
     while member < SUBTREES:
-        if is_left_out(flags, LEAVES * member):
+        if is_degenerate(flags, LEAVES * member):
             s = SUBTREES * i + member
             rotation = root_rotation(roots, s, u)
             leaf = int(0)

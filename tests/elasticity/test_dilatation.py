@@ -12,13 +12,13 @@ from shortened import crossed
 from tangents import diagonal
 
 import warp_corot as wc
+from warp_corot.discretization.deviatoric import deviatoric
 from warp_corot.discretization.discretization import FixedMesh
-from warp_corot.discretization.shear_only import shear_only
-from warp_corot.elasticity.corotated.elements import LanesField
+from warp_corot.elasticity.backends.law_cuda import LawCudaField
+from warp_corot.elasticity.backends.law_simd8 import LawSimd8Field
+from warp_corot.elasticity.corotated.elements import Simd8Field
 from warp_corot.elasticity.corotated.subtrees import SubtreeField
 from warp_corot.elasticity.dilatation.field import DilatationField
-from warp_corot.elasticity.paths.cuda import LawCudaField
-from warp_corot.elasticity.paths.law_lanes import LawLanesField
 
 YOUNG, POISSON = 1e4, 0.4
 MODELS = {
@@ -85,7 +85,7 @@ def check_forces(law, kind, device, rng, u):
     mesh = make()
     lam = YOUNG * POISSON / ((1 + POISSON) * (1 - 2 * POISSON))
     body, field = bound(law, mesh, device)
-    shear = MODELS[law]().bind(shear_only(body.discretization))
+    shear = MODELS[law]().bind(deviatoric(body.discretization))
     groups = groups_of(mesh)
     expected = reference.energy(law, mesh, groups, lam, u)
     found = field.elastic_energy(vec4(u, device)) - shear.elastic_energy(vec4(u, device))
@@ -202,7 +202,7 @@ def test_one_launch_gives_the_forces_of_several_passes(law, device, rng, monkeyp
     body = wc.SoftBody(mesh, material, device=device)
     u = vec4(rng.uniform(-0.02, 0.02, mesh.points.shape), device)
     together = nodal(MODELS[law](dilatation="shared").bind(body).elastic_forces(u))
-    for kind in (SubtreeField, LanesField, LawLanesField):
+    for kind in (SubtreeField, Simd8Field, LawSimd8Field):
         monkeypatch.setattr(kind, "share_dilatation", lambda *_: False)
     for kind in (SubtreeField, LawCudaField):
         monkeypatch.setattr(kind, "in_clusters", None)

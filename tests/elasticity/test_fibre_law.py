@@ -11,7 +11,7 @@ from tangents import assert_diagonal, assert_equal, assert_symmetric, difference
 import warp_corot as wc
 from warp_corot.kernels.elements.fibres import ReinforcedMaterial, reinforced_stress
 from warp_corot.kernels.elements.forces import scatter_forces
-from warp_corot.kernels.elements.lanes import LANES
+from warp_corot.kernels.elements.simd8 import LANES
 
 MATRIX = {"young": 500.0, "poisson": 0.4, "density": 10.0}
 MU, LAM = oracle.lame(MATRIX["young"], MATRIX["poisson"])

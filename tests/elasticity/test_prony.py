@@ -12,7 +12,7 @@ import warp_corot as wc
 from warp_corot.elasticity.tensors import gradients, green_strain
 from warp_corot.kernels.elements import prony
 from warp_corot.kernels.elements.forces import scatter_forces
-from warp_corot.kernels.elements.lanes import LANES
+from warp_corot.kernels.elements.simd8 import LANES
 
 MATERIAL = {"young": 500.0, "poisson": 0.3, "density": 10.0}
 MU, LAM = oracle.lame(MATERIAL["young"], MATERIAL["poisson"])

@@ -30,7 +30,7 @@ def forces(forest, u, tolerance):
     )
     kernel, of_kernel = subtree_cpu.scatter_law_subtrees(batch.shape), isotropic_material([*material, 0])
     if tolerance is not None:
-        kernel, near = subtree_cpu.scatter_subtrees_near(batch.shape), subtree_cpu.NearMaterial()
+        kernel, near = subtree_cpu.scatter_subtrees_tolerance(batch.shape), subtree_cpu.ToleranceMaterial()
         near.isotropic, near.tolerance = of_kernel, tolerance
         of_kernel = near
     inputs = [batch.subtrees, batch.count, of_kernel, u]
@@ -97,12 +97,12 @@ def test_strongly_strained_leaves_keep_their_own_rotations(rng):
     forest = wc.TetForest.box((1, 1, 1), 0.1, 9)
     far = rng.random((len(forest.points), 1)) < 0.1
     u = np.where(far, 1.2, 0.02) * edge_scale(forest) * rng.uniform(-1, 1, forest.points.shape)
-    shared, left_out = forces(forest, u, 0.5)
+    shared, degenerate = forces(forest, u, 0.5)
     plain, left_out_plain = forces(forest, u, None)
     _, F, _ = own(forest, u)
     strained = np.linalg.norm(F @ np.swapaxes(F, 1, 2) - np.eye(3), axis=(1, 2)).reshape(-1, 8).max(1) > 5.0
     assert 0.05 < strained.mean() < 0.95
-    assert np.array_equal(left_out[strained], left_out_plain[strained])
+    assert np.array_equal(degenerate[strained], left_out_plain[strained])
     subtrees = forest.tets.reshape(-1, 32)
     certain = np.ones(len(forest.points), bool)
     certain[subtrees[~strained]] = False

@@ -7,7 +7,7 @@ import warp as wp
 import warp_corot as wc
 from warp_corot.elasticity.viscosity import Viscosity
 from warp_corot.kernels.elements.forces import scatter_forces
-from warp_corot.kernels.elements.lanes import LANES
+from warp_corot.kernels.elements.simd8 import LANES
 from warp_corot.kernels.elements.viscosity import ViscousMaterial, viscosity_stress
 
 BOX = wc.TetForest.box((1, 1, 2), 0.1, 3)

@@ -13,7 +13,7 @@ from warp_corot.discretization.clusters.pairing import paired
 from warp_corot.discretization.clusters.single import changing_clusters, find_tables
 from warp_corot.discretization.elements import device_elements
 from warp_corot.discretization.plan import LeafCounts
-from warp_corot.elasticity.paths.clusters import ChangingClusterScatter, ClusterScatter
+from warp_corot.elasticity.backends.clusters import ChangingClusterScatter, ClusterScatter
 from warp_corot.elasticity.structs import isotropic_material
 from warp_corot.kernels.clusters.elements import (
     AlignedElements,

@@ -15,13 +15,13 @@ from thousands import FORESTS, TOLERANCE, materials, meshed, turned
 
 import warp_corot as wc
 from warp_corot.discretization.planning.fixed import ForcePlan
+from warp_corot.elasticity.backends.clusters import ClusterScatter, clustered
 from warp_corot.elasticity.corotated.anisotropic import AnisotropicField
 from warp_corot.elasticity.corotated.anisotropic_cuda import active_material, as_bytes
-from warp_corot.elasticity.paths.clusters import ClusterScatter, clustered
 from warp_corot.elasticity.structs import isotropic_material
 from warp_corot.kernels.clusters.laws import ActiveMaterial, anisotropic_law, isotropic_law, reinforced_law
 from warp_corot.kernels.corotated.anisotropic import FibreMaterial, fibre_stress
-from warp_corot.kernels.corotated.definite import quaternions_of
+from warp_corot.kernels.corotated.well_conditioned import quaternions_of
 from warp_corot.kernels.elements import constitutive
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.fibres import ReinforcedMaterial

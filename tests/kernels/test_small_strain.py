@@ -9,13 +9,13 @@ import oracle
 import pytest
 import warp as wp
 from cases import edge_scale, mixed_forest, oracle_mesh, place, random_displacement, simulation
-from left_out_launches import Launches
+from degenerate_launches import Launches
 
 import warp_corot as wc
 from warp_corot.discretization.planning.fixed import ForcePlan
 from warp_corot.elasticity.structs import isotropic_material
 from warp_corot.kernels.subtrees.cuda import scatter_subtrees_shared
-from warp_corot.kernels.subtrees.left_out import LeftOut
+from warp_corot.kernels.subtrees.degenerate import DegenerateList
 
 LAME = oracle.lame(1e4, 0.4)
 MATERIAL = {"young": 1e4, "poisson": 0.4, "density": 1000.0}
@@ -82,7 +82,7 @@ def test_shared_rotations_by_subtrees(leaf_level, amount, device, rng):
         scatter_subtrees_shared(batch.shape, False, True, False, False),
         dim=batch.count,
         inputs=[batch.subtrees, material, body.state.displacements, *none],
-        outputs=[f, batch.flagged, LeftOut()],
+        outputs=[f, batch.flagged, DegenerateList()],
         device=body.device,
         block_dim=128,
     )

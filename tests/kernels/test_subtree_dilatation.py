@@ -11,8 +11,8 @@ import warp as wp
 from cases import CUBE
 
 import warp_corot as wc
+from warp_corot.discretization.deviatoric import deviatoric
 from warp_corot.discretization.planning.fixed import ForcePlan
-from warp_corot.discretization.shear_only import shear_only
 from warp_corot.elasticity.structs import isotropic_material
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import VOLUME, mean_of
@@ -43,7 +43,7 @@ def scatter_at_once(shape, uniform):
         u: wp.array[wp.vec4],
         # Out
         f: wp.array[wp.vec4],
-        left_out: wp.array[wp.int32],
+        degenerate: wp.array[wp.int32],
     ):
         s = wp.tid()
         h, q, mirror = root_of(subtrees, s)
@@ -56,7 +56,7 @@ def scatter_at_once(shape, uniform):
         add_single(subtrees, s, turn_out(g, q0, q1, q2), f)
         g, last_mask = last_forces(y, h, material, pressure, first)
         add_single(subtrees, s, turn_out(g, q0, q1, q2), f)
-        left_out[s] = first_mask | last_mask
+        degenerate[s] = first_mask | last_mask
 
     return scatter_at_once
 
@@ -67,10 +67,10 @@ def test_forces_at_once(shape, uniform, device, rng):
     body, displacements, subtrees, count = strained(shape, uniform, 0.2, device, rng)
     expected = wc.Corotated(dilatation="shared").bind(body).elastic_forces(displacements).numpy()
     found = wp.zeros_like(displacements)
-    left_out = wp.zeros(count, dtype=wp.int32, device=device)
+    degenerate = wp.zeros(count, dtype=wp.int32, device=device)
     inputs = [subtrees, material_of(body), displacements]
-    wp.launch(scatter_at_once(shape, uniform), count, inputs, [found, left_out], device=device, block_dim=BLOCK)
-    assert not left_out.numpy().any()
+    wp.launch(scatter_at_once(shape, uniform), count, inputs, [found, degenerate], device=device, block_dim=BLOCK)
+    assert not degenerate.numpy().any()
     assert np.abs(found.numpy() - expected)[:, :3].max() < 5e-6 * np.abs(expected).max()
 
 
@@ -104,7 +104,7 @@ def test_forces_of_pressure(shape, uniform, device, rng):
     """Some leaves are beyond a quarter of their volume, and some turned over."""
     body, displacements, subtrees, count = strained(shape, uniform, 0.5, device, rng)
     both = wc.Corotated(dilatation="shared").bind(body).elastic_forces(displacements).numpy()
-    shear = wc.Corotated(dilatation="element").bind(shear_only(body.discretization))
+    shear = wc.Corotated(dilatation="element").bind(deviatoric(body.discretization))
     expected = both - shear.elastic_forces(displacements).numpy()
     found = wp.zeros_like(displacements)
     kernel = scatter_dilatation(shape, False, uniform, VOLUME)

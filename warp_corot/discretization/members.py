@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from warp_corot.kernels.elements import shared_rows as kernels
+from warp_corot.kernels.elements import mean_dilatation_rows as kernels
 from warp_corot.kernels.elements.dilatation import Dilatation
 
-#: Groups in the form of ``kernels.elements.shared_dilatation.share_in_groups``: starts, members, the number of groups
+#: Groups in the form of ``kernels.elements.mean_dilatation.share_in_groups``: starts, members, the number of groups
 #: if launches cover more, and the number in launches.
 Batch = tuple[wp.array, wp.array, wp.array, int]
 

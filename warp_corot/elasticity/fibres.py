@@ -24,14 +24,14 @@ from warp_corot.kernels.elements.fibres import (
     reinforced_stress,
 )
 from warp_corot.kernels.elements.forces import element_energies, element_von_mises
-from warp_corot.kernels.elements.law_lanes import FIBRES
+from warp_corot.kernels.elements.native_laws import FIBRES
 from warp_corot.materials.reinforced import FibreReinforced
 
+from .backends.clusters import divided
+from .backends.elements import ByElements
 from .corotated.anisotropic import fibre_material
 from .dilatation import AUTO, bind_law, check_dilatation
 from .model import ForceField, Model
-from .paths.clusters import divided
-from .paths.elements import ByElements
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretized

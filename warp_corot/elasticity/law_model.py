@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
-from warp_corot.elasticity.paths.laws import law_field
+from warp_corot.elasticity.backends.laws import law_field
 from warp_corot.kernels.elements.dilatation import Dilatation
 
 from .dilatation import AUTO, bind_law, check_dilatation

@@ -26,10 +26,10 @@ from warp_corot.kernels.elements.forces import (
     law_value,
     scatter_forces,
 )
-from warp_corot.kernels.elements.law_lanes import LawInLanes
+from warp_corot.kernels.elements.native_laws import IsotropicLaw
 from warp_corot.kernels.elements.stiffness_products import law_differential
 
-from .paths.divided import DividedForces, Piece
+from .backends.divided import DividedForces, Piece
 from .stress_law import ElementMaterial, StressLaw
 from .structs import Kept, isotropic_material
 from .tangent import ElementTangent, Tangent
@@ -38,8 +38,8 @@ if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
     from warp_corot.kernels.stepping.pace import Pace
 
-    from .paths.clusters import ClusterScatter
-    from .paths.dilating import Dilating
+    from .backends.clusters import ClusterScatter
+    from .backends.mean_dilatation import Dilating
 
 
 class SmallForces(Protocol):
@@ -436,14 +436,14 @@ class Law(NamedTuple):
 
     Attributes:
         stress, differential, energy, cauchy: The functions.
-        lanes: The same law of ``kernels.elements.law_lanes``, for the CPU; None if it is not in C++.
+        lanes: The same law of ``kernels.elements.native_laws``, for the CPU; None if it is not in C++.
     """
 
     stress: wp.Function
     differential: wp.Function
     energy: wp.Function
     cauchy: wp.Function
-    lanes: LawInLanes | None = None
+    lanes: IsotropicLaw | None = None
 
 
 class LawField(ElementField):

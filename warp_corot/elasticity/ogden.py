@@ -13,9 +13,9 @@ from warp_corot.inputs.checks import checked_number, shown
 from warp_corot.kernels.elements import ogden as kernels
 from warp_corot.kernels.elements.dilatation import LOG_VOLUME
 
+from .backends.laws import law_field
 from .dilatation import AUTO, bind_law, check_dilatation
 from .model import ForceField, Law, Model
-from .paths.laws import law_field
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization, Discretized

@@ -13,9 +13,9 @@ from warp_corot.discretization.discretization import Discretization, discretizat
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_numbers, shown
 from warp_corot.kernels.elements import prestress as kernels
-from warp_corot.kernels.elements.law_lanes import PRESTRESS
+from warp_corot.kernels.elements.native_laws import PRESTRESS
 
-from .beside import BesideField
+from .added_stress import AddedStressField
 from .corotated.model import Corotated
 from .model import ForceField, Model
 
@@ -68,7 +68,7 @@ class Prestressed(Model):
         return PrestressedField(discretization, self, self.model.bind(discretization, deterministic=deterministic))
 
 
-class PrestressedField(BesideField):
+class PrestressedField(AddedStressField):
     """The forces of an elastic law and of an initial stress.
 
     Args:

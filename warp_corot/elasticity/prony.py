@@ -15,11 +15,11 @@ from warp_corot.discretization.discretization import Discretization, discretizat
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, shown
 from warp_corot.kernels.elements import prony as kernels
-from warp_corot.kernels.elements.lanes import LANES
-from warp_corot.kernels.elements.law_lanes import PRONY
-from warp_corot.kernels.elements.prony_cpu import relax_eights
+from warp_corot.kernels.elements.native_laws import PRONY
+from warp_corot.kernels.elements.prony_cpu import relax_simd8
+from warp_corot.kernels.elements.simd8 import LANES
 
-from .beside import BesideField
+from .added_stress import AddedStressField
 from .corotated.model import Corotated
 from .model import ForceField, Model
 
@@ -92,7 +92,7 @@ class Prony(Model):
         return PronyField(discretization, self, self.model.bind(discretization, deterministic=deterministic))
 
 
-class PronyField(BesideField):
+class PronyField(AddedStressField):
     """The forces of an elastic law and of Maxwell elements beside it.
 
     Args:
@@ -111,7 +111,7 @@ class PronyField(BesideField):
         self._g, self._tau = (wp.array(v, dtype=wp.float32, device=self.device) for v in (g, tau))
         self._elapsed = wp.zeros(1, dtype=wp.float32, device=self.device)
         self._known = wp.zeros(len(self._carried) * self._count, dtype=wp.float32, device=self.device)
-        relax = relax_eights if self.device.is_cpu else kernels.relax
+        relax = relax_simd8 if self.device.is_cpu else kernels.relax
         self._relax = relax(discretization.element_kind)
 
     @property

@@ -11,9 +11,9 @@ from warp_corot.kernels.corotated.anisotropic import FibreMaterial
 from warp_corot.kernels.corotated.tangent import KeptStrains
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
 from warp_corot.kernels.elements.fibres import ReinforcedMaterial
+from warp_corot.kernels.elements.mean_dilatation import DilatedMaterial
 from warp_corot.kernels.elements.prestress import Prestress
 from warp_corot.kernels.elements.prony import PronyMaterial
-from warp_corot.kernels.elements.shared_dilatation import DilatedMaterial
 
 #: Structs of materials.
 ElementMaterial: TypeAlias = (

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from warp_corot.kernels.elements.law_lanes import VISCOUS
+from warp_corot.kernels.elements.native_laws import VISCOUS
 from warp_corot.kernels.elements.viscosity import ViscousMaterial, viscosity_stress
 
-from .paths.elements import ByElements
+from .backends.elements import ByElements
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody

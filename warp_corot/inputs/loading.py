@@ -32,7 +32,7 @@ STEPS_ON_CPU = ("subtrees.repair", *STEPS, "stepping.subnormals")
 EXPLICIT = ("stepping.lanczos", "stepping.gauge")
 #: Modules for implicit steps, and for those of bodies on forests.
 IMPLICIT = (
-    *("implicit.steps", "implicit.residual", "elements.shared_rows", "implicit.tangent", "implicit.turning"),
+    *("implicit.steps", "implicit.residual", "elements.mean_dilatation_rows", "implicit.tangent", "implicit.turning"),
     *("implicit.conjugate_gradients", "implicit.sums", "implicit.increments", "elements.reproducible"),
 )
 IMPLICIT_ON_FORESTS = (

@@ -12,7 +12,7 @@ from warp_corot.kernels.elements.constitutive import IsotropicMaterial, linear_s
 from warp_corot.kernels.elements.elements import GeneralElements
 from warp_corot.kernels.elements.forces import law_stress, repair_forces, scatter_forces
 from warp_corot.kernels.elements.general_cuda import BLOCK, PosedElements
-from warp_corot.kernels.elements.lanes import LANES
+from warp_corot.kernels.elements.simd8 import LANES
 from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.kernels.newton.attributes import split_materials, write_attributes
 from warp_corot.kernels.newton.elements import (

@@ -5,7 +5,7 @@ the inverse.
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
-from warp_corot.kernels.elements.lanes import native
+from warp_corot.kernels.elements.simd8 import native
 
 from .cycle import sum_over_lanes
 

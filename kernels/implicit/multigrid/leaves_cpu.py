@@ -5,7 +5,7 @@ world, in parts. A column of a block is a vector register, so that a contributio
 import warp as wp
 
 from warp_corot.kernels.elements.elements import LEVEL_MASK
-from warp_corot.kernels.elements.lanes import constants, on_cpu
+from warp_corot.kernels.elements.simd8 import constants, on_cpu
 
 from .values import Leaves
 

@@ -1,7 +1,7 @@
 """The contribution of a dilatation shared by groups of elements to the finest matrix.
 
-A group adds r r^T with r = sqrt(c) g of ``kernels.elements.shared_rows``, so each pair of its nodes contributes to an
-entry. Rows belong to the present state, because lambda may be thousands of times mu.
+A group adds r r^T with r = sqrt(c) g of ``kernels.elements.mean_dilatation_rows``, so each pair of its nodes
+contributes to an entry. Rows belong to the present state, because lambda may be thousands of times mu.
 
 A group of k nodes couples all of them: r r^T may be k times its own diagonal blocks. It is at most 4 times these with
 weights w_n = sum of |r_m| / (4 |r_n|), since (sum of r_n . p_n)^2 <= sum of |r_m| times sum of (r_n . p_n)^2 / |r_n|.
@@ -14,7 +14,7 @@ import warp as wp
 from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.kernels.elements.elements import ForestElements, nodal_forces, rest_volume
 from warp_corot.kernels.elements.forces import in_local_frame, own_gradient
-from warp_corot.kernels.elements.shared_rows import GroupNodes, first_entry
+from warp_corot.kernels.elements.mean_dilatation_rows import GroupNodes, first_entry
 from warp_corot.kernels.modules import Family
 
 from .pattern import key_of

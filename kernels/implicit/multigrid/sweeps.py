@@ -7,7 +7,7 @@ iteration of degree 2, which costs four.
 
 import warp as wp
 
-from warp_corot.kernels.elements.lanes import on_cpu
+from warp_corot.kernels.elements.simd8 import on_cpu
 
 from .cycle import Rows
 

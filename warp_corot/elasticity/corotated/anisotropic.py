@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, ClassVar
 import warp as wp
 
 from warp_corot.discretization.elements import E, copied
+from warp_corot.elasticity.backends.simd8 import Lanes, as_general
 from warp_corot.elasticity.model import ForceField
-from warp_corot.elasticity.paths.lanes import Lanes, as_general
 from warp_corot.elasticity.stress_law import StressLaw
 from warp_corot.elasticity.structs import Kept
 from warp_corot.kernels.corotated.anisotropic import (
@@ -19,7 +19,7 @@ from warp_corot.kernels.corotated.anisotropic import (
     fibre_density,
     fibre_stress,
 )
-from warp_corot.kernels.corotated.anisotropic_cpu import scatter_anisotropic_lanes, turn_changed, turn_elements
+from warp_corot.kernels.corotated.anisotropic_simd8 import scatter_anisotropic_simd8, turn_changed, turn_elements
 from warp_corot.kernels.corotated.anisotropic_tangent import anisotropic_differential
 from warp_corot.kernels.elements.forces import element_energies, element_von_mises, repair_forces, scatter_forces
 from warp_corot.kernels.math.rotation import byers_xu
@@ -97,7 +97,7 @@ def fibre_material(passive: OrthotropicMaterial, is_active: int, activation: wp.
     return material
 
 
-class AnisotropicLanesField(AnisotropicField):
+class AnisotropicSimd8Field(AnisotropicField):
     """On the CPU, eight elements at a time."""
 
     def __init__(self, discretization: Discretization, rotation: wp.Function, deterministic: bool):
@@ -111,7 +111,7 @@ class AnisotropicLanesField(AnisotropicField):
         count, stress = self.element_count, fibre_stress(byers_xu)
         repair = repair_forces(self.discretization.element_kind, FibreMaterial, stress)
         elements, general = _first(self.elements, count), _first(self._general, count)
-        self._lanes = Lanes(elements, general, scatter=scatter_anisotropic_lanes, repair=repair)
+        self._lanes = Lanes(elements, general, scatter=scatter_anisotropic_simd8, repair=repair)
 
     def derive(self) -> None:
         counts = self.plan.counts

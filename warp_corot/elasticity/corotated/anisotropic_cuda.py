@@ -8,10 +8,10 @@ import warp as wp
 
 from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.plan import Plan
-from warp_corot.elasticity.paths.clusters import divided
+from warp_corot.elasticity.backends.clusters import divided
 from warp_corot.kernels.clusters.laws import ActiveMaterial, anisotropic_law
 from warp_corot.kernels.corotated.anisotropic import OrthotropicMaterial
-from warp_corot.kernels.corotated.definite import quaternions_of
+from warp_corot.kernels.corotated.well_conditioned import quaternions_of
 from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.kernels.subtrees.anisotropic import repair_leaves, scatter_anisotropic_subtrees, scatter_flat
 from warp_corot.kernels.subtrees.memory import BLOCK

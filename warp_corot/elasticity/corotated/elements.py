@@ -10,10 +10,10 @@ import warp as wp
 from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.elements import Elements
 from warp_corot.discretization.plan import Plan, Units
+from warp_corot.elasticity.backends.divided import InLanes
+from warp_corot.elasticity.backends.mean_dilatation import Dilating
+from warp_corot.elasticity.backends.simd8 import Lanes
 from warp_corot.elasticity.model import ForceField
-from warp_corot.elasticity.paths.dilating import Dilating
-from warp_corot.elasticity.paths.divided import InLanes
-from warp_corot.elasticity.paths.lanes import Lanes
 from warp_corot.elasticity.stress_law import StressLaw
 from warp_corot.elasticity.structs import Kept
 from warp_corot.elasticity.tangent import Tangent
@@ -214,7 +214,7 @@ class LeafField(CorotatedField):
             self._sharing()
 
 
-class LanesField(InLanes, CorotatedField):
+class Simd8Field(InLanes, CorotatedField):
     """General elements on the CPU."""
 
     _lanes: Lanes

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from warp_corot.elasticity.paths.clusters import ClusterScatter, clustered
+from warp_corot.elasticity.backends.clusters import ClusterScatter, clustered
 from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.clusters.laws import isotropic_law
 from warp_corot.kernels.elements.general_cuda import corotated_law

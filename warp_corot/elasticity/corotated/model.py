@@ -13,9 +13,9 @@ from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.materials.anisotropic import Anisotropic
 from warp_corot.mesh import TetForest
 
-from .anisotropic import AnisotropicField, AnisotropicLanesField
+from .anisotropic import AnisotropicField, AnisotropicSimd8Field
 from .anisotropic_cuda import AnisotropicCudaField
-from .elements import CorotatedField, LanesField, LeafField
+from .elements import CorotatedField, LeafField, Simd8Field
 from .general import CorotatedGeneralField
 from .options import CorotatedOptions
 from .subtrees import SubtreeField
@@ -75,7 +75,7 @@ class Corotated(CorotatedOptions):
         elif self.stiffness != "factored":
             raise InputError(f"stiffness {self.stiffness!r} needs a forest; general elements have no three shapes")
         elif fast and discretization.device.is_cpu:
-            return LanesField(discretization, self, deterministic)
+            return Simd8Field(discretization, self, deterministic)
         elif fast and not deterministic:
             return CorotatedGeneralField(discretization, self)
         return LeafField(discretization, self, deterministic)
@@ -94,4 +94,4 @@ class Corotated(CorotatedOptions):
         if quick and discretization.device.is_cuda and not deterministic:
             return AnisotropicCudaField(discretization)
         lanes = quick and discretization.device.is_cpu
-        return (AnisotropicLanesField if lanes else AnisotropicField)(discretization, self.own_rotation, deterministic)
+        return (AnisotropicSimd8Field if lanes else AnisotropicField)(discretization, self.own_rotation, deterministic)

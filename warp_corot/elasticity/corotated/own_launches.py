@@ -10,13 +10,13 @@ import warp as wp
 from warp_corot.discretization.awaited import Awaited
 from warp_corot.discretization.plan import FlatLeaves, Plan
 from warp_corot.discretization.subtrees import GROUPED_LEAVES, Batch
-from warp_corot.elasticity.paths.clusters import ChangingClusterScatter, ClusterScatter, grouped_and_others
+from warp_corot.elasticity.backends.clusters import ChangingClusterScatter, ClusterScatter, grouped_and_others
 from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.clusters.laws import isotropic_law
 from warp_corot.kernels.corotated.algebraic import corotated_stress
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
-from warp_corot.kernels.subtrees.cuda import FLAT, Stretch, scatter_stretches, scatter_subtrees_own
-from warp_corot.kernels.subtrees.left_out import LeftOut
+from warp_corot.kernels.subtrees.cuda import FLAT, WorkRange, scatter_body, scatter_subtrees_own
+from warp_corot.kernels.subtrees.degenerate import DegenerateList
 from warp_corot.kernels.subtrees.memory import BLOCK
 
 #: Number of leaves of a uniform forest from which subtrees have a launch: clusters are faster for fewer leaves, above
@@ -68,8 +68,8 @@ class OwnLaunches:
         # The structs hold only addresses: the arrays must live as long as the structs.
         self.batches = tuple(batches)
         flat = None if self._clusters is not None else plan.flat
-        self._rows, self._blocks = ([], 0) if self._is_single else _stretches(batches, flat)
-        self._stretches = wp.array(self._rows, dtype=Stretch, device=self._device) if self._rows else None
+        self._rows, self._blocks = ([], 0) if self._is_single else _ranges(batches, flat)
+        self._ranges = wp.array(self._rows, dtype=WorkRange, device=self._device) if self._rows else None
         #: Numbers of subtrees and single leaves of each launch that may leave some out, with gaps.
         self.places = [batch.count for batch in batches] if self._is_single else [self._blocks * BLOCK]
 
@@ -83,8 +83,8 @@ class OwnLaunches:
     def kernels(self) -> list[LoadedKernel]:
         """The kernels that launches take."""
         found: list[LoadedKernel] = [(self._kernel(batch), BLOCK) for batch in self.batches if self._is_single]
-        if self._stretches is not None:
-            found.append((scatter_stretches(self._material.stride == 0), BLOCK))
+        if self._ranges is not None:
+            found.append((scatter_body(self._material.stride == 0), BLOCK))
         return [*found, *([self._clusters.kernel] if isinstance(self._clusters, ClusterScatter) else [])]
 
     @staticmethod
@@ -97,36 +97,36 @@ class OwnLaunches:
     @staticmethod
     def later_kernel(uniform: bool) -> LoadedKernel:
         """The kernel that launches over a changing mesh take."""
-        return scatter_stretches(uniform), BLOCK
+        return scatter_body(uniform), BLOCK
 
-    def scatter_forces(self, u: wp.array, f: wp.array, left_out: LeftOut) -> None:
+    def scatter_forces(self, u: wp.array, f: wp.array, degenerate: DegenerateList) -> None:
         """Add the forces of displacements u to f, both vec4, and put subtrees with leaves left out on a list."""
         material = self._material
         if self._is_single:
-            self._scatter_single(u, f, left_out)
+            self._scatter_single(u, f, degenerate)
             return
-        if self._stretches is not None:
+        if self._ranges is not None:
             wp.launch(
-                scatter_stretches(material.stride == 0),
+                scatter_body(material.stride == 0),
                 dim=self._blocks * BLOCK,
-                inputs=[self._stretches, self._flat.elements, self._flat.leaves, material, u],
-                outputs=[f, left_out],
+                inputs=[self._ranges, self._flat.elements, self._flat.leaves, material, u],
+                outputs=[f, degenerate],
                 device=self._device,
                 block_dim=BLOCK,
             )
         if self._clusters is not None:
             self._clusters(material, u, f)
 
-    def _scatter_single(self, u: wp.array, f: wp.array, left_out: LeftOut) -> None:
-        self._launch(self.batches[0], u, f, left_out)
+    def _scatter_single(self, u: wp.array, f: wp.array, degenerate: DegenerateList) -> None:
+        self._launch(self.batches[0], u, f, degenerate)
         with nullcontext() if self._awaited is None else self._awaited.later():
             for late in self.batches[1:]:
-                self._launch(late, u, f, left_out)
+                self._launch(late, u, f, degenerate)
             if self._clusters is not None:
                 self._clusters(self._material, u, f)
 
-    def _launch(self, batch: Batch, u: wp.array, f: wp.array, left_out: LeftOut) -> None:
-        inputs, outputs = [batch.subtrees, self._material, u], [f, batch.flagged, left_out]
+    def _launch(self, batch: Batch, u: wp.array, f: wp.array, degenerate: DegenerateList) -> None:
+        inputs, outputs = [batch.subtrees, self._material, u], [f, batch.flagged, degenerate]
         wp.launch(self._kernel(batch), batch.count, inputs, outputs, device=self._device, block_dim=BLOCK)
 
     def _kernel(self, batch: Batch) -> wp.Kernel:
@@ -138,19 +138,19 @@ def _fewest_grouped(plan: Plan) -> int:
     return UNIFORM_LEAVES if len(plan.batches) == 1 and len(plan.flat) == 0 else GROUPED_LEAVES
 
 
-def _stretches(batches: list[Batch], flat: FlatLeaves | None) -> tuple[list[Stretch], int]:
-    """The stretches of work of neighbouring thread blocks, and the number of blocks."""
+def _ranges(batches: list[Batch], flat: FlatLeaves | None) -> tuple[list[WorkRange], int]:
+    """The ranges of work of neighbouring thread blocks, and the number of blocks."""
     rows, begin = [], 0
     for batch in batches:
-        stretch = Stretch()
-        stretch.begin, stretch.count = begin, batch.count
-        stretch.shape, stretch.grouped = batch.shape, int(batch.grouped)
-        stretch.subtrees, stretch.flagged = batch.subtrees, batch.flagged
-        rows.append(stretch)
+        one = WorkRange()
+        one.begin, one.count = begin, batch.count
+        one.shape, one.grouped = batch.shape, int(batch.grouped)
+        one.subtrees, one.flagged = batch.subtrees, batch.flagged
+        rows.append(one)
         begin += -(-batch.count // BLOCK)
     if flat is not None and len(flat):
-        stretch = Stretch()
-        stretch.begin, stretch.count, stretch.shape = begin, len(flat), FLAT
-        rows.append(stretch)
+        one = WorkRange()
+        one.begin, one.count, one.shape = begin, len(flat), FLAT
+        rows.append(one)
         begin += -(-len(flat) // BLOCK)
     return rows, begin

@@ -13,10 +13,10 @@ import warp as wp
 
 from warp_corot.discretization.plan import FlatLeaves
 from warp_corot.discretization.subtrees import Batch, Sharing
-from warp_corot.elasticity.paths.clusters import ChangingClusterScatter, ClusterScatter
-from warp_corot.elasticity.paths.dilating import Dilating
-from warp_corot.elasticity.paths.divided import InLanes
-from warp_corot.elasticity.paths.lanes import Lanes, as_general
+from warp_corot.elasticity.backends.clusters import ChangingClusterScatter, ClusterScatter
+from warp_corot.elasticity.backends.divided import InLanes
+from warp_corot.elasticity.backends.mean_dilatation import Dilating
+from warp_corot.elasticity.backends.simd8 import Lanes, as_general
 from warp_corot.elasticity.structs import Kept
 from warp_corot.elasticity.tangent import Tangent
 from warp_corot.inputs.cpu_threads import launch
@@ -25,18 +25,18 @@ from warp_corot.kernels.clusters.laws import isotropic_law
 from warp_corot.kernels.corotated.algebraic import corotated_stress
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
 from warp_corot.kernels.elements.general_cpu import rest_matrices, scatter_law_elements
-from warp_corot.kernels.elements.lanes import LANES
+from warp_corot.kernels.elements.simd8 import LANES
 from warp_corot.kernels.subtrees import cpu as subtree_cpu
 from warp_corot.kernels.subtrees import cuda as subtree_cuda
 from warp_corot.kernels.subtrees.repair import repair_elements, repair_own, repair_shared
 
+from .degenerate import DegenerateLeaves
 from .elements import (
     CorotatedField,
     Rotations,
     general_lanes,
     rotated_material,
 )
-from .left_out import LeftOutLeaves
 from .own_launches import OwnLaunches
 from .subtree_tangent import FEWEST, SubtreeTangent, subtrees_of
 
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 #: The structs that kernels of lanes read.
 LanesMaterial: TypeAlias = (
-    "IsotropicMaterial | RotatedMaterial | subtree_cpu.NearMaterial | subtree_cpu.DilatingMaterial"
+    "IsotropicMaterial | RotatedMaterial | subtree_cpu.ToleranceMaterial | subtree_cpu.DilatingMaterial"
 )
 
 
@@ -76,7 +76,7 @@ class SubtreeField(InLanes, CorotatedField):
     @property
     def _force_kernels(self) -> list[LoadedKernel]:
         if self._own_launches is not None:
-            return [*self._own_launches.kernels, LeftOutLeaves.kernel]
+            return [*self._own_launches.kernels, DegenerateLeaves.kernel]
         of_subtrees: list[LoadedKernel] = [(self._kernel(*kind), self._block) for kind in self.plan.kinds]
         if self._dilating is not None:
             return [*of_subtrees, self._dilating.kernel("corotated"), repair_elements]
@@ -94,7 +94,7 @@ class SubtreeField(InLanes, CorotatedField):
             found += [self._dilating.kernel("corotated"), repair_elements]
         elif self.device.is_cpu:
             found += [scatter_law_elements("corotated"), repair_elements]
-        found += [LeftOutLeaves.kernel] if self._listed else []
+        found += [DegenerateLeaves.kernel] if self._listed else []
         load((), self.device, [*found, *([OwnLaunches.later_kernel(self._uniform)] if one_launch else [])])
 
     def share_dilatation(self, dilating: Dilating) -> bool:
@@ -131,15 +131,15 @@ class SubtreeField(InLanes, CorotatedField):
             self._rotations = self._shared.rotations
         elif self.rotation_level is not None:
             self._sharing()
-        self._left_out: LeftOutLeaves | None = None
+        self._degenerate: DegenerateLeaves | None = None
         self._own_launches: OwnLaunches | None = None
         if self._listed:
             if self.rotation_level is None and (OwnLaunches.suit(plan) or self.discretization.awaited is not None):
                 given = (self.isotropic, self._clusters, self.discretization.awaited)
                 self._own_launches = OwnLaunches(plan, *given)
-                self._left_out = LeftOutLeaves(self._own_launches.places, [], self.device)
+                self._degenerate = DegenerateLeaves(self._own_launches.places, [], self.device)
                 return
-            self._left_out = LeftOutLeaves.of(plan, self.device)
+            self._degenerate = DegenerateLeaves.of(plan, self.device)
         self._kernels = [self._kernel(batch.shape, batch.grouped, batch.sharing) for batch in plan.batches]
         self._materials = [self._material(batch) for batch in plan.batches]
         self._flat_rotated = Kept(rotated_material)
@@ -165,9 +165,9 @@ class SubtreeField(InLanes, CorotatedField):
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         if self._own_launches is not None:
-            assert self._left_out is not None
-            self._own_launches.scatter_forces(u, f, self._left_out.own)
-            self._left_out.repair(self.elements, self.isotropic, u, f)
+            assert self._degenerate is not None
+            self._own_launches.scatter_forces(u, f, self._degenerate.own)
+            self._degenerate.repair(self.elements, self.isotropic, u, f)
             return
         if self.plan.units is not None:
             self.extract_rotations(u)
@@ -185,8 +185,8 @@ class SubtreeField(InLanes, CorotatedField):
                 self.launch(self._forces, len(flat), [flat.elements, rotated, u], [f])
             else:
                 self.launch(self._own, len(flat), [flat.elements, isotropic, u], [f])
-        if self._left_out is not None:
-            self._left_out.repair(self.elements, self.isotropic, u, f)
+        if self._degenerate is not None:
+            self._degenerate.repair(self.elements, self.isotropic, u, f)
 
     def _kernel(self, shape: int, grouped: bool, sharing: Sharing) -> wp.Kernel:
         given = sharing is Sharing.ABOVE
@@ -197,7 +197,7 @@ class SubtreeField(InLanes, CorotatedField):
         if sharing is Sharing.OWN:
             dilatation = None if self._dilating is None else self._dilating.of
             if self._tolerance is not None:
-                return subtree_cpu.scatter_subtrees_near(shape, dilatation)
+                return subtree_cpu.scatter_subtrees_tolerance(shape, dilatation)
             return subtree_cpu.scatter_law_subtrees(shape, shared=dilatation)
         return subtree_cpu.scatter_subtrees_shared(shape, given)
 
@@ -226,12 +226,12 @@ class SubtreeField(InLanes, CorotatedField):
             else:
                 unit = self._no_unit if batch.unit is None else batch.unit
                 inputs = [batch.subtrees, self.isotropic, u, self._rotations, unit]
-            outputs.append(LeftOutLeaves.NONE if self._left_out is None else self._left_out.list_of(batch))
+            outputs.append(DegenerateLeaves.NONE if self._degenerate is None else self._degenerate.list_of(batch))
         else:
             threads = -(-batch.count // LANES)
             inputs = [batch.subtrees, batch.count, material(), u]
         launch(kernel, threads, inputs, outputs, device=self.device, block_dim=self._block)
-        if self._left_out is not None or not batch.count:
+        if self._degenerate is not None or not batch.count:
             return
         flags = batch.flags_by_eights
         inputs = [self.elements, self.isotropic, u]
@@ -241,7 +241,7 @@ class SubtreeField(InLanes, CorotatedField):
             self.launch(repair_shared, len(flags), [flags, batch.subtrees.first, batch.roots, *inputs], [f])
 
 
-def near_material(isotropic: IsotropicMaterial, tolerance: float) -> subtree_cpu.NearMaterial:
-    material = subtree_cpu.NearMaterial()
+def near_material(isotropic: IsotropicMaterial, tolerance: float) -> subtree_cpu.ToleranceMaterial:
+    material = subtree_cpu.ToleranceMaterial()
     material.isotropic, material.tolerance = isotropic, tolerance
     return material

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import warp as wp
 
-from warp_corot.elasticity.paths.lanes import as_general
+from warp_corot.elasticity.backends.simd8 import as_general
 from warp_corot.elasticity.structs import Kept
 from warp_corot.elasticity.tangent import ElementTangent, Tangent
 from warp_corot.kernels.corotated import kept_exact
@@ -20,7 +20,7 @@ from warp_corot.kernels.corotated.tangent import KeptStrains, given_differential
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
 from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.elements.general_cpu import rest_matrices
-from warp_corot.kernels.elements.lanes import LANES
+from warp_corot.kernels.elements.simd8 import LANES
 from warp_corot.kernels.subtrees.repair import turn_listed
 
 if TYPE_CHECKING:
@@ -84,8 +84,8 @@ class ExactTangent(ElementTangent):
 
 
 class KeptTangent(Tangent):
-    """Either of them on the CPU, for elements with own rotations: all that products need of an element is kept, eight
-    elements side by side.
+    """The paper's stiffness or the exact one on the CPU, for elements with own rotations: all that products need of an
+    element is kept, eight elements side by side.
 
     The diagonal is found element by element, because solvers with multigrid never need it.
 

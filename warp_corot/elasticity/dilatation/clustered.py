@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.elasticity.paths.clusters import ClusterScatter
+from warp_corot.elasticity.backends.clusters import ClusterScatter
 from warp_corot.elasticity.structs import Kept
 from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.clusters.sharing import SharingMaterial, measure_pairs, shared_pressure, sharing_law

@@ -9,23 +9,23 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_corot.discretization.deviatoric import deviatoric
 from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.elements import with_targets
 from warp_corot.discretization.members import Members
 from warp_corot.discretization.plan import Plan
-from warp_corot.discretization.shear_only import shear_only
 from warp_corot.discretization.slots import Slots
 from warp_corot.discretization.subtrees import Batch
+from warp_corot.elasticity.backends.mean_dilatation import Dilating
 from warp_corot.elasticity.model import ForceField, SmallForces
-from warp_corot.elasticity.paths.dilating import Dilating
 from warp_corot.elasticity.structs import forwards
 from warp_corot.elasticity.tangent import Tangent
 from warp_corot.inputs.loading import LoadedKernel, load
-from warp_corot.kernels.elements import shared_dilatation as kernels
+from warp_corot.kernels.elements import mean_dilatation as kernels
 from warp_corot.kernels.elements.dilatation import Dilatation
-from warp_corot.kernels.elements.lanes import LANES
-from warp_corot.kernels.elements.law_lanes import STRESSLESS
-from warp_corot.kernels.elements.shared_dilatation import DilatedMaterial
+from warp_corot.kernels.elements.mean_dilatation import DilatedMaterial
+from warp_corot.kernels.elements.native_laws import STRESSLESS
+from warp_corot.kernels.elements.simd8 import LANES
 from warp_corot.kernels.subtrees import dilatation as subtrees
 from warp_corot.kernels.subtrees.cpu import scatter_law_subtrees
 from warp_corot.kernels.subtrees.memory import BLOCK
@@ -64,7 +64,7 @@ class DilatationField(ForceField):
         of: Dilatation,
         deterministic: bool = False,
     ):
-        self.shear = bind(shear_only(discretization))
+        self.shear = bind(deviatoric(discretization))
         super().__init__(discretization, deterministic)
         self.of = of
         self._all, self._still = (wp.empty(0, dtype=kind, device=self.device) for kind in (wp.int32, wp.vec4))
@@ -277,12 +277,12 @@ class DilatationField(ForceField):
 
     def share_weights(self, u: wp.array, p: wp.array) -> wp.array:
         """Data of the shared dilatation for derivatives with respect to elements' weights, vec4 [T]; see
-        ``kernels.elements.shared_dilatation.weight_law_at``.
+        ``kernels.elements.mean_dilatation.weight_law_at``.
         """
         return self._share(u, p, kernels.share_in_groups(self.kind, kernels.weight_law_at(self.of)))
 
     def _share(self, u: wp.array, p: wp.array, share_in_groups: wp.Kernel) -> wp.array:
-        """Launch the first two passes of ``kernels.elements.shared_dilatation`` for all elements."""
+        """Launch the first two passes of ``kernels.elements.mean_dilatation`` for all elements."""
         self._regions.launch_over(
             self._measure,
             self.element_count,

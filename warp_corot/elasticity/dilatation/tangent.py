@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import warp as wp
 
 from warp_corot.elasticity.tangent import ElementTangent, Tangent
-from warp_corot.kernels.elements import shared_dilatation
-from warp_corot.kernels.elements import shared_rows as kernels
+from warp_corot.kernels.elements import mean_dilatation
+from warp_corot.kernels.elements import mean_dilatation_rows as kernels
 from warp_corot.kernels.elements.dilatation import SMALL, VOLUME, not_held
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ class SharedTangent(Tangent):
         self.shear = field.shear.tangent(exact=exact)
         # The differential of the gradient of a dilatation acts in each element separately.
         self._turns = (exact or field.of is not VOLUME) and field.of is not SMALL
-        own = shared_dilatation.own_differential(field.of), self._material, shared_dilatation.DilatedMaterial
+        own = mean_dilatation.own_differential(field.of), self._material, mean_dilatation.DilatedMaterial
         self._of_elements = ElementTangent(field, *own)
         self._holds = field.of.holding is not not_held
         self._version = -1
@@ -80,8 +80,8 @@ class SharedTangent(Tangent):
         if self._turns or self._holds:
             self._of_elements.add_diagonal(blocks)
 
-    def _material(self) -> shared_dilatation.DilatedMaterial:
-        material = shared_dilatation.DilatedMaterial()
+    def _material(self) -> mean_dilatation.DilatedMaterial:
+        material = mean_dilatation.DilatedMaterial()
         material.isotropic, material.shared = self.field.isotropic, self._shared
         material.turning = float(self._turns)
         return material

@@ -13,7 +13,7 @@ COUNT_STRIDE = 32
 
 
 @wp.struct
-class LeftOut:
+class DegenerateList:
     """Subtrees with left-out leaves, in several lists.
 
     One list would be slow: atomic additions to one number that return its former value take 5 ns each.
@@ -30,14 +30,14 @@ class LeftOut:
     // One addition for all threads of a warp; nobody waits for it here.
     const int lane = threadIdx.x & 31;
     const unsigned all = to_come + lane >= 32 ? 0xffffffffu : (1u << (to_come + lane)) - 1;
-    const unsigned those = __ballot_sync(all, is_left_out);
+    const unsigned those = __ballot_sync(all, is_degenerate);
     if (lane == 0 && those != 0) return atomicAdd(&wp::index(lists.counts, {COUNT_STRIDE} * list), __popc(those));
     return 0;
 #else
     return wp::index(lists.counts, {COUNT_STRIDE} * list);
 #endif
 """)
-def reserve(lists: LeftOut, list: int, is_left_out: bool, to_come: int) -> int:
+def reserve(lists: DegenerateList, list: int, is_degenerate: bool, to_come: int) -> int:
     """Make room on a list for the threads of a warp that have left leaves out.
 
     ``to_come`` is the number of threads from this one on. All threads of a warp must call this, and then ``append``.
@@ -60,7 +60,7 @@ def reserve(lists: LeftOut, list: int, is_left_out: bool, to_come: int) -> int:
     wp::index(lists.counts, {COUNT_STRIDE} * list) = reserved + 1;
 #endif
 """)
-def append(lists: LeftOut, list: int, reserved: int, place: int, mask: int, to_come: int):
+def append(lists: DegenerateList, list: int, reserved: int, place: int, mask: int, to_come: int):
     """Put a subtree on a list, at the place that ``reserve`` made for it, unless its mask is zero."""
     ...
 
@@ -80,13 +80,13 @@ def list_of(block: int):
     return any != 0;
 #endif
 """)
-def any_left_out(lists: LeftOut) -> bool:
+def any_degenerate(lists: DegenerateList) -> bool:
     """Whether any list has an entry; all threads of a block must call this together."""
     ...
 
 
 @wp.func
-def entry_count(lists: LeftOut, list: int):
+def entry_count(lists: DegenerateList, list: int):
     return lists.counts[COUNT_STRIDE * list]
 
 
@@ -103,7 +103,7 @@ def entry_count(lists: LeftOut, list: int):
     for (int list = 0; list < {LISTS}; ++list) wp::index(lists.counts, {COUNT_STRIDE} * list) = 0;
 #endif
 """)
-def leave(lists: LeftOut, blocks: int):
+def leave(lists: DegenerateList, blocks: int):
     """Say that this block is done; the last of all blocks empties the lists."""
     ...
 
@@ -142,7 +142,7 @@ def leave(lists: LeftOut, blocks: int):
     return at;
 #endif
 """)
-def leaves_of_entries(lists: LeftOut, begin: int, entries: int, k: int) -> int:
+def leaves_of_entries(lists: DegenerateList, begin: int, entries: int, k: int) -> int:
     """For k < 0, list the leaves of up to 32 entries for the threads of a warp and return their number; otherwise
     return the k-th of them.
 

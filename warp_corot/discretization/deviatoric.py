@@ -11,12 +11,12 @@ if TYPE_CHECKING:
     from .plan import FlatLeaves
 
 
-def shear_only(whole: Discretization) -> Discretization:
+def deviatoric(whole: Discretization) -> Discretization:
     """A discretization with zero in place of lambda; all other data are those of ``whole`` and follow its changes."""
-    return cast("Discretization", _ShearOnly(whole))
+    return cast("Discretization", _Deviatoric(whole))
 
 
-class _ShearOnly:
+class _Deviatoric:
     def __init__(self, whole: Discretization):
         self._whole, self._zeros = whole, dict[str, tuple[wp.array, wp.array]]()
 
@@ -24,7 +24,7 @@ class _ShearOnly:
         return getattr(self.__dict__["_whole"], name)
 
     @property
-    def discretization(self) -> _ShearOnly:
+    def discretization(self) -> _Deviatoric:
         return self
 
     @property

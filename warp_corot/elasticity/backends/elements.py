@@ -9,8 +9,8 @@ import warp as wp
 from warp_corot.discretization.plan import Plan
 from warp_corot.kernels.elements.forces import repair_forces, scatter_forces
 from warp_corot.kernels.elements.general_cpu import scatter_listed_elements
-from warp_corot.kernels.elements.lanes import LANES
-from warp_corot.kernels.elements.law_lanes import NativeLaw
+from warp_corot.kernels.elements.native_laws import NativeLaw
+from warp_corot.kernels.elements.simd8 import LANES
 from warp_corot.kernels.subtrees.cpu import scatter_subtrees
 
 if TYPE_CHECKING:
@@ -50,16 +50,16 @@ class ByElements:
         self._eights = scatter_listed_elements(kind, Material, self._lanes)
         self._repair = repair_forces(kind, Material, stress)
         #: How many are left out, then which.
-        self._left_out = wp.zeros(1, dtype=wp.int32, device=self._device)
+        self._degenerate = wp.zeros(1, dtype=wp.int32, device=self._device)
 
     def __call__(self, elements: Any, count: int, material: Any, u: wp.array, f: wp.array) -> None:
         """Add the forces [N] of the first ``count`` elements to f; ``material`` is the struct that the law reads."""
         if self._lanes is None:
             wp.launch(self._each, count, [elements, material, u], [f], device=self._device)
             return
-        if self._lanes.leaves_out and len(self._left_out) <= count:
-            self._left_out = wp.zeros(count + 1, dtype=wp.int32, device=self._device)
-        outputs = [f, self._left_out]
+        if self._lanes.leaves_out and len(self._degenerate) <= count:
+            self._degenerate = wp.zeros(count + 1, dtype=wp.int32, device=self._device)
+        outputs = [f, self._degenerate]
         for batch, kernel in zip(self._batches, self._subtrees, strict=True):
             inputs = [batch.subtrees, batch.count, material, u]
             wp.launch(kernel, -(-batch.count // LANES), inputs, outputs, device=self._device)
@@ -68,4 +68,4 @@ class ByElements:
             inputs = [elements, single, self._listed, material, u]
             wp.launch(self._eights, -(-single // LANES), inputs, outputs, device=self._device)
         if self._lanes.leaves_out:
-            wp.launch(self._repair, 1, [elements, material, u], [self._left_out, f], device=self._device)
+            wp.launch(self._repair, 1, [elements, material, u], [self._degenerate, f], device=self._device)

@@ -1,4 +1,4 @@
-"""Elements on the CPU, eight at a time in the lanes of its vector registers; see ``kernels.elements.lanes``."""
+"""Elements on the CPU, eight at a time in the lanes of its vector registers; see ``kernels.elements.simd8``."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from warp_corot.inputs.cpu_threads import launch, part_of
 from warp_corot.kernels.corotated.anisotropic import FibreMaterial
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.elements import GeneralElements
-from warp_corot.kernels.elements.lanes import LANES
+from warp_corot.kernels.elements.simd8 import LANES
 
 
 class Lanes:
@@ -31,7 +31,7 @@ class Lanes:
         #: Which of the material's values are those of the elements; None: all.
         self._bounds: tuple[int, int] | None = None
         #: How many, then which.
-        self._left_out = wp.zeros(self.count + 1 if repair else 0, dtype=wp.int32, device="cpu")
+        self._degenerate = wp.zeros(self.count + 1 if repair else 0, dtype=wp.int32, device="cpu")
 
     def scatter_forces(self, material: IsotropicMaterial | FibreMaterial, u: wp.array, f: wp.array) -> None:
         """Add the forces of displacements u to f, both vec4 [N]; ``material`` is the struct of all elements that
@@ -39,9 +39,9 @@ class Lanes:
         if self._bounds is not None:
             material = part_of(material, *self._bounds)
         inputs = [self._general, self.count, material, u]
-        launch(self._scatter, -(-self.count // LANES), inputs, [f, self._left_out], device="cpu")
+        launch(self._scatter, -(-self.count // LANES), inputs, [f, self._degenerate], device="cpu")
         if self._repair is not None:
-            launch(self._repair, 1, [self.elements, material, u], [self._left_out, f], device="cpu")
+            launch(self._repair, 1, [self.elements, material, u], [self._degenerate, f], device="cpu")
 
     def part(self, begin: int, end: int) -> Lanes:
         """The launches of some of the elements."""

@@ -14,14 +14,14 @@ from warp_corot.inputs.cpu_threads import Team, launch
 from warp_corot.inputs.loading import load
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import Dilatation
-from warp_corot.kernels.elements.dilatation_lanes import (
+from warp_corot.kernels.elements.elements import GeneralElements
+from warp_corot.kernels.elements.grouped_simd8 import (
     GROUPS,
     GroupedMaterial,
     order_elements,
     scatter_grouped_elements,
 )
-from warp_corot.kernels.elements.elements import GeneralElements
-from warp_corot.kernels.elements.law_lanes import LawInLanes
+from warp_corot.kernels.elements.native_laws import IsotropicLaw
 from warp_corot.kernels.subtrees.cpu import DilatingMaterial
 
 
@@ -33,7 +33,7 @@ class Dilating:
         lam: Gives lambda [Pa] as elements hold it.
         plan: The plan whose elements are grouped.
         kind: The struct of these elements.
-        starts, members, live: The groups in the form of ``kernels.elements.shared_dilatation.share_in_groups``.
+        starts, members, live: The groups in the form of ``kernels.elements.mean_dilatation.share_in_groups``.
 
     Attributes:
         count: Number of groups in launches.
@@ -61,7 +61,7 @@ class Dilating:
         self._of_groups = GroupedMaterial()
         self._of_groups.starts, self._of_groups.live = starts, live
         #: How many, then which.
-        self._left_out = wp.zeros(most + 1, dtype=wp.int32, device="cpu")
+        self._degenerate = wp.zeros(most + 1, dtype=wp.int32, device="cpu")
 
     def material(self, isotropic: IsotropicMaterial, tolerance: float | None = None) -> DilatingMaterial:
         """The struct of subtrees.
@@ -83,7 +83,7 @@ class Dilating:
         part = copy(self)
         part.count, part._of_groups, part._of_subtrees = end - begin, copied(self._of_groups), Kept(_material)
         part._of_groups.starts = self._of_groups.starts[begin : end + 1]
-        part._left_out = wp.zeros_like(self._left_out)
+        part._degenerate = wp.zeros_like(self._degenerate)
         return part
 
     @property
@@ -110,23 +110,23 @@ class Dilating:
         inputs = [self._plan.elements, material, lam, self._members, self._live]
         wp.launch(self._order, most, inputs, [self._general, grouped], device="cpu")
 
-    def kernel(self, law: LawInLanes) -> wp.Kernel:
+    def kernel(self, law: IsotropicLaw) -> wp.Kernel:
         """The kernel that adds the forces of groups under a law."""
         return scatter_grouped_elements(law, self.of)
 
-    def scatter_groups(self, law: LawInLanes, u: wp.array, f: wp.array, repair: wp.Kernel | None = None) -> None:
+    def scatter_groups(self, law: IsotropicLaw, u: wp.array, f: wp.array, repair: wp.Kernel | None = None) -> None:
         """Add the forces of groups at displacements u to f, both vec4 [N].
 
         Args:
-            law: A law of ``kernels.elements.law_lanes``.
+            law: A law of ``kernels.elements.native_laws``.
             repair: Computes the elements that the law leaves out, if any.
         """
         if not self.count:
             return
         inputs = [self._general, self.count, self._of_groups, u]
-        launch(self.kernel(law), -(-self.count // GROUPS), inputs, [f, self._left_out], device="cpu")
+        launch(self.kernel(law), -(-self.count // GROUPS), inputs, [f, self._degenerate], device="cpu")
         if repair is not None:
-            launch(repair, 1, [self._general, self._of_groups.isotropic, u], [self._left_out, f], device="cpu")
+            launch(repair, 1, [self._general, self._of_groups.isotropic, u], [self._degenerate, f], device="cpu")
 
 
 def _material(isotropic: IsotropicMaterial, lam: wp.array, tolerance: float | None) -> DilatingMaterial:

@@ -9,13 +9,13 @@ import oracle
 import pytest
 import warp as wp
 from cases import edge_scale, mixed_forest, oracle_mesh
-from left_out_launches import Launches
+from degenerate_launches import Launches
 
 import warp_corot as wc
 from warp_corot.discretization.planning.fixed import ForcePlan
-from warp_corot.elasticity.corotated.left_out import LeftOutLeaves
+from warp_corot.elasticity.corotated.degenerate import DegenerateLeaves
 from warp_corot.elasticity.structs import isotropic_material
-from warp_corot.kernels.subtrees.left_out import COUNT_STRIDE, LISTS
+from warp_corot.kernels.subtrees.degenerate import COUNT_STRIDE, LISTS
 
 TOLERANCE = 1e-5  # of the largest force, as in test_miscompile
 
@@ -25,10 +25,10 @@ def expected(forest, u, young):
     reference, x = oracle_mesh(forest), forest.points + u.astype(np.float32).astype(float)
     F = reference.deformation_gradients(x)
     sigma = np.linalg.svd(F, compute_uv=False)
-    sound = np.ones(len(forest.points), bool)
-    sound[forest.tets[sigma[:, 1] + sigma[:, 2] * np.sign(np.linalg.det(F)) < 0.1 * sigma[:, 0]]] = False
+    valid = np.ones(len(forest.points), bool)
+    valid[forest.tets[sigma[:, 1] + sigma[:, 2] * np.sign(np.linalg.det(F)) < 0.1 * sigma[:, 0]]] = False
     _, forces = oracle.evaluate("corotated", reference, x, *oracle.lame(young, 0.4))
-    return forces, sound
+    return forces, valid
 
 
 @pytest.mark.parametrize(
@@ -47,9 +47,9 @@ def test_listed_leaves_get_their_forces(share, uniform, device, rng):
     body.displacements = u
     launches = Launches(body)
     assert {batch.shape for batch in launches.plan.batches} == {0, 1, 2}
-    forces, sound = expected(forest, u, young)
+    forces, valid = expected(forest, u, young)
     for _ in range(2):
-        error = np.abs(launches.forces() - forces)[sound].max()
+        error = np.abs(launches.forces() - forces)[valid].max()
         assert error < TOLERANCE * np.abs(forces).max()
         assert (launches.count > 0) == (share > 0)
         assert (launches.listed.own.counts.numpy() == 0).all()
@@ -68,13 +68,13 @@ def test_whole_subtrees_get_their_forces(device, rng):
     (batch,) = launches.plan.batches
     for u, share in ((over, 1.0), (np.where(half, over, noise), 0.5), (noise, 0.0), (over, 1.0)):
         body.displacements = u
-        forces, sound = expected(forest, u, 1e4)
-        assert sound.mean() > 0.9
+        forces, valid = expected(forest, u, 1e4)
+        assert valid.mean() > 0.9
         for _ in range(3):
-            assert np.abs(launches.forces() - forces)[sound].max() < TOLERANCE * np.abs(forces).max()
-        left_out = batch.flagged.numpy()[: batch.count]
-        assert abs(np.mean(left_out == 255) - share) < 0.1
-        assert share == 0.5 or np.isin(left_out, [0, 255]).all()
+            assert np.abs(launches.forces() - forces)[valid].max() < TOLERANCE * np.abs(forces).max()
+        degenerate = batch.flagged.numpy()[: batch.count]
+        assert abs(np.mean(degenerate == 255) - share) < 0.1
+        assert share == 0.5 or np.isin(degenerate, [0, 255]).all()
 
 
 def test_one_bad_leaf_is_left_out_alone(device, rng):
@@ -91,13 +91,13 @@ def test_one_bad_leaf_is_left_out_alone(device, rng):
     (batch,) = launches.plan.batches
     bits = np.unpackbits(batch.flagged.numpy()[: batch.count, None], axis=1, bitorder="little")
     leaves = batch.subtrees.first.numpy()[:, None] + np.arange(8)
-    left_out = np.zeros(len(forest.tets), bool)
-    left_out[leaves[bits.astype(bool)]] = True
+    degenerate = np.zeros(len(forest.tets), bool)
+    degenerate[leaves[bits.astype(bool)]] = True
     det = np.linalg.det(F)
     # Between the two bounds, rounding and the shape of F decide.
-    assert left_out[det < 0.029].all()
-    assert not left_out[det > 0.031].any()
-    assert 0 < left_out.sum() < 8
+    assert degenerate[det < 0.029].all()
+    assert not degenerate[det > 0.031].any()
+    assert 0 < degenerate.sum() < 8
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 1.0])
@@ -110,7 +110,7 @@ def test_every_leaf_may_be_listed(share, device, rng):
     u = np.where(far, 1.0, 0.08) * edge_scale(forest) * rng.uniform(-1, 1, forest.points.shape)
     body.displacements = u
     plan = ForcePlan.of_forest(forest, None, body.device, grouped=False)
-    listed = LeftOutLeaves.of(plan, body.device)
+    listed = DegenerateLeaves.of(plan, body.device)
     # Distributed to lists of different lengths, some of them empty.
     (batch,) = plan.batches
     counts, entries = listed.own.counts.numpy(), listed.own.entries.numpy().reshape(LISTS, listed.own.room, 2)
@@ -127,6 +127,6 @@ def test_every_leaf_may_be_listed(share, device, rng):
         body.state.displacements,
         f,
     )
-    forces, sound = expected(forest, u, young)
-    assert np.abs(f.numpy()[:, :3] - forces)[sound].max() < TOLERANCE * np.abs(forces).max()
+    forces, valid = expected(forest, u, young)
+    assert np.abs(f.numpy()[:, :3] - forces)[valid].max() < TOLERANCE * np.abs(forces).max()
     assert (listed.own.counts.numpy()[: LISTS * COUNT_STRIDE] == 0).all()

@@ -10,7 +10,7 @@ from warp_corot.discretization.elements import Elements
 from warp_corot.discretization.plan import Plan
 from warp_corot.discretization.subtrees import Batch, Sharing
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
-from warp_corot.kernels.subtrees.left_out import COUNT_STRIDE, LIST_BLOCK, LISTS, LeftOut
+from warp_corot.kernels.subtrees.degenerate import COUNT_STRIDE, LIST_BLOCK, LISTS, DegenerateList
 from warp_corot.kernels.subtrees.memory import BLOCK
 from warp_corot.kernels.subtrees.repair import repair_listed_own, repair_listed_shared
 
@@ -19,7 +19,7 @@ from warp_corot.kernels.subtrees.repair import repair_listed_own, repair_listed_
 BLOCKS = 6
 
 
-class LeftOutLeaves:
+class DegenerateLeaves:
     """Lists of all leaves with own rotations, and of each batch that shares its roots' rotations.
 
     Args:
@@ -28,7 +28,7 @@ class LeftOutLeaves:
     """
 
     #: The argument of kernels that write no list.
-    NONE: ClassVar[LeftOut] = LeftOut()
+    NONE: ClassVar[DegenerateList] = DegenerateList()
 
     def __init__(self, own: list[int], shared: list[Batch], device: wp.Device):
         self.own = _empty_lists(own, device)
@@ -38,7 +38,7 @@ class LeftOutLeaves:
         self._device = device
 
     @classmethod
-    def of(cls, plan: Plan, device: wp.Device) -> LeftOutLeaves:
+    def of(cls, plan: Plan, device: wp.Device) -> DegenerateLeaves:
         """The lists of a plan."""
         own = [batch.count for batch in plan.batches if batch.sharing is Sharing.OWN]
         return cls([*own, len(plan.flat)], [batch for batch in plan.batches if batch.sharing is Sharing.ROOT], device)
@@ -46,7 +46,7 @@ class LeftOutLeaves:
     #: The kernel for leaves with own rotations.
     kernel = (repair_listed_own, LIST_BLOCK)
 
-    def list_of(self, batch: Batch) -> LeftOut:
+    def list_of(self, batch: Batch) -> DegenerateList:
         """The list that a batch's kernel appends to."""
         if batch.sharing is Sharing.OWN:
             return self.own
@@ -71,9 +71,9 @@ class LeftOutLeaves:
         )
 
 
-def _empty_lists(launches: list[int], device: wp.Device) -> LeftOut:
+def _empty_lists(launches: list[int], device: wp.Device) -> DegenerateList:
     """Empty lists with room for all subtrees of these launches, whose thread blocks take the lists in turn."""
-    listed = LeftOut()
+    listed = DegenerateList()
     listed.counts = wp.zeros((LISTS + 1) * COUNT_STRIDE, dtype=wp.int32, device=device)
     listed.room = BLOCK * sum(-(-count // (BLOCK * LISTS)) for count in launches)
     listed.entries = wp.zeros(LISTS * listed.room, dtype=wp.vec2i, device=device)

@@ -1,4 +1,4 @@
-"""Constitutive laws on the CPU: eight subtrees, or eight elements, at a time; see ``kernels.elements.law_lanes``."""
+"""Constitutive laws on the CPU: eight subtrees, or eight elements, at a time; see ``kernels.elements.native_laws``."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from warp_corot.discretization.plan import Plan
 from warp_corot.elasticity.model import Law, LawField
 from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.elements.general_cpu import rest_matrices, scatter_law_elements
-from warp_corot.kernels.elements.lanes import LANES
+from warp_corot.kernels.elements.simd8 import LANES
 from warp_corot.kernels.subtrees.cpu import scatter_law_subtrees
 from warp_corot.mesh import TetForest
 
-from .dilating import Dilating
 from .divided import InLanes
-from .lanes import Lanes, as_general
+from .mean_dilatation import Dilating
+from .simd8 import Lanes, as_general
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
 
 
-class LawLanesField(InLanes, LawField):
+class LawSimd8Field(InLanes, LawField):
     """Complete subtrees of a forest as units of work, other elements one by one, eight of each in the lanes.
 
     Args:

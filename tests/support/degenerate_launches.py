@@ -4,9 +4,9 @@ import numpy as np
 import warp as wp
 
 from warp_corot.discretization.planning.fixed import ForcePlan
-from warp_corot.elasticity.corotated.left_out import LeftOutLeaves
+from warp_corot.elasticity.corotated.degenerate import DegenerateLeaves
 from warp_corot.elasticity.structs import isotropic_material
-from warp_corot.kernels.subtrees.cuda import FLAT, Stretch, scatter_stretches
+from warp_corot.kernels.subtrees.cuda import FLAT, WorkRange, scatter_body
 from warp_corot.kernels.subtrees.memory import BLOCK
 
 
@@ -16,7 +16,7 @@ class Launches:
     def __init__(self, body):
         self.body, self.device = body, body.device
         self.plan = plan = ForcePlan.of_forest(body.mesh, None, body.device, grouped=False)
-        self.listed = LeftOutLeaves.of(plan, body.device)
+        self.listed = DegenerateLeaves.of(plan, body.device)
         self.rows, self.blocks = [], 0
         for batch in plan.batches:
             if self.device.is_cpu:
@@ -25,14 +25,14 @@ class Launches:
             self._add(batch.count, batch.shape, batch.subtrees, batch.flagged)
         if len(plan.flat):
             self._add(len(plan.flat), FLAT)
-        self.stretches = wp.array(self.rows, dtype=Stretch, device=self.device)
+        self.ranges = wp.array(self.rows, dtype=WorkRange, device=self.device)
 
     def _add(self, count, shape, subtrees=None, flagged=None):
-        stretch = Stretch()
-        stretch.begin, stretch.count, stretch.shape = self.blocks, count, shape
+        one = WorkRange()
+        one.begin, one.count, one.shape = self.blocks, count, shape
         if subtrees is not None:
-            stretch.subtrees, stretch.flagged = subtrees, flagged
-        self.rows.append(stretch)
+            one.subtrees, one.flagged = subtrees, flagged
+        self.rows.append(one)
         self.blocks += -(-count // BLOCK)
 
     def forces(self):
@@ -40,10 +40,10 @@ class Launches:
         own, f = body.discretization, wp.zeros_like(body.state.displacements)
         material = isotropic_material([own.mu, own.lam, own.material_stride])
         wp.launch(
-            scatter_stretches(body.discretization.material_stride == 0),
+            scatter_body(body.discretization.material_stride == 0),
             dim=self.blocks * BLOCK,
             inputs=[
-                self.stretches,
+                self.ranges,
                 flat.elements,
                 flat.leaves,
                 material,

@@ -14,8 +14,8 @@ from .constitutive import IsotropicMaterial
 from .dilatation import MOST, Dilatation
 from .elements import GeneralElements, frame, rest_volume
 from .general_cpu import rest_inverse_of
-from .lanes import headers, scatter_lanes
-from .law_lanes import LawInLanes, elastic
+from .native_laws import IsotropicLaw, elastic
+from .simd8 import headers, scatter_simd8
 
 wp.set_module_options({"enable_backward": False})
 
@@ -35,14 +35,14 @@ class GroupedMaterial:
 
 
 @functools.cache
-def scatter_grouped_elements(law: LawInLanes, of: Dilatation) -> wp.Kernel:
-    """Forces of a law of ``law_lanes`` with a shared dilatation; a thread is ``GROUPS`` groups.
+def scatter_grouped_elements(law: IsotropicLaw, of: Dilatation) -> wp.Kernel:
+    """Forces of a law of ``native_laws`` with a shared dilatation; a thread is ``GROUPS`` groups.
 
     The corotated law lists what it leaves out.
     """
     of_law, kind = elastic(law, "material.isotropic"), f"corot::{of.lanes}, {GROUPS}, {MOST}"
     call = f"corot::scatter_groups<{kind}>({of_law.code}, units, block, count, material, u, f, missed)"
-    return scatter_lanes(call, GeneralElements, GroupedMaterial, wp.int32, headers("groups8", of_law.header))
+    return scatter_simd8(call, GeneralElements, GroupedMaterial, wp.int32, headers("groups8", of_law.header))
 
 
 @functools.cache

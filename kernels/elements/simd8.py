@@ -61,7 +61,7 @@ def on_cpu(*code: str, otherwise: str = "") -> str:
 
 
 @functools.cache
-def scatter_lanes(
+def scatter_simd8(
     call: str, Units: type, Material: type, missed_type: type, native: wp.ModuleBuildOptions
 ) -> wp.Kernel:
     """The kernel that adds forces on the CPU; a thread is eight units.
@@ -86,7 +86,7 @@ def scatter_lanes(
     ): ...
 
     @unique_kernel(native=native)
-    def scatter_lanes(
+    def scatter_simd8(
         # In
         units: Units,
         count: int,
@@ -98,4 +98,4 @@ def scatter_lanes(
     ):
         eight_units(units, wp.tid(), count, material, u, f, missed)
 
-    return scatter_lanes
+    return scatter_simd8

@@ -12,10 +12,10 @@ import warp as wp
 
 from warp_corot.discretization.slots import Slots
 from warp_corot.inputs.cpu_threads import Regions, Team
-from warp_corot.kernels.elements.lanes import LANES
+from warp_corot.kernels.elements.simd8 import LANES
 
-from .dilating import Dilating
-from .lanes import Lanes
+from .mean_dilatation import Dilating
+from .simd8 import Lanes
 
 
 class Piece(Protocol):

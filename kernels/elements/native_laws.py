@@ -31,10 +31,10 @@ LAWS = {"corotated": "Corotated", "linear": "Linear", "stvk": "StVenantKirchhoff
 STRESSLESS = "stressless"
 
 #: An isotropic law: a name, or the terms (share, alpha) of Ogden's.
-LawInLanes = str | tuple[tuple[float, float], ...]
+IsotropicLaw = str | tuple[tuple[float, float], ...]
 
 
-def elastic(law: LawInLanes, material: str = "material") -> NativeLaw:
+def elastic(law: IsotropicLaw, material: str = "material") -> NativeLaw:
     """An isotropic law with an ``IsotropicMaterial``."""
     if law == STRESSLESS:
         return NativeLaw("corot::Stressless{}")

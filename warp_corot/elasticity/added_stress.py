@@ -13,10 +13,10 @@ from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.elements import Elements
 from warp_corot.discretization.plan import Plan
 from warp_corot.kernels.elements.forces import element_energies
-from warp_corot.kernels.elements.law_lanes import NativeLaw
+from warp_corot.kernels.elements.native_laws import NativeLaw
 
+from .backends.elements import ByElements
 from .model import ForceField, SmallForces
-from .paths.elements import ByElements
 from .stress_law import ElementMaterial
 from .structs import forwards
 from .tangent import ElementTangent, Tangent
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @forwards("law", "shares_dilatation", "find_members", "rotation_level", "elapsed", "complete_step", "relax_fully")
 @forwards("law", "write_von_mises", "state", "reset", "load_kernels", "note", "derive", "take_material", "follow")
-class BesideField(ForceField):
+class AddedStressField(ForceField):
     """The forces of a law and of an additional stress in all elements.
 
     Args:
@@ -129,7 +129,7 @@ class Stiffest:
         field: The field.
     """
 
-    def __init__(self, field: BesideField):
+    def __init__(self, field: AddedStressField):
         self._field, self.state_kept = field, field.at_rest
 
     def add_forces(self, u: wp.array, f: wp.array) -> None:
@@ -142,7 +142,7 @@ class SumTangent(Tangent):
     """The sum of two stiffnesses.
 
     Args:
-        first, second: They.
+        first, second: The two.
     """
 
     def __init__(self, first: Tangent, second: Tangent):

@@ -1,4 +1,4 @@
-"""Corotated forces of orthotropic elements on the CPU, eight to the lanes of vector registers; see ``elements.lanes``.
+"""Corotated forces of orthotropic elements on the CPU, eight to the lanes of vector registers; see ``elements.simd8``.
 
 Both kinds of elements come as general ones, with M multiplied into their rest matrix: F M = M + (d1 d2 d3) B. An
 element of which no rotation is found adds nothing and is put on a list, which ``forces.repair_forces`` goes through.
@@ -13,7 +13,7 @@ import warp as wp
 
 from warp_corot.kernels.elements.elements import ForestElements, GeneralElements, frame, rest_volume
 from warp_corot.kernels.elements.general_cpu import rest_inverse_of
-from warp_corot.kernels.elements.lanes import headers, scatter_lanes
+from warp_corot.kernels.elements.simd8 import headers, scatter_simd8
 from warp_corot.kernels.modules import unique_kernel
 
 from .anisotropic import FibreMaterial, OrthotropicMaterial, axes_of, filled
@@ -21,7 +21,7 @@ from .anisotropic import FibreMaterial, OrthotropicMaterial, axes_of, filled
 wp.set_module_options({"enable_backward": False})
 
 #: Corotated forces of orthotropic elements, whose inverse rest matrix is Dm^-1 M, and forces of their active stress.
-scatter_anisotropic_lanes = scatter_lanes(
+scatter_anisotropic_simd8 = scatter_simd8(
     "corot::scatter_orthotropic(units, block, count, material, u, f, missed)",
     GeneralElements,
     FibreMaterial,
@@ -44,7 +44,7 @@ def turn_element(
 
 @functools.cache
 def turn_elements(Elements: type) -> wp.Kernel:
-    """Elements of either kind as ``scatter_anisotropic_lanes`` wants them: Dm^-1 M, and the filled volume."""
+    """Elements of either kind as ``scatter_anisotropic_simd8`` wants them: Dm^-1 M, and the filled volume."""
 
     @unique_kernel()
     def turn_elements(

@@ -36,7 +36,7 @@ from warp_corot.kernels.tables.cluster_layout import (
 )
 from warp_corot.mesh import TetForest
 
-from .lanes import as_general
+from .simd8 import as_general
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization

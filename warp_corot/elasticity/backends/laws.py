@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 from warp_corot.elasticity.model import Law, LawField
 
-from .cuda import LawCudaField
-from .law_lanes import LawLanesField
+from .law_cuda import LawCudaField
+from .law_simd8 import LawSimd8Field
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
@@ -21,5 +21,5 @@ def law_field(law: Law, discretization: Discretization, deterministic: bool = Fa
         discretization: The mesh and the material.
         deterministic: As for every field.
     """
-    kind = LawLanesField if discretization.device.is_cpu else LawCudaField
+    kind = LawSimd8Field if discretization.device.is_cpu else LawCudaField
     return kind(discretization, law, deterministic=deterministic)
