@@ -7,7 +7,7 @@ import warp as wp
 from warp_corot.elasticity.structs import isotropic_material
 from warp_corot.kernels.corotated.kept_gradients import PLACES, KeptGradients, add_kept_product
 from warp_corot.kernels.elements.elements import GeneralElements
-from warp_corot.kernels.elements.lanes import LANES
+from warp_corot.kernels.elements.simd8 import LANES
 from warp_corot.kernels.elements.stiffness_products import add_stiffness_product
 from warp_corot.kernels.newton import implicit as kernels
 from warp_corot.solvers.implicit.block_diagonal import BlockDiagonal
