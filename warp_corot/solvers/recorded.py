@@ -30,8 +30,9 @@ from .system import System
 #: long as ten steps; and where one launch makes many steps. ``Stepper.graph_steps`` limits both.
 CPU_GRAPH_STEPS = 8
 BLOCK_STEPS = 1024
-#: A segment of up to so many steps is recorded whole once it has come so often: recording it takes as long as hundreds
-#: of replays, which would be felt in a scene that has to keep up.
+#: A segment of up to so many steps is recorded whole when it comes a second time; if the length of steps follows the
+#: state, once it has come so often: then there are many different ones, and recording one takes as long as hundreds of
+#: replays, which would be felt in a scene that has to keep up.
 SHORT, OFTEN = 8, 64
 #: The most graphs that are kept.
 MOST_GRAPHS = 256
@@ -164,7 +165,7 @@ class RecordedSteps:
         self._follow_bodies()
         if segment.count <= SHORT:
             self._asked[segment] += 1
-        if segment in self._graphs or self._asked[segment] > OFTEN:
+        if segment in self._graphs or self._asked[segment] > (OFTEN if self._safe_step is not None else 1):
             self._replay_recording(segment)
             return
         if self.in_blocks:
