@@ -193,7 +193,7 @@ def graded_ball(level: int) -> Subject:
 
 def new_body(subject: Subject, device: wp.Device) -> wc.SoftBody:
     """One copy with its fixed nodes."""
-    body = wc.SoftBody(subject.mesh, wc.Isotropic(**subject.material), device=device)
+    body = wc.SoftBody(subject.mesh, wc.Isotropic(**subject.material), device=device, threads=1)
     body.fix(subject.held)
     return body
 

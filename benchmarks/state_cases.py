@@ -132,7 +132,7 @@ class Bench:
             yield GENERAL, wc.TetMesh(mesh.points, mesh.tets), self.fill
 
     def body(self, mesh: wc.TetForest | wc.TetMesh, material: wc.Isotropic | wc.TransverselyIsotropic) -> wc.SoftBody:
-        return wc.SoftBody(mesh, material, worlds=self.subject.worlds, device=self.device)
+        return wc.SoftBody(mesh, material, worlds=self.subject.worlds, device=self.device, threads=1)
 
     def isotropic(self, share: np.ndarray | float) -> wc.Isotropic:
         return wc.Isotropic(MATERIAL["young"] * share, self.subject.poisson, MATERIAL["density"] * share)

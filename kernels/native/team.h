@@ -11,8 +11,9 @@ typedef unsigned long long address;
 typedef int result;  // Warp has a macro int(x)
 
 // TICKET is that of the present work, CALL and GIVEN are the function that computes a part and its first argument, MODE is
-// the caller's floating-point mode. LOCK is set while a thread shares work; until ALONE, in ticks, it shares none. From OWN on, each part has a line: twice the
-// ticket once it is begun and one more once it has ended; and whether its thread sleeps in a read from a pipe.
+// the caller's floating-point mode. LOCK is set while a thread shares work; until ALONE, in ticks, it shares none. From OWN
+// on, each part has a line: twice the ticket once it is begun and one more once it has ended; and whether its thread sleeps
+// in a read from a pipe.
 enum { TICKET, CALL, GIVEN, MODE, LOCK, ALONE, STOP, YIELD, PAUSE, WRITE, PIPE, OWN, MOST = 1024 };
 // Tries to see a change before another thread's part is taken, before the core is given to others that need it, before
 // the thread sleeps for microseconds, and until work comes again.
@@ -23,6 +24,8 @@ enum { LONG = 30000, TIMES = 16 };
 
 static inline address* word_of(address team, int name) { return reinterpret_cast<address*>(team) + 8 * name; }
 static inline address load_word(address team, int name) { return __atomic_load_n(word_of(team, name), __ATOMIC_ACQUIRE); }
+
+static inline result parts_of(address ticket) { return static_cast<result>(ticket % MOST); }
 
 static inline void relax(address team, int tries) {
     if (tries < SPINS) {
@@ -117,11 +120,11 @@ static inline void serve_team(address team, int part) {
         if (ticket != seen) {
             seen = ticket;
             set_mode(team);
-            if (part < ticket % MOST) compute_part(team, part, ticket);
+            if (part < parts_of(ticket)) compute_part(team, part, ticket);
             tries = 0;
         } else if (tries < TRIES) {
             if (tries == PATIENCE)
-                for (int other = 0; other < ticket % MOST; ++other) compute_part(team, other, ticket);
+                for (int other = 0; other < parts_of(ticket); ++other) compute_part(team, other, ticket);
             relax(team, tries);
         } else {
             __atomic_store_n(sleeps, 1, __ATOMIC_SEQ_CST);

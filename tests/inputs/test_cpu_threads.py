@@ -214,6 +214,11 @@ def test_a_small_body_takes_one_thread():
     assert team_for(None, 10**9).parts == core_count()
 
 
+def test_more_than_two_threads_are_chosen_for_larger_bodies(monkeypatch):
+    monkeypatch.setattr("warp_corot.inputs.cpu_threads.core_count", lambda: 16)
+    assert [team_for(None, count * LEAST_ELEMENTS).parts for count in (1, 2, 5, 6, 32, 100)] == [1, 2, 2, 3, 16, 16]
+
+
 def test_the_number_of_threads_is_checked():
     mesh = wc.TetForest.box(cells=(1, 1, 1), cell_size=0.1, level=0)
     with pytest.raises(InputError, match="threads is 0"):

@@ -64,12 +64,15 @@ def random_displacement(mesh, rng, amount):
     return (amount * edge_scale(mesh) * rng.uniform(-1, 1, mesh.points.shape)).astype(np.float32)
 
 
-def simulation(mesh, model, device, *, dt=1e-4, damping=0.0, gravity=(0, 0, 0), material=None, fixed=None):
+def simulation(
+    mesh, model, device, *, dt=1e-4, damping=0.0, gravity=(0, 0, 0), material=None, fixed=None, threads=None
+):
     """One body of the paper's material under a model (a name of MODELS, or a model).
 
     Every element has a dilatation of its own.
     """
-    body = wc.SoftBody(mesh, wc.Isotropic(**(MATERIAL if material is None else material)), device=device)
+    material = wc.Isotropic(**(MATERIAL if material is None else material))
+    body = wc.SoftBody(mesh, material, device=device, threads=threads)
     if fixed is not None:
         body.fix(fixed)
     model = MODELS[model]() if isinstance(model, str) else replace(model, dilatation="element")

@@ -55,9 +55,10 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
             [worlds, 1]; or all, [worlds, T]. Functions of the rest position are evaluated at the elements' centroids.
         worlds: Number of copies.
         device: "cpu", "cuda:0", …; None for Warp's default.
-        threads: Most threads that step the body on the CPU; None: as many as this process may use cores. A body takes
-            one for every 2,048 elements at most, no more than it has worlds if it has several, and one while it is
-            remeshed. Each number has its own rounding, the same in every run.
+        threads: Most threads that step the body on the CPU; None: as many as this process may use cores, but more than
+            two only with 4,096 elements for each. A body takes one for every 2,048 elements at most, no more than it
+            has worlds if it has several, and one while it is remeshed. Each number has its own rounding, the same in
+            every run.
 
     A body that is remeshed (``Simulation(…, remesh=…)``) has other nodes after a pass that changed the mesh: read
     ``node_count`` and the arrays again; views from before raise ``StaleViewError``. Its ``node_`` arrays have room for

@@ -21,6 +21,8 @@ V = TypeVar("V")
 
 #: Time for which a waiting rank sleeps between two checks [s].
 REST = 0.01
+#: Time that ``mpirun`` gets to pass on what a rank says before that rank ends all [s].
+SPOKEN = 0.2
 
 
 @functools.cache
@@ -106,4 +108,5 @@ def _end_all(comm: Any, kind: type[BaseException], error: BaseException, trace: 
     stream = sys.__stderr__ or sys.stderr
     stream.write(f"warp-corot: rank {comm.rank} of {comm.size} ends all others: {kind.__name__}: {error}\n")
     stream.flush()
+    time.sleep(SPOKEN)
     comm.Abort(130 if isinstance(error, KeyboardInterrupt) else 1)

@@ -23,7 +23,8 @@ from .processes import process_count
 
 #: Inputs and outputs of a part's launch, from its number and a function that takes its entries.
 Arguments = Callable[[int, Callable[[Any], Any]], tuple[list, list]]
-#: With fewer elements for each thread, waiting for one another takes longer than they save.
+#: With fewer elements for each thread, waiting for one another takes longer than they save. More than two threads gain
+#: less, and on some machines, in contact, nothing: without ``threads`` each has twice as many elements.
 LEAST_ELEMENTS = 2048
 #: Launches for things that differ in cost have so many parts for each core; fewer things are not worth a second core.
 PARTS, LEAST_THINGS = 4, 8192
@@ -263,7 +264,10 @@ def team_for(threads: int | None, elements: int, worlds: int = 1) -> Team:
     """The team for a body on the CPU: as many threads as are worth it, ``threads`` at most; None: all cores. Threads
     take whole worlds, each of which then moves as it would alone in one thread."""
     most = min(core_count() if threads is None else threads, MOST if worlds == 1 else worlds)
-    return team_of(1 if sys.platform == "win32" else max(min(most, elements // LEAST_ELEMENTS), 1))
+    worth = elements // LEAST_ELEMENTS
+    if threads is None:
+        worth = min(worth, max(worth // 2, 2))
+    return team_of(1 if sys.platform == "win32" else max(min(most, worth), 1))
 
 
 def _recorded(phase: Callable[[int], None], part: int) -> list[wp.Launch]:
