@@ -177,8 +177,10 @@ def take_beta(
         before = scalars[world, RZ]
         scalars[world, BETA] = wp.where(before > wp.float64(0.0), rz / before, wp.float64(0.0))
         scalars[world, RZ] = rz
-        if not is_number(rz) or rz <= wp.float64(0.0):
+        if not is_number(rz):
             stop(status, running, world, BROKEN)
+        elif rz <= wp.float64(0.0):
+            stop(status, running, world, LIMIT)
 
 
 @wp.kernel(enable_backward=False)

@@ -141,8 +141,8 @@ for (int world = team; world < worlds; world += teams) {
         gamma = totals[0]; delta = totals[1]; square = totals[2];
         if (!(square <= 1e300)) found = BROKEN;
         else if (square <= end) found = CONVERGED;
-        else if (done >= most) found = square <= within ? CONVERGED : LIMIT;
-        else if (!(gamma > 0.0)) found = BROKEN;
+        else if (done >= most) found = LIMIT;
+        else if (!(gamma > 0.0)) found = gamma <= 0.0 ? LIMIT : BROKEN;
         if (found != RUNNING) break;
         ++done;
         const double beta = done > 1 ? gamma / before : 0.0;
@@ -174,6 +174,8 @@ for (int world = team; world < worlds; world += teams) {
             *four_at(u, first + i) = times(inverse + 9ll * i, rest);
         }
     }
+    // Next to rounding, nothing is left that iterations could take away, and products may look negative.
+    if (square <= within && !(found == NEGATIVE && done == 1)) found = CONVERGED;
     barrier();
     if (member == 0 && thread == 0) {
         sc[RR] = square;

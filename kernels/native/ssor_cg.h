@@ -115,7 +115,7 @@ sweep([&](int i) {
 double product = for_rows([&](int i) { return dot(half[i], times(pivot + 9ll * i, half[i])); });
 const int room = couplings.nodes.shape[0], contacts = couplings.count.data[0] < room ? couplings.count.data[0] : room;
 int found = RUNNING, done = 0;
-if (!(product > 0.0)) found = BROKEN;
+if (!(product > 0.0)) found = product <= 0.0 ? LIMIT : BROKEN;
 while (found == RUNNING) {
     ++done;
     sweep_back([&](int i) {
@@ -165,11 +165,13 @@ while (found == RUNNING) {
         now = residual();
         if (!(now <= 1e300)) found = BROKEN;
         else if (now <= end) found = CONVERGED;
-        else if (done >= most) found = now <= numbers[END] ? CONVERGED : LIMIT;
+        else if (done >= most) found = LIMIT;
     }
     beta = (float)(after / product);
     product = after;
 }
+// Next to rounding, nothing is left that iterations could take away, and products may look negative.
+if (now <= numbers[END] && !(found == NEGATIVE && done == 1)) found = CONVERGED;
 numbers[RR] = now;
 status.data[world] = found;
 iterations.data[world] = done;
