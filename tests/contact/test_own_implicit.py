@@ -68,7 +68,8 @@ def test_an_organ_slips_at_the_angle_of_friction(brick, device, share):
     x, v = (array.numpy()[:, 0].astype(float).mean() for array in (body.positions, body.velocities))
     before = sim.solves.linear_iterations
     sim.advance_steps(30)
-    assert sim.solves.linear_iterations - before < 30 * 40  # less than 10 with multigrid
+    # Less than 10 with multigrid; the sweeps of the CPU take fewer than CUDA's inverses of blocks (42 at 1.01).
+    assert sim.solves.linear_iterations - before < 30 * (50 if wp.get_device(device).is_cuda else 40)
     if share < 1.0:
         assert abs(body.positions.numpy()[:, 0].mean() - x) < 1e-6
     else:
