@@ -1,7 +1,6 @@
 """Effects of damaged files on other libraries, and inconsistent numbers in them: one line each."""
 
 import json
-import sys
 
 import numpy as np
 import pytest
@@ -25,18 +24,6 @@ def test_a_stage_that_is_cut_off_gets_one_line(tmp_path):
         with pytest.raises(InputError, match=r"seed\.usdc: ") as refused:
             wc.TetMesh.load(path)
         assert "\n" not in str(refused.value)
-
-
-def test_files_beside_a_script_do_not_replace_modules_of_readers(tmp_path, monkeypatch):
-    """A script's own ``nt.py`` or ``json.py`` would be imported by the process of a reader."""
-    path = SEEDS["tetgen"](tmp_path)
-    for name in ("nt", "json", "random", "numpy"):
-        (tmp_path / f"{name}.py").write_text("raise SystemExit('this is the script')\n")
-    script = tmp_path / "script.py"
-    script.write_text("")
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(sys.modules["__main__"], "__file__", str(script), raising=False)
-    assert len(wc.TetMesh.load(path).tets) == 2
 
 
 def test_a_series_without_one_of_its_slices(tmp_path):

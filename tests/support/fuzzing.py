@@ -12,7 +12,6 @@ from __future__ import annotations
 import faulthandler
 import functools
 import gc
-import importlib
 import json
 import os
 import signal
@@ -33,7 +32,7 @@ SECONDS, WALL, MEMORY = 30.0, 900.0, 6 << 30
 #: More memory than this in use [bytes] is noted.
 MUCH = 500 << 20
 #: A process that keeps more memory than this between cases [bytes] ends with this status, and another goes on: GDCM
-#: keeps what it takes for a damaged length in a DICOM file, where `read_here` does without a separate process.
+#: keeps what it takes for a damaged length in a DICOM file.
 KEPT, FULL = 1 << 30, 98
 #: Most cases stop at a domain, since its mesh takes a hundred times as long, or at a mesh without its supports, or at a
 #: body without its options.
@@ -89,27 +88,6 @@ def say(words: dict) -> None:
 # --- the package as cases want it ------------------------------------------------------------------------------------
 
 
-def read_here(module: str, path: Path):
-    """The result of a reader in a separate process, found in this one, which takes a hundredth of the time.
-
-    A reader that crashes ends this process; it has reported its start, and in a separate process it may crash.
-    """
-    from warp_corot.io.files.quiet import bounded, quietly
-
-    say({"reads": module})
-    try:
-        with quietly(), bounded(path):
-            found = importlib.import_module(module).read(path)
-    except (Exception, SystemExit) as error:
-        return None, " ".join(str(error).split()) or type(error).__name__
-    finally:
-        gmsh = sys.modules.get("gmsh")
-        if gmsh is not None and gmsh.isInitialized():
-            gmsh.finalize()
-        say({"has read": module})
-    return found, None
-
-
 def prepared(scenes: bool) -> None:
     """Nothing is simulated, readers run here, the parser is made once, no warnings; Newton only for scenes."""
     import warnings
@@ -121,6 +99,7 @@ def prepared(scenes: bool) -> None:
     from warp_corot.cli import bodies, scene, simulate  # noqa: F401 (all modules that read files)
     from warp_corot.domain import surface
     from warp_corot.experiments import paper
+    from warp_corot.io.read import files
     from warp_corot.io.write import animate
     from warp_corot.mesh import TetForest
 
@@ -164,9 +143,18 @@ def prepared(scenes: bool) -> None:
     animate.record = stop
     paper.beam = stop
     cli.make_parser = functools.cache(cli.make_parser)
+    read = files.read_with
+
+    def read_said(module: str, path: Path):
+        """What a reader finds; it says that it has begun: where it ends this process, its library does so."""
+        say({"reads": module})
+        found = read(module, path)
+        say({"has read": module})
+        return found
+
     for name, module in list(sys.modules.items()):
-        if name.startswith("warp_corot") and hasattr(module, "read_isolated"):
-            module.read_isolated = read_here
+        if name.startswith("warp_corot") and hasattr(module, "read_with"):
+            module.read_with = read_said
         if name.startswith("warp_corot") and hasattr(module, "begin_loading"):
             # A fork of a process whose other threads load kernels would wait for their locks for ever.
             module.begin_loading = lambda *_, **__: []
@@ -434,7 +422,7 @@ def run_all(folder: Path, form: str, first: int, count: int) -> None:
             continue
         case.clear()
         case.update(form=form, case=last["case"], taken=False)
-        # A reader for a separate process may end this one.
+        # The libraries that read binary files may end a process.
         say({"ended": status, "reads": last["reads"]} if "reads" in last else {"wrong": f"ended with status {status}"})
         found._restore()
         first = last["case"] + 1

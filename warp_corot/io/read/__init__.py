@@ -1,4 +1,4 @@
-"""Readers of mesh files, one module for each family of formats, and the process in which they run."""
+"""Readers of mesh files, one module for each family of formats."""
 
 from .filemesh import Block, FileMesh
 from .files import SUFFIXES, read_mesh_file

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from warp_corot.errors import InputError
-from warp_corot.io.files.isolated import read_isolated
+from warp_corot.io.files.quiet import bounded, quietly
 
 from .filemesh import FileImage, FileMesh
 
@@ -35,7 +37,6 @@ VTK = Reader("VTK", "vtk_files", "vtkmodules", "mesh")
 GMSH = Reader("Gmsh", "gmsh_files", "gmsh", "gmsh")
 MESHIO = Reader("meshio", "meshio_files", "meshio", "mesh")
 ABAQUS = Reader("the reader of Abaqus input files", "abaqus")
-NETGEN = Reader("the reader of NetGen's files", "netgen")
 TETGEN = Reader("the reader of TetGen's files", "tetgen")
 
 #: Readers by extension, starting with the most complete one.
@@ -60,8 +61,8 @@ READERS: dict[str, tuple[Reader, ...]] = {
     ".inp": (ABAQUS,),
     ".node": (TETGEN,),
     ".ele": (TETGEN,),
-    ".vol": (NETGEN,),
-    ".vol.gz": (NETGEN,),
+    ".vol": (MESHIO,),
+    ".vol.gz": (MESHIO,),
     ".xdmf": (MESHIO,),
     ".xmf": (MESHIO,),
     ".e": (MESHIO,),
@@ -82,6 +83,8 @@ READERS: dict[str, tuple[Reader, ...]] = {
 }
 #: The extensions of mesh files.
 SUFFIXES = tuple(READERS)
+#: Errors whose texts are no sentences.
+WORDLESS = (LookupError, AttributeError, TypeError, StopIteration, AssertionError)
 #: Longer reasons are truncated.
 LONGEST_REASON = 200
 
@@ -95,7 +98,7 @@ def suffix_of(path: Path) -> str | None:
 def read_mesh_file(path: Path) -> FileMesh | FileImage:
     """Read a mesh file.
 
-    Readers are tried one after the other, each in a separate process, until one can read the file.
+    Readers are tried one after the other until one can read the file.
 
     Args:
         path: A file with one of the extensions `SUFFIXES`.
@@ -114,7 +117,7 @@ def read_mesh_file(path: Path) -> FileMesh | FileImage:
         if reader.package and importlib.util.find_spec(reader.package) is None:
             missing.append(reader)
             continue
-        found, reason = read_isolated(f"{__package__}.{reader.module}", path)
+        found, reason = read_with(reader.module, path)
         if isinstance(found, FileImage):
             return found
         if found is not None and len(found.points):
@@ -128,6 +131,28 @@ def read_mesh_file(path: Path) -> FileMesh | FileImage:
         raise InputError(f"{path}: reading {suffix} files needs: {cures}")
     also = f"; {missing[0].name} might read it: {cures}" if missing else ""
     raise InputError(f"{path}: is not a {suffix} file that can be read ({'; '.join(reasons)}){also}")
+
+
+def read_with(module: str, path: Path) -> tuple[Any, str | None]:
+    """Let a reader read a file, without output of its library and with memory for no more than the file can need.
+
+    Args:
+        module: Name of a module of this folder.
+        path: The file.
+
+    Returns:
+        The reader's result, or None; and the reason for None, which is None, too, if that is the reader's result.
+    """
+    try:
+        with quietly(), bounded(path):
+            return importlib.import_module(f".{module}", __package__).read(path), None
+    except MemoryError:
+        return None, "it asks for more memory than such a file can need"
+    except ModuleNotFoundError as error:
+        return None, f"it needs the package {error.name}: pip install {error.name}"
+    except (Exception, SystemExit) as error:
+        words = "" if isinstance(error, SystemExit) else " ".join(str(error).split())
+        return None, words if words and not isinstance(error, WORDLESS) else f"{type(error).__name__} {words}".strip()
 
 
 def shortened(reason: object) -> str:

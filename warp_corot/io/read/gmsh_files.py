@@ -40,10 +40,27 @@ def read(path: Path) -> FileMesh:
     except OSError as error:
         raise Unreadable(f"its library cannot be loaded: {error}") from None
 
-    gmsh.initialize(argv=["gmsh"], readConfigFiles=False, interruptible=False)
-    gmsh.option.setNumber("General.Terminal", 0)
-    gmsh.option.setNumber("General.NumThreads", 1)
+    is_open = gmsh.isInitialized()  # by the caller, whose models stay
+    if not is_open:
+        gmsh.initialize(argv=["gmsh"], readConfigFiles=False, interruptible=False)
+        gmsh.option.setNumber("General.Terminal", 0)
+        gmsh.option.setNumber("General.NumThreads", 1)
+    former = gmsh.model.getCurrent() if is_open else ""
+    gmsh.model.add("warp_corot")
     gmsh.logger.start()
+    try:
+        return _merged(gmsh, path)
+    finally:
+        gmsh.logger.stop()
+        gmsh.model.remove()
+        if is_open:
+            gmsh.model.setCurrent(former)
+        else:
+            gmsh.finalize()
+
+
+def _merged(gmsh: Any, path: Path) -> FileMesh:
+    """The elements of a file, which become those of Gmsh's current model."""
     try:
         gmsh.merge(str(path))
     except Exception as error:

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_numbers, checked_vector, shown
-from warp_corot.io.files.isolated import read_isolated
 from warp_corot.io.files.quiet import bounded, quietly
 
 from .filemesh import FileImage
+from .files import read_with
 
 
 @dataclass(frozen=True)
@@ -130,25 +130,25 @@ def _through_nibabel(path: Path, kind: str) -> tuple[NDArray[Any], NDArray[np.fl
 
 
 def _read_itk(path: Path) -> tuple[FileImage, str | None]:
-    return _isolated("SimpleITK", "itk_files", path, path.suffix), None
+    return _from_library("SimpleITK", "itk_files", path, path.suffix), None
 
 
 def _read_dicom(path: Path) -> tuple[FileImage, str | None]:
-    image = _isolated("SimpleITK", "itk_files", path, "DICOM")
+    image = _from_library("SimpleITK", "itk_files", path, "DICOM")
     if path.is_file() and image.values.shape[2] < 2:
         raise InputError(f"{path}: has a single slice; name the folder with the whole series")
     return image, "mm"
 
 
 def _read_vti(path: Path) -> tuple[FileImage, str | None]:
-    return _isolated("vtkmodules", "vtk_files", path, path.suffix), None
+    return _from_library("vtkmodules", "vtk_files", path, path.suffix), None
 
 
-def _isolated(package: str, module: str, path: Path, kind: str) -> FileImage:
-    """An image from a reader that needs a package and runs in a separate process."""
+def _from_library(package: str, module: str, path: Path, kind: str) -> FileImage:
+    """An image from a reader that needs a package."""
     if importlib.util.find_spec(package) is None:
         raise ImportError(package)
-    image, reason = read_isolated(f"warp_corot.io.read.{module}", path)
+    image, reason = read_with(module, path)
     if image is None and reason is None:
         raise InputError(f"{path}: is a folder without a DICOM series; it must be a file or a folder with one")
     if not isinstance(image, FileImage):
