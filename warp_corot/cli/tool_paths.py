@@ -6,9 +6,10 @@ import argparse
 import csv
 import math
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -19,13 +20,18 @@ from warp_corot.cutting.blade import Blade
 from warp_corot.domain.units import in_units
 from warp_corot.errors import InputError
 
-#: Lengths that each shape needs.
-LENGTHS = {"sphere": ("r",), "capsule": ("r", "l"), "cylinder": ("r", "l"), "box": ("x", "y", "z")}
+#: Shapes by name, each with the names of the lengths that it takes.
+SHAPES: dict[str, tuple[Callable[..., Shape], str]] = {
+    "sphere": (Sphere, "r"),
+    "capsule": (Capsule, "rl"),
+    "cylinder": (Cylinder, "rl"),
+    "box": (lambda *size, **more: Box(size, **more), "xyz"),
+}
 FORMS = "sphere:r=R, capsule:r=R,l=L, cylinder:r=R,l=L or box:x=X,y=Y,z=Z, for example capsule:r=4mm,l=100mm"
 #: Columns of a path, and their units.
 POSITION = {"time": "s", "x": "m", "y": "m", "z": "m"}
-TURN = ("qx", "qy", "qz", "qw")
-COLUMNS = f"{', '.join(POSITION)}, and for turns also {', '.join(TURN)}"
+COLUMNS = POSITION | dict.fromkeys(("qx", "qy", "qz", "qw"), "")
+KNOWN = "time, x, y, z, and for turns also qx, qy, qz, qw"
 _HEADER = re.compile(r"\s*([A-Za-z_]+)\s*(?:[\[(]\s*([^\])]+?)\s*[\])])?\s*")
 
 Floats = npt.NDArray[np.float64]
@@ -34,19 +40,12 @@ AnyTool = TypeVar("AnyTool", bound=Tool)
 
 @dataclass(frozen=True)
 class ToolShape:
-    """A shape as ``--tool`` names it.
-
-    Attributes:
-        text: The option's text.
-        kind: A key of `LENGTHS`.
-        lengths: By their names [m].
-        friction: Coulomb's coefficient; None: that of all contacts.
-    """
+    """A shape as ``--tool`` names it: the option's text, the lengths [m], and Coulomb's coefficient if it has one."""
 
     text: str
     kind: str
-    lengths: dict[str, float]
-    friction: float | None
+    lengths: tuple[float, ...]
+    options: dict[str, Any]
 
     def __str__(self) -> str:
         return self.text
@@ -57,12 +56,7 @@ class ToolShape:
         Raises:
             InputError: A length is not positive, or the friction is negative.
         """
-        at = self.lengths
-        if self.kind == "sphere":
-            return Sphere(at["r"], friction=self.friction)
-        if self.kind == "box":
-            return Box((at["x"], at["y"], at["z"]), friction=self.friction)
-        return (Capsule if self.kind == "capsule" else Cylinder)(at["r"], at["l"], friction=self.friction)
+        return SHAPES[self.kind][0](*self.lengths, **self.options)
 
 
 def tool_shape(text: str) -> ToolShape:
@@ -70,25 +64,20 @@ def tool_shape(text: str) -> ToolShape:
     kind, _, rest = text.partition(":")
     kind = kind.strip().lower()
     try:
-        if kind not in LENGTHS:
+        if kind not in SHAPES:
             raise InputError(f"{kind!r} is not a shape")
-        values = dict(_pair(word) for word in rest.split(","))
-        friction = values.pop("friction", None)
-        lengths = {name: in_units(value, "m") for name, value in values.items()}
-        if set(lengths) != set(LENGTHS[kind]) or len(values) + (friction is not None) != rest.count(",") + 1:
-            raise InputError(f"a {kind} has {', '.join(LENGTHS[kind])}, each once")
-        shape = ToolShape(text, kind, lengths, None if friction is None else float(friction))
+        names = SHAPES[kind][1]
+        pairs = [[part.strip() for part in word.split("=", 1)] for word in rest.split(",")]
+        given = {pair[0].lower(): pair[-1] for pair in pairs}
+        friction = given.pop("friction", None)
+        if set(given) != set(names) or len(pairs) != len(names) + (friction is not None):
+            raise InputError(f"a {kind} has {', '.join(names)}, each once")
+        lengths = tuple(in_units(given[name], "m") for name in names)
+        shape = ToolShape(text, kind, lengths, {} if friction is None else {"friction": float(friction)})
         shape.make()
     except (InputError, ValueError) as error:
         raise argparse.ArgumentTypeError(f"{text!r}: {error}; it must be {FORMS}") from None
     return shape
-
-
-def _pair(word: str) -> tuple[str, str]:
-    name, equals, value = word.partition("=")
-    if not equals:
-        raise InputError(f"{word!r} is not NAME=VALUE")
-    return name.strip().lower(), value.strip()
 
 
 def make_tool(shape: ToolShape, path: Path) -> Tool:
@@ -98,6 +87,11 @@ def make_tool(shape: ToolShape, path: Path) -> Tool:
         InputError: The file cannot be read, or its rows are not a path.
     """
     return _moved(Tool(shape.make()), path)
+
+
+def make_blade(path: Path, length: float) -> Blade:
+    """A straight blade of this length [m] that moves along the path in a file; see ``make_tool``."""
+    return _moved(Blade([(0.0, 0.0, -0.5 * length), (0.0, 0.0, 0.5 * length)]), path)
 
 
 def _moved(tool: AnyTool, path: Path) -> AnyTool:
@@ -110,11 +104,6 @@ def _moved(tool: AnyTool, path: Path) -> AnyTool:
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     return tool
-
-
-def make_blade(path: Path, length: float) -> Blade:
-    """A straight blade of this length [m] that moves along the path in a file; see ``make_tool``."""
-    return _moved(Blade([(0.0, 0.0, -0.5 * length), (0.0, 0.0, 0.5 * length)]), path)
 
 
 def read_tool_path(path: Path) -> tuple[Floats, Floats, Floats | None]:
@@ -134,92 +123,63 @@ def read_tool_path(path: Path) -> tuple[Floats, Floats, Floats | None]:
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: cannot be read as CSV ({error})") from None
     if not rows:
-        raise InputError(f"{path}: is empty; it must have rows of {COLUMNS}")
-    columns = _columns(rows[0][1], path)
-    if columns is None:
-        names, units = _unnamed(len(rows[0][1]), path)
-    else:
-        (names, units), rows = columns, rows[1:]
+        raise InputError(f"{path}: is empty; it must have rows of {KNOWN}")
+    first = rows[0][1]
+    units = dict.fromkeys(list(COLUMNS)[: len(first)], 1.0)
+    if first[0].strip()[:1].isalpha():
+        units, rows = _named_columns(first, path), rows[1:]
+    elif len(first) not in (len(POSITION), len(COLUMNS)):
+        raise InputError(f"{path}: has {len(first)} columns without names; they must be {KNOWN}")
     if not rows:
         raise InputError(f"{path}: has names of columns and no rows; it must have one at least")
-    values = np.array([_row(number, row, names, units, path) for number, row in rows])
-    of = {name: values[:, place] for place, name in enumerate(names)}
-    times = of["time"]
-    for (number, _), before, after in zip(rows[1:], times, times[1:], strict=False):
-        if not after > before:
-            raise InputError(f"{path}: line {number}: time is {after:g} s after {before:g} s; times must increase")
-    turns = np.stack([of[name] for name in TURN], axis=1) if "qw" in of else None
-    return times, np.stack([of[axis] for axis in "xyz"], axis=1), turns
+    values = np.array([_values(row, units, f"{path}: line {number}") for number, row in rows])
+    of = dict(zip(units, values.T, strict=True))
+    late = np.flatnonzero(np.diff(of["time"]) <= 0.0)
+    if len(late):
+        before, after = of["time"][late[0] : late[0] + 2]
+        line = rows[late[0] + 1][0]
+        raise InputError(f"{path}: line {line}: time is {after:g} s after {before:g} s; times must increase")
+    turns = np.stack([of[name] for name in ("qx", "qy", "qz", "qw")], axis=1) if "qw" in of else None
+    return of["time"], np.stack([of[axis] for axis in "xyz"], axis=1), turns
 
 
-def _columns(row: list[str], path: Path) -> tuple[list[str], list[str]] | None:
-    """Names and units of the columns; None if the row has values.
+def _named_columns(row: list[str], path: Path) -> dict[str, float]:
+    """The columns that a row names, each with its unit in SI units.
 
     Raises:
-        InputError: Other names, or one is missing.
+        InputError: Other names or units, or one is missing.
     """
-    if _is_value(row[0]):
-        return None
-    names, units = [], []
+    found: dict[str, float] = {}
     for word in row:
         match = _HEADER.fullmatch(word)
         name = match[1].lower() if match else word
         name = "time" if name == "t" else name
-        if not match or name not in (*POSITION, *TURN) or name in names:
-            raise InputError(f"{path}: has a column {word.strip()!r}; its columns must be {COLUMNS}")
-        names.append(name)
-        units.append(match[2] or POSITION.get(name, ""))
+        if not match or name not in COLUMNS or name in found:
+            raise InputError(f"{path}: has a column {word.strip()!r}; its columns must be {KNOWN}")
         try:
-            _factor(units[-1], POSITION.get(name, ""))
+            found[name] = in_units(f"1 {match[2]}", COLUMNS[name]) if match[2] and name in POSITION else 1.0
         except InputError as error:
             raise InputError(f"{path}: column {word.strip()!r}: {error}") from None
-    missing = [name for name in POSITION if name not in names]
-    missing += [name for name in TURN if name not in names and any(other in names for other in TURN)]
+    needed = COLUMNS if found.keys() - POSITION else POSITION
+    missing = [name for name in needed if name not in found]
     if missing:
-        raise InputError(f"{path}: has no column {missing[0]!r}; its columns must be {COLUMNS}")
-    return names, units
-
-
-def _unnamed(count: int, path: Path) -> tuple[list[str], list[str]]:
-    names = [*POSITION, *TURN]
-    if count not in (len(POSITION), len(names)):
-        raise InputError(f"{path}: has {count} columns without names; they must be {COLUMNS}")
-    return names[:count], [POSITION.get(name, "") for name in names[:count]]
-
-
-def _is_value(text: str) -> bool:
-    try:
-        in_units(text, "s")
-    except InputError:
-        return text.strip()[:1].isdigit()
-    return True
-
-
-def _row(number: int, row: list[str], names: list[str], units: list[str], path: Path) -> list[float]:
-    """The values of a row in SI units."""
-    if len(row) != len(names):
-        raise InputError(f"{path}: line {number} has {len(row)} values; it must have {len(names)}")
-    found = []
-    for text, name, unit in zip(row, names, units, strict=True):
-        base = POSITION.get(name)
-        try:
-            has_unit = not _is_plain(text)
-            value = in_units(text, base) if base and has_unit else float(text) * _factor(unit, base or "")
-        except (InputError, ValueError):
-            value = math.nan
-        if not math.isfinite(value):
-            raise InputError(f"{path}: line {number}: {name} is {text.strip()!r}; it must be a finite number")
-        found.append(value)
+        raise InputError(f"{path}: has no column {missing[0]!r}; its columns must be {KNOWN}")
     return found
 
 
-def _is_plain(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
-def _factor(unit: str, base: str) -> float:
-    return 1.0 if unit == base or not base else in_units(f"1 {unit}", base)
+def _values(row: list[str], units: dict[str, float], where: str) -> list[float]:
+    """The values of a row in SI units."""
+    if len(row) != len(units):
+        raise InputError(f"{where} has {len(row)} values; it must have {len(units)}")
+    found = []
+    for text, (name, unit) in zip(row, units.items(), strict=True):
+        try:
+            found.append(unit * float(text))
+        except ValueError:  # it has a unit of its own
+            try:
+                found.append(in_units(text, COLUMNS[name]))
+            except InputError:
+                found.append(math.nan)
+        if not math.isfinite(found[-1]):
+            raise InputError(f"{where}: {name} is {text.strip()!r}; it must be a finite number")
+    return found
