@@ -181,7 +181,7 @@ def test_damaged_archives_are_refused(tmp_path, rng):
     with np.load(path) as archive:
         parts = dict(archive)
     header = json.loads(parts["header"].tobytes())
-    variants = [{k: v for k, v in parts.items() if k != name} for name in parts if "loads" not in name]
+    variants = [{k: v for k, v in parts.items() if k != name} for name in parts]
     for name in header:
         less = json.dumps({k: v for k, v in header.items() if k != name}).encode()
         variants.append(parts | {"header": np.frombuffer(less, np.uint8)})

@@ -197,7 +197,7 @@ def test_a_part_left_out_is_found(tmp_path, rng):
     sim.save(tmp_path / "a.npz")
     with np.load(tmp_path / "a.npz") as archive:
         parts = dict(archive)
-    kept = [name for name in parts if name.startswith("body0.remesh.")]
+    kept = [name for name in parts if name.startswith("bodies.0.remesh.")]
     for missing in rng.choice(kept, 8, replace=False):
         np.savez(tmp_path / "b.npz", **{name: part for name, part in parts.items() if name != missing})
         with pytest.raises(wc.InputError, match="not a complete checkpoint"):

@@ -74,7 +74,10 @@ def test_two_dashes_are_no_value(tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("leaf_tets.0", 1 << 30), ("leaves.0", -1), ("code.0", 1 << 30), ("level.0", 99), ("counts", 999)],
+    [
+        *(("pieces.leaf_tets.0", 1 << 30), ("pieces.leaves.0", -1), ("pieces.code.0", 1 << 30)),
+        *(("pieces.level.0", 99), ("counts", 999)),
+    ],
 )
 def test_indices_beyond_a_changing_mesh(tmp_path, name, value):
     """Kernels do not check indices."""
@@ -82,7 +85,7 @@ def test_indices_beyond_a_changing_mesh(tmp_path, name, value):
     with np.load(path) as archive:
         arrays = dict(archive)
     assert json.loads(arrays["header"].tobytes())["bodies"][0]["remesh"]
-    arrays[f"body0.remesh.present.{name}"].reshape(-1)[0] = value
+    arrays[f"bodies.0.remesh.present.{name}"].reshape(-1)[0] = value
     np.savez(path, **arrays)
     with pytest.raises(InputError, match="is not a complete checkpoint"):
         wc.Simulation.load(path, device="cpu")

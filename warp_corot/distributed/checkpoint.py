@@ -101,8 +101,7 @@ def load_in_parts(path: str | PathLike[str], device: str | wp.Device, comm: Any)
         here = SimpleNamespace(**given, kept=kept, contact=None, obstacles=None)
         here.guard, here.running = (SimpleNamespace(state=each.state) for each in (sim.guard, sim.running))
         if sim.contact is not None:
-            arrays: dict[str, Any] = {}
-            here.obstacles = pack_obstacles(sim.contact, arrays), arrays
+            here.obstacles = pack_obstacles(sim.contact)
             here.contact = packed(sim.contact).at(nodes[0])
         return here
 
@@ -111,7 +110,7 @@ def load_in_parts(path: str | PathLike[str], device: str | wp.Device, comm: Any)
         return list(sims[0].bodies)
 
     parts, here, _ = handed_bodies(bodies, told, device, comm)
-    here.touching = {} if here.obstacles is None else obstacles_of(*here.obstacles)
+    here.touching = obstacles_of(here.obstacles)
     return parts, here
 
 

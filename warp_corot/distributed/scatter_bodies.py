@@ -16,6 +16,7 @@ from warp_corot.body.soft_body import SoftBody
 from warp_corot.elasticity import Corotated
 from warp_corot.errors import InputError
 from warp_corot.io.checkpoint.archive import pack_body, rebuilt_body
+from warp_corot.io.checkpoint.tree import joined, split
 
 from .part_sync import PartSync
 from .rejoining import Arrays, pack_part, rejoined
@@ -23,13 +24,13 @@ from .scatter_mesh import Piece, dealt, handed_out, pieces_of
 
 Longs = npt.NDArray[np.int64]
 
-#: Keyframes of nodes and of elements: the beginning of their arrays' names, how many there are, whose, and of what.
-KEYFRAMES = (
-    ("trajectory", "trajectories", "nodes", "displacements"),
-    ("activation", "activations", "elements", "stress"),
-)
+#: Keyframes of nodes and of elements: what they are called, whose they are, and of what.
+KEYFRAMES = (("trajectories", "nodes", "displacements"), ("activations", "elements", "stress"))
 #: Arrays of a body with an entry for each node of all worlds, by the ends of their names.
 NODAL = ("displacements", "velocities", "reactions", "constrained", "loads")
+
+#: The plain values of a body, its arrays by name, and its keyframes of each kind.
+Packed = tuple[Any, Arrays, list[list[Arrays]]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,18 +39,17 @@ class GivenBody:
 
     Attributes:
         piece: The part of its mesh.
-        described, arrays: As ``pack_body`` gives them, without a mesh.
+        packed: What ``_packed`` gives, of this part.
         worlds: Number of copies.
     """
 
     piece: Piece
-    described: dict[str, Any]
-    arrays: Arrays
+    packed: Packed
     worlds: int
 
     def made(self, device: str | wp.Device | None) -> SoftBody:
         kind, place, options = self.piece
-        return _made(self.described, self.arrays, self.worlds, wp.get_device(device), kind(*place, **options))
+        return _made(self.packed, self.worlds, wp.get_device(device), kind(*place, **options))
 
 
 def handed_bodies(
@@ -96,7 +96,7 @@ def gathered_body(each: PartSync, comm: Any) -> SoftBody | None:
     body, numbers = each.whole, each.part.numbers
     if not each.is_in_parts:
         return body if comm.rank == 0 else None
-    described, arrays = _packed(body)
+    plain, arrays, all_keyframes = _packed(body)
     owned, counted, worlds = each.part.is_own, np.flatnonzero(numbers.counted), body.worlds
     everywhere, elements = numbers.in_worlds(worlds), numbers.elements[counted]
     cut: dict[str, tuple[Any, str, int]] = {}
@@ -107,7 +107,7 @@ def gathered_body(each: PartSync, comm: Any) -> SoftBody | None:
     mesh = pack_part(body.mesh, of_mesh)  # type: ignore[arg-type]
     total, count = worlds * numbers.node_count, mesh["element_count"]
     of_elements = np.where(numbers.counted, numbers.elements + count * np.arange(worlds)[:, None], -1).ravel()
-    keyframes = _keyframes(described, arrays, np.where(owned, everywhere, -1), of_elements)
+    keyframes = _keyframes(all_keyframes, np.where(owned, everywhere, -1), of_elements)
     given = comm.gather((everywhere[owned], elements, cut, keyframes, of_mesh), root=0)
     if given is None:
         return None
@@ -122,25 +122,32 @@ def gathered_body(each: PartSync, comm: Any) -> SoftBody | None:
             found = np.moveaxis(whole.setdefault(name, np.zeros(shape, own.dtype)), axis, 0)
             found[nodes if what == "nodes" else numbered] = np.moveaxis(own, axis, 0)
     keyframes = [list(itertools.chain(*of_kind)) for of_kind in zip(*(each for *_, each, _ in given), strict=True)]
-    joined = rejoined(mesh, [of_mesh for *_, of_mesh in given])
-    return _made(*_with_keyframes(described, whole, keyframes), worlds, wp.get_device("cpu"), joined)
+    rejoined_mesh = rejoined(mesh, [of_mesh for *_, of_mesh in given])
+    return _made((plain, whole, keyframes), worlds, wp.get_device("cpu"), rejoined_mesh)
 
 
-def _packed(body: SoftBody) -> tuple[dict[str, Any], Arrays]:
-    arrays: Arrays = {}
+def _packed(body: SoftBody) -> Packed:
     no_field: Any = SimpleNamespace(state={})
-    return pack_body(body, Corotated(), no_field, None, "", arrays, with_mesh=False), arrays
+    tree = pack_body(body, Corotated(), no_field, None, with_mesh=False)
+    keyframes = [joined(*split(tree["state"].pop(name))) for name, *_ in KEYFRAMES]
+    return *split(tree), keyframes
 
 
-def _made(described: dict[str, Any], arrays: Arrays, worlds: int, device: wp.Device, mesh: Any) -> SoftBody:
-    body = rebuilt_body(described, "", arrays, worlds, device, mesh)
-    body.conditions.world_starts.assign(arrays["world_starts"])
+def _made(packed: Packed, worlds: int, device: wp.Device, mesh: Any) -> SoftBody:
+    plain, arrays, keyframes = packed
+    tree = joined(plain, arrays)
+    state = tree["state"]
+    if state["activation"] is not None:
+        state["activation"] = state["activation"].ravel()
+    state |= {name: given for (name, *_), given in zip(KEYFRAMES, keyframes, strict=True)}
+    body = rebuilt_body(tree, worlds, device, mesh)
+    body.conditions.world_starts.assign(tree["world_starts"])
     return body
 
 
 def _pieces(body: SoftBody, ranks: int) -> Iterator[tuple[GivenBody, Longs]]:
     """Each rank's part of a body, and its nodes among those of all worlds of the whole body."""
-    described, arrays = _packed(body)
+    plain, arrays, keyframes = _packed(body)
     for piece, numbers in pieces_of(body.mesh, dealt(body.mesh, ranks)):
         there = numbers.in_worlds(body.worlds)
         in_all = numbers.elements + body.world_element_count * np.arange(body.worlds)[:, None]
@@ -152,17 +159,14 @@ def _pieces(body: SoftBody, ranks: int) -> Iterator[tuple[GivenBody, Longs]]:
             name: _cut(values, *_kind_of(body, name, values), there, numbers.elements, body.worlds)
             for name, values in arrays.items()
         }
-        given = _with_keyframes(described, cut, _keyframes(described, arrays, *places))
-        yield GivenBody(piece, *given, body.worlds), there
+        yield GivenBody(piece, (plain, cut, _keyframes(keyframes, *places)), body.worlds), there
 
 
 def _kind_of(body: SoftBody, name: str, values: npt.NDArray[Any]) -> tuple[str, int]:
     """What the entries of an array belong to: nodes or elements of all worlds, elements of one, or nothing; and the
     axis along which they lie."""
-    material = body.material
-    if _of_keyframes(name) is not None:
-        return "same", 0
-    if name.rpartition(".")[2] in NODAL:
+    material, name = body.material, name.rpartition(".")[2]
+    if name in NODAL:
         return "nodes", 0
     if name == "activation":
         return "stresses", 1
@@ -179,34 +183,15 @@ def _cut(values: npt.NDArray[Any], kind: str, axis: int, nodes: Longs, elements:
     return np.take(values, nodes if kind == "nodes" else elements, axis)
 
 
-def _keyframes(described: dict[str, Any], arrays: Arrays, nodes: Longs, elements: Longs) -> list[list[Arrays]]:
+def _keyframes(given: list[list[Arrays]], nodes: Longs, elements: Longs) -> list[list[Arrays]]:
     """The keyframes, of each kind, of the nodes and elements that have a place, with these places."""
     found: list[list[Arrays]] = []
-    for (prefix, count, whose, what), place in zip(KEYFRAMES, (nodes, elements), strict=True):
+    for (_, whose, what), of_kind, place in zip(KEYFRAMES, given, (nodes, elements), strict=True):
         found.append([])
-        for k in range(described[count]):
-            items, times, values = (arrays[f"{prefix}{k}.{name}"] for name in (whose, "times", what))
+        for each in of_kind:
+            items, values = each[whose], each[what]
             here = place[items] >= 0
             if here.any():
                 of_each = values[:, here] if values.ndim == 3 or (what == "stress" and values.shape[1] > 1) else values
-                found[-1].append({whose: place[items[here]].astype(np.int32), "times": times, what: of_each})
+                found[-1].append(each | {whose: place[items[here]].astype(np.int32), what: of_each})
     return found
-
-
-def _with_keyframes(
-    described: dict[str, Any], arrays: Arrays, keyframes: list[list[Arrays]]
-) -> tuple[dict[str, Any], Arrays]:
-    """The same body with other keyframes."""
-    kept = {name: values for name, values in arrays.items() if _of_keyframes(name) is None}
-    if "activation" in kept:
-        kept["activation"] = kept["activation"].ravel()
-    counts = {}
-    for (prefix, count, _, _), given in zip(KEYFRAMES, keyframes, strict=True):
-        counts[count] = len(given)
-        kept |= {f"{prefix}{k}.{name}": values for k, each in enumerate(given) for name, values in each.items()}
-    return described | counts, kept
-
-
-def _of_keyframes(name: str) -> str | None:
-    """The beginning of a name, if it is that of an array of keyframes."""
-    return next((prefix for prefix, *_ in KEYFRAMES if name.startswith(prefix) and "." in name), None)

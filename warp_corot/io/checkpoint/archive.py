@@ -7,7 +7,6 @@ import json
 import warnings
 from collections.abc import Sequence
 from os import PathLike
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,6 +30,7 @@ from warp_corot.solvers import INTEGRATORS
 from .contact import blades_of, obstacles_of, pack_blades, pack_contact, unpack_blades, unpack_contact
 from .mesh import pack_mesh, unpack_mesh
 from .remesh import pack_changing, remesh_options, unpack_changing
+from .tree import joined, split
 
 if TYPE_CHECKING:
     from warp_corot.remesh.changing import Changing
@@ -39,10 +39,7 @@ Remesh = OnlineRemesh | Sequence[OnlineRemesh | None] | None
 
 FORMAT = "warp-corot checkpoint"
 #: The version of checkpoints that is written, and the only one that is read.
-VERSION = 11
-
-#: What the guard continues from.
-GUARDED = ("scale", "drift", "lately", "counted", "work")
+VERSION = 12
 
 MATERIALS = {kind.__name__: kind for kind in (Isotropic, TransverselyIsotropic, Orthotropic, FibreReinforced)}
 
@@ -63,98 +60,77 @@ def save_checkpoint(sim: Simulation, path: str | PathLike[str], *, in_parts: boo
         raise InputError(f"cannot save {target}: the folder {target.parent} does not exist")
     if target.is_dir():
         raise InputError(f"cannot save {target}: it is a folder")
-    arrays: dict[str, np.ndarray] = {}
-    header: dict[str, Any] = {
-        "format": FORMAT,
-        "version": VERSION,
-        "device": str(sim.device),
-        "stable_dt": sim.stable_dt,
-        "steps_before_reset": sim.steps_before_reset,
-        "time_before_reset": sim.time_before_reset,
-        "gravity": sim.gravity,
-        "integrator": described_of(sim.integrator, INTEGRATORS),
-        "deterministic": sim.deterministic,
-        "worlds": sim.worlds,
-        "bodies": [],
-        "kept": sorted(sim.kept),
-        "running": sim.running.state,
-    } | ({"in_parts": True} if in_parts else {})
-    for name, array in sim.kept.items():
-        arrays[f"kept.{name}"] = array.numpy()
-    for name, values in sim.guard.state.items():
-        arrays[f"guard.{name}"] = values
     packed = zip(sim.bodies, sim.models, sim.fields, sim.remeshing.changing, strict=True)
-    for number, (body, model, field, changing) in enumerate(packed):
-        header["bodies"].append(pack_body(body, model, field, changing, f"body{number}.", arrays))
-    header["cuts"] = None
-    if sim.remeshing.are_cut:
-        header["cuts"] = pack_blades(sim.blades, arrays) | {"stable_steps": sim.stable_steps}
-    header["contact"] = pack_contact(sim.contact, sim.grasps, arrays)
-    arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
-    write_archive(target, arrays)
+    cuts = pack_blades(sim.blades) | {"stable_steps": sim.stable_steps} if sim.remeshing.are_cut else None
+    plain, arrays = split(
+        {
+            "format": FORMAT,
+            "version": VERSION,
+            "device": str(sim.device),
+            "stable_dt": sim.stable_dt,
+            "steps_before_reset": sim.steps_before_reset,
+            "time_before_reset": sim.time_before_reset,
+            "gravity": sim.gravity,
+            "integrator": described_of(sim.integrator, INTEGRATORS),
+            "deterministic": sim.deterministic,
+            "worlds": sim.worlds,
+            "bodies": [pack_body(*each) for each in packed],
+            "kept": sim.kept,
+            "guard": sim.guard.state,
+            "running": sim.running.state,
+            "cuts": cuts,
+            "contact": pack_contact(sim.contact, sim.grasps),
+        }
+        | ({"in_parts": True} if in_parts else {})
+    )
+    arrays["header"] = np.frombuffer(json.dumps(plain).encode(), np.uint8)
+    try:
+        with written_whole(target) as part, part.open("wb") as file:
+            np.savez(file, allow_pickle=False, **arrays)
+    except OSError as error:
+        raise InputError(f"cannot save {error}") from error
 
 
 def pack_body(
-    body: SoftBody,
-    model: Model,
-    field: ForceField,
-    changing: Changing | None,
-    prefix: str,
-    arrays: dict[str, np.ndarray],
-    *,
-    with_mesh: bool = True,
+    body: SoftBody, model: Model, field: ForceField, changing: Changing | None, *, with_mesh: bool = True
 ) -> dict[str, Any]:
-    """Put a body, with its mesh or without, into arrays whose names begin with ``prefix``.
-
-    Returns the remaining data for JSON.
-    """
+    """A body, with its mesh or without, as a tree of plain values and arrays."""
     body.state.adopt_positions()
     mesh, material = body.mesh, body.material
     if changing is not None:
         mesh, material = changing.forest.source, changing.carried_material.given
-    described = {
+    values = {each.name: np.asarray(getattr(material, each.name)) for each in dataclasses.fields(material)}
+    return {
         "model": described_of(model, MODELS),
-        "mesh": pack_mesh(mesh, prefix, arrays) if with_mesh else None,
-        "material": _name_of(material, MATERIALS),
+        "mesh": pack_mesh(mesh) if with_mesh else None,
+        "material": {"name": _name_of(material, MATERIALS), "values": values},
         "threads": body.threads,
-        "trajectories": 0,
-        "activations": len(body.conditions.activations),
-        "field": sorted(field.state),
-        "remesh": None,
+        "world_starts": body.conditions.world_starts,
+        "field": field.state,
+        "state": None if changing is not None else _pack_state(body),
+        "remesh": None if changing is None else pack_changing(changing),
     }
-    for material_field in dataclasses.fields(material):
-        arrays[prefix + material_field.name] = np.asarray(getattr(material, material_field.name))
-    arrays[prefix + "world_starts"] = body.conditions.world_starts.numpy()
-    for name, array in field.state.items():
-        arrays[f"{prefix}field.{name}"] = array.numpy()
-    if changing is None:
-        described["trajectories"] = len(body.conditions.trajectories)
-        _pack_state(body, prefix, arrays)
-    else:
-        described["remesh"] = pack_changing(changing, f"{prefix}remesh.", arrays)
-    return described
 
 
-def _pack_state(body: SoftBody, prefix: str, arrays: dict[str, np.ndarray]) -> None:
-    arrays[prefix + "displacements"] = body.state.displacements.numpy()
-    arrays[prefix + "velocities"] = body.state.velocities.numpy()
-    arrays[prefix + "reactions"] = body.state.reactions.numpy()
-    arrays[prefix + "constrained"] = body.constrained
-    if body.state.initial is not None:
-        for name, array in zip(("displacements", "velocities"), body.state.initial, strict=True):
-            arrays[f"{prefix}initial.{name}"] = array.numpy()
-    if body.conditions.has_loads:
-        arrays[prefix + "loads"] = body.conditions.loads.numpy()
-    for k, trajectory in enumerate(body.conditions.trajectories):
-        arrays[f"{prefix}trajectory{k}.nodes"] = trajectory.nodes.numpy()
-        times, displacements = trajectory.keys()
-        arrays[f"{prefix}trajectory{k}.times"] = times
-        arrays[f"{prefix}trajectory{k}.displacements"] = displacements
-    if body.discretization.has_activation:
-        arrays[prefix + "activation"] = body.activation.numpy()
-    for k, activation in enumerate(body.conditions.activations):
-        for name in ("elements", "times", "stress"):
-            arrays[f"{prefix}activation{k}.{name}"] = getattr(activation, name).numpy()
+def _pack_state(body: SoftBody) -> dict[str, Any]:
+    state, conditions = body.state, body.conditions
+    initial = state.initial
+    return {
+        "displacements": state.displacements,
+        "velocities": state.velocities,
+        "reactions": state.reactions,
+        "constrained": body.constrained,
+        "initial": None if initial is None else dict(zip(("displacements", "velocities"), initial, strict=True)),
+        "loads": conditions.loads if conditions.has_loads else None,
+        "activation": body.activation if body.discretization.has_activation else None,
+        "trajectories": [
+            dict(zip(("nodes", "times", "displacements"), (each.nodes, *each.keys()), strict=True))
+            for each in conditions.trajectories
+        ],
+        "activations": [
+            {name: getattr(each, name) for name in ("elements", "times", "stress")} for each in conditions.activations
+        ],
+    }
 
 
 def load_checkpoint(
@@ -172,7 +148,8 @@ def load_checkpoint(
             if not isinstance(array, np.ndarray):
                 raise InputError(f"{what}: {name} is not an array")
         header = json.loads(arrays["header"].tobytes())
-        check_version(header, source)
+        if header["version"] != VERSION:
+            raise InputError(f"{source} has version {header['version']}; this warp_corot reads version {VERSION} only")
         if header["format"] != FORMAT:
             raise InputError(what)
     except InputError:
@@ -180,7 +157,7 @@ def load_checkpoint(
     except Exception as error:  # any error of NumPy, zip files or JSON
         raise InputError(what) from error
     try:
-        return _rebuilt_simulation(header, arrays, device, remesh)
+        return _rebuilt_simulation(joined(header, arrays), device, remesh)
     except (LookupError, TypeError) as error:
         raise InputError(f"{what}: {error} is missing or wrong") from error
     except (ArithmeticError, AssertionError, AttributeError, MemoryError, RuntimeError, ValueError) as error:
@@ -189,101 +166,74 @@ def load_checkpoint(
         raise InputError(f"{what}: {' '.join(str(error).split())[:160]}") from error
 
 
-def check_version(header: dict[str, Any], source: Path) -> None:
-    """Refuse a checkpoint of another version."""
-    if header["version"] != VERSION:
-        raise InputError(f"{source} has version {header['version']}; this warp_corot reads version {VERSION} only")
-
-
-def _rebuilt_simulation(
-    header: dict[str, Any], arrays: dict[str, np.ndarray], device: str | wp.Device | None, remesh: Remesh
-) -> Simulation:
-    place = header["device"] if device is None else device
-    bodies, models = [], []
-    for number, described in enumerate(header["bodies"]):
-        bodies.append(rebuilt_body(described, f"body{number}.", arrays, header["worlds"], place))
-        models.append(rebuilt(described["model"], MODELS))
-    integrator = rebuilt(header["integrator"], INTEGRATORS)
-    touching = obstacles_of(header["contact"], arrays)
+def _rebuilt_simulation(tree: dict[str, Any], device: str | wp.Device | None, remesh: Remesh) -> Simulation:
+    place = tree["device"] if device is None else device
+    touching = obstacles_of(tree["contact"])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", StabilityWarning)  # the warning was shown when the simulation was made
         sim = Simulation(
-            bodies,
-            model=models,
-            integrator=integrator,
-            gravity=header["gravity"],
-            deterministic=header["deterministic"],
-            remesh=remesh_options(header["bodies"], arrays, place, remesh, touching.get("obstacles", ())),
-            cuts=blades_of(header["cuts"], arrays),
+            [rebuilt_body(packed, tree["worlds"], place) for packed in tree["bodies"]],
+            model=[rebuilt(packed["model"], MODELS) for packed in tree["bodies"]],
+            integrator=rebuilt(tree["integrator"], INTEGRATORS),
+            gravity=tree["gravity"],
+            deterministic=tree["deterministic"],
+            remesh=remesh_options(tree["bodies"], place, remesh, touching.get("obstacles", ())),
+            cuts=blades_of(tree["cuts"]),
             **touching,
         )
-    sim.steps_before_reset, sim.time_before_reset = header["steps_before_reset"], header["time_before_reset"]
-    if header["stable_dt"] is not None:
-        sim.stable_dt = header["stable_dt"]
-    for number, (described, body, field) in enumerate(zip(header["bodies"], sim.bodies, sim.fields, strict=True)):
-        if described["remesh"] is not None:
-            changing = sim.remeshing.changing[number]
-            assert changing is not None
-            unpack_changing(changing, described["remesh"], f"body{number}.remesh.", arrays)
-        body.conditions.world_starts.assign(arrays[f"body{number}.world_starts"].astype(np.float64))
-        for name in described["field"]:
-            field.state[name].assign(arrays[f"body{number}.field.{name}"])
-    for name in header["kept"]:
-        sim.kept[name].assign(arrays[f"kept.{name}"])
-    if header["cuts"] is not None:
-        sim.stable_steps = header["cuts"]["stable_steps"]
-        unpack_blades(sim.blades, header["cuts"], arrays)
-    unpack_contact(sim.contact, header["contact"], arrays)
-    sim.guard.resume(**{name: arrays[f"guard.{name}"] for name in GUARDED})
-    sim.running.resume(**header["running"])
+    sim.steps_before_reset, sim.time_before_reset = tree["steps_before_reset"], tree["time_before_reset"]
+    if tree["stable_dt"] is not None:
+        sim.stable_dt = tree["stable_dt"]
+    bodies = zip(tree["bodies"], sim.bodies, sim.fields, sim.remeshing.changing, strict=True)
+    for packed, body, field, changing in bodies:
+        if changing is not None and packed["remesh"] is not None:
+            unpack_changing(changing, packed["remesh"])
+        body.conditions.world_starts.assign(packed["world_starts"].astype(np.float64))
+        for name, values in packed["field"].items():
+            field.state[name].assign(values)
+    for name, values in tree["kept"].items():
+        sim.kept[name].assign(values)
+    if tree["cuts"] is not None:
+        sim.stable_steps = tree["cuts"]["stable_steps"]
+        unpack_blades(sim.blades, tree["cuts"])
+    unpack_contact(sim.contact, tree["contact"])
+    sim.guard.resume(**tree["guard"])
+    sim.running.resume(**tree["running"])
     return sim
 
 
 def rebuilt_body(
-    described: dict[str, Any],
-    prefix: str,
-    arrays: dict[str, np.ndarray],
-    worlds: int,
-    device: str | wp.Device,
-    mesh: TetForest | TetMesh | None = None,
+    packed: dict[str, Any], worlds: int, device: str | wp.Device, mesh: TetForest | TetMesh | None = None
 ) -> SoftBody:
-    """The body that ``pack_body`` stored, with another mesh if it was stored without."""
-    mesh = unpack_mesh(described["mesh"], prefix, arrays) if mesh is None else mesh
-    material_kind = MATERIALS[described["material"]]
-    material = material_kind(*(arrays[prefix + f.name][()] for f in dataclasses.fields(material_kind)))
-    body = SoftBody(mesh, material, worlds=worlds, device=device, threads=described.get("threads"))
-    if described["remesh"] is None:
-        _unpack_state(body, described, prefix, arrays)
-    elif described["remesh"]["loads"]:
+    """The body that ``pack_body`` packed, with another mesh if it was packed without."""
+    values = {name: value[()] for name, value in packed["material"]["values"].items()}
+    material = MATERIALS[packed["material"]["name"]](**values)
+    mesh = unpack_mesh(packed["mesh"]) if mesh is None else mesh
+    body = SoftBody(mesh, material, worlds=worlds, device=device, threads=packed["threads"])
+    if packed["state"] is not None:
+        _unpack_state(body, packed["state"])
+    elif packed["remesh"]["loads"]:
         _ = body.loads  # made on first use
     return body
 
 
-def _unpack_state(body: SoftBody, described: dict[str, Any], prefix: str, arrays: dict[str, np.ndarray]) -> None:
-    if prefix + "initial.displacements" in arrays:
-        body.displacements = arrays[prefix + "initial.displacements"][:, :3]
-        body.velocities = arrays[prefix + "initial.velocities"][:, :3]
+def _unpack_state(body: SoftBody, state: dict[str, Any]) -> None:
+    if state["initial"] is not None:
+        body.displacements = state["initial"]["displacements"][:, :3]
+        body.velocities = state["initial"]["velocities"][:, :3]
         body.set_initial_state()
-    body.fix(arrays[prefix + "constrained"])
-    for k in range(described["trajectories"]):
-        motion = f"{prefix}trajectory{k}."
-        body.follow(
-            arrays[motion + "nodes"],
-            times=arrays[motion + "times"],
-            displacements=arrays[motion + "displacements"],
-        )
-    if prefix + "activation" in arrays:
-        body.activation.assign(arrays[prefix + "activation"])
-    activations = []
-    for k in range(described["activations"]):
-        elements, times, stress = (arrays[f"{prefix}activation{k}.{name}"] for name in ("elements", "times", "stress"))
-        activations.append(ElementActivation.of_keys(elements, Activation(times, stress), body.device))
-    body.conditions.set_activations(activations)
-    if prefix + "loads" in arrays:
-        wp.copy(body.loads, wp.array(arrays[prefix + "loads"][:, :3], dtype=wp.vec3, device=body.device))
-    body.displacements = arrays[prefix + "displacements"][:, :3]
-    body.state.set_velocities(arrays[prefix + "velocities"][:, :3])
-    body.state.reactions.assign(arrays[prefix + "reactions"])
+    body.fix(state["constrained"])
+    for each in state["trajectories"]:
+        body.follow(each["nodes"], times=each["times"], displacements=each["displacements"])
+    if state["activation"] is not None:
+        body.activation.assign(state["activation"])
+    keys = [(each["elements"], Activation(each["times"], each["stress"])) for each in state["activations"]]
+    body.conditions.set_activations([ElementActivation.of_keys(*each, body.device) for each in keys])
+    if state["loads"] is not None:
+        wp.copy(body.loads, wp.array(state["loads"][:, :3], dtype=wp.vec3, device=body.device))
+    body.displacements = state["displacements"][:, :3]
+    body.state.set_velocities(state["velocities"][:, :3])
+    body.state.reactions.assign(state["reactions"])
 
 
 def described_of(thing: Any, names: dict[str, Any]) -> dict[str, Any]:
@@ -307,16 +257,3 @@ def rebuilt(described: dict[str, Any], names: dict[str, Any]) -> Any:
     values = described["values"]
     parts = {name: rebuilt(value, names) for name, value in values.items() if isinstance(value, dict)}
     return names[described["name"]](**(values | parts))
-
-
-def write_archive(target: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Write arrays, completely or not at all.
-
-    Raises:
-        InputError: They cannot be written.
-    """
-    try:
-        with written_whole(target) as part, part.open("wb") as file:
-            np.savez(file, allow_pickle=False, **arrays)
-    except OSError as error:
-        raise InputError(f"cannot save {error}") from error

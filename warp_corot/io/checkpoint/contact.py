@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,164 +20,146 @@ from warp_corot.errors import InputError
 if TYPE_CHECKING:
     from warp_corot.cutting.blades import Blades
 
-Arrays = dict[str, np.ndarray]
-
-#: Functions that make shapes from their sizes; the place and the thickness are set afterwards.
-SHAPES = {
-    "Ground": lambda size, arrays, prefix: Ground(),
-    "Sphere": lambda size, arrays, prefix: Sphere(size[0]),
-    "Capsule": lambda size, arrays, prefix: Capsule(size[0], 2.0 * size[1]),
-    "Cylinder": lambda size, arrays, prefix: Cylinder(size[0], 2.0 * size[1]),
-    "Box": lambda size, arrays, prefix: Box([2.0 * each for each in size]),
-    "Edge": lambda size, arrays, prefix: Edge(arrays[prefix + "points"]),
-    "TriangleMesh": lambda size, arrays, prefix: TriangleMesh(arrays[prefix + "points"], arrays[prefix + "triangles"]),
-    "SignedDistance": lambda size, arrays, prefix: SignedDistance(
-        arrays[prefix + "values"], arrays[prefix + "lower"], spacing=size
-    ),
+#: Functions that make shapes from their sizes and their own arrays; the place and the thickness are set afterwards.
+SHAPES: dict[str, Callable[..., Shape]] = {
+    "Ground": lambda size: Ground(),
+    "Sphere": lambda size: Sphere(size[0]),
+    "Capsule": lambda size: Capsule(size[0], 2.0 * size[1]),
+    "Cylinder": lambda size: Cylinder(size[0], 2.0 * size[1]),
+    "Box": lambda size: Box([2.0 * each for each in size]),
+    "Edge": lambda size, points: Edge(points),
+    "TriangleMesh": lambda size, points, triangles: TriangleMesh(points, triangles),
+    "SignedDistance": lambda size, values, lower: SignedDistance(values, lower, spacing=size),
 }
 #: Arrays of shapes that have some.
 OF_SHAPES = ("points", "triangles", "values", "lower")
+#: Numbers of the law that steps have found.
+LAW = ("tolerance", "recovery", "grain", "whole")
+#: Options of contact.
+OPTIONS = ("friction", "self_contact", "flat_edges", "on")
 
 
-def pack_contact(contacts: Contacts | None, grasps: Sequence[Grasp], arrays: Arrays) -> dict[str, Any] | None:
-    """Put contact into arrays; returns the remaining data for JSON, None without contact.
+def pack_contact(contacts: Contacts | None, grasps: Sequence[Grasp]) -> dict[str, Any] | None:
+    """Contact as a tree of plain values and arrays; None without contact.
 
     Raises:
         InputError: A shape of a class of your own, or another constraint of the bodies.
     """
     if contacts is None:
         return None
-    for name, array in kept_arrays(contacts).items():
-        arrays[f"contact.{name}"] = array.numpy()
-    for number, body in enumerate(contacts.system.bodies):
-        arrays[f"contact.forces{number}"] = body.state.contact_forces.numpy()
-    law = contacts.law
-    return pack_obstacles(contacts, arrays) | {
-        "law": [law.tolerance, law.recovery, law.grain, law.whole],
+    return pack_obstacles(contacts) | {
+        "kept": kept_arrays(contacts),
+        "forces": [body.state.contact_forces for body in contacts.system.bodies],
+        "law": {name: getattr(contacts.law, name) for name in LAW},
         "rooms": contacts.surface.rooms,
         "room": 0 if contacts.pairs is None else contacts.pairs.room,
-        "grasps": [_pack_grasp(contacts, grasp, f"grasp{k}.", arrays) for k, grasp in enumerate(grasps)],
+        "grasps": [
+            {
+                "body": contacts.system.bodies.index(grasp.body),
+                "tool": contacts.obstacles.tools.index(grasp.tool),
+                "stiffness": grasp.stiffness,
+                "nodes": grasp.nodes,
+                "kept": grasp.kept,
+            }
+            for grasp in grasps
+        ],
     }
 
 
-def pack_obstacles(contacts: Contacts, arrays: Arrays) -> dict[str, Any]:
-    """Put the obstacles of contact into arrays; returns the remaining data for JSON, with the options of contact.
+def pack_obstacles(contacts: Contacts) -> dict[str, Any]:
+    """The obstacles and the options of contact as a tree of plain values and arrays.
 
     Raises:
         InputError: A shape of a class of your own.
     """
-    options, given = contacts.options, zip(contacts.obstacles.given, contacts.obstacles.tools, strict=True)
-    return {
-        "friction": options.friction,
-        "self_contact": options.self_contact,
-        "flat_edges": options.flat_edges,
-        "on": options.on,
-        "obstacles": [_pack_tool(tool, each is tool, f"tool{k}.", arrays) for k, (each, tool) in enumerate(given)],
-    }
+    given = zip(contacts.obstacles.given, contacts.obstacles.tools, strict=True)
+    options = {name: getattr(contacts.options, name) for name in OPTIONS}
+    return {"options": options, "obstacles": [_pack_tool(tool, each is tool) for each, tool in given]}
 
 
-def obstacles_of(described: dict[str, Any] | None, arrays: Arrays) -> dict[str, Any]:
+def obstacles_of(packed: dict[str, Any] | None) -> dict[str, Any]:
     """The arguments ``obstacles`` and ``contact`` of a simulation."""
-    if described is None:
+    if packed is None:
         return {}
-    obstacles = [_unpacked_tool(each, f"tool{k}.", arrays) for k, each in enumerate(described["obstacles"])]
-    options = {name: described[name] for name in ("friction", "self_contact", "flat_edges", "on")}
-    return {"obstacles": obstacles, "contact": Contact(**options)}
+    return {"obstacles": list(map(_unpacked_tool, packed["obstacles"])), "contact": Contact(**packed["options"])}
 
 
-def unpack_contact(contacts: Contacts | None, described: dict[str, Any] | None, arrays: Arrays) -> None:
+def unpack_contact(contacts: Contacts | None, packed: dict[str, Any] | None) -> None:
     """Restore the contact of a simulation."""
-    if described is None or contacts is None:
+    if packed is None or contacts is None:
         return
-    kept = {name.removeprefix("contact."): values for name, values in arrays.items() if name.startswith("contact.")}
-    for name, value in zip(("tolerance", "recovery", "grain", "whole"), described["law"], strict=True):
+    for name, value in packed["law"].items():
         setattr(contacts.law, name, value)
-    keep_again(contacts, described["rooms"], described["room"], kept)
+    keep_again(contacts, packed["rooms"], packed["room"], packed["kept"])
     bodies = contacts.system.bodies
-    for number, body in enumerate(bodies):
-        body.state.contact_forces.assign(arrays[f"contact.forces{number}"])
-    for k, each in enumerate(described["grasps"]):
+    for body, forces in zip(bodies, packed["forces"], strict=True):
+        body.state.contact_forces.assign(forces)
+    for each in packed["grasps"]:
         tool = contacts.obstacles.tools[each["tool"]]
-        grasp = Grasp(bodies[each["body"]], arrays[f"grasp{k}.nodes"], tool=tool, stiffness=each["stiffness"])
+        grasp = Grasp(bodies[each["body"]], each["nodes"], tool=tool, stiffness=each["stiffness"])
         for name, array in grasp.kept.items():
-            array.assign(arrays[f"grasp{k}.{name}"])
+            array.assign(each["kept"][name])
 
 
-def pack_blades(blades: Blades | None, arrays: Arrays) -> dict[str, Any]:
-    """Put the blades of a simulation whose bodies can be cut into arrays; returns the remaining data for JSON."""
+def pack_blades(blades: Blades | None) -> dict[str, Any]:
+    """The blades of a simulation whose bodies can be cut as a tree of plain values and arrays."""
     if blades is None:
         return {"blades": []}
-    arrays |= {f"blades.{name}": array.numpy() for name, array in blades.kept.items()}
-    given = enumerate(blades.blades)
-    packed = [_pack_tool(blade, True, f"blade{k}.", arrays) | {"level": blade.level} for k, blade in given]
-    return {"blades": packed, "every": blades.every, "unchanged": blades.unchanged}
+    packed = [_pack_tool(blade, True) | {"level": blade.level} for blade in blades.blades]
+    return {"blades": packed, "kept": blades.kept, "every": blades.every, "unchanged": blades.unchanged}
 
 
-def blades_of(described: dict[str, Any] | None, arrays: Arrays) -> list[Any] | None:
+def blades_of(packed: dict[str, Any] | None) -> list[Any] | None:
     """The argument ``cuts`` of a simulation."""
-    if described is None:
-        return None
-    return [_unpacked_tool(each, f"blade{k}.", arrays) for k, each in enumerate(described["blades"])]
+    return None if packed is None else list(map(_unpacked_tool, packed["blades"]))
 
 
-def unpack_blades(blades: Blades | None, described: dict[str, Any], arrays: Arrays) -> None:
+def unpack_blades(blades: Blades | None, packed: dict[str, Any]) -> None:
     """Restore what blades have done, on the present meshes."""
     if blades is None:
         return
     for name, array in blades.kept.items():
-        array.assign(arrays[f"blades.{name}"])
-    blades.every, blades.unchanged = int(described["every"]), int(described["unchanged"])
+        array.assign(packed["kept"][name])
+    blades.every, blades.unchanged = int(packed["every"]), int(packed["unchanged"])
 
 
-def _pack_grasp(contacts: Contacts, grasp: Grasp, prefix: str, arrays: Arrays) -> dict[str, Any]:
-    arrays[prefix + "nodes"] = grasp.nodes
-    for name, array in grasp.kept.items():
-        arrays[prefix + name] = array.numpy()
-    tool = contacts.obstacles.tools.index(grasp.tool)
-    return {"body": contacts.system.bodies.index(grasp.body), "tool": tool, "stiffness": grasp.stiffness}
-
-
-def _pack_tool(tool: Tool, moves: bool, prefix: str, arrays: Arrays) -> dict[str, Any]:
+def _pack_tool(tool: Tool, moves: bool) -> dict[str, Any]:
     shape = tool.shape
     kind = type(shape).__name__
     if kind not in SHAPES:
         raise InputError(f"a {kind} cannot be saved; only {', '.join(SHAPES)}")
-    arrays[prefix + "place"] = shape.pose
-    arrays[prefix + "pose"] = tool.pose
-    for name in OF_SHAPES:
-        if hasattr(shape, name):
-            arrays[prefix + name] = getattr(shape, name)
-    if tool.keys is not None:
-        arrays[prefix + "times"], arrays[prefix + "poses"] = tool.keys
     return {
         "shape": kind,
         "size": list(shape.size),
+        "arrays": {name: np.asarray(getattr(shape, name)) for name in OF_SHAPES if hasattr(shape, name)},
         "thickness": shape.thickness if np.isfinite(shape.thickness) else None,
         "friction": shape.friction,
+        "place": shape.pose,
         "moves": moves,
+        "pose": tool.pose,
         "speed": tool.speed,
         "is_sent": tool.is_sent,
-        "follows": tool.keys is not None,
+        "keys": tool.keys,
     }
 
 
-def _unpacked_tool(described: dict[str, Any], prefix: str, arrays: Arrays) -> Obstacle:
-    shape: Shape = SHAPES[described["shape"]](described["size"], arrays, prefix)
-    place, pose = (_finite(arrays[prefix + name], (7,)) for name in ("place", "pose"))
+def _unpacked_tool(packed: dict[str, Any]) -> Obstacle:
+    shape = SHAPES[packed["shape"]](packed["size"], **packed["arrays"])
+    place, pose = (_finite(packed[name], (7,)) for name in ("place", "pose"))
     shape.position, shape.quaternion = place[:3], place[3:]
-    shape.friction = described["friction"]
-    if described["thickness"] is not None:
-        shape.thickness = float(described["thickness"])
-    if not described["moves"]:
+    shape.friction = packed["friction"]
+    if packed["thickness"] is not None:
+        shape.thickness = float(packed["thickness"])
+    if not packed["moves"]:
         return shape
-    tool = Tool(shape, speed=described["speed"])
+    tool = Tool(shape, speed=packed["speed"])
     if isinstance(shape, Edge):
-        options = {"position": place[:3], "quaternion": place[3:], "level": described["level"]}
-        tool = Blade(shape.points, speed=described["speed"], **options)
-    tool.pose, tool.is_sent = pose, bool(described["is_sent"])
-    if described["follows"]:
-        times = _finite(arrays[prefix + "times"])
-        tool.keys = times, _finite(arrays[prefix + "poses"], (len(times), 7))
+        options = {"position": place[:3], "quaternion": place[3:], "level": packed["level"]}
+        tool = Blade(shape.points, speed=packed["speed"], **options)
+    tool.pose, tool.is_sent = pose, bool(packed["is_sent"])
+    if packed["keys"] is not None:
+        times, poses = packed["keys"]
+        tool.keys = _finite(times), _finite(poses, (len(times), 7))
     return tool
 
 

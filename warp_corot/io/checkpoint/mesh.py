@@ -19,28 +19,23 @@ OF_TREE = tuple(field.name for field in dataclasses.fields(Tree))
 OF_DOMAIN = ("phi", "fill", "labels", "node_labels", "snap")
 
 
-def pack_mesh(mesh: TetForest | TetMesh, prefix: str, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Put a mesh into arrays whose names begin with ``prefix``; returns the remaining data for JSON."""
+def pack_mesh(mesh: TetForest | TetMesh) -> dict[str, Any]:
+    """A mesh as a tree of plain values and arrays."""
     if isinstance(mesh, TetMesh):
-        arrays[prefix + "points"], arrays[prefix + "tets"] = mesh.points, mesh.tets
-        if mesh.labels is not None:
-            arrays[prefix + "labels"] = mesh.labels
-        names = list(mesh.label_names)
-        return {"kind": "general", "up_axis": mesh.up_axis, "repaired": mesh.repaired, "label_names": names}
+        names = ("points", "tets", "labels", "up_axis", "repaired", "label_names")
+        return {"kind": "general"} | {name: getattr(mesh, name) for name in names}
     place = {"up_axis": mesh.up_axis, "cells": mesh.cells, "cell_size": mesh.cell_size, "origin": mesh.origin}
     if (level := box_level(mesh)) is not None:
         return {"kind": "box", "level": level} | place
-    arrays[prefix + "lattice"], arrays[prefix + "node_ends"] = mesh.lattice, mesh.node_ends
-    for name in OF_TREE:
-        if (array := getattr(mesh.tree, name)) is not None:
-            arrays[f"{prefix}tree.{name}"] = array
-    if mesh.detail is not None:
-        found = {name: getattr(mesh.detail, name) for name in DETAIL}
-        arrays.update((f"{prefix}detail.{name}", array) for name, array in found.items() if array is not None)
-    of_domain = [name for name in OF_DOMAIN if getattr(mesh, name) is not None]
-    for name in of_domain:
-        arrays[f"{prefix}domain.{name}"] = getattr(mesh, name)
-    return {"kind": "forest", "of_domain": of_domain, "label_names": mesh.label_names} | place
+    return place | {
+        "kind": "forest",
+        "lattice": mesh.lattice,
+        "node_ends": mesh.node_ends,
+        "tree": {name: getattr(mesh.tree, name) for name in OF_TREE},
+        "detail": None if mesh.detail is None else {name: getattr(mesh.detail, name) for name in DETAIL},
+        "of_domain": {name: getattr(mesh, name) for name in OF_DOMAIN},
+        "label_names": mesh.label_names,
+    }
 
 
 def box_level(mesh: TetForest) -> int | None:
@@ -52,35 +47,23 @@ def box_level(mesh: TetForest) -> int | None:
     return mesh.tree.depth if same else None
 
 
-def unpack_mesh(described: dict[str, Any], prefix: str, arrays: dict[str, np.ndarray]) -> TetForest | TetMesh:
-    """Return the mesh that ``pack_mesh`` stored."""
-    if described["kind"] == "general":
-        mesh = TetMesh(
-            arrays[prefix + "points"],
-            arrays[prefix + "tets"],
-            up_axis=described["up_axis"],
-            labels=arrays.get(prefix + "labels"),
-            label_names=described.get("label_names", ()),
-        )
-        mesh.repaired = described["repaired"]
+def unpack_mesh(packed: dict[str, Any]) -> TetForest | TetMesh:
+    """The mesh that ``pack_mesh`` packed."""
+    up_axis = packed["up_axis"]
+    if packed["kind"] == "general":
+        labels = {"labels": packed["labels"], "label_names": packed["label_names"]}
+        mesh = TetMesh(packed["points"], packed["tets"], up_axis=up_axis, **labels)
+        mesh.repaired = packed["repaired"]
         return mesh
-    if described["kind"] == "box":
-        cells, origin = tuple(described["cells"]), tuple(described["origin"])
-        up_axis, level = described["up_axis"], described["level"]
-        return TetForest.box(cells, described["cell_size"], level, origin=origin, up_axis=up_axis)
-    tets, level, parent, first_child = (arrays[f"{prefix}tree.{name}"] for name in OF_TREE if name != "cut")
-    tree = Tree(tets, level, parent, first_child, arrays.get(f"{prefix}tree.cut"))
-    x, y, z = described["cells"]
-    a, b, c = described["origin"]
-    lattice, ends = arrays[prefix + "lattice"], arrays[prefix + "node_ends"]
+    cells, origin, size = tuple(packed["cells"]), tuple(packed["origin"]), packed["cell_size"]
+    if packed["kind"] == "box":
+        return TetForest.box(cells, size, packed["level"], origin=origin, up_axis=up_axis)
+    tree, lattice, ends = Tree(**packed["tree"]), packed["lattice"], packed["node_ends"]
     _check_tree(tree, lattice, ends)
-    detail: dict[str, Any] = {name: arrays[key] for name in DETAIL if (key := f"{prefix}detail.{name}") in arrays}
-    of_domain: dict[str, Any] = {name: arrays[f"{prefix}domain.{name}"] for name in described["of_domain"]}
-    names = tuple(described["label_names"])
-    up_axis = described["up_axis"]
-    of_domain["detail"] = Detail(**detail) if detail else None
+    detail = None if packed["detail"] is None else Detail(**packed["detail"])
+    names = tuple(packed["label_names"])
     return TetForest(
-        (x, y, z), described["cell_size"], (a, b, c), lattice, ends, tree, up_axis, label_names=names, **of_domain
+        cells, size, origin, lattice, ends, tree, up_axis, label_names=names, detail=detail, **packed["of_domain"]
     )
 
 

@@ -11,7 +11,6 @@ from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 import warp as wp
 
 from warp_corot.discretization.changing.snapshot import Piece, Snapshot, array_of, check_places
@@ -26,84 +25,64 @@ if TYPE_CHECKING:
     from warp_corot.contact.tool import Tool
     from warp_corot.remesh.changing import Changing
 
-Arrays = dict[str, np.ndarray]
-
 #: Fields of `OnlineRemesh` that JSON can store directly.
 PLAIN = ("refine_above", "simplify_below", "min_level", "max_level", "every", "capacity")
 #: Modules in which criteria can be found by their names.
 CRITERIA = "warp_corot.kernels."
 
 
-def pack_changing(changing: Changing, prefix: str, arrays: Arrays) -> dict[str, Any]:
-    """Put a body's remeshing into arrays whose names begin with ``prefix``; returns the remaining data for JSON."""
+def pack_changing(changing: Changing) -> dict[str, Any]:
+    """A body's remeshing as a tree of plain values and arrays."""
     changing.body.state.adopt_positions()
     conditions, forest, options = changing.conditions, changing.forest, changing.options
     conditions.note()
-    parameters = options.parameters
-    if parameters is not None:
-        arrays[prefix + "parameters"] = parameters.numpy()
-    for name, array in conditions.kept.items():
-        arrays[f"{prefix}conditions.{name}"] = array.numpy()
-    rows = conditions.keyframes.rows
-    for k, row in rows.items():
-        arrays[f"{prefix}row{k}.times"], arrays[f"{prefix}row{k}.displacements"] = row.times, row.displacements
-    keys = conditions.activation.keys
-    for k, each in enumerate(keys):
-        arrays[f"{prefix}activation{k}.times"], arrays[f"{prefix}activation{k}.stress"] = each.times, each.stress
     return {
         "is_remeshed": changing.is_remeshed,
         "options": {name: getattr(options, name) for name in PLAIN},
         "criterion": None if options.criterion is None else _name_of(options.criterion),
-        "parameters": parameters is not None,
+        "parameters": options.parameters,
         "near": None if options.near is None else options.near.place_among_obstacles()[1],
-        "conditions": sorted(conditions.kept),
-        "rows": list(rows),
+        "conditions": conditions.kept,
+        "rows": [[k, row.times, row.displacements] for k, row in conditions.keyframes.rows.items()],
         "between": [[*ends, row] for ends, row in conditions.keyframes.between.items()],
         "loads": changing.body.conditions.has_loads,
         "activation": changing.body.discretization.has_activation,
-        "activation_rows": [each.first for each in keys],
+        "activation_rows": [[each.first, each.times, each.stress] for each in conditions.activation.keys],
         "at_beginning": conditions.of_present_mesh,
         "survey": asdict(changing.survey.last),
-        "initial": _pack_snapshot(forest.remembered, f"{prefix}initial.", arrays),
-        "present": _pack_snapshot(Snapshot.of(forest.pools, forest.carriage.arrays), f"{prefix}present.", arrays),
+        "initial": _pack_snapshot(forest.remembered),
+        "present": _pack_snapshot(Snapshot.of(forest.pools, forest.carriage.arrays)),
     }
 
 
-def unpack_changing(changing: Changing, described: dict[str, Any], prefix: str, arrays: Arrays) -> None:
-    """Restore the remeshing that ``pack_changing`` stored, for a body with its initial mesh."""
+def unpack_changing(changing: Changing, packed: dict[str, Any]) -> None:
+    """Restore the remeshing that ``pack_changing`` packed, for a body with its initial mesh."""
     forest, keyframes, body = changing.forest, changing.conditions.keyframes, changing.body
     kept_in = forest.pools, forest.carriage.arrays
-    _unpacked_snapshot(kept_in, described["initial"], f"{prefix}initial.", arrays).restore(*kept_in)
+    _unpacked_snapshot(kept_in, packed["initial"]).restore(*kept_in)
     forest.remember()
-    _unpacked_snapshot(kept_in, described["present"], f"{prefix}present.", arrays).restore(*kept_in)
-    keyframes.rows = {
-        k: Row(arrays[f"{prefix}row{k}.times"], arrays[f"{prefix}row{k}.displacements"]) for k in described["rows"]
-    }
-    keyframes.between = {(a, b): row for a, b, row in described["between"]}
-    if described["activation"]:
+    _unpacked_snapshot(kept_in, packed["present"]).restore(*kept_in)
+    keyframes.rows = {k: Row(times, displacements) for k, times, displacements in packed["rows"]}
+    keyframes.between = {(a, b): row for a, b, row in packed["between"]}
+    if packed["activation"]:
         _ = body.activation  # made on first use
     changing.renew()
     activation = changing.conditions.activation
-    activation.keys = [
-        Keys(first, arrays[f"{prefix}activation{k}.times"], arrays[f"{prefix}activation{k}.stress"])
-        for k, first in enumerate(described["activation_rows"])
-    ]
+    activation.keys = [Keys(*row) for row in packed["activation_rows"]]
     if activation.keys:
         activation.serve()
     rows = forest.carriage.arrays.row[: body.node_count].numpy()
     nodes = np.flatnonzero(rows >= 0).astype(np.int32)
     body.conditions.set_trajectories(keyframes.trajectories(nodes, rows[nodes], body.device))
     kept = {
-        name: wp.array(arrays[f"{prefix}conditions.{name}"], dtype=KEPT[name], device=body.device)
-        for name in described["conditions"]
+        name: wp.array(values, dtype=KEPT[name], device=body.device) for name, values in packed["conditions"].items()
     }
-    changing.conditions.set_kept(kept, of_present_mesh=described["at_beginning"])
-    changing.survey.last = Findings(**described["survey"])
+    changing.conditions.set_kept(kept, of_present_mesh=packed["at_beginning"])
+    changing.survey.last = Findings(**packed["survey"])
 
 
 def remesh_options(
-    described: Sequence[dict[str, Any]],
-    arrays: Arrays,
+    packed: Sequence[dict[str, Any]],
     device: str | wp.Device,
     given: OnlineRemesh | Sequence[OnlineRemesh | None] | None,
     tools: Sequence[Tool],
@@ -111,8 +90,7 @@ def remesh_options(
     """The options with which the bodies of a checkpoint are remeshed.
 
     Args:
-        described: The bodies' data.
-        arrays: The checkpoint's arrays.
+        packed: The bodies.
         device: The device of the resumed simulation.
         given: Options in place of the stored ones, except the capacity, which stays.
         tools: The obstacles of the resumed simulation.
@@ -123,12 +101,12 @@ def remesh_options(
     kept = [
         None
         if each["remesh"] is None or not each["remesh"]["is_remeshed"]
-        else _options(each["remesh"], f"body{number}.remesh.", arrays, device, given, tools)
-        for number, each in enumerate(described)
+        else _options(each["remesh"], device, given, tools)
+        for each in packed
     ]
     if given is None:
         return kept if any(kept) else None
-    several = list(given) if isinstance(given, Sequence) else [given] * len(described)
+    several = list(given) if isinstance(given, Sequence) else [given] * len(packed)
     if len(several) != len(kept) or not all(isinstance(each, OnlineRemesh | None) for each in several):
         return given  # the simulation reports what is wrong
     found: list[OnlineRemesh | None] = []
@@ -139,22 +117,19 @@ def remesh_options(
     return found
 
 
-def _options(
-    described: dict[str, Any], prefix: str, arrays: Arrays, device: Any, given: Any, tools: Sequence[Tool]
-) -> OnlineRemesh:
-    if described["near"] is not None:
-        return OnlineRemesh(**described["options"], near=tools[described["near"]])
-    name = described["criterion"]
+def _options(packed: dict[str, Any], device: Any, given: Any, tools: Sequence[Tool]) -> OnlineRemesh:
+    if packed["near"] is not None:
+        return OnlineRemesh(**packed["options"], near=tools[packed["near"]])
+    name, parameters = packed["criterion"], packed["parameters"]
     criterion = None if name is None else _criterion(name)
     if name is not None and criterion is None and given is None:
         raise InputError(
             f"the criterion {name.rpartition('.')[2]!r} is your own function, which a checkpoint cannot hold; load "
             "with remesh=OnlineRemesh(criterion=...) as for the original simulation"
         )
-    parameters = None
-    if described["parameters"]:
-        parameters = wp.array(arrays[prefix + "parameters"], dtype=wp.float32, device=device)
-    return OnlineRemesh(**described["options"], criterion=criterion, parameters=parameters)
+    if parameters is not None:
+        parameters = wp.array(parameters, dtype=wp.float32, device=device)
+    return OnlineRemesh(**packed["options"], criterion=criterion, parameters=parameters)
 
 
 def _name_of(criterion: Any) -> str:
@@ -173,20 +148,18 @@ def _criterion(name: str) -> Any:
     return found if isinstance(found, wp.Function) else None
 
 
-def _pack_snapshot(snapshot: Snapshot, prefix: str, arrays: Arrays) -> list[list[Any]]:
-    """Put a snapshot's values into arrays; returns their names and start positions."""
-    arrays[prefix + "counts"] = snapshot.counts
-    for name, start, values in snapshot.pieces:
-        arrays[f"{prefix}{name}.{start}"] = values.numpy()
-    return [[name, start] for name, start, _ in snapshot.pieces]
+def _pack_snapshot(snapshot: Snapshot) -> dict[str, Any]:
+    """A snapshot's values by the names of their arrays and, after a dot, the beginning of the stretch."""
+    pieces = {f"{name}.{start}": values for name, start, values in snapshot.pieces}
+    return {"counts": snapshot.counts, "pieces": pieces}
 
 
-def _unpacked_snapshot(kept_in: tuple[Any, Any], pieces: list[list[Any]], prefix: str, arrays: Arrays) -> Snapshot:
-    counts = arrays[prefix + "counts"]
-    check_places(*kept_in, counts, {f"{n}.{k}": arrays[f"{prefix}{n}.{k}"] for n, k in pieces})
-    made = [Piece(n, start, _on_device(arrays[f"{prefix}{n}.{start}"], array_of(*kept_in, n))) for n, start in pieces]
-    return Snapshot(counts, tuple(made))
-
-
-def _on_device(values: npt.NDArray[Any], like: wp.array) -> wp.array:
-    return wp.array(values, dtype=like.dtype, ndim=like.ndim, device=like.device)
+def _unpacked_snapshot(kept_in: tuple[Any, Any], packed: dict[str, Any]) -> Snapshot:
+    check_places(*kept_in, packed["counts"], packed["pieces"])
+    pieces = []
+    for key, values in packed["pieces"].items():
+        name, _, start = key.rpartition(".")
+        like = array_of(*kept_in, name)
+        on_device = wp.array(values, dtype=like.dtype, ndim=like.ndim, device=like.device)
+        pieces.append(Piece(name, int(start), on_device))
+    return Snapshot(packed["counts"], tuple(pieces))
