@@ -21,7 +21,7 @@ from PIL import Image
 
 import warp_corot as wc
 from warp_corot.cli import main as warp_corot
-from warp_corot.cli.preview_frame import DrawnBody, preview_frame
+from warp_corot.cli.preview_frame import DrawnBodies
 from warp_corot.io.pictures.preview import Camera, draw_body
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -57,10 +57,10 @@ def example(script, duration, up_axis="Y", azimuth=35.0, elevation=14.0, **optio
             wc.record = kept
         (sim,) = seen
         bodies = [
-            DrawnBody(SimpleNamespace(soft=body, subject=SimpleNamespace(mesh=body.mesh, skin=None, surface=None)))
+            SimpleNamespace(soft=body, subject=SimpleNamespace(mesh=body.mesh, skin=None, surface=None))
             for body in sim.bodies
         ]
-        shown = preview_frame(bodies, sim)
+        shown = DrawnBodies(bodies).frame(sim)
         points = shown.positions
         camera = Camera.fit(np.stack([points.min(axis=0), points.max(axis=0)]), up_axis, azimuth, elevation)
         figure = plt.figure(figsize=(6.4, 4.8), layout="constrained")

@@ -1,18 +1,17 @@
-"""A frame of all bodies for pictures, and its form on the disk."""
+"""What pictures show of all bodies and obstacles at one time."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import IO, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from warp_corot.contact.shapes import Ground
 
 if TYPE_CHECKING:
-    from warp_corot.discretization.elements import Mesh
-    from warp_corot.io.write.skins import Skin
+    from warp_corot.io.pictures.colors import VertexAverage
     from warp_corot.simulation.simulation import Simulation
 
     from .bodies import RunBody
@@ -31,67 +30,57 @@ class PreviewFrame:
     ground: np.ndarray
     time: float
 
-    def write(self, file: IO[bytes]) -> None:
-        arrays = (self.positions, self.triangles, self.values, self.rest, self.held, self.ground)
-        for array in (*arrays, np.float64(self.time)):
-            np.save(file, array, allow_pickle=False)
 
-    @classmethod
-    def read(cls, file: IO[bytes]) -> PreviewFrame:
-        x, faces, values, rest, held, ground, time = (np.load(file, allow_pickle=False) for _ in range(7))
-        return cls(x, faces, values, rest, held, ground, float(time))
+class DrawnBodies:
+    """What is drawn of bodies: their skins and their stresses, bound again when a mesh has changed."""
 
-
-class DrawnBody:
-    """What is drawn of a body: its skins and its stresses, bound again when its mesh has changed."""
-
-    def __init__(self, body: RunBody):
+    def __init__(self, bodies: Sequence[RunBody]):
         from warp_corot.io.write.skins import BoundSkins
 
-        self.soft = body.soft
-        self._mesh: Mesh | None = None
-        subject, mesh = body.subject, body.soft.mesh
-        self._skins = BoundSkins([mesh], subject.skin or subject.surface, changing=[mesh is not subject.mesh])
+        self._soft = [body.soft for body in bodies]
+        own = [body.subject.skin or body.subject.surface for body in bodies]
+        changing = [body.soft.mesh is not body.subject.mesh for body in bodies]
+        self._skins = BoundSkins([soft.mesh for soft in self._soft], own, changing=changing)
+        self._averages: dict[int, tuple[Any, VertexAverage]] = {}
 
-    def skins(self) -> list[Skin]:
-        return self._skins.on([self.soft.mesh])
+    def frame(self, sim: Simulation) -> PreviewFrame:
+        """The current state."""
+        u, held = (np.concatenate(each) for each in zip(*map(_state_of, self._soft), strict=True))
+        stress = np.concatenate([self._stress(k, sim) for k in range(len(self._soft))])
+        parts = [
+            (skin.surface.moved(u), skin.surface.triangles, skin.values(stress), skin.surface.points, skin.values(held))
+            for skin in self._skins.on([soft.mesh for soft in self._soft])
+        ]
+        ground = _ground(sim, np.concatenate([part[3] for part in parts]))
+        for points, faces in _solids(sim):
+            parts.append((points, faces, np.full(len(points), np.nan), points, np.zeros(len(points))))
+        firsts = np.cumsum([0, *(len(part[0]) for part in parts)])
+        moved, faces, values, rest, fixed = zip(*parts, strict=True)
+        return PreviewFrame(
+            np.concatenate(moved).astype(np.float32),
+            np.concatenate([triangles + first for triangles, first in zip(faces, firsts, strict=False)]),
+            np.concatenate(values).astype(np.float32),
+            np.concatenate(rest),
+            np.concatenate(fixed) > 0.5,
+            ground,
+            sim.time,
+        )
 
-    def stress(self, sim: Simulation) -> np.ndarray:
-        """Von Mises stress at the nodes [Pa], [N]."""
+    def _stress(self, k: int, sim: Simulation) -> np.ndarray:
+        """Von Mises stress at the nodes of a body [Pa], [N]."""
         from warp_corot.io.pictures.colors import VertexAverage
         from warp_corot.mesh.surfaces.boundary import signed_volumes
 
-        mesh = self.soft.mesh
-        if mesh is not self._mesh:
+        mesh = self._soft[k].mesh
+        if k not in self._averages or self._averages[k][0] is not mesh:
             volumes = np.abs(signed_volumes(mesh.points, mesh.tets))
-            self._mesh, self._average = mesh, VertexAverage(mesh.tets, volumes, len(mesh.points))
-        return self._average(sim.von_mises(self.soft))
+            self._averages[k] = mesh, VertexAverage(mesh.tets, volumes, len(mesh.points))
+        return self._averages[k][1](sim.von_mises(self._soft[k]))
 
 
-def preview_frame(bodies: Sequence[DrawnBody], sim: Simulation) -> PreviewFrame:
-    """The current state of all bodies for drawing."""
-    moved: list[np.ndarray] = []
-    rest: list[np.ndarray] = []
-    triangles, values, held = [], [], []
-    for body in bodies:
-        stress = body.stress(sim)
-        for skin in body.skins():
-            triangles.append(skin.surface.triangles + sum(len(points) for points in rest))
-            moved.append(skin.surface.moved(body.soft.displacements.numpy()))
-            rest.append(skin.surface.points)
-            values.append(skin.values(stress))
-            held.append(skin.values(body.soft.constrained.astype(float)) > 0.5)
-    ground = _ground(sim, np.concatenate(rest))
-    for points, faces in _solids(sim):
-        triangles.append(faces + sum(len(points) for points in rest))
-        moved.append(points)
-        rest.append(points)
-        values.append(np.full(len(points), np.nan))
-        held.append(np.zeros(len(points), bool))
-    arrays = [np.concatenate(each) for each in (moved, triangles, values, rest, held)]
-    return PreviewFrame(
-        arrays[0].astype(np.float32), arrays[1], arrays[2].astype(np.float32), arrays[3], arrays[4], ground, sim.time
-    )
+def _state_of(soft: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Displacements [m], [N, 3], and one where nodes are held, [N]."""
+    return soft.displacements.numpy(), soft.constrained.astype(float)
 
 
 def _solids(sim: Simulation) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import itertools
+import pickle
 import sys
 import tempfile
 from collections.abc import Generator, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,7 +22,7 @@ from warp_corot.io.pictures.film import FILMS, check_film, frames_shown, write_f
 
 from .implicit import is_static
 from .options.defaults import VIEWS
-from .preview_frame import DrawnBody, PreviewFrame, preview_frame
+from .preview_frame import DrawnBodies, PreviewFrame
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -34,25 +36,8 @@ if TYPE_CHECKING:
 MOST_PANELS, MOST_COLUMNS = 12, 4
 #: Pixels of each view of a film, and its approximate number of polygons.
 FILM_SIZE, FILM_PIECES = (640, 540), 15_000
-
-
-@dataclass(frozen=True)
-class CommonView:
-    """The common view of all frames of a preview.
-
-    Attributes:
-        box: Lowest and highest coordinates of all frames [m], [2, 3].
-        cameras: A camera for each view.
-        window: Lowest and highest picture coordinates of all frames.
-        limits: Values at the ends of the colour map.
-        ground: Height of the ground [m].
-    """
-
-    box: np.ndarray
-    cameras: Sequence[Camera]
-    window: tuple[np.ndarray, np.ndarray]
-    limits: tuple[float, float]
-    ground: float
+#: Directions in which points may lie farthest out, [3, 26].
+OUTWARDS = np.array([each for each in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(each)]).T
 
 
 @dataclass
@@ -69,33 +54,36 @@ class Previews:
 
     args: argparse.Namespace
     count: int
-    frames: list[int] = field(init=False)
-    views: list[tuple[float, float]] = field(init=False)
-    fps: float = field(init=False)
-    _file: Any = None
-    _places: list[int] = field(default_factory=list)
-    _bodies: list[DrawnBody] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         path = self.args.preview
         self.views = _views(self.args.preview_views)
-        self.frames = _frames(self.args.preview_frames, self.count)
-        self.fps = self.args.fps
+        self.frames, self.fps = _frames(self.args.preview_frames, self.count), self.args.fps
         if is_film(path):
             self.frames, self.fps = frames_shown(path, list(range(self.count + 1)), self.args.fps)
         elif len(self.frames) * len(self.views) > MOST_PANELS:
             panels = f"{len(self.frames)} frames from {len(self.views)} sides"
             raise InputError(f"--preview would have {panels}; a picture has at most {MOST_PANELS} panels")
+        self._file: IO[bytes] | None = None
+        # Of all stored frames: points that lie farthest out [m], and the end of the colour map.
+        self._outermost: list[np.ndarray] = []
+        self._highest = 0.0
 
     def add(self, frame: int, bodies: Sequence[RunBody], sim: Simulation) -> None:
         """Store the current state if its frame is drawn."""
+        from warp_corot.io.pictures.drawing import value_limits
+
         if frame not in self.frames:
             return
         if self._file is None:
-            self._file = tempfile.TemporaryFile()  # noqa: SIM115 (closed in draw)
-            self._bodies = [DrawnBody(body) for body in bodies]
-        self._places.append(self._file.tell())
-        preview_frame(self._bodies, sim).write(self._file)
+            self._file = tempfile.TemporaryFile()  # noqa: SIM115 (closed with this object)
+            self._bodies = DrawnBodies(bodies)
+        shown = self._bodies.frame(sim)
+        pickle.dump(shown, self._file, pickle.HIGHEST_PROTOCOL)
+        used = np.unique(shown.triangles)
+        seen = np.concatenate([shown.positions[used], shown.rest[used]])
+        self._outermost.append(seen[np.argmax(seen @ OUTWARDS, axis=0)])
+        self._highest = max(self._highest, value_limits(shown.values)[1])
 
     def draw(self, bodies: Sequence[RunBody], name: str) -> None:
         """Draw the stored frames.
@@ -107,14 +95,13 @@ class Previews:
         Raises:
             OSError: It cannot be written.
         """
-        if not self._places:
+        if self._file is None:
             return
         from tqdm import tqdm
 
         up_axis = bodies[0].soft.mesh.up_axis
-        look = self._look(up_axis)
         with tqdm(
-            total=len(self._places),
+            total=len(self._outermost),
             desc="drawing",
             leave=False,
             disable=None,
@@ -123,26 +110,10 @@ class Previews:
             bar_format="{desc}  {percentage:3.0f} % |{bar}| {remaining} left",
         ) as bar:
             if is_film(self.args.preview):
-                with contextlib.closing(self._images(name, look, bar)) as drawing:
+                with contextlib.closing(self._images(name, up_axis, bar)) as drawing:
                     write_film(self.args.preview, drawing, self.fps)
             else:
-                self._draw_picture(name, up_axis, look, bar)
-
-    def _look(self, up_axis: str) -> CommonView:
-        """The common view of all frames."""
-        from warp_corot.io.pictures.drawing import value_limits
-        from warp_corot.io.pictures.preview import Picture, bounds_of, cameras_of, window_of
-
-        boxes, highest, ground = [], 0.0, np.inf
-        for shown in self._kept():
-            boxes.append(bounds_of([Picture(shown.positions, shown.triangles, rest=shown.rest)]))
-            highest = max(highest, value_limits(shown.values)[1])
-            axis = "XYZ".index(up_axis)
-            ground = min(ground, boxes[-1][0, axis], *shown.ground[:, axis])
-        box = np.stack([np.min(boxes, axis=0)[0], np.max(boxes, axis=0)[1]])
-        cameras = cameras_of(self._pictures(shown, ""), up_axis, *VIEWS["corner"], box)
-        window = window_of((self._pictures(each, "") for each in self._kept()), cameras, float(ground))
-        return CommonView(box, cameras, window, (0.0, highest), float(ground))
+                self._draw_picture(name, up_axis, bar)
 
     def _pictures(self, shown: PreviewFrame, frame_title: str) -> list[Picture]:
         """A frame from all sides."""
@@ -160,50 +131,60 @@ class Previews:
             for view, words in zip(self.views, titles, strict=True)
         ]
 
-    def _draw_picture(self, name: str, up_axis: str, look: CommonView, bar: Any) -> None:
-        from warp_corot.io.pictures.preview import cameras_of, draw_strip, save_picture
+    def _common(self, panels: Sequence[Picture], ground: np.ndarray, up_axis: str) -> tuple[list[Camera], float]:
+        """A camera for each panel, which sees all frames, and the height of the ground [m]."""
+        from warp_corot.io.pictures.preview import cameras_of
+
+        seen = np.concatenate(self._outermost)
+        box = np.stack([seen.min(axis=0), seen.max(axis=0)])
+        axis = "XYZ".index(up_axis)
+        return cameras_of(panels, up_axis, *VIEWS["corner"], box), float(min([box[0, axis], *ground[:, axis]]))
+
+    def _draw_picture(self, name: str, up_axis: str, bar: Any) -> None:
+        from warp_corot.io.pictures.preview import draw_strip, save_picture
 
         panels: list[Picture] = []
         for frame, shown in zip(self.frames, self._kept(), strict=False):
             when = f"frame {frame}" if is_static(self.args) else f"{shown.time:.3g} s"
             panels += self._pictures(shown, when if len(self.frames) > 1 else "")
             bar.update()
-        cameras = cameras_of(panels, up_axis, *VIEWS["corner"], look.box)
+        cameras, ground = self._common(panels, shown.ground, up_axis)
         size = (1200, 900) if len(panels) == 1 else None
         several = len(self.views) > 1 and len(self.frames) > 1
         columns = len(self.views) if several else min(len(panels), MOST_COLUMNS)
         words = name if len(self.frames) > 1 or is_static(self.args) else f"{name}; {shown.time:.3g} s"
-        drawn = draw_strip(
-            panels, cameras, value_range=look.limits, title=words, size=size, columns=columns, ground=look.ground
-        )
+        limits = (0.0, self._highest)
+        drawn = draw_strip(panels, cameras, value_range=limits, title=words, size=size, columns=columns, ground=ground)
         save_picture(drawn, self.args.preview)
 
-    def _images(self, name: str, look: CommonView, bar: Any) -> Generator[Image, None, None]:
+    def _images(self, name: str, up_axis: str, bar: Any) -> Generator[Image, None, None]:
         """The frames of a film."""
-        from warp_corot.io.pictures.preview import Strip
+        from warp_corot.io.pictures.preview import Strip, window_of
 
         width, height = FILM_SIZE
         strip = None
         for shown in self._kept():
             views = self._pictures(shown, "")
             if strip is None:
+                cameras, ground = self._common(views, shown.ground, up_axis)
                 strip = Strip(
                     views,
-                    look.cameras,
+                    cameras,
                     titled=True,
-                    value_range=look.limits,
+                    value_range=(0.0, self._highest),
                     size=(width * len(views), height),
-                    window=look.window,
-                    ground=look.ground,
+                    window=window_of(np.concatenate(self._outermost), shown.ground, cameras, ground),
+                    ground=ground,
                     fineness=1,
                 )
             yield strip.draw(views, name if is_static(self.args) else f"{name}; {shown.time:.2f} s")
             bar.update()
 
     def _kept(self) -> Iterator[PreviewFrame]:
-        for place in self._places:
-            self._file.seek(place)
-            yield PreviewFrame.read(self._file)
+        assert self._file is not None
+        self._file.seek(0)
+        for _ in self._outermost:
+            yield pickle.load(self._file)
 
 
 def is_film(path: Path) -> bool:

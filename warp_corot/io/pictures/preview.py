@@ -1,6 +1,6 @@
 """Pictures of deformed bodies as PNG files: one body, or several side by side."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -303,24 +303,20 @@ class Strip:
         self._title.set_position(((width - self._bar) / (2.0 * width), 1.0 - 14 / height))
 
 
-def window_of(pictures: Iterable[Sequence[Picture]], cameras: Sequence[Camera], ground: float) -> tuple[Array, Array]:
-    """Lowest and highest picture coordinates of the panels in all frames of a film, with a margin, [2] and [2].
+def window_of(points: Array, square: Array, cameras: Sequence[Camera], ground: float) -> tuple[Array, Array]:
+    """Lowest and highest picture coordinates of the panels of a film, with a margin, [2] and [2].
 
     Args:
-        pictures: Pictures of each frame, one for each camera.
+        points: The outermost points of all frames [m], [n, 3].
+        square: Corners of the ground [m], [4, 3] or [0, 3].
         cameras: Cameras of the panels.
         ground: Height of the ground, with the shadows on it.
     """
-    ends = []
-    for frame in pictures:
-        for picture, camera in zip(frame, cameras, strict=True):
-            used = np.unique(picture.faces)
-            given = [np.asarray(x, dtype=np.float64)[used] for x in (picture.positions, picture.rest) if x is not None]
-            given += [np.asarray(picture.options["square"])] if "square" in picture.options else []
-            for points in (*given, dropped_shadow(given[0], camera, ground)):
-                flat, _ = camera.project(points)
-                ends += [flat.min(axis=0), flat.max(axis=0)]
-    low, high = np.min(ends, axis=0), np.max(ends, axis=0)
+    flat = [
+        camera.project(np.concatenate([points, square, dropped_shadow(points, camera, ground)]))[0]
+        for camera in cameras
+    ]
+    low, high = np.min(flat, axis=(0, 1)), np.max(flat, axis=(0, 1))
     room = ROOM * float((high - low).max())
     return low - room, high + room
 
