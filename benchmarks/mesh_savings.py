@@ -11,13 +11,14 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from warp_corot.domain import Domain
 from warp_corot.errors import InputError
-from warp_corot.experiments.style import FAINT, INK, LINEAR, OWN_COLOR, new_figure, save, tidy
-from warp_corot.io.files.whole import check_output
+from warp_corot.experiments.figures import FAINT, INK, LINEAR, OWN_COLOR, STYLE
+from warp_corot.io.files.whole import check_output, written_whole
 from warp_corot.mesh import TetForest
 
 #: Edge of a root cube [m]; the bodies fit into one cube or a few.
@@ -147,7 +148,16 @@ def draw(points: Sequence[Point], path: Path) -> None:
     Raises:
         OSError: The picture cannot be written.
     """
-    figure = new_figure(9.0, 3.8)
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    with rc_context(STYLE), written_whole(path) as part:
+        figure = Figure((9.0, 3.8), dpi=200)
+        _draw(figure, points)
+        figure.savefig(part, format="png")
+
+
+def _draw(figure: Any, points: Sequence[Point]) -> None:
     left, right = (figure.add_axes((x, 0.15, 0.4, 0.62)) for x in (0.075, 0.58))
     for kind, color in KINDS.items():
         chosen = [p for p in points if p.kind == kind]
@@ -163,11 +173,9 @@ def draw(points: Sequence[Point], path: Path) -> None:
     right.axvline(1e3 * LOST, color=FAINT, linewidth=0.9, linestyle=(0, (4, 3)))
     right.annotate("spines lost", (1e3 * LOST, 1e3), (4, 0), textcoords="offset points", fontsize=8, color=FAINT)
     for ax, title in ((left, "a ball; numbers: adaptive over uniform"), (right, "a ball with three spines 2 cm thick")):
-        tidy(ax)
         ax.legend(frameon=False, fontsize=9)
         ax.set_title(title, fontsize=9.5, color=INK, loc="left")
     figure.text(0.012, 0.97, "What a surface costs in tetrahedra", fontsize=12.5, color=INK, va="top", weight="bold")
-    save(figure, path)
 
 
 def table(points: Sequence[Point]) -> list[str]:

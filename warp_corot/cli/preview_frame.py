@@ -47,7 +47,7 @@ class DrawnBodies:
         """The current state."""
         u, held = (np.concatenate(each) for each in zip(*map(_state_of, self._soft), strict=True))
         stress = np.concatenate([self._stress(k, sim) for k in range(len(self._soft))])
-        parts = [
+        parts: list[tuple[np.ndarray, ...]] = [
             (skin.surface.moved(u), skin.surface.triangles, skin.values(stress), skin.surface.points, skin.values(held))
             for skin in self._skins.on([soft.mesh for soft in self._soft])
         ]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,14 +11,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from warp_corot.errors import InputError
+from warp_corot.io.files.whole import written_whole
+from warp_corot.io.pictures.preview import Camera, draw_body
+from warp_corot.mesh.surfaces.boundary import boundary_faces
 
-from .claims import PUBLISHED_COROTATED, PUBLISHED_LINEAR
-from .paper import OWN, PEER, REFERENCE, Results, Run
-from .shapes import draw_shapes
-from .style import FAINT, INK, LINEAR, NEO, OWN_COLOR, head, new_figure, save, tidy
+from .claims import PUBLISHED_COROTATED, PUBLISHED_LINEAR, VOLUME_KEPT
+from .paper import CELL_SIZE, CELLS, OWN, PEER, REFERENCE, Results, Run
+from .report import device_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 FILES = {
     5: "figure5_computation_time.png",
@@ -26,9 +30,18 @@ FILES = {
     8: "figure8_error_by_rotation_level.png",
 }
 
+INK, FAINT = "#2b2730", "#8a8590"
+LINEAR, OWN_COLOR, NEO = "#c8452f", "#1f6f8b", "#8a8590"
 _ROTATION, _FORCE, _REST, _FUSED, _SHIPPED = "#d95f3b", "#3b7ea1", "#b9c3c9", "#8a6f8e", "#4c8c5f"
-#: After this time nothing moves, and the axis of a long run is compressed [s].
+#: After this time nothing moves, and the axis of a long run is logarithmic [s].
 _SETTLED = 3.0
+STYLE = {
+    **{f"axes.spines.{side}": False for side in ("top", "right")},
+    **dict.fromkeys(("text.color", "axes.labelcolor", "xtick.labelcolor", "ytick.labelcolor"), INK),
+    **{"axes.edgecolor": FAINT, "xtick.color": FAINT, "ytick.color": FAINT, "axes.axisbelow": True},
+    **{"axes.grid": True, "axes.grid.axis": "y", "grid.color": "#e9e8ec", "grid.linewidth": 0.7},
+    **{"font.size": 9.0, "legend.frameon": False, "legend.fontsize": 8.5},
+}
 
 
 def check_matplotlib() -> None:
@@ -62,78 +75,69 @@ def draw_figures(folder: Path, results: Results) -> list[Path]:
 
 def draw_times(path: Path, results: Results) -> None:
     """Figure 5: the time of a step by model and by rotation level, stage by stage (leaf by leaf) and as shipped."""
-    figure = new_figure(8.0, 4.9)
-    ax = figure.add_axes((0.085, 0.255, 0.895, 0.59))
-    runs = [results.runs[name] for name in (PEER, REFERENCE, "neo-hookean")]
-    own, shared = results.runs[OWN], results.levels
-    places = np.concatenate([np.arange(3.0), 3.6 + np.arange(len(shared)), [4.2 + len(shared)]])
-    names = ["linear", "StVK", "neo-\nHookean", *(str(run.case.rotation_level) for run in shared), "own"]
-    cuda = results.device.is_cuda
-    highest, half = 0.0, 0.2
-
-    def number(x: float, top: float, seconds: float) -> None:
-        ax.annotate(f"{seconds:.1f}", (x, top), (0, 3), textcoords="offset points", ha="center", fontsize=8, color=INK)
-
-    for place, run in zip(places, [*runs, *shared, own], strict=True):
-        assert run.times is not None
-        scale = 1e6 if cuda else 1.0
-        t = run.times.seconds if cuda else run.times.relative
-        force_color = _FUSED if run.times.fused else _FORCE
-        corotated = run.case.name.startswith(OWN)
-        x = place - 0.2 if corotated else place
-        bottom = 0.0
-        for part, color in ((t.rest, _REST), (t.force, force_color), (t.rotation, _ROTATION)):
-            ax.bar(x, scale * part, 2 * half, bottom=scale * bottom, color=color, edgecolor="white", linewidth=0.6)
-            bottom += part
-        ax.plot([x - half, x + half], [scale * t.step] * 2, color=INK, linewidth=1.4, solid_capstyle="butt")
-        top = scale * max(bottom, t.step)
-        highest = max(highest, top, scale * t.shipped)
-        number(x, top, scale * t.step)
-        if corotated:
-            ax.bar(place + 0.2, scale * t.shipped, 0.24, color=_SHIPPED)
-            number(place + 0.2, scale * t.shipped, scale * t.shipped)
-    ax.set_xticks(places, names)
-    ax.set_xlim(-0.65, places[-1] + 0.65)
-    ax.set_ylim(0.0, 1.1 * highest)
-    tidy(ax)
-    ax.tick_params(axis="x", length=0)
-    ax.set_ylabel("time of a step [µs]" if cuda else "time of a step\n(linear's force + rest = 1)")
-    middle = ax.get_xaxis_transform()
-    ax.text(
-        3.6 + (len(shared) - 1) / 2,
-        -0.165,
-        "corotated, rotations shared at tree level",
-        fontsize=9.5,
-        color=INK,
-        transform=middle,
-        ha="center",
-    )
-    ax.text(places[-1], -0.165, "corotated", fontsize=9.5, color=INK, transform=middle, ha="center")
-    from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    marks: list[Patch | Line2D] = [
-        Patch(color=_ROTATION, label="rotation"),
-        Patch(color=_FORCE, label="force"),
-        Patch(color=_FUSED, label="rotation and force in one kernel"),
-        Patch(color=_REST, label="rest (integration)"),
-        Line2D([], [], color=INK, linewidth=1.4, label="whole step, leaf by leaf"),
-        Patch(color=_SHIPPED, label="whole step as shipped (by subtrees)"),
-    ]
-    figure.legend(
-        handles=marks, loc="lower left", bbox_to_anchor=(0.075, 0.0), ncols=3, frameon=False, fontsize=8.5,
-        handlelength=1.2, columnspacing=1.3,
-    )  # fmt: skip
-    head(figure, "Computation time of a step by model and rotation level", results)
-    save(figure, path)
+    shared, cuda = results.levels, results.device.is_cuda
+    runs = [*(results.runs[name] for name in (PEER, REFERENCE, "neo-hookean")), *shared, results.runs[OWN]]
+    names = ["linear", "StVK", "neo-\nHookean", *(f"level {run.case.rotation_level}" for run in shared), "own"]
+    measured = [run.times for run in runs if run.times is not None]
+    times = [each.seconds if cuda else each.relative for each in measured]
+    stages = {
+        name: (1e6 if cuda else 1.0) * np.array([getattr(each, name) for each in times])
+        for name in ("rest", "force", "rotation", "step", "shipped")
+    }
+    place = np.arange(len(runs)) + 0.5 * (np.arange(len(runs)) > 2)
+    force = [_FUSED if each.fused else _FORCE for each in measured]
+    with _figure(path, "Computation time of a step by model and rotation level", results, (8.0, 4.9)) as figure:
+        ax, left, bottom = figure.subplots(), place - 0.2 * (place > 2), np.zeros(len(runs))
+        for name, color in (("rest", _REST), ("force", force), ("rotation", _ROTATION)):
+            ax.bar(left, stages[name], 0.4, bottom=bottom, color=color, edgecolor="white", linewidth=0.6)
+            bottom += stages[name]
+        whole = ax.hlines(stages["step"], left - 0.2, left + 0.2, color=INK, linewidth=1.4)
+        for x, y in zip(left, np.maximum(bottom, stages["step"]), strict=True):
+            ax.annotate(f"{y:.1f}", (x, y), (0, 3), textcoords="offset points", ha="center", fontsize=8)
+        shipped = ax.bar(place[3:] + 0.2, stages["shipped"][3:], 0.24, color=_SHIPPED)
+        ax.bar_label(shipped, fmt="%.1f", padding=3, fontsize=8)
+        ax.set_xticks(place, names)
+        ax.tick_params(axis="x", length=0)
+        ax.set_xlabel("three models, and the corotated one with rotations shared at a level of the tree, or its own")
+        ax.set_ylabel("time of a step [µs]" if cuda else "time of a step\n(linear's force + rest = 1)")
+        colors = {"rotation": _ROTATION, "force": _FORCE, "rotation and force in one kernel": _FUSED}
+        colors |= {"rest (integration)": _REST, "whole step as shipped (by subtrees)": _SHIPPED}
+        whole.set_label("whole step, leaf by leaf")
+        marks = [*(Patch(color=color, label=label) for label, color in colors.items()), whole]
+        figure.legend(handles=marks, loc="outside lower center", ncols=3, handlelength=1.2)
+
+
+def draw_shapes(path: Path, results: Results) -> None:
+    """Figure 6: the shapes at the end, each in front of its rest shape, and their outlines superimposed."""
+    mesh = results.mesh
+    faces, _ = boundary_faces(mesh.tets, mesh.points)
+    named = {PEER: "linear", REFERENCE: "St. Venant–Kirchhoff", "neo-hookean": "neo-Hookean"}
+    named |= {OWN: "corotated, own rotations", f"{OWN}-0": "corotated, level 0"}
+    shown = np.concatenate([mesh.points, *(results.runs[name].positions for name in named)])
+    camera = Camera.fit(shown, mesh.up_axis, azimuth=68.0, elevation=12.0)
+    window, _ = camera.project(shown)
+    room = 0.04 * np.ptp(window, axis=0)
+    (left, bottom), (right, top) = window.min(axis=0) - room, window.max(axis=0) + room
+    with _figure(path, "Deformed shapes at the end", results, (9.6, 6.4)) as figure:
+        *panels, last = figure.subplots(2, 3).ravel()
+        for ax, (name, label) in zip(panels, named.items(), strict=True):
+            run = results.runs[name]
+            draw_body(ax, run.positions, faces, rest=mesh.points, camera=camera, edges=True, ground=False)
+            ax.set(xlim=(left, right), ylim=(bottom, top))
+            growth = f"{100 * run.growth[-1]:+.1f} %".replace("-", "−")
+            strong = abs(run.growth[-1]) > VOLUME_KEPT
+            ax.set_title(f"{label}\nvolume {growth}", fontsize=10, color=LINEAR if strong else INK)
+        _draw_outlines(last, results)
 
 
 def draw_errors_by_model(path: Path, results: Results) -> None:
     """Figure 7: distance of the observed node from its place under StVK, over time."""
     lines = [
-        (results.runs[PEER], "linear", LINEAR, 1.8),
-        (results.runs["neo-hookean"], "neo-Hookean", NEO, 1.3),
-        (results.runs[OWN], "corotated, own", OWN_COLOR, 1.8),
+        (results.runs[PEER], "linear", LINEAR),
+        (results.runs["neo-hookean"], "neo-Hookean", NEO),
+        (results.runs[OWN], "corotated, own", OWN_COLOR),
     ]
     marks = [(PUBLISHED_LINEAR, "published, linear: 22 mm"), (PUBLISHED_COROTATED, "published, corotated: 3.6 mm")]
     _draw_errors(path, results, lines, marks, "Displacement error of the free end against StVK, by model")
@@ -145,7 +149,7 @@ def draw_errors_by_level(path: Path, results: Results) -> None:
 
     shared = results.levels
     colors = matplotlib.colormaps["viridis"](np.linspace(0.05, 0.92, len(shared)))[::-1]
-    lines = [(run, f"level {run.case.rotation_level}", color, 1.5) for run, color in zip(shared, colors, strict=True)]
+    lines = [(run, f"level {run.case.rotation_level}", color) for run, color in zip(shared, colors, strict=True)]
     marks = [(PUBLISHED_COROTATED, "published bound: 3.6 mm")]
     _draw_errors(path, results, lines, marks, "Displacement error of the free end against StVK, by rotation level")
 
@@ -156,71 +160,62 @@ def draw_errors_by_level(path: Path, results: Results) -> None:
 def _draw_errors(
     path: Path,
     results: Results,
-    lines: Sequence[tuple[Run, str, Any, float]],
+    lines: Sequence[tuple[Run, str, Any]],
     marks: Sequence[tuple[float, str]],
     title: str,
 ) -> None:
-    """Errors over time in mm: the swing on a wide panel, and the rest compressed on a narrow one."""
-    figure = new_figure(8.0, 4.4)
-    end = float(results.times[-1])
-    long = end > 2.0 * _SETTLED
-    panels = [figure.add_axes((0.08, 0.13, 0.57 if long else 0.71, 0.7))]
-    limits = [(0.0, _SETTLED if long else end)]
-    if long:
-        panels.append(figure.add_axes((0.66, 0.13, 0.13, 0.7), sharey=panels[0]))
-        limits.append((_SETTLED, end))
+    """Errors over time in mm, with those at the end in the legend."""
     time = np.concatenate([[0.0], results.times])
-    errors = [np.concatenate([[0.0], 1e3 * results.error(run.case.name)]) for run, *_ in lines]
-    top = 1.1 * max(max(e.max() for e in errors), max(1e3 * m for m, _ in marks))
-    for ax, (low, high) in zip(panels, limits, strict=True):
-        inside = (time >= low) & (time <= high)
-        for value, _ in marks:
+    with _figure(path, title, results, (8.0, 4.4)) as figure:
+        ax = figure.subplots()
+        for run, label, color in lines:
+            error = np.concatenate([[0.0], 1e3 * results.error(run.case.name)])
+            ax.plot(time, error, color=color, linewidth=1.6, label=f"{label}  {error[-1]:.1f}")
+        for value, text in marks:
             ax.axhline(1e3 * value, color=FAINT, linewidth=0.9, linestyle=(0, (4, 3)), zorder=1)
-        for error, (_, _, color, width) in zip(errors, lines, strict=True):
-            ax.plot(time[inside], error[inside], color=color, linewidth=width, solid_joinstyle="round")
-        ax.set_xlim(low, high)
-        ax.set_ylim(0.0, top)
-        tidy(ax)
-    for value, text in marks:
-        panels[0].annotate(
-            text,
-            (limits[0][1], 1e3 * value),
-            (-4, 3),
-            textcoords="offset points",
-            ha="right",
-            fontsize=8.5,
-            color=FAINT,
+            ax.text(time[-1], 1e3 * value, f"{text} ", ha="right", va="bottom", color=FAINT)
+        if time[-1] > 2.0 * _SETTLED:
+            ax.set_xscale("symlog", linthresh=_SETTLED)
+        ax.set(xlim=(0.0, time[-1]), xlabel="time [s]", ylabel="error [mm]")
+        ax.set_ylim(bottom=0.0)
+        figure.legend(loc="outside right center", title="at the end [mm]")
+
+
+def _draw_outlines(ax: Axes, results: Results) -> None:
+    """Draw the beams' sides at x = 0, seen along the x axis."""
+    mesh, (_, depth, length) = results.mesh, np.array(CELLS) * CELL_SIZE
+    x, y, z = mesh.points.T
+    side = np.flatnonzero((np.abs(x) < 1e-9) & (np.minimum(y * (depth - y), z * (length - z)) < 1e-12))
+    # Around the middle of the rectangle, by angle.
+    loop = side[np.argsort(np.arctan2(y[side] - 0.5 * depth, z[side] - 0.5 * length))]
+    loop = np.append(loop, loop[0])
+    for name, label, color, style in (
+        (None, "rest", "#c9c7ce", "-"),
+        (PEER, "linear", LINEAR, "-"),
+        (REFERENCE, "StVK", INK, "-"),
+        (OWN, "corotated, own", OWN_COLOR, (0, (3, 1.5))),
+    ):
+        at = 1e3 * (mesh.points if name is None else results.runs[name].positions)[loop]
+        ax.plot(-at[:, 2], at[:, 1], color=color, linewidth=1.6, linestyle=style, label=label)
+    ax.set_aspect("equal")
+    ax.set_axis_off()
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=2)
+
+
+@contextmanager
+def _figure(path: Path, title: str, results: Results, size: tuple[float, float]) -> Iterator[Figure]:
+    """A figure of this size in inches, without pyplot and its global state, with a title, the simulation and the
+    device; at the end it is written as PNG to a temporary file that is renamed."""
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=size, dpi=200, facecolor="white", layout="constrained")
+        about = (
+            f"beam 64 × 64 × 192 mm under its weight, {len(results.mesh.points)} nodes, {len(results.mesh.tets)} "
+            f"tetrahedra, {results.times[-1]:.1f} s simulated · {device_name(results.device)}"
         )
-    panels[0].set_ylabel("error [mm]")
-    panels[0].set_xlabel("time [s]")
-    if long:
-        panels[1].tick_params(axis="y", left=False, labelleft=False)
-        panels[1].set_xticks([20.0, 40.0, 60.0, 80.0] if round(end) == 80 else np.linspace(low, high, 3)[1:])
-        panels[1].spines["left"].set_color("#d8d6dc")
-    _label_ends(panels[-1], [e[-1] for e in errors], [(label, color) for _, label, color, _ in lines], top)
-    head(figure, title, results)
-    save(figure, path)
-
-
-def _label_ends(ax: Axes, values: list[float], labels: list[tuple[str, object]], top: float) -> None:
-    """Write names beside the ends of lines, moved apart if they would overlap."""
-    gap = 0.052 * top
-    order = np.argsort(values)
-    places = np.array(values, dtype=float)[order]
-    for _ in range(200):
-        for i in range(1, len(places)):
-            lack = gap - (places[i] - places[i - 1])
-            if lack > 0:
-                places[i] += lack / 2
-                places[i - 1] -= lack / 2
-        places = np.maximum(places, 0.02 * top)
-    # The gap is a length on paper, not a fraction of the axes, so that it looks the same on wide and narrow panels.
-    unit = 0.01 / ax.get_position().width
-    across = ax.get_yaxis_transform()
-    for place, index in zip(places, order, strict=True):
-        label, color = labels[index]
-        ends = [1.0 + 0.4 * unit, 1.0 + 2.6 * unit]
-        ax.plot(ends, [values[index], place], transform=across, color=color, linewidth=1.2, clip_on=False)
-        text = f"{label}  {values[index]:.1f}"
-        ax.text(1.0 + 3.0 * unit, place, text, transform=across, fontsize=9, color=INK, va="center")
-    ax.text(1.0 + 3.0 * unit, 0.96 * top, "at the end [mm]", transform=across, fontsize=8.5, color=FAINT, va="bottom")
+        figure.suptitle(f"$\\bf{{{title.replace(' ', '~')}}}$\n{about}", x=0.01, ha="left", fontsize=9.5)
+        yield figure
+        with written_whole(path) as part:
+            figure.savefig(part, format="png")
