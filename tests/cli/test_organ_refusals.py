@@ -36,7 +36,7 @@ def refused_files(folder: Path) -> None:
 REFUSED = [
     (["none.obj"], "none.obj: no such file"),
     (["none.nii.gz"], "none.nii.gz: no such file"),
-    (["text.stl"], "text.stl: has no triangles"),
+    (["text.stl"], "text.stl: has no tetrahedra and no triangles"),
     (["text.nii.gz"], "text.nii.gz: is not a NIfTI file"),
     (["empty.glb"], "empty.glb: is empty"),
     (["half.ply"], "half.ply: the surface is open"),

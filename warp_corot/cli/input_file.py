@@ -10,11 +10,10 @@ import numpy as np
 
 from warp_corot.domain.units import length, likely_unit, metres_per_unit, unlikely_size
 from warp_corot.errors import InputError
-from warp_corot.io.read import FileMesh, read_mesh_file
+from warp_corot.io.read import FileMesh
 from warp_corot.io.read.assets import Asset, find_asset
-from warp_corot.io.read.files import suffix_of
-from warp_corot.io.read.surfaces import UP_AXES, LoadedSurface, load_surface
-from warp_corot.io.read.tetrahedra import USD_SUFFIXES, LoadedMesh, check_file, load_tets, unknown_format
+from warp_corot.io.read.surfaces import LoadedSurface, load_surface, read_file
+from warp_corot.io.read.tetrahedra import LoadedMesh, check_file, load_tets
 from warp_corot.io.read.volumes import LoadedVolume, is_volume, load_volume, volume_of_image
 
 
@@ -26,7 +25,7 @@ class InputFile:
         name: The argument INPUT.
         kind: "box", "tets", "surface" or "scan".
         asset: The asset with this name, if any.
-        found: The content of its mesh file, if it is one.
+        found: The content of its file, unless it is a scan.
         surface: Its triangles, if it is a surface.
         volume: Its voxels, if it is a scan.
         tets: Its tetrahedra; see `with_unit`.
@@ -72,24 +71,13 @@ def open_input(name: str) -> InputFile:
         return InputFile(name, "scan", volume=load_volume(path))
     if asset is None:
         check_file(path, "mesh")
-    suffix = path.suffix.lower()
-    if suffix in USD_SUFFIXES:
-        from warp_corot.io.read.usd.look import has_mesh
-
-        drawn = asset.is_surface if asset else has_mesh(path)
-        if not drawn:
-            return InputFile(name, "tets", asset)
-    if suffix in (*USD_SUFFIXES, *UP_AXES):
-        return InputFile(name, "surface", asset, surface=load_surface(name))
-    if suffix_of(path) is None:
-        raise unknown_format(path)
-    found = read_mesh_file(path)
+    found = read_file(path)
     if not isinstance(found, FileMesh):
         return InputFile(name, "scan", volume=volume_of_image(path, found))
     if found.solids:
-        return InputFile(name, "tets", found=found)
+        return InputFile(name, "tets", asset, found)
     if found.faces:
-        return InputFile(name, "surface", found=found, surface=load_surface(name, found=found))
+        return InputFile(name, "surface", asset, found, load_surface(name, found=found))
     raise InputError(f"{path}: has no tetrahedra and no triangles (cell types: {found.kinds()})")
 
 

@@ -23,7 +23,6 @@ class Asset:
         damping: Mass-proportional damping [1/s].
         duration: Simulated time [s] after which it is nearly at rest.
         note: Explanation of the values.
-        is_surface: Whether it is a closed surface; tetrahedra otherwise.
     """
 
     name: str
@@ -36,7 +35,6 @@ class Asset:
     damping: float
     duration: float
     note: str
-    is_surface: bool = False
 
     @property
     def path(self) -> Path:
@@ -68,7 +66,6 @@ ASSETS: dict[str, Asset] = {
             damping=2.0,
             duration=4.0,
             note="the Stanford bunny, 16 cm long, of silicone gel",
-            is_surface=True,
         ),
         Asset(
             name="bear",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -57,6 +58,10 @@ class FileMesh:
         ignored: Number of the file's cells of other kinds (lines, vertices), by kind.
         notes: Notes for the user, one line each.
         node_sets: Named sets of nodes in the file, indices int64 [n].
+        metres: Metres in the file's unit; None if the file does not say.
+        up_axis: "X", "Y" or "Z"; None if the file does not say.
+        objects: Names of parts that share no nodes, and the number of tetrahedra or triangles of each, in order, if the
+            arrays of the blocks do not number them.
     """
 
     points: NDArray[np.float64]
@@ -65,6 +70,9 @@ class FileMesh:
     ignored: dict[str, int] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     node_sets: dict[str, NDArray[np.int64]] = field(default_factory=dict)
+    metres: float | None = None
+    up_axis: str | None = None
+    objects: list[tuple[str, int]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         if self.points.ndim != 2 or self.points.shape[1] != 3:
@@ -99,6 +107,17 @@ class FileImage:
     values: NDArray[Any]
     affine: NDArray[np.float64]
     notes: list[str]
+
+
+def joined_triangles(parts: Iterable[tuple[str, NDArray[Any], NDArray[Any]]], **about: Any) -> FileMesh:
+    """Surfaces, each with a name, points [N, 3] and triangles [T, 3], as one file's; ``about`` are more attributes."""
+    points, blocks, objects, offset = [np.empty((0, 3))], [], [], 0
+    for name, own, triangles in parts:
+        points.append(np.asarray(own, np.float64).reshape(-1, 3))
+        blocks.append(Block("triangle", np.asarray(triangles, np.int64).reshape(-1, 3) + offset))
+        objects.append((name, len(triangles)))
+        offset += len(own)
+    return FileMesh(np.concatenate(points), blocks, objects=objects, **about)
 
 
 def sets_of_numbers(

@@ -121,7 +121,7 @@ def read_mesh_file(path: Path) -> FileMesh | FileImage:
         if isinstance(found, FileImage):
             return found
         if found is not None and len(found.points):
-            return _checked(found, path)
+            return checked_mesh(found, path)
         if found is not None:
             reason = "it finds no nodes in it"
         if reason:
@@ -161,7 +161,7 @@ def shortened(reason: object) -> str:
     return words if len(words) <= LONGEST_REASON else words[: LONGEST_REASON - 4] + " ..."
 
 
-def _checked(mesh: FileMesh, path: Path) -> FileMesh:
+def checked_mesh(mesh: FileMesh, path: Path) -> FileMesh:
     """The mesh, after a check that its cells only name existing points.
 
     Raises:

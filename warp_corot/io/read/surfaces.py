@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
@@ -15,10 +14,10 @@ from warp_corot.errors import InputError
 from warp_corot.io.files.quiet import bounded, quietly
 
 from .assets import find_asset
-from .filemesh import FileMesh
-from .files import read_mesh_file, suffix_of
+from .filemesh import FileImage, FileMesh, joined_triangles
+from .files import checked_mesh, read_mesh_file, suffix_of
 from .split import triangles_of
-from .tetrahedra import USD_SUFFIXES, check_file, check_finite
+from .tetrahedra import USD_SUFFIXES, check_file, check_finite, read_tetrahedra, short_name
 
 #: Formats read with trimesh, and the usual up axis if the format names none; glTF's is in its standard.
 UP_AXES = {".obj": "Y", ".stl": "Z", ".ply": "Z", ".off": "Z", ".glb": "Y", ".gltf": "Y"}
@@ -55,7 +54,7 @@ def load_surface(path: str | PathLike[str], *, found: FileMesh | None = None) ->
 
     Args:
         path: A file, or ``warp:NAME`` for one in Warp's wheel.
-        found: The result of `read_mesh_file`, if the file was read before.
+        found: The result of `read_file`, if the file was read before.
 
     Raises:
         InputError: The file does not exist, has another format, cannot be read, or has no triangles; one line says
@@ -64,68 +63,69 @@ def load_surface(path: str | PathLike[str], *, found: FileMesh | None = None) ->
     asset = find_asset(path)
     source = asset.path if asset else Path(path)
     check_file(source, "surface")
-    suffix = source.suffix.lower()
-    metres: float | None
-    up_axis: str | None
-    objects: list[tuple[str, int]] = []
-    if suffix in USD_SUFFIXES:
-        from warp_corot.io.read.usd.surfaces import read_usd_surface
-
-        points, triangles, metres, up_axis, notes, objects = read_usd_surface(source)
-    elif suffix in UP_AXES:
-        points, triangles, notes, objects = _read_trimesh(source)
-        metres = 1.0 if suffix in GLTF else None
-        up_axis = UP_AXES[suffix] if suffix in GLTF else None
-    elif suffix_of(source) is not None:
-        points, triangles, notes, objects = _of_mesh_file(source, found)
-        metres = up_axis = None
-    else:
-        known = ", ".join((*UP_AXES, *USD_SUFFIXES))
-        raise InputError(f"{source}: unknown format {suffix or '(no extension)'}; it must be {known}")
-    if not len(triangles):
-        raise InputError(f"{source}: has no triangles")
-    outside = triangles[(triangles < 0) | (triangles >= len(points))]
-    if len(outside):
-        raise InputError(f"{source}: a triangle names point {outside[0]}, and there are {len(points)} points")
-    if asset:
-        points = points * asset.scale
-        notes.append(f"scaled by {asset.scale:g}: {asset.note}")
-    name = asset.name if asset else os.fsencode(source.stem).decode("utf-8", "replace")
-    return LoadedSurface(points, triangles.astype(np.int32), metres, up_axis, name, source, notes, objects)
-
-
-#: Points, triangles, notes and objects.
-Read = tuple[NDArray[np.float64], NDArray[Any], list[str], list[tuple[str, int]]]
-
-
-def _of_mesh_file(path: Path, found: FileMesh | None) -> Read:
-    mesh = read_mesh_file(path) if found is None else found
+    mesh = read_surface(source) if found is None else found
     if not isinstance(mesh, FileMesh):
-        raise InputError(f"{path}: has no triangles (it holds an image)")
+        raise InputError(f"{source}: has no triangles (it holds an image)")
     if mesh.solids:
-        raise InputError(f"{path}: has cells with volume, which TetMesh.load reads; it must have only triangles")
-    check_finite(mesh.points, path)
+        raise InputError(f"{source}: has cells with volume, which TetMesh.load reads; it must have only triangles")
+    check_finite(mesh.points, source)
     blocks = sorted(mesh.faces, key=lambda block: int(block.data.get("block", np.zeros(1))[0]))
     triangles = triangles_of(blocks)
+    if not len(triangles):
+        raise InputError(f"{source}: has no triangles")
     used, renumbered = np.unique(triangles, return_inverse=True)
+    points, notes = mesh.points[used], list(mesh.notes)
     objects: dict[str, int] = {}
     for number, name in mesh.names.get("block", {}).items():
         own = [block for block in blocks if number in block.data.get("block", ())]
         if own:
             objects[name if name not in objects else f"{name} {number}"] = len(triangles_of(own))
-    return mesh.points[used], renumbered.reshape(-1, 3), list(mesh.notes), list(objects.items())
+    if asset:
+        points = points * asset.scale
+        notes.append(f"scaled by {asset.scale:g}: {asset.note}")
+    return LoadedSurface(
+        points,
+        renumbered.reshape(-1, 3).astype(np.int32),
+        mesh.metres,
+        mesh.up_axis,
+        asset.name if asset else short_name(source),
+        source,
+        notes,
+        mesh.objects or list(objects.items()),
+    )
 
 
-def _read_trimesh(path: Path) -> Read:
-    points, triangles, objects, offset = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], [], 0
-    for mesh, transform, node, _ in placed_meshes(path):
-        mesh = mesh.copy()
-        mesh.apply_transform(transform)
-        points.append(np.asarray(mesh.vertices, dtype=np.float64).reshape(-1, 3))
-        triangles.append(np.asarray(mesh.faces).reshape(-1, 3) + offset)
-        objects.append((node, len(mesh.faces)))
-        offset += len(mesh.vertices)
-    return np.concatenate(points), np.concatenate(triangles), [], objects
+def read_surface(path: Path) -> FileMesh | FileImage:
+    """The triangles of a file: of USD stages those of Mesh prims.
+
+    Raises:
+        InputError: Another format, or it cannot be read.
+    """
+    suffix = path.suffix.lower()
+    if suffix in USD_SUFFIXES:
+        from warp_corot.io.read.usd.surfaces import read_usd_surface
+
+        return checked_mesh(read_usd_surface(path), path)
+    if suffix in UP_AXES:
+        about = {"metres": 1.0, "up_axis": UP_AXES[suffix]} if suffix in GLTF else {}
+        placed = [(node, mesh.copy().apply_transform(matrix)) for mesh, matrix, node, _ in placed_meshes(path)]
+        return checked_mesh(joined_triangles(((node, m.vertices, m.faces) for node, m in placed), **about), path)
+    if suffix_of(path) is not None:
+        return read_mesh_file(path)
+    known = ", ".join((*UP_AXES, *USD_SUFFIXES))
+    raise InputError(f"{path}: unknown format {suffix or '(no extension)'}; it must be {known}")
+
+
+def read_file(path: Path) -> FileMesh | FileImage:
+    """What a file holds: cells with volume, or else triangles, or the voxels of a VTK file with an image.
+
+    Raises:
+        InputError: Another format, or it cannot be read.
+    """
+    if path.suffix.lower() not in (*USD_SUFFIXES, *UP_AXES):
+        return read_tetrahedra(path)
+    tets = read_tetrahedra(path) if path.suffix.lower() in USD_SUFFIXES else None
+    return tets if isinstance(tets, FileMesh) and tets.solids else read_surface(path)
 
 
 def placed_meshes(path: Path, **options: Any) -> list[tuple[Any, NDArray[Any], str, str]]:

@@ -2,7 +2,7 @@
 
 import logging
 import os
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, checked_path
 
 from .assets import find_asset
-from .filemesh import FileMesh
+from .filemesh import FileImage, FileMesh
 from .files import read_mesh_file, suffix_of
 from .regions import Regions, find_regions
 from .split import split_solids
@@ -84,7 +84,7 @@ def load_tets(
         unit: Unit of the coordinates, any length such as "mm" or "3.2cm", or metres as a number. None: the file's unit,
             or metres if it has none.
         regions: Name of the file's array of region numbers; None: the likeliest.
-        found: The result of `read_mesh_file`, if the file was read before.
+        found: The result of `read_tetrahedra`, if the file was read before.
 
     Returns:
         The mesh. Elements are not checked here (orientation, volume): `TetMesh` does that.
@@ -98,24 +98,79 @@ def load_tets(
     asset = find_asset(path)
     source = asset.path if asset else checked_path(path, "path")
     check_file(source, "mesh")
-    is_stage = source.suffix.lower() in USD_SUFFIXES
-    loaded = _of_stage(source, regions) if is_stage else _of_file(source, regions, found)
-    points, tets, metres = loaded.points, loaded.tets, loaded.metres_per_unit
-    if len(tets) == 0:
-        raise InputError(f"{source}: has no tetrahedra")
-    if tets.min() < 0 or tets.max() >= len(points):
-        row, column = np.argwhere((tets < 0) | (tets >= len(points)))[0]
-        raise InputError(
-            f"{source}: tetrahedron {row} names point {tets[row, column]} but the points are 0 to {len(points) - 1}"
-        )
+    mesh = read_tetrahedra(source) if found is None else found
+    if not isinstance(mesh, FileMesh):
+        raise InputError(f"{source}: has no tetrahedra (it holds an image)")
+    if not mesh.solids:
+        is_stage = source.suffix.lower() in USD_SUFFIXES
+        kinds = "no TetMesh prim and no Mesh prim with tetraIndices" if is_stage else f"cell types: {mesh.kinds()}"
+        raise InputError(f"{source}: has no tetrahedra ({kinds})")
     from warp_corot.domain.units import metres_per_unit  # late: domains read files
 
-    points = points * (scale if unit is None else scale * metres_per_unit(unit) / metres)
+    check_finite(mesh.points, source)
+    metres = 1.0 if mesh.metres is None else mesh.metres
+    points = mesh.points * (scale * (metres if unit is None else metres_per_unit(unit)))
     check_finite(points, source)
-    for note in loaded.notes:
+    tets, cells, warped = split_solids(mesh.solids, mesh.points)
+    if not len(tets):
+        raise InputError(f"{source}: has no tetrahedra")
+    notes = list(mesh.notes)
+    others: dict[str, int] = {}
+    for block in mesh.solids:
+        if block.kind != "tetra":
+            others[block.kind] = others.get(block.kind, 0) + len(block.nodes)
+    if others:
+        plurals = {"hexahedron": "hexahedra", "wedge": "wedges", "pyramid": "pyramids"}
+        said = ", ".join(f"{count} {kind if count == 1 else plurals[kind]}" for kind, count in others.items())
+        notes.append(f"{said} {'are' if sum(others.values()) > 1 else 'is'} {SPLIT}")
+    if warped:
+        notes.append(f"{warped} cells are so warped that their tetrahedra overlap or leave gaps")
+    for note in notes:
         usual = found is not None or note.endswith(SPLIT)
         log.log(logging.INFO if usual else logging.WARNING, "%s: %s", source, note)
-    return replace(loaded, points=points, name=asset.name if asset else loaded.name)
+    try:
+        numbered = find_regions(mesh, cells, regions)
+    except InputError as error:
+        raise InputError(f"{source}: {error}") from None
+    return LoadedMesh(
+        points,
+        tets.astype(np.int32),
+        mesh.up_axis or "Z",
+        metres,
+        asset.name if asset else short_name(source),
+        source,
+        numbered,
+        mesh.metres is not None,
+        notes,
+        mesh.node_sets,
+        mesh.objects or _objects(mesh, cells),
+    )
+
+
+def read_tetrahedra(path: Path) -> FileMesh | FileImage:
+    """The content of a mesh file; of a USD stage, its tetrahedra.
+
+    Raises:
+        InputError: Another format, or it cannot be read.
+    """
+    suffix = path.suffix.lower()
+    if suffix in USD_SUFFIXES:
+        from warp_corot.io.read.usd.tetrahedra import read_usd_tets
+
+        return read_usd_tets(path)
+    if suffix in SURFACE_SUFFIXES:
+        raise InputError(f"{path}: is not a mesh of tetrahedra but a surface, which Domain.from_surface reads")
+    if suffix_of(path) is None:
+        raise InputError(
+            f"{path}: unknown format {path.suffix or '(no extension)'}; it must be {', '.join(USD_SUFFIXES)}, "
+            f"{', '.join(USUAL)}, another mesh file, a surface such as .stl or a scan such as .nii.gz"
+        )
+    return read_mesh_file(path)
+
+
+def short_name(path: Path) -> str:
+    """The name of a file for a title: UTF-8 in every locale; characters that cannot be shown become question marks."""
+    return os.fsencode(path.stem).decode("utf-8", "replace")
 
 
 def check_file(source: Path, kind: str) -> None:
@@ -150,80 +205,6 @@ def check_finite(points: NDArray[np.float64], source: Path) -> None:
     if not finite.all():
         bad = int(np.argmin(finite))
         raise InputError(f"{source}: point {bad} has coordinates {points[bad].tolist()}; they must be finite")
-
-
-def unknown_format(source: Path) -> InputError:
-    """The error for an extension that no reader takes."""
-    return InputError(
-        f"{source}: unknown format {source.suffix or '(no extension)'}; it must be {', '.join(USD_SUFFIXES)}, "
-        f"{', '.join(USUAL)}, another mesh file, a surface such as .stl or a scan such as .nii.gz"
-    )
-
-
-def _of_stage(path: Path, regions: str | None) -> LoadedMesh:
-    from warp_corot.io.read.usd.tetrahedra import read_usd_tets
-
-    read = read_usd_tets(path)
-    if regions is not None:
-        raise InputError(f"{path}: there is no array {regions!r} that numbers regions; USD stages have none")
-    objects = read.prims if len(read.prims) > 1 else []
-    return LoadedMesh(
-        read.points,
-        read.tets,
-        read.up_axis,
-        read.metres,
-        _short_name(path),
-        path,
-        says_unit=True,
-        node_sets=read.node_sets,
-        objects=objects,
-    )
-
-
-def _short_name(path: Path) -> str:
-    # UTF-8 in every locale; characters that cannot be shown become question marks.
-    return os.fsencode(path.stem).decode("utf-8", "replace")
-
-
-def _of_file(path: Path, regions: str | None, found: FileMesh | None) -> LoadedMesh:
-    if path.suffix.lower() in SURFACE_SUFFIXES:
-        raise InputError(f"{path}: is not a mesh of tetrahedra but a surface, which Domain.from_surface reads")
-    if suffix_of(path) is None:
-        raise unknown_format(path)
-    mesh = read_mesh_file(path) if found is None else found
-    if not isinstance(mesh, FileMesh):
-        raise InputError(f"{path}: has no tetrahedra (it holds an image)")
-    if not mesh.solids:
-        raise InputError(f"{path}: has no tetrahedra (cell types: {mesh.kinds()})")
-    check_finite(mesh.points, path)
-    tets, cells, warped = split_solids(mesh.solids, mesh.points)
-    notes = list(mesh.notes)
-    others = {block.kind: 0 for block in mesh.solids if block.kind != "tetra"}
-    for block in mesh.solids:
-        if block.kind in others:
-            others[block.kind] += len(block.nodes)
-    if others:
-        plurals = {"hexahedron": "hexahedra", "wedge": "wedges", "pyramid": "pyramids"}
-        said = ", ".join(f"{count} {kind if count == 1 else plurals[kind]}" for kind, count in others.items())
-        notes.append(f"{said} {'are' if sum(others.values()) > 1 else 'is'} {SPLIT}")
-    if warped:
-        notes.append(f"{warped} cells are so warped that their tetrahedra overlap or leave gaps")
-    try:
-        numbered = find_regions(mesh, cells, regions)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-    return LoadedMesh(
-        mesh.points,
-        tets.astype(np.int32),
-        "Z",
-        1.0,
-        _short_name(path),
-        path,
-        numbered,
-        notes=notes,
-        node_sets=mesh.node_sets,
-        objects=_objects(mesh, cells),
-    )
 
 
 def _objects(mesh: FileMesh, cells: NDArray[np.int64]) -> list[tuple[str, int]]:

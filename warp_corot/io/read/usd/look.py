@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pxr import Sdf, Usd, UsdGeom, UsdShade, Vt
 
 from warp_corot.errors import InputError
-from warp_corot.io.files.usd import metres_per_unit, open_stage, reads_stage
+from warp_corot.io.files.usd import metres_per_unit, open_stage
 from warp_corot.io.read.surfaces import UP_AXES
 from warp_corot.io.read.tetrahedra import USD_SUFFIXES
 
@@ -126,21 +126,6 @@ class Look:
             Sdf.CopySpec(self._stage.GetRootLayer(), origin, layer, copied)
         stage = Usd.Stage.Open(layer)
         UsdShade.MaterialBindingAPI.Apply(stage.GetPrimAtPath(there)).Bind(UsdShade.Material.Get(stage, copied))
-
-
-@reads_stage
-def has_mesh(path: Path) -> bool:
-    """Whether a stage has a Mesh prim and no tetrahedra.
-
-    Raises:
-        InputError: Not a stage.
-    """
-    stage, meshes = open_stage(path), False
-    for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
-        if prim.IsA(UsdGeom.TetMesh) or prim.HasAttribute("tetraIndices"):
-            return False
-        meshes = meshes or prim.IsA(UsdGeom.Mesh)
-    return meshes
 
 
 def has_looks(path: str | PathLike[str]) -> bool:

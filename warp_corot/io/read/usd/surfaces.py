@@ -12,6 +12,7 @@ from pxr import Usd, UsdGeom
 
 from warp_corot.errors import InputError
 from warp_corot.io.files.usd import first_value, in_world, metres_per_unit, open_stage, reads_stage, world_matrix
+from warp_corot.io.read.filemesh import FileMesh, joined_triangles
 
 
 class DrawnMesh(NamedTuple):
@@ -60,31 +61,21 @@ def drawn_meshes(stage: Any, path: Path) -> Iterator[DrawnMesh]:
 
 
 @reads_stage
-def read_usd_surface(
-    path: Path,
-) -> tuple[NDArray[np.float64], NDArray[np.int64], float, str, list[str], list[tuple[str, int]]]:
-    """All visible Mesh prims of a stage as one surface.
-
-    Returns:
-        Points [N, 3] in the stage's unit, triangles [T, 3], metres in that unit, the up axis, notes for the user,
-        and the names of the prims with the number of triangles of each.
+def read_usd_surface(path: Path) -> FileMesh:
+    """All visible Mesh prims of a stage as triangles in the world.
 
     Raises:
         InputError: The file is not a stage, or a damaged one.
     """
     stage = open_stage(path)
-    metres = metres_per_unit(stage, path)
-    points, triangles, notes, offset = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], [], 0
-    objects = []
-    for drawn in drawn_meshes(stage, path):
-        if drawn.smooth:
-            notes.append(f"{drawn.mesh.GetPath()} is a subdivision surface; its control mesh is used")
-        points.append(drawn.points)
-        triangles.append(drawn.triangles + offset)
-        objects.append((drawn.mesh.GetPrim().GetName(), len(drawn.triangles)))
-        offset += len(drawn.points)
-    up_axis = str(UsdGeom.GetStageUpAxis(stage))
-    return np.concatenate(points), np.concatenate(triangles), metres, up_axis, notes, objects
+    drawn = list(drawn_meshes(stage, path))
+    smooth = [each.mesh.GetPath() for each in drawn if each.smooth]
+    return joined_triangles(
+        [(each.mesh.GetPrim().GetName(), each.points, each.triangles) for each in drawn],
+        notes=[f"{name} is a subdivision surface; its control mesh is used" for name in smooth],
+        metres=metres_per_unit(stage, path),
+        up_axis=str(UsdGeom.GetStageUpAxis(stage)),
+    )
 
 
 def _triangles(mesh: UsdGeom.Mesh, path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,50 +11,26 @@ from pxr import Usd, UsdGeom
 
 from warp_corot.errors import InputError
 from warp_corot.io.files.usd import first_value, in_world, metres_per_unit, open_stage, reads_stage
-from warp_corot.io.read.filemesh import sets_of_numbers
-
-
-@dataclass(frozen=True)
-class StageTets:
-    """The tetrahedra of all prims of a stage, joined, in world space.
-
-    Attributes:
-        points: Rest positions [m], float64 [N, 3].
-        tets: int32 [T, 4].
-        up_axis: The stage's up axis.
-        metres: The stage's metres per unit.
-        prims: Names of the prims, and the number of tetrahedra of each, in order.
-        node_sets: Node sets from primvars of whole numbers, indices int64 [n].
-    """
-
-    points: NDArray[np.float64]
-    tets: NDArray[np.int32]
-    up_axis: str
-    metres: float
-    prims: list[tuple[str, int]]
-    node_sets: dict[str, NDArray[np.int64]]
+from warp_corot.io.read.filemesh import Block, FileMesh, sets_of_numbers
 
 
 @reads_stage
-def read_usd_tets(path: Path) -> StageTets:
-    """Read every tetrahedral prim of a stage.
+def read_usd_tets(path: Path) -> FileMesh:
+    """The tetrahedra of all prims of a stage, joined, in world space; none if no prim has any.
 
     The rest shape is the primvar ``rest`` if there is one (as in files of `UsdWriter`), else ``points`` at
     the default time, else at the first time sample, also if the mesh changes over time. Inactive and abstract
-    prims are left out; instances are read.
+    prims are left out; instances are read. Node sets come from primvars of whole numbers.
 
     Args:
         path: A .usd, .usda, .usdc or .usdz file.
 
     Raises:
-        InputError: The file is not a USD stage, has no tetrahedra, or their indices are not a multiple of four.
+        InputError: The file is not a USD stage, or its indices are not a multiple of four or name no points.
     """
     stage = open_stage(path)
-    metres = metres_per_unit(stage, path)
-    up_axis = str(UsdGeom.GetStageUpAxis(stage))
-
-    all_points: list[NDArray[np.float64]] = []
-    all_tets: list[NDArray[np.int64]] = []
+    all_points: list[NDArray[np.float64]] = [np.empty((0, 3))]
+    blocks: list[Block] = []
     prims: list[tuple[str, int]] = []
     sets: dict[str, list[NDArray[np.int64]]] = {}
     offset = 0
@@ -68,22 +43,19 @@ def read_usd_tets(path: Path) -> StageTets:
             bad = indices[(indices < 0) | (indices >= len(points))][0]
             raise InputError(f"{path}: prim {prim.GetPath()} names point {bad} but has points 0 to {len(points) - 1}")
         all_points.append(in_world(prim, points))
-        all_tets.append(indices + offset)
-        name = prim.GetName()
-        taken = {known for known, _ in prims}
+        blocks.append(Block("tetra", indices + offset))
+        name, taken = prim.GetName(), {known for known, _ in prims}
         prims.append((name if name not in taken else f"{name}_{len(prims) + 1}", len(indices)))
         for known, nodes in _node_sets(prim, len(points)).items():
             sets.setdefault(known, []).append(nodes + offset)
         offset += len(points)
-    if not all_tets:
-        raise InputError(f"{path}: has no tetrahedra (no TetMesh prim and no Mesh prim with tetraIndices)")
-    return StageTets(
-        np.concatenate(all_points) * metres,
-        np.concatenate(all_tets).astype(np.int32),
-        up_axis,
-        metres,
-        prims,
-        {known: np.concatenate(parts) for known, parts in sets.items()},
+    return FileMesh(
+        np.concatenate(all_points),
+        blocks,
+        node_sets={known: np.concatenate(parts) for known, parts in sets.items()},
+        metres=metres_per_unit(stage, path),
+        up_axis=str(UsdGeom.GetStageUpAxis(stage)),
+        objects=prims if len(prims) > 1 else [],
     )
 
 
