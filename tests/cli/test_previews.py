@@ -5,12 +5,12 @@ import pytest
 from command_line import SHORT, simulate
 
 pytest.importorskip("matplotlib")
-from pictures import CUBE, FACES, picture_of
+from pictures import CUBE, FACES, picture_of, render_preview, render_strip
 from PIL import Image, ImageChops
 
 from warp_corot.io.pictures.film import write_film
 from warp_corot.io.pictures.lettering import fit_line
-from warp_corot.io.pictures.preview import Picture, render_preview, render_strip
+from warp_corot.io.pictures.preview import Picture
 
 RUN = ["box", "-o", "a.usd", *SHORT]  # frames 0, 1 and 2
 

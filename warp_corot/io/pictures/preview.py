@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from warp_corot.errors import InputError
-from warp_corot.io.files.whole import check_output, written_whole
+from warp_corot.io.files.whole import written_whole
 
 from .camera import Array, Camera
 from .drawing import INK, checked_surface, draw_body, draw_silhouette, value_limits
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from PIL.Image import Image
 
-__all__ = ["Camera", "Picture", "draw_body", "render_preview", "render_strip", "value_limits"]
+__all__ = ["Camera", "Picture", "draw_body", "value_limits"]
 
 #: Pixels an inch, on which sizes of type depend; and the margin of a film's window.
 DPI, ROOM = 150.0, 0.06
@@ -37,86 +37,6 @@ class Picture:
     title: str = ""
     options: dict[str, Any] = field(default_factory=dict)
     view: tuple[float, float] | None = None
-
-
-def render_preview(
-    path: str | Path,
-    positions: ArrayLike,
-    faces: ArrayLike,
-    *,
-    scalars: ArrayLike | None = None,
-    scalar_label: str = "von Mises stress [Pa]",
-    value_range: tuple[float, float] | None = None,
-    rest: ArrayLike | None = None,
-    up_axis: str = "Y",
-    azimuth: float = 35.0,
-    elevation: float = 14.0,
-    title: str | None = None,
-    size: tuple[int, int] = (1200, 900),
-    **options: Any,
-) -> None:
-    """Render one body to a PNG file of ``size`` pixels, with a colour bar if it has scalars; see `draw_body`.
-
-    Raises:
-        InputError: The path does not end in .png, its folder does not exist, Matplotlib is not installed, or as in
-            `draw_body`.
-        OSError: The file could not be written; a former picture stays.
-    """
-    picture = Picture(positions, faces, scalars, rest, title or "", options=options)
-    render_strip(
-        path,
-        [picture],
-        scalar_label=scalar_label,
-        value_range=value_range,
-        up_axis=up_axis,
-        azimuth=azimuth,
-        elevation=elevation,
-        size=size,
-    )
-
-
-def render_strip(
-    path: str | Path,
-    pictures: Sequence[Picture],
-    *,
-    scalar_label: str = "von Mises stress [Pa]",
-    value_range: tuple[float, float] | None = None,
-    up_axis: str = "Y",
-    azimuth: float = 35.0,
-    elevation: float = 14.0,
-    title: str | None = None,
-    size: tuple[int, int] | None = None,
-) -> None:
-    """Render several bodies, or one at several times, side by side with the same view, scale and colours.
-
-    Args:
-        path: A .png file.
-        pictures: From left to right; each may have its own title.
-        scalar_label: Label of the colour bar.
-        value_range: Values at the ends of the colour map; None: 0 to the highest 99th percentile, rounded up.
-        up_axis: "X", "Y" or "Z".
-        azimuth: View around the up axis [°], see `Camera.fit`.
-        elevation: View from above [°].
-        title: Title above all pictures.
-        size: Pixels; None: 600 a picture, with the height that they need.
-
-    Raises:
-        InputError, OSError: As in `render_preview`.
-    """
-    target = check_output(path, (".png",))
-    if not pictures:
-        raise InputError("pictures is empty; it must have at least one body")
-    save_picture(
-        draw_strip(
-            pictures,
-            cameras_of(pictures, up_axis, azimuth, elevation),
-            scalar_label=scalar_label,
-            value_range=value_range,
-            title=title,
-            size=size,
-        ),
-        target,
-    )
 
 
 def cameras_of(
@@ -155,17 +75,22 @@ def draw_strip(
 
 
 class Strip:
-    """Pictures side by side with one colour bar, drawn again for each frame of a film; see `render_strip`.
+    """Pictures side by side with one scale and one colour bar, drawn again for each frame of a film.
 
     Args:
         pictures: Those of the first frame, from left to right, and row after row.
         cameras: One for each picture.
         titled: Whether frames have a title.
-        scalar_label, value_range, size: As in `render_strip`.
+        scalar_label: Label of the colour bar.
+        value_range: Values at the ends of the colour map; None: 0 to the highest 99th percentile, rounded up.
+        size: Pixels; None: 600 a picture, with the height that they need.
         window: Lowest and highest picture coordinates of the panels, see `window_of`; None: those of the pictures.
         ground: Height of the ground; None: below the lowest node.
         fineness: Factor on the pixels drawn along each side, which are then averaged.
         columns: Pictures in a row; None: all.
+
+    Raises:
+        InputError: Matplotlib is not installed, or positions or faces as in `draw_body`.
     """
 
     def __init__(
