@@ -120,9 +120,7 @@ def joined_triangles(parts: Iterable[tuple[str, NDArray[Any], NDArray[Any]]], **
     return FileMesh(np.concatenate(points), blocks, objects=objects, **about)
 
 
-def sets_of_numbers(
-    name: str, values: NDArray[np.int64], there: NDArray[np.int64] | None = None
-) -> dict[str, NDArray[np.int64]]:
+def sets_of_numbers(name: str, values: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
     """The node sets that an array of whole numbers, one a node, defines.
 
     An array of zeros and ones is one set with the array's name. An array with a few distinct numbers is one set for
@@ -130,11 +128,9 @@ def sets_of_numbers(
 
     Args:
         name: The array's name.
-        values: Its numbers, or those of some of the nodes.
-        there: The distinct numbers of all nodes; None: those in ``values``.
+        values: Its numbers.
     """
-    numbers = np.unique(values) if there is None else there
-    numbers = numbers[numbers != 0]
+    numbers = np.unique(values[values != 0])
     if len(numbers) > MOST_SETS:
         return {}
     if numbers.tolist() == [1]:
