@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pxr import Gf, Sdf, Tf, Usd
+from pxr import Sdf, Tf, Usd
 
 from warp_corot.errors import InputError
 from warp_corot.io.files.usd import reason, usd_name
 from warp_corot.io.files.whole import sync
-from warp_corot.io.pictures.colors import COLORMAP_NAME, round_limit
 from warp_corot.io.read.usd.scene import Scene, TetPrim
 
+from .colored import ColoredStage
 from .over_prims import BodyOver, PointsOver, TetsOver, bind_look, draw_ground
 from .pieces import PieceStore, Samples
 
@@ -56,7 +56,7 @@ class SceneState:
     surfaces: Sequence[NDArray[np.float32]]
 
 
-class SceneWriter:
+class SceneWriter(ColoredStage):
     """Write frames of a scene to a stage with the scene's own stage as a sublayer; it is valid at any moment.
 
     Units, axis, materials, cameras and everything else come from the stage below, which must keep its place relative to
@@ -94,13 +94,11 @@ class SceneWriter:
         show_stress: bool = False,
         flatten: bool = False,
     ):
-        self._store = _Store(path, scene.path)
-        self.path = self._store.path
+        super().__init__(_Store(path, scene.path))
         if self.path.exists() and self.path.samefile(scene.path):
             raise InputError(f"{self.path}: is the input; it must be another file")
         if scene.uses(self.path):
             raise InputError(f"{self.path}: is part of the input {scene.path}; it must be another file")
-        self.frames = 0
         self._scene, self._flatten = scene, flatten
         self._layer = _base_layer(scene, fps)
         moving = {*bodies, *scene.animated}
@@ -113,14 +111,6 @@ class SceneWriter:
             draw_ground(self._layer, ground)
         if show_stress:
             bind_look(self._layer, [prim.path for prim in tets])
-        self._top = 0.0
-        self._tops_used: set[float] = set()
-        self._closed = False
-
-    @property
-    def stress_range(self) -> tuple[float, float]:
-        """Stresses [Pa] at the two ends of the colour map so far."""
-        return 0.0, self._top
 
     def write(self, state: SceneState) -> None:
         """Add a frame.
@@ -128,8 +118,7 @@ class SceneWriter:
         Raises:
             OSError: It could not be written, for example because the disk is full; former frames stay and play.
         """
-        if self._closed:
-            raise InputError(f"{self.path}: is closed; frames must be added before")
+        self._check_open()
         if not self.frames:
             self._store.declare(self._layer)
         samples: Samples = {}
@@ -139,13 +128,7 @@ class SceneWriter:
             samples |= body.samples(pose)
         for surface, points in zip(self._surfaces, state.surfaces, strict=True):
             samples |= surface.samples(points)
-        self._widen(np.concatenate(state.von_mises))
-        self._tops_used.add(self._top)
-        samples |= self._colors(samples)
-        legend = {"map": COLORMAP_NAME, "quantity": "von Mises stress", "unit": "Pa"}
-        self._store.custom_data["stressColors"] = legend | {"lowest": 0.0, "highest": self._top}
-        self._store.add(float(self.frames), samples, sum(map(_nbytes, samples.values())))
-        self.frames += 1
+        self._add(samples, np.concatenate(state.von_mises))
 
     def close(self) -> None:
         """Join all frames into one file; further calls do nothing.
@@ -153,21 +136,15 @@ class SceneWriter:
         Raises:
             OSError: It could not be written; former frames stay and play.
         """
-        if self._closed:
-            return
-        self._closed = True
-        self._store.finish(self._colors if self._tops_used - {self._top} else None)
-        if self._flatten and self.frames:
+        was_open = not self._closed
+        super().close()
+        if was_open and self._flatten and self.frames:
             _flatten(self.path)
 
-    def _widen(self, stress: NDArray[np.float32]) -> None:
-        rank = int(0.99 * len(stress))
-        self._top = max(self._top, round_limit(float(np.partition(stress, rank)[rank])))
-
-    def _colors(self, samples: Samples) -> Samples:
+    def _colors(self, samples: Samples, nodal: NDArray[np.float64] | None = None) -> Samples:
         colors: Samples = {}
         for soft in self._soft:
-            colors |= soft.colors(samples, self._top)
+            colors |= soft.colors(samples, self.stress_range[1])
         return colors
 
 
@@ -216,10 +193,6 @@ def _way(path: Path, below: Path) -> str:
     except ValueError:  # another drive
         return usd_name(below)
     return found if found.startswith("../") else f"./{found}"
-
-
-def _nbytes(value: Any) -> int:
-    return 128 if isinstance(value, Gf.Matrix4d) else memoryview(value).nbytes
 
 
 def _flatten(path: Path) -> None:

@@ -1,7 +1,6 @@
 """Simulated frames as a USD stage: the tetrahedra and their boundary, or smooth surfaces in place of it."""
 
 import logging
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
@@ -12,11 +11,12 @@ from pxr import Kind, Sdf, Usd, UsdGeom
 
 from warp_corot.contact.tool import Obstacle
 from warp_corot.errors import InputError
-from warp_corot.io.pictures.colors import COLORMAP_NAME, VertexAverage, round_limit
+from warp_corot.io.pictures.colors import VertexAverage
 from warp_corot.io.write.provenance import KEY
 from warp_corot.io.write.skins import Skin
 from warp_corot.mesh.surfaces.boundary import right_handed, signed_volumes
 
+from .colored import ColoredStage
 from .materials import declare_physics
 from .obstacles import ObstaclePrim, obstacle_prims
 from .pieces import PieceStore, Samples
@@ -37,7 +37,7 @@ class Mesh(Protocol):
     def tets(self) -> NDArray[np.int32]: ...
 
 
-class UsdWriter:
+class UsdWriter(ColoredStage):
     """Write one body's frames to a USD stage that is valid at any moment, even if the run is killed (see `usd.pieces`).
 
     The stage, in metres, has ``/SoftBody`` (the default prim) with ``tetrahedra``, a `UsdGeom.TetMesh` of purpose
@@ -49,10 +49,6 @@ class UsdWriter:
     tetrahedra around each node, as indices into the 256 colours of `colors.stress_colors`; custom
     data of ``/SoftBody`` name the map and its range. ``/SoftBody/physics`` has the physics materials, and with
     ``gravity`` a physics scene, see `usd.materials.declare_physics`.
-
-    The colour range, unless given, starts at 0 and ends at the 99th percentile of the highest frame so far, rounded
-    up to few digits (`colors.round_limit`). On closing, earlier frames are coloured again with the last range, so that
-    all frames share it.
 
     Mirrored tetrahedra are written with two indices swapped, so that all are right-handed as the schema requires.
 
@@ -79,7 +75,6 @@ class UsdWriter:
         fixed: Fixed nodes, mask [N] or indices.
         material: An object with ``young`` [Pa], ``poisson``, ``density`` [kg/m³], each a number or an array [T].
         up_axis: "X", "Y" or "Z"; None: the mesh's own, else "Y".
-        stress_range: Lowest and highest stress of the colour map [Pa].
         flush_seconds: Approximate wall time [s] whose frames a sudden end may lose.
         skins: Surfaces bound to the mesh's nodes.
         tets: Whether to write the TetMesh; None: only without skins.
@@ -105,7 +100,6 @@ class UsdWriter:
         fixed: ArrayLike | None = None,
         material: Any = None,
         up_axis: str | None = None,
-        stress_range: tuple[float, float] | None = None,
         flush_seconds: float = 2.0,
         skins: Sequence[Skin] = (),
         tets: bool | None = None,
@@ -119,11 +113,7 @@ class UsdWriter:
             raise InputError(f"up_axis is {up_axis!r}; it must be X, Y or Z")
         if not (np.isfinite(fps) and fps > 0.0):
             raise InputError(f"fps is {fps}; it must be a positive number")
-        if stress_range is not None and not 0.0 <= stress_range[0] < stress_range[1] < math.inf:
-            raise InputError(f"stress_range is {stress_range}; it must be two rising stresses in Pa")
-        self._store = PieceStore(path, flush_seconds=flush_seconds)
-        self.path = self._store.path
-        self.frames = 0
+        super().__init__(PieceStore(path, flush_seconds=flush_seconds))
         self._fps = float(fps)
         self._up_axis = up_axis
         self._changing = changing
@@ -135,28 +125,7 @@ class UsdWriter:
         self._skins = [SkinPrim(skin, path, mesh.points, changing=changing) for skin, path in named]
         self._prims: list[TetPrims | SkinPrim | ObstaclePrim] = [*([self._tets] if self._tets else []), *self._skins]
         self._prims += obstacle_prims(obstacles, self._present.points, world)
-        self._range_given = stress_range is not None
-        self._stress_range = stress_range or (0.0, 0.0)
-        self._ranges_used: set[tuple[float, float]] = set()
         self._given: Statics | None = None
-        self._closed = False
-
-    @property
-    def stress_range(self) -> tuple[float, float]:
-        """Stresses [Pa] at the two ends of the colour map so far."""
-        return self._stress_range
-
-    def widen_range(self, top: float) -> None:
-        """Let the colour range reach this stress [Pa], unless it was given."""
-        if not self._range_given and top > self._stress_range[1]:
-            self._stress_range = (0.0, top)
-
-    def range_for(self, stress: NDArray[np.float32]) -> float:
-        """The end of the colour range that a frame with these stresses of its tetrahedra needs [Pa]."""
-        if len(stress) == 0:
-            return 0.0
-        rank = min(len(stress) - 1, int(0.99 * len(stress)))
-        return round_limit(float(np.partition(stress, rank)[rank]))
 
     def change_mesh(
         self, mesh: Mesh, *, fixed: ArrayLike | None = None, material: Any = None, skins: Sequence[Skin] = ()
@@ -201,8 +170,7 @@ class UsdWriter:
             InputError: A shape that does not fit the mesh, or other optional arguments than in the first frame.
             OSError: It could not be written, for example because the disk is full; former frames stay and play.
         """
-        if self._closed:
-            raise InputError(f"{self.path}: is closed; frames must be added before")
+        self._check_open()
         given = Statics(velocities is not None, von_mises is not None, touched is not None)
         if self._given is None:
             self._given = given
@@ -216,39 +184,12 @@ class UsdWriter:
         if von_mises is not None:
             stress = floats(von_mises, (len(self._present.tets),), "von_mises")
             nodal = self._present.average(stress)
-            self.widen_range(self.range_for(stress))
-            self._ranges_used.add(self._stress_range)
-            self._store.custom_data["stressColors"] = self._color_legend()
         self._store.layer_data = {KEY: self.about} if self.about else {}
         frame = Frame(x, v, stress, nodal, touched)
         samples: Samples = {}
         for prim in self._prims:
-            own = prim.samples(frame)
-            samples |= own
-            if stress is not None:
-                samples |= prim.colors(own, self._stress_range, nodal)
-        self._store.add(float(self.frames), samples, sum(_nbytes(value) for value in samples.values()))
-        self.frames += 1
-
-    def flush(self) -> None:
-        """Write the frames so far to disk now; the stage plays them.
-
-        Raises:
-            OSError: As in `write`.
-        """
-        self._store.flush()
-
-    def close(self) -> None:
-        """Join all frames into one file and remove the pieces; further calls do nothing.
-
-        Raises:
-            OSError: The joined file could not be written; the pieces stay, and the stage plays them.
-        """
-        if self._closed:
-            return
-        self._closed = True
-        recolor = self._ranges_used - {self._stress_range}
-        self._store.finish(self._recolor if recolor else None)
+            samples |= prim.samples(frame)
+        self._add(samples, stress, nodal)
 
     def __enter__(self) -> "UsdWriter":
         return self
@@ -261,20 +202,10 @@ class UsdWriter:
                 raise
             logging.getLogger(__name__).warning("%s", error)  # the first error is the one to raise
 
-    def _color_legend(self) -> dict[str, Any]:
-        lowest, highest = self._stress_range
-        return {
-            "map": COLORMAP_NAME,
-            "quantity": "von Mises stress",
-            "unit": "Pa",
-            "lowest": lowest,
-            "highest": highest,
-        }
-
-    def _recolor(self, samples: Samples) -> Samples:
+    def _colors(self, samples: Samples, nodal: NDArray[np.float64] | None = None) -> Samples:
         colors: Samples = {}
         for prim in self._prims:
-            colors |= prim.colors(samples, self._stress_range)
+            colors |= prim.colors(samples, self.stress_range, nodal)
         return colors
 
     def _follows(self) -> dict[str, str]:
@@ -312,10 +243,3 @@ def _present(mesh: Mesh, fixed: ArrayLike | None, material: Any) -> Present:
     volumes = signed_volumes(points, mesh.tets)
     tets = right_handed(np.asarray(mesh.tets, dtype=np.int32), volumes < 0.0)
     return Present(points, tets, VertexAverage(tets, np.abs(volumes), len(points)), fixed, material)
-
-
-def _nbytes(values: Any) -> int:
-    try:
-        return memoryview(values).nbytes
-    except TypeError:  # a quaternion
-        return 16
