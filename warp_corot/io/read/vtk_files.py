@@ -58,14 +58,17 @@ def read(path: Path) -> FileMesh | FileImage:
     Raises:
         Unreadable: With VTK's own message.
     """
-    window = vtkStringOutputWindow()
+    window, former = vtkStringOutputWindow(), vtkOutputWindow.GetInstance()
     vtkOutputWindow.SetInstance(window)
-    reader = _reader(path)
-    reader.SetFileName(str(path))
-    readable = not hasattr(reader, "CanReadFile") or reader.CanReadFile(str(path))
-    if readable:
-        reader.Update()
-        data = reader.GetOutputDataObject(0)
+    try:
+        reader = _reader(path)
+        reader.SetFileName(str(path))
+        readable = not hasattr(reader, "CanReadFile") or reader.CanReadFile(str(path))
+        if readable:
+            reader.Update()
+            data = reader.GetOutputDataObject(0)
+    finally:
+        vtkOutputWindow.SetInstance(former)
     said = _errors(window.GetOutput())
     if not readable or said or data is None:
         raise Unreadable(said or _first_look(path))
