@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from warp_corot.io.write.skins import joined_surfaces
 from warp_corot.mesh.surfaces.bound import BoundPoints, SurfaceMesh
 from warp_corot.mesh.surfaces.marching import marched
 
@@ -52,13 +53,7 @@ def cut(surface: SurfaceMesh, mesh: Any, plane: Plane) -> SurfaceMesh:
     phi = getattr(mesh, "phi", None)
     if phi is not None:
         section = _kept(section, np.einsum("vn,vn->v", section.weights, phi[section.nodes]))
-    first = len(kept.points)
-    return SurfaceMesh(
-        np.concatenate([kept.points, section.points]),
-        np.concatenate([kept.nodes, section.nodes]).astype(np.int32),
-        np.concatenate([kept.weights, section.weights]),
-        np.concatenate([kept.triangles, section.triangles + first]).astype(np.int32),
-    )
+    return joined_surfaces([kept, section])
 
 
 def _kept(surface: SurfaceMesh, beyond: npt.NDArray[np.float64]) -> SurfaceMesh:
