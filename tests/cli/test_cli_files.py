@@ -245,7 +245,7 @@ def test_scenes_are_placed_by_their_transforms(folder):
     scene.add_geometry(ball, node_name="small")
     scene.add_geometry(ball, node_name="large", transform=turned)
     scene.export("scene.glb")
-    surface = open_input("scene.glb").surface
+    surface = open_input("scene.glb").loaded
     assert surface.points.min(axis=0) == pytest.approx([-0.05, -0.1, -0.1], abs=1e-3)
     assert surface.points.max(axis=0) == pytest.approx([0.6, 0.1, 0.1], abs=1e-3)
     assert wc.Domain.from_surface("scene.glb").closed.pieces == 2

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -26,9 +27,7 @@ class InputFile:
         kind: "box", "tets", "surface" or "scan".
         asset: The asset with this name, if any.
         found: The content of its file, unless it is a scan.
-        surface: Its triangles, if it is a surface.
-        volume: Its voxels, if it is a scan.
-        tets: Its tetrahedra; see `with_unit`.
+        loaded: Its triangles or voxels; its tetrahedra, see `with_unit`.
         notes: Notes for the user, one line each.
         unit: The unit of its coordinates; see `with_unit`. None: that of the asset.
     """
@@ -37,9 +36,7 @@ class InputFile:
     kind: str
     asset: Asset | None = None
     found: FileMesh | None = None
-    surface: LoadedSurface | None = None
-    volume: LoadedVolume | None = None
-    tets: LoadedMesh | None = None
+    loaded: LoadedMesh | LoadedSurface | LoadedVolume | None = None
     notes: list[str] = field(default_factory=list)
     unit: str | float | None = None
 
@@ -68,12 +65,12 @@ def open_input(name: str) -> InputFile:
     asset = find_asset(name)
     path = asset.path if asset else Path(name)
     if path.is_dir() or is_volume(path):
-        return InputFile(name, "scan", volume=load_volume(path))
+        return InputFile(name, "scan", loaded=load_volume(path))
     if asset is None:
         check_file(path, "mesh")
     found = read_file(path)
     if not isinstance(found, FileMesh):
-        return InputFile(name, "scan", volume=volume_of_image(path, found))
+        return InputFile(name, "scan", loaded=volume_of_image(path, found))
     if found.solids:
         return InputFile(name, "tets", asset, found)
     if found.faces:
@@ -94,16 +91,18 @@ def with_unit(opened: InputFile, args: argparse.Namespace) -> InputFile:
     if args.scale is not None and not 0.0 < args.scale < np.inf:
         raise InputError(f"scale is {args.scale:g}; it must be a positive number")
     named: str | float | None = None
+    loaded = opened.loaded
     if opened.kind == "tets":
         given = None if args.unit is None else metres_per_unit(args.unit)
-        tets = load_tets(opened.name, unit=given, regions=args.regions_by, found=opened.found)
-        size, named = _longest(tets.points, tets.tets), 1.0 if tets.says_unit else None
-        opened = replace(opened, tets=tets)
-    elif opened.surface is not None:
-        size, named = _longest(opened.surface.points, opened.surface.triangles), opened.surface.metres
-    elif opened.volume is not None:
-        steps = np.linalg.norm(opened.volume.affine[:3, :3], axis=0)
-        size, named = float((opened.volume.values.shape * steps).max()), opened.volume.unit
+        loaded = load_tets(opened.name, unit=given, regions=args.regions_by, found=opened.found)
+        opened = replace(opened, loaded=loaded)
+    if isinstance(loaded, LoadedMesh):
+        size, named = _longest(loaded.points, loaded.tets), 1.0 if loaded.says_unit else None
+    elif isinstance(loaded, LoadedSurface):
+        size, named = _longest(loaded.points, loaded.triangles), loaded.metres
+    elif isinstance(loaded, LoadedVolume):
+        steps = np.linalg.norm(loaded.affine[:3, :3], axis=0)
+        size, named = float((loaded.values.shape * steps).max()), loaded.unit
     else:
         return opened
     if args.unit is not None or args.scale is not None or opened.asset:
@@ -122,47 +121,32 @@ def with_unit(opened: InputFile, args: argparse.Namespace) -> InputFile:
     return replace(opened, unit=unit)
 
 
-def placed_tets(opened: InputFile, args: argparse.Namespace) -> LoadedMesh:
-    """The tetrahedra in metres."""
-    loaded, asset = opened.tets, opened.asset
-    assert loaded is not None
+def placed(opened: InputFile, args: argparse.Namespace) -> Any:
+    """The content, scaled and moved: tetrahedra in metres, triangles and voxels in `InputFile.unit`."""
+    loaded, asset, offset = opened.loaded, opened.asset, offset_of(args)
     scale = 1.0 if args.scale is None else args.scale
-    if asset and args.scale is None and args.unit is None:
-        scale = asset.scale
-    if args.unit is None and not loaded.says_unit and not asset:
-        scale *= metres_per_unit(opened.unit or 1.0)
-    opened.notes += loaded.notes
-    return replace(loaded, points=loaded.points * scale + offset_of(args), up_axis=args.up or loaded.up_axis)
+    as_asset = asset is not None and args.scale is None and args.unit is None
+    if isinstance(loaded, LoadedMesh):
+        if args.unit is None and not loaded.says_unit and not asset:
+            scale *= metres_per_unit(opened.unit or 1.0)
+        scale = asset.scale if asset and as_asset else scale
+        opened.notes += loaded.notes
+        return replace(loaded, points=loaded.points * scale + offset, up_axis=args.up or loaded.up_axis)
+    assert loaded is not None
+    notes = [*loaded.notes, *([f"scaled by {args.scale:g}, as asked for"] if args.scale is not None else [])]
+    if isinstance(loaded, LoadedVolume):
+        affine = np.diag([scale, scale, scale, 1.0]) @ loaded.affine
+        affine[:3, 3] += offset / metres_per_unit(opened.unit or 1.0)
+        return replace(loaded, affine=affine, notes=notes)
+    if asset and not as_asset:  # the requested size replaces the asset's own scale
+        scale, notes = scale / asset.scale, notes[len(loaded.notes) :]
+    points = loaded.points * scale + offset / metres_per_unit(opened.unit or loaded.metres or 1.0)
+    return replace(loaded, points=points, up_axis=args.up or loaded.up_axis, notes=notes)
 
 
 def offset_of(args: argparse.Namespace) -> np.ndarray:
     """The initial displacement of a body [m], [3]."""
     return np.zeros(3) if args.offset is None else np.array(args.offset, dtype=np.float64)
-
-
-def placed_surface(opened: InputFile, args: argparse.Namespace) -> LoadedSurface:
-    """The triangles, scaled and moved, in `InputFile.unit`."""
-    loaded = opened.surface
-    assert loaded is not None
-    scale = 1.0 if args.scale is None else args.scale
-    own_notes = loaded.notes
-    if opened.asset and (args.unit is not None or args.scale is not None):
-        # The requested size replaces the asset's own scale.
-        scale, own_notes = scale / opened.asset.scale, []
-    notes = [*own_notes, *([f"scaled by {args.scale:g}, as asked for"] if args.scale is not None else [])]
-    points = loaded.points * scale + offset_of(args) / metres_per_unit(opened.unit or loaded.metres or 1.0)
-    return replace(loaded, points=points, up_axis=args.up or loaded.up_axis, notes=notes)
-
-
-def placed_volume(opened: InputFile, args: argparse.Namespace) -> LoadedVolume:
-    """The voxels, scaled and moved, in `InputFile.unit`."""
-    loaded = opened.volume
-    assert loaded is not None
-    scale = 1.0 if args.scale is None else args.scale
-    affine = np.diag([scale, scale, scale, 1.0]) @ loaded.affine
-    affine[:3, 3] += offset_of(args) / metres_per_unit(opened.unit or 1.0)
-    notes = [*loaded.notes, *([f"scaled by {args.scale:g}, as asked for"] if args.scale is not None else [])]
-    return replace(loaded, affine=affine, notes=notes)
 
 
 def longest_side(points: np.ndarray) -> float:

@@ -17,7 +17,7 @@ from warp_corot.inputs.choices import SHORT_DURATION
 from warp_corot.io.read.tetrahedra import LoadedMesh
 from warp_corot.mesh import TetForest, TetMesh
 
-from .input_file import InputFile, offset_of, placed_tets
+from .input_file import InputFile, offset_of, placed
 from .label_materials import of_regions, parse_labels
 from .multibody import merged_nodes
 from .options.defaults import BOX_LEVEL, STIFFNESS_PER_WEIGHT
@@ -120,7 +120,7 @@ def find_subject(opened: InputFile, args: argparse.Namespace) -> InputMesh:
     if opened.kind == "box":
         level = BOX_LEVEL if args.level is None else args.level
         return _box(1.0 if args.scale is None else args.scale, level, offset_of(args))
-    loaded = placed_tets(opened, args)
+    loaded: LoadedMesh = placed(opened, args)
     points, tets = loaded.points, loaded.tets
     sets = {name: np.isin(np.arange(len(points)), nodes) for name, nodes in loaded.node_sets.items()}
     if args.join:

@@ -9,6 +9,7 @@ import numpy as np
 
 from warp_corot.errors import InputError
 from warp_corot.experiments import paper
+from warp_corot.io.read.volumes import LoadedVolume
 from warp_corot.materials.isotropic import Isotropic
 
 from .exit_status import as_options, complain
@@ -35,7 +36,7 @@ def needs_young(args: argparse.Namespace) -> bool:
     """Whether a part of the body has no stiffness if ``--young`` is not given."""
     if args.labels is not None:
         return False
-    if args.materials is None or (volume := open_input(args.input).volume) is None:
+    if args.materials is None or not isinstance(volume := open_input(args.input).loaded, LoadedVolume):
         return True
     named, _ = numbers_by_name(parse_labels(args.materials, "--materials"), volume)
     return bool(len(np.setdiff1d(volume.values, [0, *(number for of_name in named.values() for number in of_name)])))
@@ -67,7 +68,7 @@ def organ_in_parts(args: argparse.Namespace) -> InputMesh:
         mesh = wd.from_domain(domain, **fineness_of(args, domain))
     for note in opened.notes:
         complain(note, kind="note")
-    loaded = opened.volume or opened.surface
+    loaded = opened.loaded
     assert loaded is not None
     subject = InputMesh(mesh, loaded.name.encode(errors="replace").decode(), opened.source, labels=entries)
     if opened.asset:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -31,69 +31,61 @@ def bodies_in(opened: InputFile, args: argparse.Namespace) -> list[tuple[InputFi
     ``--join`` is not given. They share the number of tetrahedra by volume. Prims, blocks and instances of
     tetrahedra are separate bodies, too.
     """
-    if opened.kind == "tets":
-        return [(part, args) for part in _of_tets(opened, args.join)]
-    surface = opened.surface
-    if surface is None or args.join or not 2 <= len(surface.objects) <= MOST_BODIES:
+    loaded = opened.loaded
+    several = isinstance(loaded, LoadedMesh | LoadedSurface) and 2 <= len(loaded.objects) <= MOST_BODIES
+    if args.join or not several:
         return [(opened, args)]
-    from warp_corot.domain.closing import close_surface
+    assert isinstance(loaded, LoadedMesh | LoadedSurface)
+    parts, shares = _parts(loaded), np.zeros(0)
+    if isinstance(loaded, LoadedSurface):
+        from warp_corot.domain.closing import close_surface
 
-    parts = _parts(surface)
-    try:
-        whole, *closed = (close_surface(part.points, part.triangles) for part in (surface, *parts))
-    except InputError:
-        return [(opened, args)]
-    if whole.cavities or any(part.caps for part in closed):
-        return [(opened, args)]
-    volumes = np.array([part.volume for part in closed])
-    opened.notes.append(_told(parts))
+        try:
+            whole, *closed = (close_surface(part.points, part.triangles) for part in (loaded, *parts))
+        except InputError:
+            return [(opened, args)]
+        if whole.cavities or any(part.caps for part in closed):
+            return [(opened, args)]
+        shares = np.array([part.volume for part in closed])
+        shares /= shares.sum()
+    names = ", ".join(part.name for part in parts[:8]) + (", ..." if len(parts) > 8 else "")
+    opened.notes.append(f"{len(parts)} separate bodies: {names} (--join makes them one)")
+    fineness = (args.level, args.max_level, args.surface_error, args.cell_size)
     found = []
-    for place, (part, share) in enumerate(zip(parts, volumes / volumes.sum(), strict=True)):
+    for place, part in enumerate(parts):
         own = argparse.Namespace(**vars(args))
-        fineness = (args.level, args.max_level, args.surface_error, args.cell_size)
-        if args.tets is not None or all(given is None for given in fineness):
-            own.tets = max(FEWEST_TETS, int((args.tets or TETS) * share))
-        found.append((replace(opened, surface=part, notes=opened.notes if place == 0 else []), own))
+        if len(shares) and (args.tets is not None or all(given is None for given in fineness)):
+            own.tets = max(FEWEST_TETS, int((args.tets or TETS) * shares[place]))
+        found.append((replace(opened, loaded=part, notes=opened.notes if place == 0 else []), own))
     return found
 
 
-def _of_tets(opened: InputFile, join: bool) -> list[InputFile]:
-    """The parts of a file with tetrahedra, which share no nodes."""
-    loaded = opened.tets
-    assert loaded is not None
-    if join or not 2 <= len(loaded.objects) <= MOST_BODIES:
-        return [opened]
+def _parts(loaded: LoadedMesh | LoadedSurface) -> list[Any]:
+    """The objects of a file, which share no nodes."""
+    cells = loaded.tets if isinstance(loaded, LoadedMesh) else loaded.triangles
     ends = np.cumsum([count for _, count in loaded.objects])
-    parts = [
-        _part(loaded, name, tets)
-        for (name, _), tets in zip(loaded.objects, np.split(np.arange(len(loaded.tets)), ends[:-1]), strict=True)
-    ]
-    opened.notes.append(_told(parts))
-    return [replace(opened, tets=part, notes=opened.notes if place == 0 else []) for place, part in enumerate(parts)]
-
-
-def _part(loaded: LoadedMesh, name: str, chosen: npt.NDArray[np.integer]) -> LoadedMesh:
-    """The body with some of the tetrahedra."""
-    used, tets = np.unique(loaded.tets[chosen], return_inverse=True)
-    sets = {known: np.flatnonzero(np.isin(used, nodes)) for known, nodes in loaded.node_sets.items()}
-    regions = loaded.regions
-    if regions is not None:
-        regions = replace(regions, of_tet=regions.of_tet[chosen])
-    return replace(
-        loaded,
-        points=loaded.points[used],
-        tets=tets.reshape(-1, 4).astype(np.int32),
-        name=name,
-        regions=regions,
-        notes=loaded.notes if not chosen[0] else [],
-        node_sets={known: nodes for known, nodes in sets.items() if len(nodes)},
-        objects=[],
-    )
-
-
-def _told(parts: Sequence[LoadedMesh] | Sequence[LoadedSurface]) -> str:
-    names = ", ".join(part.name for part in parts[:8]) + (", ..." if len(parts) > 8 else "")
-    return f"{len(parts)} separate bodies: {names} (--join makes them one)"
+    parts: list[LoadedMesh | LoadedSurface] = []
+    for (name, count), chosen in zip(loaded.objects, np.split(np.arange(len(cells)), ends[:-1]), strict=True):
+        if not count:
+            continue
+        used, renumbered = np.unique(cells[chosen], return_inverse=True)
+        own = np.asarray(renumbered.reshape(-1, cells.shape[1]), dtype=np.int32)
+        part = replace(loaded, points=loaded.points[used], name=name, objects=[])
+        if isinstance(part, LoadedSurface):
+            parts.append(replace(part, triangles=own))
+            continue
+        sets = {known: np.flatnonzero(np.isin(used, nodes)) for known, nodes in part.node_sets.items()}
+        regions = part.regions
+        parts.append(
+            replace(
+                part,
+                tets=own,
+                regions=None if regions is None else replace(regions, of_tet=regions.of_tet[chosen]),
+                notes=[] if parts else part.notes,
+                node_sets={known: nodes for known, nodes in sets.items() if len(nodes)},
+            )
+        )
+    return parts
 
 
 def merged_nodes(
@@ -109,13 +101,3 @@ def _welded(points: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.int64], npt
     step = SAME * longest_side(points) or 1.0
     _, kept, place = np.unique(np.round(points / step), axis=0, return_index=True, return_inverse=True)
     return kept, place.reshape(-1)
-
-
-def _parts(surface: LoadedSurface) -> list[LoadedSurface]:
-    ends = np.cumsum([count for _, count in surface.objects])
-    parts = []
-    for (name, _), triangles in zip(surface.objects, np.split(surface.triangles, ends[:-1]), strict=True):
-        used, renumbered = np.unique(triangles, return_inverse=True)
-        points, own = surface.points[used], renumbered.reshape(-1, 3).astype(np.int32)
-        parts.append(replace(surface, points=points, triangles=own, name=name, objects=[]))
-    return [part for part in parts if len(part.triangles)]

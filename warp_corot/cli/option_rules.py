@@ -36,7 +36,7 @@ RULES = (
     Rule(("rotation_level",), lambda _, opened: opened.kind != "tets", "box, surfaces and scans"),
     Rule(
         ("join",),
-        lambda args, opened: opened.kind == "tets" or len(opened.surface.objects if opened.surface else ()) > 1,
+        lambda args, opened: opened.kind == "tets" or len(getattr(opened.loaded, "objects", ())) > 1,
         "surfaces of several objects and meshes of tetrahedra",
     ),
     Rule(("labels", "smoothing"), lambda _, opened: opened.kind == "scan", "scans"),

@@ -11,11 +11,12 @@ import numpy as np
 
 from warp_corot.errors import InputError
 from warp_corot.inputs.stopwatch import WATCH
+from warp_corot.io.read.surfaces import LoadedSurface
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.lattice import checked_level
 
 from .exit_status import as_options
-from .input_file import InputFile, offset_of, placed_surface, placed_volume
+from .input_file import InputFile, offset_of, placed
 from .input_mesh import InputMesh
 from .label_materials import LabelMaterial, numbers_by_name, parse_labels
 from .options.defaults import CUBES_OF_LEVEL, MAX_LEVEL_FOR_ERROR, TETS
@@ -65,7 +66,7 @@ def find_organ(opened: InputFile, args: argparse.Namespace) -> InputMesh:
         done = WATCH.clock()
         measured = _measured(args, mesh, domain, surface)
         skin = _own_surface(opened, args, domain)
-    asset, loaded = opened.asset, opened.volume or opened.surface
+    asset, loaded = opened.asset, opened.loaded
     assert loaded is not None
     subject = InputMesh(
         mesh,
@@ -101,14 +102,14 @@ def fineness_of(args: argparse.Namespace, domain: Domain) -> dict[str, Any]:
 def _surface(opened: InputFile, args: argparse.Namespace) -> Domain:
     from warp_corot.domain import Domain
 
-    return Domain.from_surface(placed_surface(opened, args), unit=opened.unit, device=args.device)
+    return Domain.from_surface(placed(opened, args), unit=opened.unit, device=args.device)
 
 
 def _scan(opened: InputFile, args: argparse.Namespace, entries: list[LabelMaterial]) -> Domain:
     """The domain of a scan; ``entries`` are filled with the materials of its labels."""
     from warp_corot.domain import Domain
 
-    volume, unit = placed_volume(opened, args), opened.unit
+    volume, unit = placed(opened, args), opened.unit
     if args.threshold is None:
         volume = _without_nan(volume, opened.notes)
     option, text = ("--labels", args.labels) if args.labels is not None else ("--materials", args.materials)
@@ -194,11 +195,11 @@ def _mesh(args: argparse.Namespace, domain: Domain) -> TetForest:
 
 def _own_surface(opened: InputFile, args: argparse.Namespace, domain: Domain) -> OwnSurface | None:
     """The input surface, if it is to be drawn."""
-    if opened.surface is None or args.skin == "marched":
+    if not isinstance(opened.loaded, LoadedSurface) or args.skin == "marched":
         return None
     from warp_corot.io.write.skins import OwnSurface
 
-    found = OwnSurface.of_domain(opened.source, opened.surface, domain.bounds, offset_of(args))
+    found = OwnSurface.of_domain(opened.source, opened.loaded, domain.bounds, offset_of(args))
     if found is None:
         opened.notes.append("the surface was changed when it was closed: the marched one is drawn")
     return found
