@@ -37,7 +37,7 @@ REFUSED = [
     (["none.obj"], "none.obj: no such file"),
     (["none.nii.gz"], "none.nii.gz: no such file"),
     (["text.stl"], "text.stl: has no tetrahedra and no triangles"),
-    (["text.nii.gz"], "text.nii.gz: is not a NIfTI file"),
+    (["text.nii.gz"], "text.nii.gz: is not a .nii.gz file"),
     (["empty.glb"], "empty.glb: is empty"),
     (["half.ply"], "half.ply: the surface is open"),
     (["flat.off"], "flat.off: the surface has zero thickness"),

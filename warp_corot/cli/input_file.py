@@ -15,7 +15,7 @@ from warp_corot.io.read import FileMesh
 from warp_corot.io.read.assets import Asset, find_asset
 from warp_corot.io.read.surfaces import LoadedSurface, load_surface, read_file
 from warp_corot.io.read.tetrahedra import LoadedMesh, check_file, load_tets
-from warp_corot.io.read.volumes import LoadedVolume, is_volume, load_volume, volume_of_image
+from warp_corot.io.read.volumes import LoadedVolume, volume_of_image
 
 
 @dataclass
@@ -64,9 +64,7 @@ def open_input(name: str) -> InputFile:
         raise InputError(f"{name}: is a web address; the input must be a file on this machine")
     asset = find_asset(name)
     path = asset.path if asset else Path(name)
-    if path.is_dir() or is_volume(path):
-        return InputFile(name, "scan", loaded=load_volume(path))
-    if asset is None:
+    if asset is None and not path.is_dir():
         check_file(path, "mesh")
     found = read_file(path)
     if not isinstance(found, FileMesh):

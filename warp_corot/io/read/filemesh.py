@@ -102,11 +102,13 @@ class FileImage:
         values: [nx, ny, nz].
         affine: From voxel indices to positions, float64 [4, 4].
         notes: Notes for the user, one line each.
+        unit: "m", "cm", "mm", or None if the file does not say.
     """
 
     values: NDArray[Any]
     affine: NDArray[np.float64]
     notes: list[str]
+    unit: str | None = None
 
 
 def joined_triangles(parts: Iterable[tuple[str, NDArray[Any], NDArray[Any]]], **about: Any) -> FileMesh:

@@ -36,6 +36,8 @@ class Reader:
 VTK = Reader("VTK", "vtk_files", "vtkmodules", "mesh")
 GMSH = Reader("Gmsh", "gmsh_files", "gmsh", "gmsh")
 MESHIO = Reader("meshio", "meshio_files", "meshio", "mesh")
+NIBABEL = Reader("nibabel", "nibabel_files", "nibabel", "scans")
+ITK = Reader("SimpleITK", "itk_files", "SimpleITK", "scans")
 ABAQUS = Reader("the reader of Abaqus input files", "abaqus")
 TETGEN = Reader("the reader of TetGen's files", "tetgen")
 
@@ -81,8 +83,14 @@ READERS: dict[str, tuple[Reader, ...]] = {
     ".tec": (MESHIO,),
     ".xml": (MESHIO,),
 }
-#: The extensions of mesh files.
-SUFFIXES = tuple(READERS)
+#: Readers of scans by extension.
+SCANS: dict[str, tuple[Reader, ...]] = {
+    **dict.fromkeys((".nii.gz", ".nii", ".mgz", ".mgh"), (NIBABEL,)),
+    **dict.fromkeys((".mha", ".mhd", ".nrrd", ".nhdr", ".dcm"), (ITK,)),
+    ".vti": (VTK,),
+}
+#: The extensions of all these files.
+SUFFIXES = (*READERS, *SCANS)
 #: Errors whose texts are no sentences.
 WORDLESS = (LookupError, AttributeError, TypeError, StopIteration, AssertionError)
 #: Longer reasons are truncated.
@@ -90,30 +98,30 @@ LONGEST_REASON = 200
 
 
 def suffix_of(path: Path) -> str | None:
-    """The file's extension if it is that of a mesh file, else None."""
+    """The file's extension if it is that of a mesh file or a scan, else None."""
     name = path.name.lower()
     return next((suffix for suffix in sorted(SUFFIXES, key=len, reverse=True) if name.endswith(suffix)), None)
 
 
 def read_mesh_file(path: Path) -> FileMesh | FileImage:
-    """Read a mesh file.
+    """Read a mesh file, a scan, or a folder with a DICOM series.
 
     Readers are tried one after the other until one can read the file.
 
     Args:
-        path: A file with one of the extensions `SUFFIXES`.
+        path: A file with one of the extensions `SUFFIXES`, or a folder.
 
     Returns:
-        Points and cells; or the voxels of a VTK file with an image.
+        Points and cells; or the voxels of a scan.
 
     Raises:
         InputError: No installed reader can read it; one line with the readers' own reasons.
     """
-    suffix = suffix_of(path)
+    suffix = "DICOM" if path.is_dir() else suffix_of(path)
     if suffix is None:
         raise InputError(f"{path}: unknown format {path.suffix or '(no extension)'}; it must be {', '.join(SUFFIXES)}")
     reasons, missing = [], []
-    for reader in READERS[suffix]:
+    for reader in (READERS | SCANS).get(suffix, (ITK,)):
         if reader.package and importlib.util.find_spec(reader.package) is None:
             missing.append(reader)
             continue
@@ -130,7 +138,8 @@ def read_mesh_file(path: Path) -> FileMesh | FileImage:
     if not reasons and missing:
         raise InputError(f"{path}: reading {suffix} files needs: {cures}")
     also = f"; {missing[0].name} might read it: {cures}" if missing else ""
-    raise InputError(f"{path}: is not a {suffix} file that can be read ({'; '.join(reasons)}){also}")
+    what = "is a folder without a DICOM series" if path.is_dir() else f"is not a {suffix} file"
+    raise InputError(f"{path}: {what} that can be read ({'; '.join(reasons)}){also}")
 
 
 def read_with(module: str, path: Path) -> tuple[Any, str | None]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,19 +23,25 @@ UNEVEN = 1.0e-3
 DESCRIPTION, MODALITY, POSITION = "0008|103e", "0008|0060", "0020|0032"
 
 
-def read(path: Path) -> FileImage | None:
-    """The voxels of an image; for a folder, those of the largest series in it and its subfolders, None without any.
+def read(path: Path) -> FileImage:
+    """The voxels of an image; for a folder, those of the largest series in it and its subfolders.
 
     Raises:
-        Unreadable: With ITK's own message; or the image does not have three dimensions and one number a voxel.
+        Unreadable: With ITK's own message; the image does not have three dimensions and one number a voxel; or there is
+            no series, or one slice only.
     """
     try:
         if path.is_dir():
             return _series(path)
-        return _voxels(SimpleITK.ReadImage(str(path)), [])
+        image = _voxels(SimpleITK.ReadImage(str(path)), [])
     except RuntimeError as error:
         # ITK names itself and its source files first; the reason comes last.
         raise Unreadable(re.split(r"(?:sitk::|ITK )ERROR:", str(error))[-1]) from None
+    if path.suffix.lower() != ".dcm":
+        return image
+    if image.values.shape[2] < 2:
+        raise Unreadable("it has a single slice; name the folder with the whole series")
+    return replace(image, unit="mm")
 
 
 def _voxels(image: Any, notes: list[str]) -> FileImage:
@@ -48,10 +55,10 @@ def _voxels(image: Any, notes: list[str]) -> FileImage:
     return FileImage(values, RAS_FROM_LPS @ affine, [*notes, TURNED])
 
 
-def _series(folder: Path) -> FileImage | None:
+def _series(folder: Path) -> FileImage:
     series = _all_series(folder)
     if not series:
-        return None
+        raise Unreadable("it has none; name a file, or a folder with one")
     files = max(series, key=len)
     reader = SimpleITK.ImageSeriesReader()
     reader.SetFileNames(files)
@@ -62,7 +69,7 @@ def _series(folder: Path) -> FileImage | None:
     uneven = _unevenness(files)
     if uneven is not None:
         notes.append(f"slices are missing or unevenly spaced, by up to {uneven:.3g} mm")
-    return _voxels(image, notes)
+    return replace(_voxels(image, notes), unit="mm")
 
 
 def _may_be_slice(path: Path) -> bool:

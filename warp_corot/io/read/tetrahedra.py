@@ -160,7 +160,7 @@ def read_tetrahedra(path: Path) -> FileMesh | FileImage:
         return read_usd_tets(path)
     if suffix in SURFACE_SUFFIXES:
         raise InputError(f"{path}: is not a mesh of tetrahedra but a surface, which Domain.from_surface reads")
-    if suffix_of(path) is None:
+    if suffix_of(path) is None and not path.is_dir():
         raise InputError(
             f"{path}: unknown format {path.suffix or '(no extension)'}; it must be {', '.join(USD_SUFFIXES)}, "
             f"{', '.join(USUAL)}, another mesh file, a surface such as .stl or a scan such as .nii.gz"
