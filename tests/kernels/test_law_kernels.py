@@ -190,13 +190,13 @@ def test_anisotropic_general_elements(kind, device, rng):
     axes = quaternions(field)
     law, chosen = anisotropic_law("muscle" in kind), clustered(body.discretization)
     scatter = ClusterScatter(field.elements, law, ActiveMaterial, chosen=chosen, layout=ANISOTROPIC)
-    add_forces(scatter, active_material(field.material, axes, 1, active), on_device, f)
+    add_forces(scatter, active_material(field.passive, axes, 1, active), on_device, f)
     assert_right(f.numpy()[:, :3], leaf_by_leaf(field, active, on_device))
 
 
 def quaternions(field):
-    axes = wp.empty(len(field.material.axes), dtype=wp.quat, device=field.device)
-    field.launch(quaternions_of, len(axes), [field.material.axes], [axes])
+    axes = wp.empty(len(field.passive.axes), dtype=wp.quat, device=field.device)
+    field.launch(quaternions_of, len(axes), [field.passive.axes], [axes])
     return axes
 
 

@@ -404,7 +404,6 @@ class ElementField(ForceField):
         super().__init__(body, deterministic)
         kind = self.discretization.element_kind
         self._functions, self._Material = (stress, differential), Material
-        self._forces = scatter_forces(kind, Material, stress)
         self._energies = element_energies(kind, Material, density)
         self._von_mises = element_von_mises(kind, Material, cauchy)
 
@@ -425,6 +424,10 @@ class ElementField(ForceField):
     @property
     def _force_kernels(self) -> list[LoadedKernel]:
         return [self._forces]
+
+    @property
+    def _forces(self) -> wp.Kernel:
+        return scatter_forces(self.discretization.element_kind, self._Material, self._functions[0])
 
     @property
     def stress_law(self) -> StressLaw:
