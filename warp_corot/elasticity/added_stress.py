@@ -11,13 +11,13 @@ import warp as wp
 
 from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.plan import Plan
+from warp_corot.inputs.forwarding import forwards
 from warp_corot.kernels.elements.forces import element_energies
 from warp_corot.kernels.elements.native_laws import NativeLaw
 
 from .backends.elements import ByElements
 from .model import ForceField, SmallForces
 from .stress_law import ElementMaterial
-from .structs import forwards
 from .tangent import ElementTangent, Tangent
 
 

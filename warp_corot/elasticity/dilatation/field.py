@@ -18,8 +18,8 @@ from warp_corot.discretization.slots import Slots
 from warp_corot.discretization.subtrees import Batch
 from warp_corot.elasticity.backends.mean_dilatation import Dilating
 from warp_corot.elasticity.model import ForceField, SmallForces
-from warp_corot.elasticity.structs import forwards
 from warp_corot.elasticity.tangent import Tangent
+from warp_corot.inputs.forwarding import forwards
 from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.elements import mean_dilatation as kernels
 from warp_corot.kernels.elements.dilatation import Dilatation
