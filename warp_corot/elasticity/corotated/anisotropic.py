@@ -54,6 +54,10 @@ class FibreField(ElementField):
     def _activation(self) -> list:
         return [int(self.discretization.has_activation), self.discretization.activation]
 
+    def write_energies(self, u: wp.array, energies: wp.array) -> None:
+        # In one part: ``part_of`` does not cut materials with directions.
+        self.launch(self._energies, self.element_count, [self.elements, self.material, u], [energies])
+
     def write_potentials(self, u: wp.array, energies: wp.array) -> None:
         self.write_energies(u, energies)
         if self.discretization.has_activation:
