@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from warp_corot.body.activation import Activation, ElementActivation
+from warp_corot.body.activation import Activation, followed_stress
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.elasticity import MODELS, ForceField, Model
 from warp_corot.errors import InputError, StabilityWarning
@@ -146,15 +146,15 @@ def _pack_state(body: SoftBody, prefix: str, arrays: dict[str, np.ndarray]) -> N
     if body.conditions.has_loads:
         arrays[prefix + "loads"] = body.conditions.loads.numpy()
     for k, trajectory in enumerate(body.conditions.trajectories):
-        arrays[f"{prefix}trajectory{k}.nodes"] = trajectory.nodes.numpy()
+        arrays[f"{prefix}trajectory{k}.nodes"] = trajectory.host_numbers
         times, displacements = trajectory.keys()
         arrays[f"{prefix}trajectory{k}.times"] = times
         arrays[f"{prefix}trajectory{k}.displacements"] = displacements
     if body.discretization.has_activation:
         arrays[prefix + "activation"] = body.activation.numpy()
     for k, activation in enumerate(body.conditions.activations):
-        for name in ("elements", "times", "stress"):
-            arrays[f"{prefix}activation{k}.{name}"] = getattr(activation, name).numpy()
+        for name, of_it in (("elements", "numbers"), ("times", "times"), ("stress", "values")):
+            arrays[f"{prefix}activation{k}.{name}"] = getattr(activation, of_it).numpy()
 
 
 def load_checkpoint(
@@ -277,7 +277,7 @@ def _unpack_state(body: SoftBody, described: dict[str, Any], prefix: str, arrays
     activations = []
     for k in range(described["activations"]):
         elements, times, stress = (arrays[f"{prefix}activation{k}.{name}"] for name in ("elements", "times", "stress"))
-        activations.append(ElementActivation.of_keys(elements, Activation(times, stress), body.device))
+        activations.append(followed_stress(elements, Activation(times, stress), body.device))
     body.conditions.set_activations(activations)
     if prefix + "loads" in arrays:
         wp.copy(body.loads, wp.array(arrays[prefix + "loads"][:, :3], dtype=wp.vec3, device=body.device))
