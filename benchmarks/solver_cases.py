@@ -83,7 +83,6 @@ def force_cases(problem: Problem) -> list[Case]:
         forest("linear", wc.Linear(), "linear", model_flops("linear", shape)),
         forest("StVK", wc.StVenantKirchhoff(), "stvk", model_flops("stvk", shape)),
         forest("neo-Hookean", wc.NeoHookean(), "neo_hookean", model_flops("neo_hookean", shape)),
-        forest("StVK on edges", wc.EdgeStVK(), "edge_stvk", model_flops("edge_stvk", shape)),
         force_case(
             problem,
             "mass-spring",

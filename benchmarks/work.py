@@ -13,7 +13,6 @@ multiply-add is two), without addressing, selection by type, or tests that fail.
 from __future__ import annotations
 
 from warp_corot.kernels.elements.stiffness import is_zero
-from warp_corot.kernels.tables.shapes import edge_stiffness
 
 NODE = 16.0  # vec4
 INDICES = 16.0
@@ -97,17 +96,7 @@ def model_flops(model: str, shape: int, rotation: float = 0.0) -> float | None:
         "stvk": FRAME_ADDED + SYMMETRIC_PRODUCT + 6 + HOOKE + MATRIX_PRODUCT,
         "neo_hookean": FRAME_ADDED + COFACTOR + DETERMINANT + 6 + 27,
     }
-    if model in inner:
-        return outer + inner[model]
-    if model == "edge_stvk":
-        entries = sum(
-            abs(a) + abs(b) > 1e-12
-            for ra, rb in zip(*edge_stiffness(shape), strict=True)
-            for a, b in zip(ra, rb, strict=True)
-        )
-        # each edge: difference, 2 X.d + d.d, tension times deformed edge added at both ends
-        return 6 * (3 + 12 + 3 + 4) + 2 * entries + 6 * 6 + SCATTER
-    return None
+    return outer + inner[model] if model in inner else None
 
 
 #: of one spring: difference, lengths, elongation, force, added at both ends

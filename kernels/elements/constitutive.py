@@ -1,10 +1,8 @@
-"""Constitutive laws, one set of functions each: first Piola-Kirchhoff stress and its differential, energy density, and
-a stress for display.
+"""Constitutive laws, one set of functions each: first Piola-Kirchhoff stress, its differential, and energy density.
 
 A law takes the displacement gradient A of an element in an orthonormal frame of its own, so that F = I + A there, and
 returns P in the same frame. Materials are isotropic, so any frame is right, also a left-handed one. ``elements`` gives
-G = (du/dX) Q, and A = Q^T G. ``cauchy`` functions return a tensor with the invariants of the Cauchy stress, for von
-Mises stress and the like. ``differential`` functions return dP, the exact directional derivative of P at A in the
+G = (du/dX) Q, and A = Q^T G. ``differential`` functions return dP, the exact directional derivative of P at A in the
 direction dA, which has the digits of dA. Stresses in Pa, energy densities in J/m^3.
 
 No law subtracts numbers near one: each is written in A, so that its stress has float32's digits at any strain.
@@ -66,6 +64,13 @@ def symmetric(a: wp.mat33):
     return 0.5 * (a + wp.transpose(a))
 
 
+@wp.func
+def push_forward(a: wp.mat33, piola: wp.mat33):
+    """The Cauchy stress P F^T / J, with |J| kept away from zero."""
+    f = identity3() + a
+    return (piola * wp.transpose(f)) / wp.max(wp.abs(wp.determinant(f)), 1.0e-3)
+
+
 # --- linear elasticity ---------------------------------------------------------------------------------------------
 
 
@@ -82,11 +87,6 @@ def linear_differential(a: wp.mat33, da: wp.mat33, mu: float, lam: float):
 @wp.func
 def linear_energy(a: wp.mat33, mu: float, lam: float):
     return hooke_energy(symmetric(a), mu, lam)
-
-
-@wp.func
-def linear_cauchy(a: wp.mat33, mu: float, lam: float):
-    return hooke(symmetric(a), mu, lam)
 
 
 # --- St. Venant-Kirchhoff (with explicit central differences: TLED) ------------------------------------------------
@@ -113,18 +113,6 @@ def stvk_differential(a: wp.mat33, da: wp.mat33, mu: float, lam: float):
 @wp.func
 def stvk_energy(a: wp.mat33, mu: float, lam: float):
     return hooke_energy(green_strain(a), mu, lam)
-
-
-@wp.func
-def push_forward(a: wp.mat33, piola: wp.mat33):
-    """P F^T / J, with |J| kept away from zero."""
-    f = identity3() + a
-    return (piola * wp.transpose(f)) / wp.max(wp.abs(wp.determinant(f)), 1.0e-3)
-
-
-@wp.func
-def stvk_cauchy(a: wp.mat33, mu: float, lam: float):
-    return push_forward(a, stvk_stress(a, mu, lam))
 
 
 # --- corotated: R is the rotation of F Q ---------------------------------------------------------------------------
@@ -258,8 +246,3 @@ def neo_hookean_energy(a: wp.mat33, mu: float, lam: float):
     det = wp.dot(column(a, 0), column(cof, 0))
     isochoric = wp.ddot(e, e) - 0.5 * trace * trace - det
     return mu * isochoric + volumetric_energy(dilation(a, cof), mu, lam)
-
-
-@wp.func
-def neo_hookean_cauchy(a: wp.mat33, mu: float, lam: float):
-    return push_forward(a, neo_hookean_stress(a, mu, lam))

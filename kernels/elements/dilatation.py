@@ -5,8 +5,6 @@ J - 1. Linear tetrahedra have more of these than a nearly incompressible body ha
 elements share it. A group of elements, such as the eight leaves of a subtree, has the mean of theirs, weighted by
 lambda and volume, and the energy
     W = sum over e of lambda_e V_e w(theta),  theta = sum of lambda_e V_e theta_e / sum of lambda_e V_e.
-In a forest without subtrees there is one theta at each node, the mean of the elements around it, and each element has
-the mean of w at its four nodes.
 
 This alone would let an element of a group turn over while others grow, as elements of crushed tissue do. So where
 theta_e is J - 1, W also has lambda_e V_e h(theta_e) for each element. h is zero up to |theta| = ``FREE``; from there on

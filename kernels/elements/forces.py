@@ -14,7 +14,7 @@ import warp as wp
 
 from warp_corot.kernels.modules import unique_kernel
 
-from .constitutive import IsotropicMaterial
+from .constitutive import IsotropicMaterial, push_forward
 from .elements import ForestElements, GeneralElements, frame, local_gradient, rest_volume, scatter_stress
 
 wp.set_module_options({"enable_backward": False})
@@ -74,8 +74,21 @@ def law_stress(stress: wp.Function) -> wp.Function:
 
 
 @functools.cache
+def law_cauchy(stress: wp.Function) -> wp.Function:
+    """A law's Cauchy stress for the kernels below."""
+
+    @wp.func
+    def law_cauchy(elements: Any, t: int, material: IsotropicMaterial, u: wp.array[wp.vec4]):
+        i = t * material.stride
+        a = own_gradient(elements, t, u)
+        return push_forward(a, stress(a, material.mu[i], material.lam[i]))
+
+    return law_cauchy
+
+
+@functools.cache
 def law_value(function: wp.Function) -> wp.Function:
-    """A law's energy density or Cauchy stress for the kernels below."""
+    """A law's energy density, or the Cauchy stress of small strains, for the kernels below."""
 
     @wp.func
     def law_value(elements: Any, t: int, material: IsotropicMaterial, u: wp.array[wp.vec4]):

@@ -24,7 +24,6 @@ from .constitutive import (
     neo_hookean_differential,
     neo_hookean_energy,
     neo_hookean_stress,
-    push_forward,
     symmetric,
 )
 
@@ -145,7 +144,7 @@ def ogden_function(terms: tuple[tuple[float, float], ...]) -> wp.Function:
 
 @functools.cache
 def ogden(terms: tuple[tuple[float, float], ...]) -> dict[str, wp.Function]:
-    """Stress, differential, energy density and Cauchy stress of the law, as ``constitutive`` has them.
+    """Stress, differential and energy density of the law, as ``constitutive`` has them.
 
     Args:
         terms: Share of the shear modulus and exponent alpha of each; shares add up to one.
@@ -206,8 +205,4 @@ def ogden(terms: tuple[tuple[float, float], ...]) -> dict[str, wp.Function]:
         _s2, _c2, w2 = of_square(e[2])
         return neo_hookean_energy(a, v * mu, lam) + mu * (w0 + w1 + w2)
 
-    @wp.func
-    def cauchy(a: wp.mat33, mu: float, lam: float):
-        return push_forward(a, stress(a, mu, lam))
-
-    return {"stress": stress, "differential": differential, "energy": energy, "cauchy": cauchy}
+    return {"stress": stress, "differential": differential, "energy": energy}

@@ -24,6 +24,7 @@ from warp_corot.kernels.elements.elements import (
     nodal_forces,
     scatter_stress,
 )
+from warp_corot.kernels.elements.forces import repair_forces
 from warp_corot.kernels.elements.merging import add_four_forces
 from warp_corot.kernels.math.matrices import identity3
 from warp_corot.kernels.math.rotation import rotation_out_of_line
@@ -218,25 +219,6 @@ def repair_flagged(Material: type, stress: wp.Function, kernel: Callable = uniqu
 
 
 @wp.kernel(enable_backward=False)
-def repair_elements(
-    # In
-    elements: GeneralElements,
-    material: IsotropicMaterial,
-    u: wp.array[wp.vec4],
-    # In and out
-    listed: wp.array[wp.int32],
-    # Out
-    f: wp.array[wp.vec4],
-):
-    """Add the forces of listed elements (their number, then their indices), by one thread, which empties the list."""
-    for i in range(listed[0]):
-        t = listed[i + 1]
-        p = own_stress(elements, t, material, u)
-        scatter_stress(elements, t, p, f)
-    listed[0] = 0
-
-
-@wp.kernel(enable_backward=False)
 def turn_listed(
     # In
     elements: GeneralElements,
@@ -285,5 +267,6 @@ def repair_shared(
         member += 1
 
 
-#: Of corotated leaves with own rotations.
+#: Of corotated leaves with own rotations, and of listed general elements.
 repair_own = repair_flagged(IsotropicMaterial, own_stress, functools.partial(wp.kernel, enable_backward=False))
+repair_elements = repair_forces(GeneralElements, IsotropicMaterial, own_stress)

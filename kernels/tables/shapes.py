@@ -72,26 +72,6 @@ def fingerprint(*tables: object) -> int:
     return zlib.crc32(repr(tables).encode()) & 0x7FFFFFFF
 
 
-def gram(shape: int, i: int, j: int) -> float:
-    """Inner product of the gradients of hat functions i and j, times h^2."""
-    return sum(GRADIENT[shape][c][i] * GRADIENT[shape][c][j] for c in range(3))
-
-
-def edge_stiffness(shape: int) -> tuple[list[list[float]], list[list[float]]]:
-    """The 6x6 edge-spring stiffness of one shape over h^-1: parts multiplying lambda and mu (Delingette 2008)."""
-    first, second = [], []
-    for i, j in EDGES:
-        c_e = gram(shape, i, j)
-        first.append([VOLUME[shape] * 0.25 * c_e * gram(shape, k, m) for k, m in EDGES])
-        second.append(
-            [
-                VOLUME[shape] * 0.25 * (gram(shape, j, k) * gram(shape, i, m) + gram(shape, j, m) * gram(shape, i, k))
-                for k, m in EDGES
-            ]
-        )
-    return first, second
-
-
 def _scaled(expression: str, weight: float) -> str:
     return expression if weight == 1.0 else f"-({expression})" if weight == -1.0 else f"({expression}) * {weight!r}f"
 

@@ -133,14 +133,14 @@ def test_anisotropic_subtrees_one_by_one(name, kind, device, rng):
     on_device, active = strained(mesh, rng, device)
     whole = AnisotropicField(body.discretization, byers_xu, False)
     axes = quaternions(whole)
-    options = ("muscle" in kind, whole.material.axes_stride == 0, whole.material.stride == 0)
+    options = ("muscle" in kind, whole.passive.axes_stride == 0, whole.passive.stride == 0)
     plan = ForcePlan.of_forest(mesh, None, wp.get_device(device), grouped=False)
     f, flags, fibres = wp.zeros_like(on_device), 0, with_activation(whole, active)
     for batch in plan.batches:
         by_node(batch.subtrees, body.device)
         left = wp.zeros(-(-batch.count // 8), dtype=wp.uint64, device=device)
         kernel = scatter_anisotropic_subtrees(batch.shape, False, *options)
-        inputs = [batch.subtrees, active_material(whole.material, axes, 1, active), on_device]
+        inputs = [batch.subtrees, active_material(whole.passive, axes, 1, active), on_device]
         wp.launch(kernel, batch.count, inputs=inputs, outputs=[f, as_bytes(left)], device=device, block_dim=BLOCK)
         inputs = [8, left, batch.subtrees.first, body.discretization.elements, fibres, on_device]
         wp.launch(repair_leaves, 8 * len(left), inputs=inputs, outputs=[f], device=device)
@@ -190,13 +190,13 @@ def test_anisotropic_general_elements(kind, device, rng):
     axes = quaternions(field)
     law, chosen = anisotropic_law("muscle" in kind), clustered(body.discretization)
     scatter = ClusterScatter(field.elements, law, ActiveMaterial, chosen=chosen, layout=ANISOTROPIC)
-    add_forces(scatter, active_material(field.material, axes, 1, active), on_device, f)
+    add_forces(scatter, active_material(field.passive, axes, 1, active), on_device, f)
     assert_right(f.numpy()[:, :3], leaf_by_leaf(field, active, on_device))
 
 
 def quaternions(field):
-    axes = wp.empty(len(field.material.axes), dtype=wp.quat, device=field.device)
-    field.launch(quaternions_of, len(axes), [field.material.axes], [axes])
+    axes = wp.empty(len(field.passive.axes), dtype=wp.quat, device=field.device)
+    field.launch(quaternions_of, len(axes), [field.passive.axes], [axes])
     return axes
 
 
@@ -216,7 +216,7 @@ def strained(mesh, rng, device):
 
 def with_activation(field, active):
     fibres = FibreMaterial()
-    fibres.passive, fibres.is_active, fibres.activation = field.material, 1, active
+    fibres.passive, fibres.is_active, fibres.activation = field.passive, 1, active
     return fibres
 
 

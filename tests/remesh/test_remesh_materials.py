@@ -59,8 +59,8 @@ def active_twin(body, model, sim):
     if body.discretization.has_activation:
         fixed.body.activate(body.activation.numpy())
     for each in body.conditions.activations:
-        keys = wc.Activation(each.times.numpy() - sim.time, each.stress.numpy())
-        fixed.body.activate(keys, each.elements.numpy())
+        keys = wc.Activation(each.times.numpy() - sim.time, each.values.numpy())
+        fixed.body.activate(keys, each.host_numbers)
     return fixed
 
 
@@ -206,7 +206,7 @@ def test_what_a_parent_takes_from_its_children(device, rng):
     body.activate(wc.Activation([0.0, 1.0], np.tile(rng.uniform(-100.0, 100.0), (2, 1))), follows)
     sim = wc.Simulation(body, gravity=(0, 0, 0), remesh=near(9.0, device, every=1, min_level=1))
     before = np.where(follows, np.nan, body.activation.numpy())
-    before[follows] = body.conditions.activations[0].stress.numpy()[0, 0]
+    before[follows] = body.conditions.activations[0].values.numpy()[0, 0]
     sim.step()
     present = body.mesh
     leaves = by_corners(mesh.lattice[mesh.tets])
@@ -228,7 +228,7 @@ def test_what_a_parent_takes_from_its_children(device, rng):
     alike = follows[first] == follows[second]
     assert 0.2 < alike.mean() < 0.8
     np.testing.assert_allclose(body.activation.numpy()[merged], np.where(alike, mean(before), before[first]), atol=1e-4)
-    still_follows = np.isin(merged, body.conditions.activations[0].elements.numpy())
+    still_follows = np.isin(merged, body.conditions.activations[0].numbers.numpy())
     np.testing.assert_array_equal(still_follows, follows[first])
 
 
@@ -257,16 +257,16 @@ def test_reset_goes_back_to_what_the_first_mesh_did_last(device):
     body = bar(muscle([1, 0, 0]), device)
     body.activate(wc.Activation(TIMES, STRESS), depth(body) > 0.1)
     sim = wc.Simulation(body, remesh=near(0.1, device))
-    elements = body.conditions.activations[0].elements.numpy()
+    elements = body.conditions.activations[0].numbers.numpy()
     body.activate(40.0, [0, 1])
     sim.advance_steps(30)
-    assert len(body.conditions.activations[0].elements) != len(elements)
+    assert len(body.conditions.activations[0].numbers) != len(elements)
     body.activate(7.0)
     sim.advance_steps(10)
     assert not body.conditions.activations
     sim.reset()
     (activation,) = body.conditions.activations
-    np.testing.assert_array_equal(activation.elements.numpy(), elements)
+    np.testing.assert_array_equal(activation.host_numbers, elements)
     np.testing.assert_array_equal(body.activation.numpy()[[0, 1]], 40.0)
     sim.advance_steps(3)
     now = np.interp(2 * sim.dt, TIMES, STRESS)

@@ -131,7 +131,7 @@ def test_a_hand_that_drags_leaves_recorded_steps_as_they_are(device):
     assert body.launch_revision == revision
     body.prescribe(top[:-1], velocity=[0.0, 0.0, 0.0])
     assert body.launch_revision > revision
-    assert [t.host_nodes.tolist() for t in body.conditions.trajectories] == [[top[-1]]]
+    assert [t.host_numbers.tolist() for t in body.conditions.trajectories] == [[top[-1]]]
 
 
 def test_a_released_node_has_its_former_mass(device):

@@ -9,7 +9,9 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import InputError
-from warp_corot.inputs.keys import checked_times, staying
+from warp_corot.inputs.keys import checked_times
+
+from .trajectory import Followed
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,45 +49,17 @@ class Activation:
         return self
 
 
-@dataclass(frozen=True, eq=False)
-class ElementActivation:
-    """Keyframes that a set of elements follows, on the device.
+def followed_stress(elements: np.ndarray, activation: Activation, device: wp.Device) -> Followed:
+    """Keyframes for these elements, on a device.
 
-    Attributes:
-        elements: int32 [n], indices into the elements of all worlds.
-        times: float64 [K] [s].
-        stress: float32 [K, n], or [K, 1] for all elements [Pa].
+    Raises:
+        InputError: The number of columns differs from the number of elements.
     """
-
-    elements: wp.array
-    times: wp.array
-    stress: wp.array
-
-    @classmethod
-    def of_keys(cls, elements: np.ndarray, activation: Activation, device: wp.Device) -> ElementActivation:
-        """Keyframes for these elements.
-
-        Raises:
-            InputError: The number of columns differs from the number of elements.
-        """
-        stress = np.asarray(activation.stress)
-        if stress.ndim == 2 and stress.shape[1] not in (1, len(elements)):
-            raise InputError(f"stress of an Activation has shape {stress.shape}; there are {len(elements)} elements")
-        return cls(
-            wp.array(elements, dtype=wp.int32, device=device),
-            wp.array(activation.times, dtype=wp.float64, device=device),
-            wp.array(stress.reshape(len(stress), -1), dtype=wp.float32, device=device),
-        )
-
-    def without(self, chosen: np.ndarray) -> ElementActivation | None:
-        """The same for the elements that are not among the chosen; None if all are."""
-        left = staying(self.elements.numpy(), chosen, self.stress.numpy())
-        if left is None:
-            return self
-        elements, stress = left
-        if not len(elements):
-            return None
-        return ElementActivation.of_keys(elements, Activation(self.times.numpy(), stress), self.elements.device)
+    stress = np.asarray(activation.stress)
+    if stress.ndim == 2 and stress.shape[1] not in (1, len(elements)):
+        raise InputError(f"stress of an Activation has shape {stress.shape}; there are {len(elements)} elements")
+    values = stress.reshape(len(stress), -1)
+    return Followed.made(elements, np.asarray(activation.times), values, wp.float32, device)
 
 
 def constant_stress(stress: float | npt.ArrayLike, worlds: int, count: int) -> npt.NDArray[np.float64]:

@@ -15,10 +15,10 @@ from warp_corot.kernels.stepping.activation import follow_activation
 from warp_corot.kernels.stepping.conditions import LOAD_NODES, free_nodes, hold_nodes, release_nodes
 from warp_corot.kernels.stepping.integrate import follow_trajectory
 
-from .activation import Activation, ElementActivation
+from .activation import Activation, followed_stress
 from .patch_arrays import PatchArrays
 from .state import State
-from .trajectory import NodeKeyframes, Trajectory
+from .trajectory import Followed, NodeKeyframes
 
 
 class Conditions:
@@ -52,8 +52,8 @@ class Conditions:
         self.inverse_mass = wp.empty(len(mass), dtype=wp.float32, device=self.device)
         self.loads = wp.zeros(1, dtype=wp.vec4, device=self.device)
         self.has_loads = False
-        self.trajectories: list[Trajectory] = []
-        self.activations: list[ElementActivation] = []
+        self.trajectories: list[Followed] = []
+        self.activations: list[Followed] = []
         self.world_starts = wp.zeros(self.sizes.worlds, dtype=wp.float64, device=self.device)
         self.revision = self.rewritten = 0
         self.patches = PatchArrays(self.device)
@@ -104,7 +104,7 @@ class Conditions:
                 return
         self.stop_following(keys.nodes)
         trajectory = keys.on(self.device)
-        self.hold(trajectory.nodes, self.patches.still)
+        self.hold(trajectory.numbers, self.patches.still)
         self.set_trajectories([*self.trajectories, trajectory])
 
     def stop_following(self, nodes: npt.NDArray[np.integer]) -> None:
@@ -113,7 +113,7 @@ class Conditions:
         if any(now is not before for now, before in zip(kept, self.trajectories, strict=True)):
             self.set_trajectories([each for each in kept if each is not None])
 
-    def set_trajectories(self, trajectories: Sequence[Trajectory]) -> None:
+    def set_trajectories(self, trajectories: Sequence[Followed]) -> None:
         """Let nodes follow these keyframes only."""
         self.trajectories = list(trajectories)
         self.revision += 1
@@ -156,10 +156,10 @@ class Conditions:
         the count of the work that their supports do against the forces so far."""
         state = self.state
         for each in self.trajectories:
-            inputs = [each.nodes, each.times, each.displacements, clock.arrays, self.world_starts]
+            inputs = [each.numbers, each.times, each.values, clock.arrays, self.world_starts]
             inputs += [self.sizes.world_nodes, offset, state.forces, state.displacements]
             outputs = [state.velocities, support_work]
-            wp.launch(follow_trajectory, len(each.nodes), inputs, outputs, device=self.device)
+            wp.launch(follow_trajectory, len(each.numbers), inputs, outputs, device=self.device)
 
     def follow_activations(self, clock: Clock, offset: int) -> None:
         """Launch the kernel that sets the active stress of elements that follow keyframes.
@@ -169,10 +169,10 @@ class Conditions:
             offset: Number of launched steps that the clock does not count yet.
         """
         for each in self.activations:
-            inputs = [each.elements, each.times, each.stress, clock.arrays, self.world_starts]
+            inputs = [each.numbers, each.times, each.values, clock.arrays, self.world_starts]
             inputs += [self.sizes.world_elements, offset]
             outputs = [self.discretization.activation]
-            wp.launch(follow_activation, len(each.elements), inputs, outputs, device=self.device)
+            wp.launch(follow_activation, len(each.numbers), inputs, outputs, device=self.device)
 
     def activate(self, elements: npt.NDArray[np.integer], stress: Activation | npt.NDArray[np.float64]) -> None:
         """Set keyframes or stresses [Pa], [k], for elements, [k], in place of former keyframes."""
@@ -183,13 +183,13 @@ class Conditions:
             values[elements] = stress
             live.assign(values)
         elif len(elements):
-            added = [ElementActivation.of_keys(elements, stress, self.device)]
+            added = [followed_stress(elements, stress, self.device)]
         kept = [left for each in self.activations if (left := each.without(elements))]
         # New values in the same array do not change the launches.
         if added or kept != self.activations:
             self.set_activations(kept + added)
 
-    def set_activations(self, activations: Sequence[ElementActivation]) -> None:
+    def set_activations(self, activations: Sequence[Followed]) -> None:
         """Let active stress follow these keyframes only."""
         self.activations = list(activations)
         self.revision += 1

@@ -46,56 +46,63 @@ class NodeKeyframes:
             )
         return cls(nodes, t, d.reshape(len(t), -1, 3))
 
-    def on(self, device: wp.Device) -> Trajectory:
+    def on(self, device: wp.Device) -> Followed:
         """Copy the keyframes to a device."""
-        return Trajectory(
-            wp.array(self.nodes, dtype=wp.int32, device=device),
-            wp.array(self.times, dtype=wp.float64, device=device),
-            wp.array(self.displacements, dtype=wp.vec3, device=device),
-            np.asarray(self.nodes, np.int32),
-        )
+        return Followed.made(self.nodes, self.times, self.displacements, wp.vec3, device)
 
 
 @dataclass(frozen=True, eq=False)
-class Trajectory:
-    """Keyframed displacements that a set of nodes follows, on the device.
+class Followed:
+    """Keyframes that nodes or elements follow, on the device.
 
     Attributes:
-        nodes: int32 [n].
+        numbers: The nodes or elements of all worlds, int32 [n].
         times: float64 [K] [s].
-        displacements: vec3 [K, n], or [K, 1] for all nodes [m].
-        host_nodes: A copy of ``nodes`` on the host.
+        values: A column for each, or one for all, [K, n] or [K, 1]: displacements [m], vec3, or active stress [Pa],
+            float32.
+        host_numbers: A copy of ``numbers`` on the host.
     """
 
-    nodes: wp.array
+    numbers: wp.array
     times: wp.array
-    displacements: wp.array
-    host_nodes: npt.NDArray[np.int32]
+    values: wp.array
+    host_numbers: npt.NDArray[np.int32]
 
-    def rewritten(self, keys: NodeKeyframes) -> Trajectory | None:
+    @classmethod
+    def made(
+        cls, numbers: npt.NDArray[np.integer], times: np.ndarray, values: np.ndarray, dtype: type, device: wp.Device
+    ) -> Followed:
+        return cls(
+            wp.array(numbers, dtype=wp.int32, device=device),
+            wp.array(times, dtype=wp.float64, device=device),
+            wp.array(values, dtype=dtype, device=device),
+            np.asarray(numbers, np.int32),
+        )
+
+    def rewritten(self, keys: NodeKeyframes) -> Followed | None:
         """Write other keyframes into these arrays; None unless they have the same nodes and as many times."""
-        if self.displacements.shape != keys.displacements.shape[:2] or len(self.times) != len(keys.times):
+        if self.values.shape != keys.displacements.shape[:2] or len(self.times) != len(keys.times):
             return None
-        if not np.array_equal(self.host_nodes, keys.nodes):
+        if not np.array_equal(self.host_numbers, keys.nodes):
             return None
         self.times.assign(keys.times)
-        self.displacements.assign(keys.displacements.astype(np.float32))
+        self.values.assign(keys.displacements.astype(np.float32))
         return replace(self)
 
     def keys(self) -> tuple[np.ndarray, np.ndarray]:
         """Times and displacements as arguments for ``NodeKeyframes.checked``."""
-        d = self.displacements.numpy()
+        d = self.values.numpy()
         return self.times.numpy(), d[:, 0] if d.shape[1] == 1 else d
 
-    def without(self, chosen: np.ndarray) -> Trajectory | None:
-        """The same for the nodes that are not among the chosen; None if all are."""
-        stays = ~np.isin(self.host_nodes, chosen)
-        if stays.all():
-            return self
-        nodes, d = self.host_nodes[stays], self.displacements.numpy()
-        if d.shape[1] > 1:
-            d = d[:, stays]
-        if not len(nodes):
+    def of(self, chosen: npt.NDArray[np.bool_], numbers: npt.NDArray[np.integer], device: wp.Device) -> Followed | None:
+        """The same for some of those that follow, bool [n], with other numbers on a device; None if there are none."""
+        if not chosen.any():
             return None
-        kept = d[:, 0] if d.shape[1] == 1 else d
-        return NodeKeyframes.checked(nodes, self.times.numpy(), kept).on(self.nodes.device)
+        values = self.values.numpy()
+        of_each = values[:, chosen] if values.shape[1] > 1 else values
+        return Followed.made(numbers[chosen], self.times.numpy(), of_each, self.values.dtype, device)
+
+    def without(self, left: npt.NDArray[np.integer]) -> Followed | None:
+        """The same for those that do not leave; None if all do."""
+        stays = ~np.isin(self.host_numbers, left)
+        return self if stays.all() else self.of(stays, self.host_numbers, self.times.device)

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import operator
 import weakref
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.body.activation import Activation, ElementActivation
 from warp_corot.body.soft_body import SoftBody
-from warp_corot.body.trajectory import NodeKeyframes, Trajectory
+from warp_corot.body.trajectory import Followed
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import shown
 
@@ -55,8 +54,8 @@ class PartSync:
         #: The number in the part of each node that this rank moves, -1 for others.
         self._number = np.full(worlds * count, -1, np.int32)
         self._number[self.own_nodes] = np.flatnonzero(own)
-        self._trajectories: list[Trajectory] = []
-        self._activations: list[ElementActivation] = []
+        self._trajectories: list[Followed] = []
+        self._activations: list[Followed] = []
         #: Triangles of the surface around this rank's nodes; None before there is contact.
         self._triangles: Places | None = None
 
@@ -209,21 +208,9 @@ class PartSync:
             part.use_loads(part.loads, False)
 
     def _take_keyframes(self) -> None:
-        given = self.whole.conditions.trajectories
-        if len(given) == len(self._trajectories) and all(map(operator.is_, given, self._trajectories)):
-            return
-        self._trajectories = list(given)
-        found = []
-        for each in given:
-            numbers = self._number[each.host_nodes]
-            own = numbers >= 0
-            displacements = each.displacements.numpy()
-            if displacements.shape[1] > 1:
-                displacements = displacements[:, own]
-            if own.any():
-                keys = NodeKeyframes(numbers[own], each.times.numpy(), displacements)
-                found.append(keys.on(self.part.device))
-        self.part.conditions.set_trajectories(found)
+        found = self._followed(self._trajectories, self.whole.conditions.trajectories, self._number)
+        if found is not None:
+            self.part.conditions.set_trajectories(found)
 
     def _take_activation(self) -> None:
         whole, part = self.whole, self.part
@@ -231,18 +218,22 @@ class PartSync:
             return
         part.conditions.make_activation()
         self._elements.to_part(whole.discretization.activation, part.discretization.activation)
-        given = whole.conditions.activations
-        if len(given) == len(self._activations) and all(map(operator.is_, given, self._activations)):
-            return
-        self._activations, found = list(given), []
         number = np.full(whole.worlds * whole.world_element_count, -1, np.int32)
         number[self._elements.whole] = self._elements.part
-        for each in given:
-            here, stress = number[each.elements.numpy()], each.stress.numpy()
-            if (own := here >= 0).any():
-                keys = Activation(each.times.numpy(), stress[:, own] if stress.shape[1] > 1 else stress)
-                found.append(ElementActivation.of_keys(here[own], keys, part.device))
-        part.conditions.set_activations(found)
+        found = self._followed(self._activations, whole.conditions.activations, number)
+        if found is not None:
+            part.conditions.set_activations(found)
+
+    def _followed(
+        self, known: list[Followed], given: Sequence[Followed], number: npt.NDArray[np.int32]
+    ) -> list[Followed] | None:
+        """The part's share of keyframes of the whole body, from the numbers in the part; None if they are known."""
+        if len(given) == len(known) and all(map(operator.is_, given, known)):
+            return None
+        known[:] = given
+        places = [number[each.host_numbers] for each in given]
+        found = [each.of(there >= 0, there, self.part.device) for each, there in zip(given, places, strict=True)]
+        return [each for each in found if each is not None]
 
 
 # --- gathering -------------------------------------------------------------------------------------------------------

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from warp_corot.discretization.elements import Mesh
 from warp_corot.discretization.groups import group_numbers
@@ -16,6 +14,7 @@ from warp_corot.discretization.matching import neighbour_groups
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_numbers, shown
 from warp_corot.mesh import TetForest, TetMesh
+from warp_corot.mesh.growing.cut import linked
 from warp_corot.mesh.tree import UniformTree
 
 Ints = npt.NDArray[np.int32]
@@ -126,8 +125,7 @@ def _merged(groups: Ints, others: npt.NDArray[np.integer]) -> Ints:
     """The smallest groups that divide none of these groups and none of the others, int32 [T]."""
     ends = [np.unique(each, return_inverse=True)[1].ravel() for each in (groups, others)]
     first, count = int(ends[0].max()) + 1, sum(int(each.max()) + 1 for each in ends)
-    links = coo_matrix((np.ones(len(groups), np.int8), (ends[0], first + ends[1])), (count, count))
-    return connected_components(links, directed=False)[1][ends[0]].astype(np.int32)
+    return linked(np.stack([ends[0], first + ends[1]], axis=1), count)[ends[0]].astype(np.int32)
 
 
 def _ordered(groups: Ints) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import numpy.typing as npt
 import warp as wp
+
+from warp_corot.inputs.forwarding import forwards
 
 from .combined import DifferenceDomain, IntersectionDomain, NamedDomain, UnionDomain
 from .function import Function, FunctionDomain
@@ -223,6 +224,8 @@ class Domain(SignedFunction):
         return _Made(CapsuleDomain(start, end, radius, **options))
 
 
+@forwards("kind", "has_pieces", "holds", "exits", "corners", "points_in", "label_volumes")
+@forwards("kind", "_phi", "_labels", "_thickness", "_details")
 class _Made(Domain):
     """A signed function of any kind, as a user holds it."""
 
@@ -241,37 +244,5 @@ class _Made(Domain):
     def kind(self) -> SignedFunction:
         return self._kind
 
-    @property
-    def has_pieces(self) -> bool:
-        return self._kind.has_pieces
-
     def part(self, name: str) -> Domain:
         return _Made(self._kind.part(name))
-
-    def holds(self, points: npt.ArrayLike) -> np.ndarray:
-        return self._kind.holds(points)
-
-    def exits(self, starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        return self._kind.exits(starts, ends)
-
-    def corners(self) -> np.ndarray:
-        return self._kind.corners()
-
-    def points_in(self, name: str, count: int) -> np.ndarray:
-        return self._kind.points_in(name, count)
-
-    @property
-    def label_volumes(self) -> np.ndarray:
-        return self._kind.label_volumes
-
-    def _phi(self, points: wp.array) -> wp.array:
-        return self._kind._phi(points)
-
-    def _labels(self, points: wp.array) -> wp.array:
-        return self._kind._labels(points)
-
-    def _thickness(self, points: wp.array, along: wp.array, reach: float, side: float) -> np.ndarray:
-        return self._kind._thickness(points, along, reach, side)
-
-    def _details(self) -> list[str]:
-        return self._kind._details()

@@ -5,28 +5,24 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import warp as wp
 
 from warp_corot.discretization.discretization import Discretization
-from warp_corot.discretization.elements import Elements
 from warp_corot.discretization.plan import Plan
+from warp_corot.inputs.forwarding import forwards
 from warp_corot.kernels.elements.forces import element_energies
 from warp_corot.kernels.elements.native_laws import NativeLaw
 
 from .backends.elements import ByElements
 from .model import ForceField, SmallForces
 from .stress_law import ElementMaterial
-from .structs import forwards
 from .tangent import ElementTangent, Tangent
-
-if TYPE_CHECKING:
-    pass
 
 
 @forwards("law", "shares_dilatation", "find_members", "rotation_level", "elapsed", "complete_step", "relax_fully")
-@forwards("law", "write_von_mises", "state", "reset", "load_kernels", "note", "derive", "take_material", "follow")
+@forwards("law", "state", "reset", "load_kernels", "note", "derive", "take_material", "follow")
 class AddedStressField(ForceField):
     """The forces of a law and of an additional stress in all elements.
 
@@ -57,11 +53,9 @@ class AddedStressField(ForceField):
         self.law = law
         super().__init__(discretization, law.deterministic)
         kind = discretization.element_kind
-        self._forces = ByElements(discretization, self.plan, Material, stress, lanes)
+        self._forces = ByElements(discretization, self.plan, Material, stress, lanes, slotted=self.deterministic)
         self._energies = element_energies(kind, Material, density, adds=True)
         self._own_law = differential, lambda: self.material, Material
-        #: Separate places for each element's forces, if sums must be reproducible.
-        self._slotted = discretization.plan(subtrees=False, deterministic=True) if self.deterministic else None
 
     @property
     @abstractmethod
@@ -78,18 +72,8 @@ class AddedStressField(ForceField):
         self.add_own_forces(u, f)
 
     def add_own_forces(self, u: wp.array, f: wp.array) -> None:
-        """Launch the kernel that adds only the forces of the additional stress."""
-        if self._slotted is None:
-            self._scatter_own(self.elements, u, f)
-            return
-        slots = self._slotted.slots
-        assert slots is not None
-        slots.values.zero_()
-        self._scatter_own(self._slotted.elements, u, slots.values)
-        slots.gather(f)
-
-    def _scatter_own(self, elements: Elements, u: wp.array, f: wp.array) -> None:
-        self._forces(elements, self.element_count, self.material, u, f)
+        """Launch the kernels that add only the forces of the additional stress."""
+        self._forces(self.element_count, self.material, u, f)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         raise NotImplementedError("add_forces does all")
@@ -105,10 +89,13 @@ class AddedStressField(ForceField):
 
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
         self.law.write_energies(u, energies)
-        self.launch(self._energies, self.element_count, [self.elements, self.material, u], [energies])
+        self._add_own_energies(u, energies)
 
     def write_potentials(self, u: wp.array, energies: wp.array) -> None:
         self.law.write_potentials(u, energies)
+        self._add_own_energies(u, energies)
+
+    def _add_own_energies(self, u: wp.array, energies: wp.array) -> None:
         self.launch(self._energies, self.element_count, [self.elements, self.material, u], [energies])
 
     def write_von_mises(self, u: wp.array, stress: wp.array) -> None:

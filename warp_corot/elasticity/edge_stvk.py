@@ -5,15 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from warp_corot.discretization.discretization import discretization_of
 from warp_corot.inputs.checks import checked_choice
-from warp_corot.kernels.elements.constitutive import IsotropicMaterial, stvk_cauchy, stvk_stress
-from warp_corot.kernels.elements.forces import element_von_mises, law_stress, law_value
-from warp_corot.kernels.elements.spring_stiffness import edge_stvk_differential
-from warp_corot.kernels.elements.springs import edge_stvk_energies, scatter_edge_stvk
+from warp_corot.kernels.elements.constitutive import stvk_stress
+from warp_corot.kernels.elements.forces import law_cauchy
+from warp_corot.kernels.elements.springs import spring_density, spring_differential, spring_stress
 
 from .dilatation import ELEMENT, refuse_shared
 from .model import ElementField, ForceField, Model
+from .stvk import StVenantKirchhoff
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization, Discretized
@@ -24,8 +23,8 @@ class EdgeStVK(Model):
     """W = D^T K D / 2 over an element's six edges (Delingette 2008; Kikuuwe, Tabuchi and Yamamoto 2009).
 
     Attributes:
-        springs: "biquadratic": D = l^2 - L^2, equal to ``StVenantKirchhoff``; "quadratic": D = 2 L (l - L), its
-            small-strain form.
+        springs: "biquadratic": D = l^2 - L^2, which is ``StVenantKirchhoff``, whose forces it has; "quadratic": D = 2 L
+            (l - L), its small-strain form.
         dilatation: "element", the only value for springs.
     """
 
@@ -37,14 +36,13 @@ class EdgeStVK(Model):
         refuse_shared(self.dilatation, "EdgeStVK")
 
     def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:
-        discretization = discretization_of(body)
-        kind, biquadratic = discretization.element_kind, self.springs == "biquadratic"
+        if self.springs == "biquadratic":
+            return StVenantKirchhoff(ELEMENT).bind(body, deterministic=deterministic)
         return ElementField(
-            discretization,
-            forces=scatter_edge_stvk(kind, biquadratic),
-            energies=edge_stvk_energies(kind, biquadratic),
-            von_mises=element_von_mises(kind, IsotropicMaterial, law_value(stvk_cauchy)),
-            differential=edge_stvk_differential(biquadratic),
-            stress=law_stress(stvk_stress) if biquadratic else None,
+            body,
+            stress=spring_stress,
+            differential=spring_differential,
+            density=spring_density,
+            cauchy=law_cauchy(stvk_stress),
             deterministic=deterministic,
         )

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import warp as wp
 
 from warp_corot.discretization.discretization import Discretization, discretization_of
 from warp_corot.discretization.plan import Plan
-from warp_corot.elasticity.stress_law import StressLaw
 from warp_corot.elasticity.structs import Kept
 from warp_corot.errors import InputError
+from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.clusters.laws import reinforced_law
-from warp_corot.kernels.corotated.anisotropic import FibreMaterial, OrthotropicMaterial, active_density
+from warp_corot.kernels.corotated.anisotropic import OrthotropicMaterial
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import LOG_VOLUME
 from warp_corot.kernels.elements.fibres import (
@@ -23,13 +23,12 @@ from warp_corot.kernels.elements.fibres import (
     reinforced_differential,
     reinforced_stress,
 )
-from warp_corot.kernels.elements.forces import element_energies, element_von_mises
 from warp_corot.kernels.elements.native_laws import FIBRES
 from warp_corot.materials.reinforced import FibreReinforced
 
 from .backends.clusters import divided
 from .backends.elements import ByElements
-from .corotated.anisotropic import fibre_material
+from .corotated.anisotropic import FibreField
 from .dilatation import AUTO, bind_law, check_dilatation
 from .model import ForceField, Model
 
@@ -65,56 +64,44 @@ class HolzapfelGasserOgden(Model):
         return bind_law(ReinforcedField, LOG_VOLUME, self.dilatation, discretization, deterministic)
 
 
-class ReinforcedField(ForceField):
+class ReinforcedField(FibreField):
     """The forces of ``HolzapfelGasserOgden``; on the CPU of eight subtrees or elements at a time."""
 
-    takes_anisotropic: ClassVar[bool] = True
-
     def __init__(self, discretization: Discretization, deterministic: bool):
-        super().__init__(discretization, deterministic)
-        kind = discretization.element_kind
+        super().__init__(
+            discretization,
+            stress=reinforced_stress,
+            differential=reinforced_differential,
+            density=reinforced_density,
+            cauchy=reinforced_cauchy,
+            Material=ReinforcedMaterial,
+            deterministic=deterministic,
+        )
         _, self._clusters = divided(discretization, self.plan, reinforced_law, ReinforcedMaterial)
-        self._forces = ByElements(discretization, self.plan, ReinforcedMaterial, reinforced_stress, FIBRES)
-        self._energies = element_energies(kind, ReinforcedMaterial, reinforced_density)
-        self._von_mises = element_von_mises(kind, ReinforcedMaterial, reinforced_cauchy)
-        self._fibres = discretization.anisotropic_material()
-        self._made, self._active = Kept(_material), Kept(fibre_material)
+        self._by_elements = ByElements(discretization, self.plan, ReinforcedMaterial, reinforced_stress, FIBRES)
+        self._made = Kept(_material)
 
     def plan_of(self, discretization: Discretization) -> Plan:
         return discretization.plan(subtrees=self.device.is_cpu, deterministic=self.deterministic)
+
+    @property
+    def _force_kernels(self) -> list[LoadedKernel]:
+        return self._by_elements.kernels if self._clusters is None else [self._clusters.kernel]
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         if self._clusters is not None:
             self._clusters(self.material, u, f)
         else:
-            self._forces(self.elements, self.element_count, self.material, u, f)
-
-    @property
-    def stress_law(self) -> StressLaw:
-        return StressLaw(reinforced_stress, reinforced_differential, self.material, ReinforcedMaterial)
-
-    def write_energies(self, u: wp.array, energies: wp.array) -> None:
-        self.launch(self._energies, self.element_count, [self.elements, self.material, u], [energies])
-
-    def write_potentials(self, u: wp.array, energies: wp.array) -> None:
-        self.write_energies(u, energies)
-        if self.discretization.has_activation:
-            kernel = element_energies(self.discretization.element_kind, FibreMaterial, active_density, adds=True)
-            active = self._active(self._fibres, *self._activation)
-            self.launch(kernel, self.element_count, [self.elements, active, u], [energies])
-
-    def write_von_mises(self, u: wp.array, stress: wp.array) -> None:
-        shown = _material(self.isotropic_shown, self._fibres, *self._activation)
-        self.launch(self._von_mises, self.element_count, [self.elements, shown, u], [stress])
+            self._by_elements(self.element_count, self.material, u, f)
 
     @property
     def material(self) -> ReinforcedMaterial:
         """The material with the present active stress."""
-        return self._made(self.isotropic, self._fibres, *self._activation)
+        return self._made(self.isotropic, self.passive, *self._activation)
 
     @property
-    def _activation(self) -> list:
-        return [int(self.discretization.has_activation), self.discretization.activation]
+    def material_shown(self) -> ReinforcedMaterial:
+        return _material(self.isotropic_shown, self.passive, *self._activation)
 
 
 def _material(

@@ -6,12 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from warp_corot.elasticity.model import Law
-from warp_corot.kernels.elements.constitutive import (
-    linear_cauchy,
-    linear_differential,
-    linear_energy,
-    linear_stress,
-)
+from warp_corot.kernels.elements.constitutive import linear_differential, linear_energy, linear_stress
 from warp_corot.kernels.elements.dilatation import SMALL
 
 from .law_model import LawModel
@@ -32,7 +27,7 @@ class Linear(LawModel):
     """
 
     strained_safety: ClassVar[float] = 0.9  # its stiffness never changes
-    law = Law(linear_stress, linear_differential, linear_energy, linear_cauchy, "linear")
+    law = Law(linear_stress, linear_differential, linear_energy, "linear", linear_stress)
     shared = SMALL
 
     def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:

@@ -11,10 +11,14 @@ from warp_corot.discretization.discretization import Discretization, Discretized
 from warp_corot.discretization.elements import in_worlds, repeated
 from warp_corot.discretization.plan import Plan
 from warp_corot.discretization.slots import Slots
-from warp_corot.kernels.elements.constitutive import IsotropicMaterial, stvk_cauchy
-from warp_corot.kernels.elements.forces import element_von_mises, law_value
-from warp_corot.kernels.elements.spring_stiffness import add_mass_spring_diagonal, add_mass_spring_product
-from warp_corot.kernels.elements.springs import mass_spring_energies, scatter_mass_spring
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, stvk_stress
+from warp_corot.kernels.elements.forces import element_von_mises, law_cauchy
+from warp_corot.kernels.elements.springs import (
+    add_mass_spring_diagonal,
+    add_mass_spring_product,
+    mass_spring_energies,
+    scatter_mass_spring,
+)
 from warp_corot.kernels.tables.shapes import EDGES
 
 from .dilatation import ELEMENT, refuse_shared
@@ -87,7 +91,7 @@ class MassSpringField(ForceField):
         lame = 0.4 * (young if young.size == 1 else np.broadcast_to(young, (worlds, len(tets))))
         on_device = wp.array(lame.ravel(), dtype=wp.float32, device=self.device)
         self._hooke = isotropic_material([on_device, on_device, int(lame.size > 1)])
-        self._von_mises = element_von_mises(discretization.element_kind, IsotropicMaterial, law_value(stvk_cauchy))
+        self._von_mises = element_von_mises(discretization.element_kind, IsotropicMaterial, law_cauchy(stvk_stress))
 
     @property
     def energy_count(self) -> int:

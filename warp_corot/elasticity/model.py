@@ -22,6 +22,7 @@ from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.forces import (
     element_energies,
     element_von_mises,
+    law_cauchy,
     law_stress,
     law_value,
     scatter_forces,
@@ -380,31 +381,41 @@ class Model(ABC):
 
 
 class ElementField(ForceField):
-    """Force field of kernels that need only each element's nodal displacements.
+    """Force field of device functions of each element's nodal displacements, element by element.
 
     Args:
         body, deterministic: As for every field.
-        forces, energies, von_mises: The kernels.
-        differential: The differential of the stress, a device function of ``kernels.elements.stiffness_products``.
-        stress: The stress, one of ``kernels.elements.forces``, if the law has one.
+        stress, density, cauchy: The functions of ``kernels.elements.forces``.
+        differential: The differential of the stress, one of ``kernels.elements.stiffness_products``.
+        Material: The struct that they read.
     """
 
     def __init__(
         self,
         body: Discretized | Discretization,
         *,
-        forces: wp.Kernel,
-        energies: wp.Kernel,
-        von_mises: wp.Kernel,
+        stress: wp.Function,
         differential: wp.Function,
-        stress: wp.Function | None = None,
+        density: wp.Function,
+        cauchy: wp.Function,
+        Material: type = IsotropicMaterial,
         deterministic: bool = False,
     ):
         super().__init__(body, deterministic)
-        self._forces, self._differential = forces, differential
-        self._energies = energies
-        self._von_mises = von_mises
-        self._stress_function = stress
+        kind = self.discretization.element_kind
+        self._functions, self._Material = (stress, differential), Material
+        self._energies = element_energies(kind, Material, density)
+        self._von_mises = element_von_mises(kind, Material, cauchy)
+
+    @property
+    def material(self) -> ElementMaterial:
+        """The struct for forces and energies."""
+        return self.isotropic
+
+    @property
+    def material_shown(self) -> ElementMaterial:
+        """The struct for stresses."""
+        return self.isotropic_shown
 
     @property
     def kernels(self) -> list[LoadedKernel]:
@@ -415,35 +426,37 @@ class ElementField(ForceField):
         return [self._forces]
 
     @property
-    def stress_law(self) -> StressLaw | None:
-        return self._stress_function and StressLaw(self._stress_function, self._differential, self.isotropic)
+    def _forces(self) -> wp.Kernel:
+        return scatter_forces(self.discretization.element_kind, self._Material, self._functions[0])
+
+    @property
+    def stress_law(self) -> StressLaw:
+        return StressLaw(*self._functions, self.material, self._Material)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        self.launch(self._forces, self.element_count, [self.elements, self.isotropic, u], [f])
-
-    def tangent(self, *, exact: bool = False) -> Tangent:
-        return ElementTangent(self, self._differential, lambda: self.isotropic)
+        self.launch(self._forces, self.element_count, [self.elements, self.material, u], [f])
 
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
-        self._launch_over_elements(self._energies, self.isotropic, u, energies)
+        self._launch_over_elements(self._energies, self.material, u, energies)
 
     def write_von_mises(self, u: wp.array, stress: wp.array) -> None:
-        self.launch(self._von_mises, self.element_count, [self.elements, self.isotropic_shown, u], [stress])
+        self.launch(self._von_mises, self.element_count, [self.elements, self.material_shown, u], [stress])
 
 
 class Law(NamedTuple):
     """A constitutive law of each element's deformation gradient, functions of ``kernels.elements.constitutive``.
 
     Attributes:
-        stress, differential, energy, cauchy: The functions.
+        stress, differential, energy: The functions.
         lanes: The same law of ``kernels.elements.native_laws``, for the CPU; None if it is not in C++.
+        cauchy: The Cauchy stress; None: that of the stress.
     """
 
     stress: wp.Function
     differential: wp.Function
     energy: wp.Function
-    cauchy: wp.Function
     lanes: IsotropicLaw | None = None
+    cauchy: wp.Function | None = None
 
 
 class LawField(ElementField):
@@ -455,14 +468,12 @@ class LawField(ElementField):
     """
 
     def __init__(self, body: Discretized | Discretization, law: Law, *, deterministic: bool = False):
-        kind = discretization_of(body).element_kind
-        self.law, stress = law, law_stress(law.stress)
+        self.law = law
         super().__init__(
             body,
-            deterministic=deterministic,
-            forces=scatter_forces(kind, IsotropicMaterial, stress),
-            energies=element_energies(kind, IsotropicMaterial, law_value(law.energy)),
-            von_mises=element_von_mises(kind, IsotropicMaterial, law_value(law.cauchy)),
+            stress=law_stress(law.stress),
             differential=law_differential(law.differential),
-            stress=stress,
+            density=law_value(law.energy),
+            cauchy=law_cauchy(law.stress) if law.cauchy is None else law_value(law.cauchy),
+            deterministic=deterministic,
         )

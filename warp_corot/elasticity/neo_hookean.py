@@ -5,12 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from warp_corot.elasticity.model import Law
-from warp_corot.kernels.elements.constitutive import (
-    neo_hookean_cauchy,
-    neo_hookean_differential,
-    neo_hookean_energy,
-    neo_hookean_stress,
-)
+from warp_corot.kernels.elements.constitutive import neo_hookean_differential, neo_hookean_energy, neo_hookean_stress
 from warp_corot.kernels.elements.dilatation import LOG_VOLUME
 
 from .law_model import LawModel
@@ -34,5 +29,5 @@ class NeoHookean(LawModel):
             more in any element, and the material is isotropic.
     """
 
-    law = Law(neo_hookean_stress, neo_hookean_differential, neo_hookean_energy, neo_hookean_cauchy, "neo-hookean")
+    law = Law(neo_hookean_stress, neo_hookean_differential, neo_hookean_energy, "neo-hookean")
     shared = LOG_VOLUME

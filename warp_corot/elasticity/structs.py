@@ -1,28 +1,13 @@
-"""Structs that kernels read, kept from launch to launch, because making one takes longer than a launch; and attributes
-that a field has from the field that it wraps.
-"""
+"""Structs that kernels read, kept from launch to launch, because making one takes longer than a launch."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from operator import attrgetter
 from typing import Generic, TypeVar
 
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 
 S = TypeVar("S")
-C = TypeVar("C")
-
-
-def forwards(to: str, *names: str) -> Callable[[type[C]], type[C]]:
-    """Decorate a class whose attributes of these names are those of its attribute ``to``."""
-
-    def decorate(cls: type[C]) -> type[C]:
-        for name in names:
-            setattr(cls, name, property(attrgetter(f"{to}.{name}")))
-        return cls
-
-    return decorate
 
 
 class Kept(Generic[S]):

@@ -5,12 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from warp_corot.elasticity.model import Law
-from warp_corot.kernels.elements.constitutive import (
-    stvk_cauchy,
-    stvk_differential,
-    stvk_energy,
-    stvk_stress,
-)
+from warp_corot.kernels.elements.constitutive import stvk_differential, stvk_energy, stvk_stress
 from warp_corot.kernels.elements.dilatation import GREEN
 
 from .law_model import LawModel
@@ -29,5 +24,5 @@ class StVenantKirchhoff(LawModel):
             more in any element, and the material is isotropic.
     """
 
-    law = Law(stvk_stress, stvk_differential, stvk_energy, stvk_cauchy, "stvk")
+    law = Law(stvk_stress, stvk_differential, stvk_energy, "stvk")
     shared = GREEN

@@ -39,9 +39,8 @@ class Viscosity:
         complete: Callable[[wp.array], wp.array] | None = None,
     ):
         self.body, self.field, self.seconds, self._complete = body, field, seconds, complete
-        self._scatter = ByElements(body.discretization, field.plan, ViscousMaterial, viscosity_stress, VISCOUS)
-        #: Separate places for each element's forces, if sums must be reproducible.
-        self._slotted = body.discretization.plan(subtrees=False, deterministic=True) if field.deterministic else None
+        law = ViscousMaterial, viscosity_stress, VISCOUS
+        self._scatter = ByElements(body.discretization, field.plan, *law, slotted=field.deterministic)
 
     def add_forces(self) -> None:
         """Launch the kernel that adds the forces of the present displacements and velocities to the body's [N]."""
@@ -51,16 +50,6 @@ class Viscosity:
 
     def scatter(self, u: wp.array, v: wp.array, f: wp.array) -> None:
         """Launch the kernel that adds the forces of displacements u and velocities v, linear in v, to f [N]."""
-        if self._slotted is None:
-            self._launch(self.field.elements, u, v, f)
-            return
-        slots = self._slotted.slots
-        assert slots is not None
-        slots.values.zero_()
-        self._launch(self._slotted.elements, u, v, slots.values)
-        slots.gather(f)
-
-    def _launch(self, elements: object, u: wp.array, v: wp.array, f: wp.array) -> None:
         material = ViscousMaterial()
         material.isotropic, material.seconds, material.velocities = self.field.isotropic, self.seconds, v
-        self._scatter(elements, self.field.element_count, material, u, f)
+        self._scatter(self.field.element_count, material, u, f)

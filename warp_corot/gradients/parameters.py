@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Collection, Iterable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+
+from warp_corot.errors import InputError
+from warp_corot.inputs.checks import shown
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
@@ -30,6 +33,34 @@ NEEDS = {
 def needed(names: Sequence[str]) -> set[str]:
     """The sums of ``ElementWork`` for derivatives of these names."""
     return {need for name in names if (need := NEEDS.get(name)) is not None}
+
+
+def checked_names(wrt: str | Sequence[str], known: Collection[str]) -> tuple[str, ...]:
+    """Names of derivatives, each once.
+
+    Raises:
+        InputError: A name is not one of those known, or there are none.
+    """
+    given = (wrt,) if isinstance(wrt, str) or not isinstance(wrt, Iterable) else tuple(wrt)
+    names = tuple(each for place, each in enumerate(given) if each not in given[:place])
+    wanted = ", ".join(map(repr, known))
+    for name in names:
+        if not isinstance(name, str) or name not in known:
+            raise InputError(f"wrt has {shown(name)}; it must be one or several of {wanted}")
+    if not names:
+        raise InputError(f"wrt is empty; it must be one or several of {wanted}")
+    return names
+
+
+def requested(found: object, name: str, known: Collection[str]) -> Any:
+    """A derivative by its name.
+
+    Raises:
+        InputError: It was not requested.
+    """
+    if name not in known or getattr(found, name) is None:
+        raise InputError(f"{shown(name)} is not one of the requested derivatives")
+    return getattr(found, name)
 
 
 def of_young(body: SoftBody, of_mu: Array, of_lam: Array) -> Array | float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,7 @@ from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.options import Contact
 from warp_corot.contact.shapes import Shape
 from warp_corot.discretization.nodal import padded
-from warp_corot.elasticity import Corotated, ForceField, Model
+from warp_corot.elasticity import Corotated, Model
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.checks import checked_count, refuse_tape, shown
 from warp_corot.inputs.simulation_lock import under_lock
@@ -75,9 +75,7 @@ class RunGradient:
     obstacles: Array | None = None
 
     def __getitem__(self, name: str) -> Any:
-        if name not in NAMES or getattr(self, name) is None:
-            raise InputError(f"{shown(name)} is not one of the requested derivatives")
-        return getattr(self, name)
+        return parameters.requested(self, name, NAMES)
 
 
 @under_lock
@@ -136,37 +134,39 @@ def run_gradient(
     marks = {steps} if every is None else {*range(checked_count(every, "every", least=1), steps + 1, every)}
     if not marks:
         raise InputError(f"every is {every}; the run has {steps} steps")
-    seen = _Values(body, objective)
+    given = _Run(sums, steps, marks, down, _Values(body, objective))
     of_obstacles = np.zeros((len(things), 3))
     if isinstance(integrator, SymplecticEuler):
-        kept, of_u, of_v = _explicit(body, field, integrator, down, sums, steps, marks, seen)
+        kept, of_u, of_v = _explicit(given, integrator)
     else:
         assert isinstance(integrator, ImplicitIntegrator)
-        run = _implicit(
-            body, field, integrator, law, down, sums, steps, marks, seen, adjoint_tolerance, things, contact
-        )
+        sim = Simulation(body, model=law, integrator=integrator, gravity=down, obstacles=things, contact=contact)
+        run = _implicit(given, integrator, sim, len(things), adjoint_tolerance)
         kept, of_u, of_v = steps + 1, run.of_displacements, run.of_velocities
         of_obstacles = of_obstacles + run.of_obstacles
     found = sums.derivatives() | {"displacements": of_u, "velocities": of_v, "obstacles": of_obstacles}
     if "rest" in names:
         found["rest"] = found["rest"] + of_u
-    return RunGradient(seen.value, kept, **{name: found[name] for name in names})
+    return RunGradient(given.seen.value, kept, **{name: found[name] for name in names})
 
 
-def _explicit(
-    body: SoftBody,
-    field: ForceField,
-    integrator: SymplecticEuler,
-    gravity: tuple[float, float, float],
-    sums: StepSums,
-    steps: int,
-    marks: set[int],
-    seen: _Values,
-) -> tuple[int, Array, Array]:
+class _Run(NamedTuple):
+    """What both kinds of steps need: the sums, the number of steps, the steps after which the objective is seen,
+    gravity, and the objective's values."""
+
+    sums: StepSums
+    steps: int
+    marks: set[int]
+    gravity: tuple[float, float, float]
+    seen: _Values
+
+
+def _explicit(given: _Run, integrator: SymplecticEuler) -> tuple[int, Array, Array]:
     """The number of kept states, and the adjoint of the beginning."""
-    length = math.isqrt(steps - 1) + 1
+    sums, steps, marks, gravity, seen = given
+    body, length = sums.body, math.isqrt(steps - 1) + 1
     ends = sorted({*range(length, steps, length), *marks, steps})
-    run = ExplicitRun(body, field, integrator, gravity, sums, ends)
+    run = ExplicitRun(body, sums.field, integrator, gravity, sums, ends)
     run.forward()
     sums.clear()
     check_finite(body)
@@ -181,32 +181,21 @@ def _explicit(
 
 
 def _implicit(
-    body: SoftBody,
-    field: ForceField,
-    integrator: ImplicitIntegrator,
-    law: Model,
-    gravity: tuple[float, float, float],
-    sums: StepSums,
-    steps: int,
-    marks: set[int],
-    seen: _Values,
-    tolerance: float,
-    obstacles: Sequence[Shape],
-    contact: Contact | None,
+    given: _Run, integrator: ImplicitIntegrator, sim: Simulation, obstacles: int, tolerance: float
 ) -> ImplicitRun:
     """The run backwards of implicit steps, at the beginning."""
-    sim = Simulation(body, model=law, integrator=integrator, gravity=gravity, obstacles=obstacles, contact=contact)
-    states, contacts, friction = [wp.clone(body.state.displacements)], [], [0.0] * len(obstacles)
-    for _ in range(steps):
+    sums, body = given.sums, given.sums.body
+    states, contacts, friction = [wp.clone(body.state.displacements)], [], [0.0] * obstacles
+    for _ in range(given.steps):
         sim.step()
         states.append(wp.clone(body.state.displacements))
         if sim.contact is not None:
             contacts.append(RestingContact(body, sim.contact, touches_after(body, sim.contact), friction))
     check_finite(body)
-    run = ImplicitRun(body, field, integrator, sums, states, tolerance, contacts)
-    for step in reversed(range(steps)):
-        if step + 1 in marks:
-            run.of_displacements = run.of_displacements + seen.derivative(states[step + 1])
+    run = ImplicitRun(body, sums.field, integrator, sums, states, tolerance, contacts)
+    for step in reversed(range(given.steps)):
+        if step + 1 in given.marks:
+            run.of_displacements = run.of_displacements + given.seen.derivative(states[step + 1])
         run.backward(step)
     return run
 
@@ -277,10 +266,4 @@ def _checked(body: SoftBody, integrator: Integrator, steps: int, wrt: str | Sequ
         )
     if integrator.viscosity:
         raise InputError(f"viscosity is {integrator.viscosity}; steps with gradients have none")
-    names = (wrt,) if isinstance(wrt, str) else tuple(wrt)
-    for name in names:
-        if name not in NAMES:
-            raise InputError(f"wrt has {shown(name)}; it must be one or several of {', '.join(map(repr, NAMES))}")
-    if not names:
-        raise InputError(f"wrt is empty; it must be one or several of {', '.join(map(repr, NAMES))}")
-    return names
+    return parameters.checked_names(wrt, NAMES)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,8 +14,6 @@ from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.options import Contact
 from warp_corot.contact.shapes import Shape
 from warp_corot.elasticity import Model
-from warp_corot.errors import InputError
-from warp_corot.inputs.checks import shown
 from warp_corot.inputs.simulation_lock import under_lock
 from warp_corot.simulation.static import StaticReport
 
@@ -63,9 +61,7 @@ class StaticGradient:
     obstacles: Array | None = None
 
     def __getitem__(self, name: str) -> Any:
-        if name not in parameters.NEEDS or getattr(self, name) is None:
-            raise InputError(f"{shown(name)} is not one of the requested derivatives")
-        return getattr(self, name)
+        return parameters.requested(self, name, parameters.NEEDS)
 
 
 @under_lock
@@ -115,7 +111,7 @@ def static_gradient(
         ConvergenceError: The body does not come to rest, the state of rest is not stable, or the adjoint solve does not
             converge.
     """
-    names = checked_names(wrt)
+    names = parameters.checked_names(wrt, parameters.NEEDS)
     solved = solved_state(
         body,
         model=model,
@@ -135,20 +131,3 @@ def static_gradient(
     value, derivative = value_and_derivative(objective, positions)
     found = solved.pull_back(derivative, names)
     return StaticGradient(value, solved.report, solved.adjoint_iterations, solved.adjoint_residual, **found)
-
-
-def checked_names(wrt: str | Sequence[str]) -> tuple[str, ...]:
-    """Names of derivatives.
-
-    Raises:
-        InputError: A name is not one of them, or there are none.
-    """
-    given = (wrt,) if isinstance(wrt, str) or not isinstance(wrt, Iterable) else tuple(wrt)
-    names = tuple(each for place, each in enumerate(given) if each not in given[:place])
-    wanted = ", ".join(map(repr, parameters.NEEDS))
-    for name in names:
-        if not isinstance(name, str) or name not in parameters.NEEDS:
-            raise InputError(f"wrt has {shown(name)}; it must be one or several of {wanted}")
-    if not names:
-        raise InputError(f"wrt is empty; it must be one or several of {wanted}")
-    return names

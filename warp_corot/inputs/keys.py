@@ -20,19 +20,3 @@ def checked_times(times: npt.ArrayLike) -> npt.NDArray[np.float64]:
     if t.ndim != 1 or len(t) < 2 or not np.isfinite(t).all() or (np.diff(t) <= 0).any():
         raise InputError(f"times of shape {t.shape} must be at least two finite, increasing numbers")
     return t
-
-
-def staying(
-    followers: npt.NDArray[np.integer], chosen: npt.NDArray[np.integer], values: npt.NDArray[np.floating]
-) -> tuple[npt.NDArray[np.integer], npt.NDArray[np.floating]] | None:
-    """The followers of keyframes that are not among the chosen, with their values; None if all stay.
-
-    Args:
-        followers: [n].
-        chosen: Those that stop following.
-        values: A column for each follower, or one for all, [K, n, …] or [K, 1, …].
-    """
-    stays = ~np.isin(followers, chosen)
-    if stays.all():
-        return None
-    return followers[stays], values[:, stays] if values.shape[1] > 1 else values

@@ -24,7 +24,7 @@ from .lattice import LATTICE_BITS, checked_box
 from .lattice import MAX_LEVEL as MAX_LEVEL
 from .pieces import pieces_of
 from .surfaces.bodies import largest_piece, separating_surface, summary, surface
-from .surfaces.bound import BoundPoints, SurfaceMesh, bound
+from .surfaces.bound import SurfaceMesh
 from .surfaces.embedding import embed
 from .tree import UniformTree
 from .uniform import halvings, uniform_leaves
@@ -189,30 +189,7 @@ class TetForest(ForestArrays):
         return refined(self, chosen)
 
     def embed(self, points: npt.ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-        """The leaf that holds each point, or the nearest one, and the point's place in it.
-
-        Args:
-            points: [n, 3] [m].
-
-        Returns:
-            Leaves int32 [n], and barycentric weights of their nodes float64 [n, 4]; some are negative if the point is
-            outside the leaf.
-
-        Raises:
-            InputError: The points are not [n, 3], or not finite.
-        """
         return embed(self, points)
-
-    def bind(self, points: npt.ArrayLike, triangles: npt.ArrayLike | None = None) -> BoundPoints:
-        """Bind your own points, or with triangles [F, 3] a surface, to the mesh, so that they follow it.
-
-        A closed surface is wound outwards, as `Domain.from_surface` winds it.
-
-        Raises:
-            InputError: As for `embed`, or triangles name points that do not exist.
-        """
-        elements, weights = self.embed(points)
-        return bound(np.asarray(points), self.tets[elements], weights, triangles)
 
     def surface(self) -> SurfaceMesh:
         """The closed marched surface of a mesh made from a domain; the boundary of any other mesh.

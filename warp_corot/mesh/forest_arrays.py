@@ -8,9 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from warp_corot.errors import InputError
-from warp_corot.inputs.checks import shown
-
+from .labelled import LabelledMesh
 from .lattice import LATTICE_BITS, checked_level, volume_shares
 from .tree import Tree, UniformTree
 
@@ -19,7 +17,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class ForestArrays:
+class ForestArrays(LabelledMesh):
     """The arrays that refinement, embedding and drawing use; ``TetForest``, which users hold, documents them."""
 
     cells: tuple[int, int, int]
@@ -41,7 +39,7 @@ class ForestArrays:
     leaf_groups: np.ndarray | None = None
 
     @cached_property
-    def points(self) -> np.ndarray:
+    def points(self) -> np.ndarray:  # type: ignore[override]
         """Rest positions of the nodes [m], float64 [N, 3]."""
         return self.lattice_points[: self.node_count]
 
@@ -56,7 +54,7 @@ class ForestArrays:
         return len(self.lattice) if isinstance(self.tree, UniformTree) else int(self.tets.max()) + 1
 
     @cached_property
-    def tets(self) -> np.ndarray:
+    def tets(self) -> np.ndarray:  # type: ignore[override]
         """The leaves' nodes in Maubach order, in tree order, int32 [T, 4]."""
         return self.tree.leaf_tets
 
@@ -90,24 +88,4 @@ class ForestArrays:
             found[below[real]] = climbed[real]
             further = tree.level[climbed] > level
             below, climbed = below[further], climbed[further]
-        return found
-
-    def elements_of(self, label: str) -> np.ndarray:
-        """Leaves with this label, bool [T].
-
-        Raises:
-            InputError: The mesh has no label of this name.
-        """
-        if label not in self.label_names or self.labels is None:
-            raise InputError(f"there is no label {shown(label)}; there are: {', '.join(self.label_names) or 'none'}")
-        return np.equal(self.labels, self.label_names.index(label) + 1)
-
-    def nodes_of(self, label: str) -> np.ndarray:
-        """Nodes of the leaves with this label, bool [N]; nodes on a border belong to both sides.
-
-        Raises:
-            InputError: The mesh has no label of this name.
-        """
-        found = np.zeros(self.node_count, bool)
-        found[self.tets[self.elements_of(label)]] = True
         return found

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from warp_corot.mesh.growing.cut import face_pairs
+from warp_corot.mesh.growing.cut import face_pairs, linked
 
 
 def pieces_of(tets: npt.NDArray[np.integer]) -> npt.NDArray[np.int32]:
@@ -17,11 +17,6 @@ def pieces_of(tets: npt.NDArray[np.integer]) -> npt.NDArray[np.int32]:
     Args:
         tets: Nodes of each element [T, 4].
     """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    pairs, count = face_pairs(tets), len(tets)
-    links = coo_array((np.ones(len(pairs), np.int8), pairs.T), shape=(count, count))
-    _, piece = connected_components(links, directed=False)
+    piece = linked(face_pairs(tets), len(tets))
     rank = np.argsort(np.argsort(-np.bincount(piece), kind="stable"), kind="stable")
     return rank[piece].astype(np.int32)

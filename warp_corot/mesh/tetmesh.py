@@ -15,7 +15,7 @@ from warp_corot.inputs.checks import checked_axis, checked_number, checked_numbe
 from warp_corot.inputs.indices import checked_indices
 from warp_corot.kernels.tables.shapes import EDGES
 
-from .surfaces.bound import BoundPoints, bound
+from .labelled import LabelledMesh
 from .surfaces.boundary import signed_volumes
 from .surfaces.locating import embed_in_tets
 
@@ -23,7 +23,7 @@ from .surfaces.locating import embed_in_tets
 FLAT = 1e-7
 
 
-class TetMesh:
+class TetMesh(LabelledMesh):
     """Tetrahedra of any shape.
 
     Mirrored tetrahedra (negative volume) are repaired by exchanging their last two nodes; ``repaired`` says how many.
@@ -157,51 +157,8 @@ class TetMesh:
         """Rest volume of each tetrahedron [m^3], float64 [T]."""
         return signed_volumes(self.points, self.tets)
 
-    def elements_of(self, label: str) -> np.ndarray:
-        """Tetrahedra of a region, bool [T].
-
-        Raises:
-            InputError: The mesh has no region of this name.
-        """
-        if label not in self.label_names or self.labels is None:
-            raise InputError(f"there is no label {shown(label)}; there are: {', '.join(self.label_names) or 'none'}")
-        return np.equal(self.labels, self.label_names.index(label) + 1)
-
-    def nodes_of(self, label: str) -> np.ndarray:
-        """Nodes of the tetrahedra of a region, bool [N]; nodes on a border belong to both sides.
-
-        Raises:
-            InputError: The mesh has no region of this name.
-        """
-        found = np.zeros(len(self.points), bool)
-        found[self.tets[self.elements_of(label)]] = True
-        return found
-
     def embed(self, points: npt.ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-        """The tetrahedron that holds each point, or the one behind the nearest face, and the point's weights in it.
-
-        Args:
-            points: [n, 3] [m].
-
-        Returns:
-            Tetrahedra int32 [n], and barycentric weights of their nodes float64 [n, 4]; some are negative if the point
-            is outside.
-
-        Raises:
-            InputError: The points are not [n, 3], or not finite.
-        """
         return embed_in_tets(self.points, self.tets, np.asarray(points))
-
-    def bind(self, points: npt.ArrayLike, triangles: npt.ArrayLike | None = None) -> BoundPoints:
-        """Bind your own points, or with triangles [F, 3] a surface, to the mesh, so that they follow it.
-
-        A closed surface is wound outwards, as `Domain.from_surface` winds it.
-
-        Raises:
-            InputError: As for `embed`, or triangles name points that do not exist.
-        """
-        elements, weights = self.embed(points)
-        return bound(np.asarray(points), self.tets[elements], weights, triangles)
 
 
 def _mask(nodes: npt.ArrayLike, count: int) -> npt.NDArray[np.bool_]:

@@ -7,12 +7,11 @@ import math
 import numpy as np
 import numpy.typing as npt
 import warp as wp
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 
 from warp_corot.elasticity import Corotated
 from warp_corot.kernels.newton import gauge as newton_gauge
 from warp_corot.kernels.stepping import gauge
+from warp_corot.mesh.growing.cut import linked, node_pairs
 from warp_corot.solvers.guarding.mapped import Mapped
 from warp_corot.solvers.steps.gauge import REST_TURNS
 from warp_corot.solvers.steps.stable_step import PROBE
@@ -192,9 +191,8 @@ class Following:
 def _size(model: newton.Model, tets: npt.NDArray[np.integer]) -> float:
     """The diagonal of the bounding box of the largest connected body of tetrahedra [m]."""
     count = model.particle_count
-    edges = csr_array((np.ones(3 * len(tets), bool), (np.repeat(tets[:, 0], 3), tets[:, 1:].ravel())), (count, count))
-    number, body = connected_components(edges, directed=False)
-    x = model.particle_q.numpy()
+    body = linked(node_pairs(tets), count)
+    number, x = int(body.max()) + 1, model.particle_q.numpy()
     low, high = (np.full((number, 3), value) for value in (np.inf, -np.inf))
     np.minimum.at(low, body, x)
     np.maximum.at(high, body, x)

@@ -7,12 +7,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import warp as wp
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 
 from warp_corot.errors import InputError
 from warp_corot.kernels.newton.pairs import PairLists, Surfaces, count_pair_loads, scatter_pairs
 from warp_corot.kernels.newton.rows import ContactLaw
+from warp_corot.mesh.growing.cut import linked, node_pairs
 
 from .library import newton
 
@@ -135,7 +134,5 @@ def _triangles_of_edges(
 def _parts(model: newton.Model, triangles: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
     """Number of the connected body of each particle, int32 [P]."""
     tets = model.tet_indices.numpy().reshape(-1, 4)
-    pairs = np.concatenate([tets[:, [0, k]] for k in (1, 2, 3)] + [triangles[:, [0, k]] for k in (1, 2)])
-    count = model.particle_count
-    graph = csr_array((np.ones(len(pairs), bool), pairs.T), shape=(count, count))
-    return np.asarray(connected_components(graph, directed=False)[1], np.int32)
+    pairs = np.concatenate([node_pairs(tets)] + [triangles[:, [0, k]] for k in (1, 2)])
+    return linked(pairs, model.particle_count).astype(np.int32)

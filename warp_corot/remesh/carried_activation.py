@@ -10,7 +10,8 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.body.activation import Activation, ElementActivation
+from warp_corot.body.activation import Activation, followed_stress
+from warp_corot.body.trajectory import Followed
 from warp_corot.discretization.changing.pools import DeviceForest
 from warp_corot.kernels.remesh.anisotropic import READ_LEAVES, WRITE_LEAVES
 from warp_corot.kernels.remesh.state import NO_ROW
@@ -53,7 +54,7 @@ class CarriedActivation:
         self._body = body
         self._forest = forest
         self.keys: list[Keys] = []
-        self._made: list[ElementActivation] = []
+        self._made: list[Followed] = []
 
     def note(self, kept_rows: wp.array | None) -> None:
         """Read the user's changes.
@@ -92,14 +93,14 @@ class CarriedActivation:
         self._made = [made for keys in self.keys if (made := _of_keys(keys, rows, self._body.device))]
         self._body.conditions.set_activations(self._made)
 
-    def _adopt(self, activations: Sequence[ElementActivation], kept_rows: wp.array | None) -> wp.array:
+    def _adopt(self, activations: Sequence[Followed], kept_rows: wp.array | None) -> wp.array:
         """Number these keyframes, and return the row that each element follows, int32 [T]."""
         rows = np.full(self._body.element_count, int(NO_ROW), np.int32)
         wanted = np.empty(0, np.int32) if kept_rows is None else kept_rows.numpy()
         self.keys = [keys for keys in self.keys if keys.follow(wanted).any()]
         for activation in activations:
-            first, elements = max((keys.end for keys in self.keys), default=0), activation.elements.numpy()
-            keys = Keys(first, activation.times.numpy(), activation.stress.numpy())
+            first, elements = max((keys.end for keys in self.keys), default=0), activation.host_numbers
+            keys = Keys(first, activation.times.numpy(), activation.values.numpy())
             rows[elements] = first + (np.arange(len(elements)) if keys.end - first > 1 else 0)
             self.keys.append(keys)
         self._made = list(activations)
@@ -125,10 +126,10 @@ class CarriedActivation:
         return carriage.arrays.numbers, carriage.number_names.index(name)
 
 
-def _of_keys(keys: Keys, rows: npt.NDArray[np.int32], device: wp.Device) -> ElementActivation | None:
+def _of_keys(keys: Keys, rows: npt.NDArray[np.int32], device: wp.Device) -> Followed | None:
     """The elements that follow these keyframes; None if there are none."""
     elements = np.flatnonzero(keys.follow(rows))
     if not len(elements):
         return None
     stress = keys.stress if keys.end - keys.first == 1 else keys.stress[:, rows[elements] - keys.first]
-    return ElementActivation.of_keys(elements, Activation(keys.times, stress), device)
+    return followed_stress(elements, Activation(keys.times, stress), device)

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.body.trajectory import NodeKeyframes, Trajectory
+from warp_corot.body.trajectory import Followed, NodeKeyframes
 from warp_corot.kernels.remesh.state import MIXED_ROWS, NO_ROW
 
 
@@ -36,24 +36,24 @@ class Keyframes:
     def __init__(self) -> None:
         self.rows: dict[int, Row] = {}
         self.between: dict[tuple[int, int], int] = {}
-        self._trajectories: list[Trajectory] = []
+        self._trajectories: list[Followed] = []
         #: The nodes and rows from which these were made; None if they were not made here.
         self._made_of: tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]] | None = None
 
-    def are(self, trajectories: Sequence[Trajectory]) -> bool:
+    def are(self, trajectories: Sequence[Followed]) -> bool:
         """Whether these trajectories are those made or adopted last."""
         return len(trajectories) == len(self._trajectories) and all(
             a is b for a, b in zip(trajectories, self._trajectories, strict=True)
         )
 
-    def adopt(self, trajectories: Sequence[Trajectory], node_count: int) -> npt.NDArray[np.int32]:
+    def adopt(self, trajectories: Sequence[Followed], node_count: int) -> npt.NDArray[np.int32]:
         """Adopt trajectories, and return the row that each node follows, int32 [N]."""
         found = np.full(node_count, int(NO_ROW), np.int32)
         for trajectory in trajectories:
             times, displacements = trajectory.keys()
             columns = displacements[:, None] if displacements.ndim == 2 else displacements
             numbers = [self._add(Row(times.copy(), column.copy())) for column in np.moveaxis(columns, 1, 0)]
-            found[trajectory.nodes.numpy()] = numbers
+            found[trajectory.host_numbers] = numbers
         self._trajectories, self._made_of = list(trajectories), None
         return found
 
@@ -78,7 +78,7 @@ class Keyframes:
 
     def trajectories(
         self, nodes: npt.NDArray[np.int32], rows: npt.NDArray[np.int32], device: wp.Device
-    ) -> list[Trajectory]:
+    ) -> list[Followed]:
         """The nodes' keyframes as trajectories; the last ones if they are still valid.
 
         Args:
@@ -134,11 +134,11 @@ class Keyframes:
         return number
 
 
-def _alike(ones: Sequence[Trajectory], others: Sequence[Trajectory]) -> bool:
+def _alike(ones: Sequence[Followed], others: Sequence[Followed]) -> bool:
     """Whether two lists of trajectories have the same nodes on the same keyframes, in the same order."""
     return len(ones) == len(others) and all(
-        np.array_equal(a.nodes.numpy(), b.nodes.numpy())
+        np.array_equal(a.host_numbers, b.host_numbers)
         and np.array_equal(a.times.numpy(), b.times.numpy())
-        and np.array_equal(a.displacements.numpy(), b.displacements.numpy())
+        and np.array_equal(a.values.numpy(), b.values.numpy())
         for a, b in zip(ones, others, strict=True)
     )

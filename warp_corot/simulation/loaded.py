@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.elasticity import ForceField
+from warp_corot.mesh.growing.cut import linked, node_pairs
 
 #: Loads on a free body balance if their sum is less than this share of the sum of their magnitudes.
 BALANCED = 1e-5
@@ -86,12 +87,7 @@ def _rigid_motions(x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 
 def _parts(tets: npt.NDArray[np.integer], count: int) -> npt.NDArray[np.int32]:
     """The part of each node, -1 if it is in no element: elements that share a node belong to one part."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    rows, columns = np.repeat(tets[:, 0], 3), tets[:, 1:].ravel()
-    links = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(count, count))
-    _, label = connected_components(links, directed=False)
+    label = linked(node_pairs(tets), count)
     used = np.zeros(count, bool)
     used[tets.ravel()] = True
     part = np.full(count, -1, np.int32)

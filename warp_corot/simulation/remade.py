@@ -115,7 +115,7 @@ def _copy_of(body: SoftBody, material: Material | None) -> SoftBody:
         copy.set_initial_state()
     copy.fix(body.constrained if body.worlds == 1 else body.constrained.reshape(body.worlds, -1))
     for trajectory in conditions.trajectories:
-        copy.follow(trajectory.host_nodes, *trajectory.keys())
+        copy.follow(trajectory.host_numbers, *trajectory.keys())
     if conditions.has_loads:
         wp.copy(copy.loads, body.loads)
     if body.discretization.has_activation:

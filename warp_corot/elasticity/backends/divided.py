@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import copy
-from dataclasses import replace
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import warp as wp
 
 from warp_corot.discretization.slots import Slots
 from warp_corot.inputs.cpu_threads import Regions, Team
-from warp_corot.kernels.elements.simd8 import LANES
-
-from .mean_dilatation import Dilating
-from .simd8 import Lanes
 
 
 class Piece(Protocol):
@@ -27,41 +21,6 @@ class Piece(Protocol):
     def nodes(self) -> list[wp.array]:
         """The nodes of these elements, in arrays of any shape."""
         ...
-
-
-class InLanes:
-    """A field of subtrees and other elements in lanes on the CPU, which can be divided."""
-
-    plan: Any
-    discretization: Any
-    _lanes: Lanes | None
-    _dilating: Dilating | None
-
-    def pieces(self, team: Team) -> list[Piece]:
-        """See ``ForceField``: copies of the field, each with some of the subtrees and of the other elements."""
-        if self.plan.counts is not None or self.plan.units is not None:
-            return []
-
-        worlds = self.discretization.worlds
-
-        def parts_of(whole: Any) -> list[Any]:
-            return [whole.part(*bounds) for bounds in team.bounds(whole.count, LANES, worlds)]
-
-        batches = [parts_of(batch) for batch in self.plan.batches]
-        dilating, lanes = self._dilating and self._dilating.parts(team, worlds), self._lanes and parts_of(self._lanes)
-        pieces: list[Any] = [copy(self) for _ in range(team.parts)]
-        for part, piece in enumerate(pieces):
-            piece.plan = replace(self.plan, batches=tuple(batch[part] for batch in batches))
-            piece._dilating, piece._lanes = dilating and dilating[part], lanes and lanes[part]
-        return pieces
-
-    @property
-    def nodes(self) -> list[wp.array]:
-        """See ``Piece``."""
-        nodes = [batch.subtrees.nodes for batch in self.plan.batches]
-        if self._dilating is not None:
-            return [*nodes, self._dilating.nodes] if self._dilating.count else nodes
-        return nodes if self._lanes is None else [*nodes, self._lanes.elements.nodes]
 
 
 class DividedForces:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import warp as wp
 
 from warp_corot.discretization.elements import E, copied
 from warp_corot.elasticity.backends.simd8 import Lanes, as_general
-from warp_corot.elasticity.model import ForceField
-from warp_corot.elasticity.stress_law import StressLaw
+from warp_corot.elasticity.model import ElementField
 from warp_corot.elasticity.structs import Kept
+from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.corotated.anisotropic import (
     FibreMaterial,
     OrthotropicMaterial,
@@ -21,14 +21,51 @@ from warp_corot.kernels.corotated.anisotropic import (
 )
 from warp_corot.kernels.corotated.anisotropic_simd8 import scatter_anisotropic_simd8, turn_changed, turn_elements
 from warp_corot.kernels.corotated.anisotropic_tangent import anisotropic_differential
-from warp_corot.kernels.elements.forces import element_energies, element_von_mises, repair_forces, scatter_forces
+from warp_corot.kernels.elements.forces import element_energies, repair_forces
 from warp_corot.kernels.math.rotation import byers_xu
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
 
 
-class AnisotropicField(ForceField):
+class FibreField(ElementField):
+    """Force field of a material with directions, along the first of which there may be an active stress.
+
+    Args:
+        discretization, functions: As for ``ElementField``.
+
+    Attributes:
+        passive: The material without the active stress.
+    """
+
+    takes_anisotropic: ClassVar[bool] = True
+
+    def __init__(self, discretization: Discretization, **functions: Any):
+        super().__init__(discretization, **functions)
+        self.passive = discretization.anisotropic_material()
+        self._fibres = Kept(fibre_material)
+
+    @property
+    def fibres(self) -> FibreMaterial:
+        """The material with directions, with the present active stress."""
+        return self._fibres(self.passive, *self._activation)
+
+    @property
+    def _activation(self) -> list:
+        return [int(self.discretization.has_activation), self.discretization.activation]
+
+    def write_energies(self, u: wp.array, energies: wp.array) -> None:
+        # In one part: ``part_of`` does not cut materials with directions.
+        self.launch(self._energies, self.element_count, [self.elements, self.material, u], [energies])
+
+    def write_potentials(self, u: wp.array, energies: wp.array) -> None:
+        self.write_energies(u, energies)
+        if self.discretization.has_activation:
+            kernel = element_energies(self.discretization.element_kind, FibreMaterial, active_density, adds=True)
+            self.launch(kernel, self.element_count, [self.elements, self.fibres, u], [energies])
+
+
+class AnisotropicField(FibreField):
     """W = V/2 e : C : e with e = sym(R^T F) - I, R the element's own rotation, C fixed in rest space.
 
     The force is the gradient of W, with the derivative of R, which isotropic materials do not need, and conserves
@@ -48,46 +85,24 @@ class AnisotropicField(ForceField):
         deterministic: As for every field.
     """
 
-    takes_anisotropic: ClassVar[bool] = True
-
     def __init__(self, discretization: Discretization, rotation: wp.Function, deterministic: bool):
-        super().__init__(discretization, deterministic)
-        kind = discretization.element_kind
-        self._rotation = rotation
-        self._forces = scatter_forces(kind, FibreMaterial, fibre_stress(rotation))
-        self._energies = element_energies(kind, FibreMaterial, fibre_density(rotation))
-        self._von_mises = element_von_mises(kind, FibreMaterial, fibre_cauchy(rotation))
-        self.material = discretization.anisotropic_material()
-        self._fibres = Kept(fibre_material)
-
-    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        self.launch(self._forces, self.element_count, [self.elements, self.fibres, u], [f])
+        super().__init__(
+            discretization,
+            stress=fibre_stress(rotation),
+            differential=anisotropic_differential(rotation),
+            density=fibre_density(rotation),
+            cauchy=fibre_cauchy(rotation),
+            Material=FibreMaterial,
+            deterministic=deterministic,
+        )
 
     @property
-    def stress_law(self) -> StressLaw | None:
-        differential = anisotropic_differential(self._rotation)
-        return StressLaw(fibre_stress(self._rotation), differential, self.fibres, FibreMaterial)
-
-    def write_energies(self, u: wp.array, energies: wp.array) -> None:
-        self.launch(self._energies, self.element_count, [self.elements, self.fibres, u], [energies])
-
-    def write_potentials(self, u: wp.array, energies: wp.array) -> None:
-        self.write_energies(u, energies)
-        if self.discretization.has_activation:
-            kernel = element_energies(self.discretization.element_kind, FibreMaterial, active_density, adds=True)
-            self.launch(kernel, self.element_count, [self.elements, self.fibres, u], [energies])
-
-    def write_von_mises(self, u: wp.array, stress: wp.array) -> None:
-        self.launch(self._von_mises, self.element_count, [self.elements, self.fibres, u], [stress])
+    def material(self) -> FibreMaterial:
+        return self.fibres
 
     @property
-    def fibres(self) -> FibreMaterial:
-        """The material with the present active stress."""
-        return self._fibres(self.material, *self._activation)
-
-    @property
-    def _activation(self) -> list:
-        return [int(self.discretization.has_activation), self.discretization.activation]
+    def material_shown(self) -> FibreMaterial:
+        return self.fibres
 
 
 def fibre_material(passive: OrthotropicMaterial, is_active: int, activation: wp.array) -> FibreMaterial:
@@ -103,20 +118,24 @@ class AnisotropicSimd8Field(AnisotropicField):
     def __init__(self, discretization: Discretization, rotation: wp.Function, deterministic: bool):
         super().__init__(discretization, rotation, deterministic)
         # The elements as general ones, with rest matrices in the material's axes.
-        inputs = [self.elements, self.material]
+        inputs = [self.elements, self.passive]
         self._general = as_general(self.elements, turn_elements(discretization.element_kind), inputs)
         self.follow()
 
+    @property
+    def _force_kernels(self) -> list[LoadedKernel]:
+        repair = repair_forces(self.discretization.element_kind, FibreMaterial, fibre_stress(byers_xu))
+        return [scatter_anisotropic_simd8, repair]
+
     def follow(self) -> None:
-        count, stress = self.element_count, fibre_stress(byers_xu)
-        repair = repair_forces(self.discretization.element_kind, FibreMaterial, stress)
-        elements, general = _first(self.elements, count), _first(self._general, count)
-        self._lanes = Lanes(elements, general, scatter=scatter_anisotropic_simd8, repair=repair)
+        scatter, repair = self._force_kernels
+        elements, general = (_first(each, self.element_count) for each in (self.elements, self._general))
+        self._lanes = Lanes(elements, general, scatter=scatter, repair=repair)
 
     def derive(self) -> None:
         counts = self.plan.counts
         assert counts is not None
-        inputs = [counts.threads, counts.goes, counts.now, counts.before, self.elements, self.material]
+        inputs = [counts.threads, counts.goes, counts.now, counts.before, self.elements, self.passive]
         self.launch(turn_changed, counts.threads, inputs, [self._general.rest_inverse, self._general.volume])
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:

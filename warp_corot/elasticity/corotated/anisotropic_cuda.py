@@ -9,6 +9,7 @@ import warp as wp
 from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.plan import Plan
 from warp_corot.elasticity.backends.clusters import divided
+from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.clusters.laws import ActiveMaterial, anisotropic_law
 from warp_corot.kernels.corotated.anisotropic import OrthotropicMaterial
 from warp_corot.kernels.corotated.well_conditioned import quaternions_of
@@ -35,9 +36,11 @@ class AnisotropicCudaField(AnisotropicField):
     def __init__(self, discretization: Discretization):
         super().__init__(discretization, quick_rotation, deterministic=False)
         self._transverse = isinstance(discretization.material, TransverselyIsotropic)
-        self._quaternions = wp.empty(len(self.material.axes), dtype=wp.quat, device=self.device)
+        self._quaternions = wp.empty(len(self.passive.axes), dtype=wp.quat, device=self.device)
         self.derive()
         self.follow()
+
+    _force_kernels: list[LoadedKernel] = []  # noqa: RUF012 (never changed)
 
     def plan_of(self, discretization: Discretization) -> Plan:
         return discretization.plan(subtrees=discretization.prefers_subtrees)
@@ -49,11 +52,11 @@ class AnisotropicCudaField(AnisotropicField):
             wp.load_module(kernel.module, self.device)
 
     def derive(self) -> None:
-        self.launch(quaternions_of, len(self._quaternions), [self.material.axes], [self._quaternions])
+        self.launch(quaternions_of, len(self._quaternions), [self.passive.axes], [self._quaternions])
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         fibres, flat = self.fibres, self.plan.flat
-        active = active_material(self.material, self._quaternions, *self._activation)
+        active = active_material(self.passive, self._quaternions, *self._activation)
         for batch, kernel, flags in zip(self._batches, self._kernels, self._flags, strict=True):
             inputs, outputs = [batch.subtrees, active, u], [f, as_bytes(flags)]
             wp.launch(kernel, batch.count, inputs=inputs, outputs=outputs, device=self.device, block_dim=BLOCK)
@@ -71,7 +74,7 @@ class AnisotropicCudaField(AnisotropicField):
         self._flags = [wp.zeros(-(-b.count // 8), dtype=wp.uint64, device=self.device) for b in self._batches]
 
     def _kernel(self, shape: int, grouped: bool) -> wp.Kernel:
-        one_axes, one_stiffness = self.material.axes_stride == 0, self.material.stride == 0
+        one_axes, one_stiffness = self.passive.axes_stride == 0, self.passive.stride == 0
         return scatter_anisotropic_subtrees(shape, grouped, self._transverse, one_axes, one_stiffness)
 
 

@@ -8,11 +8,8 @@ from typing import TYPE_CHECKING, ClassVar
 import warp as wp
 
 from warp_corot.discretization.discretization import Discretization
-from warp_corot.discretization.elements import Elements
 from warp_corot.discretization.plan import Plan, Units
-from warp_corot.elasticity.backends.divided import InLanes
-from warp_corot.elasticity.backends.mean_dilatation import Dilating
-from warp_corot.elasticity.backends.simd8 import Lanes
+from warp_corot.elasticity.backends.in_lanes import InLanes
 from warp_corot.elasticity.model import ForceField
 from warp_corot.elasticity.stress_law import StressLaw
 from warp_corot.elasticity.structs import Kept
@@ -30,7 +27,6 @@ from warp_corot.kernels.corotated.energy import own_energies, own_von_mises
 from warp_corot.kernels.corotated.tangent import exact_differential
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
 from warp_corot.kernels.elements.forces import element_energies, element_von_mises, scatter_forces
-from warp_corot.kernels.elements.general_cpu import scatter_law_elements
 from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.kernels.subtrees.repair import repair_elements
 
@@ -59,11 +55,6 @@ def rotated_material(isotropic: IsotropicMaterial, rotations: wp.array, unit: wp
     material = RotatedMaterial()
     material.isotropic, material.rotations, material.unit = isotropic, rotations, unit
     return material
-
-
-def general_lanes(elements: Elements) -> Lanes:
-    """Launches over general elements on the CPU, each with its own rotation."""
-    return Lanes(elements, elements, scatter=scatter_law_elements("corotated"), repair=repair_elements)
 
 
 class CorotatedField(ForceField):
@@ -217,29 +208,15 @@ class LeafField(CorotatedField):
 class Simd8Field(InLanes, CorotatedField):
     """General elements on the CPU."""
 
-    _lanes: Lanes
+    repair = repair_elements
 
     def __init__(self, discretization: Discretization, model: CorotatedOptions, deterministic: bool):
         super().__init__(discretization, model, deterministic)
-        self._lanes = general_lanes(self.elements)
+        self.follow()
 
     @property
     def _force_kernels(self) -> list[LoadedKernel]:
-        dilating = self._dilating
-        forces = scatter_law_elements("corotated") if dilating is None else dilating.kernel("corotated")
-        return [forces, repair_elements]
-
-    def share_dilatation(self, dilating: Dilating) -> bool:
-        self._dilating = dilating
-        self.derive()
-        return True
-
-    def derive(self) -> None:
-        if self._dilating is not None:
-            self._dilating.derive(self.isotropic)
+        return self.other_kernels
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        if self._dilating is None:
-            self._lanes.scatter_forces(self.isotropic, u, f)
-        else:
-            self._dilating.scatter_groups("corotated", u, f, repair_elements)
+        self.scatter_others(u, f)

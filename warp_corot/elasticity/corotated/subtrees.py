@@ -11,12 +11,10 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import warp as wp
 
-from warp_corot.discretization.plan import FlatLeaves
 from warp_corot.discretization.subtrees import Batch, Sharing
 from warp_corot.elasticity.backends.clusters import ChangingClusterScatter, ClusterScatter
-from warp_corot.elasticity.backends.divided import InLanes
+from warp_corot.elasticity.backends.in_lanes import InLanes
 from warp_corot.elasticity.backends.mean_dilatation import Dilating
-from warp_corot.elasticity.backends.simd8 import Lanes, as_general
 from warp_corot.elasticity.structs import Kept
 from warp_corot.elasticity.tangent import Tangent
 from warp_corot.inputs.cpu_threads import launch
@@ -24,7 +22,6 @@ from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.clusters.laws import isotropic_law
 from warp_corot.kernels.corotated.algebraic import corotated_stress
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
-from warp_corot.kernels.elements.general_cpu import rest_matrices, scatter_law_elements
 from warp_corot.kernels.elements.simd8 import LANES
 from warp_corot.kernels.subtrees import cpu as subtree_cpu
 from warp_corot.kernels.subtrees import cuda as subtree_cuda
@@ -34,7 +31,6 @@ from .degenerate import DegenerateLeaves
 from .elements import (
     CorotatedField,
     Rotations,
-    general_lanes,
     rotated_material,
 )
 from .own_launches import OwnLaunches
@@ -56,6 +52,7 @@ class SubtreeField(InLanes, CorotatedField):
     """The fast path: complete subtrees in batches, leaf by leaf only what is left over."""
 
     takes_subtrees = True
+    repair = repair_elements
 
     def __init__(self, discretization: Discretization, model: CorotatedOptions, deterministic: bool):
         super().__init__(discretization, model, deterministic)
@@ -68,8 +65,7 @@ class SubtreeField(InLanes, CorotatedField):
         self.derive()
 
     def derive(self) -> None:
-        if self._dilating is not None:
-            self._dilating.derive(self.isotropic)
+        super().derive()
         if self._clusters is not None:
             self._clusters.derive()
 
@@ -78,10 +74,8 @@ class SubtreeField(InLanes, CorotatedField):
         if self._own_launches is not None:
             return [*self._own_launches.kernels, DegenerateLeaves.kernel]
         of_subtrees: list[LoadedKernel] = [(self._kernel(*kind), self._block) for kind in self.plan.kinds]
-        if self._dilating is not None:
-            return [*of_subtrees, self._dilating.kernel("corotated"), repair_elements]
-        if self._lanes is not None:
-            return [*of_subtrees, scatter_law_elements("corotated"), repair_elements]
+        if self._dilating is not None or self._lanes is not None:
+            return [*of_subtrees, *self.other_kernels]
         of_leaves = [self._own if self.plan.flat.unit is None else self._forces] if len(self.plan.flat) else []
         return [*of_subtrees, *of_leaves]
 
@@ -90,20 +84,14 @@ class SubtreeField(InLanes, CorotatedField):
         kinds = () if one_launch else self.plan.kinds
         found: list[LoadedKernel] = [(self._kernel(*kind), self._block) for kind in kinds]
         found += [self._forces, self._own, self._extract, repair_own]
-        if self._dilating is not None:
-            found += [self._dilating.kernel("corotated"), repair_elements]
-        elif self.device.is_cpu:
-            found += [scatter_law_elements("corotated"), repair_elements]
+        found += self.other_kernels if self.device.is_cpu else []
         found += [DegenerateLeaves.kernel] if self._listed else []
         load((), self.device, [*found, *([OwnLaunches.later_kernel(self._uniform)] if one_launch else [])])
 
     def share_dilatation(self, dilating: Dilating) -> bool:
         if any(sharing is not Sharing.OWN for _shape, _grouped, sharing in self.plan.kinds):
             return False
-        self._dilating = dilating
-        self.derive()
-        self.follow()
-        return True
+        return super().share_dilatation(dilating)
 
     def tangent(self, *, exact: bool = False) -> Tangent:
         own = self.model.level is None and self._tolerance is None
@@ -143,15 +131,6 @@ class SubtreeField(InLanes, CorotatedField):
         self._kernels = [self._kernel(batch.shape, batch.grouped, batch.sharing) for batch in plan.batches]
         self._materials = [self._material(batch) for batch in plan.batches]
         self._flat_rotated = Kept(rotated_material)
-        self._lanes: Lanes | None = None
-        if len(plan.flat) and self._dilating is None:
-            self._prepare_flat(plan.flat)
-
-    def _prepare_flat(self, flat: FlatLeaves) -> None:
-        self._flat_material = self.isotropic_of(flat)
-        if self.device.is_cpu and flat.unit is None:
-            general = flat.general or as_general(flat.elements, rest_matrices, [flat.elements])
-            self._lanes = general_lanes(general)
 
     @property
     def _tolerance(self) -> float | None:
@@ -174,17 +153,13 @@ class SubtreeField(InLanes, CorotatedField):
         for batch, kernel, material in zip(self.plan.batches, self._kernels, self._materials, strict=True):
             self._launch_batch(batch, kernel, material, u, f)
         flat = self.plan.flat
-        if self._dilating is not None:
-            self._dilating.scatter_groups("corotated", u, f, repair_elements)
+        if self._dilating is not None or self._lanes is not None:
+            self.scatter_others(u, f)
+        elif len(flat) and flat.unit is not None:
+            rotated = self._flat_rotated(self._flat_material, self._rotations, flat.unit)
+            self.launch(self._forces, len(flat), [flat.elements, rotated, u], [f])
         elif len(flat):
-            isotropic = self._flat_material
-            if self._lanes is not None:
-                self._lanes.scatter_forces(isotropic, u, f)
-            elif flat.unit is not None:
-                rotated = self._flat_rotated(isotropic, self._rotations, flat.unit)
-                self.launch(self._forces, len(flat), [flat.elements, rotated, u], [f])
-            else:
-                self.launch(self._own, len(flat), [flat.elements, isotropic, u], [f])
+            self.launch(self._own, len(flat), [flat.elements, self._flat_material, u], [f])
         if self._degenerate is not None:
             self._degenerate.repair(self.elements, self.isotropic, u, f)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -11,15 +10,13 @@ import warp as wp
 
 from warp_corot.discretization.deviatoric import deviatoric
 from warp_corot.discretization.discretization import Discretization
-from warp_corot.discretization.elements import with_targets
 from warp_corot.discretization.members import Members
 from warp_corot.discretization.plan import Plan
-from warp_corot.discretization.slots import Slots
 from warp_corot.discretization.subtrees import Batch
 from warp_corot.elasticity.backends.mean_dilatation import Dilating
 from warp_corot.elasticity.model import ForceField, SmallForces
-from warp_corot.elasticity.structs import forwards
 from warp_corot.elasticity.tangent import Tangent
+from warp_corot.inputs.forwarding import forwards
 from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.elements import mean_dilatation as kernels
 from warp_corot.kernels.elements.dilatation import Dilatation
@@ -80,7 +77,8 @@ class DilatationField(ForceField):
         self.join_launches()
         self._make_room()
         #: All elements, and slots for the forces of each by itself; the plan's own slots are those of its units.
-        self._by_itself = (self.elements, None) if self.slots is None else _with_slots(discretization)
+        plan = self if self.slots is None else discretization.plan(subtrees=False, deterministic=True)
+        self._by_itself = plan.elements, plan.slots
 
     def plan_of(self, discretization: Discretization) -> Plan:
         """The given plan if it has subtrees, or leaves outside of these, or if the mesh changes, because only one plan
@@ -316,14 +314,6 @@ class DilatationField(ForceField):
     @property
     def _energies(self) -> wp.Kernel:
         return kernels.add_energies(self.kind, self.of)
-
-
-def _with_slots(discretization: Discretization) -> tuple[Any, Slots]:
-    """All elements, of which each has slots of its own."""
-    mesh = discretization.mesh
-    slots, targets = Slots.of_units(mesh.tets, len(mesh.points), discretization.device, discretization.worlds)
-    numbers = wp.array(targets, dtype=wp.vec4i, device=discretization.device)
-    return with_targets(discretization.elements, numbers), slots
 
 
 def law_of(field: ForceField) -> tuple[ForceField, DilatationField | None]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from warp_corot.body.activation import Activation, ElementActivation
+from warp_corot.body.activation import Activation, followed_stress
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.elasticity import MODELS, ForceField, Model
 from warp_corot.errors import InputError, StabilityWarning
@@ -124,11 +124,11 @@ def _pack_state(body: SoftBody) -> dict[str, Any]:
         "loads": conditions.loads if conditions.has_loads else None,
         "activation": body.activation if body.discretization.has_activation else None,
         "trajectories": [
-            dict(zip(("nodes", "times", "displacements"), (each.nodes, *each.keys()), strict=True))
+            dict(zip(("nodes", "times", "displacements"), (each.host_numbers, *each.keys()), strict=True))
             for each in conditions.trajectories
         ],
         "activations": [
-            {name: getattr(each, name) for name in ("elements", "times", "stress")} for each in conditions.activations
+            {"elements": each.numbers, "times": each.times, "stress": each.values} for each in conditions.activations
         ],
     }
 
@@ -228,7 +228,7 @@ def _unpack_state(body: SoftBody, state: dict[str, Any]) -> None:
     if state["activation"] is not None:
         body.activation.assign(state["activation"])
     keys = [(each["elements"], Activation(each["times"], each["stress"])) for each in state["activations"]]
-    body.conditions.set_activations([ElementActivation.of_keys(*each, body.device) for each in keys])
+    body.conditions.set_activations([followed_stress(*each, body.device) for each in keys])
     if state["loads"] is not None:
         wp.copy(body.loads, wp.array(state["loads"][:, :3], dtype=wp.vec3, device=body.device))
     body.displacements = state["displacements"][:, :3]

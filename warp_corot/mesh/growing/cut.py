@@ -115,6 +115,7 @@ def face_pairs(tets: Array) -> Array:
 
 
 def linked(pairs: Array, count: int) -> Array:
+    """The number of the connected part that each of ``count`` items belongs to, from pairs [m, 2] that are linked."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -124,9 +125,6 @@ def linked(pairs: Array, count: int) -> Array:
 
 def connected(tets: Array) -> Array:
     """The piece of each element [n]; elements that share a node are connected. Negative nodes connect nothing."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     count = int(tets.max()) + 1
     first = tets.max(axis=1)
     tets = np.where(tets < 0, first[:, None], tets)
@@ -134,6 +132,9 @@ def connected(tets: Array) -> Array:
     alone = first < 0
     tets[alone] = count + np.arange(np.count_nonzero(alone), dtype=tets.dtype)[:, None]
     count += int(np.count_nonzero(alone))
-    rows, columns = np.repeat(tets[:, 0], 3), tets[:, 1:].ravel()
-    links = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=(count, count))
-    return connected_components(links, directed=False)[1][tets[:, 0]]
+    return linked(node_pairs(tets), count)[tets[:, 0]]
+
+
+def node_pairs(tets: Array) -> Array:
+    """Pairs of nodes that link all nodes of each element, [3 n, 2]."""
+    return np.stack([np.repeat(tets[:, 0], 3), tets[:, 1:].ravel()], axis=1)

@@ -249,12 +249,8 @@ def _crumbs(filling: Filling, piece: Array, small: Array) -> tuple[Array, Array]
 
 
 def _fullest_of_each_piece(pairs: Array, waiting: Array, held: Array) -> Array:
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    linked = pairs[waiting[pairs].all(axis=1)]
     n = len(waiting)
-    _, piece = connected_components(coo_array((np.ones(len(linked)), linked.T), shape=(n, n)), directed=False)
+    piece = linked(pairs[waiting[pairs].all(axis=1)], n)
     left = np.flatnonzero(waiting)
     left = left[np.argsort(held[left], kind="stable")]
     fullest = np.full(n, -1)

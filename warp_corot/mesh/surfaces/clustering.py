@@ -10,6 +10,8 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from warp_corot.mesh.growing.cut import linked
+
 from .bound import SurfaceMesh
 from .locating import distances_from, nearest_faces
 
@@ -40,7 +42,7 @@ def clustered(surface: SurfaceMesh, sizes: Floats) -> SurfaceMesh:
     # Vertices on both sides of a cube's wall may still be close together.
     again, triangles, _ = _merged(surface.points[kept], triangles, quadrics, 0.5 * sizes[kept], 0.5)
     kept = kept[again]
-    pieces = _connected(_edges(surface.triangles), len(surface.points))
+    pieces = linked(_edges(surface.triangles), len(surface.points))
     lost = np.zeros(len(surface.points), bool)
     lost[surface.triangles] = True
     lost &= ~np.isin(pieces, pieces[kept])
@@ -75,7 +77,7 @@ def _clustered(points: Floats, ends: Ints, quadrics: Floats, sizes: Floats, shif
     together = np.ones(len(first), bool)
     for numbers in cubes.T:
         together &= numbers[first] == numbers[second]
-    cluster = _connected(ends[together], len(points))
+    cluster = linked(ends[together], len(points))
     count = int(cluster.max(initial=-1)) + 1
     sums: Floats = np.column_stack([np.bincount(cluster, each, count) for each in quadrics.T])
     error = _errors(points, cluster, sums)
@@ -161,7 +163,7 @@ class Clusters:
     def __init__(self, points: Floats, triangles: Ints, size: float):
         self._points, self._triangles, self._size = points, triangles, size
         self._ends = _edges(triangles)
-        self._pieces = _connected(self._ends, len(points))
+        self._pieces = linked(self._ends, len(points))
         self._quadrics = _quadrics(points, triangles)
         self._known: dict[int, tuple[Ints, Ints]] = {}
 
@@ -238,15 +240,6 @@ def _edges(triangles: Ints) -> Ints:
     """The edges of a closed surface, each once [E, 2]."""
     ends = triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     return ends[ends[:, 0] < ends[:, 1]]
-
-
-def _connected(ends: Ints, count: int) -> Ints:
-    """The number of the connected part that each vertex belongs to."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    links = coo_array((np.ones(len(ends), np.int8), ends.T), shape=(count, count))
-    return connected_components(links, directed=False)[1]
 
 
 def _distinct(triangles: Ints) -> Ints:

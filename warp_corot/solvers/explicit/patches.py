@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from warp_corot.body.trajectory import Trajectory
+from warp_corot.body.trajectory import Followed
 from warp_corot.elasticity.corotated.general import CorotatedGeneralField
 from warp_corot.elasticity.corotated.subtrees import SubtreeField
 from warp_corot.elasticity.dilatation.field import law_of
@@ -60,7 +60,7 @@ class PatchSteps:
         self._exchange = Exchange()
         self._exchange.published = wp.zeros(2 * body.node_count, dtype=wp.vec4, device=device)
         self._exchange.begun = wp.array(np.ones(patches.count), dtype=wp.uint32, device=device)
-        self._trajectories: list[Trajectory] | None = None
+        self._trajectories: list[Followed] | None = None
         self.prepare()
 
     @classmethod
@@ -218,12 +218,12 @@ def _packed(places: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(places.astype("<u2")).view("<u8").ravel()
 
 
-def _set_keyframes(tables: PatchBody, trajectories: Sequence[Trajectory], body: SoftBody) -> None:
+def _set_keyframes(tables: PatchBody, trajectories: Sequence[Followed], body: SoftBody) -> None:
     """Put the keyframes of all trajectories one after another; a node follows the last one that names it."""
     follows, place = np.full(body.node_count, -1), np.zeros(body.node_count)
     times, values, columns = [np.zeros(0)], [np.zeros((0, 3))], []
     for k, trajectory in enumerate(trajectories):
-        nodes, d = trajectory.nodes.numpy(), trajectory.displacements.numpy()
+        nodes, d = trajectory.host_numbers, trajectory.values.numpy()
         follows[nodes], place[nodes] = k, np.arange(len(nodes))
         times.append(trajectory.times.numpy())
         values.append(d.reshape(-1, 3))
@@ -241,11 +241,11 @@ def _set_keyframes(tables: PatchBody, trajectories: Sequence[Trajectory], body: 
     tables.values = wp.array(np.concatenate(values), dtype=wp.vec3, device=body.device)
 
 
-def _rewrite_keyframes(tables: PatchBody, trajectories: Sequence[Trajectory]) -> None:
+def _rewrite_keyframes(tables: PatchBody, trajectories: Sequence[Followed]) -> None:
     """Copy times and displacements of trajectories whose nodes and numbers of keyframes have not changed."""
     key = value = 0
     for trajectory in trajectories:
-        displacements = trajectory.displacements.flatten()
+        displacements = trajectory.values.flatten()
         wp.copy(tables.times, trajectory.times, dest_offset=key)
         wp.copy(tables.values, displacements, dest_offset=value)
         key, value = key + len(trajectory.times), value + len(displacements)

@@ -13,7 +13,6 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.loading import load
 from warp_corot.kernels.elements.prony import set_elapsed
 from warp_corot.kernels.implicit import steps as kernels
-from warp_corot.kernels.stepping.integrate import follow_trajectory
 from warp_corot.solvers.halo import ALONE
 
 from .block_system import BlockSystem
@@ -209,7 +208,8 @@ class BodySteps:
         """Launch what is given for the ``offset``-th step since the clock was last advanced, and the test whether it is
         a first step."""
         self.body.conditions.follow_activations(self.system.pace, offset + 1)
-        self._follow_trajectories(offset)
+        body, system = self.body, self.system
+        body.conditions.follow_trajectories(system.pace, offset, system.support_work_of(body))
         if self.shared.rows is None:
             wp.copy(self._begins, self.shared.sturdy)
         if not self.history:
@@ -239,15 +239,6 @@ class BodySteps:
         wp.launch(kernels.count_solves, 1, inputs, [self.shared.totals], device=self.device)
 
     # --- pieces ------------------------------------------------------------------------------------------------------
-
-    def _follow_trajectories(self, offset: int) -> None:
-        """Launch the velocities that move nodes to their keyframes at the end of the step."""
-        body, system = self.body, self.system
-        for each in body.conditions.trajectories:
-            inputs = [each.nodes, each.times, each.displacements, system.pace.arrays, body.conditions.world_starts]
-            inputs += [body.world_node_count, offset, body.state.forces, body.state.displacements]
-            outputs = [body.state.velocities, system.support_work_of(body)]
-            wp.launch(follow_trajectory, len(each.nodes), inputs, outputs, device=self.device)
 
     def launch_begin(self) -> None:
         """Launch the input of the step's solve."""
