@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import csr_array
 
 from warp_corot.errors import InputError
 from warp_corot.mesh.forest_arrays import ForestArrays
@@ -142,24 +143,38 @@ def _snapped(forest: ForestArrays, found: SurfaceMesh, edges_of: SurfaceMesh) ->
     points = np.flatnonzero(np.abs(moves).max(axis=1) > 0.0)
     if not len(points):
         return found
-    # An element that has both nodes of a point's edge: edges are of one side.
-    ends = np.sort(found.nodes[points][:, :2], axis=1).astype(np.int64)
-    ends[found.weights[points, 1] == 0.0, 1] = ends[found.weights[points, 1] == 0.0, 0]
-    pairs = np.array([(a, b) for a in range(4) for b in range(4)])
-    edges = np.sort(forest.tets[:, pairs], axis=2).reshape(-1, 2).astype(np.int64)
-    keys, first = np.unique(edges[:, 0] << 32 | edges[:, 1], return_index=True)
-    asked = ends[:, 0] << 32 | ends[:, 1]
-    place = np.minimum(np.searchsorted(keys, asked), len(keys) - 1)
-    # Edges of leaves that were left out are of no element.
-    elements = np.where(keys[place] == asked, first[place] // len(pairs), _elements_at(forest, found.nodes[points, 0]))
     x, nodes, weights = found.points.copy(), found.nodes.copy(), found.weights.copy()
     x[points] += moves[points]
     if forest.phi is not None:
         rim = points[edges_of.nodes[points, 0] != edges_of.nodes[points, 1]]
         x[rim] = _on_rim(forest, x[rim], moves[rim])
+    ends = np.where(found.weights[points, 1:2] == 0.0, found.nodes[points, :1], found.nodes[points, :2])
+    elements = _beside(forest, ends, x[points], moves[points])
     nodes[points] = forest.tets[elements]
     weights[points] = barycentric(forest, elements, x[points])
     return replace(found, points=x, nodes=nodes, weights=weights)
+
+
+def _beside(forest: ForestArrays, ends: np.ndarray, x: np.ndarray, moves: np.ndarray) -> np.ndarray:
+    """The element at an end of each point's edge [n, 2] that holds the moved point best, [n].
+
+    It is on the side of the cut on which the edge is: an element beside the point carries forces at it without a lever.
+    """
+    near = np.flatnonzero(np.isin(forest.tets, ends).any(axis=1))
+    corners = forest.tets[near]
+    rows = corners.ravel(), np.repeat(np.arange(len(near)), 4)
+    around = csr_array((np.ones(corners.size), rows), shape=(forest.node_count, len(near)))
+    found = (around[ends[:, 0]] + around[ends[:, 1]]).tocoo()
+    point, element = found.row, near[found.col]
+    centres = forest.points[forest.tets[element]].mean(axis=1)
+    side = np.einsum("nc,nc->n", centres - x[point], moves[point])
+    # Edges are of one side; those of leaves that were left out are of no element.
+    whole = np.bincount(point, np.where(found.data == 2.0, side, 0.0), len(x))
+    own = np.where(whole == 0.0, np.bincount(point, side, len(x)), whole)
+    quality = barycentric(forest, element, x[point]).min(axis=1)
+    quality[side * own[point] < 0.0] -= len(x)
+    order = np.lexsort((quality, point))
+    return element[order[np.cumsum(np.bincount(point, minlength=len(x))) - 1]]
 
 
 def _on_rim(forest: ForestArrays, x: np.ndarray, moves: np.ndarray) -> np.ndarray:
