@@ -184,7 +184,7 @@ class RandomBlades:
         np.testing.assert_allclose(mesh.volumes.sum(), self.volume, rtol=1e-9)
         np.testing.assert_allclose(momentum(self.body)[0], self.mass, rtol=1e-9)
         if self.has_surface:
-            np.testing.assert_allclose(self._inside(), self.inside, rtol=0.03)
+            np.testing.assert_allclose(self._inside(), self.inside, rtol=1e-3)
 
     def _inside(self):
         """The volume that the surface has inside, without moves of its points to cuts; both are closed."""

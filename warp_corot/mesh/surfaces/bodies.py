@@ -30,6 +30,9 @@ def surface(forest: ForestArrays) -> SurfaceMesh:
     """See `TetForest.surface`."""
     if forest.phi is None:
         found = boundary_surface(forest)
+        if forest.tree.cut is None:
+            return found
+        found = replace(found, is_cut=_of_cuts(forest))
         return _snapped(forest, found, found)
     if forest.tree.cut is not None:
         marched_surface = marched_cut(forest.lattice_points, _cut_apart(forest), forest.phi)
@@ -139,24 +142,53 @@ def _snapped(forest: ForestArrays, found: SurfaceMesh, edges_of: SurfaceMesh) ->
     """
     if forest.snap is None:
         return found
-    moves = np.einsum("vn,vnc->vc", edges_of.weights, forest.snap[edges_of.nodes].astype(np.float64))
+    moves, on_cut = _moves_to_cuts(forest, edges_of)
     points = np.flatnonzero(np.abs(moves).max(axis=1) > 0.0)
     if not len(points):
         return found
+    ends = np.where(found.weights[points, 1:2] == 0.0, found.nodes[points, :1], found.nodes[points, :2])
+    elements, is_beyond = _beside(forest, ends, found.points[points] + moves[points], moves[points])
+    moved = on_cut[points] | is_beyond
+    points, elements = points[moved], elements[moved]
     x, nodes, weights = found.points.copy(), found.nodes.copy(), found.weights.copy()
     x[points] += moves[points]
     if forest.phi is not None:
         rim = points[edges_of.nodes[points, 0] != edges_of.nodes[points, 1]]
         x[rim] = _on_rim(forest, x[rim], moves[rim])
-    ends = np.where(found.weights[points, 1:2] == 0.0, found.nodes[points, :1], found.nodes[points, :2])
-    elements = _beside(forest, ends, x[points], moves[points])
     nodes[points] = forest.tets[elements]
     weights[points] = barycentric(forest, elements, x[points])
     return replace(found, points=x, nodes=nodes, weights=weights)
 
 
-def _beside(forest: ForestArrays, ends: np.ndarray, x: np.ndarray, moves: np.ndarray) -> np.ndarray:
-    """The element at an end of each point's edge [n, 2] that holds the moved point best, [n].
+def _moves_to_cuts(forest: ForestArrays, edges_of: SurfaceMesh) -> tuple[np.ndarray, np.ndarray]:
+    """The way from each point to the cut at the ends of its edge [V, 3], and whether it is on a face of a cut [V].
+
+    An end and its way to the cut make a plane; if the other end has no such way, that of the point is across it.
+    """
+    weights = edges_of.weights[:, :2]
+    snap = np.asarray(forest.snap, np.float64)[edges_of.nodes[:, :2]]
+    squares = np.einsum("vnc,vnc->vn", snap, snap)
+    shares = weights * (squares > 0.0)
+    total = shares.sum(axis=1)
+    ahead = forest.lattice_points[edges_of.nodes[:, :2]] + snap - edges_of.points[:, None]
+    across = np.einsum("vnc,vnc->vn", ahead, snap) / np.where(squares > 0.0, squares, 1.0)
+    planes = np.einsum("vn,vnc->vc", shares * across, snap) / np.where(total > 0.0, total, 1.0)[:, None]
+    on_cut = np.zeros(len(snap), bool)
+    on_cut[edges_of.triangles[edges_of.is_cut]] = True
+    return np.where(total[:, None] < 0.999, planes, np.einsum("vn,vnc->vc", weights, snap)), on_cut
+
+
+def _of_cuts(forest: ForestArrays) -> np.ndarray:
+    """Which faces of the boundary are of cuts, bool [F]."""
+    assert forest.tree.cut is not None
+    faces, parents = boundary_faces(forest.tets, forest.points)
+    opposite = (forest.tets[parents][:, :, None] != faces[:, None, :]).all(axis=2).argmax(axis=1)
+    return np.asarray((forest.tree.cut[forest.tree.leaves[parents]] >> opposite) & 1 == 1)
+
+
+def _beside(forest: ForestArrays, ends: np.ndarray, x: np.ndarray, moves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The element at an end of each point's edge [n, 2] that holds the moved point best, [n], and whether the point was
+    beyond the cut.
 
     It is on the side of the cut on which the edge is: an element beside the point carries forces at it without a lever.
     """
@@ -164,17 +196,17 @@ def _beside(forest: ForestArrays, ends: np.ndarray, x: np.ndarray, moves: np.nda
     corners = forest.tets[near]
     rows = corners.ravel(), np.repeat(np.arange(len(near)), 4)
     around = csr_array((np.ones(corners.size), rows), shape=(forest.node_count, len(near)))
-    found = (around[ends[:, 0]] + around[ends[:, 1]]).tocoo()
+    # An edge of a leaf that was left out may be of no element: then its inner end counts.
+    is_whole = around[ends[:, 0]].multiply(around[ends[:, 1]]).sum(axis=1) > 0.0
+    found = (around[ends[:, 0]] + around[np.where(is_whole, ends[:, 1], ends[:, 0])]).tocoo()
     point, element = found.row, near[found.col]
     centres = forest.points[forest.tets[element]].mean(axis=1)
     side = np.einsum("nc,nc->n", centres - x[point], moves[point])
-    # Edges are of one side; those of leaves that were left out are of no element.
-    whole = np.bincount(point, np.where(found.data == 2.0, side, 0.0), len(x))
-    own = np.where(whole == 0.0, np.bincount(point, side, len(x)), whole)
+    own = np.bincount(point, np.where(found.data == 2.0, side, 0.0), len(x))
     quality = barycentric(forest, element, x[point]).min(axis=1)
     quality[side * own[point] < 0.0] -= len(x)
     order = np.lexsort((quality, point))
-    return element[order[np.cumsum(np.bincount(point, minlength=len(x))) - 1]]
+    return element[order[np.cumsum(np.bincount(point, minlength=len(x))) - 1]], own > 0.0
 
 
 def _on_rim(forest: ForestArrays, x: np.ndarray, moves: np.ndarray) -> np.ndarray:

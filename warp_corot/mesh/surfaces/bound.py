@@ -59,10 +59,12 @@ class SurfaceMesh(BoundPoints):
     Attributes:
         triangles: int32 [F, 3], wound counter-clockwise seen from outside.
         sides: Labels behind and in front of each triangle, int32 [F, 2], 0 outside; None for a single body.
+        is_cut: Which triangles are faces of cuts, bool [F]; None: the body is not cut.
     """
 
     triangles: np.ndarray
     sides: np.ndarray | None = None
+    is_cut: np.ndarray | None = None
 
     @property
     def ends(self) -> np.ndarray:
