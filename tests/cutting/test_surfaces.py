@@ -125,7 +125,7 @@ def test_lips_that_touch_carry_as_if_they_were_whole(device):
 
 @pytest.mark.parametrize("make", [organ, None])
 def test_recordings_show_the_cut(make, device, tmp_path):
-    from pxr import Usd, UsdGeom
+    from pxr import Usd, UsdGeom, UsdShade
 
     pytest.importorskip("meshio")
     if make is None:
@@ -150,3 +150,12 @@ def test_recordings_show_the_cut(make, device, tmp_path):
         parts.append(components(triangles)[1])
     assert parts[0] == 1
     assert parts[-1] == 2
+    # The faces of the cut have their own material.
+    (subset,) = UsdShade.MaterialBindingAPI(mesh).GetMaterialBindSubsets()
+    material, _ = UsdShade.MaterialBindingAPI(subset).ComputeBoundMaterial()
+    assert material.ComputeSurfaceSource()[0].GetShaderId() == "UsdPreviewSurface"
+    assert UsdGeom.Subset.ValidateFamily(mesh, UsdGeom.Tokens.face, UsdShade.Tokens.materialBind)[0]
+    assert len(subset.GetIndicesAttr().Get(0)) == 0
+    a, b, c = np.moveaxis(points[triangles[np.array(subset.GetIndicesAttr().Get(code))]], 1, 0)
+    inside = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+    assert inside == pytest.approx(2.0 * body.cut_area, rel=0.1)

@@ -13,6 +13,7 @@ from scipy.sparse import csr_array
 from warp_corot.errors import InputError
 from warp_corot.mesh.forest_arrays import ForestArrays
 from warp_corot.mesh.growing.detail import Detail
+from warp_corot.mesh.lattice import LATTICE_BITS
 from warp_corot.mesh.numbering import in_order_of_leaves, live_or_void, renumbered, with_virtual
 from warp_corot.mesh.pieces import pieces_of
 from warp_corot.mesh.tree import VOID
@@ -24,6 +25,9 @@ from .marching import marched, marched_cut
 from .separating import separated
 
 Forest = TypeVar("Forest", bound=ForestArrays)
+
+#: Nodes stay where they are if a cut is so nearly parallel to the face of a box: the square of the sine of the angle.
+LEAST = 0.1
 
 
 def surface(forest: ForestArrays) -> SurfaceMesh:
@@ -143,6 +147,8 @@ def _snapped(forest: ForestArrays, found: SurfaceMesh, edges_of: SurfaceMesh) ->
     if forest.snap is None:
         return found
     moves, on_cut = _moves_to_cuts(forest, edges_of)
+    if forest.phi is None:
+        moves = _within_faces(forest, edges_of.nodes[:, 0], moves)
     points = np.flatnonzero(np.abs(moves).max(axis=1) > 0.0)
     if not len(points):
         return found
@@ -176,6 +182,15 @@ def _moves_to_cuts(forest: ForestArrays, edges_of: SurfaceMesh) -> tuple[np.ndar
     on_cut = np.zeros(len(snap), bool)
     on_cut[edges_of.triangles[edges_of.is_cut]] = True
     return np.where(total[:, None] < 0.999, planes, np.einsum("vn,vnc->vc", weights, snap)), on_cut
+
+
+def _within_faces(forest: ForestArrays, nodes: np.ndarray, moves: np.ndarray) -> np.ndarray:
+    """Moves [n, 3] of nodes of a box, which stay in its faces and end on the same cut."""
+    lattice = forest.lattice[nodes]
+    is_free = (lattice > 0) & (lattice < np.array(forest.cells) << LATTICE_BITS)
+    within = np.where(is_free, moves, 0.0)
+    squares, kept = (np.einsum("nc,nc->n", each, moves) for each in (moves, within))
+    return within * np.where(kept > LEAST * squares, squares / np.where(kept > 0.0, kept, 1.0), 0.0)[:, None]
 
 
 def _of_cuts(forest: ForestArrays) -> np.ndarray:

@@ -75,6 +75,11 @@ class SurfaceMesh(BoundPoints):
         """
         return self.nodes[:, :2]
 
+    @property
+    def of_cut(self) -> npt.NDArray[np.bool_]:
+        """Which triangles are faces of cuts, bool [F]."""
+        return np.zeros(len(self.triangles), bool) if self.is_cut is None else self.is_cut
+
     @cached_property
     def normals(self) -> np.ndarray:
         """Outward unit normals of the points at rest, weighted by the triangles' areas, float64 [V, 3]."""
