@@ -32,6 +32,8 @@ NEAR = wp.constant(wp.float64(1.4))
 NEAR_DEFORMED = wp.constant(wp.float64(2.5))
 #: At rest, no node of a leaf is farther from its centroid than this many times the cube root of its volume.
 RADIUS = wp.constant(wp.float64(1.71))
+#: Surfaces meet at an edge if the square of the sine of their angle is larger; otherwise they are one.
+APART = wp.constant(wp.float64(0.1))
 #: Triangles that have a box in common.
 BUNDLE = wp.constant(16)
 #: A leaf's bits in ``Cuts.fresh``: its faces that are cut now, and of these those that it has the surface behind.
@@ -465,7 +467,10 @@ def snap_face(
     pools: Pools,
     carried: Carried,
 ):
-    """Note how far the nodes of a face are from the surface, which a leaf brings back to rest."""
+    """Note how far the nodes of a face are from the surface, which a leaf brings back to rest.
+
+    A node that is on another cut already stays on it.
+    """
     offset = surface.offset
     if t >= 0:
         offset = wp.dot(normal, surface.points[surface.triangles[t][0]])
@@ -480,16 +485,20 @@ def snap_face(
         for axis in range(3):
             now[axis, n] = edge[axis]
             before[axis, n] = edge_at_rest[axis]
-    volume = wp.determinant(now)
-    if volume == zero:
-        return
-    back = before * wp.inverse(now)
-    most = radius(tet, centroid(tet, zero, pools, carried), zero, pools, carried)
+    across = wp.transpose(now * wp.inverse(before)) * normal
+    square = wp.length_sq(across)
+    most = NEAR * radius(tet, centroid(tet, zero, pools, carried), zero, pools, carried)
     for n in range(3):
         node = tet[face_node(face, n)]
         away = offset - wp.dot(normal, place_of(node, surface.is_deformed, pools, carried))
-        move = back * (away * normal)
-        if wp.length(move) <= most:
+        if wp.abs(away) <= most * wp.sqrt(square):
+            move = (away / square) * across
+            other = doubled(load_node(carried.snap, node))
+            if wp.length_sq(other) > zero:
+                along = across - (wp.dot(across, other) / wp.length_sq(other)) * other
+                both = other + ((away - wp.dot(across, other)) / wp.length_sq(along)) * along
+                if wp.length_sq(along) > APART * square and wp.length(both) <= most:
+                    move = both
             carried.snap[node] = wp.vec4(float(move[0]), float(move[1]), float(move[2]), 0.0)
 
 

@@ -77,6 +77,31 @@ def test_lips_are_as_flat_as_the_plane(device):
         assert found == pytest.approx(2.0 * area, rel=0.06)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_faces_of_cuts_are_drawn_where_planes_went(seed, device):
+    """Within a tenth of an element also at the rim; and the body keeps its volume."""
+    rng = np.random.default_rng(seed)
+    body = organ(device)
+    sim = wc.Simulation(body, gravity=(0, 0, 0))
+    whole = body.mesh.surface().volume
+    size = 0.25 * 2.0 ** (-7 / 3)
+    first, second = rng.normal(size=(2, 3))
+    second -= 0.5 * (second @ first) / (first @ first) * first  # the planes are far from parallel
+    planes = [wc.Plane(first, 0.07), wc.Plane(second, -0.05)]
+    for plane in planes:
+        assert sim.cut(plane) > 0.0
+        surface = body.mesh.surface()
+        assert_closed(surface.triangles)
+        assert surface.volume == pytest.approx(whole, rel=0.02)
+        x = surface.points[surface.triangles[surface.is_cut]]
+        away = np.stack([x @ each.normal - each.offset for each in planes], axis=2)
+        if plane is planes[0]:
+            away = away[..., :1]
+        on_one = (np.abs(away).max(axis=1) < 0.1 * size).any(axis=1)
+        # Some points at the rim are of elements that were left out of the mesh.
+        assert on_one.mean() > 0.95
+
+
 def test_lips_that_touch_carry_as_if_they_were_whole(device):
     """A body that is cut across its weight sags as the uncut one does."""
     sags = []
@@ -100,7 +125,7 @@ def test_lips_that_touch_carry_as_if_they_were_whole(device):
 
 @pytest.mark.parametrize("make", [organ, None])
 def test_recordings_show_the_cut(make, device, tmp_path):
-    from pxr import Usd, UsdGeom
+    from pxr import Usd, UsdGeom, UsdShade
 
     pytest.importorskip("meshio")
     if make is None:
@@ -125,3 +150,12 @@ def test_recordings_show_the_cut(make, device, tmp_path):
         parts.append(components(triangles)[1])
     assert parts[0] == 1
     assert parts[-1] == 2
+    # The faces of the cut have their own material.
+    (subset,) = UsdShade.MaterialBindingAPI(mesh).GetMaterialBindSubsets()
+    material, _ = UsdShade.MaterialBindingAPI(subset).ComputeBoundMaterial()
+    assert material.ComputeSurfaceSource()[0].GetShaderId() == "UsdPreviewSurface"
+    assert UsdGeom.Subset.ValidateFamily(mesh, UsdGeom.Tokens.face, UsdShade.Tokens.materialBind)[0]
+    assert len(subset.GetIndicesAttr().Get(0)) == 0
+    a, b, c = np.moveaxis(points[triangles[np.array(subset.GetIndicesAttr().Get(code))]], 1, 0)
+    inside = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+    assert inside == pytest.approx(2.0 * body.cut_area, rel=0.1)

@@ -26,8 +26,8 @@ def box(cells, level, device, **material):
     return held(wc.SoftBody(wc.TetForest.box(cells, CELL, level), tissue(**material), device=device))
 
 
-def held(body):
-    body.fix("x < xmin + 0.1 * (xmax - xmin)")
+def held(body, share=0.1):
+    body.fix(f"x < xmin + {share} * (xmax - xmin)")
     return body
 
 
@@ -89,8 +89,8 @@ def strained(rng, device):
 
 
 def stuck(rng, device):
-    """A ball on a table, whose lips touch."""
-    body = held(wc.SoftBody(ball_mesh(), tissue(), device=device))
+    """A ball on a table, whose lips touch; it is held so that its weight alone presses no element inside out."""
+    body = held(wc.SoftBody(ball_mesh(), tissue(), device=device), 0.3)
     contact = wc.Contact(friction=0.3, self_contact=True)
     return body, {"obstacles": [wc.Ground(normal=(0, 1, 0), offset=-0.052)], "contact": contact}
 
@@ -184,7 +184,7 @@ class RandomBlades:
         np.testing.assert_allclose(mesh.volumes.sum(), self.volume, rtol=1e-9)
         np.testing.assert_allclose(momentum(self.body)[0], self.mass, rtol=1e-9)
         if self.has_surface:
-            np.testing.assert_allclose(self._inside(), self.inside, rtol=0.03)
+            np.testing.assert_allclose(self._inside(), self.inside, rtol=1e-3)
 
     def _inside(self):
         """The volume that the surface has inside, without moves of its points to cuts; both are closed."""

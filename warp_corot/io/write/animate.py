@@ -91,9 +91,13 @@ class _Joined:
         self, surface: Surface | Sequence[Surface | None] | None, tets: bool | None, labels: bool
     ) -> BoundSkins | None:
         """Surfaces that are drawn in place of the boundary of the tetrahedra; None if there are only tetrahedra."""
-        if surface is None and not labels and tets is not False and not any(map(has_domain, self.meshes)):
+        if self.are_plain(surface, labels) and tets is not False and not self.are_cut:
             return None
         return BoundSkins(self.meshes, surface, labels, self.changing, self.are_cut)
+
+    def are_plain(self, surface: Surface | Sequence[Surface | None] | None, labels: bool) -> bool:
+        """Whether bodies are drawn by their tetrahedra."""
+        return surface is None and not labels and not any(map(has_domain, self.meshes))
 
     def _join(self) -> None:
         self._revisions = [world.body.version for world in self.worlds]
@@ -244,7 +248,7 @@ def record(
         fixed=joined.fixed,
         material=joined,
         skins=skins.on(joined.meshes) if skins else (),
-        tets=tets,
+        tets=True if tets is None and joined.are_plain(surface, labels) else tets,
         changing=any(joined.changing),
         gravity=sim.gravity,
         obstacles=() if sim.contact is None else sim.contact.obstacles.given,

@@ -150,9 +150,7 @@ class BoundSkins:
             for mesh, own, moves in zip(meshes, given, may_change, strict=True)
         ]
         if are_cut and not labels:
-            self._skins = [
-                [replace(s, is_cut=s.look is None and not s.is_boundary) for s in own] for own in self._skins
-            ]
+            self._skins = [[replace(skin, is_cut=skin.look is None) for skin in own] for own in self._skins]
 
     def on(self, meshes: Sequence[Any]) -> list[Skin]:
         """The skins, bound to the nodes of the current meshes; skins with the same name are joined."""
@@ -292,4 +290,5 @@ def joined_surfaces(parts: Sequence[SurfaceMesh]) -> SurfaceMesh:
         np.concatenate([part.nodes for part in parts]),
         np.concatenate([part.weights for part in parts]),
         np.concatenate(triangles).astype(np.int32),
+        is_cut=np.concatenate([part.of_cut for part in parts]),
     )

@@ -8,10 +8,12 @@ from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import csr_array
 
 from warp_corot.errors import InputError
 from warp_corot.mesh.forest_arrays import ForestArrays
 from warp_corot.mesh.growing.detail import Detail
+from warp_corot.mesh.lattice import LATTICE_BITS
 from warp_corot.mesh.numbering import in_order_of_leaves, live_or_void, renumbered, with_virtual
 from warp_corot.mesh.pieces import pieces_of
 from warp_corot.mesh.tree import VOID
@@ -24,11 +26,17 @@ from .separating import separated
 
 Forest = TypeVar("Forest", bound=ForestArrays)
 
+#: Nodes stay where they are if a cut is so nearly parallel to the face of a box: the square of the sine of the angle.
+LEAST = 0.1
+
 
 def surface(forest: ForestArrays) -> SurfaceMesh:
     """See `TetForest.surface`."""
     if forest.phi is None:
         found = boundary_surface(forest)
+        if forest.tree.cut is None:
+            return found
+        found = replace(found, is_cut=_of_cuts(forest))
         return _snapped(forest, found, found)
     if forest.tree.cut is not None:
         marched_surface = marched_cut(forest.lattice_points, _cut_apart(forest), forest.phi)
@@ -138,20 +146,16 @@ def _snapped(forest: ForestArrays, found: SurfaceMesh, edges_of: SurfaceMesh) ->
     """
     if forest.snap is None:
         return found
-    moves = np.einsum("vn,vnc->vc", edges_of.weights, forest.snap[edges_of.nodes].astype(np.float64))
+    moves, on_cut = _moves_to_cuts(forest, edges_of)
+    if forest.phi is None:
+        moves = _within_faces(forest, edges_of.nodes[:, 0], moves)
     points = np.flatnonzero(np.abs(moves).max(axis=1) > 0.0)
     if not len(points):
         return found
-    # An element that has both nodes of a point's edge: edges are of one side.
-    ends = np.sort(found.nodes[points][:, :2], axis=1).astype(np.int64)
-    ends[found.weights[points, 1] == 0.0, 1] = ends[found.weights[points, 1] == 0.0, 0]
-    pairs = np.array([(a, b) for a in range(4) for b in range(4)])
-    edges = np.sort(forest.tets[:, pairs], axis=2).reshape(-1, 2).astype(np.int64)
-    keys, first = np.unique(edges[:, 0] << 32 | edges[:, 1], return_index=True)
-    asked = ends[:, 0] << 32 | ends[:, 1]
-    place = np.minimum(np.searchsorted(keys, asked), len(keys) - 1)
-    # Edges of leaves that were left out are of no element.
-    elements = np.where(keys[place] == asked, first[place] // len(pairs), _elements_at(forest, found.nodes[points, 0]))
+    ends = np.where(found.weights[points, 1:2] == 0.0, found.nodes[points, :1], found.nodes[points, :2])
+    elements, is_beyond = _beside(forest, ends, found.points[points] + moves[points], moves[points])
+    moved = on_cut[points] | is_beyond
+    points, elements = points[moved], elements[moved]
     x, nodes, weights = found.points.copy(), found.nodes.copy(), found.weights.copy()
     x[points] += moves[points]
     if forest.phi is not None:
@@ -160,6 +164,64 @@ def _snapped(forest: ForestArrays, found: SurfaceMesh, edges_of: SurfaceMesh) ->
     nodes[points] = forest.tets[elements]
     weights[points] = barycentric(forest, elements, x[points])
     return replace(found, points=x, nodes=nodes, weights=weights)
+
+
+def _moves_to_cuts(forest: ForestArrays, edges_of: SurfaceMesh) -> tuple[np.ndarray, np.ndarray]:
+    """The way from each point to the cut at the ends of its edge [V, 3], and whether it is on a face of a cut [V].
+
+    An end and its way to the cut make a plane; if the other end has no such way, that of the point is across it.
+    """
+    weights = edges_of.weights[:, :2]
+    snap = np.asarray(forest.snap, np.float64)[edges_of.nodes[:, :2]]
+    squares = np.einsum("vnc,vnc->vn", snap, snap)
+    shares = weights * (squares > 0.0)
+    total = shares.sum(axis=1)
+    ahead = forest.lattice_points[edges_of.nodes[:, :2]] + snap - edges_of.points[:, None]
+    across = np.einsum("vnc,vnc->vn", ahead, snap) / np.where(squares > 0.0, squares, 1.0)
+    planes = np.einsum("vn,vnc->vc", shares * across, snap) / np.where(total > 0.0, total, 1.0)[:, None]
+    on_cut = np.zeros(len(snap), bool)
+    on_cut[edges_of.triangles[edges_of.is_cut]] = True
+    return np.where(total[:, None] < 0.999, planes, np.einsum("vn,vnc->vc", weights, snap)), on_cut
+
+
+def _within_faces(forest: ForestArrays, nodes: np.ndarray, moves: np.ndarray) -> np.ndarray:
+    """Moves [n, 3] of nodes of a box, which stay in its faces and end on the same cut."""
+    lattice = forest.lattice[nodes]
+    is_free = (lattice > 0) & (lattice < np.array(forest.cells) << LATTICE_BITS)
+    within = np.where(is_free, moves, 0.0)
+    squares, kept = (np.einsum("nc,nc->n", each, moves) for each in (moves, within))
+    return within * np.where(kept > LEAST * squares, squares / np.where(kept > 0.0, kept, 1.0), 0.0)[:, None]
+
+
+def _of_cuts(forest: ForestArrays) -> np.ndarray:
+    """Which faces of the boundary are of cuts, bool [F]."""
+    assert forest.tree.cut is not None
+    faces, parents = boundary_faces(forest.tets, forest.points)
+    opposite = (forest.tets[parents][:, :, None] != faces[:, None, :]).all(axis=2).argmax(axis=1)
+    return np.asarray((forest.tree.cut[forest.tree.leaves[parents]] >> opposite) & 1 == 1)
+
+
+def _beside(forest: ForestArrays, ends: np.ndarray, x: np.ndarray, moves: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The element at an end of each point's edge [n, 2] that holds the moved point best, [n], and whether the point was
+    beyond the cut.
+
+    It is on the side of the cut on which the edge is: an element beside the point carries forces at it without a lever.
+    """
+    near = np.flatnonzero(np.isin(forest.tets, ends).any(axis=1))
+    corners = forest.tets[near]
+    rows = corners.ravel(), np.repeat(np.arange(len(near)), 4)
+    around = csr_array((np.ones(corners.size), rows), shape=(forest.node_count, len(near)))
+    # An edge of a leaf that was left out may be of no element: then its inner end counts.
+    is_whole = around[ends[:, 0]].multiply(around[ends[:, 1]]).sum(axis=1) > 0.0
+    found = (around[ends[:, 0]] + around[np.where(is_whole, ends[:, 1], ends[:, 0])]).tocoo()
+    point, element = found.row, near[found.col]
+    centres = forest.points[forest.tets[element]].mean(axis=1)
+    side = np.einsum("nc,nc->n", centres - x[point], moves[point])
+    own = np.bincount(point, np.where(found.data == 2.0, side, 0.0), len(x))
+    quality = barycentric(forest, element, x[point]).min(axis=1)
+    quality[side * own[point] < 0.0] -= len(x)
+    order = np.lexsort((quality, point))
+    return element[order[np.cumsum(np.bincount(point, minlength=len(x))) - 1]], own > 0.0
 
 
 def _on_rim(forest: ForestArrays, x: np.ndarray, moves: np.ndarray) -> np.ndarray:

@@ -59,10 +59,12 @@ class SurfaceMesh(BoundPoints):
     Attributes:
         triangles: int32 [F, 3], wound counter-clockwise seen from outside.
         sides: Labels behind and in front of each triangle, int32 [F, 2], 0 outside; None for a single body.
+        is_cut: Which triangles are faces of cuts, bool [F]; None: the body is not cut.
     """
 
     triangles: np.ndarray
     sides: np.ndarray | None = None
+    is_cut: np.ndarray | None = None
 
     @property
     def ends(self) -> np.ndarray:
@@ -72,6 +74,11 @@ class SurfaceMesh(BoundPoints):
         Points on edges of elements that were left out are bound to four nodes of the nearest element instead.
         """
         return self.nodes[:, :2]
+
+    @property
+    def of_cut(self) -> npt.NDArray[np.bool_]:
+        """Which triangles are faces of cuts, bool [F]."""
+        return np.zeros(len(self.triangles), bool) if self.is_cut is None else self.is_cut
 
     @cached_property
     def normals(self) -> np.ndarray:

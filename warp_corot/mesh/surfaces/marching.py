@@ -75,6 +75,9 @@ def marched_cut(points: Array, tets: Array, values: Array) -> SurfaceMesh:
     Args:
         points, values: As for ``marched``.
         tets: Nodes of all elements with a node inside.
+
+    Returns:
+        As ``marched``, with ``is_cut``.
     """
     around = marched(points, tets, values)
     faces, _ = boundary_faces(tets, points)
@@ -88,10 +91,11 @@ def marched_cut(points: Array, tets: Array, values: Array) -> SurfaceMesh:
         ends = {1: [(a, a), (a, b), (a, c)], 2: [(a, a), (b, b), (b, c), (a, c)], 3: [(a, a), (b, b), (c, c)]}[count]
         polygon = np.stack([np.stack(pair, axis=1) for pair in ends], axis=1)
         corners += [polygon[:, [0, k, k + 1]] for k in range(1, len(ends) - 1)]
-    return _merged_surface(points, np.concatenate(corners), values)
+    is_cut = np.arange(sum(map(len, corners))) >= len(corners[0])
+    return _merged_surface(points, np.concatenate(corners), values, is_cut)
 
 
-def _merged_surface(points: Array, corners: Array, values: Array) -> SurfaceMesh:
+def _merged_surface(points: Array, corners: Array, values: Array, is_cut: Array | None = None) -> SurfaceMesh:
     """Triangles with corners on edges [F, 3, 2], inner end first, as a surface with shared vertices."""
     ends = corners.reshape(-1, 2).astype(np.int64)
     at_node = values[ends[:, 1]] == 0
@@ -101,24 +105,26 @@ def _merged_surface(points: Array, corners: Array, values: Array) -> SurfaceMesh
     inner, outer = values[a].astype(np.float64), values[b].astype(np.float64)
     t = np.divide(inner, inner - outer, out=np.zeros(len(keys)), where=a != b)
     triangles = place.reshape(-1, 3)
-    triangles = _without_flat(triangles, a == b)
+    kept = _not_flat(triangles, a == b)
+    triangles, is_cut = triangles[kept], None if is_cut is None else is_cut[kept]
     used, triangles = np.unique(triangles, return_inverse=True)
     a, b, t = a[used], b[used], t[used]
     x = points[a] + t[:, None] * (points[b] - points[a])
     nodes = np.stack([a, b, a, a], axis=1).astype(np.int32)
     weights = np.stack([1 - t, t, 0 * t, 0 * t], axis=1)
-    return SurfaceMesh(x, nodes, weights, triangles.reshape(-1, 3).astype(np.int32))
+    return SurfaceMesh(x, nodes, weights, triangles.reshape(-1, 3).astype(np.int32), is_cut=is_cut)
 
 
-def _without_flat(triangles: Array, at_node: Array) -> Array:
-    """Remove triangles that lost a side, and pairs that lie back to back on one another."""
+def _not_flat(triangles: Array, at_node: Array) -> Array:
+    """Numbers of the triangles but those that lost a side, and pairs that lie back to back on one another."""
     a, b, c = triangles.T
-    triangles = triangles[(a != b) & (b != c) & (c != a)]
-    whole = np.flatnonzero(at_node[triangles].all(axis=1))
+    kept = np.flatnonzero((a != b) & (b != c) & (c != a))
+    whole = np.flatnonzero(at_node[triangles[kept]].all(axis=1))
     if not len(whole):
-        return triangles
-    _, which, count = np.unique(np.sort(triangles[whole], axis=1), axis=0, return_inverse=True, return_counts=True)
-    return np.delete(triangles, whole[count[which.ravel()] == 2], axis=0)
+        return kept
+    same = np.sort(triangles[kept[whole]], axis=1)
+    _, which, count = np.unique(same, axis=0, return_inverse=True, return_counts=True)
+    return np.delete(kept, whole[count[which.ravel()] == 2])
 
 
 def crossing_polygons(points: Array, tets: Array, values: Array) -> tuple[Array, Array, Array]:
@@ -163,4 +169,4 @@ def _quadrangle(faces: list[list[tuple[int, int]]]) -> list[tuple[int, int]]:
 def plain_triangles(polygons: Array, ends: Array) -> Array:
     """Two triangles for each polygon [P, 4], without those that have no area [F, 3]."""
     triangles = np.concatenate([polygons[:, [0, 1, 2]], polygons[:, [0, 2, 3]]])
-    return _without_flat(triangles, ends[:, 0] == ends[:, 1])
+    return triangles[_not_flat(triangles, ends[:, 0] == ends[:, 1])]

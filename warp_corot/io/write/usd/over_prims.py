@@ -13,7 +13,7 @@ from warp_corot.io.read.usd.scene import Scene, TetPrim
 from warp_corot.mesh.surfaces.boundary import boundary_faces, signed_volumes
 
 from .pieces import Samples
-from .prims import extent
+from .prims import drawn_material, extent
 
 _RESET = "!resetXformStack!"
 _MOTION = "xformOp:transform:simulated"
@@ -134,16 +134,7 @@ def draw_ground(layer: Sdf.Layer, corners: NDArray[np.float64]) -> None:
 def bind_look(layer: Sdf.Layer, paths: Sequence[str]) -> None:
     """Let prims be drawn in their ``displayColor``, with any material, by a stronger binding."""
     stage = Usd.Stage.Open(layer)
-    material = UsdShade.Material.Define(stage, f"/{_LOOK}")
-    reader = UsdShade.Shader.Define(stage, f"/{_LOOK}/color")
-    reader.CreateIdAttr("UsdPrimvarReader_float3")
-    reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("displayColor")
-    shader = UsdShade.Shader.Define(stage, f"/{_LOOK}/surface")
-    shader.CreateIdAttr("UsdPreviewSurface")
-    shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(0.6)
-    color = shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)
-    color.ConnectToSource(reader.ConnectableAPI(), "result")
-    material.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
+    material = drawn_material(stage, f"/{_LOOK}")
     for path in paths:
         spec = layer.GetPrimAtPath(path)
         spec.SetInfo("apiSchemas", Sdf.TokenListOp.Create(prependedItems=["MaterialBindingAPI"]))

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pxr import Gf, Sdf, Tf, UsdGeom, Vt
+from pxr import Gf, Sdf, Tf, UsdGeom, UsdShade, Vt
 
 from warp_corot.errors import InputError
 from warp_corot.io.files.usd import free_name
@@ -21,6 +21,9 @@ from .touched import ATTRIBUTES, PRESSURE, Touched, declare_touched
 
 ROOT, TETS, SURFACE = "/SoftBody", "/SoftBody/tetrahedra", "/SoftBody/surface"
 MATERIALS = "/SoftBody/materials"
+#: The subset of a surface with the faces of cuts, its material, and the colour inside tissue (sRGB).
+CUT = "cut"
+INSIDE = (0.55, 0.12, 0.12)
 PHYSICS = "/SoftBody/physics"
 OBSTACLES = "/SoftBody/obstacles"
 
@@ -99,6 +102,8 @@ class SkinPrim:
             if not self._changing:
                 for path, value in triangle_samples(self._path, surface.triangles).items():
                     stage.GetAttributeAtPath(path).Set(value)
+        if self._changing and self._skin.is_cut:
+            declare_cut(mesh, self._path, statics.stress)
         mesh.GetPrim().SetDisplayName(self._skin.name)
         if self._with_normals:
             mesh.CreateNormalsAttr()
@@ -135,6 +140,9 @@ class SkinPrim:
         if self._changing:
             if self._said is None or not _are_same(self._said.surface, surface):
                 samples |= triangle_samples(self._path, surface.triangles)
+                if self._skin.is_cut:
+                    inside = np.flatnonzero(surface.of_cut).astype(np.int32)
+                    samples[f"{self._path}/{CUT}.indices"] = Vt.IntArray.FromNumpy(inside)
             self._said = self._skin
         return samples
 
@@ -148,7 +156,8 @@ class SkinPrim:
 
 
 def _are_same(one: SurfaceMesh, other: SurfaceMesh) -> bool:
-    return np.array_equal(one.triangles, other.triangles) and np.array_equal(one.points, other.points)
+    pairs = ((one.triangles, other.triangles), (one.points, other.points), (one.of_cut, other.of_cut))
+    return all(np.array_equal(a, b) for a, b in pairs)
 
 
 def skin_paths(skins: Sequence[Skin]) -> list[str]:
@@ -165,6 +174,35 @@ def declare_triangles(mesh: Any) -> None:
     mesh.CreateFaceVertexIndicesAttr()
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     mesh.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
+
+
+def declare_cut(mesh: Any, path: str, with_stress: bool) -> None:
+    """Declare the faces of cuts as a subset with its own material: redder than tissue, or in the colours of stress."""
+    subset = UsdGeom.Subset.Define(mesh.GetPrim().GetStage(), f"{path}/{CUT}")
+    subset.CreateElementTypeAttr(UsdGeom.Tokens.face)
+    subset.CreateFamilyNameAttr(UsdShade.Tokens.materialBind)
+    subset.CreateIndicesAttr()
+    UsdGeom.Subset.SetFamilyType(mesh, UsdShade.Tokens.materialBind, UsdGeom.Tokens.nonOverlapping)
+    material = drawn_material(mesh.GetPrim().GetStage(), f"{MATERIALS}/{CUT}", None if with_stress else INSIDE)
+    UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(material)
+
+
+def drawn_material(stage: Any, path: str, color: Sequence[float] | None = None) -> Any:
+    """A preview material of one colour (sRGB), or of the prim's ``displayColor``."""
+    material = UsdShade.Material.Define(stage, path)
+    shader = UsdShade.Shader.Define(stage, f"{path}/surface")
+    shader.CreateIdAttr("UsdPreviewSurface")
+    shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(0.6)
+    diffuse = shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)
+    if color is None:
+        reader = UsdShade.Shader.Define(stage, f"{path}/color")
+        reader.CreateIdAttr("UsdPrimvarReader_float3")
+        reader.CreateInput("varname", Sdf.ValueTypeNames.String).Set("displayColor")
+        diffuse.ConnectToSource(reader.ConnectableAPI(), "result")
+    else:
+        diffuse.Set(Gf.Vec3f(*srgb_to_linear(color)))
+    material.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
+    return material
 
 
 def triangle_samples(path: str, triangles: NDArray[np.int32]) -> Samples:
