@@ -22,6 +22,8 @@ wp.set_module_options({"enable_backward": False})
 CLOSER, SETTLED = 0.03, 10.0
 #: Maximum number of nodes that bear a contact: four for each of the four places of a pair of soft surfaces.
 PLACES = 16
+#: On the CPU the residual's norm is found at least after so many iterations.
+RARELY = 16
 #: Sums of parts on the CPU are so many places apart, in cache lines of their own.
 LINE = 8
 
@@ -274,6 +276,7 @@ _NUMBERS = constants(
     CLOSER=CLOSER,
     PLACES=PLACES,
     LINE=LINE,
+    RARELY=RARELY,
 )
 
 

@@ -127,7 +127,8 @@ sweep([&](int i) {
 });
 double product = for_rows([&](int i) { return dot(half[i], times(pivot + 9ll * i, half[i])); });
 const int beside = of_contacts.beside_count.data[0];
-int found = RUNNING, done = 0;
+double goal = product * end / now;
+int found = RUNNING, done = 0, asked = 0;
 if (!(product > 0.0)) found = BROKEN;
 while (found == RUNNING) {
     ++done;
@@ -175,9 +176,11 @@ while (found == RUNNING) {
         half[i] -= (image[i] + turned[i]) * alpha;
         return dot(half[i], times(pivot + 9ll * i, half[i]));
     });
-    // The residual's own norm costs half a product, so it is asked for rarely until the end is near.
-    if (done % 4 == 0 || done >= most || !(after > 0.0)) {
+    // The residual's own norm costs half a product, so it is asked for where the preconditioned one says that it will do.
+    if (after <= goal || done - asked >= RARELY || done >= most || !(after > 0.0)) {
         now = residual();
+        goal = after * end / now;
+        asked = done;
         if (!(now <= 1e300)) found = BROKEN;
         else if (now <= end) found = CONVERGED;
         else if (done >= most) found = now <= numbers[END] ? CONVERGED : LIMIT;
