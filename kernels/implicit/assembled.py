@@ -22,6 +22,8 @@ wp.set_module_options({"enable_backward": False})
 CLOSER, SETTLED = 0.03, 10.0
 #: Maximum number of nodes that bear a contact: four for each of the four places of a pair of soft surfaces.
 PLACES = 16
+#: On the CPU the residual's norm is found at least after so many iterations.
+RARELY = 16
 #: Sums of parts on the CPU are so many places apart, in cache lines of their own.
 LINE = 8
 
@@ -46,8 +48,21 @@ class Division:
 
     nodes: wp.array[wp.int32]  # by row
     rows: wp.array[wp.int32]  # by node
-    parts: wp.array[wp.int32]  # the part of each row
+    spans_of: wp.array[wp.int32]  # the number of the span of each row
     spans: wp.array2d[wp.vec2i]  # [levels * parts, pieces] the rows of each level and part, from and to
+
+
+@wp.struct
+class ContactEntries:
+    """What contacts add to the rows of a matrix off its diagonal, on the CPU: a list for each row."""
+
+    count: wp.array[wp.int32]  # [1] how many there are
+    heads: wp.array[wp.int32]  # the first one of each row; -1: none
+    next: wp.array[wp.int32]  # [E] the next one of the same row; -1: none
+    columns: wp.array[wp.int32]  # [E]
+    blocks: wp.array[wp.mat33]  # [E] transposed [N/m]
+    beside_count: wp.array[wp.int32]  # [1]
+    beside: wp.array[wp.int32]  # the contacts, as products, that have no entries
 
 
 # --- the matrix -------------------------------------------------------------------------------------------------------
@@ -71,12 +86,15 @@ def lay_out(entries: int, blocks: wp.array[wp.mat33], planes: wp.array[wp.float3
 def finish_matrix(
     # In
     begin: int,
+    is_new: int,
     count: int,
     entries: int,
     nodes: wp.array[wp.int32],
     diagonal: wp.array[wp.int32],
     plain: wp.array[wp.mat33],
     couplings: Couplings,
+    # In and out
+    marks: wp.array[wp.int32],
     # Out
     blocks: wp.array[wp.mat33],
     pivots: wp.array[wp.mat33],
@@ -84,11 +102,15 @@ def finish_matrix(
     planes: wp.array[wp.float32],
 ):
     """From the row ``begin`` on: the diagonal with friction; the same with contacts, in the range of S; and the inverse
-    of that there."""
+    of that there. Unless the matrix ``is_new``, only rows that contact changes, or has changed: ``marks`` says which."""
     world, k = wp.tid()
     k += begin
     i = world * count + k
     node = world * count + nodes[k]
+    touches = couplings.projected[node] != 0 or wp.trace(couplings.blocks[node]) > 0.0
+    if is_new == 0 and not touches and marks[i] == 0:
+        return
+    marks[i] = wp.where(touches, 1, 0)
     own = plain[node]
     inverse = wp.mat33()
     whole = wp.mat33()
@@ -181,6 +203,63 @@ def end_coupling(c: int, places: int, couplings: Couplings):
         couplings.nodes[c, k] = -1
 
 
+@wp.func
+def add_entry(row: int, column: int, block: wp.mat33, found: ContactEntries):
+    """Add a block to a row, which is new or has an entry in this column."""
+    e = int(found.heads[row])
+    while e >= 0:
+        if found.columns[e] == column:
+            found.blocks[e] = found.blocks[e] + block
+            return
+        e = found.next[e]
+    e = found.count[0]
+    found.count[0] = e + 1
+    found.columns[e] = column
+    found.blocks[e] = block
+    found.next[e] = found.heads[row]
+    found.heads[row] = e
+
+
+@wp.kernel(enable_backward=False)
+def add_entries(
+    # In
+    count: int,
+    per_team: int,
+    division: Division,
+    couplings: Couplings,
+    # Out
+    found: ContactEntries,
+):
+    """Write the products of contacts as entries of rows; in one thread. Contacts that couple rows of two threads which
+    sweep at the same time, or for which there may be no room, stay ``beside`` the rows. Lists must be empty."""
+    found.count[0] = 0
+    found.beside_count[0] = 0
+    for c in range(wp.min(couplings.count[0], couplings.nodes.shape[0])):
+        places = int(0)
+        while places < PLACES and couplings.nodes[c, wp.min(places, PLACES - 1)] >= 0:
+            places += 1
+        start = (couplings.nodes[c, 0] / count) * count
+        fits = bool(found.count[0] + places * places <= found.columns.shape[0])
+        if per_team > 1:
+            for k in range(places):
+                own = division.spans_of[division.rows[couplings.nodes[c, k] - start]]
+                for m in range(k):
+                    other = division.spans_of[division.rows[couplings.nodes[c, m] - start]]
+                    fits = fits and (own == other or own / per_team != other / per_team)
+        if not fits:
+            found.beside[found.beside_count[0]] = c
+            found.beside_count[0] = found.beside_count[0] + 1
+        else:
+            for k in range(places):
+                row = division.rows[couplings.nodes[c, k] - start]
+                part = couplings.parts[c, k]
+                for m in range(places):
+                    if m != k:
+                        there = couplings.parts[c, m]
+                        block = wp.outer(wp.vec3(there[0], there[1], there[2]), wp.vec3(part[0], part[1], part[2]))
+                        add_entry(start + row, division.rows[couplings.nodes[c, m] - start], block, found)
+
+
 # --- solves -----------------------------------------------------------------------------------------------------------
 
 _NUMBERS = constants(
@@ -197,6 +276,7 @@ _NUMBERS = constants(
     CLOSER=CLOSER,
     PLACES=PLACES,
     LINE=LINE,
+    RARELY=RARELY,
 )
 
 
@@ -217,6 +297,7 @@ def solve_rows(
     inverses: wp.array[wp.mat33],
     pivots: wp.array[wp.mat33],
     couplings: Couplings,
+    of_contacts: ContactEntries,
     x: wp.array[wp.vec4],
     r: wp.array[wp.vec4],
     scalars: wp.array2d[wp.float64],
@@ -249,6 +330,7 @@ def solve(
     inverses: wp.array[wp.mat33],
     pivots: wp.array[wp.mat33],
     couplings: Couplings,
+    of_contacts: ContactEntries,
     # In and out
     x: wp.array[wp.vec4],
     r: wp.array[wp.vec4],
@@ -285,6 +367,7 @@ def solve(
         inverses,
         pivots,
         couplings,
+        of_contacts,
         x,
         r,
         scalars,

@@ -1,14 +1,15 @@
 // Conjugate gradients for all worlds, preconditioned by a symmetric sweep (SSOR) over block rows. Threads share the rows
 // of a world, or the worlds if there are at least as many.
 //
-// The matrix with contacts is A; L and U are the parts of its rows below and above the diagonal, without contacts, and
-// P is its diagonal with them. With M = (P + L) P^-1 (P + U) the iteration runs in (P + L)^-1 r, so that a product and its preconditioner together read each block
-// once (Eisenstat 1981): with t = (P + U)^-1 p, (P + L)^-1 A t = t + (P + L)^-1 (p + (A - L - U - 2 P) t).
+// The matrix is A = L + P + U + C: its parts below, on and above the diagonal, all with contacts, except for what C couples
+// of them: rows that two threads sweep over at the same time, and what the list of contacts' entries has no room for. With
+// M = (P + L) P^-1 (P + U) the iteration runs in (P + L)^-1 r, so that a product and its preconditioner together read each
+// block once (Eisenstat 1981): with t = (P + U)^-1 p, (P + L)^-1 A t = t + (P + L)^-1 (p + (C - P) t).
 //
 // Rows stand level after level, and in each part after part; those of a level are coupled with no other part's of the
 // same level. So threads sweep over the parts of a level side by side, level after level.
 // In: team.h; team, per_team, the number of parts; worlds, count, entries, rows, diagonal, division, inverses, pivots,
-// couplings, most. In and out: x, r, by node; scalars, status. Out: iterations. Work: u, p, q, s; parts, sums of parts.
+// couplings, of_contacts, most. In and out: x, r, by node; scalars, status. Out: iterations. Work: u, p, q, s; parts, sums of parts.
 const int* starts = rows.starts.data;
 const int* columns = rows.columns.data;
 const int* own = diagonal.data;
@@ -48,6 +49,18 @@ const auto sum = [&](const four* v, int begin, int end) {
     a += b + c;
     return four{a[0], a[1], a[2], 0.0f};
 };
+// The same with contacts: below the diagonal, and above it.
+const int* heads = &of_contacts.heads.data[first];
+const bool touches = of_contacts.count.data[0] > 0;
+const auto with_contacts = [&](four a, const four* v, int i, bool is_above) {
+    for (int e = touches ? heads[i] : -1; e >= 0; e = of_contacts.next.data[e]) {
+        const int column = of_contacts.columns.data[e];
+        if ((column > i) == is_above) a += times(&of_contacts.blocks.data[e].data[0][0], v[column]);
+    }
+    return a;
+};
+const auto below = [&](const four* v, int i) { return with_contacts(sum(v, starts[i], own[i]), v, i, false); };
+const auto above = [&](const four* v, int i) { return with_contacts(sum(v, own[i] + 1, starts[i + 1]), v, i, true); };
 // In double precision, as squares of what is nearly at rest are less than any float.
 const auto dot = [](const four& a, const four& b) {
     return (double)a[0] * b[0] + (double)a[1] * b[1] + (double)a[2] * b[2];
@@ -96,7 +109,7 @@ const auto sweep_back = [&](const auto& work) {
 // |(P + L) half|^2, the residual's
 const auto residual = [&]() {
     return for_rows([&](int i) {
-        four v = sum(half, starts[i], own[i]);
+        four v = below(half, i);
         const long long node = first + node_of[i];
         if (couplings.projected.data[node]) v = times(&couplings.projectors.data[node].data[0][0], v);
         v += times(pivot + 9ll * i, half[i]);
@@ -109,39 +122,42 @@ const double end = is_last ? CLOSER * numbers[END] : numbers[END];
 double now = numbers[RR];
 float beta = 0.0f;
 sweep([&](int i) {
-    half[i] = times(inverse + 9ll * i, rest[node_of[i]] - sum(half, starts[i], own[i]));
+    half[i] = times(inverse + 9ll * i, rest[node_of[i]] - below(half, i));
     return 0.0;
 });
 double product = for_rows([&](int i) { return dot(half[i], times(pivot + 9ll * i, half[i])); });
-const int room = couplings.nodes.shape[0], contacts = couplings.count.data[0] < room ? couplings.count.data[0] : room;
-int found = RUNNING, done = 0;
+const int beside = of_contacts.beside_count.data[0];
+double goal = product * end / now;
+int found = RUNNING, done = 0, asked = 0;
 if (!(product > 0.0)) found = product <= 0.0 ? LIMIT : BROKEN;
 while (found == RUNNING) {
     ++done;
     sweep_back([&](int i) {
         four along = times(pivot + 9ll * i, half[i]);
         if (done > 1) along += direction[i] * beta;
-        const four t = times(inverse + 9ll * i, along - sum(turned, own[i] + 1, starts[i + 1]));
+        const four t = times(inverse + 9ll * i, along - above(turned, i));
         direction[i] = along;
         turned[i] = t;
-        image[i] = along + times(blocks + 9ll * own[i], t) - times(pivot + 9ll * i, t) * 2.0f;
+        image[i] = along - times(pivot + 9ll * i, t);
     });
-    if (contacts > 0) in_parts([&](int part) {
-        for (int c = 0; c < contacts; ++c) {
-            const int* node = &wp::index(couplings.nodes, c, 0);
-            const four* weight = reinterpret_cast<const four*>(&wp::index(couplings.parts, c, 0));
+    if (beside > 0) in_parts([&](int part) {
+        for (int c = 0; c < beside; ++c) {
+            const int k = of_contacts.beside.data[c];
+            const int* node = &wp::index(couplings.nodes, k, 0);
+            const four* weight = reinterpret_cast<const four*>(&wp::index(couplings.parts, k, 0));
             if (node[0] < first || node[0] >= first + count) continue;
             four along = {0.0f, 0.0f, 0.0f, 0.0f};
-            for (int k = 0; k < PLACES && node[k] >= 0; ++k) along += weight[k] * turned[row_of[node[k] - first]];
-            const float size = along[0] + along[1] + along[2];
-            for (int k = 0; k < PLACES && node[k] >= 0; ++k) {
-                const int row = row_of[node[k] - first];
-                if (!shares_rows || division.parts.data[row] == part) image[row] += weight[k] * size;
+            for (int j = 0; j < PLACES && node[j] >= 0; ++j) along += weight[j] * turned[row_of[node[j] - first]];
+            for (int j = 0; j < PLACES && node[j] >= 0; ++j) {
+                const int row = row_of[node[j] - first];
+                if (shares_rows && division.spans_of.data[row] % per_team != part) continue;
+                const four others = along - weight[j] * turned[row];
+                image[row] += weight[j] * (others[0] + others[1] + others[2]);
             }
         }
     });
     const double curvature = sweep([&](int i) {
-        image[i] = times(inverse + 9ll * i, image[i] - sum(image, starts[i], own[i]));
+        image[i] = times(inverse + 9ll * i, image[i] - below(image, i));
         // What follows needs the sum; the sweep needs this part alone.
         return dot(direction[i], image[i] + turned[i]);
     });
@@ -160,12 +176,14 @@ while (found == RUNNING) {
         half[i] -= (image[i] + turned[i]) * alpha;
         return dot(half[i], times(pivot + 9ll * i, half[i]));
     });
-    // The residual's own norm costs half a product, so it is asked for rarely until the end is near.
-    if (done % 4 == 0 || done >= most || !(after > 0.0)) {
+    // The residual's own norm costs half a product, so it is asked for where the preconditioned one says that it will do.
+    if (after <= goal || done - asked >= RARELY || done >= most || !(after > 0.0)) {
         now = residual();
+        goal = after * end / now;
+        asked = done;
         if (!(now <= 1e300)) found = BROKEN;
         else if (now <= end) found = CONVERGED;
-        else if (done >= most) found = LIMIT;
+        else if (done >= most || after <= 0.0) found = LIMIT;
     }
     beta = (float)(after / product);
     product = after;

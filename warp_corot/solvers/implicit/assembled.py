@@ -34,8 +34,9 @@ if TYPE_CHECKING:
 THREADS, FEWEST_LANES, MOST_LANES = 512, 4, 16
 #: Numbers between the barriers of two teams of blocks, so that these lie in lines of their own.
 STRIDE = 32
-#: Room for the products that contacts add: so many a node, and at least this many.
-ROOM, LEAST_ROOM = 2, 4096
+#: Room for the products that contacts add: so many a node, and at least this many; on the CPU so many times as much for
+#: their entries.
+ROOM, LEAST_ROOM, ENTRIES = 2, 4096, 8
 
 
 def suits(operator: TangentOperator) -> bool:
@@ -140,7 +141,7 @@ class AssembledSolve:
         """Find the rows of the whole matrix, where the entries of each body are in it, and how threads share it."""
         self._rows = Rows()
         starts, columns, spans, self._firsts, first = [], [], [], [], 0
-        diagonal, thread, nodes = *np.zeros((2, self._count), np.int64), np.arange(self._count)
+        diagonal, span_of, nodes = *np.zeros((2, self._count), np.int64), np.arange(self._count)
         levels = max((len(body.edges) - 1) // parts for body in self._bodies)
         for body, at, end in zip(self._bodies, self.blocks.starts, self.blocks.ends, strict=True):
             found, count = body.pattern, body.operator.node_count
@@ -152,7 +153,7 @@ class AssembledSolve:
                 columns.append(row + found.columns.numpy()[: found.entries])
                 diagonal[row : row + count] = first + found.diagonal.numpy()[:count]
                 nodes[row : row + count] = row + body.nodes.numpy()
-                thread[row : row + count] = np.repeat(np.arange(levels * parts) % parts, np.diff(edges))
+                span_of[row : row + count] = np.repeat(np.arange(levels * parts), np.diff(edges))
                 spans.append(row + np.stack([edges[:-1], edges[1:]], axis=1))
                 first += found.entries
             # Rows of nodes that there may be later have a zero.
@@ -168,7 +169,7 @@ class AssembledSolve:
             for each in (np.concatenate(starts), np.concatenate(columns), diagonal)
         )
         self._division = kernels.Division()
-        for name, numbers in {"nodes": nodes, "rows": np.argsort(nodes), "parts": thread}.items():
+        for name, numbers in {"nodes": nodes, "rows": np.argsort(nodes), "spans_of": span_of}.items():
             setattr(self._division, name, wp.array(numbers, dtype=wp.int32, device=self.device))
         self._division.spans = wp.array(np.stack(spans, axis=1), dtype=wp.vec2i, device=self.device)
 
@@ -184,6 +185,13 @@ class AssembledSolve:
             ("drag", wp.mat33, nodes),
         ):
             setattr(self.couplings, name, wp.zeros(size, dtype=dtype, device=self.device))
+        entries = kernels.ContactEntries()
+        many = ENTRIES * room if self.touches and self.device.is_cpu else 1
+        for name, size in {"count": 1, "heads": nodes, "next": many, "columns": many, "beside_count": 1}.items():
+            setattr(entries, name, wp.zeros(size, dtype=wp.int32, device=self.device))
+        entries.blocks = wp.zeros(many, dtype=wp.mat33, device=self.device)
+        entries.beside = wp.zeros(room, dtype=wp.int32, device=self.device)
+        self._of_contacts, self._marks = entries, wp.zeros(nodes, dtype=wp.int32, device=self.device)
         self._couplings = []
         for start in self.blocks.starts:
             own = kernels.Couplings()
@@ -240,7 +248,7 @@ class AssembledSolve:
         if self.device.is_cuda:
             self._launch(kernels.lay_out, self._entries, [self._entries, self._rows.blocks], [self._planes])
         self._empty()
-        self._finish()
+        self._finish(is_new=True)
 
     def take_contact(self, contacts: Sequence[ObstacleContact | None], soft: SoftContact | None) -> None:
         """Launch the exchange of the contacts in the matrix for the present ones."""
@@ -250,7 +258,11 @@ class AssembledSolve:
                 contact.launch_couplings(couplings)
         if soft is not None:
             soft.launch_couplings(self.couplings)
-        self._finish()
+        self._finish(is_new=False)
+        if self.device.is_cpu:
+            self._of_contacts.heads.fill_(-1)
+            inputs = [self._count, self.threads, self._division, self.couplings]
+            wp.launch(kernels.add_entries, 1, inputs, [self._of_contacts], device=self.device)
 
     def iterate(self, solver: ConjugateGradients, x: wp.array) -> None:
         """Launch iterations from the residual of x that a solve has begun with, in the worlds that run."""
@@ -258,6 +270,7 @@ class AssembledSolve:
             self._barriers.zero_()
         inputs = [self._worlds, self._count, self._entries, self._per_team, self._lanes, solver.most, self._rows]
         inputs += [self._planes, self._diagonal, self._inverses, self._pivots, self.couplings]
+        inputs += [self._of_contacts]
         outputs = [x, solver.r, solver.scalars, solver.status, solver.iterations]
         outputs += [*self._vectors, self._parts, self._barriers, self._division]
         outputs += [self._regions.team.address]
@@ -284,13 +297,13 @@ class AssembledSolve:
     # --- pieces ------------------------------------------------------------------------------------------------------
 
     def _empty(self) -> None:
-        self.couplings.count.zero_()
-        self.couplings.blocks.zero_()
-        self.couplings.projected.zero_()
+        couplings, entries = self.couplings, self._of_contacts
+        for each in (couplings.count, couplings.blocks, couplings.projected, entries.count, entries.beside_count):
+            each.zero_()
 
-    def _finish(self) -> None:
-        inputs = [0, self._count, self._entries, self._division.nodes, self._diagonal, self.diagonal, self.couplings]
-        outputs = [self._rows.blocks, self._pivots, self._inverses, self._planes]
+    def _finish(self, *, is_new: bool) -> None:
+        inputs = [0, int(is_new), self._count, self._entries, self._division.nodes, self._diagonal, self.diagonal, self.couplings]
+        outputs = [self._marks, self._rows.blocks, self._pivots, self._inverses, self._planes]
         self._regions.launch_from(kernels.finish_matrix, (self._worlds, self._count), inputs, outputs)
 
     def _launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any]) -> None:

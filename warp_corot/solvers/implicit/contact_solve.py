@@ -39,8 +39,8 @@ class ContactSolve:
     def __init__(self, system: BlockSystem, newtons: list[Newton]):
         self.system, self._newtons, self.device = system, newtons, system.device
         length = system.blocks.count
-        self._q, self._r, self._rest, self._change = (
-            wp.zeros(length, dtype=wp.vec4, device=self.device) for _ in range(4)
+        self._image, self._q, self._r, self._rest, self._change = (
+            wp.zeros(length, dtype=wp.vec4, device=self.device) for _ in range(5)
         )
         contacts = [each for each in system.contacts if each is not None]
         sizes = system.worlds, system.node_count
@@ -52,6 +52,7 @@ class ContactSolve:
         self._rounds, self._going, self._again, *none = (
             wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(6)
         )
+        self._holds = any(each.nodes is not None for each in contacts)
         self._is_alone = len(contacts) == 1
         self._changed = contacts[0].changed if self._is_alone else wp.zeros(1, dtype=wp.int32, device=self.device)
         soft = system.soft
@@ -89,6 +90,8 @@ class ContactSolve:
         """Launch the linear solves, until contact no longer changes."""
         for count in (self._rounds, self.iterations, *self._of_pairs[1:]):
             count.zero_()
+        if not self._holds:
+            self.system.apply_bodies(self.system.x, self._image)
         if self.system.soft is None:
             self._until_settled()
         else:
@@ -124,8 +127,9 @@ class ContactSolve:
         if soft is not None:
             soft.launch_located(d)
             soft.update(d)
-        system.apply_bodies(d, self._q)
-        wp.launch(find_rest, len(d), [system.b, self._q, self._rest], device=self.device)
+        if self._holds:
+            system.apply_bodies(d, self._image)
+        wp.launch(find_rest, len(d), [system.b, self._image, self._rest], device=self.device)
         wp.copy(self._r, self._rest)
         if soft is not None:
             soft.add_forces(self._r)
@@ -136,20 +140,19 @@ class ContactSolve:
         system.apply_bodies(self._change, self._q)
         if soft is not None:
             soft.find_reached(d, self._change)
-        self._search.launch(self._rest, self._q, self._change, d)
+        self._search.launch(self._rest, self._q, self._change, d, self._image)
         self._judge()
 
     def _judge(self) -> None:
         """Launch the choice of the nodes that obstacles hold from now on, and whether another round is needed."""
         system, soft, d = self.system, self.system.soft, self.system.x
-        system.apply_bodies(d, self._q)
         b = system.b
         if soft is not None:
             soft.update(d, is_solved=True)
             wp.copy(self._r, b)
             b = self._r
             soft.add_forces(b)
-        for contact, (forces, q, own) in self._each(b, self._q, d):
+        for contact, (forces, q, own) in self._each(b, self._image, d):
             contact.launch_judgement(forces, q, own)
             if not self._is_alone:
                 wp.launch(kernels.gather_change, 1, [contact.changed, self._changed], device=self.device)

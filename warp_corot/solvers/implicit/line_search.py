@@ -58,7 +58,9 @@ class LineSearch:
     def _add_slopes(self, d: wp.array, change: wp.array) -> None:
         self._contacts.add_slopes(d, change, self._search, self._slopes)
 
-    def launch(self, rest: wp.array, product: wp.array, change: wp.array, d: wp.array) -> None:
+    def launch(
+        self, rest: wp.array, product: wp.array, change: wp.array, d: wp.array, image: wp.array | None = None
+    ) -> None:
         """Launch d += share of the change.
 
         Args:
@@ -66,6 +68,7 @@ class LineSearch:
             product: A times the change.
             change: The change, zero at entries that are not free.
             d: Motions.
+            image: A d, which follows.
         """
         self._power.launch_products(change, rest, 0)
         self._loss.launch_products(change, product, 0)
@@ -74,7 +77,10 @@ class LineSearch:
         outputs = [self._search, self._slopes, self._searching]
         wp.launch(kernels.begin_search, (self._worlds, lanes), inputs, outputs, device=self.device)
         wp.capture_while(self._searching, self._try, d=d, change=change)
-        self._launch(kernels.add_share, self._worlds * self._count, [self._search, self._count, change, d])
+        for increase, grown in ((change, d), (product, image)):
+            if grown is not None:
+                inputs = [self._search, self._count, increase, grown]
+                self._launch(kernels.add_share, self._worlds * self._count, inputs)
 
     def _try(self, d: wp.array, change: wp.array) -> None:
         self._add_slopes(d, change)
