@@ -10,6 +10,10 @@ from typing import Any
 
 import warp as wp
 
+#: Flags for the CPU's compiler with which it inlines the largest functions: those that are given structs of many arrays
+#: would copy these at each call.
+INLINED = "-march=native -mllvm=-inline-threshold=200000 -mllvm=-slp-recursion-max-depth=4"
+
 
 def unique_kernel(cpu_compiler_flags: str | None = None, native: wp.ModuleBuildOptions | None = None, **options: Any):
     """The decorator of kernels that factories make, and of those that few runs launch: each has a module of its own.

@@ -13,6 +13,7 @@ iterations of a step in one launch.
 import warp as wp
 
 from warp_corot.kernels.elements.simd8 import on_cpu
+from warp_corot.kernels.modules import INLINED
 from warp_corot.kernels.stepping.pace import DT, Pace
 from warp_corot.kernels.stepping.threads import spread_thread, synchronize_blocks, synchronize_grid
 
@@ -26,7 +27,7 @@ from .supports import MOSTLY, left_between
 from .touches import Touches, find_touch
 from .vertices import ACTS, BEGINS, ENDS, OUT, WAITS, Rigid, across, anchor, begin_place
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINED})
 
 #: Number of threads of a block on CUDA: few, because the work of few contacts takes its time in the exchange of one
 #: multiprocessor with memory.
