@@ -43,7 +43,8 @@ def pack_contact(contacts: Contacts | None, grasps: Sequence[Grasp], arrays: Arr
     """Put contact into arrays; returns the remaining data for JSON, None without contact.
 
     Raises:
-        InputError: A shape of a class of your own, or another constraint of the bodies.
+        InputError: A shape of a class of your own, a grasp that an array opens and closes, or another constraint of the
+            bodies.
     """
     if contacts is None:
         return None
@@ -130,6 +131,8 @@ def unpack_blades(blades: Blades | None, described: dict[str, Any], arrays: Arra
 
 
 def _pack_grasp(contacts: Contacts, grasp: Grasp, prefix: str, arrays: Arrays) -> dict[str, Any]:
+    if grasp.closed is not None:
+        raise InputError("a grasp that an array opens and closes cannot be saved; release it first")
     arrays[prefix + "nodes"] = grasp.nodes
     for name, array in grasp.kept.items():
         arrays[prefix + name] = array.numpy()
