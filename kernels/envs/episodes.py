@@ -181,6 +181,14 @@ def steer_fingers(far: float, low: wp.vec3, high: wp.vec3, narrow: float, wide: 
     worlds.targets[1, w] = wp.transformation(middle + apart, wp.quat_identity())
 
 
+@wp.kernel(enable_backward=False)
+def pace_tools(seconds: float, targets: wp.array2d[wp.transform], motions: Motions):
+    """Let tools go to their targets at a speed with which they arrive after a time [s], so that they do not jerk."""
+    o, w = wp.tid()
+    far = wp.transform_get_translation(targets[o, w]) - wp.transform_get_translation(motions.later[w, o])
+    motions.speed[w, o] = wp.length(far) / seconds
+
+
 # --- what is seen --------------------------------------------------------------------------------------------------
 
 
@@ -257,9 +265,7 @@ def observe(
 @wp.func
 def seen(worlds: Worlds, w: int, first: int):
     """Three numbers of an observation."""
-    return wp.vec3(
-        worlds.observations[w, first], worlds.observations[w, first + 1], worlds.observations[w, first + 2]
-    )
+    return wp.vec3(worlds.observations[w, first], worlds.observations[w, first + 1], worlds.observations[w, first + 2])
 
 
 @wp.func

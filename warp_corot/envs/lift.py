@@ -37,7 +37,8 @@ class Lift(SoftEnv):
         actions=4,
         notes={"height": 1},
         steps=200,
-        view=(-65.0, 18.0),
+        window=((-0.02, -0.01, 0.0), (0.05, 0.035, 0.075)),
+        view=(25.0, 15.0),
     )
 
     def make_scene(self) -> Scene:

@@ -38,11 +38,12 @@ class Palpate(SoftEnv):
         actions=3,
         notes={"largest_force": 1, "largest_at": 2},
         steps=300,
-        view=(35.0, 30.0),
+        window=((-0.005, -0.005, 0.0), (0.065, 0.065, 0.04)),
+        view=(30.0, 25.0),
     )
 
     def make_scene(self) -> Scene:
-        mesh = box((8, 8, 3), TISSUE, self.cells)
+        mesh = box((6, 6, 2), TISSUE, self.cells)
         x, y, z = TISSUE
         points = nodes_at(mesh, [(0.0, 0.0, z), (x, 0.0, z), (0.0, y, z), (x, y, z)])
         probe = Tool(Sphere(RADIUS, position=(0.5 * x, 0.5 * y, 0.035)), speed=2.0 * SPEED)
@@ -63,7 +64,9 @@ class Palpate(SoftEnv):
     def scripted_actions(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         probe = observations[:, self.columns["tool0.position"]]
         step = np.rint(observations[:, self.columns["time"]][:, 0] * self.max_episode_steps)
-        route = [(row, side) for k, row in enumerate(ROWS) for side in ((0.012, 0.048) if k % 2 == 0 else (0.048, 0.012))]
+        route = [
+            (row, side) for k, row in enumerate(ROWS) for side in ((0.012, 0.048) if k % 2 == 0 else (0.048, 0.012))
+        ]
         corners = np.array([(x, y, DEPTH) for y, x in route])
         # When the probe arrives at each corner, with a little time to spare.
         ways = np.abs(np.diff(np.vstack([[0.03, 0.03, 0.035], corners]), axis=0)).max(axis=1)

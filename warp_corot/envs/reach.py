@@ -39,13 +39,16 @@ class Reach(SoftEnv):
         notes={"goal": 3, "stress": 1},
         steps=200,
         feels_stress=True,
-        view=(-70.0, 25.0),
+        window=((-0.005, -0.005, 0.0), (0.045, 0.03, 0.07)),
+        view=(25.0, 20.0),
     )
 
     def make_scene(self) -> Scene:
         x, y, z = TISSUE
         left, right = 0.5 * (x - CHANNEL), 0.5 * (x + CHANNEL)
-        mesh = box((5, 3, 3), TISSUE, self.cells, lambda p: (abs(p[:, 0] - 0.5 * x) < 0.5 * CHANNEL) & (p[:, 2] > 0.008))
+        mesh = box(
+            (5, 3, 3), TISSUE, self.cells, lambda p: (abs(p[:, 0] - 0.5 * x) < 0.5 * CHANNEL) & (p[:, 2] > 0.008)
+        )
         points = nodes_at(mesh, [(left, 0.0, z), (right, 0.0, z), (left, y, z), (right, y, z)])
         tool = Tool(Capsule(RADIUS, 2.0 * HALF, position=(0.5 * x, 0.5 * y, 0.055)), speed=2.0 * SPEED)
         return Scene(mesh, "z == zmin", [tool], [], points, friction=0.1)

@@ -36,7 +36,8 @@ class Retract(SoftEnv):
         actions=4,
         notes={"goal": 3, "closed": 1},
         steps=200,
-        view=(-60.0, 20.0),
+        window=((0.0, -0.01, 0.0), (0.09, 0.06, 0.06)),
+        view=(-35.0, 20.0),
     )
 
     def make_scene(self) -> Scene:
@@ -62,10 +63,10 @@ class Retract(SoftEnv):
         gripper, goal = observations[:, self.columns["tool0.position"]], observations[:, self.columns["goal"]]
         site = observations[:, self.columns["points"]][:, :3]
         closed = observations[:, self.columns["closed"]][:, 0] > 0.0
-        above = site + [0.0, 0.0, 0.0045]
+        above = site + np.array([0.0, 0.0, 0.0045])
         near = np.linalg.norm(gripper - above, axis=1) < 0.002
         beside = np.linalg.norm((gripper - above)[:, :2], axis=1) > 0.003
-        aim = np.where(beside[:, None], above + [0.0, 0.0, 0.008], above)
+        aim = np.where(beside[:, None], above + np.array([0.0, 0.0, 0.008]), above)
         way = np.where(closed[:, None], goal - site, aim - gripper)
         speed = np.where(closed[:, None], 0.6, 1.0) * np.minimum(1.0, 30.0 * np.abs(way) / SPEED)
         closing = np.where(closed | near, 1.0, -1.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -22,7 +22,7 @@ from warp_corot.body.places import Nodes
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.grasp import Grasp
 from warp_corot.contact.options import Contact
-from warp_corot.contact.shapes import Shape
+from warp_corot.contact.shapes import Shape, Vector
 from warp_corot.contact.tool import Tool
 from warp_corot.elasticity import Corotated
 from warp_corot.errors import InputError
@@ -44,7 +44,7 @@ RATE, IMPLICIT_STEPS = 50, 2
 #: Explicit steps over the largest stable one of the stiffest tissue at rest: strained tissue is stiffer.
 SAFETY = 0.6
 #: Damping of explicit steps [1/s]: tissue in water and blood does not ring.
-DAMPING = 8.0
+DAMPING = 20.0
 DENSITY, POISSON = 1000.0, 0.4
 #: A node that is so far from its place [m] is lost, and the episode ends.
 FARTHEST = 1.0
@@ -86,15 +86,17 @@ class Task:
         notes: Names and sizes of the task's own numbers among the observations.
         steps: Steps of an episode until it is cut off.
         feels_stress: Whether steps find the largest stress of the tissue.
-        up: Elevation of the camera [°].
+        window: Lowest and highest corner of what pictures show [m].
+        view: Azimuth and elevation of the camera [°].
     """
 
     ranges: Mapping[str, tuple[float, float]]
     actions: int
     notes: Mapping[str, int]
     steps: int
+    window: tuple[Vector, Vector]
+    view: tuple[float, float]
     feels_stress: bool = False
-    view: tuple[float, float] = field(default=(35.0, 20.0))
 
 
 class SoftEnv(VectorEnv):
@@ -384,8 +386,10 @@ class SoftEnv(VectorEnv):
         self._launch_observation()
 
     def _launch_step(self) -> None:
-        worlds, body = self.worlds, self.sim.body
+        worlds, body, contact = self.worlds, self.sim.body, self.sim.contact
+        assert contact is not None
         self.launch_actions()
+        self._launch(kernels.pace_tools, worlds.targets.shape, [1.0 / RATE, worlds.targets, contact.obstacles.motions])
         self.sim.recorded.launch(Segment(self._count, adopts=True, publishes=True))
         inputs = [body.world_node_count, FARTHEST, body.state.displacements, worlds]
         self._launch(kernels.find_lost, body.node_count, inputs)
@@ -412,8 +416,7 @@ class SoftEnv(VectorEnv):
         inputs = [chosen, self._centroids, POISSON, worlds, discretization.mu, discretization.lam]
         self._launch(kernels.write_stiffness, body.element_count, [*inputs, *discretization.lame[:2]])
         assert sim.contact is not None
-        shape = (len(self.scene.tools), self.num_envs)
-        self._launch(kernels.place_tools, shape, [chosen, worlds.targets, sim.contact.obstacles.motions])
+        self._launch(kernels.place_tools, worlds.targets.shape, [chosen, worlds.targets, sim.contact.obstacles.motions])
 
     def _launch_observation(self) -> None:
         sim, body, contact = self.sim, self.sim.body, self.sim.contact

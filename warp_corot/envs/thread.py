@@ -6,18 +6,18 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.contact.shapes import Capsule, Ground, Sphere
+from warp_corot.contact.shapes import Box, Capsule, Ground
 from warp_corot.contact.tool import Tool
 from warp_corot.kernels.envs import episodes, tasks
 
 from .meshes import box, nodes_at
 from .soft_env import RATE, Scene, SoftEnv, Task
 
-#: Edges of the tube and the width of its wall [m], the gripper's height above its middle, and its speed [m/s].
-TUBE, WALL, ABOVE, SPEED = (0.024, 0.024, 0.032), 0.008, 0.04, 0.1
+#: Edges of the tube and the width of its wall [m], the gripper's height above the tube's lower end, and its speed [m/s].
+TUBE, WALL, ABOVE, SPEED = (0.024, 0.024, 0.032), 0.008, 0.0345, 0.1
 #: Radius of the peg, half the length between the centres of its ends, and the height of its middle [m].
 PEG, HALF, MIDDLE = 0.0035, 0.012, 0.012
-LOW, HIGH = (-0.03, -0.03, 0.035), (0.054, 0.054, 0.1)
+LOW, HIGH = (-0.03, -0.03, 0.03), (0.054, 0.054, 0.1)
 
 
 class Thread(SoftEnv):
@@ -37,14 +37,15 @@ class Thread(SoftEnv):
         actions=3,
         notes={},
         steps=200,
-        view=(-60.0, 15.0),
+        window=((-0.015, -0.015, 0.0), (0.04, 0.04, 0.09)),
+        view=(30.0, 15.0),
     )
 
     def make_scene(self) -> Scene:
         x, y, _ = TUBE
         mesh = box((3, 3, 4), TUBE, self.cells, lambda p: np.abs(p[:, :2] - 0.5 * x).max(axis=1) < 0.5 * x - WALL)
         points = nodes_at(mesh, [(i, j, 0.0) for i in (WALL, x - WALL) for j in (WALL, y - WALL)])
-        gripper = Tool(Sphere(0.003, position=(0.5 * x, 0.5 * y, 0.09)), speed=2.0 * SPEED)
+        gripper = Tool(Box((0.024, 0.024, 0.004), position=(0.5 * x, 0.5 * y, 0.09)), speed=2.0 * SPEED)
         peg = Tool(Capsule(PEG, 2.0 * HALF, position=(0.5 * x, 0.5 * y, MIDDLE)))
         top = mesh.points[:, 2] > TUBE[2] - 1e-6
         return Scene(mesh, None, [gripper, peg], [Ground()], points, gripped=top, reach=0.1, friction=0.1)
@@ -61,13 +62,11 @@ class Thread(SoftEnv):
         self._launch(tasks.judge_threading, self.num_envs, inputs)
 
     def scripted_actions(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-        peg, rim = (
-            observations[:, self.columns["tool1.position"]],
-            observations[:, self.columns["points"]].reshape(-1, 4, 3).mean(axis=1),
-        )
-        off = peg - rim
-        away = np.linalg.norm(off[:, :2], axis=1)
-        sinks = (away < 0.001) | (rim[:, 2] < MIDDLE + HALF)
-        way = np.clip(0.3 * off * (RATE / SPEED), -0.6, 0.6)
+        gripper, peg = (observations[:, self.columns[f"tool{k}.position"]] for k in (0, 1))
+        rim = observations[:, self.columns["points"]].reshape(-1, 4, 3).mean(axis=1)
+        away = np.linalg.norm((peg - rim)[:, :2], axis=1)
+        # Over the peg, and down once the tube hardly swings.
+        sinks = (away < 0.0015) | (rim[:, 2] < MIDDLE + HALF + PEG)
+        way = np.clip((peg - gripper) * (0.5 * RATE / SPEED), -0.5, 0.5)
         way[:, 2] = np.where(sinks, -0.4, 0.0)
         return way.astype(np.float32)
