@@ -65,7 +65,7 @@ def draw_episodes(
         return
     state = wp.rand_init(worlds.seed[w], worlds.number[w])
     for d in range(low.shape[0]):
-        worlds.draws[w, d] = wp.lerp(low[d], high[d], wp.randf(state))
+        worlds.draws[w, d] = low[d] + (high[d] - low[d]) * wp.randf(state)
     worlds.number[w] = worlds.number[w] + 1
     worlds.step[w] = 0
     worlds.streak[w] = 0

@@ -25,7 +25,8 @@ def box(
         cells: Factor on the counts.
         without: Which points [n, 3] [m] are not in the body, for the cubes' centroids.
     """
-    whole = TetForest.box(tuple(cells * count for count in counts))
+    x, y, z = counts
+    whole = TetForest.box((cells * x, cells * y, cells * z))
     points = whole.points * (np.asarray(edges) / (cells * np.asarray(counts)))
     tets = np.asarray(whole.tets)
     if without is not None:

@@ -30,10 +30,10 @@ class Palpate(SoftEnv):
 
     task = Task(
         ranges={
-            "young": (5e3, 1e4),
+            "young": (4e3, 8e3),
             **{"shift_x": (-0.003, 0.003), "shift_y": (-0.003, 0.003), "turn": (-0.1, 0.1)},
             **{"lump_x": (0.016, 0.044), "lump_y": (0.016, 0.044), "lump_z": (0.011, 0.013)},
-            **{"radius": (0.009, 0.011), "ratio": (8.0, 12.0)},
+            **{"radius": (0.009, 0.011), "ratio": (7.0, 9.0)},
         },
         actions=3,
         notes={"largest_force": 1, "largest_at": 2},

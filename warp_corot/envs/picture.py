@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_corot.contact.shapes import Ground
+from warp_corot.contact.tool import Obstacle
 from warp_corot.errors import InputError
 from warp_corot.io.pictures.camera import Camera
 from warp_corot.io.pictures.colors import VertexAverage
@@ -39,7 +40,7 @@ def draw_world(env: SoftEnv, world: int = 0) -> npt.NDArray[np.uint8]:
     average = VertexAverage(mesh.tets, mesh.volumes, len(mesh.points))
     points, faces = [copy.positions.numpy().astype(np.float64)], [body.surface_triangles]
     values = [average(env.sim.von_mises()[copy.elements])]
-    given = [*scene.tools, *scene.obstacles]
+    given: list[Obstacle] = [*scene.tools, *scene.obstacles]
     for each, pose in zip(given, poses_of(given, world), strict=True):
         if (solid := solid_of(shape_of(each))) is not None:
             faces.append(solid.triangles + sum(map(len, points)))

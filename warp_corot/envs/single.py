@@ -42,6 +42,6 @@ class SingleEnv(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]])
         info = {name: each[0].item() for name, each in info.items()}
         return observations[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
 
-    def render(self) -> npt.NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> npt.NDArray[np.uint8] | None:
         pictures = self.worlds.render()
         return None if pictures is None else pictures[0]

@@ -13,7 +13,7 @@ from warp_corot.kernels.envs import episodes, tasks
 from .meshes import box, nodes_at
 from .soft_env import RATE, Scene, SoftEnv, Task
 
-#: Edges of the tube and the width of its wall [m], the gripper's height above the tube's lower end, and its speed [m/s].
+#: Edges of the tube and the width of its wall, the gripper's height above the lower end [m], and its speed [m/s].
 TUBE, WALL, ABOVE, SPEED = (0.024, 0.024, 0.032), 0.008, 0.0345, 0.1
 #: Radius of the peg, half the length between the centres of its ends, and the height of its middle [m].
 PEG, HALF, MIDDLE = 0.0035, 0.012, 0.012
