@@ -19,6 +19,9 @@ from .shapes import carried
 
 wp.set_module_options({"enable_backward": False})
 
+#: Whether a node is held: not while the grasp is open, yes, or not because it was out of reach when the grasp closed.
+OPEN, HELD, MISSED = (wp.constant(k) for k in range(3))
+
 
 @wp.kernel(enable_backward=False)
 def take_hold(
@@ -26,18 +29,37 @@ def take_hold(
     nodes: wp.array[wp.int32],
     per_world: int,
     o: int,
-    motions: Motions,
+    poses: wp.array2d[wp.transform],
+    closed: wp.array[wp.int32],
+    reach: float,
     rest: wp.array[wp.vec4],
     u: wp.array[wp.vec4],
+    # In and out
+    held: wp.array[wp.int32],
     # Out
     places: wp.array[wp.vec3],
 ):
-    """Record the positions of nodes in the tool's frame."""
+    """Let nodes go where the grasp is open. Where it has just closed, take hold of those within reach of the tool's
+    origin, and record their positions in the tool's frame.
+    """
     k = wp.tid()
-    i = nodes[k]
-    pose = motions.later[k / per_world, o]
-    x = load_node(rest, i) + load_node(u, i)
-    places[k] = wp.quat_rotate_inv(wp.transform_get_rotation(pose), x - wp.transform_get_translation(pose))
+    world = k / per_world
+    if closed[world] == 0:
+        held[k] = OPEN
+    elif held[k] == OPEN:
+        i = nodes[k]
+        place = wp.transform_point(wp.transform_inverse(poses[world, o]), load_node(rest, i) + load_node(u, i))
+        places[k] = place
+        held[k] = wp.where(wp.length(place) <= reach, HELD, MISSED)
+
+
+@wp.kernel(enable_backward=False)
+def open_grasps(chosen: wp.array[wp.int32], per_world: int, held: wp.array[wp.int32], forces: wp.array[wp.vec3]):
+    """Let the nodes of chosen worlds go."""
+    k = wp.tid()
+    if chosen[k / per_world] != 0:
+        held[k] = OPEN
+        forces[k] = wp.vec3()
 
 
 @wp.kernel(enable_backward=False)
@@ -48,6 +70,7 @@ def hold_in_tool(
     o: int,
     motions: Motions,
     places: wp.array[wp.vec3],
+    held: wp.array[wp.int32],
     stiffness: float,
     damping: float,
     gravity: wp.vec3,
@@ -71,7 +94,7 @@ def hold_in_tool(
     k = wp.tid()
     i = nodes[k]
     forces[k] = wp.vec3()
-    if inverse_mass[i] == 0.0:
+    if inverse_mass[i] == 0.0 or held[k] != HELD:
         return
     world = k / per_world
     own = foreseen(i, damping, gravity, inverse_mass, has_load, load, pace, offset, rest, f, u, v)
@@ -94,6 +117,7 @@ def pull_to_tool(
     o: int,
     motions: Motions,
     places: wp.array[wp.vec3],
+    held: wp.array[wp.int32],
     stiffness: float,
     multipliers: wp.array[wp.vec3],
     inverse_mass: wp.array[wp.float32],
@@ -108,7 +132,7 @@ def pull_to_tool(
     k = wp.tid()
     i = nodes[k]
     force = wp.vec3()
-    if inverse_mass[i] > 0.0:
+    if inverse_mass[i] > 0.0 and held[k] == HELD:
         there = wp.transform_point(motions.later[k / per_world, o], places[k])
         force = multipliers[k] + stiffness * (there - load_node(rest, i) - load_node(u, i))
         store_node(f, i, load_node(f, i) + force)
@@ -116,15 +140,19 @@ def pull_to_tool(
 
 
 @wp.kernel(enable_backward=False)
-def add_hold_product(nodes: wp.array[wp.int32], stiffness: float, p: wp.array[wp.vec4], y: wp.array[wp.vec4]):
-    i = nodes[wp.tid()]
-    store_node(y, i, load_node(y, i) + stiffness * load_node(p, i))
+def add_hold_product(
+    nodes: wp.array[wp.int32], held: wp.array[wp.int32], stiffness: float, p: wp.array[wp.vec4], y: wp.array[wp.vec4]
+):
+    k = wp.tid()
+    if held[k] == HELD:
+        store_node(y, nodes[k], load_node(y, nodes[k]) + stiffness * load_node(p, nodes[k]))
 
 
 @wp.kernel(enable_backward=False)
-def add_hold_blocks(nodes: wp.array[wp.int32], stiffness: float, blocks: wp.array[wp.mat33]):
-    i = nodes[wp.tid()]
-    blocks[i] = blocks[i] + stiffness * wp.identity(3, dtype=wp.float32)
+def add_hold_blocks(nodes: wp.array[wp.int32], held: wp.array[wp.int32], stiffness: float, blocks: wp.array[wp.mat33]):
+    k = wp.tid()
+    if held[k] == HELD:
+        blocks[nodes[k]] = blocks[nodes[k]] + stiffness * wp.identity(3, dtype=wp.float32)
 
 
 @wp.kernel(enable_backward=False)

@@ -45,7 +45,7 @@ class Motions:
     """The motion of obstacles, [O], or [W, O] with a row for each world."""
 
     mode: wp.array[wp.int32]
-    speed: wp.array[wp.float32]  # SENT: at most [m/s]
+    speed: wp.array2d[wp.float32]  # SENT: at most [m/s]
     reach: wp.array[wp.float32]  # largest distance of its points from its origin [m], for rotations
     first: wp.array[wp.int32]  # KEYED: the first key
     keys: wp.array[wp.int32]  # how many
@@ -126,7 +126,7 @@ def move_obstacle(world: int, o: int, motions: Motions, pace: Pace, world_starts
         share = wp.clamp(share, wp.float64(0.0), wp.float64(1.0))
         motions.target[world, o] = between(motions.poses[key], motions.poses[key + 1], float(share))
     if mode != FIXED:
-        most = motions.speed[o] * float(pace.seconds[DT])
+        most = motions.speed[world, o] * float(pace.seconds[DT])
         motions.later[world, o] = sent(now, motions.target[world, o], most, motions.reach[o])
 
 

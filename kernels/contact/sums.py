@@ -7,6 +7,7 @@ from warp_corot.kernels.stepping.balance import sum_of_lanes
 from .motion import Motions, Surface
 from .shapes import Shapes, distance_to
 from .touches import Touches
+from .vertices import Rigid
 
 wp.set_module_options({"enable_backward": False})
 
@@ -171,3 +172,27 @@ def share_touches(
         if touches.acts[o, t] != 0:
             total += touches.shares[o, t][corners[k] % 3] * touches.force[o, t]
     totals[o, s] = total
+
+
+@wp.kernel(enable_backward=False)
+def forget_places(
+    # In
+    chosen: wp.array[wp.int32],
+    triangles: wp.array[wp.vec3i],
+    # In and out
+    rigid: Rigid,
+    kinds: wp.array2d[wp.int32],
+    touches: Touches,
+):
+    """Forget the last step's contact with obstacles, of places and triangles in chosen worlds."""
+    o, k = wp.tid()
+    if k < kinds.shape[1] and rigid.surface.node[k] >= 0 and chosen[rigid.surface.world[k]] != 0:
+        rigid.forces[o, k] = wp.vec3()
+        rigid.anchors[o, k] = wp.vec4()
+        rigid.allowance[o, k] = 0.0
+        kinds[o, k] = 0
+    if k < touches.force.shape[1]:
+        corner = triangles[k][0]
+        if corner >= 0 and chosen[rigid.surface.world[corner]] != 0:
+            touches.force[o, k] = wp.vec3()
+            touches.allowance[o, k] = 0.0

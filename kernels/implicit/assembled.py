@@ -102,7 +102,8 @@ def finish_matrix(
     planes: wp.array[wp.float32],
 ):
     """From the row ``begin`` on: the diagonal with friction; the same with contacts, in the range of S; and the inverse
-    of that there. Unless the matrix ``is_new``, only rows that contact changes, or has changed: ``marks`` says which."""
+    of that there. Unless the matrix ``is_new``, only rows that contact changes, or has changed: ``marks`` says
+    which."""
     world, k = wp.tid()
     k += begin
     i = world * count + k

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import warp as wp
 
 import warp_corot as wc
 
@@ -81,6 +82,42 @@ def test_a_released_patch_falls_back(device, integrator):
 
 
 @BOTH
+def test_an_array_opens_and_closes_a_grasp_in_each_world(device, integrator):
+    """A gripper above the edge of the upper side holds what is within reach, from where it is when it closes."""
+    worlds, reach = 3, 0.016
+    body, tool, sim, grasp = held_block(device, worlds=worlds, integrator=integrator)
+    grasp.release()
+    closed = wp.array([1, 0, 0], dtype=wp.int32, device=device)
+    grasp = wc.Grasp(body, "z == zmax", tool=tool, closed=closed, reach=reach)
+    points = body.mesh.points
+    near = (points[:, 2] > 0.0199) & (np.linalg.norm(points - (0.02, 0.02, 0.03), axis=1) <= reach)
+    assert 0 < near.sum() < (points[:, 2] > 0.0199).sum()
+    up = np.tile((0.0, 0.0, 0.002), (near.sum(), 1))
+
+    def moved(world):
+        return body.displacements.numpy().reshape(worlds, -1, 3)[world]
+
+    tool.move((0.02, 0.02, 0.032))
+    sim.advance(0.3)
+    np.testing.assert_allclose(moved(0)[near], up, atol=1e-6)
+    assert (moved(1) == 0.0).all()
+    # The second world takes hold of the body at rest; the first one lets go.
+    closed.assign([0, 1, 0])
+    sim.advance(0.02)
+    tool.move((0.02, 0.02, 0.034))
+    sim.advance(0.4)
+    np.testing.assert_allclose(moved(1)[near], up, atol=1e-6)
+    assert np.abs(moved(0)).max() < 1e-5
+    assert (grasp.wrench.numpy()[[0, 2]] == 0.0).all()
+    # A reset opens it, and it closes where the tool begins, which has its way before it.
+    sim.reset([1])
+    sim.advance(0.02)
+    tool.move((0.02, 0.02, 0.03))
+    sim.advance(0.3)
+    np.testing.assert_allclose(moved(1)[near], np.zeros_like(up), atol=2e-6)
+
+
+@BOTH
 def test_a_grasped_patch_is_remeshed(device, integrator):
     """New nodes between held nodes are held; where elements are merged, the remaining nodes are held."""
     body = wc.SoftBody(wc.TetForest.box((2, 2, 1), 0.02, 1), SOFT, device=device)
@@ -118,3 +155,14 @@ def test_bad_grasps_are_refused(device):
         wc.Grasp(body, "z == zmax", tool=tool, stiffness=0.0)
     with pytest.raises(wc.InputError, match="surface"):
         wc.Grasp(body, np.zeros(body.node_count, bool), tool=tool)
+
+
+def test_a_grasp_that_opens_is_not_saved_and_wants_its_array(device, tmp_path):
+    body, tool, sim, _grasp = held_block(device, worlds=2)
+    with pytest.raises(wc.InputError, match=r"closed is .* must be a Warp array int32 \[2\]"):
+        wc.Grasp(body, "z == zmax", tool=tool, closed=wp.ones(3, dtype=wp.int32, device=device))
+    with pytest.raises(wc.InputError, match="reach is 0"):
+        wc.Grasp(body, "z == zmax", tool=tool, reach=0.0)
+    wc.Grasp(body, "z == zmax", tool=tool, closed=wp.ones(2, dtype=wp.int32, device=device))
+    with pytest.raises(wc.InputError, match="cannot be saved"):
+        sim.save(tmp_path / "grasp.npz")

@@ -32,7 +32,7 @@ FLOORS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("simulation", ("simulation",)),
     ("gradients", ("gradients", "frameworks")),
     ("io, newton, experiments, haptics", ("io", "newton", "experiments", "haptics")),
-    ("viewing, distributed", ("viewing", "distributed")),
+    ("viewing, distributed, envs", ("viewing", "distributed", "envs")),
     ("cli", ("cli", "api", "__init__", "__main__")),
 )
 

@@ -285,7 +285,7 @@ class Contacts:
 
     def reset(self, chosen: wp.array) -> None:
         if self.rigid is not None:
-            self.rigid.forget()
+            self.rigid.reset(chosen)
         self.forget()
         self.obstacles.reset(chosen)
         self._is_looked_at = False
@@ -303,8 +303,7 @@ class Contacts:
 
         Forces are carried if every rank has the whole surfaces, and forgotten if each has only a part.
         """
-        for name in ("tolerance", "recovery", "whole", "closing", "grain"):
-            setattr(self.law, name, getattr(former.law, name))
+        self.take_law(former)
         self.obstacles.continue_from(former.obstacles)
         wp.copy(self.obstacles.wrenches, former.obstacles.wrenches)
         self.search.continue_from(former.search)
@@ -313,6 +312,11 @@ class Contacts:
             carried = CarriedForces(former.surface, former.rigid, former.pairs)
             carried.go_on_with(self.surface, self.rigid, self.pairs)
             carried.give_back()
+
+    def take_law(self, other: Contacts) -> None:
+        """Take the constants of the law of contact from other contact, before the first step."""
+        for name in ("tolerance", "recovery", "whole", "closing", "grain"):
+            setattr(self.law, name, getattr(other.law, name))
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 

@@ -33,16 +33,30 @@ class Grasp:
         patch: Its nodes, as for ``SoftBody.fix``; nodes inside the body are left out.
         tool: The tool that holds them; an obstacle of the same simulation.
         stiffness: Stiffness of the whole patch [N/m]; None: the patch is held rigidly.
+        closed: Opens and closes the grasp in each world, int32 [worlds] on the device, which every step reads: from the
+            step that finds a number other than zero, the world's tool holds those nodes that are then within reach.
+            None: the grasp is closed from now on. A reset of a world opens its grasp; checkpoints refuse it.
+        reach: The largest distance from the tool's origin of nodes that are taken hold of [m].
 
     Raises:
         InputError: The tool is in no simulation or the body in another, the patch has no node of the surface, the body
-            is remeshed in several worlds, or the stiffness is not positive.
+            is remeshed in several worlds or with ``closed``, the stiffness is not positive, or ``closed`` has another
+            type, length or device.
     """
 
     #: Whether its stiffness couples no two nodes.
     is_diagonal = True
 
-    def __init__(self, body: SoftBody, patch: Nodes, *, tool: Tool, stiffness: float | None = None):
+    def __init__(
+        self,
+        body: SoftBody,
+        patch: Nodes,
+        *,
+        tool: Tool,
+        stiffness: float | None = None,
+        closed: wp.array | None = None,
+        reach: float = math.inf,
+    ):
         if not isinstance(body, SoftBody):
             raise InputError(f"body is {shown(body)}; it must be a SoftBody")
         if not isinstance(tool, Tool):
@@ -57,6 +71,15 @@ class Grasp:
             )
         if stiffness is not None and not 0.0 < checked_number(stiffness, "stiffness", "N/m") < math.inf:
             raise InputError(f"stiffness is {stiffness}; it must be a positive number [N/m], or None")
+        if closed is not None:
+            given = isinstance(closed, wp.array) and (closed.dtype, closed.shape, closed.device)
+            if given != (wp.int32, (body.worlds,), body.device) or body.changing is not None:
+                raise InputError(
+                    f"closed is {shown(closed)}; it must be a Warp array int32 [{body.worlds}] on {body.device}, of a "
+                    "body that is not remeshed"
+                )
+        if not checked_number(reach, "reach", "m") > 0.0:
+            raise InputError(f"reach is {reach}; it must be a positive distance [m]")
         chosen = chosen_nodes(nodes_at(patch, lambda: body.mesh), body.world_node_count, 1).indices
         nodes = np.intersect1d(chosen, body.surface_triangles)
         if not len(nodes):
@@ -64,12 +87,13 @@ class Grasp:
         self.body, self.tool, self.device, self._system = body, tool, body.device, system
         self.stiffness = None if stiffness is None else float(stiffness)
         self.launch_revision = 0
+        self.closed, self._reach = closed, min(float(reach), 1e30)
+        self._closed = wp.ones(body.worlds, dtype=wp.int32, device=self.device) if closed is None else closed
         self._take(nodes)
         self._wrenches: wp.array = wp.zeros(body.worlds, dtype=wp.spatial_vectorf, device=self.device)
         body.state.adopt_positions()
-        state = body.state
-        inputs = [self._nodes, self._per_world, self._number, self._obstacles.motions, state.rest, state.displacements]
-        wp.launch(kernels.take_hold, len(self._nodes), inputs, [self._places], device=self.device)
+        self._held.zero_()
+        self._take_hold(self._obstacles.motions.later)
         system.constraints.append(self)
         system.changes += 1
 
@@ -95,7 +119,7 @@ class Grasp:
 
     def again(self, body: SoftBody) -> Grasp:
         """The same grasp of a body that continues this one's in a simulation that has taken the tool."""
-        grasp = Grasp(body, self.nodes, tool=self.tool, stiffness=self.stiffness)
+        grasp = Grasp(body, self.nodes, tool=self.tool, stiffness=self.stiffness, closed=self.closed, reach=self._reach)
         for array, former in ((grasp._places, self._places), (grasp._forces, self._forces)):
             if len(array) == len(former):
                 wp.copy(array, former)
@@ -140,9 +164,18 @@ class Grasp:
     def launch(self, offset: int, damping: float) -> None:
         if not len(self._nodes):
             return
+        if self.closed is not None:
+            self._take_hold(self._obstacles.motions.now)
         system, state, conditions = self._system, self.body.state, self.body.conditions
-        inputs = [self._nodes, self._per_world, self._number, self._obstacles.motions, self._places, self._stiffness]
-        inputs += [damping, system.gravity, conditions.inverse_mass, int(conditions.has_loads), conditions.loads]
+        inputs = [self._nodes, self._per_world, self._number, self._obstacles.motions, self._places, self._held]
+        inputs += [
+            self._stiffness,
+            damping,
+            system.gravity,
+            conditions.inverse_mass,
+            int(conditions.has_loads),
+            conditions.loads,
+        ]
         inputs += [system.pace.arrays, offset, state.rest, state.displacements, state.velocities]
         outputs = [state.forces, state.contact_forces, self._forces]
         kernel = kernels.HOLD_IN_TOOL[conditions.loads.dtype]
@@ -150,24 +183,26 @@ class Grasp:
 
     def launch_begin(self) -> None:
         """Launch the beginning of an implicit step."""
+        if self.closed is not None:
+            self._take_hold(self._obstacles.motions.now)
         if self.stiffness is None and len(self._nodes):
             wp.copy(self._multipliers, self._forces)
 
     def add_forces(self) -> None:
         """Launch its forces in implicit steps, in the present state with the tool at the end of the step."""
         state = self.body.state
-        inputs = [self._nodes, self._per_world, self._number, self._obstacles.motions, self._places]
+        inputs = [self._nodes, self._per_world, self._number, self._obstacles.motions, self._places, self._held]
         inputs += [self._implicit_stiffness, self._multipliers, self.body.conditions.inverse_mass]
         inputs += [state.rest, state.displacements]
         self._launch(kernels.pull_to_tool, inputs, [state.forces, self._forces])
 
     def add_stiffness(self, body: SoftBody, p: wp.array, y: wp.array) -> None:
         if body is self.body:
-            self._launch(kernels.add_hold_product, [self._nodes, self._implicit_stiffness, p], [y])
+            self._launch(kernels.add_hold_product, [self._nodes, self._held, self._implicit_stiffness, p], [y])
 
     def add_diagonal(self, body: SoftBody, blocks: wp.array) -> None:
         if body is self.body:
-            self._launch(kernels.add_hold_blocks, [self._nodes, self._implicit_stiffness], [blocks])
+            self._launch(kernels.add_hold_blocks, [self._nodes, self._held, self._implicit_stiffness], [blocks])
 
     def launch_held(self, body: SoftBody) -> None:
         """Launch the addition of its forces at the end of an implicit step to those of contact."""
@@ -188,13 +223,21 @@ class Grasp:
         """Do nothing: a grasp keeps nothing from the last steps."""
 
     def reset(self, chosen: wp.array) -> None:
-        """Do nothing: a grasp goes on holding."""
+        """Open the grasp in chosen worlds, if it opens at all; otherwise it goes on holding."""
+        if self.closed is not None:
+            self._launch(kernels.open_grasps, [chosen, self._per_world], [self._held, self._forces])
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
     def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
         if len(self._nodes):
             wp.launch(kernel, len(self._nodes), inputs, outputs, device=self.device)
+
+    def _take_hold(self, poses: wp.array) -> None:
+        """Launch the opening and closing, with the tools in these poses, [worlds, O]."""
+        state = self.body.state
+        inputs = [self._nodes, self._per_world, self._number, poses, self._closed, self._reach]
+        self._launch(kernels.take_hold, [*inputs, state.rest, state.displacements], [self._held, self._places])
 
     def _rigid_stiffness(self) -> float:
         """The stiffness of a node that is held rigidly in implicit steps [N/m]."""
@@ -217,6 +260,8 @@ class Grasp:
         self._places, self._forces, self._multipliers = (
             wp.zeros(len(everywhere), dtype=wp.vec3, device=device) for _ in range(3)
         )
+        # New nodes of a changed mesh are held like those between which they lie.
+        self._held = wp.full(len(everywhere), kernels.HELD, dtype=wp.int32, device=device)
         self.launch_revision += 1
 
 

@@ -60,7 +60,7 @@ class Obstacles:
         count = max(len(self.tools), 1)
         motions, device = kernels.Motions(), self.device
         motions.mode, motions.first, motions.keys = (wp.zeros(count, dtype=wp.int32, device=device) for _ in range(3))
-        motions.speed = wp.zeros(count, dtype=wp.float32, device=device)
+        motions.speed = wp.zeros((self.worlds, len(self.tools)), dtype=wp.float32, device=device)
         reach = [min(tool.shape.reach, 1e6) for tool in self.tools]
         motions.reach = wp.array(reach or [0.0], dtype=wp.float32, device=device)
         poses = np.array([_first_pose(tool) for tool in self.tools]).reshape(-1, 7)
@@ -118,7 +118,7 @@ class Obstacles:
         motions = self.motions
         for array, values in ((motions.mode, mode), (motions.first, first), (motions.keys, keys)):
             array[: len(values)].assign(np.array([int(value) for value in values], np.int32))
-        motions.speed[: len(speed)].assign(np.array(speed, np.float32))
+        motions.speed.assign(np.broadcast_to(np.array(speed, np.float32), motions.speed.shape))
         if placed != self._keys:
             motions.times = wp.empty(placed, dtype=wp.float64, device=self.device)
             motions.poses = wp.empty(placed, dtype=wp.transform, device=self.device)

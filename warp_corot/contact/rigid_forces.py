@@ -76,6 +76,18 @@ class RigidForces:
             allowances.zero_()
         self.forces.zero_()
 
+    def reset(self, chosen: wp.array) -> None:
+        """Forget the last step in chosen worlds, nonzero in int32 [worlds]."""
+        count = max(self.surface.count, self.surface.triangle_count if self.have_edges else 0)
+        inputs = [chosen, self.surface.triangles]
+        wp.launch(
+            sums.forget_places,
+            (self.obstacles.count, count),
+            inputs,
+            [self.arrays, self.kinds, self.touches],
+            device=self.device,
+        )
+
     @property
     def state(self) -> dict[str, wp.array]:
         """The arrays that it keeps from step to step."""

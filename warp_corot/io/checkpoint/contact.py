@@ -43,10 +43,13 @@ def pack_contact(contacts: Contacts | None, grasps: Sequence[Grasp]) -> dict[str
     """Contact as a tree of plain values and arrays; None without contact.
 
     Raises:
-        InputError: A shape of a class of your own, or another constraint of the bodies.
+        InputError: A shape of a class of your own, a grasp that an array opens and closes, or another constraint of the
+            bodies.
     """
     if contacts is None:
         return None
+    if any(grasp.closed is not None for grasp in grasps):
+        raise InputError("a grasp that an array opens and closes cannot be saved; release it first")
     return pack_obstacles(contacts) | {
         "kept": kept_arrays(contacts),
         "forces": [body.state.contact_forces for body in contacts.system.bodies],

@@ -302,7 +302,8 @@ class AssembledSolve:
             each.zero_()
 
     def _finish(self, *, is_new: bool) -> None:
-        inputs = [0, int(is_new), self._count, self._entries, self._division.nodes, self._diagonal, self.diagonal, self.couplings]
+        inputs = [0, int(is_new), self._count, self._entries, self._division.nodes, self._diagonal]
+        inputs += [self.diagonal, self.couplings]
         outputs = [self._marks, self._rows.blocks, self._pivots, self._inverses, self._planes]
         self._regions.launch_from(kernels.finish_matrix, (self._worlds, self._count), inputs, outputs)
 

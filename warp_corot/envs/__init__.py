@@ -1,0 +1,26 @@
+"""Environments in which a policy learns to handle soft tissue, as vector environments of gymnasium.
+
+``import warp_corot.envs`` registers them: ``gymnasium.make_vec("warp_corot/Retract-v0", num_envs=64)``.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+from gymnasium import register
+
+from .lift import Lift
+from .palpate import Palpate
+from .reach import Reach
+from .retract import Retract
+from .single import SingleEnv
+from .soft_env import Scene, SoftEnv, Task
+from .thread import Thread
+
+__all__ = ["TASKS", "Lift", "Palpate", "Reach", "Retract", "Scene", "SingleEnv", "SoftEnv", "Task", "Thread"]
+
+#: The environments by their names in gymnasium.
+TASKS = {f"warp_corot/{kind.__name__}-v0": kind for kind in (Retract, Palpate, Reach, Lift, Thread)}
+
+for _name, _kind in TASKS.items():
+    register(_name, entry_point=partial(SingleEnv, _kind), vector_entry_point=_kind)

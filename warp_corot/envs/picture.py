@@ -1,0 +1,70 @@
+"""Pictures of a world of an environment."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_corot.contact.shapes import Ground
+from warp_corot.contact.tool import Obstacle
+from warp_corot.errors import InputError
+from warp_corot.io.pictures.camera import Camera
+from warp_corot.io.pictures.colors import VertexAverage
+from warp_corot.io.pictures.drawing import draw_body
+from warp_corot.io.write.solids import poses_of, shape_of, solid_of
+
+if TYPE_CHECKING:
+    from .soft_env import SoftEnv
+
+#: Pixels of a picture, and those an inch.
+SIZE, DPI = (480, 360), 100
+#: Von Mises stress at the end of the colours [Pa].
+MOST = 6e3
+
+
+def draw_world(env: SoftEnv, world: int = 0) -> npt.NDArray[np.uint8]:
+    """Tissue, coloured by its von Mises stress, and tools, uint8 [height, width, 3]; waits for the device.
+
+    Raises:
+        InputError: Matplotlib is not installed.
+    """
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise InputError('pictures need Matplotlib: pip install "warp-corot[plot]"') from None
+    body, scene = env.sim.body, env.scene
+    copy, mesh = body.world(world), env.scene.mesh
+    average = VertexAverage(mesh.tets, mesh.volumes, len(mesh.points))
+    points, faces = [copy.positions.numpy().astype(np.float64)], [body.surface_triangles]
+    values = [average(env.sim.von_mises()[copy.elements])]
+    given: list[Obstacle] = [*scene.tools, *scene.obstacles]
+    for each, pose in zip(given, poses_of(given, world), strict=True):
+        if (solid := solid_of(shape_of(each))) is not None:
+            faces.append(solid.triangles + sum(map(len, points)))
+            points.append(solid.at(pose))
+            values.append(np.full(len(points[-1]), np.nan))
+    figure = Figure((SIZE[0] / DPI, SIZE[1] / DPI), dpi=DPI, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    stands = any(isinstance(shape_of(each), Ground) for each in given)
+    low, high = env.task.window
+    camera = Camera.fit(np.array([low, high]), "Z", *env.task.view)
+    draw_body(
+        axes,
+        np.concatenate(points),
+        np.concatenate(faces),
+        scalars=np.concatenate(values),
+        value_range=(0.0, MOST),
+        camera=camera,
+        ground=0.0 if stands else float(low[2]),
+    )
+    corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+    seen = camera.project(corners)[0]
+    axes.set_xlim(seen[:, 0].min(), seen[:, 0].max())
+    axes.set_ylim(seen[:, 1].min(), seen[:, 1].max())
+    axes.set_aspect("equal")
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()

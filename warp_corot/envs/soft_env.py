@@ -1,0 +1,453 @@
+"""Environments in which a policy learns to handle soft tissue: many worlds of a simulation, stepped on one device."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+try:
+    from gymnasium.spaces import Box
+    from gymnasium.vector import AutoresetMode, VectorEnv
+    from gymnasium.vector.utils import batch_space
+except ImportError as error:
+    raise ImportError('environments need gymnasium: pip install "warp-corot[envs]"') from error
+
+from warp_corot.body.places import Nodes
+from warp_corot.body.soft_body import SoftBody
+from warp_corot.contact.grasp import Grasp
+from warp_corot.contact.options import Contact
+from warp_corot.contact.shapes import Shape, Vector
+from warp_corot.contact.tool import Tool
+from warp_corot.elasticity import Corotated
+from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_choice, checked_count, shown
+from warp_corot.inputs.device import checked_device
+from warp_corot.kernels.envs import episodes as kernels
+from warp_corot.materials.isotropic import Isotropic
+from warp_corot.mesh.tetmesh import TetMesh
+from warp_corot.simulation.simulation import Simulation
+from warp_corot.solvers import BackwardEuler, SymplecticEuler
+from warp_corot.solvers.recorded import Segment
+
+#: Actions, observations, rewards and flags as arrays of these.
+ARRAYS = ("numpy", "torch", "warp")
+AUTORESETS = {"next_step": AutoresetMode.NEXT_STEP, "same_step": AutoresetMode.SAME_STEP}
+INTEGRATORS = ("explicit", "implicit")
+#: Steps of the environment in a second, and of implicit integrators in a step of the environment.
+RATE, IMPLICIT_STEPS = 50, 2
+#: Explicit steps over the largest stable one of the stiffest tissue at rest: strained tissue is stiffer.
+SAFETY = 0.6
+#: Damping of explicit steps [1/s]: tissue in water and blood does not ring.
+DAMPING = 20.0
+DENSITY, POISSON = 1000.0, 0.4
+#: A node that is so far from its place [m] is lost, and the episode ends.
+FARTHEST = 1.0
+
+
+@dataclass
+class Scene:
+    """What a task is made of, in one world.
+
+    Attributes:
+        mesh: The tissue at rest.
+        fixed: Its held nodes, as for ``SoftBody.fix``; None: none.
+        tools: Tools that an episode places; those that actions move come first.
+        obstacles: Obstacles at rest.
+        points: Observed nodes, [P].
+        gripped: Nodes that the first tool holds while it is closed; None: it is no gripper.
+        reach: Distance from its origin at which it takes hold of them [m].
+        friction: Coefficient of friction of all contacts without their own.
+    """
+
+    mesh: TetMesh
+    fixed: Nodes | None
+    tools: list[Tool]
+    obstacles: list[Shape]
+    points: npt.NDArray[np.integer]
+    gripped: Nodes | None = None
+    reach: float = 0.0
+    friction: float = 0.3
+
+
+@dataclass
+class Task:
+    """What a task declares.
+
+    Attributes:
+        ranges: The lowest and the highest value of each number that is drawn for an episode, in the order of the task's
+            kernel; ``young`` [Pa] is the first.
+        actions: How many actions there are.
+        notes: Names and sizes of the task's own numbers among the observations.
+        steps: Steps of an episode until it is cut off.
+        feels_stress: Whether steps find the largest stress of the tissue.
+        window: Lowest and highest corner of what pictures show [m].
+        view: Azimuth and elevation of the camera [°].
+    """
+
+    ranges: Mapping[str, tuple[float, float]]
+    actions: int
+    notes: Mapping[str, int]
+    steps: int
+    window: tuple[Vector, Vector]
+    view: tuple[float, float]
+    feels_stress: bool = False
+
+
+class SoftEnv(VectorEnv):
+    """Soft tissue and tools in several worlds, one for each environment, as a ``gymnasium.vector.VectorEnv``.
+
+    A step takes 1/50 s. All of it is one recording of launches on the device: nothing is copied to the host, unless
+    arrays are NumPy's. Worlds do not depend on one another: on the CPU with ``threads=1``, and on CUDA, world i of an
+    environment with seed s gives bit for bit the episodes of a single one with seed s + i.
+
+    Args:
+        num_envs: The number of worlds.
+        array: What actions, observations, rewards and flags are: "numpy", "torch" or "warp". The latter two are new
+            arrays on the device.
+        autoreset: "next_step": a world whose episode is over begins again in the next step, which ignores its action
+            and has no reward. "same_step": in the same step, and ``info["final_obs"]`` has the last observations of all
+            worlds.
+        ranges: Lowest and highest values of numbers that are drawn for each episode, in place of those in
+            ``task.ranges``.
+        max_episode_steps: Steps after which an episode is cut off; None: the task's own.
+        integrator: "explicit", or "implicit": two steps of ``BackwardEuler`` in each step, without time steps that
+            depend on the stiffest tissue.
+        device: The device; None for Warp's default.
+        threads: As for ``SoftBody``.
+        render_mode: "rgb_array": ``render`` draws worlds; or None.
+        cells: Factor on the number of cubes along each edge of the task's mesh.
+
+    Attributes:
+        task: What the task declares.
+        sim: The simulation, which users may look at; ``sim.body`` is the tissue.
+        columns: The place of each named part of an observation.
+
+    Raises:
+        InputError: An argument has another type or value, or a range is not among the task's.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 (gymnasium's)
+        "render_modes": ["rgb_array"],
+        "render_fps": RATE,
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
+    }
+    task: ClassVar[Task]
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        *,
+        array: str = "numpy",
+        autoreset: str = "next_step",
+        ranges: Mapping[str, tuple[float, float]] | None = None,
+        max_episode_steps: int | None = None,
+        integrator: str = "explicit",
+        device: str | wp.Device | None = None,
+        threads: int | None = None,
+        render_mode: str | None = None,
+        cells: int = 1,
+    ):
+        checked_choice(array, "array", ARRAYS)
+        checked_choice(autoreset, "autoreset", tuple(AUTORESETS))
+        checked_choice(integrator, "integrator", INTEGRATORS)
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise InputError(f"render_mode is {shown(render_mode)}; it must be 'rgb_array' or None")
+        self.num_envs = checked_count(num_envs, "num_envs", least=1)
+        self.cells = checked_count(cells, "cells", least=1)
+        self.array, self.render_mode, self.device = array, render_mode, checked_device(device)
+        self.metadata = {**self.metadata, "autoreset_mode": AUTORESETS[autoreset]}
+        self.ranges = self._checked_ranges(ranges or {})
+        steps = self.task.steps if max_episode_steps is None else max_episode_steps
+        self.max_episode_steps = checked_count(steps, "max_episode_steps", least=1)
+        self._threads = threads
+        self._make_simulation(integrator)
+        self._make_arrays(at_once=autoreset == "same_step")
+        self.single_action_space = Box(-1.0, 1.0, (self.task.actions,), np.float32)
+        size = self.worlds.observations.shape[1]
+        self.single_observation_space = Box(-np.inf, np.inf, (size,), np.float32)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self._seed(None)
+        # Modules are loaded before launches are recorded.
+        self._launch_beginning(self._asked)
+        self.sim.step()
+        self.sim.pace.is_shared = True
+        self._launch_step()
+        self._graphs: dict[Callable[[], None], wp.Graph] = {}
+        self._revision = -1
+
+    # --- what a task says ------------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def make_scene(self) -> Scene:
+        """What the task is made of."""
+
+    @abstractmethod
+    def launch_task_beginning(self, chosen: wp.array) -> None:
+        """Launch what an episode of the task begins with in chosen worlds, int32 [worlds]."""
+
+    @abstractmethod
+    def launch_actions(self) -> None:
+        """Launch what actions do to the targets of tools."""
+
+    @abstractmethod
+    def launch_judgement(self) -> None:
+        """Launch the rewards, and the ends of episodes."""
+
+    @abstractmethod
+    def scripted_actions(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        """Actions of a policy by hand, which succeeds: float32 [n, A] for observations float32 [n, K]."""
+
+    # --- as an environment -----------------------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin new episodes.
+
+        Args:
+            seed: World i is seeded with ``seed + i``, or with the i-th of several seeds; None: worlds go on drawing
+                from their seeds.
+            options: ``{"reset_mask": bool [worlds]}`` resets only some worlds.
+
+        Returns:
+            Observations and ``{}``.
+
+        Raises:
+            InputError: The seeds or the mask have another length.
+        """
+        mask = np.ones(self.num_envs, bool)
+        if options and "reset_mask" in options:
+            mask = np.asarray(options["reset_mask"], bool)
+            if mask.shape != (self.num_envs,):
+                raise InputError(f"reset_mask has shape {mask.shape}; it must be [{self.num_envs}]")
+        if seed is not None:
+            super().reset(seed=seed if isinstance(seed, int) else None)
+            self._seed(seed, mask)
+        self._asked.assign(mask.astype(np.int32))
+        self._replay(self._launch_reset)
+        return self._given(self.worlds.observations), {}
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Make a step in all worlds.
+
+        Args:
+            actions: Within [-1, 1], float32 [worlds, A]: an array of NumPy, PyTorch or Warp. Values outside are
+                clipped, and those that are not numbers count as zero.
+
+        Returns:
+            Observations [worlds, K], rewards [worlds], terminations and truncations, bool [worlds], and information:
+            "success", bool [worlds], and "lost", int32 [worlds], nonzero where the tissue's state was not finite.
+
+        Raises:
+            InputError: The actions have another shape.
+        """
+        wp.copy(self.worlds.actions, self._taken(actions))
+        if self.sim.contact is not None and self.sim.contact.is_full:
+            self.sim.contact.grow()
+        self._replay(self._launch_step)
+        given, worlds = self._given, self.worlds
+        info = {"success": given(worlds.success), "lost": given(worlds.lost)}
+        if worlds.at_once:
+            info["final_obs"] = given(self._final)
+        flags = given(worlds.terminated), given(worlds.truncated)
+        return given(worlds.observations), given(worlds.reward), *flags, info
+
+    def render(self) -> tuple[npt.NDArray[np.uint8], ...] | None:
+        """Pictures of the first worlds, at most four, uint8 [height, width, 3] each; None without a render mode."""
+        if self.render_mode is None:
+            return None
+        from .picture import draw_world
+
+        return tuple(draw_world(self, world) for world in range(min(self.num_envs, 4)))
+
+    @property
+    def drawn(self) -> dict[str, npt.NDArray[np.float32]]:
+        """The drawn numbers of the present episodes, float32 [worlds] each; waits for the device."""
+        return dict(zip(self.ranges, self.worlds.draws.numpy().T, strict=True))
+
+    # --- pieces ----------------------------------------------------------------------------------------------------
+
+    def _checked_ranges(self, given: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
+        ranges = {name: (float(low), float(high)) for name, (low, high) in self.task.ranges.items()}
+        for name, bounds in given.items():
+            if name not in ranges:
+                raise InputError(f"there is no range {shown(name)}; there are {', '.join(ranges)}")
+            low, high = np.asarray(bounds, float)
+            if not (np.isfinite([low, high]).all() and low <= high and (name != "young" or low > 0.0)):
+                raise InputError(f"the range {name} is {bounds}; it must be a lowest and a highest number")
+            ranges[name] = float(low), float(high)
+        return ranges
+
+    def _make_simulation(self, integrator: str) -> None:
+        """Make the simulation; time steps and the law of contact are those of a single world, so that they do not
+        depend on the number of worlds."""
+        # The stiffest tissue bounds steps; episodes write their own stiffness.
+        stiffest = self.ranges["young"][1] * max(self.ranges.get("ratio", (1.0, 1.0))[1], 1.0)
+        steps: SymplecticEuler | BackwardEuler = BackwardEuler(dt=1.0 / (RATE * IMPLICIT_STEPS))
+        self._count = IMPLICIT_STEPS
+        if integrator == "explicit":
+            single = self._simulated(1, stiffest, SymplecticEuler(damping=DAMPING))[1]
+            self._count = int(np.ceil(1.0 / (RATE * SAFETY * single.stable_dt)))
+            steps = SymplecticEuler(dt=1.0 / (RATE * self._count), damping=DAMPING)
+        self.scene, self.sim = self._simulated(self.num_envs, stiffest, steps)
+        if integrator == "explicit" and self.sim.contact is not None and self.num_envs > 1:
+            single = self._simulated(1, stiffest, steps)[1]
+            assert single.contact is not None
+            self.sim.contact.take_law(single.contact)
+
+    def _simulated(self, worlds: int, young: float, steps: SymplecticEuler | BackwardEuler) -> tuple[Scene, Simulation]:
+        scene = self.make_scene()
+        material = Isotropic(np.full((worlds, len(scene.mesh.tets)), young), POISSON, DENSITY)
+        body = SoftBody(scene.mesh, material, worlds=worlds, device=self.device, threads=self._threads)
+        if scene.fixed is not None:
+            body.fix(scene.fixed)
+        sim = Simulation(
+            body,
+            model=Corotated(rotation_level=None),
+            integrator=steps,
+            gravity=(0.0, 0.0, -9.81),
+            obstacles=[*scene.tools, *scene.obstacles],
+            contact=Contact(friction=scene.friction),
+            deterministic=isinstance(steps, SymplecticEuler),
+        )
+        return scene, sim
+
+    def _make_arrays(self, *, at_once: bool) -> None:
+        count, scene, device, task = self.num_envs, self.scene, self.device, self.task
+        sizes = {f"tool{k}.{name}": 3 for k in range(len(scene.tools)) for name in TOOL_PARTS}
+        sizes |= {"points": 3 * len(scene.points), "time": 1, **task.notes}
+        ends = np.cumsum(list(sizes.values())).tolist()
+        self.columns = {name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True)}
+        worlds = self.worlds = kernels.Worlds()
+        shapes = {"draws": (count, len(self.ranges)), "actions": (count, task.actions)}
+        shapes |= {"observations": (count, ends[-1]), "notes": (count, sum(task.notes.values()))}
+        kinds: dict[str, Any] = {name: wp.float32 for name in ("peak", "reward", "young", "ratio", *shapes)}
+        kinds |= dict.fromkeys(("seed", "number", "step", "streak", "over", "again", "lost", "closed"), wp.int32)
+        kinds |= dict.fromkeys(("terminated", "truncated", "success"), wp.bool)
+        kinds |= {"pose": wp.transform, "lump": wp.vec4, "targets": wp.transform}
+        shapes["targets"] = (len(scene.tools), count)
+        for name, kind in kinds.items():
+            setattr(worlds, name, wp.zeros(shapes.get(name, count), dtype=kind, device=device))
+        first = np.array([np.tile(tool.pose, (count, 1)) for tool in scene.tools], np.float32)
+        worlds.targets.assign(first)
+        worlds.limit, worlds.at_once = self.max_episode_steps, int(at_once)
+        self._final = wp.zeros_like(worlds.observations)
+        self._asked = wp.ones(count, dtype=wp.int32, device=device)
+        bounds = np.array(list(self.ranges.values()), np.float32).T
+        self._low, self._high = (wp.array(each, dtype=wp.float32, device=device) for each in bounds)
+        mesh = scene.mesh
+        self._centroids = wp.array(mesh.points[mesh.tets].mean(axis=1), dtype=wp.vec3, device=device)
+        self._points = wp.array(scene.points, dtype=wp.int32, device=device)
+        self._stress = wp.zeros(self.sim.body.element_count, dtype=wp.float32, device=device)
+        for k, tool in enumerate(scene.tools):
+            tool.use_poses(worlds.targets[k])
+        self._grasp: Grasp | None = None
+        if scene.gripped is not None:
+            given = {"tool": scene.tools[0], "closed": worlds.closed, "reach": scene.reach}
+            self._grasp = Grasp(self.sim.body, scene.gripped, **given)
+
+    def _seed(self, seed: int | Sequence[int] | None, mask: npt.NDArray[np.bool_] | None = None) -> None:
+        """Seed the generators of chosen worlds, which begin with their first episode."""
+        if seed is None:
+            seeds = self.np_random.integers(2**31, size=self.num_envs)
+        else:
+            seeds = np.asarray(seed, np.int64).reshape(-1)
+            if len(seeds) not in (1, self.num_envs) or (isinstance(seed, Sequence) and len(seeds) != self.num_envs):
+                raise InputError(f"seed has {len(seeds)} numbers; it must be one number, or {self.num_envs}")
+            seeds = seeds if isinstance(seed, Sequence) else seeds + np.arange(self.num_envs)
+        former, number = self.worlds.seed.numpy(), self.worlds.number.numpy()
+        chosen = np.ones(self.num_envs, bool) if mask is None else mask
+        self.worlds.seed.assign(np.where(chosen, seeds % 2**31, former).astype(np.int32))
+        self.worlds.number.assign(np.where(chosen, 0, number).astype(np.int32))
+
+    def _replay(self, launches: Callable[[], None]) -> None:
+        """Launch what was recorded, or record it first."""
+        revision = self.sim.system.launch_revision
+        if revision != self._revision:
+            self._graphs.clear()
+            self.sim.system.prepare()
+            self.sim.stepper.prepare()
+            self._revision = revision
+        if launches not in self._graphs:
+            with wp.ScopedCapture(device=self.device) as capture:
+                launches()
+            self._graphs[launches] = capture.graph
+        wp.capture_launch(self._graphs[launches])
+
+    def _launch_reset(self) -> None:
+        self._launch_beginning(self._asked)
+        self._launch_observation()
+
+    def _launch_step(self) -> None:
+        worlds, body, contact = self.worlds, self.sim.body, self.sim.contact
+        assert contact is not None
+        self.launch_actions()
+        self._launch(kernels.pace_tools, worlds.targets.shape, [1.0 / RATE, worlds.targets, contact.obstacles.motions])
+        self.sim.recorded.launch(Segment(self._count, adopts=True, publishes=True))
+        inputs = [body.world_node_count, FARTHEST, body.state.displacements, worlds]
+        self._launch(kernels.find_lost, body.node_count, inputs)
+        if self.task.feels_stress:
+            self.sim.fields[0].write_von_mises(body.state.displacements, self._stress)
+            self._launch(kernels.find_peak, self.num_envs, [body.world_element_count, self._stress, worlds])
+        self._launch_observation()
+        self.launch_judgement()
+        if worlds.at_once:
+            self._launch_observation()
+            wp.copy(self._final, worlds.observations)
+        self._launch_beginning(worlds.again)
+        self._launch_observation()
+
+    def _launch_beginning(self, chosen: wp.array) -> None:
+        """Launch the beginning of episodes in chosen worlds, int32 [worlds]."""
+        worlds, body, sim = self.worlds, self.sim.body, self.sim
+        self._launch(kernels.draw_episodes, self.num_envs, [chosen, self._low, self._high, worlds])
+        self.launch_task_beginning(chosen)
+        sim.reset(chosen)
+        state, discretization = body.state, body.discretization
+        inputs = [chosen, body.world_node_count, worlds.pose, state.rest, state.displacements, state.positions]
+        self._launch(kernels.place_nodes, body.node_count, inputs)
+        inputs = [chosen, self._centroids, POISSON, worlds, discretization.mu, discretization.lam]
+        self._launch(kernels.write_stiffness, body.element_count, [*inputs, *discretization.lame[:2]])
+        assert sim.contact is not None
+        self._launch(kernels.place_tools, worlds.targets.shape, [chosen, worlds.targets, sim.contact.obstacles.motions])
+
+    def _launch_observation(self) -> None:
+        sim, body, contact = self.sim, self.sim.body, self.sim.contact
+        assert contact is not None
+        inputs = [len(self.scene.tools), 1.0 / (RATE * self._count), contact.obstacles.motions]
+        inputs += [contact.obstacles.wrenches, None if self._grasp is None else self._grasp.wrench, self._points]
+        inputs += [body.world_node_count, body.state.rest, body.state.displacements, self.worlds]
+        self._launch(kernels.observe, sim.worlds, inputs)
+
+    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list) -> None:
+        wp.launch(kernel, dim, inputs, device=self.device)
+
+    def _taken(self, actions: Any) -> wp.array:
+        """Actions as a Warp array on the device."""
+        shape = self.worlds.actions.shape
+        if not isinstance(actions, wp.array):
+            if hasattr(actions, "data_ptr"):
+                actions = wp.from_torch(actions.detach().float().contiguous())
+            else:
+                actions = wp.array(np.asarray(actions, np.float32), dtype=wp.float32, device=self.device)
+        if actions.shape != shape or actions.dtype != wp.float32:
+            raise InputError(f"actions is {list(actions.shape)}; it must be float32 {list(shape)}")
+        return actions
+
+    def _given(self, array: wp.array) -> Any:
+        """A copy of an array on the device, as the kind that the user asked for."""
+        if self.array == "numpy":
+            return array.numpy().copy()
+        clone = wp.clone(array)
+        return clone if self.array == "warp" else wp.to_torch(clone)
+
+
+#: Parts of a tool's observation, in the order of the kernel.
+TOOL_PARTS = ("position", "velocity", "force", "torque")
