@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,6 +11,7 @@ import warp as wp
 
 from warp_corot.elasticity import ForceField
 from warp_corot.kernels.gradients import steps as kernels
+from warp_corot.solvers.steps.repeated import Replays
 
 from .sums import StepSums
 
@@ -58,13 +60,13 @@ class ExplicitRun:
         )
         self._kept = [wp.zeros_like(self._u) for _ in range(max(self.lengths))]
         self.displacements, self.velocities = [wp.clone(self._u)], [wp.clone(self._v)]
-        self._graphs: dict[tuple[str, int], wp.Graph] = {}
+        self._replays = Replays(self.device)
         self._tangent.prepare(self._u)
 
     def forward(self) -> None:
         """Run to the end, and leave the body in that state."""
         for length in self.lengths:
-            self._replay("forward", length, self._forward)
+            self._replays.launch(("forward", length), partial(self._forward, length))
             self.displacements.append(wp.clone(self._u))
             self.velocities.append(wp.clone(self._v))
         state = self.body.state
@@ -77,8 +79,8 @@ class ExplicitRun:
         length = self.lengths[segment]
         wp.copy(self._u, self.displacements[segment])
         wp.copy(self._v, self.velocities[segment])
-        self._replay("forward", length, self._forward)
-        self._replay("backward", length, self._backward)
+        self._replays.launch(("forward", length), partial(self._forward, length))
+        self._replays.launch(("backward", length), partial(self._backward, length))
 
     def _forward(self, length: int) -> None:
         conditions = self.body.conditions
@@ -99,18 +101,6 @@ class ExplicitRun:
             self._tangent.take(u)
             self._tangent.add_product(self._p, self._product)
             self._launch(kernels.subtract, [self._product], [self.of_displacements])
-
-    def _replay(self, name: str, length: int, steps: Callable[[int], None]) -> None:
-        """Launch a number of steps, and record them after the first time."""
-        graph = self._graphs.get((name, length))
-        if graph is not None:
-            wp.capture_launch(graph)
-            return
-        steps(length)
-        if self.lengths.count(length) > 1 or name == "forward":
-            with wp.ScopedCapture(device=self.device) as capture:
-                steps(length)
-            self._graphs[name, length] = capture.graph
 
     def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
         wp.launch(kernel, self.body.sizes.launch_nodes, inputs, outputs, device=self.device)

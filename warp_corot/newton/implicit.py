@@ -15,13 +15,13 @@ from warp_corot.kernels.newton import implicit as kernels
 from warp_corot.solvers.implicit.block_system import BlockSystem
 from warp_corot.solvers.implicit.contact_solve import ContactSolve
 from warp_corot.solvers.implicit.line_search import LineSearch
+from warp_corot.solvers.steps.repeated import Replays
 
 from .arguments import Step
 from .contact import KINEMATIC, Contacts
 from .library import newton
 from .links import RowForces
 from .others import Others
-from .replays import Replays
 from .state import NAMESPACE
 from .step_operator import RowBlocks, StepOperator
 from .steps import RUNAWAY, Steps

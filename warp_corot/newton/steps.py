@@ -10,6 +10,7 @@ import warp as wp
 from warp_corot.kernels.newton import particles as kernels
 from warp_corot.kernels.newton import worlds as worlds
 from warp_corot.kernels.newton.bodies import add_wrenches, move_bodies
+from warp_corot.solvers.steps.repeated import Replays
 from warp_corot.solvers.subnormals import FlushedSubnormals
 
 from .arguments import Step
@@ -17,7 +18,6 @@ from .contact import Contacts
 from .following import RETRIES, Following
 from .library import newton
 from .others import Others
-from .replays import Replays
 from .report import Report
 from .state import attribute_of
 from .tetrahedra import Tetrahedra
