@@ -43,7 +43,8 @@ def write_vector(vectors: wp.array[wp.vec3], i: int, value: wp.vec3):
 def by_vectors(kernel: wp.Kernel, argument: str) -> dict[type, wp.Kernel]:
     """The instances of a generic kernel for both vector types of one of its arrays.
 
-    They are made once, because Warp would look for the right one at every launch.
+    They are made once, because Warp would look for the right one at every launch. Replays of a recording on the CPU
+    call the instance that was recorded last for all of them (Warp 1.19), so recorded ones must only read the array.
     """
     return {dtype: wp.overload(kernel, {argument: wp.array(dtype=dtype)}) for dtype in (wp.vec3, wp.vec4)}
 
