@@ -92,14 +92,15 @@ def check(case, found, names, step=1e-3, tolerance=TOLERANCE):
 @pytest.mark.parametrize("law", LAWS)
 def test_all_derivatives_of_a_forest(law, device):
     case = Case(wc.TetForest.box((1, 1, 3), CUBE, 3), law, device)
-    found = case.gradient(wrt=NAMES)
+    names = [name for name in NAMES if name != "rest" or law != "edge_stvk_quadratic"]
+    found = case.gradient(wrt=names)
     assert found.value == pytest.approx(case.value(), abs=1e-6)
     assert found.report.converged
     assert found.adjoint_residual < 1e-4
-    assert found.loads.shape == found.boundary.shape == found.rest.shape == case.mesh.points.shape
+    assert all(found[name].shape == case.mesh.points.shape for name in names if name in ("loads", "boundary", "rest"))
     assert not found.loads[case.fixed].any()
     assert not found.boundary[~case.fixed].any()
-    check(case, found, NAMES)
+    check(case, found, names)
 
 
 @pytest.mark.slow
@@ -244,6 +245,7 @@ def test_refusals(device):
         ({"model": wc.Corotated(rotation_level=0)}, "the model shares rotations"),
         ({"model": wc.Prony(model=wc.Corotated(rotation_level=0)), "wrt": "loads"}, "the model shares rotations"),
         ({"model": wc.MassSpring()}, "have no derivative with respect to moduli"),
+        ({"model": wc.EdgeStVK(springs="quadratic"), "wrt": ("young", "rest")}, "with respect to the rest shape;"),
         ({"precision": "float16"}, "precision is 'float16'; it must be 'float32' or 'float64'"),
         ({"model": wc.MassSpring(), "wrt": "loads", "precision": "float64"}, "precision is 'float64'; it needs an iso"),
         ({"adjoint_tolerance": 2.0}, "adjoint_tolerance is 2.0; it must be between 0 and 1"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from warp_corot.inputs.checks import checked_choice
@@ -12,10 +12,19 @@ from warp_corot.kernels.elements.springs import spring_density, spring_different
 
 from .dilatation import ELEMENT, refuse_shared
 from .model import ElementField, ForceField, Model
+from .stress_law import StressLaw
 from .stvk import StVenantKirchhoff
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization, Discretized
+
+
+class SpringField(ElementField):
+    """Force field of quadratic springs, whose stress depends on where an element has its edges."""
+
+    @property
+    def stress_law(self) -> StressLaw:
+        return replace(super().stress_law, sees_shape=True)
 
 
 @dataclass(frozen=True)
@@ -38,7 +47,7 @@ class EdgeStVK(Model):
     def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:
         if self.springs == "biquadratic":
             return StVenantKirchhoff(ELEMENT).bind(body, deterministic=deterministic)
-        return ElementField(
+        return SpringField(
             body,
             stress=spring_stress,
             differential=spring_differential,

@@ -32,9 +32,11 @@ class StressLaw:
             ``kernels.elements.stiffness_products`` takes it.
         material: The struct that both read.
         Material: Its type; for ``IsotropicMaterial`` the stress is linear in Lamé's parameters.
+        sees_shape: Whether the stress depends on an element's rest shape besides its deformation gradient.
     """
 
     stress: wp.Function
     differential: wp.Function
     material: ElementMaterial
     Material: type = IsotropicMaterial
+    sees_shape: bool = False

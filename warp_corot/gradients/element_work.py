@@ -37,9 +37,10 @@ class ElementWork:
         self.field, self.names, self.device = field, names, field.device
         self._shared = field if isinstance(field, DilatationField) else None
         law = (self._shared.shear if self._shared else field).stress_law
-        if names and law is None:
-            missing = _listed(names)
-            raise InputError(f"the model's forces have no derivative with respect to {missing}; leave it out of wrt")
+        missing = names if law is None else {"rest"} & names if law.sees_shape else set()
+        if missing:
+            said = _listed(missing)
+            raise InputError(f"the model's forces have no derivative with respect to {said}; leave it out of wrt")
         if "lame" in names and law is not None and law.Material is not IsotropicMaterial:
             raise InputError("the material is anisotropic; derivatives with respect to its moduli do not exist yet")
         if "activation" in names and law is not None and law.Material is not FibreMaterial:
