@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import locale
 from collections.abc import Callable
 from pathlib import Path
 
@@ -297,6 +298,7 @@ def _itk(suffix: str, compress: bool = False) -> Callable[[Path], Path]:
 def _dicom(folder: Path) -> Path:
     import SimpleITK
 
+    language = locale.setlocale(locale.LC_ALL)
     writer = SimpleITK.ImageFileWriter()
     writer.KeepOriginalImageUIDOn()
     (folder / "series").mkdir()
@@ -309,6 +311,7 @@ def _dicom(folder: Path) -> Path:
             image.SetMetaData(key, value)
         writer.SetFileName(str(folder / "series" / f"{k}.dcm"))
         writer.Execute(image)
+    locale.setlocale(locale.LC_ALL, language)  # which writing DICOM changes to "C" for the whole process
     return folder / "series"
 
 
