@@ -89,7 +89,7 @@ def test_views_and_frames_are_panels(folder):
 )
 def test_titles_say_what_happens(folder, options, said, monkeypatch):
     titles = []
-    monkeypatch.setattr("warp_corot.io.pictures.preview.draw_strip", lambda *_, title, **__: titles.append(title))
+    monkeypatch.setattr("warp_corot.io.pictures.preview.Strip.draw", lambda *given: titles.append(given[-1]))
     monkeypatch.setattr("warp_corot.io.pictures.preview.save_picture", lambda *_: None)
     assert simulate(*RUN, "--preview", "a.png", *options) == 0
     (title,) = titles

@@ -77,8 +77,7 @@ def test_nearer_bodies_hide_farther_ones(tmp_path):
             faces,
             scalars=scalars,
             value_range=(0, 1),
-            azimuth=0.0,
-            elevation=0.0,
+            view=(0.0, 0.0),
             size=SIZE,
             ground=False,
         )
@@ -93,9 +92,7 @@ def test_scalars_become_the_colors_of_the_map(tmp_path, per):
     for value in (0.0, 0.5, 1.0):
         path = tmp_path / f"{value}.png"
         scalars = np.full(len(CUBE) if per == "node" else len(FACES), value)
-        render_preview(
-            path, CUBE, FACES, scalars=scalars, value_range=(0, 1), azimuth=0, elevation=0, size=SIZE, ground=False
-        )
+        render_preview(path, CUBE, FACES, scalars=scalars, value_range=(0, 1), view=(0.0, 0.0), size=SIZE, ground=False)
         seen = picture_of(path)[SIZE[1] // 2, (SIZE[0] - 130) // 2] / 255.0
         wanted = stress_colors()[round(255 * value)]
         assert np.abs(seen / seen.max() - wanted / wanted.max()).max() < 0.2
@@ -197,7 +194,7 @@ def test_dots_are_hidden_by_what_is_before_them(tmp_path):
         held = np.arange(len(both)) == (-1 if node is None else node)
         # From along that diagonal, so that the corner is behind the middle of the first.
         azimuth, elevation = np.degrees([np.arctan2(1.0, 2.0), np.arctan2(1.0, np.sqrt(5.0))])
-        view = {"azimuth": azimuth, "elevation": elevation}
-        render_preview(tmp_path / "a.png", both, faces, held=held, size=SIZE, pieces=1, **view)
+        view = (azimuth, elevation)
+        render_preview(tmp_path / "a.png", both, faces, held=held, size=SIZE, pieces=1, view=view)
         pictures[name] = picture_of(tmp_path / "a.png").astype(int)
     np.testing.assert_array_equal(pictures["hidden"], pictures["none"])

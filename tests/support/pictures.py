@@ -3,7 +3,8 @@
 import numpy as np
 from PIL import Image
 
-from warp_corot.io.pictures.preview import Picture, cameras_of, draw_strip, save_picture
+from warp_corot.io.pictures.drawing import checked_surface, value_limits
+from warp_corot.io.pictures.preview import Picture, Strip, save_picture
 from warp_corot.mesh.surfaces.boundary import boundary_faces
 
 # A cube of side 1 about the origin.
@@ -18,13 +19,20 @@ def picture_of(path) -> np.ndarray:
         return np.asarray(image.convert("RGB"), dtype=int)
 
 
-def render_strip(path, pictures, up_axis="Y", azimuth=35.0, elevation=14.0, **options) -> None:
-    """Draw bodies side by side into a file, from one side."""
-    save_picture(draw_strip(pictures, cameras_of(pictures, up_axis, azimuth, elevation), **options), path)
+def render_strip(path, pictures, up_axis="Y", title="", **options) -> None:
+    """Draw bodies side by side into a file."""
+    given = [(x, each.faces) for each in pictures for x in (each.positions, each.rest) if x is not None]
+    seen = [x[faces].reshape(-1, 3) for x, faces in (checked_surface(*each, "positions") for each in given)]
+    highest = [value_limits(each.scalars)[1] for each in pictures if each.scalars is not None]
+    options = {"value_range": (0.0, max(highest)) if highest else None, "titled": bool(title), **options}
+    save_picture(Strip(pictures, np.concatenate(seen), up_axis, **options).draw(pictures, title), path)
 
 
-def render_preview(path, positions, faces, scalars=None, rest=None, title="", size=(1200, 900), **options) -> None:
+def render_preview(
+    path, positions, faces, scalars=None, rest=None, title="", size=(1200, 900), view=(35.0, 14.0), **options
+) -> None:
     """Draw one body into a file; options that are not those of a strip are those of its drawing."""
-    of_strip = ("up_axis", "azimuth", "elevation", "value_range", "scalar_label")
+    of_strip = ("up_axis", "value_range", "scalar_label")
     given = {name: options.pop(name) for name in of_strip if name in options}
-    render_strip(path, [Picture(positions, faces, scalars, rest, title, options=options)], size=size, **given)
+    picture = Picture(positions, faces, scalars, rest, title, options, view)
+    render_strip(path, [picture], size=size, **given)

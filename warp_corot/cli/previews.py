@@ -27,7 +27,6 @@ from .preview_frame import DrawnBodies, PreviewFrame
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-    from warp_corot.io.pictures.camera import Camera
     from warp_corot.io.pictures.preview import Picture
     from warp_corot.simulation.simulation import Simulation
 
@@ -99,21 +98,59 @@ class Previews:
             return
         from tqdm import tqdm
 
-        up_axis = bodies[0].soft.mesh.up_axis
-        with tqdm(
-            total=len(self._outermost),
-            desc="drawing",
-            leave=False,
-            disable=None,
-            delay=2.0,
-            file=sys.stderr,
-            bar_format="{desc}  {percentage:3.0f} % |{bar}| {remaining} left",
-        ) as bar:
+        from warp_corot.io.pictures.preview import save_picture
+
+        with (
+            tqdm(
+                total=len(self._outermost),
+                desc="drawing",
+                leave=False,
+                disable=None,
+                delay=2.0,
+                file=sys.stderr,
+                bar_format="{desc}  {percentage:3.0f} % |{bar}| {remaining} left",
+            ) as bar,
+            contextlib.closing(self._images(name, bodies[0].soft.mesh.up_axis, bar)) as images,
+        ):
             if is_film(self.args.preview):
-                with contextlib.closing(self._images(name, up_axis, bar)) as drawing:
-                    write_film(self.args.preview, drawing, self.fps)
+                write_film(self.args.preview, images, self.fps)
             else:
-                self._draw_picture(name, up_axis, bar)
+                save_picture(next(images), self.args.preview)
+
+    def _images(self, name: str, up_axis: str, bar: Any) -> Generator[Image, None, None]:
+        """The frames of a film, or the only picture."""
+        from warp_corot.io.pictures.preview import Strip
+
+        film, sides = is_film(self.args.preview), len(self.views)
+        strip = None
+        for pictures, title in self._sheets(name, film, bar):
+            if strip is None:
+                one = len(pictures) == 1
+                strip = Strip(
+                    pictures,
+                    np.concatenate(self._outermost),
+                    up_axis,
+                    titled=True,
+                    value_range=(0.0, self._highest),
+                    size=(FILM_SIZE[0] * sides, FILM_SIZE[1]) if film else (1200, 900) if one else None,
+                    fineness=1 if film else 2,
+                    columns=sides if film or 1 < sides < len(pictures) else min(len(pictures), MOST_COLUMNS),
+                )
+            yield strip.draw(pictures, title)
+
+    def _sheets(self, name: str, film: bool, bar: Any) -> Iterator[tuple[list[Picture], str]]:
+        """Pictures that are drawn side by side, and their title."""
+        static, several = is_static(self.args), len(self.frames) > 1
+        panels = []
+        for frame, shown in zip(self.frames, self._kept(), strict=False):
+            if film:
+                yield self._pictures(shown, ""), name if static else f"{name}; {shown.time:.2f} s"
+            else:
+                when = f"frame {frame}" if static else f"{shown.time:.3g} s"
+                panels += self._pictures(shown, when if several else "")
+            bar.update()
+        if not film:
+            yield panels, name if several or static else f"{name}; {shown.time:.3g} s"
 
     def _pictures(self, shown: PreviewFrame, frame_title: str) -> list[Picture]:
         """A frame from all sides."""
@@ -127,58 +164,9 @@ class Previews:
         if is_film(self.args.preview):
             options["pieces"] = FILM_PIECES
         return [
-            Picture(shown.positions, shown.triangles, shown.values, shown.rest, words, dict(options), view)
+            Picture(shown.positions, shown.triangles, shown.values, shown.rest, words, options, view)
             for view, words in zip(self.views, titles, strict=True)
         ]
-
-    def _common(self, panels: Sequence[Picture], ground: np.ndarray, up_axis: str) -> tuple[list[Camera], float]:
-        """A camera for each panel, which sees all frames, and the height of the ground [m]."""
-        from warp_corot.io.pictures.preview import cameras_of
-
-        seen = np.concatenate(self._outermost)
-        box = np.stack([seen.min(axis=0), seen.max(axis=0)])
-        axis = "XYZ".index(up_axis)
-        return cameras_of(panels, up_axis, *VIEWS["corner"], box), float(min([box[0, axis], *ground[:, axis]]))
-
-    def _draw_picture(self, name: str, up_axis: str, bar: Any) -> None:
-        from warp_corot.io.pictures.preview import draw_strip, save_picture
-
-        panels: list[Picture] = []
-        for frame, shown in zip(self.frames, self._kept(), strict=False):
-            when = f"frame {frame}" if is_static(self.args) else f"{shown.time:.3g} s"
-            panels += self._pictures(shown, when if len(self.frames) > 1 else "")
-            bar.update()
-        cameras, ground = self._common(panels, shown.ground, up_axis)
-        size = (1200, 900) if len(panels) == 1 else None
-        several = len(self.views) > 1 and len(self.frames) > 1
-        columns = len(self.views) if several else min(len(panels), MOST_COLUMNS)
-        words = name if len(self.frames) > 1 or is_static(self.args) else f"{name}; {shown.time:.3g} s"
-        limits = (0.0, self._highest)
-        drawn = draw_strip(panels, cameras, value_range=limits, title=words, size=size, columns=columns, ground=ground)
-        save_picture(drawn, self.args.preview)
-
-    def _images(self, name: str, up_axis: str, bar: Any) -> Generator[Image, None, None]:
-        """The frames of a film."""
-        from warp_corot.io.pictures.preview import Strip, window_of
-
-        width, height = FILM_SIZE
-        strip = None
-        for shown in self._kept():
-            views = self._pictures(shown, "")
-            if strip is None:
-                cameras, ground = self._common(views, shown.ground, up_axis)
-                strip = Strip(
-                    views,
-                    cameras,
-                    titled=True,
-                    value_range=(0.0, self._highest),
-                    size=(width * len(views), height),
-                    window=window_of(np.concatenate(self._outermost), shown.ground, cameras, ground),
-                    ground=ground,
-                    fineness=1,
-                )
-            yield strip.draw(views, name if is_static(self.args) else f"{name}; {shown.time:.2f} s")
-            bar.update()
 
     def _kept(self) -> Iterator[PreviewFrame]:
         assert self._file is not None

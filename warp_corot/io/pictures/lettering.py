@@ -10,13 +10,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Width of the colour bar in pixels.
-BAR = 16
+#: Pixels an inch, on which sizes of type depend; and the width of the colour bar in pixels.
+DPI, BAR = 150.0, 16
 
 
 def draw_color_bar(figure: "Figure", limits: tuple[float, float], label: str) -> "Axes":
     label, limits = _readable(label, limits)
-    ax = figure.add_axes((0.0, 0.2, BAR / (figure.get_figwidth() * 150.0), 0.55))
+    ax = figure.add_axes((0.0, 0.2, BAR / (figure.get_figwidth() * DPI), 0.55))
     ax.imshow(stress_colors()[:, None, :], aspect="auto", origin="lower", extent=(0.0, 1.0, *limits))
     ax.set_xticks([])
     ax.yaxis.tick_right()
@@ -41,14 +41,14 @@ def _readable(label: str, limits: tuple[float, float]) -> tuple[str, tuple[float
 def needed_width(legend: "Axes", width: int) -> float:
     """Pixels that the colour bar and its text need; text that is too high is made smaller."""
     renderer = legend.figure.canvas.get_renderer()  # type: ignore[attr-defined]
-    height = legend.figure.bbox.height
+    height, pixel = legend.figure.bbox.height, legend.figure.dpi / DPI
     label = legend.yaxis.label
     for points in (8.0, 7.0, 6.0, 5.0):
         if label.get_window_extent(renderer).height <= 0.95 * height:
             break
         label.set_fontsize(points)
     box = legend.get_tightbbox(renderer)
-    needed = 130.0 if box is None else 10.0 + float(box.x1) - float(legend.get_window_extent(renderer).x0) + 12.0
+    needed = 0.0 if box is None else (box.x1 - legend.get_window_extent(renderer).x0) / pixel + 22.0
     return min(max(needed, 130.0), 0.7 * width)
 
 
@@ -60,7 +60,7 @@ def fit_line(text: Any, width: float) -> None:
     renderer = text.figure.canvas.get_renderer()
 
     def is_wide() -> bool:
-        return text.get_window_extent(renderer).width > width
+        return text.get_window_extent(renderer).width > width * text.figure.dpi / DPI
 
     while is_wide() and text.get_fontsize() > 7.0:
         text.set_fontsize(text.get_fontsize() - 0.5)
