@@ -71,7 +71,7 @@ def test_reading_and_meshing_show_since_when_and_lines_stay_whole(tmp_path):
 def test_a_run_of_many_worlds_shows_how_far_it_is(tmp_path):
     said = on_terminal(MANY_WORLDS, tmp_path)
     assert "simulating" in said
-    assert "of 10, " in said
+    assert "of 10 frames, " in said
 
 
 def test_nothing_is_shown_without_a_terminal(folder, capfd):

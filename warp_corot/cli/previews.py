@@ -6,9 +6,8 @@ import argparse
 import contextlib
 import itertools
 import pickle
-import sys
 import tempfile
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,6 +18,7 @@ import numpy as np
 from warp_corot.errors import InputError
 from warp_corot.io.files.whole import check_output
 from warp_corot.io.pictures.film import FILMS, check_film, frames_shown, write_film
+from warp_corot.simulation.progress import bar_of
 
 from .implicit import is_static
 from .options.defaults import VIEWS
@@ -96,34 +96,24 @@ class Previews:
         """
         if self._file is None:
             return
-        from tqdm import tqdm
-
         from warp_corot.io.pictures.preview import save_picture
 
         with (
-            tqdm(
-                total=len(self._outermost),
-                desc="drawing",
-                leave=False,
-                disable=None,
-                delay=2.0,
-                file=sys.stderr,
-                bar_format="{desc}  {percentage:3.0f} % |{bar}| {remaining} left",
-            ) as bar,
-            contextlib.closing(self._images(name, bodies[0].soft.mesh.up_axis, bar)) as images,
+            bar_of(len(self._outermost), "frames", "drawing") as drawn,
+            contextlib.closing(self._images(name, bodies[0].soft.mesh.up_axis, drawn)) as images,
         ):
             if is_film(self.args.preview):
                 write_film(self.args.preview, images, self.fps)
             else:
                 save_picture(next(images), self.args.preview)
 
-    def _images(self, name: str, up_axis: str, bar: Any) -> Generator[Image, None, None]:
+    def _images(self, name: str, up_axis: str, drawn: Callable[[float], None]) -> Generator[Image, None, None]:
         """The frames of a film, or the only picture."""
         from warp_corot.io.pictures.preview import Strip
 
         film, sides = is_film(self.args.preview), len(self.views)
         strip = None
-        for pictures, title in self._sheets(name, film, bar):
+        for pictures, title in self._sheets(name, film, drawn):
             if strip is None:
                 one = len(pictures) == 1
                 strip = Strip(
@@ -138,17 +128,17 @@ class Previews:
                 )
             yield strip.draw(pictures, title)
 
-    def _sheets(self, name: str, film: bool, bar: Any) -> Iterator[tuple[list[Picture], str]]:
+    def _sheets(self, name: str, film: bool, drawn: Callable[[float], None]) -> Iterator[tuple[list[Picture], str]]:
         """Pictures that are drawn side by side, and their title."""
         static, several = is_static(self.args), len(self.frames) > 1
         panels = []
-        for frame, shown in zip(self.frames, self._kept(), strict=False):
+        for number, (frame, shown) in enumerate(zip(self.frames, self._kept(), strict=False), start=1):
             if film:
                 yield self._pictures(shown, ""), name if static else f"{name}; {shown.time:.2f} s"
             else:
                 when = f"frame {frame}" if static else f"{shown.time:.3g} s"
                 panels += self._pictures(shown, when if several else "")
-            bar.update()
+            drawn(number)
         if not film:
             yield panels, name if several or static else f"{name}; {shown.time:.3g} s"
 

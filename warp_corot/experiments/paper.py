@@ -39,8 +39,6 @@ OBSERVED = (0.032, 0.032, 0.192)
 GRAVITY = (0.0, -9.8, 0.0)
 MATERIAL = {"young": 500.0, "poisson": 0.49, "density": 10.0}
 
-#: Simulated time [s]: the paper's, and a shorter one in which the beam comes to rest.
-
 #: Names of the reference models.
 REFERENCE, PEER, OWN = "stvk", "linear", "corotated"
 

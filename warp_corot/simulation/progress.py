@@ -40,28 +40,32 @@ def hidden() -> Iterator[None]:
 
 
 @contextmanager
-def bar_of(total: float, unit: str) -> Iterator[Callable[[float], None]]:
+def bar_of(
+    total: float, unit: str, what: str = "simulating", *, wanted: bool = True
+) -> Iterator[Callable[[float], None]]:
     """A bar that appears when the work has taken two seconds, and disappears at the end of the block.
 
     Args:
         total: The amount of work.
         unit: Its unit: "s", "steps".
+        what: What the work is.
+        wanted: Whether there is a bar at all.
 
     Yields:
         A function to be called with the amount that is done.
     """
-    began = time.perf_counter()
+    began, shown = time.perf_counter(), wanted and is_shown()
     bar: Any = None
 
     def update(done: float) -> None:
         nonlocal bar
         if bar is None:
-            if time.perf_counter() - began < SILENT or not is_shown():
+            if not shown or time.perf_counter() - began < SILENT:
                 return
             from tqdm import tqdm
 
             form = "{desc}  {percentage:3.0f} % |{bar}| {n:.4g} of {total:.4g} " + unit + ", {remaining} left"
-            bar = tqdm(desc="simulating", total=total, leave=False, file=sys.stderr, bar_format=form)
+            bar = tqdm(desc=what, total=total, leave=False, file=sys.stderr, bar_format=form)
             bar.start_t = bar.last_print_t = bar.start_t - (time.perf_counter() - began)
         bar.update(done - bar.n)
 

@@ -16,6 +16,7 @@ def draw_shadow(ax: "Axes", triangles: Array, camera: Camera, height: float, cel
     Returns the picture coordinates [n, 2] of the cells that are visibly dark.
     """
     from matplotlib.collections import QuadMesh
+    from scipy.ndimage import gaussian_filter
 
     up = camera.world_up
     right = camera.axes[0]
@@ -30,7 +31,7 @@ def draw_shadow(ax: "Axes", triangles: Array, camera: Camera, height: float, cel
     dark = np.zeros((cells, cells))
     dark[tuple(np.minimum((flat - low) / (high - low) * cells, cells - 1).astype(int).T)] = 1.0
     # Two widths: a tight contact shadow within a wide soft one.
-    dark = 0.5 * _blur(dark, 0.012 * cells, 0.012 * cells) + 0.5 * _blur(dark, 0.05 * cells, 0.05 * cells)
+    dark = 0.5 * gaussian_filter(dark, 0.012 * cells) + 0.5 * gaussian_filter(dark, 0.05 * cells)
     middles = low + (np.arange(cells)[:, None] + 0.5) / cells * (high - low)
     u, v = np.meshgrid(*middles.T, indexing="ij")
     ground = u[..., None] * right + v[..., None] * back + height * up
@@ -48,10 +49,3 @@ def dropped_shadow(points: Array, camera: Camera, height: float) -> Array:
     light = -0.30 * right + 1.0 * up - 0.12 * np.cross(up, right)
     lift = np.maximum(points @ up - height, 0.0)
     return points - lift[:, None] / (light @ up) * light
-
-
-def _blur(image: Array, wide_u: float, wide_v: float) -> Array:
-    """Gaussian blur by the discrete Fourier transform (the image wraps round, its margins are empty)."""
-    fu, fv = np.fft.fftfreq(image.shape[0])[:, None], np.fft.rfftfreq(image.shape[1])[None, :]
-    kernel = np.exp(-2.0 * np.pi**2 * ((wide_u * fu) ** 2 + (wide_v * fv) ** 2))
-    return np.clip(np.fft.irfft2(np.fft.rfft2(image) * kernel, s=image.shape), 0.0, 1.0)

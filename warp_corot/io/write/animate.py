@@ -20,7 +20,7 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, checked_path, shown
 from warp_corot.inputs.simulation_lock import under_lock
 from warp_corot.inputs.stopwatch import WATCH
-from warp_corot.simulation.progress import hidden, is_shown
+from warp_corot.simulation.progress import bar_of, hidden
 from warp_corot.simulation.simulation import Simulation
 
 from .provenance import provenance, steps_made
@@ -280,12 +280,8 @@ def record(
 @contextmanager
 def progress_bar(count: int, *, wanted: bool = True) -> Iterator[Progress]:
     """A bar on a terminal for long runs, to be called with numbers of frames."""
-    from tqdm import tqdm
-
-    form = "{desc}  {percentage:3.0f} % |{bar}| frame {n_fmt} of {total_fmt}, {remaining} left"
-    off = not (wanted and is_shown())
-    with tqdm(desc="simulating", total=count, delay=2.0, leave=False, disable=off, bar_format=form) as bar, hidden():
-        yield lambda frame, _: bar.update(frame - bar.n)
+    with bar_of(count, "frames", wanted=wanted) as update, hidden():
+        yield lambda frame, _: update(frame)
 
 
 @under_lock

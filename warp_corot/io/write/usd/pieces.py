@@ -28,6 +28,7 @@ from pxr import Sdf, Tf
 from warp_corot.errors import InputError
 from warp_corot.io.files.usd import check_stage_path, is_locked, reason, take_lock, usd_name
 from warp_corot.io.files.whole import WriteError, sync, writing
+from warp_corot.simulation.progress import bar_of
 
 from .clips import declare_attributes, new_root, play_pieces, set_time_range, varying_attributes
 
@@ -276,16 +277,11 @@ class PieceStore:
 
     def _with_bar(self, opened: list[Sdf.Layer]) -> Iterator[tuple[float, Samples]]:
         """All frames; joining them takes as long as the disk needs, and terminals show a bar."""
-        from tqdm import tqdm
-
         count = len(self._pending) + round(sum(last - first + 1.0 for first, last in self._pieces))
-        form = "{desc}  {percentage:3.0f} % |{bar}| frame {n_fmt} of {total_fmt}, {remaining} left"
-        with tqdm(
-            total=count, desc=f"joining {self.path.name}", delay=2.0, leave=False, disable=None, bar_format=form
-        ) as bar:
-            for frame in self._frames(opened):
+        with bar_of(count, "frames", f"joining {self.path.name}") as update:
+            for number, frame in enumerate(self._frames(opened), start=1):
                 yield frame
-                bar.update()
+                update(number)
 
     def _held_over(self, samples: Samples) -> Samples:
         """Values that must be repeated just before a frame, so that they are not interpolated with those of the
