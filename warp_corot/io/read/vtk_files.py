@@ -90,18 +90,7 @@ def _reader(path: Path) -> Any:
         from vtkmodules import vtkIOHDF
 
         return vtkIOHDF.vtkHDFReader()
-    kinds = {
-        ".vtu": vtkIOXML.vtkXMLUnstructuredGridReader,
-        ".vtp": vtkIOXML.vtkXMLPolyDataReader,
-        ".vts": vtkIOXML.vtkXMLStructuredGridReader,
-        ".vtr": vtkIOXML.vtkXMLRectilinearGridReader,
-        ".vti": vtkIOXML.vtkXMLImageDataReader,
-        ".vtm": vtkIOXML.vtkXMLMultiBlockDataReader,
-        ".vtmb": vtkIOXML.vtkXMLMultiBlockDataReader,
-        ".pvtu": vtkIOXML.vtkXMLPUnstructuredGridReader,
-        ".pvtp": vtkIOXML.vtkXMLPPolyDataReader,
-    }
-    return kinds[suffix]()
+    return vtkIOXML.vtkXMLGenericDataObjectReader()
 
 
 def _errors(said: str) -> str:
