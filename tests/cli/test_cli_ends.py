@@ -7,7 +7,6 @@ import re
 import signal
 import sys
 import time
-from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -25,7 +24,7 @@ OPTIONS += ["smoothing", "draw-tets", "draw-labels"]
 @pytest.fixture(autouse=True)
 def nothing_said_of_compiling(monkeypatch):
     """Suppress the message about compiling, which depends on what ran before and is tested elsewhere."""
-    monkeypatch.setattr("warp_corot.cli.run_setup.compiling_said", lambda device: nullcontext())
+    monkeypatch.setattr("warp_corot.cli.run_setup.tell_compiling", lambda device: None)
 
 
 def test_a_free_fall_is_noted(folder, capsys):

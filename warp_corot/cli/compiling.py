@@ -9,8 +9,7 @@ from __future__ import annotations
 import functools
 import os
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from typing import Any
 
 import warp as wp
@@ -22,38 +21,18 @@ from warp_corot.inputs.stopwatch import KERNELS, WATCH
 
 from .exit_status import complain
 
-Say = Callable[[str], None]
-
-#: Called at the start of the next compilation.
-_waiting: list[Callable[[], None]] = []
+#: The device of which the next compilation is said; "" for none.
+_device = ""
 #: Whether this process has compiled kernels; otherwise they were in Warp's cache.
 has_compiled = False
 
 
-def say_plainly(text: str) -> None:
-    """Print a line on stderr."""
-    complain(text, kind="")
-
-
-@contextmanager
-def compiling_said(device: wp.Device, say: Say = say_plainly) -> Iterator[None]:
-    """Say in one line that kernels are being compiled, if any are; say nothing if all are in Warp's cache.
-
-    Args:
-        device: The device for which they are compiled.
-        say: Prints the line.
-    """
-
-    def tell() -> None:
-        say(f"compiling kernels for {device}, once: this takes some seconds ...")
-
+def tell_compiling(device: wp.Device) -> None:
+    """Say in one line that kernels are compiled for a device, as soon as any are; say nothing if all are in Warp's
+    cache."""
+    global _device
     _listen()
-    _waiting.append(tell)
-    try:
-        yield
-    finally:
-        if tell in _waiting:
-            _waiting.remove(tell)
+    _device = str(device)
 
 
 def begin_compiling(device: str | None) -> None:
@@ -79,12 +58,12 @@ def _listen() -> None:
 
 
 def _heard(event: str, args: tuple[Any, ...]) -> None:
-    global has_compiled
+    global has_compiled, _device
     if event == "os.mkdir" and _in_kernel_cache(args[0]):
         has_compiled = True
-        told, _waiting[:] = _waiting[:], []
-        for tell in told:
-            tell()
+        device, _device = _device, ""
+        if device:
+            complain(f"compiling kernels for {device}, once: this takes some seconds ...", kind="")
 
 
 def _in_kernel_cache(path: Any) -> bool:

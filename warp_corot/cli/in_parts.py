@@ -20,7 +20,7 @@ from warp_corot.simulation.parts import checked_gravity
 from warp_corot.solvers import SymplecticEuler
 
 from .bodies import model_of
-from .compiling import compiling_said
+from .compiling import tell_compiling
 from .exit_status import complain, early_end
 from .loading import Load, loads_of, ramp_of
 from .meshes_in_parts import (
@@ -88,15 +88,15 @@ def run_in_parts(args: argparse.Namespace) -> int:
     from warp_corot.io.write.animate import Recording, frame_count, progress_bar, rounding
 
     done = Recording(args.output)
-    with compiling_said(checked_device(args.device)):
-        subject = box_in_parts(args) if args.input == "box" else organ_in_parts(args)
-        duration = subject.duration if args.duration is None else args.duration
-        if note := rounding(duration, args.fps):
-            complain(note, kind="note")
-        sim, loads = _simulation(args, subject, duration)
-        probes = [_PartProbe(text, sim) for text in args.probe or () if args.csv]
-        # All ranks sum the rows, and rank 0 writes them.
-        table = Table(args.csv if sim.rank == 0 else Path(os.devnull), sim, probes) if args.csv else None
+    tell_compiling(checked_device(args.device))
+    subject = box_in_parts(args) if args.input == "box" else organ_in_parts(args)
+    duration = subject.duration if args.duration is None else args.duration
+    if note := rounding(duration, args.fps):
+        complain(note, kind="note")
+    sim, loads = _simulation(args, subject, duration)
+    probes = [_PartProbe(text, sim) for text in args.probe or () if args.csv]
+    # All ranks sum the rows, and rank 0 writes them.
+    table = Table(args.csv if sim.rank == 0 else Path(os.devnull), sim, probes) if args.csv else None
     try:
         with (
             progress_bar(frame_count(duration, args.fps)) as progress,

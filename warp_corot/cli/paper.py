@@ -83,7 +83,7 @@ def _with_progress(settings: Settings, device: str | None) -> Results:
     from warp_corot.inputs.device import checked_device
     from warp_corot.simulation.progress import hidden
 
-    from .compiling import compiling_said
+    from .compiling import tell_compiling
 
     where = checked_device(device)
     with tqdm(
@@ -99,10 +99,6 @@ def _with_progress(settings: Settings, device: str | None) -> Results:
             bar.set_description_str(what, refresh=not done)
             bar.update(done)
 
-        def say(text: str) -> None:
-            bar.clear()
-            complain(text, kind="")
-            bar.refresh()
-
-        with compiling_said(where, say), hidden():
+        tell_compiling(where)
+        with hidden():
             return run_experiment(settings, device=where, progress=tell)

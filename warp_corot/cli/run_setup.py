@@ -28,7 +28,7 @@ from warp_corot.solvers import INTEGRATORS
 
 from .bodies import RunBody, asked_bodies, find_body, find_patches, gravity_of, make_body
 from .choosing import choose_steps, may_choose
-from .compiling import compiling_said
+from .compiling import tell_compiling
 from .exit_status import complain
 from .implicit import integrator_name, is_static
 from .loading import ramp_of
@@ -102,27 +102,27 @@ def _made_ready(
         with waiting(f"reading {each.input}"):
             inputs.append(asked_bodies(each))
     bodies = [body for found in inputs for body in found]
-    with compiling_said(device):
-        begin_loading(_modules(bodies, touches or touched.contact is not None, chooses, device), device)
-        for body in bodies:
-            with waiting(f"meshing {body.args.input}"):
-                body.subject = find_body(body)
-        duration, count = _frames(shared, bodies, touched)
-        started = WATCH.clock()
-        for found in inputs:
-            find_patches(found)
-        for body in bodies:
-            make_body(body, duration, alone=len(bodies) == 1)
-        place_ground(touched, shared, bodies, gravity_of(shared, bodies[0].subject))
-        if chooses:
-            choose_steps(shared, bodies, touched, device)
-        with waiting("preparing the simulation"):
-            sim = make_simulation(shared, bodies, touched, others)
-            say_overlaps(touched, bodies, sim)
-            say_reach(bodies, sim)
-        for body in bodies:
-            press_patches(sim, body.soft, body.loads, body.patches, ramp_of(shared, duration))
-        probes = [Probe(text, body.soft, body.patches) for body in bodies for text in body.probes]
+    tell_compiling(device)
+    begin_loading(_modules(bodies, touches or touched.contact is not None, chooses, device), device)
+    for body in bodies:
+        with waiting(f"meshing {body.args.input}"):
+            body.subject = find_body(body)
+    duration, count = _frames(shared, bodies, touched)
+    started = WATCH.clock()
+    for found in inputs:
+        find_patches(found)
+    for body in bodies:
+        make_body(body, duration, alone=len(bodies) == 1)
+    place_ground(touched, shared, bodies, gravity_of(shared, bodies[0].subject))
+    if chooses:
+        choose_steps(shared, bodies, touched, device)
+    with waiting("preparing the simulation"):
+        sim = make_simulation(shared, bodies, touched, others)
+        say_overlaps(touched, bodies, sim)
+        say_reach(bodies, sim)
+    for body in bodies:
+        press_patches(sim, body.soft, body.loads, body.patches, ramp_of(shared, duration))
+    probes = [Probe(text, body.soft, body.patches) for body in bodies for text in body.probes]
     bodies[0].subject.times["body"] = WATCH.clock() - started
     steps = 1.0 / (shared.fps * sim.dt)
     if steps > MANY_STEPS:

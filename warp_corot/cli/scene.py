@@ -14,7 +14,7 @@ from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.device import checked_device
 from warp_corot.inputs.stopwatch import WATCH
 
-from .compiling import compiling_said
+from .compiling import tell_compiling
 from .exit_status import complain, early_end
 from .implicit import unfinished
 from .summary import aligned, milliseconds, pressure, speed, wall_time
@@ -59,17 +59,17 @@ def run(args: argparse.Namespace) -> int:
         frame_count(args.duration, args.fps)
     PieceStore(args.output)  # checks the path, and writes nothing before the first frame
     device = checked_device(args.device)
-    with compiling_said(device):
-        sim = StageSimulation(
-            args.input,
-            fps=args.fps,
-            dt=args.dt,
-            options=options,
-            damping=args.damping,
-            rigid=args.rigid,
-            integrator=args.integrator,
-            device=device,
-        )
+    tell_compiling(device)
+    sim = StageSimulation(
+        args.input,
+        fps=args.fps,
+        dt=args.dt,
+        options=options,
+        damping=args.damping,
+        rigid=args.rigid,
+        integrator=args.integrator,
+        device=device,
+    )
     count = frame_count(args.duration, sim.fps)
     writer = sim.writer(args.output, show_stress=args.show_stress, flatten=args.flatten)
     shortened = None if args.dt is None else shortening(args.dt, sim.fps)

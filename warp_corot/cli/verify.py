@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
     from warp_corot.inputs.device import checked_device
     from warp_corot.simulation.progress import hidden
 
-    from .compiling import compiling_said
+    from .compiling import tell_compiling
 
     if args.list:
         for case in CASES.values():
@@ -49,7 +49,8 @@ def run(args: argparse.Namespace) -> int:
     told: list[dict[str, Any]] = []
     took = 0.0
     print(HEAD + "source")
-    with compiling_said(device), hidden():
+    tell_compiling(device)
+    with hidden():
         for name in names:
             rows, seconds = run_case(name, setup)
             for row in rows:

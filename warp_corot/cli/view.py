@@ -18,7 +18,6 @@ from warp_corot.elasticity.dilatation import AUTO
 from warp_corot.errors import InputError
 from warp_corot.materials.isotropic import Isotropic
 
-from .compiling import compiling_said
 from .exit_status import interrupt_status
 from .loading import ramp_of
 from .pressing import press_patches
@@ -44,17 +43,16 @@ def run(args: argparse.Namespace) -> int:
     check_port(args.host, args.port)
     asked = bodies_of(args)
     ready = set_up(asked, touches=True)
-    with compiling_said(ready.sim.device):
-        page = View(
-            ready.sim,
-            host=args.host,
-            port=args.port,
-            token=args.token,
-            own=[body.subject.skin or body.subject.surface for body in ready.bodies],
-            made=lambda sim: _carry_over(ready, asked[0], sim),
-            run_file=lambda sim: run_text(asked, sim),
-            title=names_of(ready.bodies),  # stiffness and weight may change on the page
-        )
+    page = View(
+        ready.sim,
+        host=args.host,
+        port=args.port,
+        token=args.token,
+        own=[body.subject.skin or body.subject.surface for body in ready.bodies],
+        made=lambda sim: _carry_over(ready, asked[0], sim),
+        run_file=lambda sim: run_text(asked, sim),
+        title=names_of(ready.bodies),  # stiffness and weight may change on the page
+    )
     try:
         print(f"the page is at {page.address} (Ctrl-C ends it)", flush=True)
         page.run()
