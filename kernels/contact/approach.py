@@ -23,15 +23,15 @@ from .motion import Bearing, Foreseen, Motions, Surface, distance_between
 from .near import BESIDE, FAR, Near
 from .shapes import GROUND, distance_to, sure_distance
 from .touches import Touches
-from .vertices import FORESEEN, Rigid
+from .vertices import FORESEEN, OUT, Rigid
 from .watch import FARTHEST, Watch, begin_obstacle, pair_of
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINED})
 
 #: The phases of a visit.
 CHOOSE, CARRY, PLACE, CORNERS, LIMIT = (wp.constant(k) for k in range(5))
-#: A flag for places that were not visited in the step before.
-LATE = wp.constant(16)
+#: Flags for places that were not visited in the step before, and for those that may touch something in this one.
+LATE, LISTED = wp.constant(16), wp.constant(32)
 #: A triangle is visited within this many of its longest edges of an obstacle; all of it is within 0.58 of one of a
 #: corner. Nearer to an obstacle than LONG edges at rest the edges are measured, and nodes may go by GROWN of the
 #: longest one until they are again.
@@ -64,6 +64,10 @@ class Visits:
     count: wp.array[wp.int32]  # [1] the number of steps, ever
     places: wp.array[wp.int32]  # [S] that number at the last visit to a place
     touches: wp.array[wp.int32]  # [O T] the same for an obstacle and a triangle
+    chosen: wp.array[wp.int32]  # [S] the places that are visited in this step
+    chosen_count: wp.array[wp.int32]  # [1]
+    contacts: wp.array[wp.int32]  # [O S] contacts at places that may act, by their numbers in ``mass_split``
+    contact_count: wp.array[wp.int32]  # [1]
     carriers: wp.array[wp.int32]  # [N] that number when the motion of a carrier was found last
     due: wp.array[wp.int32]  # [N] those that are due
     due_count: wp.array[wp.int32]  # [1]
@@ -162,6 +166,8 @@ def begin_visits(
             visits.touches[pair] = 0
     here.count[0] = 0
     here.touch_count[0] = kept
+    visits.chosen_count[0] = 0
+    visits.contact_count[0] = 0
     visits.due_count[0] = 0
     visits.carrying_count[0] = 0
     number = pace.counts[DONE] + wp.int64(offset)
@@ -183,30 +189,46 @@ def begin_visits(
 @wp.func_native(
     on_cpu(
         """
-    const four x = {start[0], start[1], start[2], 0.0f}, g = {gravity[0], gravity[1], gravity[2], 0.0f};
-    const auto at = [i](const auto& a) { return *reinterpret_cast<const four*>(&wp::index(a, i)); };
-    const four gone = at(u) - x, kicked = (at(v) + kick * (w * at(f) + g)) * damped;
-    const four goes = w > 0.0f ? kicked : at(v), sum = gone * gone + (ahead * ahead) * goes * goes;
-    return 2.0f * (sum[0] + sum[1] + sum[2]);
+    const int* nodes = &wp::index(node, 0);
+    const float* w = &wp::index(inverse_mass, 0);
+    const auto first = [](const auto& a) { return reinterpret_cast<const four*>(&wp::index(a, 0)); };
+    const four *from = first(budgets), *forces = first(f), *at = first(u), *speeds = first(v);
+    const four g = {gravity[0], gravity[1], gravity[2], 0.0f};
+    for (; n < end; ++n) {
+        const int i = nodes[n];
+        if (i < 0) continue;
+        const four gone = at[i] - from[n], kicked = (speeds[i] + kick * (w[i] * forces[i] + g)) * damped;
+        const four goes = w[i] > 0.0f ? kicked : speeds[i], sum = gone * gone + (ahead * ahead) * goes * goes;
+        const float left = from[n][3] - used;
+        // The square of a sum of two is at most twice the sum of their squares.
+        if (!(left > 0.0f && 2.0f * (sum[0] + sum[1] + sum[2]) <= left * left)) break;
+    }
+    return n;
 """,
-        otherwise="return 0.0f;\n",
+        otherwise="return end;\n",
     )
 )
-def squared_way(
-    i: int,
-    start: wp.vec4,
+def next_due(
+    n: int,
+    end: int,
+    used: float,
     kick: float,
     damped: float,
     ahead: float,
-    w: float,
     gravity: wp.vec3,
+    node: wp.array[wp.int32],
+    budgets: wp.array[wp.vec4],
+    inverse_mass: wp.array[wp.float32],
     f: wp.array[wp.vec4],
     u: wp.array[wp.vec4],
     v: wp.array[wp.vec4],
-) -> float:
-    """A bound on the square of how far a node has gone and goes in a time ``ahead`` without contact and loads [m^2].
+) -> int:
+    """The next carrier from n on that may be due without loads; most are not, and need no roots.
 
-    The square of a sum of two is at most twice the sum of their squares.
+    Args:
+        used: How much of the budgets is used by other motion [m].
+        kick, damped: As in ``foreseen``.
+        ahead: How long nodes go on as in this step [s].
     """
     ...
 
@@ -255,28 +277,30 @@ def find_due(
     damped = 1.0 / (1.0 + dt * damping)
     used = visits.came[0] + AHEAD * visits.came[1] + watch.least[0]
     is_first = visits.is_first[0] != 0
-    for n in range(begin, end):
-        i = nodes.node[n]
-        if i >= 0:
+    n = int(begin)
+    while n < end:
+        if not is_first and has_load == 0:
+            n = next_due(
+                n, end, used, kick, damped, AHEAD * dt, gravity, nodes.node, visits.budgets, inverse_mass, f, u, v
+            )
+        if n < end and nodes.node[n] >= 0:
+            i = nodes.node[n]
             budget = visits.budgets[n]
-            left = budget[3] - used
-            way = squared_way(i, budget, kick, damped, AHEAD * dt, inverse_mass[i], gravity, f, u, v)
-            # Most nodes pass this test, without roots.
-            if is_first or has_load != 0 or not (left > 0.0 and way <= left * left):
-                own = foreseen(i, damping, gravity, inverse_mass, has_load, load, pace, offset, rest, f, u, v)
-                gone = wp.length(load_node(u, i) - wp.vec3(budget[0], budget[1], budget[2]))
-                goes = AHEAD * wp.length(own.d)
-                if is_first or not (gone + goes <= left):
-                    visits.carriers[n] = visits.count[0]
-                    know(n, own, nodes, visits)
-                    visits.needs[n] = goes + used
-                    way = wp.where(is_first, 0.0, visits.ways[n] + gone)
-                    visits.ways[n] = way
-                    visits.budgets[n] = start_at(load_node(u, i), FAR)
-                    if way > FARTHEST_WAY * watch.size:
-                        visits.step[0] = wp.int64(-2)  # all places are visited in the next step
-                    append(visits.due, visits.due_count, n, visits.is_shared)
-                    watch.awake[0] = 1
+            own = foreseen(i, damping, gravity, inverse_mass, has_load, load, pace, offset, rest, f, u, v)
+            gone = wp.length(load_node(u, i) - wp.vec3(budget[0], budget[1], budget[2]))
+            goes = AHEAD * wp.length(own.d)
+            if is_first or not (gone + goes <= budget[3] - used):
+                visits.carriers[n] = visits.count[0]
+                know(n, own, nodes, visits)
+                visits.needs[n] = goes + used
+                way = wp.where(is_first, 0.0, visits.ways[n] + gone)
+                visits.ways[n] = way
+                visits.budgets[n] = start_at(load_node(u, i), FAR)
+                if way > FARTHEST_WAY * watch.size:
+                    visits.step[0] = wp.int64(-2)  # all places are visited in the next step
+                append(visits.due, visits.due_count, n, visits.is_shared)
+                watch.awake[0] = 1
+        n += 1
 
 
 @wp.kernel(enable_backward=False)
@@ -294,7 +318,7 @@ def choose(s: int, here: Near, visits: Visits):
     was = visits.places[s]
     if not claim(visits.places, s, visits.count[0], visits.is_shared):
         return False
-    append(here.nodes, here.count, s, visits.is_shared)
+    append(visits.chosen, visits.chosen_count, s, visits.is_shared)
     here.flags[s] = BESIDE | wp.where(was + 1 < visits.count[0], LATE, 0)
     return True
 
@@ -390,10 +414,11 @@ def room_beside(
     visits: Visits,
     here: Near,
 ):
-    """How far a place may go before it or a triangle around it may touch an obstacle [m]; triangles that may in this
-    step are listed."""
+    """How far a place may go before it or a triangle around it may touch an obstacle [m]; those that may are listed."""
     surface = rigid.surface
     x = surface.x[s]
+    close = FORESEEN * (wp.length(surface.d[s]) + visits.came[1])
+    may_touch = bool(False)
     farthest = FARTHEST * watch.size
     room = float(farthest)
     for o in range(rigid.forces.shape[0]):
@@ -403,7 +428,12 @@ def room_beside(
         pose = rigid.motions.now[surface.world[s], o]
         distance, _n = distance_to(rigid.shapes, o, pose, x, room + span + rigid.law.tolerance)
         gap = sure_distance(rigid.shapes, o, distance) - rigid.law.tolerance
-        if rigid.allowance[o, s] != 0.0 or wp.length_sq(rigid.forces[o, s]) > 0.0:
+        # A place that could act in the last step is found once more.
+        holds = rigid.allowance[o, s] != 0.0 or wp.length_sq(rigid.forces[o, s]) > 0.0
+        if gap <= close or rigid.acts[o, s] != OUT or holds:
+            may_touch = True
+            append(visits.contacts, visits.contact_count, o * surface.node.shape[0] + s, visits.is_shared)
+        if holds:
             gap = wp.min(gap, 0.0)
         elif gap < -watch.least[0] and (here.flags[s] & LATE) != 0 and visits.may_miss[0] != 0:
             wp.atomic_add(watch.missed, 0, 1)
@@ -412,12 +442,14 @@ def room_beside(
         else:
             longest = longest_edge(s, x, 1.0, triangles, corner_starts, corners, nodes, surface, u)
             room = wp.min(room, wp.min(gap - longest, GROWN * longest))
-            close = FORESEEN * (wp.length(surface.d[s]) + visits.came[1]) + watch.least[0]
-            if gap <= COVERED * longest + close:
+            if gap <= COVERED * longest + close + watch.least[0]:
                 for c in range(corner_starts[s], corner_starts[s + 1]):
                     pair = o * triangles.shape[0] + corners[c] / 3
                     if claim(visits.touches, pair, 1, visits.is_shared):
                         append(here.touches, here.touch_count, pair, visits.is_shared)
+    if may_touch:
+        here.flags[s] = here.flags[s] | LISTED
+        append(here.nodes, here.count, s, visits.is_shared)
     return wp.max(room, 0.0)
 
 
@@ -458,7 +490,7 @@ def visit(
         first, last: The phases.
         has_edges: Whether an obstacle can pass between nodes.
         nodes: The carriers.
-        here: What this step visits.
+        here: What may touch in this step.
     """
     surface = rigid.surface
     are_borne = surface.bearing.bearers.shape[0] > 0
@@ -476,16 +508,16 @@ def visit(
                 choose(n, here, visits)
     if first <= CARRY and last >= CARRY:
         k = int(thread)
-        while k < here.count[0]:
-            s = here.nodes[k]
+        while k < visits.chosen_count[0]:
+            s = visits.chosen[k]
             k += threads
             carry(
                 s, damping, gravity, inverse_mass, has_load, load, pace, offset, rest, f, u, v, nodes, surface, visits
             )
     if first <= PLACE and last >= PLACE:
         k = int(thread)
-        while k < here.count[0]:
-            s = here.nodes[k]
+        while k < visits.chosen_count[0]:
+            s = visits.chosen[k]
             k += threads
             if are_borne:
                 find_borne(s, nodes, surface)
@@ -511,7 +543,9 @@ def visit(
                     )  # fmt: skip
                     if are_borne:
                         find_borne(s, nodes, surface)
-
+                if (here.flags[s] & LISTED) == 0:
+                    here.flags[s] = here.flags[s] | LISTED
+                    append(here.nodes, here.count, s, visits.is_shared)
     if last == LIMIT and are_borne:
         k = int(thread)
         while k < visits.due_count[0]:

@@ -13,7 +13,6 @@ iterations of a step in one launch.
 import warp as wp
 
 from warp_corot.kernels.elements.simd8 import on_cpu
-from warp_corot.kernels.modules import INLINED
 from warp_corot.kernels.stepping.pace import DT, Pace
 from warp_corot.kernels.stepping.threads import spread_thread, synchronize_blocks, synchronize_grid
 
@@ -27,7 +26,7 @@ from .supports import MOSTLY, left_between
 from .touches import Touches, find_touch
 from .vertices import ACTS, BEGINS, ENDS, OUT, WAITS, Rigid, across, anchor, begin_place
 
-wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINED})
+wp.set_module_options({"enable_backward": False})
 
 #: Number of threads of a block on CUDA: few, because the work of few contacts takes its time in the exchange of one
 #: multiprocessor with memory.
@@ -507,27 +506,3 @@ def solve_contacts(
         while k < near.count[0]:
             end_place(near.nodes[k], iterations % 2, near, all, sums)
             k += threads
-
-
-# --- results ---------------------------------------------------------------------------------------------------------
-
-
-@wp.kernel(enable_backward=False)
-def add_pairs(grain: float, rows: Rows, forces: wp.array[wp.vec3l]):
-    """Add the forces of pairs to their places."""
-    row = wp.tid()
-    if row < row_count(rows) and rows.acts[row] != 0:
-        for k in range(4):
-            if rows.shares[row][k] != 0.0:
-                wp.atomic_add(forces, rows.places[row][k], grains_of(rows.shares[row][k] * rows.force[row], grain))
-
-
-@wp.kernel(enable_backward=False)
-def place_forces(grain: float, totals: wp.array2d[wp.vec3], forces: wp.array[wp.vec3l], surface: Surface):
-    """Find the force at each place: those of pairs, which become zero, and those of obstacles."""
-    s = wp.tid()
-    force = force_of(forces[s], grain)
-    forces[s] = wp.vec3l()
-    for o in range(totals.shape[0]):
-        force += totals[o, s]
-    surface.f[s] = force

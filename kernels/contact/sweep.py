@@ -79,6 +79,8 @@ def sweep_contacts(
     are_separate: int,
     awake: wp.array[wp.int32],
     near: Near,
+    listed: wp.array[wp.int32],
+    listed_count: wp.array[wp.int32],
     pace: Pace,
     # In and out
     all: Contacts,
@@ -89,15 +91,27 @@ def sweep_contacts(
 
     Args:
         threads, thread: The number of threads, each of which has a launch of its own, and this one.
+        listed, listed_count: The contacts of obstacles at places that may act, and how many there are; empty: any.
         records: Memory for as many contacts as there usually are.
     """
     if awake[0] == 0:
         return
     dt = float(pace.seconds[DT])
     if first == LOCATE:
+        # Instead of all obstacles at all places that are near.
+        beside = near.count[0] * all.rigid.forces.shape[0]
+        count = contact_count(near, all)
+        if listed.shape[0] > 0:
+            count += listed_count[0] - beside
         k = int(thread)
-        while k < contact_count(near, all):
-            number = number_of(k, near, all)
+        while k < count:
+            number = int(-1)
+            if listed.shape[0] == 0:
+                number = number_of(k, near, all)
+            elif k < listed_count[0]:
+                number = listed[k]
+            else:
+                number = number_of(k - listed_count[0] + beside, near, all)
             may_act = int(0)
             if number >= 0:
                 may_act = locate(number, dt, all, sums)

@@ -29,7 +29,7 @@ class Approach:
         regions: The threads.
 
     Attributes:
-        here: What the last step has visited.
+        here: What may have touched an obstacle in the last step.
     """
 
     def __init__(
@@ -62,7 +62,9 @@ class Approach:
             visits.came = wp.zeros(2, dtype=wp.float32, device=device)
             visits.step = wp.zeros(1, dtype=wp.int64, device=device)
             sizes = {"places": places, "touches": touches, "carriers": carriers, "due": carriers, "carrying": carriers}
-            alone = dict.fromkeys(("is_first", "may_miss", "count", "due_count", "carrying_count"), 1)
+            sizes |= {"chosen": places, "contacts": self._rigid.forces.size}
+            counts = ("chosen_count", "contact_count", "due_count", "carrying_count")
+            alone = dict.fromkeys(("is_first", "may_miss", "count", *counts), 1)
             for name, size in (sizes | alone).items():
                 setattr(visits, name, wp.zeros(size, dtype=wp.int32, device=device))
             visits.is_shared = int(self._regions.team.parts > 1)
@@ -149,7 +151,7 @@ class Approach:
         last = int(kernels.LIMIT)
         spans = [(0, last)] if threads == 1 else [(phase, phase) for phase in range(last + 1)]
         self._regions.launch((kernels.visit, offset), *(partial(visit, *span) for span in spans))
-        self._split.launch(self.here)
+        self._split.launch(self.here, (self._visits.contacts, self._visits.contact_count))
         state.contact_forces.zero_()
 
         def end(part: int) -> None:

@@ -8,6 +8,7 @@ import warp as wp
 
 from warp_corot.inputs.cpu_threads import Regions, Team, launch
 from warp_corot.kernels.contact import mass_split as kernels
+from warp_corot.kernels.contact import sums
 from warp_corot.kernels.contact.law import Law
 from warp_corot.kernels.contact.near import Near
 from warp_corot.kernels.contact.rows import Meeting, Rows
@@ -67,6 +68,7 @@ class MassSplit:
         self._rigid, self._pairs, self._taken = rigid, pairs, (-1, -1)
         self._regions = Regions(team, self.device)
         alone = pairs is None and not surface.is_borne and (rigid is None or rigid.is_separate)
+        self._none = wp.zeros(0, dtype=wp.int32, device=self.device)
         self._are_separate, self.iterations = alone, EXACT if alone else ITERATIONS
         self.follow()
 
@@ -116,9 +118,13 @@ class MassSplit:
         part = self.surface.parts[k]
         return self.surface.count + part.bearer_start if part.bearers else part.start
 
-    def launch(self, near: Near | None = None) -> None:
-        """Launch all phases of a step for what is near; None: what the last search has found."""
-        near = near or self._search.near
+    def launch(self, near: Near | None = None, listed: tuple[wp.array, wp.array] | None = None) -> None:
+        """Launch all phases of a step for what is near; None: what the last search has found.
+
+        Args:
+            listed: The contacts of obstacles at places that may act, and how many there are; None: any.
+        """
+        near, self._listed = near or self._search.near, listed or (self._none, self._none)
         last = self.iterations + 1
         if self._shared.ranks.is_alone:
             spans = [(0, last)] if self._is_one else [(phase, phase) for phase in range(last + 1)]
@@ -147,9 +153,9 @@ class MassSplit:
         forces, arrays = self.sums.forces[0], self.surface.arrays
         if self._pairs is not None:
             inputs = [self._law.grain, self._pairs.rows]
-            wp.launch(kernels.add_pairs, self._pairs.room, inputs, [forces], device=self.device, block_dim=BLOCK)
+            wp.launch(sums.add_pairs, self._pairs.room, inputs, [forces], device=self.device, block_dim=BLOCK)
         inputs = [self._law.grain, totals, forces]
-        wp.launch(kernels.place_forces, self.surface.count, inputs, [arrays], device=self.device, block_dim=BLOCK)
+        wp.launch(sums.place_forces, self.surface.count, inputs, [arrays], device=self.device, block_dim=BLOCK)
 
     def _launch(self, near: Near, first: int, last: int, part: int) -> None:
         contacts = kernels.Contacts()
@@ -167,8 +173,8 @@ class MassSplit:
         inputs: list = [first, last, self.iterations, int(self._are_separate), search.watch.awake, near, self._pace]
         outputs = [contacts, self.sums]
         if self.device.is_cpu:
-            inputs, outputs = [self._threads, part, *inputs], [contacts, self._records, self.sums]
-            launch(sweep_contacts, 1, inputs, outputs, device=self.device)
+            inputs = [self._threads, part, *inputs[:-1], *self._listed, inputs[-1]]
+            launch(sweep_contacts, 1, inputs, [contacts, self._records, self.sums], device=self.device)
         else:
             dim, block = self._threads, min(self._threads, BLOCK)
             wp.launch(kernels.solve_contacts, dim, [dim, *inputs], outputs, device=self.device, block_dim=block)
