@@ -57,14 +57,9 @@ def place_among(place: Foreseen, weight: float, own: Foreseen):
     return place
 
 
-@wp.kernel(enable_backward=False)
-def place_borne(start: int, bearers: Surface, surface: Surface):
-    """Find the positions of borne places of a body, and their motion in this step without contact."""
-    s = start + wp.tid()
-    surface.f[s] = wp.vec3()
-    surface.yielding[s] = 0.0
-    if surface.node[s] < 0:
-        return
+@wp.func
+def find_borne(s: int, bearers: Surface, surface: Surface):
+    """Find the position of a borne place, and its motion in this step without contact."""
     b = surface.bearing.bearers[s]
     w = surface.bearing.weights[s]
     place = Foreseen()
@@ -82,6 +77,16 @@ def place_borne(start: int, bearers: Surface, surface: Surface):
     surface.yielding[s] = place.yielding
     surface.bearing.loose[s] = wp.clamp(place.loose, 0.0, 1.0)
     surface.bearing.held[s] = place.held
+
+
+@wp.kernel(enable_backward=False)
+def place_borne(start: int, bearers: Surface, surface: Surface):
+    """Find the positions of borne places of a body, and their motion in this step without contact."""
+    s = start + wp.tid()
+    surface.f[s] = wp.vec3()
+    surface.yielding[s] = 0.0
+    if surface.node[s] >= 0:
+        find_borne(s, bearers, surface)
 
 
 @wp.func

@@ -10,7 +10,7 @@ from warp_corot.kernels.stepping.pace import Pace
 from warp_corot.kernels.stepping.work import count_constraint
 
 from .begin import BLOCK as BLOCK
-from .mass_split import Sums, force_of
+from .mass_split import Sums, take_force
 from .motion import Surface
 from .watch import Watch, follow_node
 
@@ -62,11 +62,7 @@ def end_contact(
             force = wp.vec3()
             n = s + shift
             if watch.awake[0] != 0 and sums.touched[n] != 0:
-                force = force_of(sums.forces[buffer, n], grain)
-                sums.touched[n] = 0
-                for other in range(2):
-                    sums.weights[other, n] = 0
-                    sums.forces[other, n] = wp.vec3l()
+                force = take_force(n, buffer, grain, sums)
             store_node(contact_forces, i, force)
             if wp.dot(force, force) > 0.0:
                 total = load_node(f, i) + force

@@ -13,7 +13,6 @@ iterations of a step in one launch.
 import warp as wp
 
 from warp_corot.kernels.elements.simd8 import on_cpu
-from warp_corot.kernels.modules import INLINED
 from warp_corot.kernels.stepping.pace import DT, Pace
 from warp_corot.kernels.stepping.threads import spread_thread, synchronize_blocks, synchronize_grid
 
@@ -27,7 +26,7 @@ from .supports import MOSTLY, left_between
 from .touches import Touches, find_touch
 from .vertices import ACTS, BEGINS, ENDS, OUT, WAITS, Rigid, across, anchor, begin_place
 
-wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINED})
+wp.set_module_options({"enable_backward": False})
 
 #: Number of threads of a block on CUDA: few, because the work of few contacts takes its time in the exchange of one
 #: multiprocessor with memory.
@@ -270,6 +269,17 @@ def add(contact: Contact, times: int, force: wp.vec3, buffer: int, grain: float,
 
 
 @wp.func
+def take_force(n: int, buffer: int, grain: float, sums: Sums):
+    """The force at a node at the end of a step [N], of which the sums become zero."""
+    force = force_of(sums.forces[buffer, n], grain)
+    sums.touched[n] = 0
+    for other in range(2):
+        sums.weights[other, n] = 0
+        sums.forces[other, n] = wp.vec3l()
+    return force
+
+
+@wp.func
 def pushed(parents: Parents, buffer: int, grain: float, sums: Sums):
     """How far the forces of a buffer move a place in this step [m]; and how far it moves for each unit of force if all
     contacts at its nodes push in proportion to their weights [m/N].
@@ -364,11 +374,51 @@ def iterate(contact: Contact, before: int, law: Law, surface: Surface, sums: Sum
     return contact
 
 
+@wp.func
+def contact_count(near: Near, all: Contacts):
+    """How many contacts there may be in this step."""
+    return near.count[0] * all.rigid.forces.shape[0] + near.touch_count[0] + row_count(all.rows)
+
+
+@wp.func
+def number_of(k: int, near: Near, all: Contacts):
+    """The number of the k-th of them; -1 for a place that no obstacle is near."""
+    obstacles = all.rigid.forces.shape[0]
+    beside = near.count[0] * obstacles
+    touches = beside + near.touch_count[0]
+    number = int(-1)
+    if k < beside:
+        s = near.nodes[k // obstacles]
+        if (near.flags[s] & BESIDE) != 0:
+            number = (k % obstacles) * all.rigid.surface.node.shape[0] + s
+    elif k < touches:
+        number = all.first_triangle + near.touches[k - beside]
+    elif k < touches + row_count(all.rows):
+        number = all.first_pair + k - touches
+    return number
+
+
+@wp.func
+def end_place(s: int, buffer: int, near: Near, all: Contacts, sums: Sums):
+    """Find where a place goes in this step, and update its anchors."""
+    surface = all.rigid.surface
+    d, _compliance = pushed(parents_of(s, surface), buffer, all.rigid.law.grain, sums)
+    surface.d[s] = surface.d[s] + d
+    if (near.flags[s] & BESIDE) != 0:
+        anchor(s, all.rigid)
+
+
+@wp.func
+def clear_lists(sums: Sums):
+    sums.arrived[1] = wp.uint64(0)
+    sums.live_count[1] = sums.live_count[0]
+    sums.live_count[0] = 0
+
+
 @wp.kernel(enable_backward=False, grid_stride=False, launch_bounds=(64, 4))
 def solve_contacts(
     # In
     threads: int,
-    begin: int,
     first: int,
     last: int,
     iterations: int,
@@ -381,42 +431,28 @@ def solve_contacts(
     sums: Sums,
 ):
     """Make some phases of a step: the first one finds all contacts, then there are the iterations, and the last one
-    finds where places go and updates anchors.
+    finds where places go and updates anchors. For CUDA; see ``sweep`` for the CPU.
 
     Args:
-        threads: The number of threads, of blocks that are all resident on CUDA.
-        begin: The number of the launch's first thread; on the CPU each is a launch of its own.
+        threads: The number of threads, of blocks that are all resident.
         first, last: The phases, from 0 to ``iterations`` + 1.
         awake: Whether contact is awake, [1]; there are no contacts if it is not.
         are_separate: Whether no two contacts share a node: places that are nodes, and one obstacle. Then a thread goes
             through all phases of a place by itself.
     """
-    thread = begin + wp.tid()
+    thread = wp.tid()
     if awake[0] == 0:
         return
     dt = float(pace.seconds[DT])
     surface = all.rigid.surface
     law = all.rigid.law
-    obstacles = all.rigid.forces.shape[0]
     start = spread_thread(thread, threads, BLOCK)
     k = int(start)
     if first == LOCATE:
-        beside = near.count[0] * obstacles
-        touches = beside + near.touch_count[0]
-        count = touches + row_count(all.rows)
-        places = surface.node.shape[0]
         # Warps stay together.
-        beyond = count + wp.where(threads > 1, thread % WARP, 0)
+        beyond = contact_count(near, all) + wp.where(threads > 1, thread % WARP, 0)
         while k < beyond:
-            number = int(-1)
-            if k < beside:
-                s = near.nodes[k // obstacles]
-                if (near.flags[s] & BESIDE) != 0:
-                    number = (k % obstacles) * places + s
-            elif k < touches:
-                number = all.first_triangle + near.touches[k - beside]
-            elif k < count:
-                number = all.first_pair + k - touches
+            number = number_of(k, near, all)
             may_act = int(0)
             if number >= 0:
                 may_act = locate(number, dt, all, sums)
@@ -465,38 +501,8 @@ def solve_contacts(
         if first < last and are_separate == 0:
             synchronize_grid(sums.arrived)
         if thread == 0:
-            sums.arrived[1] = wp.uint64(0)
-            sums.live_count[1] = sums.live_count[0]
-            sums.live_count[0] = 0
+            clear_lists(sums)
         k = int(start)
         while k < near.count[0]:
-            s = near.nodes[k]
-            d, _compliance = pushed(parents_of(s, surface), iterations % 2, law.grain, sums)
-            surface.d[s] = surface.d[s] + d
-            if (near.flags[s] & BESIDE) != 0:
-                anchor(s, all.rigid)
+            end_place(near.nodes[k], iterations % 2, near, all, sums)
             k += threads
-
-
-# --- results ---------------------------------------------------------------------------------------------------------
-
-
-@wp.kernel(enable_backward=False)
-def add_pairs(grain: float, rows: Rows, forces: wp.array[wp.vec3l]):
-    """Add the forces of pairs to their places."""
-    row = wp.tid()
-    if row < row_count(rows) and rows.acts[row] != 0:
-        for k in range(4):
-            if rows.shares[row][k] != 0.0:
-                wp.atomic_add(forces, rows.places[row][k], grains_of(rows.shares[row][k] * rows.force[row], grain))
-
-
-@wp.kernel(enable_backward=False)
-def place_forces(grain: float, totals: wp.array2d[wp.vec3], forces: wp.array[wp.vec3l], surface: Surface):
-    """Find the force at each place: those of pairs, which become zero, and those of obstacles."""
-    s = wp.tid()
-    force = force_of(forces[s], grain)
-    forces[s] = wp.vec3l()
-    for o in range(totals.shape[0]):
-        force += totals[o, s]
-    surface.f[s] = force

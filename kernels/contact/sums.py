@@ -4,7 +4,9 @@ import warp as wp
 
 from warp_corot.kernels.stepping.balance import sum_of_lanes
 
+from .mass_split import force_of, grains_of
 from .motion import Motions, Surface
+from .rows import Rows, row_count
 from .shapes import Shapes, distance_to
 from .touches import Touches
 from .vertices import Rigid
@@ -196,3 +198,24 @@ def forget_places(
         if corner >= 0 and chosen[rigid.surface.world[corner]] != 0:
             touches.force[o, k] = wp.vec3()
             touches.allowance[o, k] = 0.0
+
+
+@wp.kernel(enable_backward=False)
+def add_pairs(grain: float, rows: Rows, forces: wp.array[wp.vec3l]):
+    """Add the forces of pairs to their places."""
+    row = wp.tid()
+    if row < row_count(rows) and rows.acts[row] != 0:
+        for k in range(4):
+            if rows.shares[row][k] != 0.0:
+                wp.atomic_add(forces, rows.places[row][k], grains_of(rows.shares[row][k] * rows.force[row], grain))
+
+
+@wp.kernel(enable_backward=False)
+def place_forces(grain: float, totals: wp.array2d[wp.vec3], forces: wp.array[wp.vec3l], surface: Surface):
+    """Find the force at each place: those of pairs, which become zero, and those of obstacles."""
+    s = wp.tid()
+    force = force_of(forces[s], grain)
+    forces[s] = wp.vec3l()
+    for o in range(totals.shape[0]):
+        force += totals[o, s]
+    surface.f[s] = force

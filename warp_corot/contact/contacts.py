@@ -18,6 +18,7 @@ from warp_corot.solvers.halo import ALONE
 from warp_corot.solvers.system import System
 
 from .active_set import ActiveSet
+from .approach import Approach
 from .borne_set import BorneSet
 from .carried import CarriedForces
 from .joined_rows import JoinedRows
@@ -110,8 +111,13 @@ class Contacts:
         #: The forces of explicit steps.
         self.split = MassSplit(*given)
         self._is_explicit = False
-        #: Steps while nothing is near; None where the device cannot leave anything out.
-        self.sleep = Sleep(system, made, self.obstacles, self.search) if self.search.can_sleep else None
+        #: Steps that visit only what may touch an obstacle; None on CUDA, between soft surfaces and over ranks.
+        self.approach: Approach | None = None
+        if self.device.is_cpu and self.rigid is not None and self.pairs is None and system.ranks.is_alone:
+            self.approach = Approach(system, made, self.search, self.rigid, self.split, self._regions)
+        #: Steps while nothing is near; None where the device cannot leave anything out, or nothing is searched for.
+        can_sleep = self.approach is None and self.search.can_sleep
+        self.sleep = Sleep(system, made, self.obstacles, self.search) if can_sleep else None
         self._revision = 0
         self._is_looked_at = self._has_crushed = False
         self._make_arrays()
@@ -153,6 +159,8 @@ class Contacts:
 
     def forget(self) -> None:
         self.search.forget()
+        if self.approach is not None:
+            self.approach.forget()
         if self.pairs is not None:
             self.pairs.forget()
 
@@ -184,7 +192,12 @@ class Contacts:
         self._has_crushed = self._has_crushed or warn_of_crushed(self)
 
     def launch(self, offset: int, damping: float) -> None:
-        if self.sleep is not None:
+        self._is_explicit = True
+        if self.approach is not None:
+            self.obstacles.launch_targets()
+            accounts = self.system.constraint_accounts(0) if self.counts_work else []
+            self.approach.launch(offset, damping, accounts[0] if accounts else None)
+        elif self.sleep is not None:
             self.sleep.launch(offset, partial(self._act, offset, damping))
         else:
             self.obstacles.launch_targets()
@@ -196,7 +209,6 @@ class Contacts:
         self._predict(offset, damping, begins=True, moves=moves)
         self.search.launch(offset, follows=True, sleeps=self.sleep is not None)
         self.split.launch()
-        self._is_explicit = True
         follows = self.search.is_needed and not surface.is_whole
         for k, (body, part) in enumerate(zip(system.bodies, surface.parts, strict=True)):
             state, conditions, accounts = body.state, body.conditions, system.constraint_accounts(k)
@@ -255,7 +267,9 @@ class Contacts:
 
     def publish(self) -> None:
         surface, obstacles = self.surface, self.obstacles
-        if self.sleep is not None:
+        if self.approach is not None:
+            self.approach.launch_end()
+        elif self.sleep is not None:
             self.sleep.launch_check()
         forces = None
         if self.rigid is not None:
@@ -275,6 +289,8 @@ class Contacts:
         self.search.launch_report()
         if self._is_explicit:
             self.split.launch_place_forces(forces)
+            if self.approach is not None:
+                self.approach.launch_completion()
         inputs = [surface.arrays, surface.triangles, surface.corner_starts, surface.corners]
         self._launch(sums.node_pressures, surface.count, inputs, [self._pressures])
         self._shared.exchange(self._pressures)
@@ -330,6 +346,8 @@ class Contacts:
             self.rigid.follow()
         if self.pairs is not None:
             self.pairs.follow()
+        if self.approach is not None:
+            self.approach.follow()
 
     @property
     def smallest(self) -> float:

@@ -8,8 +8,11 @@ import warp as wp
 
 from warp_corot.inputs.cpu_threads import Regions, Team, launch
 from warp_corot.kernels.contact import mass_split as kernels
+from warp_corot.kernels.contact import sums
 from warp_corot.kernels.contact.law import Law
+from warp_corot.kernels.contact.near import Near
 from warp_corot.kernels.contact.rows import Meeting, Rows
+from warp_corot.kernels.contact.sweep import sweep_contacts
 from warp_corot.kernels.contact.touches import Touches
 from warp_corot.kernels.contact.vertices import Rigid
 from warp_corot.kernels.stepping.pace import Pace
@@ -23,6 +26,8 @@ from .surface_halo import SurfaceHalo
 #: Number of iterations if contacts share nodes, and otherwise: then the first one is exact.
 ITERATIONS, EXACT = 4, 1
 BLOCK = int(kernels.BLOCK)
+#: The most contacts that the CPU keeps ready during the iterations.
+RECORDS = 1 << 14
 #: On CUDA one launch makes all phases if there is room for so many blocks of contacts for each multiprocessor. Its
 #: blocks of threads are resident: one on each multiprocessor for few contacts, else so many; and the most blocks of
 #: other launches.
@@ -63,6 +68,7 @@ class MassSplit:
         self._rigid, self._pairs, self._taken = rigid, pairs, (-1, -1)
         self._regions = Regions(team, self.device)
         alone = pairs is None and not surface.is_borne and (rigid is None or rigid.is_separate)
+        self._none = wp.zeros(0, dtype=wp.int32, device=self.device)
         self._are_separate, self.iterations = alone, EXACT if alone else ITERATIONS
         self.follow()
 
@@ -84,6 +90,7 @@ class MassSplit:
         self.sums.live = wp.zeros(contacts, dtype=wp.int32, device=device)
         self.sums.live_count = wp.zeros(2, dtype=wp.int32, device=device)
         self.sums.arrived = wp.zeros(2, dtype=wp.uint64, device=device)
+        self._records = wp.zeros(min(contacts, RECORDS) if device.is_cpu else 0, dtype=kernels.Contact, device=device)
         #: Whether one launch makes all phases, and its threads, or those of a launch for each phase.
         self._is_one, self._threads = self._are_separate or self._regions.team.parts == 1, self._regions.team.parts
         self.sums.is_shared = int(self._regions.team.parts > 1)
@@ -97,6 +104,11 @@ class MassSplit:
             self._threads = BLOCK * min(blocks, most)
 
     @property
+    def grain(self) -> float:
+        """Forces at nodes are summed in multiples of this [N]."""
+        return self._law.grain
+
+    @property
     def buffer(self) -> int:
         """The buffer of the sums that has the forces at the end of a step."""
         return self.iterations % 2
@@ -106,16 +118,21 @@ class MassSplit:
         part = self.surface.parts[k]
         return self.surface.count + part.bearer_start if part.bearers else part.start
 
-    def launch(self) -> None:
-        """Launch all phases of a step."""
+    def launch(self, near: Near | None = None, listed: tuple[wp.array, wp.array] | None = None) -> None:
+        """Launch all phases of a step for what is near; None: what the last search has found.
+
+        Args:
+            listed: The contacts of obstacles at places that may act, and how many there are; None: any.
+        """
+        near, self._listed = near or self._search.near, listed or (self._none, self._none)
         last = self.iterations + 1
         if self._shared.ranks.is_alone:
             spans = [(0, last)] if self._is_one else [(phase, phase) for phase in range(last + 1)]
-            self._regions.launch(kernels.solve_contacts, *(partial(self._launch, *span) for span in spans))
+            self._regions.launch(kernels.solve_contacts, *(partial(self._launch, near, *span) for span in spans))
             return
         self._shared.exchange(self.surface.arrays.yielding)
         for phase in range(last + 1):
-            self._launch(phase, phase, 0)
+            self._launch(near, phase, phase, 0)
             for buffer in (0, 1) if phase == 0 else (phase % 2,):
                 self._shared.exchange(self.sums.weights[buffer])
                 self._shared.exchange(self.sums.forces[buffer])
@@ -136,11 +153,11 @@ class MassSplit:
         forces, arrays = self.sums.forces[0], self.surface.arrays
         if self._pairs is not None:
             inputs = [self._law.grain, self._pairs.rows]
-            wp.launch(kernels.add_pairs, self._pairs.room, inputs, [forces], device=self.device, block_dim=BLOCK)
+            wp.launch(sums.add_pairs, self._pairs.room, inputs, [forces], device=self.device, block_dim=BLOCK)
         inputs = [self._law.grain, totals, forces]
-        wp.launch(kernels.place_forces, self.surface.count, inputs, [arrays], device=self.device, block_dim=BLOCK)
+        wp.launch(sums.place_forces, self.surface.count, inputs, [arrays], device=self.device, block_dim=BLOCK)
 
-    def _launch(self, first: int, last: int, part: int) -> None:
+    def _launch(self, near: Near, first: int, last: int, part: int) -> None:
         contacts = kernels.Contacts()
         contacts.first_triangle, contacts.first_pair = self._at_places, self._at_places + self._at_triangles
         contacts.triangles, contacts.touches = self.surface.triangles, Touches()
@@ -153,14 +170,11 @@ class MassSplit:
         if self._pairs is not None:
             contacts.meeting, contacts.rows = self._pairs.meeting, self._pairs.rows
         search = self._search
-        inputs: list = [self._threads, part, first, last, self.iterations, int(self._are_separate)]
-        inputs += [search.watch.awake, search.near, self._pace]
-        dim = 1 if self.device.is_cpu else self._threads
-        launch(
-            kernels.solve_contacts,
-            dim,
-            inputs,
-            [contacts, self.sums],
-            device=self.device,
-            block_dim=min(dim, BLOCK),
-        )
+        inputs: list = [first, last, self.iterations, int(self._are_separate), search.watch.awake, near, self._pace]
+        outputs = [contacts, self.sums]
+        if self.device.is_cpu:
+            inputs = [self._threads, part, *inputs[:-1], *self._listed, inputs[-1]]
+            launch(sweep_contacts, 1, inputs, [contacts, self._records, self.sums], device=self.device)
+        else:
+            dim, block = self._threads, min(self._threads, BLOCK)
+            wp.launch(kernels.solve_contacts, dim, [dim, *inputs], outputs, device=self.device, block_dim=block)

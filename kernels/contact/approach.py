@@ -1,0 +1,636 @@
+"""Steps beside obstacles on the CPU that visit only what may touch: conservative advancement.
+
+A visit to a place of the surface finds how far it is from obstacles. The nodes that carry it may go as far before the
+next visit, less what obstacles have come nearer, so that a step looks at nothing but how far each of these nodes has
+gone. After Mirtich, Impulse-based dynamic simulation of rigid body systems (1996), section 2.3.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from warp_corot.kernels.elements.elements import load_node, store_node
+from warp_corot.kernels.elements.simd8 import on_cpu
+from warp_corot.kernels.modules import INLINED
+from warp_corot.kernels.stepping.integrate import by_vectors
+from warp_corot.kernels.stepping.pace import DONE, DT, Pace, length_before
+from warp_corot.kernels.stepping.work import count_constraint
+
+from .bearing import find_borne, is_borne
+from .begin import foreseen
+from .mass_split import Sums, take_force
+from .motion import Bearing, Foreseen, Motions, Surface, distance_between
+from .near import BESIDE, FAR, Near
+from .shapes import GROUND, distance_to, sure_distance
+from .touches import Touches
+from .vertices import FORESEEN, OUT, Rigid
+from .watch import FARTHEST, Watch, begin_obstacle, pair_of
+
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINED})
+
+#: The phases of a visit.
+CHOOSE, CARRY, PLACE, CORNERS, LIMIT = (wp.constant(k) for k in range(5))
+#: Flags for places that were not visited in the step before, and for those that may touch something in this one.
+LATE, LISTED = wp.constant(16), wp.constant(32)
+#: A triangle is visited within this many of its longest edges of an obstacle; all of it is within 0.58 of one of a
+#: corner. Nearer to an obstacle than LONG edges at rest the edges are measured, and nodes may go by GROWN of the
+#: longest one until they are again.
+COVERED, LONG, GROWN = wp.constant(1.3), wp.constant(8.0), wp.constant(0.3)
+#: All places are visited again before a way is longer than so many elements, of which rounding would matter.
+FARTHEST_WAY = wp.constant(4096.0)
+#: A visit is due if a carrier uses up its budget when it goes so many times its motion in the step without contact.
+AHEAD = wp.constant(2.0)
+
+
+@wp.struct
+class Visits:
+    """What steps visit. Carriers are the places, [N] = [S], or the nodes that bear them, [N] = [B]."""
+
+    # [N] a displacement, and how far the carrier may go from there before it is due, plus ``came`` then [m]
+    budgets: wp.array[wp.vec4]
+    ways: wp.array[
+        wp.float32
+    ]  # [N] how far the carrier has come to this displacement since all places were visited [m]
+    # of each place that a carrier bears, as in ``Bearing.places``: ``ways`` plus ``came`` at which it is visited [m]
+    until: wp.array[wp.float32]
+    entries: wp.array[wp.vec4i]  # [S] where these are for the nodes that bear a place
+    needs: wp.array[wp.float32]  # [N] how much of their budgets must be left in this step for those that are due [m]
+    spans: wp.array[wp.float32]  # [S] the longest edge around a place at rest [m]
+    # [2] how far any obstacle has gone since all places were visited, and goes in this step, at most [m]
+    came: wp.array[wp.float32]
+    step: wp.array[wp.int64]  # [1] the number of the last step
+    is_first: wp.array[wp.int32]  # [1] whether this step visits everything
+    may_miss: wp.array[wp.int32]  # [1] whether places may not have moved into obstacles unseen
+    count: wp.array[wp.int32]  # [1] the number of steps, ever
+    places: wp.array[wp.int32]  # [S] that number at the last visit to a place
+    touches: wp.array[wp.int32]  # [O T] the same for an obstacle and a triangle
+    chosen: wp.array[wp.int32]  # [S] the places that are visited in this step
+    chosen_count: wp.array[wp.int32]  # [1]
+    contacts: wp.array[wp.int32]  # [O S] contacts at places that may act, by their numbers in ``mass_split``
+    contact_count: wp.array[wp.int32]  # [1]
+    carriers: wp.array[wp.int32]  # [N] that number when the motion of a carrier was found last
+    due: wp.array[wp.int32]  # [N] those that are due
+    due_count: wp.array[wp.int32]  # [1]
+    carrying: wp.array[wp.int32]  # [N] those whose motion is known
+    carrying_count: wp.array[wp.int32]  # [1]
+    is_shared: int  # whether several threads visit at the same time
+
+
+# Where one thread works, plain instructions take a fraction of the time of atomic ones.
+@wp.func_native(
+    on_cpu(
+        """
+    int& now = wp::index(a, i);
+    if (now == value) return false;
+    if (is_shared) return __atomic_exchange_n(&now, value, __ATOMIC_RELAXED) != value;
+    now = value;
+    return true;
+""",
+        otherwise="return false;\n",
+    )
+)
+def claim(a: wp.array[wp.int32], i: int, value: int, is_shared: int) -> bool:
+    """Write a value. Returns whether there was another one, to one thread of those that ask at the same time."""
+    ...
+
+
+@wp.func_native(
+    on_cpu("""
+    int& end = wp::index(count, 0);
+    wp::index(list, is_shared ? __atomic_fetch_add(&end, 1, __ATOMIC_RELAXED) : end++) = item;
+""")
+)
+def append(list: wp.array[wp.int32], count: wp.array[wp.int32], item: int, is_shared: int):
+    """Add an item to the end of a list."""
+    ...
+
+
+@wp.func_native(
+    on_cpu("""
+    // The order of numbers that are not negative is that of their bits.
+    int* to = reinterpret_cast<int*>(&wp::index(budgets, n)) + 3;
+    const int bits = *reinterpret_cast<const int*>(&most);
+    if (is_shared) {
+        int now = __atomic_load_n(to, __ATOMIC_RELAXED);
+        while (bits < now && !__atomic_compare_exchange_n(to, &now, bits, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED));
+    } else if (bits < *to) *to = bits;
+""")
+)
+def lower_budget(budgets: wp.array[wp.vec4], n: int, most: float, is_shared: int):
+    """Lower a budget to at most a value that is not negative."""
+    ...
+
+
+@wp.kernel(enable_backward=False)
+def find_entries(bearing: Bearing, entries: wp.array[wp.vec4i]):
+    """Find where the nodes that bear places list them."""
+    n = wp.tid()
+    for e in range(bearing.starts[n], bearing.starts[n + 1]):
+        s = bearing.places[e]
+        for m in range(4):
+            if bearing.bearers[s][m] == n:
+                entries[s][m] = e
+
+
+# --- what is due -----------------------------------------------------------------------------------------------------
+
+
+@wp.kernel(enable_backward=False)
+def begin_visits(
+    # In
+    motions: Motions,
+    pace: Pace,
+    world_starts: wp.array[wp.float64],
+    offset: int,
+    touches: Touches,
+    # In and out
+    watch: Watch,
+    here: Near,
+    visits: Visits,
+):
+    """Move obstacles, and forget the visits of the last step."""
+    meets = float(0.0)
+    for k in range(watch.poses.shape[0] * watch.poses.shape[1]):
+        world, o = pair_of(k, watch)
+        begin_obstacle(world, o, motions, pace, world_starts, offset, 0, watch)
+        meets = wp.max(meets, distance_between(motions.now[world, o], motions.later[world, o], motions.reach[o]))
+    kept = int(0)
+    for k in range(here.touch_count[0]):
+        pair = here.touches[k]
+        force = touches.force[pair // touches.force.shape[1], pair % touches.force.shape[1]]
+        # A triangle with a force is found again, wherever it is now.
+        if wp.length_sq(force) > 0.0:
+            here.touches[kept] = pair
+            kept += 1
+        else:
+            visits.touches[pair] = 0
+    here.count[0] = 0
+    here.touch_count[0] = kept
+    visits.chosen_count[0] = 0
+    visits.contact_count[0] = 0
+    visits.due_count[0] = 0
+    visits.carrying_count[0] = 0
+    number = pace.counts[DONE] + wp.int64(offset)
+    visits.is_first[0] = wp.where(visits.step[0] + wp.int64(1) == number, 0, 1)
+    visits.step[0] = number
+    visits.count[0] = visits.count[0] + 1
+    # Before a run nodes may have been moved from outside.
+    is_moved = offset == 0 and pace.counts[DONE] == watch.published[0]
+    visits.may_miss[0] = wp.where(visits.is_first[0] != 0 or is_moved, 0, 1)
+    if visits.is_first[0] != 0:
+        visits.came[0] = 0.0
+        watch.searches[0] = watch.searches[0] + 1
+    else:
+        visits.came[0] = visits.came[0] + visits.came[1]
+    visits.came[1] = meets
+    watch.awake[0] = wp.where(kept > 0, 1, 0)
+
+
+@wp.func_native(
+    on_cpu(
+        """
+    const int* nodes = &wp::index(node, 0);
+    const float* w = &wp::index(inverse_mass, 0);
+    const auto first = [](const auto& a) { return reinterpret_cast<const four*>(&wp::index(a, 0)); };
+    const four *from = first(budgets), *forces = first(f), *at = first(u), *speeds = first(v);
+    const four g = {gravity[0], gravity[1], gravity[2], 0.0f};
+    for (; n < end; ++n) {
+        const int i = nodes[n];
+        if (i < 0) continue;
+        const four gone = at[i] - from[n], kicked = (speeds[i] + kick * (w[i] * forces[i] + g)) * damped;
+        const four goes = w[i] > 0.0f ? kicked : speeds[i], sum = gone * gone + (ahead * ahead) * goes * goes;
+        const float left = from[n][3] - used;
+        // The square of a sum of two is at most twice the sum of their squares.
+        if (!(left > 0.0f && 2.0f * (sum[0] + sum[1] + sum[2]) <= left * left)) break;
+    }
+    return n;
+""",
+        otherwise="return end;\n",
+    )
+)
+def next_due(
+    n: int,
+    end: int,
+    used: float,
+    kick: float,
+    damped: float,
+    ahead: float,
+    gravity: wp.vec3,
+    node: wp.array[wp.int32],
+    budgets: wp.array[wp.vec4],
+    inverse_mass: wp.array[wp.float32],
+    f: wp.array[wp.vec4],
+    u: wp.array[wp.vec4],
+    v: wp.array[wp.vec4],
+) -> int:
+    """The next carrier from n on that may be due without loads; most are not, and need no roots.
+
+    Args:
+        used: How much of the budgets is used by other motion [m].
+        kick, damped: As in ``foreseen``.
+        ahead: How long nodes go on as in this step [s].
+    """
+    ...
+
+
+@wp.func
+def start_at(u: wp.vec3, left: float):
+    return wp.vec4(u[0], u[1], u[2], left)
+
+
+@wp.func
+def know(n: int, own: Foreseen, nodes: Surface, visits: Visits):
+    """Store the motion of a carrier without contact."""
+    append(visits.carrying, visits.carrying_count, n, visits.is_shared)
+    nodes.rest[n] = own.rest
+    nodes.x[n] = own.x
+    nodes.d[n] = own.d
+    nodes.yielding[n] = own.yielding
+
+
+@wp.kernel(enable_backward=False)
+def find_due(
+    # In
+    begin: int,
+    end: int,
+    damping: float,
+    gravity: wp.vec3,
+    inverse_mass: wp.array[wp.float32],
+    has_load: int,
+    load: wp.array[Any],
+    pace: Pace,
+    offset: int,
+    rest: wp.array[wp.vec4],
+    f: wp.array[wp.vec4],
+    u: wp.array[wp.vec4],
+    v: wp.array[wp.vec4],
+    # In and out
+    nodes: Surface,
+    watch: Watch,
+    visits: Visits,
+):
+    """List the carriers from ``begin`` to ``end`` whose budgets this step may use up."""
+    dt = float(pace.seconds[DT])
+    kick = dt
+    if offset == 0:
+        kick = 0.5 * (float(length_before(pace)) + dt)
+    damped = 1.0 / (1.0 + dt * damping)
+    used = visits.came[0] + AHEAD * visits.came[1] + watch.least[0]
+    is_first = visits.is_first[0] != 0
+    n = int(begin)
+    while n < end:
+        if not is_first and has_load == 0:
+            n = next_due(
+                n, end, used, kick, damped, AHEAD * dt, gravity, nodes.node, visits.budgets, inverse_mass, f, u, v
+            )
+        if n < end and nodes.node[n] >= 0:
+            i = nodes.node[n]
+            budget = visits.budgets[n]
+            own = foreseen(i, damping, gravity, inverse_mass, has_load, load, pace, offset, rest, f, u, v)
+            gone = wp.length(load_node(u, i) - wp.vec3(budget[0], budget[1], budget[2]))
+            goes = AHEAD * wp.length(own.d)
+            if is_first or not (gone + goes <= budget[3] - used):
+                visits.carriers[n] = visits.count[0]
+                know(n, own, nodes, visits)
+                visits.needs[n] = goes + used
+                way = wp.where(is_first, 0.0, visits.ways[n] + gone)
+                visits.ways[n] = way
+                visits.budgets[n] = start_at(load_node(u, i), FAR)
+                if way > FARTHEST_WAY * watch.size:
+                    visits.step[0] = wp.int64(-2)  # all places are visited in the next step
+                append(visits.due, visits.due_count, n, visits.is_shared)
+                watch.awake[0] = 1
+        n += 1
+
+
+@wp.kernel(enable_backward=False)
+def end_run(pace: Pace, watch: Watch):
+    """Note which step was a run's last one."""
+    watch.published[0] = pace.counts[DONE]
+
+
+# --- visits ----------------------------------------------------------------------------------------------------------
+
+
+@wp.func
+def choose(s: int, here: Near, visits: Visits):
+    """Visit a place in this step, once. Returns whether it was not chosen before."""
+    was = visits.places[s]
+    if not claim(visits.places, s, visits.count[0], visits.is_shared):
+        return False
+    append(visits.chosen, visits.chosen_count, s, visits.is_shared)
+    here.flags[s] = BESIDE | wp.where(was + 1 < visits.count[0], LATE, 0)
+    return True
+
+
+@wp.func
+def carriers_of(s: int, surface: Surface):
+    """The numbers of the nodes that carry a place, and its weights."""
+    if is_borne(s, surface):
+        return surface.bearing.bearers[s], surface.bearing.weights[s]
+    return wp.vec4i(s, s, s, s), wp.vec4(1.0, 0.0, 0.0, 0.0)
+
+
+@wp.func
+def position_of(s: int, nodes: Surface, surface: Surface, u: wp.array[wp.vec4], share: float):
+    """Where a place is that this step need not visit, with this share of its displacement: zero is at rest."""
+    n, w = carriers_of(s, surface)
+    x = wp.vec3()
+    for m in range(4):
+        if w[m] != 0.0:
+            x += w[m] * (nodes.rest[n[m]] + share * load_node(u, nodes.node[n[m]]))
+    return x
+
+
+@wp.func
+def longest_edge(
+    s: int,
+    x: wp.vec3,
+    share: float,
+    triangles: wp.array[wp.vec3i],
+    corner_starts: wp.array[wp.int32],
+    corners: wp.array[wp.int32],
+    nodes: Surface,
+    surface: Surface,
+    u: wp.array[wp.vec4],
+):
+    """The longest edge from a place at x [m]; ``share`` as for ``position_of``."""
+    longest = float(0.0)
+    for c in range(corner_starts[s], corner_starts[s + 1]):
+        # Each edge belongs to two triangles, in one of which its end comes next.
+        r = triangles[corners[c] / 3][(corners[c] + 1) % 3]
+        longest = wp.max(longest, wp.length(position_of(r, nodes, surface, u, share) - x))
+    return longest
+
+
+@wp.func
+def carry(
+    s: int,
+    damping: float,
+    gravity: wp.vec3,
+    inverse_mass: wp.array[wp.float32],
+    has_load: int,
+    load: wp.array[Any],
+    pace: Pace,
+    offset: int,
+    rest: wp.array[wp.vec4],
+    f: wp.array[wp.vec4],
+    u: wp.array[wp.vec4],
+    v: wp.array[wp.vec4],
+    nodes: Surface,
+    surface: Surface,
+    visits: Visits,
+):
+    """Find the motion of the carriers of a place in this step without contact, and begin to measure their way here."""
+    b, _w = carriers_of(s, surface)
+    for m in range(4):
+        n = b[m]
+        if claim(visits.carriers, n, visits.count[0], visits.is_shared):
+            i = nodes.node[n]
+            know(
+                n,
+                foreseen(i, damping, gravity, inverse_mass, has_load, load, pace, offset, rest, f, u, v),
+                nodes,
+                visits,
+            )
+            now = load_node(u, i)
+            budget = visits.budgets[n]
+            gone = wp.length(now - wp.vec3(budget[0], budget[1], budget[2]))
+            visits.ways[n] = visits.ways[n] + gone
+            visits.budgets[n] = start_at(now, wp.max(budget[3] - gone, 0.0))
+
+
+@wp.func
+def room_beside(
+    s: int,
+    has_edges: int,
+    triangles: wp.array[wp.vec3i],
+    corner_starts: wp.array[wp.int32],
+    corners: wp.array[wp.int32],
+    u: wp.array[wp.vec4],
+    nodes: Surface,
+    rigid: Rigid,
+    watch: Watch,
+    visits: Visits,
+    here: Near,
+):
+    """How far a place may go before it or a triangle around it may touch an obstacle [m]; those that may are listed."""
+    surface = rigid.surface
+    x = surface.x[s]
+    close = FORESEEN * (wp.length(surface.d[s]) + visits.came[1])
+    may_touch = bool(False)
+    farthest = FARTHEST * watch.size
+    room = float(farthest)
+    for o in range(rigid.forces.shape[0]):
+        span = float(0.0)
+        if has_edges != 0 and rigid.shapes.kind[o] != GROUND:
+            span = LONG * visits.spans[s]
+        pose = rigid.motions.now[surface.world[s], o]
+        distance, _n = distance_to(rigid.shapes, o, pose, x, room + span + rigid.law.tolerance)
+        gap = sure_distance(rigid.shapes, o, distance) - rigid.law.tolerance
+        # A place that could act in the last step is found once more.
+        holds = rigid.allowance[o, s] != 0.0 or wp.length_sq(rigid.forces[o, s]) > 0.0
+        if gap <= close or rigid.acts[o, s] != OUT or holds:
+            may_touch = True
+            append(visits.contacts, visits.contact_count, o * surface.node.shape[0] + s, visits.is_shared)
+        if holds:
+            gap = wp.min(gap, 0.0)
+        elif gap < -watch.least[0] and (here.flags[s] & LATE) != 0 and visits.may_miss[0] != 0:
+            wp.atomic_add(watch.missed, 0, 1)
+        if span == 0.0 or gap > span:
+            room = wp.min(room, gap - span)
+        else:
+            longest = longest_edge(s, x, 1.0, triangles, corner_starts, corners, nodes, surface, u)
+            room = wp.min(room, wp.min(gap - longest, GROWN * longest))
+            if gap <= COVERED * longest + close + watch.least[0]:
+                for c in range(corner_starts[s], corner_starts[s + 1]):
+                    pair = o * triangles.shape[0] + corners[c] / 3
+                    if claim(visits.touches, pair, 1, visits.is_shared):
+                        append(here.touches, here.touch_count, pair, visits.is_shared)
+    if may_touch:
+        here.flags[s] = here.flags[s] | LISTED
+        append(here.nodes, here.count, s, visits.is_shared)
+    return wp.max(room, 0.0)
+
+
+@wp.kernel(enable_backward=False)
+def visit(
+    # In
+    threads: int,
+    thread: int,
+    first: int,
+    last: int,
+    damping: float,
+    gravity: wp.vec3,
+    inverse_mass: wp.array[wp.float32],
+    has_load: int,
+    load: wp.array[Any],
+    pace: Pace,
+    offset: int,
+    rest: wp.array[wp.vec4],
+    f: wp.array[wp.vec4],
+    u: wp.array[wp.vec4],
+    v: wp.array[wp.vec4],
+    has_edges: int,
+    triangles: wp.array[wp.vec3i],
+    corner_starts: wp.array[wp.int32],
+    corners: wp.array[wp.int32],
+    watch: Watch,
+    # In and out
+    nodes: Surface,
+    rigid: Rigid,
+    visits: Visits,
+    # Out
+    here: Near,
+):
+    """Find the motion of what is due without contact, and how far it is from obstacles.
+
+    Args:
+        threads, thread: Number of threads, and this one.
+        first, last: The phases.
+        has_edges: Whether an obstacle can pass between nodes.
+        nodes: The carriers.
+        here: What may touch in this step.
+    """
+    surface = rigid.surface
+    are_borne = surface.bearing.bearers.shape[0] > 0
+    if first == CHOOSE:
+        k = int(thread)
+        while k < visits.due_count[0]:
+            n = visits.due[k]
+            k += threads
+            if are_borne:
+                need = visits.ways[n] + visits.needs[n]
+                for e in range(surface.bearing.starts[n], surface.bearing.starts[n + 1]):
+                    if visits.is_first[0] != 0 or not (visits.until[e] >= need):
+                        choose(surface.bearing.places[e], here, visits)
+            else:
+                choose(n, here, visits)
+    if first <= CARRY and last >= CARRY:
+        k = int(thread)
+        while k < visits.chosen_count[0]:
+            s = visits.chosen[k]
+            k += threads
+            carry(
+                s, damping, gravity, inverse_mass, has_load, load, pace, offset, rest, f, u, v, nodes, surface, visits
+            )
+    if first <= PLACE and last >= PLACE:
+        k = int(thread)
+        while k < visits.chosen_count[0]:
+            s = visits.chosen[k]
+            k += threads
+            if are_borne:
+                find_borne(s, nodes, surface)
+            if visits.is_first[0] != 0 and has_edges != 0:
+                at_rest = position_of(s, nodes, surface, u, 0.0)
+                visits.spans[s] = longest_edge(s, at_rest, 0.0, triangles, corner_starts, corners, nodes, surface, u)
+            room = room_beside(s, has_edges, triangles, corner_starts, corners, u, nodes, rigid, watch, visits, here)
+            b, w = carriers_of(s, surface)
+            left = visits.came[0] + room / (wp.abs(w[0]) + wp.abs(w[1]) + wp.abs(w[2]) + wp.abs(w[3]))
+            for m in range(4):
+                if w[m] != 0.0:
+                    lower_budget(visits.budgets, b[m], left, visits.is_shared)
+                    if are_borne:
+                        visits.until[visits.entries[s][m]] = visits.ways[b[m]] + left
+    if first <= CORNERS and last >= CORNERS and thread == 0:
+        for k in range(here.touch_count[0]):
+            for m in range(3):
+                s = triangles[here.touches[k] % triangles.shape[0]][m]
+                if choose(s, here, visits):
+                    carry(
+                        s, damping, gravity, inverse_mass, has_load, load, pace, offset, rest, f, u, v, nodes, surface,
+                        visits,
+                    )  # fmt: skip
+                    if are_borne:
+                        find_borne(s, nodes, surface)
+                if (here.flags[s] & LISTED) == 0:
+                    here.flags[s] = here.flags[s] | LISTED
+                    append(here.nodes, here.count, s, visits.is_shared)
+    if last == LIMIT and are_borne:
+        k = int(thread)
+        while k < visits.due_count[0]:
+            n = visits.due[k]
+            k += threads
+            most = float(FAR)
+            for e in range(surface.bearing.starts[n], surface.bearing.starts[n + 1]):
+                most = wp.min(most, visits.until[e])
+            lower_budget(visits.budgets, n, wp.max(most - visits.ways[n], 0.0), visits.is_shared)
+
+
+@wp.kernel(enable_backward=False)
+def end_visits(
+    # In
+    threads: int,
+    thread: int,
+    shift: int,
+    buffer: int,
+    grain: float,
+    nodes: Surface,
+    visits: Visits,
+    counts: int,
+    damping: float,
+    gravity: wp.vec3,
+    inverse_mass: wp.array[wp.float32],
+    has_load: int,
+    load: wp.array[Any],
+    pace: Pace,
+    offset: int,
+    rest: wp.array[wp.vec4],
+    f: wp.array[wp.vec4],
+    u: wp.array[wp.vec4],
+    v: wp.array[wp.vec4],
+    # In and out
+    sums: Sums,
+    account: wp.array2d[wp.float64],
+    # Out
+    contact_forces: wp.array[wp.vec4],
+):
+    """Add the contact forces at the carriers of what was visited to a body's forces; see ``end_contact``."""
+    k = int(thread)
+    while k < visits.carrying_count[0]:
+        n = visits.carrying[k]
+        k += threads
+        if sums.touched[n + shift] != 0:
+            i = nodes.node[n]
+            force = take_force(n + shift, buffer, grain, sums)
+            store_node(contact_forces, i, force)
+            if wp.dot(force, force) > 0.0:
+                total = load_node(f, i) + force
+                store_node(f, i, total)
+                if counts != 0:
+                    count_constraint(
+                        i, force, total, damping, gravity, inverse_mass, has_load, load, pace, offset, v, account
+                    )
+
+
+@wp.kernel(enable_backward=False)
+def complete_triangles(
+    # In
+    pace: Pace,
+    u: wp.array[wp.vec4],
+    v: wp.array[wp.vec4],
+    nodes: Surface,
+    triangles: wp.array[wp.vec3i],
+    corner_starts: wp.array[wp.int32],
+    corners: wp.array[wp.int32],
+    here: Near,
+    visits: Visits,
+    # Out
+    surface: Surface,
+):
+    """Find where the other corners of triangles around places with a force were at the beginning of the last step."""
+    before = float(length_before(pace))
+    for k in range(here.count[0]):
+        s = here.nodes[k]
+        if wp.length_sq(surface.f[s]) > 0.0:
+            for c in range(corner_starts[s], corner_starts[s + 1]):
+                r = triangles[corners[c] / 3][(corners[c] + 1) % 3]
+                if visits.places[r] != visits.count[0]:
+                    b, w = carriers_of(r, surface)
+                    x = position_of(r, nodes, surface, u, 1.0)
+                    for m in range(4):
+                        x -= (w[m] * before) * load_node(v, nodes.node[b[m]])
+                    surface.x[r] = x
+
+
+FIND_DUE, VISIT, END_VISITS = (by_vectors(kernel, "load") for kernel in (find_due, visit, end_visits))
