@@ -261,21 +261,15 @@ def locate_point(
     spans: Spans,
     changed: wp.array[wp.int32],
 ):
-    """The same at a body's places that nodes bear; nothing sinks in there. Those that are found again are the listed
-    ones: a place that obstacles come near meanwhile is missing."""
+    """The same at a body's places that nodes bear; nothing sinks in there."""
     if points[s][0] < 0 or is_held_at(s, surface, carriers):
-        return
-    is_asked = which != AGAIN
-    for o in range(touches.force.shape[0]):
-        is_asked = is_asked or spans.listed[o, s] != 0
-    if not is_asked:
         return
     world = surface.world[s]
     x = surface.x[s]
     e = motion_at(s, surface, carriers, d)
     way = wp.length(e)
     for o in range(touches.force.shape[0]):
-        if which != FIRST and (spans.listed[o, s] != 0) != (which == AGAIN):
+        if which == MISSING and spans.listed[o, s] != 0:
             continue
         now = motions.now[world, o]
         later = motions.later[world, o]
