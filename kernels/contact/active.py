@@ -30,6 +30,9 @@ APART, TOUCHES = wp.constant(0), wp.constant(1)
 THOSE_APART, THOSE_TOUCHED = wp.constant(0), wp.constant(1)
 #: Number of rounds after which no node is released any more.
 LATE = wp.constant(12)
+#: Number of rounds after which a node that touches keeps its plane and its bound of friction: a plane that follows the
+#: node around an obstacle, or changes by rounding, may never let a step end.
+STAYS = wp.constant(24)
 #: How often a node may be released in a step.
 RELEASED = wp.constant(3)
 #: The stiffness of friction over that of the node.
@@ -107,6 +110,7 @@ def find_bounds(
     motions: Motions,
     law: Law,
     pace: Pace,
+    rounds: wp.array[wp.int32],
     surface: Surface,
     d: wp.array[wp.vec4],
     # Out
@@ -126,7 +130,7 @@ def find_bounds(
     dt = float(pace.seconds[DT])
     for o in range(holding.kinds.shape[0]):
         is_apart = holding.kinds[o, s] == APART
-        if is_apart != (which == THOSE_APART):
+        if is_apart != (which == THOSE_APART) or (not is_apart and rounds[0] > STAYS):
             continue
         now = motions.now[world, o]
         moved = carried(now, motions.later[world, o], x)
@@ -327,18 +331,18 @@ def let_go(o: int, s: int, is_late: bool, holding: Holding) -> bool:
 
 
 @wp.func
-def judge_single(
-    o: int, s: int, force: wp.vec3, slip: wp.vec3, friction: float, is_late: bool, holding: Holding
-) -> bool:
+def judge_single(o: int, s: int, force: wp.vec3, slip: wp.vec3, friction: float, rounds: int, holding: Holding) -> bool:
     """A node that touches one obstacle: its force, and whether it changes."""
     n = holding.normals[o, s]
     push = wp.dot(force, n)
     if push < 0.0:
-        return let_go(o, s, is_late, holding)
+        return let_go(o, s, rounds >= LATE, holding)
     most = friction * push
+    if rounds >= STAYS:
+        most = holding.most[o, s]
     sideways = wp.vec3()
     if most > 0.0:
-        sideways = held_back(trial_of(o, s, slip, holding), push, friction)
+        sideways = held_back(trial_of(o, s, slip, holding), most, 1.0)
     holding.forces[o, s] = push * n + sideways
     holding.most[o, s] = most
     return False
@@ -394,7 +398,6 @@ def judge_places(
     world = surface.world[s]
     x = surface.x[s]
     step = load_node(d, i)
-    is_late = rounds[0] >= LATE
     count = holding.kinds.shape[0]
     touching = int(0)
     first = int(0)
@@ -406,9 +409,9 @@ def judge_places(
     force = load_node(q, i) - load_node(b, i)
     if touching == 1:
         slip = step - carried(motions.now[world, first], motions.later[world, first], x)
-        changes = judge_single(first, s, force, slip, shapes.friction[first], is_late, holding)
+        changes = judge_single(first, s, force, slip, shapes.friction[first], rounds[0], holding)
     elif touching > 1:
-        changes = judge_several(s, force, is_late, holding)
+        changes = judge_several(s, force, rounds[0] >= LATE, holding)
     for o in range(count):
         least = holding.least[o, s]
         if holding.kinds[o, s] == APART and least > NO_BOUND:

@@ -117,10 +117,9 @@ def take_span(
                 crowd_at(corners[k], found.shares[k], surface, carriers)
 
 
-@wp.kernel(enable_backward=False)
-def locate_spans(
-    # In
-    start: int,
+@wp.func
+def locate_span(
+    t: int,
     which: int,
     shapes: Shapes,
     thickness: wp.array[wp.float32],
@@ -130,20 +129,15 @@ def locate_spans(
     surface: Surface,
     triangles: wp.array[wp.vec3i],
     d: wp.array[wp.vec4],
-    # In and out
     carriers: Carriers,
     touches: Touches,
     spans: Spans,
-    # Out
     changed: wp.array[wp.int32],
 ):
     """Find spans of a body's triangles at the beginning of the step, or after motions d; forces become multipliers.
 
     If a motion is fast, its path may lead through the obstacle, so the span stays where the step begins.
     """
-    if is_done(which, spans):
-        return
-    t = start + wp.tid()
     corners = triangles[t]
     if corners[0] < 0:
         return
@@ -207,9 +201,52 @@ def locate_spans(
 
 
 @wp.kernel(enable_backward=False)
-def locate_points(
+def locate_spans(
     # In
+    threads: int,
     start: int,
+    count: int,
+    which: int,
+    shapes: Shapes,
+    thickness: wp.array[wp.float32],
+    motions: Motions,
+    law: Law,
+    pace: Pace,
+    surface: Surface,
+    triangles: wp.array[wp.vec3i],
+    d: wp.array[wp.vec4],
+    # In and out
+    carriers: Carriers,
+    touches: Touches,
+    spans: Spans,
+    # Out
+    changed: wp.array[wp.int32],
+):
+    k = wp.tid()
+    while k < count and not is_done(which, spans):
+        given = start + k
+        locate_span(
+            given,
+            which,
+            shapes,
+            thickness,
+            motions,
+            law,
+            pace,
+            surface,
+            triangles,
+            d,
+            carriers,
+            touches,
+            spans,
+            changed,
+        )
+        k += threads
+
+
+@wp.func
+def locate_point(
+    s: int,
     which: int,
     shapes: Shapes,
     thickness: wp.array[wp.float32],
@@ -219,17 +256,12 @@ def locate_points(
     surface: Surface,
     points: wp.array[wp.vec3i],
     d: wp.array[wp.vec4],
-    # In and out
     carriers: Carriers,
     touches: Touches,
     spans: Spans,
-    # Out
     changed: wp.array[wp.int32],
 ):
     """The same at a body's places that nodes bear; nothing sinks in there."""
-    if is_done(which, spans):
-        return
-    s = start + wp.tid()
     if points[s][0] < 0 or is_held_at(s, surface, carriers):
         return
     world = surface.world[s]
@@ -262,6 +294,37 @@ def locate_points(
         found.allowed = 0.0
         found.friction = shapes.friction[o]
         take_span(o, s, which, found, e - found.moved, points[s], law, pace, surface, carriers, touches, spans, changed)
+
+
+@wp.kernel(enable_backward=False)
+def locate_points(
+    # In
+    threads: int,
+    start: int,
+    count: int,
+    which: int,
+    shapes: Shapes,
+    thickness: wp.array[wp.float32],
+    motions: Motions,
+    law: Law,
+    pace: Pace,
+    surface: Surface,
+    points: wp.array[wp.vec3i],
+    d: wp.array[wp.vec4],
+    # In and out
+    carriers: Carriers,
+    touches: Touches,
+    spans: Spans,
+    # Out
+    changed: wp.array[wp.int32],
+):
+    k = wp.tid()
+    while k < count and not is_done(which, spans):
+        given = start + k
+        locate_point(
+            given, which, shapes, thickness, motions, law, pace, surface, points, d, carriers, touches, spans, changed
+        )
+        k += threads
 
 
 @wp.kernel(enable_backward=False)

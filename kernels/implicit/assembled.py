@@ -19,7 +19,7 @@ wp.set_module_options({"enable_backward": False})
 #: the same residual, bunnies of 5 and 30 kPa were 3.1 and 1.2 times as far off; with 0.1, a stiff block that spins
 #: beside an obstacle still had more strain energy than its rotation gives it. Solves that end at a share of their first
 #: residual need that only if they begin at less than this many times the tolerance, and may be the last of a step.
-CLOSER, SETTLED = 0.03, 10.0
+CLOSER, SETTLED = 0.03, 30.0
 #: Maximum number of nodes that bear a contact: four for each of the four places of a pair of soft surfaces.
 PLACES = 16
 #: On the CPU the residual's norm is found at least after so many iterations.

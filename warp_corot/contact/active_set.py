@@ -201,7 +201,7 @@ class ActiveSet:
         contacts = self._contacts
         obstacles, pace = contacts.obstacles, contacts.system.pace.arrays
         inputs = [int(at_end), which, obstacles.shapes, self._thickness, obstacles.motions, contacts.law, pace]
-        self._launch(kernels.find_bounds, [*inputs, self._surface, d, self._holding])
+        self._launch(kernels.find_bounds, [*inputs, self._rounds, self._surface, d, self._holding])
 
     def _locate(self, which: int, d: wp.array) -> None:
         assert self._spans is not None

@@ -20,7 +20,7 @@ from .carriers import PlaceCarriers
 from .rigid_forces import RigidForces
 
 #: The stiffness of a span over that of its point.
-STIFF = 32.0
+STIFF = 16.0
 #: Maximum number of threads of launches over those that are listed.
 MOST_THREADS = 1 << 14
 #: Types of the arrays of ``Spans``, and of those of ``Touches`` that points need.
@@ -128,8 +128,11 @@ class Spans:
             wp.launch(finding.empty_spans, count, inputs, device=self.device)
         rigid = [int(which), obstacles.shapes, self._thickness, obstacles.motions, self._law, self._pace, arrays]
         for each in self._items:
-            inputs = [*rigid, each.corners, d, self._carriers.arrays, each.touches, each.spans, changed]
-            self._launch(each.locate, each, inputs)
+            # One thread of the CPU sees at once that nothing is to be found.
+            threads = 1 if self.device.is_cpu else each.count
+            inputs = [threads, each.start, each.count, *rigid, each.corners, d]
+            inputs += [self._carriers.arrays, each.touches, each.spans, changed]
+            wp.launch(each.locate, threads, inputs, device=self.device)
         for each in self._items:
             self._on_listed(finding.stiffen_spans, each, [*self._places(each), each.touches, each.spans])
 

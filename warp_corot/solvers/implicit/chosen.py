@@ -23,7 +23,7 @@ COST_ON_CPU, SHARED_ON_CPU, COST = 5, 3, 32
 #: So many times as much on the CPU with contact, whose springs multigrid takes into all its matrices before each solve.
 WITH_CONTACT = 2
 #: Multigrid is tried if assembled solves cost as much as so many of its iterations; never where soft surfaces meet,
-#: whose contact it does not know.
+#: whose contact it does not know, nor on the CPU with contact, which assembled solves know better there.
 WORTH, NEVER = 10, 1 << 20
 #: The length of a step times the largest frequency of a node among fixed ones, above which multigrid solves first. A
 #: bunny of 20,000 elements has 70 at 5 kPa and 171 at 30 kPa, and takes 190 and 410 iterations on CUDA. With contact
@@ -107,7 +107,8 @@ class ChosenSolve:
         self._either(None, judge_set_ups)
         if not self.is_open:
             return
-        worth = WORTH if system.soft is None else NEVER
+        knows_more = system.soft is not None or (self.assembled.touches and self.device.is_cpu)
+        worth = NEVER if knows_more else WORTH
         inputs = [iterations, status, int(self.assembled.touches), worth, self._cost, self.assembled.couplings]
         wp.launch(kernels.choose, 1, inputs, [self._counts, self._is_assembled], device=self.device)
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from .newton import Newton
 
 #: A solve ends at this share of its first residual, because contact may change after it.
-SHARE = 0.15
+SHARE = 0.3
 #: Maximum number of linear solves in a step with contact.
 ROUNDS = 100
 
