@@ -20,7 +20,7 @@ from .carriers import PlaceCarriers
 from .rigid_forces import RigidForces
 
 #: The stiffness of a span over that of its point.
-STIFF = 16.0
+STIFF = 32.0
 #: Maximum number of threads of launches over those that are listed.
 MOST_THREADS = 1 << 14
 #: Types of the arrays of ``Spans``, and of those of ``Touches`` that points need.
