@@ -1,7 +1,10 @@
 """Environments: what gymnasium asks of them, what worlds promise, and the tasks, which a policy by hand can do."""
 
 import resource
+import runpy
+import sys
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -322,3 +325,15 @@ def test_a_single_environment_is_a_world():
     np.testing.assert_array_equal(observation, found[0][0])
     assert reward == found[1][0]
     assert info == {"success": False, "lost": 0}
+
+
+def test_the_example_trains(device, tmp_path, monkeypatch, capsys):
+    """A short run: whether a policy learns shows in a long one only."""
+    torch = pytest.importorskip("torch")
+    script, output = Path(__file__).parents[2] / "examples" / "learning" / "train_ppo.py", tmp_path / "policy.pt"
+    options = ["--device", device, "--worlds", "4", "--rollouts", "2", "--steps", "8", "-o", str(output)]
+    monkeypatch.setattr(sys, "argv", [str(script), *options])
+    runpy.run_path(str(script), run_name="__main__")
+    lines = [line for line in capsys.readouterr().out.splitlines() if "success" in line or "no episode" in line]
+    assert len(lines) == 2
+    assert {"actor", "mean", "square"} == set(torch.load(output))

@@ -46,9 +46,9 @@ def draw_world(env: SoftEnv, world: int = 0) -> npt.NDArray[np.uint8]:
             faces.append(solid.triangles + sum(map(len, points)))
             points.append(solid.at(pose))
             values.append(np.full(len(points[-1]), np.nan))
-    figure = Figure((SIZE[0] / DPI, SIZE[1] / DPI), dpi=DPI, layout="constrained")
+    figure = Figure((SIZE[0] / DPI, SIZE[1] / DPI), dpi=DPI)
     canvas = FigureCanvasAgg(figure)
-    axes = figure.subplots()
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     stands = any(isinstance(shape_of(each), Ground) for each in given)
     low, high = env.task.window
     camera = Camera.fit(np.array([low, high]), "Z", *env.task.view)
@@ -63,8 +63,8 @@ def draw_world(env: SoftEnv, world: int = 0) -> npt.NDArray[np.uint8]:
     )
     corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
     seen = camera.project(corners)[0]
-    axes.set_xlim(seen[:, 0].min(), seen[:, 0].max())
-    axes.set_ylim(seen[:, 1].min(), seen[:, 1].max())
-    axes.set_aspect("equal")
+    middle, half = 0.5 * (seen.min(axis=0) + seen.max(axis=0)), 0.5 * np.ptp(seen, axis=0)
+    half = max(half[0] / SIZE[0], half[1] / SIZE[1]) * np.array(SIZE)
+    axes.set(xlim=(middle[0] - half[0], middle[0] + half[0]), ylim=(middle[1] - half[1], middle[1] + half[1]))
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
