@@ -50,29 +50,43 @@ class Worlds:
 # --- the beginning -------------------------------------------------------------------------------------------------
 
 
+@wp.func
+def turned(draws: wp.array2d[wp.float32], w: int, centre: wp.vec3):
+    """A pose: drawn shifts along x and y [m], and a drawn turn about the vertical through a centre [rad]."""
+    q = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), draws[w, 3])
+    shift = wp.vec3(draws[w, 1], draws[w, 2], 0.0)
+    return wp.transformation(centre + shift - wp.quat_rotate(q, centre), q)
+
+
 @wp.kernel(enable_backward=False)
 def draw_episodes(
     # In
     chosen: wp.array[wp.int32],
     low: wp.array[wp.float32],
     high: wp.array[wp.float32],
+    centre: wp.vec3,
     # Out
     worlds: Worlds,
 ):
-    """Draw the numbers of the episodes that begin in chosen worlds."""
+    """Draw the numbers of the episodes that begin in chosen worlds: Young's modulus, shifts and turn of the body about
+    a centre [m], and those of the task.
+    """
     w = wp.tid()
     if chosen[w] == 0:
         return
     state = wp.rand_init(worlds.seed[w], worlds.number[w])
     for d in range(low.shape[0]):
         worlds.draws[w, d] = low[d] + (high[d] - low[d]) * wp.randf(state)
+    for k in range(worlds.notes.shape[1]):
+        worlds.notes[w, k] = 0.0
     worlds.number[w] = worlds.number[w] + 1
     worlds.step[w] = 0
     worlds.streak[w] = 0
     worlds.over[w] = 0
-    worlds.lost[w] = 0
     worlds.closed[w] = 0
     worlds.ratio[w] = 1.0
+    worlds.young[w] = worlds.draws[w, 0]
+    worlds.pose[w] = turned(worlds.draws, w, centre)
 
 
 @wp.kernel(enable_backward=False)
@@ -194,10 +208,11 @@ def pace_tools(seconds: float, targets: wp.array2d[wp.transform], motions: Motio
 
 @wp.kernel(enable_backward=False)
 def find_lost(per_world: int, far: float, u: wp.array[wp.vec4], worlds: Worlds):
-    """Find worlds with a displacement that is not finite, or larger than ``far`` [m]."""
+    """Find worlds, in an episode, with a displacement that is not finite, or larger than ``far`` [m]."""
     i = wp.tid()
-    if not wp.length(load_node(u, i)) < far:
-        worlds.lost[i / per_world] = 1
+    w = i / per_world
+    if worlds.over[w] == 0 and not wp.length(load_node(u, i)) < far:
+        worlds.lost[w] = 1
 
 
 @wp.kernel(enable_backward=False)

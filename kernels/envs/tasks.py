@@ -1,18 +1,14 @@
-"""Tasks: how their episodes begin, and how steps are judged."""
+"""Tasks: how their episodes begin, and how steps are judged.
+
+The first four numbers that an episode draws are used by all tasks: ``episodes.draw_episodes``. Others follow in the
+order in which a task names them.
+"""
 
 import warp as wp
 
 from .episodes import FORCE, OF_TOOL, POSITION, Worlds, conclude, note, seen
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.func
-def turned(draws: wp.array2d[wp.float32], w: int, first: int, centre: wp.vec3):
-    """A pose: drawn shifts along x and y [m], and a drawn turn about the vertical through a centre [rad]."""
-    q = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), draws[w, first + 2])
-    shift = wp.vec3(draws[w, first], draws[w, first + 1], 0.0)
-    return wp.transformation(centre + shift - wp.quat_rotate(q, centre), q)
 
 
 @wp.func
@@ -25,22 +21,19 @@ def upright(x: wp.vec3):
     return wp.transformation(x, wp.quat_identity())
 
 
-# --- retraction: young, shift x, y, turn, start x, y, z, goal x, y, z ------------------------------------------------
+# --- retraction: start x, y, z, goal x, y, z -------------------------------------------------------------------------
 
 
 @wp.kernel(enable_backward=False)
-def begin_retraction(chosen: wp.array[wp.int32], centre: wp.vec3, site: wp.vec3, worlds: Worlds):
-    """Place the flap, the gripper above its rim, and the goal of the rim's middle, ``site`` at rest [m]."""
+def begin_retraction(chosen: wp.array[wp.int32], site: wp.vec3, worlds: Worlds):
+    """Place the gripper above the rim, and the goal of the rim's middle, ``site`` at rest [m]."""
     w = wp.tid()
     if chosen[w] == 0:
         return
-    worlds.young[w] = worlds.draws[w, 0]
-    pose = turned(worlds.draws, w, 1, centre)
-    worlds.pose[w] = pose
+    pose = worlds.pose[w]
     here = wp.transform_point(pose, site)
     worlds.targets[0, w] = upright(here + drawn(worlds.draws, w, 4))
     note(worlds, w, 0, wp.transform_point(pose, site + drawn(worlds.draws, w, 7)))
-    worlds.notes[w, 3] = 0.0
 
 
 @wp.kernel(enable_backward=False)
@@ -55,23 +48,19 @@ def judge_retraction(near: float, hold: int, bonus: float, worlds: Worlds):
     conclude(worlds, w, reward, to_goal < near, hold, bonus, False)
 
 
-# --- palpation: young, shift x, y, turn, lump x, y, z, its radius, its ratio -----------------------------------------
+# --- palpation: lump x, y, z, its radius, its ratio ------------------------------------------------------------------
 
 
 @wp.kernel(enable_backward=False)
-def begin_palpation(chosen: wp.array[wp.int32], centre: wp.vec3, start: wp.vec3, worlds: Worlds):
-    """Place the tissue, a lump in it, and the probe above."""
+def begin_palpation(chosen: wp.array[wp.int32], start: wp.vec3, worlds: Worlds):
+    """Place a lump in the tissue, and the probe above."""
     w = wp.tid()
     if chosen[w] == 0:
         return
-    worlds.young[w] = worlds.draws[w, 0]
-    worlds.pose[w] = turned(worlds.draws, w, 1, centre)
     lump = drawn(worlds.draws, w, 4)
     worlds.lump[w] = wp.vec4(lump[0], lump[1], lump[2], worlds.draws[w, 7])
     worlds.ratio[w] = worlds.draws[w, 8]
     worlds.targets[0, w] = upright(start)
-    for k in range(3):
-        worlds.notes[w, k] = 0.0
 
 
 @wp.kernel(enable_backward=False)
@@ -93,24 +82,21 @@ def judge_palpation(near: float, least: float, hold: int, bonus: float, worlds: 
     conclude(worlds, w, reward, away < near and force >= least, hold, bonus, False)
 
 
-# --- reach: young, shift x, y, turn, start x, y, z, goal y, z --------------------------------------------------------
+# --- reach: start x, y, z, goal y, z ---------------------------------------------------------------------------------
 
 
 @wp.kernel(enable_backward=False)
 def begin_reach(chosen: wp.array[wp.int32], centre: wp.vec3, start: wp.vec3, half: float, worlds: Worlds):
-    """Place the tissue with its channel, the tool above, and the goal of the tool's tip in the channel; ``half`` is
+    """Place the tool above the tissue, and the goal of its tip in the channel below ``centre`` [m]; ``half`` is
     the distance from the tool's origin to its tip [m].
     """
     w = wp.tid()
     if chosen[w] == 0:
         return
-    worlds.young[w] = worlds.draws[w, 0]
-    pose = turned(worlds.draws, w, 1, centre)
-    worlds.pose[w] = pose
+    pose = worlds.pose[w]
     worlds.targets[0, w] = upright(start + drawn(worlds.draws, w, 4))
     goal = wp.transform_point(pose, centre + wp.vec3(0.0, worlds.draws[w, 7], worlds.draws[w, 8]))
     note(worlds, w, 0, goal + wp.vec3(0.0, 0.0, half))
-    worlds.notes[w, 3] = 0.0
 
 
 @wp.kernel(enable_backward=False)
@@ -126,22 +112,19 @@ def judge_reach(near: float, bound: float, hold: int, bonus: float, worlds: Worl
     conclude(worlds, w, reward, away < near, hold, bonus, bruised)
 
 
-# --- lift: young, shift x, y, turn, fingers' middle x, y, z, their distance ------------------------------------------
+# --- lift: fingers' middle x, y, z, their distance -------------------------------------------------------------------
 
 
 @wp.kernel(enable_backward=False)
-def begin_lift(chosen: wp.array[wp.int32], centre: wp.vec3, worlds: Worlds):
-    """Place the block, and the fingers above it."""
+def begin_lift(chosen: wp.array[wp.int32], worlds: Worlds):
+    """Place the fingers above the block."""
     w = wp.tid()
     if chosen[w] == 0:
         return
-    worlds.young[w] = worlds.draws[w, 0]
-    worlds.pose[w] = turned(worlds.draws, w, 1, centre)
     middle = drawn(worlds.draws, w, 4)
     apart = wp.vec3(0.5 * worlds.draws[w, 7], 0.0, 0.0)
     worlds.targets[0, w] = upright(middle - apart)
     worlds.targets[1, w] = upright(middle + apart)
-    worlds.notes[w, 0] = 0.0
 
 
 @wp.kernel(enable_backward=False)
@@ -160,7 +143,7 @@ def judge_lift(points: int, low: float, high: float, hold: int, bonus: float, wo
     conclude(worlds, w, reward, block[2] > high, hold, bonus, False)
 
 
-# --- threading: young, shift x, y, turn, hold z, peg x, y ------------------------------------------------------------
+# --- threading: hold z, peg x, y -------------------------------------------------------------------------------------
 
 
 @wp.kernel(enable_backward=False)
@@ -169,11 +152,7 @@ def begin_threading(chosen: wp.array[wp.int32], centre: wp.vec3, above: float, w
     w = wp.tid()
     if chosen[w] == 0:
         return
-    worlds.young[w] = worlds.draws[w, 0]
-    pose = turned(worlds.draws, w, 1, centre)
-    pose = wp.transformation(
-        wp.transform_get_translation(pose) + wp.vec3(0.0, 0.0, worlds.draws[w, 4]), wp.transform_get_rotation(pose)
-    )
+    pose = upright(wp.vec3(0.0, 0.0, worlds.draws[w, 4])) * worlds.pose[w]
     worlds.pose[w] = pose
     worlds.targets[0, w] = upright(wp.transform_point(pose, centre + wp.vec3(0.0, 0.0, above)))
     peg = wp.vec3(worlds.draws[w, 5], worlds.draws[w, 6], wp.transform_get_translation(worlds.targets[1, w])[2])

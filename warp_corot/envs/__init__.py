@@ -14,7 +14,8 @@ from .palpate import Palpate
 from .reach import Reach
 from .retract import Retract
 from .single import SingleEnv
-from .soft_env import Scene, SoftEnv, Task
+from .soft_env import SoftEnv
+from .task import Scene, Task
 from .thread import Thread
 
 __all__ = ["TASKS", "Lift", "Palpate", "Reach", "Retract", "Scene", "SingleEnv", "SoftEnv", "Task", "Thread"]

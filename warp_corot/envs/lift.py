@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-import warp as wp
 
 from warp_corot.contact.shapes import Box, Ground
 from warp_corot.contact.tool import Tool
 from warp_corot.kernels.envs import episodes, tasks
 
-from .meshes import box, nodes_at
-from .soft_env import RATE, Scene, SoftEnv, Task
+from .soft_env import RATE, SoftEnv
+from .task import Scene, Task, box, nodes_at
 
 #: Edges of the block and of a finger [m], and the speed of the fingers along each axis [m/s].
 BLOCK, FINGER, SPEED = (0.03, 0.024, 0.024), (0.008, 0.02, 0.02), 0.1
-LOW, HIGH = (-0.02, -0.02, 0.012), (0.05, 0.044, 0.09)
 #: Smallest and largest distance between the fingers' centres [m].
 NARROW, WIDE = 0.024, 0.06
 
@@ -34,7 +32,13 @@ class Lift(SoftEnv):
             **{"shift_x": (-0.008, 0.008), "shift_y": (-0.008, 0.008), "turn": (-0.2, 0.2)},
             **{"start_x": (0.005, 0.025), "start_y": (0.002, 0.022), "start_z": (0.04, 0.055), "apart": (0.05, 0.058)},
         },
+        begin=tasks.begin_lift,
+        begun=(),
+        judge=tasks.judge_lift,
+        judged=(8, 0.5 * BLOCK[2], 0.5 * BLOCK[2] + 0.03, 10, 10.0),
         actions=4,
+        speed=SPEED,
+        workspace=((-0.02, -0.02, 0.012), (0.05, 0.044, 0.09)),
         notes={"height": 1},
         steps=200,
         window=((-0.02, -0.01, 0.0), (0.05, 0.035, 0.075)),
@@ -45,23 +49,12 @@ class Lift(SoftEnv):
         mesh = box((4, 3, 3), BLOCK, self.cells)
         x, y, z = BLOCK
         points = nodes_at(mesh, [(i * x, j * y, k * z) for i in (0, 1) for j in (0, 1) for k in (0, 1)])
-        fingers = [
-            Tool(Box(FINGER, position=(side, 0.5 * y, 0.05), friction=0.9), speed=4.0 * SPEED)
-            for side in (-0.01, x + 0.01)
-        ]
-        return Scene(mesh, None, fingers, [Ground()], points)
-
-    def launch_task_beginning(self, chosen: wp.array) -> None:
-        x, y, _ = BLOCK
-        self._launch(tasks.begin_lift, self.num_envs, [chosen, wp.vec3(0.5 * x, 0.5 * y, 0.0), self.worlds])
+        shapes = [Box(FINGER, position=(side, 0.5 * y, 0.05), friction=0.9) for side in (-0.01, x + 0.01)]
+        fingers = [Tool(shape, speed=4.0 * SPEED) for shape in shapes]
+        return Scene(mesh, None, fingers, [Ground()], points, (0.5 * x, 0.5 * y, 0.0))
 
     def launch_actions(self) -> None:
-        inputs = [SPEED / RATE, wp.vec3(*LOW), wp.vec3(*HIGH), NARROW, WIDE, self.worlds]
-        self._launch(episodes.steer_fingers, self.num_envs, inputs)
-
-    def launch_judgement(self) -> None:
-        low = 0.5 * BLOCK[2]
-        self._launch(tasks.judge_lift, self.num_envs, [8, low, low + 0.03, 10, 10.0, self.worlds])
+        self._launch(episodes.steer_fingers, self.num_envs, [*self._steering, NARROW, WIDE, self.worlds])
 
     def scripted_actions(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         fingers = [observations[:, self.columns[f"tool{k}.position"]] for k in (0, 1)]

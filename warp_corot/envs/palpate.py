@@ -8,14 +8,13 @@ import warp as wp
 
 from warp_corot.contact.shapes import Sphere
 from warp_corot.contact.tool import Tool
-from warp_corot.kernels.envs import episodes, tasks
+from warp_corot.kernels.envs import tasks
 
-from .meshes import box, nodes_at
-from .soft_env import RATE, Scene, SoftEnv, Task
+from .soft_env import RATE, SoftEnv
+from .task import Scene, Task, box, nodes_at
 
 #: Edges of the tissue [m], the radius of the probe, and its speed along each axis [m/s].
 TISSUE, RADIUS, SPEED = (0.06, 0.06, 0.02), 0.008, 0.06
-LOW, HIGH = (0.0, 0.0, 0.022), (0.06, 0.06, 0.04)
 #: Height of the probe while the scripted policy searches, and the rows of its search [m].
 DEPTH, ROWS = 0.0245, (0.016, 0.03, 0.044)
 
@@ -35,7 +34,13 @@ class Palpate(SoftEnv):
             **{"lump_x": (0.016, 0.044), "lump_y": (0.016, 0.044), "lump_z": (0.011, 0.013)},
             **{"radius": (0.009, 0.011), "ratio": (7.0, 9.0)},
         },
+        begin=tasks.begin_palpation,
+        begun=(wp.vec3(0.5 * TISSUE[0], 0.5 * TISSUE[1], 0.035),),
+        judge=tasks.judge_palpation,
+        judged=(0.008, 0.1, 25, 10.0),
         actions=3,
+        speed=SPEED,
+        workspace=((0.0, 0.0, 0.022), (0.06, 0.06, 0.04)),
         notes={"largest_force": 1, "largest_at": 2},
         steps=300,
         window=((-0.005, -0.005, 0.0), (0.065, 0.065, 0.04)),
@@ -47,19 +52,7 @@ class Palpate(SoftEnv):
         x, y, z = TISSUE
         points = nodes_at(mesh, [(0.0, 0.0, z), (x, 0.0, z), (0.0, y, z), (x, y, z)])
         probe = Tool(Sphere(RADIUS, position=(0.5 * x, 0.5 * y, 0.035)), speed=2.0 * SPEED)
-        return Scene(mesh, "z == zmin", [probe], [], points, friction=0.05)
-
-    def launch_task_beginning(self, chosen: wp.array) -> None:
-        x, y, _ = TISSUE
-        start = wp.vec3(0.5 * x, 0.5 * y, 0.035)
-        inputs = [chosen, wp.vec3(0.5 * x, 0.5 * y, 0.0), start, self.worlds]
-        self._launch(tasks.begin_palpation, self.num_envs, inputs)
-
-    def launch_actions(self) -> None:
-        self._launch(episodes.steer, self.num_envs, [SPEED / RATE, wp.vec3(*LOW), wp.vec3(*HIGH), self.worlds])
-
-    def launch_judgement(self) -> None:
-        self._launch(tasks.judge_palpation, self.num_envs, [0.008, 0.1, 25, 10.0, self.worlds])
+        return Scene(mesh, "z == zmin", [probe], [], points, (0.5 * x, 0.5 * y, 0.0), friction=0.05)
 
     def scripted_actions(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         probe = observations[:, self.columns["tool0.position"]]

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from warp_corot.contact.shapes import Ground
 from warp_corot.contact.tool import Obstacle
 from warp_corot.errors import InputError
 from warp_corot.io.pictures.camera import Camera
@@ -18,8 +17,8 @@ from warp_corot.io.write.solids import poses_of, shape_of, solid_of
 if TYPE_CHECKING:
     from .soft_env import SoftEnv
 
-#: Pixels of a picture, and those an inch.
-SIZE, DPI = (480, 360), 100
+#: Pixels of a picture.
+SIZE = np.array([480, 360])
 #: Von Mises stress at the end of the colours [Pa].
 MOST = 6e3
 
@@ -46,25 +45,17 @@ def draw_world(env: SoftEnv, world: int = 0) -> npt.NDArray[np.uint8]:
             faces.append(solid.triangles + sum(map(len, points)))
             points.append(solid.at(pose))
             values.append(np.full(len(points[-1]), np.nan))
-    figure = Figure((SIZE[0] / DPI, SIZE[1] / DPI), dpi=DPI)
+    figure = Figure((SIZE[0] / 100, SIZE[1] / 100), dpi=100)
     canvas = FigureCanvasAgg(figure)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    stands = any(isinstance(shape_of(each), Ground) for each in given)
     low, high = env.task.window
     camera = Camera.fit(np.array([low, high]), "Z", *env.task.view)
-    draw_body(
-        axes,
-        np.concatenate(points),
-        np.concatenate(faces),
-        scalars=np.concatenate(values),
-        value_range=(0.0, MOST),
-        camera=camera,
-        ground=0.0 if stands else float(low[2]),
-    )
+    options = {"scalars": np.concatenate(values), "value_range": (0.0, MOST), "camera": camera, "ground": 0.0}
+    draw_body(axes, np.concatenate(points), np.concatenate(faces), **options)
     corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
     seen = camera.project(corners)[0]
-    middle, half = 0.5 * (seen.min(axis=0) + seen.max(axis=0)), 0.5 * np.ptp(seen, axis=0)
-    half = max(half[0] / SIZE[0], half[1] / SIZE[1]) * np.array(SIZE)
-    axes.set(xlim=(middle[0] - half[0], middle[0] + half[0]), ylim=(middle[1] - half[1], middle[1] + half[1]))
+    middle, half = 0.5 * (seen.min(axis=0) + seen.max(axis=0)), 0.5 * (np.ptp(seen, axis=0) / SIZE).max() * SIZE
+    left, right = middle - half, middle + half
+    axes.set(xlim=(left[0], right[0]), ylim=(left[1], right[1]))
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()

@@ -8,14 +8,15 @@ import warp as wp
 
 from warp_corot.contact.shapes import Capsule
 from warp_corot.contact.tool import Tool
-from warp_corot.kernels.envs import episodes, tasks
+from warp_corot.kernels.envs import tasks
 
-from .meshes import box, nodes_at
-from .soft_env import RATE, Scene, SoftEnv, Task
+from .soft_env import RATE, SoftEnv
+from .task import Scene, Task, box, nodes_at
 
 #: Edges of the tissue, the width of its channel, the tool's radius and half its length [m], and its speed [m/s].
 TISSUE, CHANNEL, RADIUS, HALF, SPEED = (0.04, 0.024, 0.024), 0.008, 0.005, 0.02, 0.06
-LOW, HIGH = (-0.01, -0.01, 0.03), (0.05, 0.034, 0.07)
+#: About which the tissue is turned [m].
+CENTRE = wp.vec3(0.5 * TISSUE[0], 0.5 * TISSUE[1], 0.0)
 #: The stress that bruises [Pa].
 BRUISE = 6e3
 
@@ -35,7 +36,13 @@ class Reach(SoftEnv):
             **{"start_x": (-0.01, 0.01), "start_y": (-0.005, 0.005), "start_z": (0.0, 0.006)},
             **{"goal_y": (-0.005, 0.005), "goal_z": (0.011, 0.014)},
         },
+        begin=tasks.begin_reach,
+        begun=(CENTRE, CENTRE + wp.vec3(0.0, 0.0, 0.032 + HALF), HALF),
+        judge=tasks.judge_reach,
+        judged=(0.002, BRUISE, 5, 10.0),
         actions=3,
+        speed=SPEED,
+        workspace=((-0.01, -0.01, 0.03), (0.05, 0.034, 0.07)),
         notes={"goal": 3, "stress": 1},
         steps=200,
         feels_stress=True,
@@ -46,24 +53,10 @@ class Reach(SoftEnv):
     def make_scene(self) -> Scene:
         x, y, z = TISSUE
         left, right = 0.5 * (x - CHANNEL), 0.5 * (x + CHANNEL)
-        mesh = box(
-            (5, 3, 3), TISSUE, self.cells, lambda p: (abs(p[:, 0] - 0.5 * x) < 0.5 * CHANNEL) & (p[:, 2] > 0.008)
-        )
+        mesh = box((5, 3, 3), TISSUE, self.cells, lambda p: (left < p[:, 0]) & (p[:, 0] < right) & (p[:, 2] > 0.008))
         points = nodes_at(mesh, [(left, 0.0, z), (right, 0.0, z), (left, y, z), (right, y, z)])
         tool = Tool(Capsule(RADIUS, 2.0 * HALF, position=(0.5 * x, 0.5 * y, 0.055)), speed=2.0 * SPEED)
-        return Scene(mesh, "z == zmin", [tool], [], points, friction=0.1)
-
-    def launch_task_beginning(self, chosen: wp.array) -> None:
-        x, y, _ = TISSUE
-        start = wp.vec3(0.5 * x, 0.5 * y, 0.032 + HALF)
-        inputs = [chosen, wp.vec3(0.5 * x, 0.5 * y, 0.0), start, HALF, self.worlds]
-        self._launch(tasks.begin_reach, self.num_envs, inputs)
-
-    def launch_actions(self) -> None:
-        self._launch(episodes.steer, self.num_envs, [SPEED / RATE, wp.vec3(*LOW), wp.vec3(*HIGH), self.worlds])
-
-    def launch_judgement(self) -> None:
-        self._launch(tasks.judge_reach, self.num_envs, [0.002, BRUISE, 5, 10.0, self.worlds])
+        return Scene(mesh, "z == zmin", [tool], [], points, CENTRE, friction=0.1)
 
     def scripted_actions(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         tool, goal = observations[:, self.columns["tool0.position"]], observations[:, self.columns["goal"]]

@@ -8,14 +8,13 @@ import warp as wp
 
 from warp_corot.contact.shapes import Ground, Sphere
 from warp_corot.contact.tool import Tool
-from warp_corot.kernels.envs import episodes, tasks
+from warp_corot.kernels.envs import tasks
 
-from .meshes import box, nodes_at
-from .soft_env import RATE, Scene, SoftEnv, Task
+from .soft_env import SoftEnv
+from .task import Scene, Task, box, nodes_at
 
 #: Edges of the flap [m], the radius of the gripper, and the speed of a tool along each axis [m/s].
 FLAP, RADIUS, SPEED = (0.072, 0.048, 0.008), 0.004, 0.1
-LOW, HIGH = (-0.02, -0.03, 0.002), (0.11, 0.08, 0.09)
 
 
 class Retract(SoftEnv):
@@ -33,7 +32,13 @@ class Retract(SoftEnv):
             **{"start_x": (-0.015, 0.015), "start_y": (-0.015, 0.015), "start_z": (0.015, 0.03)},
             **{"goal_x": (-0.025, -0.01), "goal_y": (-0.008, 0.008), "goal_z": (0.02, 0.035)},
         },
+        begin=tasks.begin_retraction,
+        begun=(wp.vec3(FLAP[0], 0.5 * FLAP[1], FLAP[2]),),
+        judge=tasks.judge_retraction,
+        judged=(0.005, 10, 10.0),
         actions=4,
+        speed=SPEED,
+        workspace=((-0.02, -0.03, 0.002), (0.11, 0.08, 0.09)),
         notes={"goal": 3, "closed": 1},
         steps=200,
         window=((0.0, -0.01, 0.0), (0.09, 0.06, 0.06)),
@@ -46,18 +51,7 @@ class Retract(SoftEnv):
         points = nodes_at(mesh, [(x, 0.5 * y, z), (x, 0.0, z), (x, y, z)])
         gripper = Tool(Sphere(RADIUS, position=(x, 0.5 * y, 0.03)), speed=2.0 * SPEED)
         rim = mesh.points[:, 0] > x - 1e-6
-        return Scene(mesh, "x == xmin", [gripper], [Ground()], points, gripped=rim, reach=0.009)
-
-    def launch_task_beginning(self, chosen: wp.array) -> None:
-        x, y, z = FLAP
-        inputs = [chosen, wp.vec3(0.0, 0.5 * y, 0.0), wp.vec3(x, 0.5 * y, z), self.worlds]
-        self._launch(tasks.begin_retraction, self.num_envs, inputs)
-
-    def launch_actions(self) -> None:
-        self._launch(episodes.steer, self.num_envs, [SPEED / RATE, wp.vec3(*LOW), wp.vec3(*HIGH), self.worlds])
-
-    def launch_judgement(self) -> None:
-        self._launch(tasks.judge_retraction, self.num_envs, [0.005, 10, 10.0, self.worlds])
+        return Scene(mesh, "x == xmin", [gripper], [Ground()], points, (0.0, 0.5 * y, 0.0), gripped=rim, reach=0.009)
 
     def scripted_actions(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         gripper, goal = observations[:, self.columns["tool0.position"]], observations[:, self.columns["goal"]]

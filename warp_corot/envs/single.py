@@ -21,10 +21,8 @@ class SingleEnv(gymnasium.Env[npt.NDArray[np.float32], npt.NDArray[np.float32]])
 
     def __init__(self, kind: type[SoftEnv], **options: Any):
         self.worlds = kind(1, **options)
-        self.observation_space, self.action_space = (
-            self.worlds.single_observation_space,
-            self.worlds.single_action_space,
-        )
+        self.observation_space = self.worlds.single_observation_space
+        self.action_space = self.worlds.single_action_space
         self.metadata = {name: each for name, each in self.worlds.metadata.items() if name != "autoreset_mode"}
         self.render_mode = self.worlds.render_mode
 

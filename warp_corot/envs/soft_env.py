@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import suppress
 from typing import Any, ClassVar
 
 import numpy as np
@@ -18,22 +18,22 @@ try:
 except ImportError as error:
     raise ImportError('environments need gymnasium: pip install "warp-corot[envs]"') from error
 
-from warp_corot.body.places import Nodes
 from warp_corot.body.soft_body import SoftBody
+from warp_corot.contact.contacts import Contacts
 from warp_corot.contact.grasp import Grasp
 from warp_corot.contact.options import Contact
-from warp_corot.contact.shapes import Shape, Vector
-from warp_corot.contact.tool import Tool
+from warp_corot.discretization.discretization import centroids
 from warp_corot.elasticity import Corotated
-from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_choice, checked_count, shown
+from warp_corot.errors import InputError, UnstableError
+from warp_corot.inputs.checks import checked_choice, checked_count, checked_flag, checked_numbers, shown
 from warp_corot.inputs.device import checked_device
 from warp_corot.kernels.envs import episodes as kernels
 from warp_corot.materials.isotropic import Isotropic
-from warp_corot.mesh.tetmesh import TetMesh
 from warp_corot.simulation.simulation import Simulation
-from warp_corot.solvers import BackwardEuler, SymplecticEuler
+from warp_corot.solvers import BackwardEuler, Integrator, SymplecticEuler
 from warp_corot.solvers.recorded import Segment
+
+from .task import Scene, Task
 
 #: Actions, observations, rewards and flags as arrays of these.
 ARRAYS = ("numpy", "torch", "warp")
@@ -46,65 +46,18 @@ SAFETY = 0.6
 #: Damping of explicit steps [1/s]: tissue in water and blood does not ring.
 DAMPING = 20.0
 DENSITY, POISSON = 1000.0, 0.4
+#: Parts of a tool's observation, in the order of the kernel.
+TOOL_PARTS = ("position", "velocity", "force", "torque")
 #: A node that is so far from its place [m] is lost, and the episode ends.
 FARTHEST = 1.0
-
-
-@dataclass
-class Scene:
-    """What a task is made of, in one world.
-
-    Attributes:
-        mesh: The tissue at rest.
-        fixed: Its held nodes, as for ``SoftBody.fix``; None: none.
-        tools: Tools that an episode places; those that actions move come first.
-        obstacles: Obstacles at rest.
-        points: Observed nodes, [P].
-        gripped: Nodes that the first tool holds while it is closed; None: it is no gripper.
-        reach: Distance from its origin at which it takes hold of them [m].
-        friction: Coefficient of friction of all contacts without their own.
-    """
-
-    mesh: TetMesh
-    fixed: Nodes | None
-    tools: list[Tool]
-    obstacles: list[Shape]
-    points: npt.NDArray[np.integer]
-    gripped: Nodes | None = None
-    reach: float = 0.0
-    friction: float = 0.3
-
-
-@dataclass
-class Task:
-    """What a task declares.
-
-    Attributes:
-        ranges: The lowest and the highest value of each number that is drawn for an episode, in the order of the task's
-            kernel; ``young`` [Pa] is the first.
-        actions: How many actions there are.
-        notes: Names and sizes of the task's own numbers among the observations.
-        steps: Steps of an episode until it is cut off.
-        feels_stress: Whether steps find the largest stress of the tissue.
-        window: Lowest and highest corner of what pictures show [m].
-        view: Azimuth and elevation of the camera [°].
-    """
-
-    ranges: Mapping[str, tuple[float, float]]
-    actions: int
-    notes: Mapping[str, int]
-    steps: int
-    window: tuple[Vector, Vector]
-    view: tuple[float, float]
-    feels_stress: bool = False
 
 
 class SoftEnv(VectorEnv):
     """Soft tissue and tools in several worlds, one for each environment, as a ``gymnasium.vector.VectorEnv``.
 
     A step takes 1/50 s. All of it is one recording of launches on the device: nothing is copied to the host, unless
-    arrays are NumPy's. Worlds do not depend on one another: on the CPU with ``threads=1``, and on CUDA, world i of an
-    environment with seed s gives bit for bit the episodes of a single one with seed s + i.
+    arrays are NumPy's. Worlds do not depend on one another: on the CPU with ``threads=1`` and explicit steps, world i
+    of an environment with seed s gives bit for bit the episodes of a single one with seed s + i.
 
     Args:
         num_envs: The number of worlds.
@@ -118,6 +71,8 @@ class SoftEnv(VectorEnv):
         max_episode_steps: Steps after which an episode is cut off; None: the task's own.
         integrator: "explicit", or "implicit": two steps of ``BackwardEuler`` in each step, without time steps that
             depend on the stiffest tissue.
+        deterministic: Whether explicit steps on CUDA give the same result every time, which takes time; see
+            ``Simulation``.
         device: The device; None for Warp's default.
         threads: As for ``SoftBody``.
         render_mode: "rgb_array": ``render`` draws worlds; or None.
@@ -148,6 +103,7 @@ class SoftEnv(VectorEnv):
         ranges: Mapping[str, tuple[float, float]] | None = None,
         max_episode_steps: int | None = None,
         integrator: str = "explicit",
+        deterministic: bool = True,
         device: str | wp.Device | None = None,
         threads: int | None = None,
         render_mode: str | None = None,
@@ -166,11 +122,11 @@ class SoftEnv(VectorEnv):
         steps = self.task.steps if max_episode_steps is None else max_episode_steps
         self.max_episode_steps = checked_count(steps, "max_episode_steps", least=1)
         self._threads = threads
+        self._is_deterministic = checked_flag(deterministic, "deterministic") and integrator == "explicit"
         self._make_simulation(integrator)
         self._make_arrays(at_once=autoreset == "same_step")
         self.single_action_space = Box(-1.0, 1.0, (self.task.actions,), np.float32)
-        size = self.worlds.observations.shape[1]
-        self.single_observation_space = Box(-np.inf, np.inf, (size,), np.float32)
+        self.single_observation_space = Box(-np.inf, np.inf, self.worlds.observations.shape[1:], np.float32)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self._seed(None)
@@ -189,20 +145,12 @@ class SoftEnv(VectorEnv):
         """What the task is made of."""
 
     @abstractmethod
-    def launch_task_beginning(self, chosen: wp.array) -> None:
-        """Launch what an episode of the task begins with in chosen worlds, int32 [worlds]."""
-
-    @abstractmethod
-    def launch_actions(self) -> None:
-        """Launch what actions do to the targets of tools."""
-
-    @abstractmethod
-    def launch_judgement(self) -> None:
-        """Launch the rewards, and the ends of episodes."""
-
-    @abstractmethod
     def scripted_actions(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         """Actions of a policy by hand, which succeeds: float32 [n, A] for observations float32 [n, K]."""
+
+    def launch_actions(self) -> None:
+        """Launch what actions do to the targets of tools; here they steer the first one."""
+        self._launch(kernels.steer, self.num_envs, [*self._steering, self.worlds])
 
     # --- as an environment -----------------------------------------------------------------------------------------
 
@@ -249,15 +197,18 @@ class SoftEnv(VectorEnv):
             InputError: The actions have another shape.
         """
         wp.copy(self.worlds.actions, self._taken(actions))
-        if self.sim.contact is not None and self.sim.contact.is_full:
-            self.sim.contact.grow()
+        if self._contact.is_full:
+            # A world that flies apart is lost and begins again.
+            with suppress(UnstableError):
+                self._contact.grow()
         self._replay(self._launch_step)
-        given, worlds = self._given, self.worlds
-        info = {"success": given(worlds.success), "lost": given(worlds.lost)}
+        worlds = self.worlds
+        info = {"success": self._given(worlds.success), "lost": self._given(worlds.lost)}
         if worlds.at_once:
-            info["final_obs"] = given(self._final)
-        flags = given(worlds.terminated), given(worlds.truncated)
-        return given(worlds.observations), given(worlds.reward), *flags, info
+            info["final_obs"] = self._given(self._final)
+        given = worlds.observations, worlds.reward, worlds.terminated, worlds.truncated
+        observations, rewards, terminated, truncated = map(self._given, given)
+        return observations, rewards, terminated, truncated, info
 
     def render(self) -> tuple[npt.NDArray[np.uint8], ...] | None:
         """Pictures of the first worlds, at most four, uint8 [height, width, 3] each; None without a render mode."""
@@ -272,6 +223,12 @@ class SoftEnv(VectorEnv):
         """The drawn numbers of the present episodes, float32 [worlds] each; waits for the device."""
         return dict(zip(self.ranges, self.worlds.draws.numpy().T, strict=True))
 
+    @property
+    def _steering(self) -> list:
+        """How far tools go in a step [m], and the box that they do not leave."""
+        low, high = self.task.workspace
+        return [self.task.speed / RATE, wp.vec3(*low), wp.vec3(*high)]
+
     # --- pieces ----------------------------------------------------------------------------------------------------
 
     def _checked_ranges(self, given: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
@@ -279,10 +236,15 @@ class SoftEnv(VectorEnv):
         for name, bounds in given.items():
             if name not in ranges:
                 raise InputError(f"there is no range {shown(name)}; there are {', '.join(ranges)}")
-            low, high = np.asarray(bounds, float)
-            if not (np.isfinite([low, high]).all() and low <= high and (name != "young" or low > 0.0)):
+            pair = checked_numbers(bounds, name, "[2]")
+            if (
+                pair.shape != (2,)
+                or not np.isfinite(pair).all()
+                or pair[0] > pair[1]
+                or (name == "young" and pair[0] <= 0)
+            ):
                 raise InputError(f"the range {name} is {bounds}; it must be a lowest and a highest number")
-            ranges[name] = float(low), float(high)
+            ranges[name] = float(pair[0]), float(pair[1])
         return ranges
 
     def _make_simulation(self, integrator: str) -> None:
@@ -290,19 +252,17 @@ class SoftEnv(VectorEnv):
         depend on the number of worlds."""
         # The stiffest tissue bounds steps; episodes write their own stiffness.
         stiffest = self.ranges["young"][1] * max(self.ranges.get("ratio", (1.0, 1.0))[1], 1.0)
-        steps: SymplecticEuler | BackwardEuler = BackwardEuler(dt=1.0 / (RATE * IMPLICIT_STEPS))
-        self._count = IMPLICIT_STEPS
+        self._count, steps, law = IMPLICIT_STEPS, None, None
         if integrator == "explicit":
-            single = self._simulated(1, stiffest, SymplecticEuler(damping=DAMPING))[1]
+            _, single, law = self._simulated(1, stiffest, SymplecticEuler(damping=DAMPING))
             self._count = int(np.ceil(1.0 / (RATE * SAFETY * single.stable_dt)))
             steps = SymplecticEuler(dt=1.0 / (RATE * self._count), damping=DAMPING)
-        self.scene, self.sim = self._simulated(self.num_envs, stiffest, steps)
-        if integrator == "explicit" and self.sim.contact is not None and self.num_envs > 1:
-            single = self._simulated(1, stiffest, steps)[1]
-            assert single.contact is not None
-            self.sim.contact.take_law(single.contact)
+        euler = BackwardEuler(dt=1.0 / (RATE * self._count))
+        self.scene, self.sim, self._contact = self._simulated(self.num_envs, stiffest, steps or euler)
+        if law is not None:
+            self._contact.take_law(law)
 
-    def _simulated(self, worlds: int, young: float, steps: SymplecticEuler | BackwardEuler) -> tuple[Scene, Simulation]:
+    def _simulated(self, worlds: int, young: float, steps: Integrator) -> tuple[Scene, Simulation, Contacts]:
         scene = self.make_scene()
         material = Isotropic(np.full((worlds, len(scene.mesh.tets)), young), POISSON, DENSITY)
         body = SoftBody(scene.mesh, material, worlds=worlds, device=self.device, threads=self._threads)
@@ -315,9 +275,10 @@ class SoftEnv(VectorEnv):
             gravity=(0.0, 0.0, -9.81),
             obstacles=[*scene.tools, *scene.obstacles],
             contact=Contact(friction=scene.friction),
-            deterministic=isinstance(steps, SymplecticEuler),
+            deterministic=self._is_deterministic,
         )
-        return scene, sim
+        assert sim.contact is not None
+        return scene, sim, sim.contact
 
     def _make_arrays(self, *, at_once: bool) -> None:
         count, scene, device, task = self.num_envs, self.scene, self.device, self.task
@@ -335,15 +296,13 @@ class SoftEnv(VectorEnv):
         shapes["targets"] = (len(scene.tools), count)
         for name, kind in kinds.items():
             setattr(worlds, name, wp.zeros(shapes.get(name, count), dtype=kind, device=device))
-        first = np.array([np.tile(tool.pose, (count, 1)) for tool in scene.tools], np.float32)
-        worlds.targets.assign(first)
+        worlds.targets.assign(np.array([np.tile(tool.pose, (count, 1)) for tool in scene.tools], np.float32))
         worlds.limit, worlds.at_once = self.max_episode_steps, int(at_once)
         self._final = wp.zeros_like(worlds.observations)
         self._asked = wp.ones(count, dtype=wp.int32, device=device)
         bounds = np.array(list(self.ranges.values()), np.float32).T
         self._low, self._high = (wp.array(each, dtype=wp.float32, device=device) for each in bounds)
-        mesh = scene.mesh
-        self._centroids = wp.array(mesh.points[mesh.tets].mean(axis=1), dtype=wp.vec3, device=device)
+        self._centroids = wp.array(centroids(scene.mesh), dtype=wp.vec3, device=device)
         self._points = wp.array(scene.points, dtype=wp.int32, device=device)
         self._stress = wp.zeros(self.sim.body.element_count, dtype=wp.float32, device=device)
         for k, tool in enumerate(scene.tools):
@@ -386,10 +345,10 @@ class SoftEnv(VectorEnv):
         self._launch_observation()
 
     def _launch_step(self) -> None:
-        worlds, body, contact = self.worlds, self.sim.body, self.sim.contact
-        assert contact is not None
+        worlds, body, motions = self.worlds, self.sim.body, self._contact.obstacles.motions
+        worlds.lost.zero_()
         self.launch_actions()
-        self._launch(kernels.pace_tools, worlds.targets.shape, [1.0 / RATE, worlds.targets, contact.obstacles.motions])
+        self._launch(kernels.pace_tools, worlds.targets.shape, [1.0 / RATE, worlds.targets, motions])
         self.sim.recorded.launch(Segment(self._count, adopts=True, publishes=True))
         inputs = [body.world_node_count, FARTHEST, body.state.displacements, worlds]
         self._launch(kernels.find_lost, body.node_count, inputs)
@@ -397,7 +356,7 @@ class SoftEnv(VectorEnv):
             self.sim.fields[0].write_von_mises(body.state.displacements, self._stress)
             self._launch(kernels.find_peak, self.num_envs, [body.world_element_count, self._stress, worlds])
         self._launch_observation()
-        self.launch_judgement()
+        self._launch(self.task.judge, self.num_envs, [*self.task.judged, worlds])
         if worlds.at_once:
             self._launch_observation()
             wp.copy(self._final, worlds.observations)
@@ -407,24 +366,24 @@ class SoftEnv(VectorEnv):
     def _launch_beginning(self, chosen: wp.array) -> None:
         """Launch the beginning of episodes in chosen worlds, int32 [worlds]."""
         worlds, body, sim = self.worlds, self.sim.body, self.sim
-        self._launch(kernels.draw_episodes, self.num_envs, [chosen, self._low, self._high, worlds])
-        self.launch_task_beginning(chosen)
+        inputs = [chosen, self._low, self._high, wp.vec3(*self.scene.centre), worlds]
+        self._launch(kernels.draw_episodes, self.num_envs, inputs)
+        self._launch(self.task.begin, self.num_envs, [chosen, *self.task.begun, worlds])
         sim.reset(chosen)
         state, discretization = body.state, body.discretization
         inputs = [chosen, body.world_node_count, worlds.pose, state.rest, state.displacements, state.positions]
         self._launch(kernels.place_nodes, body.node_count, inputs)
         inputs = [chosen, self._centroids, POISSON, worlds, discretization.mu, discretization.lam]
         self._launch(kernels.write_stiffness, body.element_count, [*inputs, *discretization.lame[:2]])
-        assert sim.contact is not None
-        self._launch(kernels.place_tools, worlds.targets.shape, [chosen, worlds.targets, sim.contact.obstacles.motions])
+        inputs = [chosen, worlds.targets, self._contact.obstacles.motions]
+        self._launch(kernels.place_tools, worlds.targets.shape, inputs)
 
     def _launch_observation(self) -> None:
-        sim, body, contact = self.sim, self.sim.body, self.sim.contact
-        assert contact is not None
-        inputs = [len(self.scene.tools), 1.0 / (RATE * self._count), contact.obstacles.motions]
-        inputs += [contact.obstacles.wrenches, None if self._grasp is None else self._grasp.wrench, self._points]
+        body, obstacles = self.sim.body, self._contact.obstacles
+        inputs = [len(self.scene.tools), 1.0 / (RATE * self._count), obstacles.motions]
+        inputs += [obstacles.wrenches, None if self._grasp is None else self._grasp.wrench, self._points]
         inputs += [body.world_node_count, body.state.rest, body.state.displacements, self.worlds]
-        self._launch(kernels.observe, sim.worlds, inputs)
+        self._launch(kernels.observe, self.num_envs, inputs)
 
     def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list) -> None:
         wp.launch(kernel, dim, inputs, device=self.device)
@@ -432,11 +391,10 @@ class SoftEnv(VectorEnv):
     def _taken(self, actions: Any) -> wp.array:
         """Actions as a Warp array on the device."""
         shape = self.worlds.actions.shape
-        if not isinstance(actions, wp.array):
-            if hasattr(actions, "data_ptr"):
-                actions = wp.from_torch(actions.detach().float().contiguous())
-            else:
-                actions = wp.array(np.asarray(actions, np.float32), dtype=wp.float32, device=self.device)
+        if hasattr(actions, "data_ptr"):
+            actions = wp.from_torch(actions.detach().float().contiguous())
+        elif not isinstance(actions, wp.array):
+            actions = wp.array(np.asarray(actions, np.float32), dtype=wp.float32, device=self.device)
         if actions.shape != shape or actions.dtype != wp.float32:
             raise InputError(f"actions is {list(actions.shape)}; it must be float32 {list(shape)}")
         return actions
@@ -447,7 +405,3 @@ class SoftEnv(VectorEnv):
             return array.numpy().copy()
         clone = wp.clone(array)
         return clone if self.array == "warp" else wp.to_torch(clone)
-
-
-#: Parts of a tool's observation, in the order of the kernel.
-TOOL_PARTS = ("position", "velocity", "force", "torque")

@@ -8,16 +8,17 @@ import warp as wp
 
 from warp_corot.contact.shapes import Box, Capsule, Ground
 from warp_corot.contact.tool import Tool
-from warp_corot.kernels.envs import episodes, tasks
+from warp_corot.kernels.envs import tasks
 
-from .meshes import box, nodes_at
-from .soft_env import RATE, Scene, SoftEnv, Task
+from .soft_env import RATE, SoftEnv
+from .task import Scene, Task, box, nodes_at
 
 #: Edges of the tube and the width of its wall, the gripper's height above the lower end [m], and its speed [m/s].
 TUBE, WALL, ABOVE, SPEED = (0.024, 0.024, 0.032), 0.008, 0.0345, 0.1
+#: About which the tube is turned [m].
+CENTRE = wp.vec3(0.5 * TUBE[0], 0.5 * TUBE[1], 0.0)
 #: Radius of the peg, half the length between the centres of its ends, and the height of its middle [m].
 PEG, HALF, MIDDLE = 0.0035, 0.012, 0.012
-LOW, HIGH = (-0.03, -0.03, 0.03), (0.054, 0.054, 0.1)
 
 
 class Thread(SoftEnv):
@@ -34,7 +35,13 @@ class Thread(SoftEnv):
             **{"shift_x": (-0.012, 0.012), "shift_y": (-0.012, 0.012), "turn": (-0.4, 0.4), "height": (0.032, 0.04)},
             **{"peg_x": (0.004, 0.02), "peg_y": (0.004, 0.02)},
         },
+        begin=tasks.begin_threading,
+        begun=(CENTRE, ABOVE),
+        judge=tasks.judge_threading,
+        judged=(4, 0.003, 0.006, MIDDLE + HALF + PEG, 5, 10.0),
         actions=3,
+        speed=SPEED,
+        workspace=((-0.03, -0.03, 0.03), (0.054, 0.054, 0.1)),
         notes={},
         steps=200,
         window=((-0.015, -0.015, 0.0), (0.04, 0.04, 0.09)),
@@ -48,18 +55,7 @@ class Thread(SoftEnv):
         gripper = Tool(Box((0.024, 0.024, 0.004), position=(0.5 * x, 0.5 * y, 0.09)), speed=2.0 * SPEED)
         peg = Tool(Capsule(PEG, 2.0 * HALF, position=(0.5 * x, 0.5 * y, MIDDLE)))
         top = mesh.points[:, 2] > TUBE[2] - 1e-6
-        return Scene(mesh, None, [gripper, peg], [Ground()], points, gripped=top, reach=0.1, friction=0.1)
-
-    def launch_task_beginning(self, chosen: wp.array) -> None:
-        centre = wp.vec3(0.5 * TUBE[0], 0.5 * TUBE[1], 0.0)
-        self._launch(tasks.begin_threading, self.num_envs, [chosen, centre, ABOVE, self.worlds])
-
-    def launch_actions(self) -> None:
-        self._launch(episodes.steer, self.num_envs, [SPEED / RATE, wp.vec3(*LOW), wp.vec3(*HIGH), self.worlds])
-
-    def launch_judgement(self) -> None:
-        inputs = [4, 0.003, 0.006, MIDDLE + HALF + PEG, 5, 10.0, self.worlds]
-        self._launch(tasks.judge_threading, self.num_envs, inputs)
+        return Scene(mesh, None, [gripper, peg], [Ground()], points, CENTRE, gripped=top, reach=0.1, friction=0.1)
 
     def scripted_actions(self, observations: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         gripper, peg = (observations[:, self.columns[f"tool{k}.position"]] for k in (0, 1))
