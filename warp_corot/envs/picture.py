@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -50,8 +50,8 @@ def draw_world(env: SoftEnv, world: int = 0) -> npt.NDArray[np.uint8]:
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     low, high = env.task.window
     camera = Camera.fit(np.array([low, high]), "Z", *env.task.view)
-    options = {"scalars": np.concatenate(values), "value_range": (0.0, MOST), "camera": camera, "ground": 0.0}
-    draw_body(axes, np.concatenate(points), np.concatenate(faces), **options)
+    options: dict[str, Any] = {"value_range": (0.0, MOST), "camera": camera, "ground": 0.0}
+    draw_body(axes, np.concatenate(points), np.concatenate(faces), scalars=np.concatenate(values), **options)
     corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
     seen = camera.project(corners)[0]
     middle, half = 0.5 * (seen.min(axis=0) + seen.max(axis=0)), 0.5 * (np.ptp(seen, axis=0) / SIZE).max() * SIZE
