@@ -9,14 +9,14 @@ from pathlib import Path
 
 from PIL import Image
 
-from warp_corot import envs
+from warp_corot.envs import TASKS as KINDS
 
 IMAGES = Path(__file__).resolve().parent
 #: Steps from one picture to the next, most frames and colours of a film, and the time that each frame is shown [ms].
 EVERY, MOST, COLORS, SHOWN = 4, 22, 32, 100
 #: Seed of the episodes that are shown.
 SEED = 3
-TASKS = {kind.__name__.lower(): kind for kind in envs.TASKS.values()}
+TASKS = {kind.__name__.lower(): kind for kind in KINDS.values()}
 
 
 def frames(kind):
