@@ -123,6 +123,27 @@ def test_lips_that_touch_carry_as_if_they_were_whole(device):
     assert sags[1] == pytest.approx(sags[0], rel=0.05)
 
 
+def test_surfaces_that_would_stay_in_one_piece_are_refused(device, tmp_path):
+    """A user's own surface does not follow a cut: that is one line, and nothing is drawn wrongly."""
+    mesh = wc.TetForest.box((2, 1, 1), 0.2, 3)
+    material = wc.Isotropic(3e4, 0.4, 1000.0)
+    x = np.array([[0.1, 0.1, 0.1], [0.3, 0.1, 0.1], [0.1, 0.15, 0.1]])
+    bound = wc.SoftBody(mesh, material, device=device)
+    bound.bind(x, [[0, 1, 2]])
+    sim = wc.Simulation(bound)
+    with pytest.raises(wc.InputError, match="does not come apart where it is cut"):
+        sim.cut(wc.Plane((1, 0, 0), 0.2))
+    sim.advance_steps(1)
+    body = wc.SoftBody(mesh, material, device=device)
+    sim = wc.Simulation(body, cuts=[])
+    body.bind(x)
+    with pytest.raises(wc.InputError, match="does not come apart where it is cut"):
+        body.bind(x, [[0, 1, 2]])
+    surface = mesh.bind(x, [[0, 1, 2]])
+    with pytest.raises(wc.InputError, match="a surface is given, but the body can be cut"):
+        wc.record(sim, tmp_path / "a.usda", duration=0.1, surface=surface)
+
+
 @pytest.mark.parametrize("make", [organ, None])
 def test_recordings_show_the_cut(make, device, tmp_path):
     from pxr import Usd, UsdGeom, UsdShade

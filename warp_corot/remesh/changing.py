@@ -194,6 +194,11 @@ class Changing:
         return capture.graph
 
     @property
+    def is_cut(self) -> bool:
+        """Whether the body can be cut."""
+        return self.cuts is not None
+
+    @property
     def cut_area(self) -> float:
         """The area of all cuts so far, at rest [m^2]; waits for the device."""
         return float(self.forest.carriage.arrays.cut_area.numpy()[0])
