@@ -12,7 +12,7 @@ import warp as wp
 from warp_corot.contact.obstacles import Obstacles
 from warp_corot.errors import InputError
 from warp_corot.kernels.remesh import blades as kernels
-from warp_corot.kernels.remesh import cut as cut_kernels
+from warp_corot.kernels.remesh.cut_surface import BUNDLE, Surface
 from warp_corot.mesh.lattice import volume_shares
 
 from .blade import Blade
@@ -66,11 +66,11 @@ class EdgePoints:
         edges.former = wp.zeros(total, dtype=wp.vec3, device=self.device)
         edges.work = wp.zeros(len(rows), dtype=wp.float64, device=self.device)
         edges.common = changing.carried_material.modulus
-        surface = self.surface = cut_kernels.Surface()
+        surface = self.surface = Surface()
         surface.count = 2 * total
         surface.points = wp.zeros(3 * total, dtype=wp.vec3d, device=self.device)
         surface.triangles = wp.zeros(2 * total, dtype=wp.vec3i, device=self.device)
-        surface.bounds = self._boxes(1 + -(-surface.count // int(cut_kernels.BUNDLE)))
+        surface.bounds = self._boxes(1 + -(-surface.count // int(BUNDLE)))
         levels = [-1 if blade.level is None else blade.level for blade in blades]
         surface.levels = self._ints(np.repeat(levels, 2 * np.array(counts)))
         surface.debt = wp.zeros(2 * total, dtype=wp.float64, device=self.device)

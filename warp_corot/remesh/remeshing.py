@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
     from warp_corot.cutting.blade import Blade
     from warp_corot.elasticity import ForceField, Model
-    from warp_corot.kernels.remesh.cut import Surface
+    from warp_corot.kernels.remesh.cut_surface import Surface
 
     from .changing import Changing
 
