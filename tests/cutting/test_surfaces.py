@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from blade_cases import labelled_mesh
 from bodies import ball
 from cut_cases import assert_closed, assert_cut_sound
 from scipy.sparse import coo_array
@@ -142,6 +143,25 @@ def test_surfaces_that_would_stay_in_one_piece_are_refused(device, tmp_path):
     surface = mesh.bind(x, [[0, 1, 2]])
     with pytest.raises(wc.InputError, match="a surface is given, but the body can be cut"):
         wc.record(sim, tmp_path / "a.usda", duration=0.1, surface=surface)
+
+
+def test_labelled_bodies_are_cut(device, tmp_path):
+    """Labels, materials and the surface follow; surfaces between labels are refused."""
+    mesh = labelled_mesh()
+    body = wc.SoftBody(mesh, wc.Isotropic(np.where(mesh.labels == 1, 2e4, 6e4), 0.4, 1000.0), device=device)
+    shares = np.bincount(mesh.labels, mesh.volumes)
+    sim = wc.Simulation(body, gravity=(0, 0, 0), cuts=[])
+    middle = mesh.points[mesh.tets[mesh.labels == 2]].mean(axis=(0, 1))
+    sim.cut(wc.Plane((0.1, 1.0, 0.2), point=middle))
+    assert body.pieces == 2
+    np.testing.assert_allclose(np.bincount(body.mesh.labels, body.mesh.volumes), shares, rtol=1e-9)
+    surface = body.mesh.surface()
+    assert_closed(surface.triangles)
+    assert surface.volume == pytest.approx(mesh.surface().volume, rel=0.02)
+    with pytest.raises(wc.InputError, match="surfaces between labels do not come apart"):
+        body.mesh.separating_surface()
+    with pytest.raises(wc.InputError, match="labels are drawn, but the body can be cut"):
+        wc.record(sim, tmp_path / "a.usda", duration=0.1, labels=True)
 
 
 @pytest.mark.parametrize("make", [organ, None])

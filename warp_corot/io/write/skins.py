@@ -143,6 +143,11 @@ class BoundSkins:
         given = _one_each(surface, len(meshes))
         if labels and not any(map(has_labels, meshes)):
             raise InputError("labels is True, but the mesh has none; it must be made from a domain with labels")
+        if are_cut:
+            for mesh, own in zip(meshes, given, strict=True):
+                if labels or not (own is None or (isinstance(own, SurfaceMesh) and has_domain(mesh))):
+                    what = "labels are drawn" if labels else "a surface is given"
+                    raise InputError(f"{what}, but the body can be cut: only the surface of its mesh then comes apart")
         self._meshes = list(meshes)
         may_change = [False] * len(meshes) if changing is None else changing
         self._skins = [
@@ -150,10 +155,6 @@ class BoundSkins:
             for mesh, own, moves in zip(meshes, given, may_change, strict=True)
         ]
         if are_cut:
-            for mesh, own in zip(meshes, given, strict=True):
-                if labels or not (own is None or (isinstance(own, SurfaceMesh) and has_domain(mesh))):
-                    what = "labels are drawn" if labels else "a surface is given"
-                    raise InputError(f"{what}, but the body can be cut: only the surface of its mesh then comes apart")
             self._skins = [[replace(skin, is_cut=True) for skin in own] for own in self._skins]
 
     def on(self, meshes: Sequence[Any]) -> list[Skin]:
