@@ -6,7 +6,8 @@
 A blade goes down through the middle of a box. A *blade step* is what follows when a cut is due: the search for what the
 blade has swept, the cut, all that is derived from the mesh, and the host's part; the table has its median and its 90th
 percentile, how often it is due, and what a step of the same body costs with and without the blade. It also says what
-recordings of steps take that a cut has made invalid. The script checks that the box is in two pieces in the end.
+recordings of steps take that a cut has made invalid, and what steps take after cuts, over those of a body that was made
+of the same elements. The script checks that the box is in two pieces in the end.
 """
 
 from __future__ import annotations
@@ -99,6 +100,26 @@ def measured(size: int, device: str) -> dict[str, float]:
     return row
 
 
+def after(size: int, device: str, repeats: int = 9) -> dict[str, float]:
+    """Seconds of a step after three planes have cut a box, and of a body that was made of the same elements."""
+    sim = scene(size, device, cuts=False)
+    centre = 0.5 * CELL * np.array(BOXES[size][0])
+    for normal in ((1.0, 0.2, 0.1), (0.1, 1.0, 0.2), (0.1, -0.2, 1.0)):
+        sim.cut(wc.Plane(normal, point=centre))
+    other = wc.SoftBody(sim.body.mesh, sim.body.material, device=device)
+    other.fix(sim.body.constrained)
+    precut = wc.Simulation(other, gravity=(0, 0, 0), integrator=wc.SymplecticEuler(damping=10.0))
+    each = max(64, sim.recorded.interval)
+    seconds = np.zeros((repeats + 1, 2))
+    for repeat in range(repeats + 1):  # the first ones compile and record
+        for k, one in enumerate((sim, precut)):
+            begin = now(one.device)
+            one.advance_steps(each)
+            seconds[repeat, k] = (now(one.device) - begin) / each
+    cut, whole = np.median(seconds[1:], axis=0)
+    return {"pieces": sim.body.pieces, "after": cut, "precut": whole}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--device", default=None, help="cpu or cuda:0")
@@ -111,12 +132,14 @@ def main() -> None:
     print(f"{'elements':>9} {'steps a cut':>11} {'cuts':>5} {'blade step':>11} {'90 %':>9} {'step with':>10} "
           f"{'of it steps':>11} {'step without':>12} {'searches for dt':>16}   [ms] on {device}")  # fmt: skip
     for size in args.sizes:
-        row = measured(size, device)
+        row = measured(size, device) | after(size, device)
         rows.append(row)
         ms = {name: 1e3 * row[name] for name in ("median", "tenth", "step", "replay", "plain", "find")}
         print(f"{row['elements']:>9} {row['every']:>11} {row['cuts']:>5} {ms['median']:>11.2f} {ms['tenth']:>9.2f} "
               f"{ms['step']:>10.3f} {ms['replay']:>11.3f} {ms['plain']:>12.3f} "
               f"{row['finds']:>7} x {ms['find'] / max(row['finds'], 1):6.1f}", flush=True)  # fmt: skip
+        print(f"{'':>9} in {row['pieces']} pieces a step takes {1e3 * row['after']:.3f} ms, "
+              f"{row['after'] / row['precut']:.2f} times that of a body of these elements", flush=True)  # fmt: skip
     if args.json:
         Path(args.json).write_text(json.dumps(rows, indent=1))
     sys.exit(0)

@@ -15,7 +15,7 @@ from warp_corot.kernels.contact.motion import Motions, move_obstacle
 from warp_corot.kernels.elements.elements import load_node
 from warp_corot.kernels.stepping.pace import DONE, DT, Pace
 
-from .cut import BUNDLE, Surface
+from .cut_surface import BUNDLE, Surface
 from .pools import LEAVES, Pools
 from .state import Carried, doubled, modulus_of
 

@@ -8,7 +8,8 @@ and no other face of its leaves is pulled harder, so that a tear runs instead of
 import warp as wp
 
 from .criteria import green_strain
-from .cut import Cuts, Surface, add_star, cut_side, face_node, is_cut, meet, star_count
+from .cut import Cuts, add_star, cut_side, face_node, is_cut, meet, star_count
+from .cut_surface import Surface
 from .mark import Contents, load_state
 from .pools import LEAVES, Pools
 from .state import Carried

@@ -1,8 +1,9 @@
 """Blades on the command line."""
 
 import pytest
+import trimesh
 from command_line import assert_refused, simulate
-from pxr import Usd, UsdGeom
+from pxr import Usd, UsdGeom, UsdShade
 
 PATH = """time, x [mm], y [mm], z [mm], qx, qy, qz, qw
 0, 32, 80, 101, 0, 1, 0, 1
@@ -18,6 +19,19 @@ def test_a_blade_cuts_what_the_command_makes(folder):
     points = UsdGeom.TetMesh.Get(stage, "/SoftBody/tetrahedra").GetPointsAttr()
     first, last = (points.Get(code) for code in (0, stage.GetEndTimeCode()))
     assert len(last) > len(first)
+
+
+def test_the_surface_of_an_organ_is_cut(folder, capsys):
+    """The surface of the mesh is drawn, because that of the file does not come apart."""
+    trimesh.creation.icosphere(subdivisions=2, radius=0.04).export("ball.obj")
+    (folder / "path.csv").write_text(PATH.replace("32, ", "0, ").replace("101", "0"))
+    options = ["--unit", "m", "--tets", 2000, "--young", "20kPa", "--density", 1000, "--blade", "path.csv"]
+    assert_refused(folder, capsys, "--skin input", "ball.obj", "-o", "cut.usda", *options, "--skin", "input")
+    assert simulate("ball.obj", "-o", "cut.usda", *options, "--duration", 0.25, "--fps", 20, "--device", "cpu") == 0
+    stage = Usd.Stage.Open("cut.usda")
+    (subset,) = UsdShade.MaterialBindingAPI(stage.GetPrimAtPath("/SoftBody/surface")).GetMaterialBindSubsets()
+    first, last = (subset.GetIndicesAttr().Get(code) for code in (0, stage.GetEndTimeCode()))
+    assert len(first) == 0 < len(last)
 
 
 @pytest.mark.parametrize(

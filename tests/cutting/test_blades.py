@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import warp as wp
 from cut_cases import assert_cut_sound
 
 import warp_corot as wc
@@ -155,6 +156,40 @@ def test_a_blade_is_moved_by_hand(device):
     assert body.pieces == 2
 
 
+@pytest.mark.parametrize("way", ["follow", "move", "use_poses"])
+def test_a_handle_and_an_edge_are_one_scalpel(way, device):
+    """A tool and a blade that are given the same motion: the edge cuts, and the handle presses what it meets."""
+    body = block(device, toughness=0.5)
+    upright = (-np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))  # their z axis is along y
+    handle = wc.Tool(wc.Capsule(radius=0.004, length=0.04), speed=0.5)
+    blade = wc.Blade([(0, 0, -0.024), (0, 0, -0.075)], speed=0.5)
+    before, behind, down = (0.061, 0.067, -0.02), (0.061, 0.067, 0.06), (0.061, 0.061, 0.02)
+    poses = wp.zeros(1, dtype=wp.transform, device=device)
+
+    def move(place):
+        for each in (handle, blade):
+            each.move(place, upright)
+
+    move(before)
+    poses.assign(np.float32([[*before, *upright]]))
+    sim = wc.Simulation(body, gravity=(0, 0, 0), obstacles=[handle], cuts=[blade])
+    for each in (handle, blade):
+        if way == "follow":
+            each.follow([0.0, 0.2, 0.4], [before, behind, down], upright)
+        elif way == "use_poses":
+            each.use_poses(poses)
+    for time, place, pieces in ((0.2, behind, 2), (0.4, down, 2)):
+        if way == "move":
+            move(place)
+        poses.assign(np.float32([[*place, *upright]]))
+        sim.advance_until(time)
+        np.testing.assert_allclose(handle.present_pose, blade.present_pose, atol=1e-6)
+        np.testing.assert_allclose(handle.present_pose[0, :3], place, atol=1e-4)
+        assert body.pieces == pieces
+    assert handle.wrench.numpy()[0][1] > 1e-3
+    assert blade.work > 0.0
+
+
 def test_reset_heals_and_begins_again(device):
     body, blade = block(device), falling()
     sim = cut(body, blade)
@@ -230,6 +265,8 @@ def test_bad_blades_are_refused_in_one_line(device):
             wc.Simulation(block(device), cuts=cuts)
     with pytest.raises(wc.InputError, match="given twice"):
         wc.Simulation(block(device), cuts=[blade, blade])
+    with pytest.raises(wc.InputError, match=r"edge is 1e\+09 m long"):
+        wc.Simulation(block(device), cuts=[wc.Blade([(0, 0, 0), (0, 0, 1e9)])])
     fast = falling(seconds=0.001)
     with pytest.raises(wc.InputError, match=r"a blade goes .* mm in a step"):
         wc.Simulation(block(device), cuts=[fast])

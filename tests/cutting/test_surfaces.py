@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from blade_cases import labelled_mesh
 from bodies import ball
 from cut_cases import assert_closed, assert_cut_sound
 from scipy.sparse import coo_array
@@ -121,6 +122,46 @@ def test_lips_that_touch_carry_as_if_they_were_whole(device):
     assert_closed(body.contact_surface.triangles)
     assert sags[0] < -0.005
     assert sags[1] == pytest.approx(sags[0], rel=0.05)
+
+
+def test_surfaces_that_would_stay_in_one_piece_are_refused(device, tmp_path):
+    """A user's own surface does not follow a cut: that is one line, and nothing is drawn wrongly."""
+    mesh = wc.TetForest.box((2, 1, 1), 0.2, 3)
+    material = wc.Isotropic(3e4, 0.4, 1000.0)
+    x = np.array([[0.1, 0.1, 0.1], [0.3, 0.1, 0.1], [0.1, 0.15, 0.1]])
+    bound = wc.SoftBody(mesh, material, device=device)
+    bound.bind(x, [[0, 1, 2]])
+    sim = wc.Simulation(bound)
+    with pytest.raises(wc.InputError, match="does not come apart where it is cut"):
+        sim.cut(wc.Plane((1, 0, 0), 0.2))
+    sim.advance_steps(1)
+    body = wc.SoftBody(mesh, material, device=device)
+    sim = wc.Simulation(body, cuts=[])
+    body.bind(x)
+    with pytest.raises(wc.InputError, match="does not come apart where it is cut"):
+        body.bind(x, [[0, 1, 2]])
+    surface = mesh.bind(x, [[0, 1, 2]])
+    with pytest.raises(wc.InputError, match="a surface is given, but the body can be cut"):
+        wc.record(sim, tmp_path / "a.usda", duration=0.1, surface=surface)
+
+
+def test_labelled_bodies_are_cut(device, tmp_path):
+    """Labels, materials and the surface follow; surfaces between labels are refused."""
+    mesh = labelled_mesh()
+    body = wc.SoftBody(mesh, wc.Isotropic(np.where(mesh.labels == 1, 2e4, 6e4), 0.4, 1000.0), device=device)
+    shares = np.bincount(mesh.labels, mesh.volumes)
+    sim = wc.Simulation(body, gravity=(0, 0, 0), cuts=[])
+    middle = mesh.points[mesh.tets[mesh.labels == 2]].mean(axis=(0, 1))
+    sim.cut(wc.Plane((0.1, 1.0, 0.2), point=middle))
+    assert body.pieces == 2
+    np.testing.assert_allclose(np.bincount(body.mesh.labels, body.mesh.volumes), shares, rtol=1e-9)
+    surface = body.mesh.surface()
+    assert_closed(surface.triangles)
+    assert surface.volume == pytest.approx(mesh.surface().volume, rel=0.02)
+    with pytest.raises(wc.InputError, match="surfaces between labels do not come apart"):
+        body.mesh.separating_surface()
+    with pytest.raises(wc.InputError, match="labels are drawn, but the body can be cut"):
+        wc.record(sim, tmp_path / "a.usda", duration=0.1, labels=True)
 
 
 @pytest.mark.parametrize("make", [organ, None])

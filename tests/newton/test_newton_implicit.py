@@ -216,6 +216,8 @@ def test_unsupported_models_are_refused(device):
     model = made.finalize(device=device)
     with pytest.raises(wc.InputError, match="integrator is 'midpoint'; it must be one of explicit, implicit"):
         wn.SolverCorotated(model, integrator="midpoint")
+    with pytest.raises(wc.InputError, match="the number of a Newton model's particles is fixed"):
+        wn.SolverCorotated(model, cuts=[wc.Blade([(0, 0, 0), (0, 0, 1)])])
     with pytest.raises(wc.InputError, match="self_contact_margin is given, and integrator is 'implicit'"):
         wn.SolverCorotated(model, integrator="implicit", self_contact_margin=0.01)
     with pytest.raises(wc.InputError, match="integrator='implicit' steps only tetrahedra"):

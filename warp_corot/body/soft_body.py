@@ -24,6 +24,7 @@ from warp_corot.materials.isotropic import Material
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.pieces import pieces_of
 from warp_corot.mesh.surfaces.bodies import boundary_surface
+from warp_corot.mesh.surfaces.bound import NOT_OPENED
 from warp_corot.mesh.surfaces.boundary import boundary_faces
 
 from .conditions import Conditions
@@ -301,7 +302,8 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
             points: Rest positions [m], [n, 3].
 
         Raises:
-            InputError: The mesh is not a forest, the body has several worlds, or as in ``TetForest.bind``.
+            InputError: The mesh is not a forest, the body has several worlds, there are triangles and the body can be
+                cut, or as in ``TetForest.bind``.
         """
         from warp_corot.discretization.changing.following import FollowingBinding
 
@@ -309,6 +311,8 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
             raise InputError(f"only a TetForest can have points bound to it, not a {type(self.mesh).__name__}")
         if self.worlds > 1:
             raise InputError(f"worlds is {self.worlds}; bind points to the mesh, and move them with one world's nodes")
+        if triangles is not None and self.changing is not None and self.changing.is_cut:
+            raise InputError(NOT_OPENED)
         leaves, _ = self.mesh.embed(points)
         binding = FollowingBinding(self.mesh.bind(points, triangles), self.mesh, leaves, self.device)
         self.bindings.append(binding)

@@ -38,9 +38,12 @@ class DrawnBodies:
         from warp_corot.io.write.skins import BoundSkins
 
         self._soft = [body.soft for body in bodies]
-        own = [body.subject.skin or body.subject.surface for body in bodies]
+        # All bodies of a simulation can be cut, or none.
+        are_cut = all(soft.changing is not None and soft.changing.is_cut for soft in self._soft)
+        own = [None if are_cut else body.subject.skin for body in bodies]
+        drawn = [skin or body.subject.surface for body, skin in zip(bodies, own, strict=True)]
         changing = [body.soft.mesh is not body.subject.mesh for body in bodies]
-        self._skins = BoundSkins([soft.mesh for soft in self._soft], own, changing=changing)
+        self._skins = BoundSkins([soft.mesh for soft in self._soft], drawn, changing=changing, are_cut=are_cut)
         self._averages: dict[int, tuple[Any, VertexAverage]] = {}
 
     def frame(self, sim: Simulation) -> PreviewFrame:

@@ -150,7 +150,7 @@ def _record(
             shared.output,
             duration=ready.duration or None,
             fps=shared.fps,
-            surface=_surfaces(bodies),
+            surface=_surfaces(bodies, are_cut=sim.remeshing.are_cut),
             tets=any(body.args.draw_tets for body in bodies) or None,
             labels=any(body.args.draw_labels for body in bodies),
             also=shared.also or (),
@@ -160,9 +160,14 @@ def _record(
         )
 
 
-def _surfaces(bodies: Sequence[RunBody]) -> list[OwnSurface | SurfaceMesh | None] | None:
-    """The smooth surfaces of bodies; None if none has any, so that tetrahedra are drawn."""
-    found = [None if body.args.draw_labels else body.subject.skin or body.subject.surface for body in bodies]
+def _surfaces(bodies: Sequence[RunBody], *, are_cut: bool) -> list[OwnSurface | SurfaceMesh | None] | None:
+    """The smooth surfaces of bodies; None if none has any, so that tetrahedra are drawn. Of those that are cut it is
+    that of the mesh."""
+    skins = [None if are_cut else body.subject.skin for body in bodies]
+    found = [
+        None if body.args.draw_labels else skin or body.subject.surface
+        for body, skin in zip(bodies, skins, strict=True)
+    ]
     return found if any(surface is not None for surface in found) else None
 
 

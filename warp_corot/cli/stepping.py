@@ -80,6 +80,10 @@ def blades_of(args: argparse.Namespace, bodies: Sequence[RunBody]) -> list[Blade
     """
     if not args.blade and args.blade_length is not None:
         raise InputError("--blade-length is for --blade, which is not given")
+    for body in bodies if args.blade else ():
+        kept = "--skin input" if body.args.skin == "input" else "--draw-labels" if body.args.draw_labels else None
+        if kept:
+            raise InputError(f"{kept} draws a surface that does not come apart; with --blade leave it out")
     size = max(float(np.ptp(body.subject.mesh.points, axis=0).max()) for body in bodies)
     return [make_blade(path, args.blade_length or LONG * size) for path in args.blade or ()]
 

@@ -76,6 +76,11 @@ class Blade(Tool):
         return self.shape.points
 
     @property
+    def length(self) -> float:
+        """Length of the edge [m]."""
+        return float(np.linalg.norm(np.diff(self.edge, axis=0), axis=1).sum())
+
+    @property
     def work(self) -> float:
         """Work that the blade has done on the tissue so far [J]: the energy of its cuts, and what the tissue took up.
 

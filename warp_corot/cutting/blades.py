@@ -12,7 +12,7 @@ import warp as wp
 from warp_corot.contact.obstacles import Obstacles
 from warp_corot.errors import InputError
 from warp_corot.kernels.remesh import blades as kernels
-from warp_corot.kernels.remesh import cut as cut_kernels
+from warp_corot.kernels.remesh.cut_surface import BUNDLE, Surface
 from warp_corot.mesh.lattice import volume_shares
 
 from .blade import Blade
@@ -29,6 +29,8 @@ KEPT = ("state", "former", "nodes", "weights", "size", "modulus", "push", "move"
 REFINEMENTS = 3
 #: Cuts in a row that change no mesh, after which the stable step is found again; that takes as long as a hundred steps.
 SETTLED = 64
+#: The most points on an edge.
+MOST_POINTS = 1 << 14
 #: The most steps between two cuts.
 MOST_STEPS = 64
 
@@ -64,11 +66,11 @@ class EdgePoints:
         edges.former = wp.zeros(total, dtype=wp.vec3, device=self.device)
         edges.work = wp.zeros(len(rows), dtype=wp.float64, device=self.device)
         edges.common = changing.carried_material.modulus
-        surface = self.surface = cut_kernels.Surface()
+        surface = self.surface = Surface()
         surface.count = 2 * total
         surface.points = wp.zeros(3 * total, dtype=wp.vec3d, device=self.device)
         surface.triangles = wp.zeros(2 * total, dtype=wp.vec3i, device=self.device)
-        surface.bounds = self._boxes(1 + -(-surface.count // int(cut_kernels.BUNDLE)))
+        surface.bounds = self._boxes(1 + -(-surface.count // int(BUNDLE)))
         levels = [-1 if blade.level is None else blade.level for blade in blades]
         surface.levels = self._ints(np.repeat(levels, 2 * np.array(counts)))
         surface.debt = wp.zeros(2 * total, dtype=wp.float64, device=self.device)
@@ -162,11 +164,17 @@ class Blades(Obstacles):
         unchanged: Cuts since the last one that changed a mesh; at least ``SETTLED`` before the first.
 
     Raises:
-        InputError: A blade is too fast to be followed, or another simulation has it.
+        InputError: A blade is too fast to be followed or too long, or another simulation has it.
     """
 
     def __init__(self, given: Sequence[Blade], system: System, changing: Sequence[Changing], longest: float):
         self._size, self._longest = min(_size(each, given) for each in changing), longest
+        for blade in given:
+            longest_edge = MOST_POINTS * SPACING * self._size
+            if blade.length > longest_edge:
+                raise InputError(
+                    f"edge is {blade.length:.3g} m long; on these elements at most {longest_edge:.3g} m can cut"
+                )
         super().__init__(given, 0.0, system)
         self.blades = tuple(given)
         self.of_bodies = [EdgePoints(given, each, self._size) for each in changing]

@@ -158,6 +158,10 @@ class MeshChanges(Protocol):
         """The mesh on the device."""
 
     @property
+    def is_cut(self) -> bool:
+        """Whether the body can be cut."""
+
+    @property
     def cut_area(self) -> float:
         """The area of all cuts so far, at rest [m^2]."""
 

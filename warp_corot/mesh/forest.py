@@ -203,7 +203,7 @@ class TetForest(ForestArrays):
         """The surfaces between labels and around them, with ``sides``; `SurfaceMesh.of_label` gives a single label's.
 
         Raises:
-            InputError: The mesh has no labels.
+            InputError: The mesh has no labels, or it is cut.
         """
         return separating_surface(self)
 

@@ -38,6 +38,7 @@ def check_options(
     substeps: Any,
     stable_dt: Any,
     self_contact_margin: Any,
+    cuts: Any,
 ) -> None:
     """Check the options of ``SolverCorotated``.
 
@@ -46,6 +47,11 @@ def check_options(
     """
     if not isinstance(model, newton.Model) and not isinstance(model, ModelView):
         raise InputError(f"model is {_named(model)}; it must be a newton.Model, the result of builder.finalize()")
+    if cuts is not None:
+        raise InputError(
+            "cuts is given, but a cut makes new particles, and the number of a Newton model's particles is fixed; "
+            "warp_corot.Simulation(..., cuts=[blade]) cuts"
+        )
     choices = (("lame", lame, LAME), ("integrator", integrator, INTEGRATORS))
     for name, value, among in choices:
         if not isinstance(value, str) or value not in among:

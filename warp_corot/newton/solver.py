@@ -93,6 +93,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
             themselves, like ``margin`` of ``CollisionPipeline.init_soft_self_contact``, which finds the pairs; None:
             they pass through one another.
         stable_dt: The largest stable step [s], if known; None: found from elements and masses.
+        cuts: None: a cut makes new particles, but the number of a model's particles is fixed. ``Simulation`` cuts.
 
     Attributes:
         stable_dt: The largest stable step about rest [s], of tetrahedra, springs, triangles (cloth) and bending edges
@@ -119,6 +120,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
         particle_contact: bool = False,
         self_contact_margin: float | None = None,
         stable_dt: float | None = None,
+        cuts: None = None,
     ):
         check_options(
             model,
@@ -128,6 +130,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
             substeps=substeps,
             stable_dt=stable_dt,
             self_contact_margin=self_contact_margin,
+            cuts=cuts,
         )
         super().__init__(model)
         self._substeps = None if substeps is None else int(substeps)

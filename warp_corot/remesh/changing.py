@@ -20,7 +20,7 @@ from warp_corot.discretization.changing.transfer import Column
 from warp_corot.discretization.clock import Clock
 from warp_corot.errors import InputError
 from warp_corot.kernels.remesh.criteria import nearness
-from warp_corot.kernels.remesh.cut import Surface
+from warp_corot.kernels.remesh.cut_surface import Surface
 from warp_corot.kernels.remesh.mark import elongation, marking_kernel
 from warp_corot.kernels.remesh.state import MEAN_OF_CONTENTS
 from warp_corot.kernels.stepping.integrate import set_start
@@ -192,6 +192,11 @@ class Changing:
         with wp.ScopedCapture(device=self.device) as capture:
             launch()
         return capture.graph
+
+    @property
+    def is_cut(self) -> bool:
+        """Whether the body can be cut."""
+        return self.cuts is not None
 
     @property
     def cut_area(self) -> float:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from warp_corot.errors import CapacityWarning, InputError, depth_of_user
 from warp_corot.inputs.checks import shown
+from warp_corot.mesh.surfaces.bound import NOT_OPENED
 
 from .online import OnlineRemesh
 
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
     from warp_corot.cutting.blade import Blade
     from warp_corot.elasticity import ForceField, Model
-    from warp_corot.kernels.remesh.cut import Surface
+    from warp_corot.kernels.remesh.cut_surface import Surface
 
     from .changing import Changing
 
@@ -69,6 +70,8 @@ class Remeshing:
         for each, body, model in zip(options, bodies, models, strict=True):
             if each is not None or are_cut:
                 body.check_own_arrays()
+                if are_cut and any(binding.normals is not None for binding in body.bindings):
+                    raise InputError(NOT_OPENED)
                 if model.kept_of_elements is not None:
                     raise InputError(
                         f"{model.kept_of_elements}; a body that is remeshed or cut must have another model"

@@ -11,6 +11,7 @@ import warp as wp
 from warp_corot.kernels.remesh import cut as cut_kernels
 from warp_corot.kernels.remesh import split as split_kernels
 from warp_corot.kernels.remesh import tear as tear_kernels
+from warp_corot.kernels.remesh.cut_surface import Surface
 from warp_corot.kernels.remesh.mark import Contents
 
 from .pools import DeviceForest
@@ -47,7 +48,7 @@ class CutPass:
         cuts.toughness, cuts.toughness_column = toughness, names.index("toughness") if "toughness" in names else -1
         cuts.names = forest.pools.tets.view(wp.int32)
 
-    def launch_cut(self, surface: cut_kernels.Surface, *, goes_on: bool = False) -> None:
+    def launch_cut(self, surface: Surface, *, goes_on: bool = False) -> None:
         """Launch a cut: which faces the surface crosses, and the separation of their nodes.
 
         Args:
@@ -68,7 +69,7 @@ class CutPass:
             contents: The material of leaves.
         """
         pools, carried, cuts = self.forest.pools, self.forest.carriage.arrays, self._cuts
-        surface = cut_kernels.Surface()
+        surface = Surface()
         surface.stress = stress
         self._once(cut_kernels.begin_cut, 0, pools, cuts)
         self._many(tear_kernels.list_all, pools, cuts)
@@ -77,7 +78,7 @@ class CutPass:
         self._many(tear_kernels.tear_faces, pools, cuts)
         self._launch_end(surface)
 
-    def launch_marks(self, surface: cut_kernels.Surface) -> None:
+    def launch_marks(self, surface: Surface) -> None:
         """Launch the marks of leaves at triangles that are to be refined to their levels."""
         self._many(cut_kernels.mark_near, surface, self.forest.carriage.arrays, self.forest.pools)
 
@@ -95,7 +96,7 @@ class CutPass:
 
     # --- pieces ------------------------------------------------------------------------------------------------------
 
-    def _launch_end(self, surface: cut_kernels.Surface) -> None:
+    def _launch_end(self, surface: Surface) -> None:
         """Launch what follows when faces have been cut."""
         pools, carried, cuts = self.forest.pools, self.forest.carriage.arrays, self._cuts
         self._many(cut_kernels.join_lone, pools, cuts)
@@ -126,9 +127,9 @@ class CutPass:
         return wp.full(max(count, 1), value, dtype=wp.int32, device=self.device)
 
 
-def plane_surface(normal: npt.ArrayLike, offset: float, *, is_deformed: bool) -> cut_kernels.Surface:
+def plane_surface(normal: npt.ArrayLike, offset: float, *, is_deformed: bool) -> Surface:
     """A plane of the points x with normal . x = offset [m]; normal of unit length."""
-    surface = cut_kernels.Surface()
+    surface = Surface()
     surface.is_deformed = float(is_deformed)
     surface.normal, surface.offset = wp.vec3d(*np.asarray(normal, dtype=float)), float(offset)
     return surface

@@ -125,11 +125,11 @@ class BoundSkins:
             meshes one each, None for the mesh's own.
         labels: Draw each label of a mesh as a separate closed surface.
         changing: Whether each mesh may change: surfaces given for such a mesh may be bound to an earlier one.
-        are_cut: Whether they may be cut. The surface of a body with domain then becomes that of its mesh, as do
-            surfaces in memory; those of files and of labels stay in one piece.
+        are_cut: Whether they may be cut. The surface of a body then becomes that of its mesh.
 
     Raises:
-        InputError: Surfaces that do not fit, or no mesh has labels.
+        InputError: Surfaces that do not fit, or no mesh has labels; or bodies may be cut, and a surface is of a file,
+            of labels, or of a body without a domain, so that it would not come apart.
     """
 
     def __init__(
@@ -143,14 +143,19 @@ class BoundSkins:
         given = _one_each(surface, len(meshes))
         if labels and not any(map(has_labels, meshes)):
             raise InputError("labels is True, but the mesh has none; it must be made from a domain with labels")
+        if are_cut:
+            for mesh, own in zip(meshes, given, strict=True):
+                if labels or not (own is None or (isinstance(own, SurfaceMesh) and has_domain(mesh))):
+                    what = "labels are drawn" if labels else "a surface is given"
+                    raise InputError(f"{what}, but the body can be cut: only the surface of its mesh then comes apart")
         self._meshes = list(meshes)
         may_change = [False] * len(meshes) if changing is None else changing
         self._skins = [
             _skins_of_one(mesh, _rebound(own, mesh) if moves and isinstance(own, SurfaceMesh) else own, labels)
             for mesh, own, moves in zip(meshes, given, may_change, strict=True)
         ]
-        if are_cut and not labels:
-            self._skins = [[replace(skin, is_cut=skin.look is None) for skin in own] for own in self._skins]
+        if are_cut:
+            self._skins = [[replace(skin, is_cut=True) for skin in own] for own in self._skins]
 
     def on(self, meshes: Sequence[Any]) -> list[Skin]:
         """The skins, bound to the nodes of the current meshes; skins with the same name are joined."""

@@ -53,6 +53,10 @@ def separating_surface(forest: ForestArrays) -> SurfaceMesh:
     """See `TetForest.separating_surface`."""
     if forest.phi is None or forest.node_labels is None:
         raise InputError("this mesh has no labels; it must be made from a domain that has labels")
+    if forest.tree.cut is not None:
+        raise InputError(
+            "this mesh is cut, and surfaces between labels do not come apart; surface() is closed around it"
+        )
     if forest.detail is not None:
         return _embedded(forest, forest.detail.separating_surface())
     return _on_nodes(forest, separated(forest.lattice_points, _all_cut(forest), forest.phi, forest.node_labels))

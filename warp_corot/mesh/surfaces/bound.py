@@ -21,6 +21,11 @@ from .locating import checked_points
 #: corner of a cube it is 0.58.
 SIDED = 0.4
 
+#: Why bodies that can be cut have no bound surfaces.
+NOT_OPENED = (
+    "a surface that is bound to a body does not come apart where it is cut; body.mesh.surface() is the present one"
+)
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class BoundPoints:
