@@ -24,7 +24,7 @@ from .near import BESIDE, FAR, Near
 from .shapes import GROUND, distance_to, sure_distance
 from .touches import Touches
 from .vertices import FORESEEN, OUT, Rigid
-from .watch import FARTHEST, Watch, begin_obstacle, pair_of
+from .watch import FARTHEST, STABLE, Watch, begin_obstacle, pair_of
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINED})
 
@@ -448,6 +448,8 @@ def room_beside(
                     if claim(visits.touches, pair, 1, visits.is_shared):
                         append(here.touches, here.touch_count, pair, visits.is_shared)
     if may_touch:
+        if not (wp.length(surface.d[s]) <= STABLE * watch.size):
+            wp.atomic_add(watch.missed, 0, 1)
         here.flags[s] = here.flags[s] | LISTED
         append(here.nodes, here.count, s, visits.is_shared)
     return wp.max(room, 0.0)

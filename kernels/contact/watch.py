@@ -14,6 +14,8 @@ AHEAD = wp.constant(16.0)
 #: this many elements, more than any stable step covers.
 FAST = wp.constant(2.0)
 FARTHEST = wp.constant(64.0)
+#: In a stable step nothing that is hit goes farther than so many elements.
+STABLE = wp.constant(4.0)
 #: In implicit steps as much is reserved around the place where a node is expected to go as it has last strayed from
 #: there, but at most so many elements: a step in which one strays farther has another search.
 STRAYED = wp.constant(0.25)

@@ -118,7 +118,7 @@ const auto residual = [&]() {
 };
 if (status.data[world] != RUNNING) return;
 const bool is_last = !(numbers[END] > numbers[WITHIN] && numbers[BEGAN] > SETTLED * SETTLED * numbers[WITHIN]);
-const double end = is_last ? CLOSER * numbers[END] : numbers[END];
+const double end = is_last ? CLOSER_SWEPT * numbers[END] : numbers[END];
 double now = numbers[RR];
 float beta = 0.0f;
 sweep([&](int i) {

@@ -61,8 +61,8 @@ def test_derivatives_are_those_of_other_answers(device, rng, axes):
     )
     assert found.report.contacts[0].normal_force > 0.01
     assert found.young == pytest.approx((value(young=2.02e4) - value(young=1.98e4)) / 400.0, rel=2e-3)
-    # The last digit of the gap makes 0.2 % of a difference.
-    differences = [(value(poisson=0.4 + h) - value(poisson=0.4 - h)) / (2.0 * h) for h in np.linspace(3e-3, 5e-3, 5)]
+    # The last digit of the gap makes 0.2 to 0.3 % of a difference.
+    differences = [(value(poisson=0.4 + h) - value(poisson=0.4 - h)) / (2.0 * h) for h in np.linspace(3e-3, 5e-3, 15)]
     assert found.poisson == pytest.approx(np.mean(differences), rel=2e-3)
     moved = found.boundary[top].sum(axis=0)
     for axis in np.eye(3)[list(axes)]:

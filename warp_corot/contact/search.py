@@ -22,10 +22,9 @@ from .surface import ContactSurface
 if TYPE_CHECKING:
     from .rigid_forces import RigidForces
 
-#: The least motion that is reserved for anything between two searches, as a fraction of the smallest element's size: at
-#: first, and at most after something that was hit has moved farther in one step than was reserved.
-LEAST, MOST = 0.05, 4.0
-WIDER = 4.0
+#: The least motion that is reserved for anything between two searches, as a fraction of the smallest element's size,
+#: and how many times as much after something that was hit has moved farther in one step than was reserved.
+LEAST, WIDER = 0.05, 4.0
 #: Maximum number of threads that process a list on CUDA.
 MOST_THREADS = 1 << 18
 #: Number of threads of a block, and of resident blocks on each multiprocessor.
@@ -58,7 +57,7 @@ class Search:
 
     def __init__(self, surface: ContactSurface, obstacles: Obstacles, size: float, *, branches: bool = True):
         self.surface, self.obstacles, self.device = surface, obstacles, surface.device
-        self.farthest = MOST * size
+        self.farthest = float(kernels.STABLE) * size
         self.rigid: RigidForces | None = None
         self.find_pairs: Callable[[], None] | None = None
         self._report = Mapped(3, self.device)
