@@ -24,6 +24,7 @@ from .near import BESIDE, FAR, Near
 from .shapes import GROUND, distance_to, sure_distance
 from .touches import Touches
 from .vertices import FORESEEN, OUT, Rigid
+from .visits import Visits, append, claim, lower_budget
 from .watch import FARTHEST, STABLE, Watch, begin_obstacle, pair_of
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINED})
@@ -40,85 +41,6 @@ COVERED, LONG, GROWN = wp.constant(1.3), wp.constant(8.0), wp.constant(0.3)
 FARTHEST_WAY = wp.constant(4096.0)
 #: A visit is due if a carrier uses up its budget when it goes so many times its motion in the step without contact.
 AHEAD = wp.constant(2.0)
-
-
-@wp.struct
-class Visits:
-    """What steps visit. Carriers are the places, [N] = [S], or the nodes that bear them, [N] = [B]."""
-
-    # [N] a displacement, and how far the carrier may go from there before it is due, plus ``came`` then [m]
-    budgets: wp.array[wp.vec4]
-    ways: wp.array[
-        wp.float32
-    ]  # [N] how far the carrier has come to this displacement since all places were visited [m]
-    # of each place that a carrier bears, as in ``Bearing.places``: ``ways`` plus ``came`` at which it is visited [m]
-    until: wp.array[wp.float32]
-    entries: wp.array[wp.vec4i]  # [S] where these are for the nodes that bear a place
-    needs: wp.array[wp.float32]  # [N] how much of their budgets must be left in this step for those that are due [m]
-    spans: wp.array[wp.float32]  # [S] the longest edge around a place at rest [m]
-    # [2] how far any obstacle has gone since all places were visited, and goes in this step, at most [m]
-    came: wp.array[wp.float32]
-    step: wp.array[wp.int64]  # [1] the number of the last step
-    is_first: wp.array[wp.int32]  # [1] whether this step visits everything
-    may_miss: wp.array[wp.int32]  # [1] whether places may not have moved into obstacles unseen
-    count: wp.array[wp.int32]  # [1] the number of steps, ever
-    places: wp.array[wp.int32]  # [S] that number at the last visit to a place
-    touches: wp.array[wp.int32]  # [O T] the same for an obstacle and a triangle
-    chosen: wp.array[wp.int32]  # [S] the places that are visited in this step
-    chosen_count: wp.array[wp.int32]  # [1]
-    contacts: wp.array[wp.int32]  # [O S] contacts at places that may act, by their numbers in ``mass_split``
-    contact_count: wp.array[wp.int32]  # [1]
-    carriers: wp.array[wp.int32]  # [N] that number when the motion of a carrier was found last
-    due: wp.array[wp.int32]  # [N] those that are due
-    due_count: wp.array[wp.int32]  # [1]
-    carrying: wp.array[wp.int32]  # [N] those whose motion is known
-    carrying_count: wp.array[wp.int32]  # [1]
-    is_shared: int  # whether several threads visit at the same time
-
-
-# Where one thread works, plain instructions take a fraction of the time of atomic ones.
-@wp.func_native(
-    on_cpu(
-        """
-    int& now = wp::index(a, i);
-    if (now == value) return false;
-    if (is_shared) return __atomic_exchange_n(&now, value, __ATOMIC_RELAXED) != value;
-    now = value;
-    return true;
-""",
-        otherwise="return false;\n",
-    )
-)
-def claim(a: wp.array[wp.int32], i: int, value: int, is_shared: int) -> bool:
-    """Write a value. Returns whether there was another one, to one thread of those that ask at the same time."""
-    ...
-
-
-@wp.func_native(
-    on_cpu("""
-    int& end = wp::index(count, 0);
-    wp::index(list, is_shared ? __atomic_fetch_add(&end, 1, __ATOMIC_RELAXED) : end++) = item;
-""")
-)
-def append(list: wp.array[wp.int32], count: wp.array[wp.int32], item: int, is_shared: int):
-    """Add an item to the end of a list."""
-    ...
-
-
-@wp.func_native(
-    on_cpu("""
-    // The order of numbers that are not negative is that of their bits.
-    int* to = reinterpret_cast<int*>(&wp::index(budgets, n)) + 3;
-    const int bits = *reinterpret_cast<const int*>(&most);
-    if (is_shared) {
-        int now = __atomic_load_n(to, __ATOMIC_RELAXED);
-        while (bits < now && !__atomic_compare_exchange_n(to, &now, bits, true, __ATOMIC_RELAXED, __ATOMIC_RELAXED));
-    } else if (bits < *to) *to = bits;
-""")
-)
-def lower_budget(budgets: wp.array[wp.vec4], n: int, most: float, is_shared: int):
-    """Lower a budget to at most a value that is not negative."""
-    ...
 
 
 @wp.kernel(enable_backward=False)

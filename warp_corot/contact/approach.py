@@ -9,6 +9,7 @@ import warp as wp
 from warp_corot.inputs.cpu_threads import Regions, launch
 from warp_corot.kernels.contact import approach as kernels
 from warp_corot.kernels.contact.near import Near
+from warp_corot.kernels.contact.visits import Visits
 from warp_corot.solvers.system import System
 
 from .mass_split import MassSplit
@@ -52,7 +53,7 @@ class Approach:
             self._taken = self._surface.revision
             places, touches = self._surface.count, self._rigid.touches.force.size
             carriers = self._surface.bearer_count or places
-            visits, device = kernels.Visits(), self._device
+            visits, device = Visits(), self._device
             visits.budgets = wp.zeros(carriers, dtype=wp.vec4, device=device)
             visits.ways, visits.needs = (wp.zeros(carriers, dtype=wp.float32, device=device) for _ in range(2))
             bearing = self._surface.arrays.bearing
