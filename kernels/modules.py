@@ -15,15 +15,22 @@ import warp as wp
 INLINED = "-march=native -mllvm=-inline-threshold=200000 -mllvm=-slp-recursion-max-depth=4"
 
 
-def unique_kernel(cpu_compiler_flags: str | None = None, native: wp.ModuleBuildOptions | None = None, **options: Any):
+def unique_kernel(
+    cpu_compiler_flags: str | None = None,
+    native: wp.ModuleBuildOptions | None = None,
+    fast_math: bool = False,
+    **options: Any,
+):
     """The decorator of kernels that factories make, and of those that few runs launch: each has a module of its own.
 
     Args:
         cpu_compiler_flags: Flags for the CPU's compiler; None: Warp's.
         native: C++ that the module includes; None: none.
+        fast_math: Whether CUDA divides and takes roots with errors of some units in the last place, in less code.
         options: Further options of ``wp.kernel``.
     """
     of_module = {"enable_backward": False, "cpu_compiler_flags": cpu_compiler_flags, "extra_build_options": native}
+    of_module["fast_math"] = fast_math
     return wp.kernel(module="unique", enable_backward=False, module_options=of_module, **options)
 
 

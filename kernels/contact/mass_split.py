@@ -10,9 +10,14 @@ buffer and writes those of the other: so it ends with one barrier. On CUDA resid
 iterations of a step in one launch.
 """
 
+# ruff: noqa: SIM102 (Warp leaves out a branch if its whole condition is static.)
+import functools
+from types import SimpleNamespace
+
 import warp as wp
 
 from warp_corot.kernels.elements.simd8 import on_cpu
+from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.stepping.pace import DT, Pace
 from warp_corot.kernels.stepping.threads import spread_thread, synchronize_blocks, synchronize_grid
 
@@ -118,87 +123,84 @@ def parents_of(s: int, surface: Surface):
 
 
 @wp.func
-def contact_of(number: int, dt: float, all: Contacts):
-    """The contact with a number, which has been located in this step."""
-    found = Contact()
+def read_place(number: int, all: Contacts):
+    """A place and an obstacle."""
     places = all.rigid.surface.node.shape[0]
-    if number < all.first_triangle:
-        o = number // places
-        s = number % places
-        away = all.rigid.away[o, s]
-        found.places = wp.vec4i(s, -1, -1, -1)
-        found.weights = wp.vec4(1.0, 0.0, 0.0, 0.0)
-        found.normal = wp.vec3(away[0], away[1], away[2])
-        found.gap = away[3]
-        found.moved = all.rigid.moved[o, s]
-        found.friction = all.rigid.shapes.friction[o]
-        found.force = all.rigid.forces[o, s]
-        found.more = all.rigid.more[o, s]
-        found.acts = all.rigid.acts[o, s]
-    elif number < all.first_pair:
-        o = (number - all.first_triangle) // all.triangles.shape[0]
-        t = (number - all.first_triangle) % all.triangles.shape[0]
-        c = all.triangles[t]
-        w = all.touches.shares[o, t]
-        found.places = wp.vec4i(c[0], c[1], c[2], -1)
-        found.weights = wp.vec4(w[0], w[1], w[2], 0.0)
-        found.normal = all.touches.normal[o, t]
-        found.gap = all.touches.gap[o, t]
-        found.moved = all.touches.moved[o, t]
-        found.friction = all.touches.friction[o, t]
-        found.force = all.touches.force[o, t]
-        found.more = all.touches.more[o, t]
-        found.acts = all.touches.acts[o, t]
-    else:
-        row = number - all.first_pair
-        found.places = all.rows.places[row]
-        found.weights = all.rows.shares[row]
-        found.normal = all.rows.normal[row]
-        found.gap = all.rows.gap[row]
-        found.friction = all.meeting.friction
-        found.force = all.rows.force[row]
-        found.more = all.rows.more[row]
-        found.acts = all.rows.acts[row]
-    surface = all.rigid.surface
-    found.parents = parents_of(found.places[0], surface)
-    found.opens = -found.moved
-    for k in range(4):
-        weight = found.weights[k]
-        if weight != 0.0:
-            s = found.places[k]
-            share = loose_share(s, surface)
-            found.loose += wp.abs(weight) * share
-            found.opens += weight * surface.d[s]
-            if share > 0.0:
-                found.free += weight * surface.d[s]
-    gap = found.gap
-    if found.loose < MOSTLY:
-        gap += left_between(found.places, found.weights, gap, found.loose, found.normal, surface)
-    found.least = least_motion(gap, all.rigid.law, dt)
+    o = number // places
+    s = number % places
+    found = Contact()
+    away = all.rigid.away[o, s]
+    found.places = wp.vec4i(s, -1, -1, -1)
+    found.weights = wp.vec4(1.0, 0.0, 0.0, 0.0)
+    found.normal = wp.vec3(away[0], away[1], away[2])
+    found.gap = away[3]
+    found.moved = all.rigid.moved[o, s]
+    found.friction = all.rigid.shapes.friction[o]
+    found.force = all.rigid.forces[o, s]
+    found.more = all.rigid.more[o, s]
+    found.acts = all.rigid.acts[o, s]
     return found
 
 
 @wp.func
-def keep(number: int, contact: Contact, all: Contacts):
-    """Store what an iteration changes."""
-    places = all.rigid.surface.node.shape[0]
-    if number < all.first_triangle:
-        o = number // places
-        s = number % places
-        all.rigid.forces[o, s] = contact.force
-        all.rigid.more[o, s] = contact.more
-        all.rigid.acts[o, s] = contact.acts
-    elif number < all.first_pair:
-        o = (number - all.first_triangle) // all.triangles.shape[0]
-        t = (number - all.first_triangle) % all.triangles.shape[0]
-        all.touches.force[o, t] = contact.force
-        all.touches.more[o, t] = contact.more
-        all.touches.acts[o, t] = contact.acts
-    else:
-        row = number - all.first_pair
-        all.rows.force[row] = contact.force
-        all.rows.more[row] = contact.more
-        all.rows.acts[row] = contact.acts
+def keep_place(number: int, contact: Contact, rigid: Rigid):
+    places = rigid.surface.node.shape[0]
+    o = number // places
+    s = number % places
+    rigid.forces[o, s] = contact.force
+    rigid.more[o, s] = contact.more
+    rigid.acts[o, s] = contact.acts
+
+
+@wp.func
+def read_triangle(pair: int, triangles: wp.array[wp.vec3i], touches: Touches):
+    """A triangle and an obstacle."""
+    o = pair // triangles.shape[0]
+    t = pair % triangles.shape[0]
+    found = Contact()
+    c = triangles[t]
+    w = touches.shares[o, t]
+    found.places = wp.vec4i(c[0], c[1], c[2], -1)
+    found.weights = wp.vec4(w[0], w[1], w[2], 0.0)
+    found.normal = touches.normal[o, t]
+    found.gap = touches.gap[o, t]
+    found.moved = touches.moved[o, t]
+    found.friction = touches.friction[o, t]
+    found.force = touches.force[o, t]
+    found.more = touches.more[o, t]
+    found.acts = touches.acts[o, t]
+    return found
+
+
+@wp.func
+def keep_triangle(pair: int, contact: Contact, triangles: int, touches: Touches):
+    o = pair // triangles
+    t = pair % triangles
+    touches.force[o, t] = contact.force
+    touches.more[o, t] = contact.more
+    touches.acts[o, t] = contact.acts
+
+
+@wp.func
+def read_row(row: int, meeting: Meeting, rows: Rows):
+    """A pair of soft surfaces."""
+    found = Contact()
+    found.places = rows.places[row]
+    found.weights = rows.shares[row]
+    found.normal = rows.normal[row]
+    found.gap = rows.gap[row]
+    found.friction = meeting.friction
+    found.force = rows.force[row]
+    found.more = rows.more[row]
+    found.acts = rows.acts[row]
+    return found
+
+
+@wp.func
+def keep_row(row: int, contact: Contact, rows: Rows):
+    rows.force[row] = contact.force
+    rows.more[row] = contact.more
+    rows.acts[row] = contact.acts
 
 
 # --- sums at nodes ---------------------------------------------------------------------------------------------------
@@ -252,23 +254,6 @@ def add_at(n: int, weight: float, times: int, force: wp.vec3, buffer: int, grain
 
 
 @wp.func
-def add(contact: Contact, times: int, force: wp.vec3, buffer: int, grain: float, surface: Surface, sums: Sums):
-    """Add a contact's weights at the nodes of its places so many times, 1 if it begins to act and -1 if it ends; and a
-    force.
-    """
-    for k in range(4):
-        weight = contact.weights[k]
-        if weight != 0.0:
-            parents = contact.parents
-            if k > 0:
-                parents = parents_of(contact.places[k], surface)
-            for m in range(4):
-                w = parents.weights[m]
-                if w != 0.0:
-                    add_at(parents.nodes[m], weight * w, times, force, buffer, grain, sums)
-
-
-@wp.func
 def take_force(n: int, buffer: int, grain: float, sums: Sums):
     """The force at a node at the end of a step [N], of which the sums become zero."""
     force = force_of(sums.forces[buffer, n], grain)
@@ -298,104 +283,183 @@ def pushed(parents: Parents, buffer: int, grain: float, sums: Sums):
 # --- the phases of a step --------------------------------------------------------------------------------------------
 
 
-@wp.func
-def locate(number: int, dt: float, all: Contacts, sums: Sums):
-    """Find a contact in this step, with the force with which it begins. Returns whether it may act."""
-    surface = all.rigid.surface
-    law = all.rigid.law
-    places = surface.node.shape[0]
-    is_near = bool(False)
-    if number < all.first_triangle:
-        is_near = begin_place(number % places, number // places, dt, all.rigid)
-    elif number < all.first_pair:
-        pair = number - all.first_triangle
-        is_near = find_touch(
-            pair // all.triangles.shape[0], pair % all.triangles.shape[0], all.rigid, all.triangles, all.touches
-        )
-    else:
-        is_near = locate_row(number - all.first_pair, law, surface, all.meeting, all.rows)
-    if not is_near:
-        return 0
-    contact = contact_of(number, dt, all)
-    pushes = wp.dot(contact.force, contact.force) > 0.0
-    if pushes or contact.least > wp.dot(contact.opens, contact.normal):
-        contact.acts = ACTS
-        for buffer in range(2):
-            add(contact, 1, contact.force, buffer, law.grain, surface, sums)
-        keep(number, contact, all)
-    return 1
+@functools.cache
+def phases(has_triangles: bool, has_pairs: bool) -> SimpleNamespace:
+    """The functions of a step with obstacles at places and, if so, at triangles, and with soft pairs. What is not there
+    is not compiled: most of the code is, as each contact there has up to four places.
+    """
+    most = 4 if has_pairs else 3 if has_triangles else 1
 
+    @wp.func
+    def contact_of(number: int, dt: float, all: Contacts):
+        """The contact with a number, which has been located in this step."""
+        found = Contact()
+        if number < all.first_triangle:
+            found = read_place(number, all)
+        if wp.static(has_triangles):
+            if number >= all.first_triangle and number < all.first_pair:
+                found = read_triangle(number - all.first_triangle, all.triangles, all.touches)
+        if wp.static(has_pairs):
+            if number >= all.first_pair:
+                found = read_row(number - all.first_pair, all.meeting, all.rows)
+        surface = all.rigid.surface
+        found.parents = parents_of(found.places[0], surface)
+        found.opens = -found.moved
+        for k in range(most):
+            weight = found.weights[k]
+            if weight != 0.0:
+                s = found.places[k]
+                share = loose_share(s, surface)
+                found.loose += wp.abs(weight) * share
+                found.opens += weight * surface.d[s]
+                if share > 0.0:
+                    found.free += weight * surface.d[s]
+        gap = found.gap
+        if found.loose < MOSTLY:
+            gap += left_between(found.places, found.weights, gap, found.loose, found.normal, surface)
+        found.least = least_motion(gap, all.rigid.law, dt)
+        return found
 
-@wp.func
-def iterate(contact: Contact, before: int, law: Law, surface: Surface, sums: Sums):
-    """Correct the force of a contact, with the sums of the buffer ``before`` and into the other one."""
-    opens = contact.opens
-    free = contact.free
-    compliance = float(0.0)
-    for k in range(4):
-        weight = contact.weights[k]
-        if weight != 0.0:
-            parents = contact.parents
-            if k > 0:
-                parents = parents_of(contact.places[k], surface)
-            motion, own = pushed(parents, before, law.grain, sums)
-            opens += weight * motion
-            free += weight * motion
-            compliance += wp.abs(weight) * own
-    n = contact.normal
-    wanted = contact.least - wp.dot(opens, n)
-    # The other buffer has not got the last changes yet.
-    added = contact.more
-    contact.more = wp.vec3()
-    counted = int(0)
-    if contact.acts == BEGINS:
-        counted += 1
-        contact.acts = ACTS
-    elif contact.acts == ENDS:
-        counted -= 1
-        contact.acts = WAITS
-    if contact.acts == ACTS:
-        force = wp.vec3()
-        if compliance > 0.0:
-            wanted -= left_to_held(wanted + wp.dot(free, n), contact.loose)
-            normal_force = wp.max(wp.dot(contact.force, n) + wanted / compliance, 0.0)
-            sideways = across(contact.force, n) - across(opens, n) / compliance
-            force = normal_force * n + held_back(sideways, normal_force, contact.friction)
-        contact.more = force - contact.force
-        contact.force = force
-        added += contact.more
-        if wp.dot(force, force) == 0.0:
+    @wp.func
+    def keep(number: int, contact: Contact, all: Contacts):
+        """Store what an iteration changes."""
+        if number < all.first_triangle:
+            keep_place(number, contact, all.rigid)
+        if wp.static(has_triangles):
+            if number >= all.first_triangle and number < all.first_pair:
+                keep_triangle(number - all.first_triangle, contact, all.triangles.shape[0], all.touches)
+        if wp.static(has_pairs):
+            if number >= all.first_pair:
+                keep_row(number - all.first_pair, contact, all.rows)
+
+    @wp.func
+    def add(contact: Contact, times: int, force: wp.vec3, buffer: int, grain: float, surface: Surface, sums: Sums):
+        """Add a contact's weights at the nodes of its places so many times, 1 if it begins to act and -1 if it ends;
+        and a force."""
+        for k in range(most):
+            weight = contact.weights[k]
+            if weight != 0.0:
+                parents = contact.parents
+                if k > 0:
+                    parents = parents_of(contact.places[k], surface)
+                for m in range(4):
+                    w = parents.weights[m]
+                    if w != 0.0:
+                        add_at(parents.nodes[m], weight * w, times, force, buffer, grain, sums)
+
+    @wp.func
+    def locate(number: int, dt: float, all: Contacts, sums: Sums):
+        """Find a contact in this step, with the force with which it begins. Returns whether it may act."""
+        surface = all.rigid.surface
+        law = all.rigid.law
+        places = surface.node.shape[0]
+        is_near = bool(False)
+        if number < all.first_triangle:
+            is_near = begin_place(number % places, number // places, dt, all.rigid)
+        if wp.static(has_triangles):
+            if number >= all.first_triangle and number < all.first_pair:
+                pair = number - all.first_triangle
+                count = all.triangles.shape[0]
+                is_near = find_touch(pair // count, pair % count, all.rigid, all.triangles, all.touches)
+        if wp.static(has_pairs):
+            if number >= all.first_pair:
+                is_near = locate_row(number - all.first_pair, law, surface, all.meeting, all.rows)
+        if not is_near:
+            return 0
+        contact = contact_of(number, dt, all)
+        pushes = wp.dot(contact.force, contact.force) > 0.0
+        if pushes or contact.least > wp.dot(contact.opens, contact.normal):
+            contact.acts = ACTS
+            for buffer in range(2):
+                add(contact, 1, contact.force, buffer, law.grain, surface, sums)
+            keep(number, contact, all)
+        return 1
+
+    @wp.func
+    def iterate(contact: Contact, before: int, law: Law, surface: Surface, sums: Sums):
+        """Correct the force of a contact, with the sums of the buffer ``before`` and into the other one."""
+        opens = contact.opens
+        free = contact.free
+        compliance = float(0.0)
+        for k in range(most):
+            weight = contact.weights[k]
+            if weight != 0.0:
+                parents = contact.parents
+                if k > 0:
+                    parents = parents_of(contact.places[k], surface)
+                motion, own = pushed(parents, before, law.grain, sums)
+                opens += weight * motion
+                free += weight * motion
+                compliance += wp.abs(weight) * own
+        n = contact.normal
+        wanted = contact.least - wp.dot(opens, n)
+        # The other buffer has not got the last changes yet.
+        added = contact.more
+        contact.more = wp.vec3()
+        counted = int(0)
+        if contact.acts == BEGINS:
+            counted += 1
+            contact.acts = ACTS
+        elif contact.acts == ENDS:
             counted -= 1
-            contact.acts = ENDS
-    elif wanted > 0.0:
-        counted += 1
-        contact.acts = BEGINS
-    add(contact, counted, added, 1 - before, law.grain, surface, sums)
-    return contact
+            contact.acts = WAITS
+        if contact.acts == ACTS:
+            force = wp.vec3()
+            if compliance > 0.0:
+                wanted -= left_to_held(wanted + wp.dot(free, n), contact.loose)
+                normal_force = wp.max(wp.dot(contact.force, n) + wanted / compliance, 0.0)
+                sideways = across(contact.force, n) - across(opens, n) / compliance
+                force = normal_force * n + held_back(sideways, normal_force, contact.friction)
+            contact.more = force - contact.force
+            contact.force = force
+            added += contact.more
+            if wp.dot(force, force) == 0.0:
+                counted -= 1
+                contact.acts = ENDS
+        elif wanted > 0.0:
+            counted += 1
+            contact.acts = BEGINS
+        add(contact, counted, added, 1 - before, law.grain, surface, sums)
+        return contact
 
+    @wp.func
+    def contact_count(near: Near, all: Contacts):
+        """How many contacts there may be in this step."""
+        count = near.count[0] * all.rigid.forces.shape[0]
+        if wp.static(has_triangles):
+            count += near.touch_count[0]
+        if wp.static(has_pairs):
+            count += row_count(all.rows)
+        return count
 
-@wp.func
-def contact_count(near: Near, all: Contacts):
-    """How many contacts there may be in this step."""
-    return near.count[0] * all.rigid.forces.shape[0] + near.touch_count[0] + row_count(all.rows)
+    @wp.func
+    def number_of(k: int, near: Near, all: Contacts):
+        """The number of the k-th of them; -1 for a place that no obstacle is near."""
+        obstacles = all.rigid.forces.shape[0]
+        beside = near.count[0] * obstacles
+        if k < beside:
+            s = near.nodes[k // obstacles]
+            if (near.flags[s] & BESIDE) != 0:
+                return (k % obstacles) * all.rigid.surface.node.shape[0] + s
+            return -1
+        touches = int(beside)
+        if wp.static(has_triangles):
+            touches += near.touch_count[0]
+            if k < touches:
+                return all.first_triangle + near.touches[k - beside]
+        if wp.static(has_pairs):
+            if k < touches + row_count(all.rows):
+                return all.first_pair + k - touches
+        return -1
 
-
-@wp.func
-def number_of(k: int, near: Near, all: Contacts):
-    """The number of the k-th of them; -1 for a place that no obstacle is near."""
-    obstacles = all.rigid.forces.shape[0]
-    beside = near.count[0] * obstacles
-    touches = beside + near.touch_count[0]
-    number = int(-1)
-    if k < beside:
-        s = near.nodes[k // obstacles]
-        if (near.flags[s] & BESIDE) != 0:
-            number = (k % obstacles) * all.rigid.surface.node.shape[0] + s
-    elif k < touches:
-        number = all.first_triangle + near.touches[k - beside]
-    elif k < touches + row_count(all.rows):
-        number = all.first_pair + k - touches
-    return number
+    return SimpleNamespace(
+        contact_of=contact_of,
+        keep=keep,
+        locate=locate,
+        iterate=iterate,
+        contact_count=contact_count,
+        number_of=number_of,
+    )
 
 
 @wp.func
@@ -415,94 +479,103 @@ def clear_lists(sums: Sums):
     sums.live_count[0] = 0
 
 
-@wp.kernel(enable_backward=False, grid_stride=False, launch_bounds=(64, 4))
-def solve_contacts(
-    # In
-    threads: int,
-    first: int,
-    last: int,
-    iterations: int,
-    are_separate: int,
-    awake: wp.array[wp.int32],
-    near: Near,
-    pace: Pace,
-    # In and out
-    all: Contacts,
-    sums: Sums,
-):
-    """Make some phases of a step: the first one finds all contacts, then there are the iterations, and the last one
-    finds where places go and updates anchors. For CUDA; see ``sweep`` for the CPU.
+@functools.cache
+def solver(has_triangles: bool, has_pairs: bool) -> wp.Kernel:
+    """The kernel of these contacts, for CUDA; see ``phases``."""
+    of = phases(has_triangles, has_pairs)
+    contact_of, keep, locate, iterate = of.contact_of, of.keep, of.locate, of.iterate
+    contact_count, number_of = of.contact_count, of.number_of
 
-    Args:
-        threads: The number of threads, of blocks that are all resident.
-        first, last: The phases, from 0 to ``iterations`` + 1.
-        awake: Whether contact is awake, [1]; there are no contacts if it is not.
-        are_separate: Whether no two contacts share a node: places that are nodes, and one obstacle. Then a thread goes
-            through all phases of a place by itself.
-    """
-    thread = wp.tid()
-    if awake[0] == 0:
-        return
-    dt = float(pace.seconds[DT])
-    surface = all.rigid.surface
-    law = all.rigid.law
-    start = spread_thread(thread, threads, BLOCK)
-    k = int(start)
-    if first == LOCATE:
-        # Warps stay together.
-        beyond = contact_count(near, all) + wp.where(threads > 1, thread % WARP, 0)
-        while k < beyond:
-            number = number_of(k, near, all)
-            may_act = int(0)
-            if number >= 0:
-                may_act = locate(number, dt, all, sums)
-            list_by_warp(sums.live, sums.live_count, number, wp.where(are_separate != 0, 0, may_act))
-            k += threads
-    phase = wp.max(first, LOCATE + 1)
-    live = int(0)
-    own = int(-1)
-    mine = Contact()
-    blocks = int(1)
-    while phase <= wp.min(last, iterations):
-        if phase > first and are_separate == 0:
-            if phase == LOCATE + 1:
+    @unique_kernel(grid_stride=False, launch_bounds=(64, 4), fast_math=True)
+    def solve_contacts(
+        # In
+        threads: int,
+        first: int,
+        last: int,
+        iterations: int,
+        are_separate: int,
+        awake: wp.array[wp.int32],
+        near: Near,
+        pace: Pace,
+        # In and out
+        all: Contacts,
+        sums: Sums,
+    ):
+        """Make some phases of a step: the first one finds all contacts, then there are the iterations, and the last
+        one finds where places go and updates anchors. For CUDA; see ``sweep`` for the CPU.
+
+        Args:
+            threads: The number of threads, of blocks that are all resident.
+            first, last: The phases, from 0 to ``iterations`` + 1.
+            awake: Whether contact is awake, [1]; there are no contacts if it is not.
+            are_separate: Whether no two contacts share a node: places that are nodes, and one obstacle. Then a thread
+                goes through all phases of a place by itself.
+        """
+        thread = wp.tid()
+        if awake[0] == 0:
+            return
+        dt = float(pace.seconds[DT])
+        surface = all.rigid.surface
+        law = all.rigid.law
+        start = spread_thread(thread, threads, BLOCK)
+        k = int(start)
+        if first == LOCATE:
+            # Warps stay together.
+            beyond = contact_count(near, all) + wp.where(threads > 1, thread % WARP, 0)
+            while k < beyond:
+                number = number_of(k, near, all)
+                may_act = int(0)
+                if number >= 0:
+                    may_act = locate(number, dt, all, sums)
+                list_by_warp(sums.live, sums.live_count, number, wp.where(are_separate != 0, 0, may_act))
+                k += threads
+        phase = wp.max(first, LOCATE + 1)
+        live = int(0)
+        own = int(-1)
+        mine = Contact()
+        blocks = int(1)
+        while phase <= wp.min(last, iterations):
+            if phase > first and are_separate == 0:
+                if phase == LOCATE + 1:
+                    synchronize_grid(sums.arrived)
+                else:
+                    synchronize_blocks(sums.arrived, 1, blocks)
+            if own < 0:
+                live = wp.where(are_separate != 0, near.count[0], sums.live_count[0])
+                # Only blocks that have any of them wait for one another.
+                blocks = wp.clamp((live + WARP - 1) // WARP, 1, wp.max(threads // BLOCK, 1))
+            k = int(start)
+            if thread // BLOCK >= blocks:
+                phase = iterations
+                live = 0
+            while k < live:
+                number = own
+                contact = mine
+                if k != start or own < 0:
+                    number = sums.live[k]
+                    if are_separate != 0:
+                        number = near.nodes[k]
+                    contact = contact_of(number, dt, all)
+                if contact.acts != OUT:
+                    contact = iterate(contact, (phase - 1) % 2, law, surface, sums)
+                # A thread's first contact stays in registers.
+                if k == start:
+                    own = number
+                    mine = contact
+                else:
+                    keep(number, contact, all)
+                k += threads
+            phase += 1
+        if own >= 0:
+            keep(own, mine, all)
+        if last > iterations:
+            if first < last and are_separate == 0:
                 synchronize_grid(sums.arrived)
-            else:
-                synchronize_blocks(sums.arrived, 1, blocks)
-        if own < 0:
-            live = wp.where(are_separate != 0, near.count[0], sums.live_count[0])
-            # Only blocks that have any of them wait for one another.
-            blocks = wp.clamp((live + WARP - 1) // WARP, 1, wp.max(threads // BLOCK, 1))
-        k = int(start)
-        if thread // BLOCK >= blocks:
-            phase = iterations
-            live = 0
-        while k < live:
-            number = own
-            contact = mine
-            if k != start or own < 0:
-                number = sums.live[k]
-                if are_separate != 0:
-                    number = near.nodes[k]
-                contact = contact_of(number, dt, all)
-            if contact.acts != OUT:
-                contact = iterate(contact, (phase - 1) % 2, law, surface, sums)
-            # A thread's first contact stays in registers.
-            if k == start:
-                own = number
-                mine = contact
-            else:
-                keep(number, contact, all)
-            k += threads
-        phase += 1
-    if own >= 0:
-        keep(own, mine, all)
-    if last > iterations:
-        if first < last and are_separate == 0:
-            synchronize_grid(sums.arrived)
-        if thread == 0:
-            clear_lists(sums)
-        k = int(start)
-        while k < near.count[0]:
-            end_place(near.nodes[k], iterations % 2, near, all, sums)
-            k += threads
+            if thread == 0:
+                clear_lists(sums)
+            k = int(start)
+            while k < near.count[0]:
+                end_place(near.nodes[k], iterations % 2, near, all, sums)
+                k += threads
+
+    return solve_contacts

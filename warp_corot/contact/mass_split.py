@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 
 import warp as wp
@@ -12,16 +13,19 @@ from warp_corot.kernels.contact import sums
 from warp_corot.kernels.contact.law import Law
 from warp_corot.kernels.contact.near import Near
 from warp_corot.kernels.contact.rows import Meeting, Rows
-from warp_corot.kernels.contact.sweep import sweep_contacts
+from warp_corot.kernels.contact.sweep import sweeper
 from warp_corot.kernels.contact.touches import Touches
 from warp_corot.kernels.contact.vertices import Rigid
 from warp_corot.kernels.stepping.pace import Pace
 
+from .obstacles import have_edges
+from .options import Contact
 from .pairs import Pairs
 from .rigid_forces import RigidForces
 from .search import Search
 from .surface import ContactSurface
 from .surface_halo import SurfaceHalo
+from .tool import Obstacle
 
 #: Number of iterations if contacts share nodes, and otherwise: then the first one is exact.
 ITERATIONS, EXACT = 4, 1
@@ -32,6 +36,15 @@ RECORDS = 1 << 14
 #: blocks of threads are resident: one on each multiprocessor for few contacts, else so many; and the most blocks of
 #: other launches.
 FEW_TURNS, MOST_TURNS, BLOCKS_EACH, MOST_BLOCKS = 4, 64, 4, 4096
+
+
+def solver_of(
+    device: wp.Device, obstacles: Sequence[Obstacle], options: Contact, bodies: int
+) -> tuple[wp.Kernel, int | None]:
+    """The kernel of a step, for what may touch, and its threads of a block."""
+    kernel = kernels.solver if device.is_cuda else sweeper
+    meet = bodies > 1 or options.self_contact
+    return kernel(have_edges(obstacles), meet), BLOCK if device.is_cuda else None
 
 
 class MassSplit:
@@ -70,6 +83,8 @@ class MassSplit:
         alone = pairs is None and not surface.is_borne and (rigid is None or rigid.is_separate)
         self._none = wp.zeros(0, dtype=wp.int32, device=self.device)
         self._are_separate, self.iterations = alone, EXACT if alone else ITERATIONS
+        made = kernels.solver if self.device.is_cuda else sweeper
+        self._kernel = made(rigid is not None and rigid.have_edges, pairs is not None)
         self.follow()
 
     def follow(self) -> None:
@@ -128,7 +143,7 @@ class MassSplit:
         last = self.iterations + 1
         if self._shared.ranks.is_alone:
             spans = [(0, last)] if self._is_one else [(phase, phase) for phase in range(last + 1)]
-            self._regions.launch(kernels.solve_contacts, *(partial(self._launch, near, *span) for span in spans))
+            self._regions.launch(self._kernel, *(partial(self._launch, near, *span) for span in spans))
             return
         self._shared.exchange(self.surface.arrays.yielding)
         for phase in range(last + 1):
@@ -174,7 +189,7 @@ class MassSplit:
         outputs = [contacts, self.sums]
         if self.device.is_cpu:
             inputs = [self._threads, part, *inputs[:-1], *self._listed, inputs[-1]]
-            launch(sweep_contacts, 1, inputs, [contacts, self._records, self.sums], device=self.device)
+            launch(self._kernel, 1, inputs, [contacts, self._records, self.sums], device=self.device)
         else:
             dim, block = self._threads, min(self._threads, BLOCK)
-            wp.launch(kernels.solve_contacts, dim, [dim, *inputs], outputs, device=self.device, block_dim=block)
+            wp.launch(self._kernel, dim, [dim, *inputs], outputs, device=self.device, block_dim=block)

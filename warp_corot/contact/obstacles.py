@@ -25,6 +25,11 @@ LARGEST_SHARE = 0.5
 CATCHING_UP = 2.0
 
 
+def have_edges(obstacles: Sequence[Obstacle]) -> bool:
+    """Whether any obstacle can pass between the nodes of a body; a half-space cannot."""
+    return any(not isinstance(each.shape if isinstance(each, Tool) else each, Ground) for each in obstacles)
+
+
 class Obstacles:
     """Obstacles of all worlds; each may have a different place in each world.
 
@@ -80,8 +85,8 @@ class Obstacles:
 
     @property
     def have_edges(self) -> bool:
-        """Whether any of them can pass between the nodes of a body; a half-space cannot."""
-        return any(not isinstance(tool.shape, Ground) for tool in self.tools)
+        """Whether any of them can pass between the nodes of a body."""
+        return have_edges(self.tools)
 
     @property
     def state(self) -> dict[str, wp.array]:

@@ -82,6 +82,7 @@ class SoftEnv(VectorEnv):
         task: What the task declares.
         sim: The simulation, which users may look at; ``sim.body`` is the tissue.
         columns: The place of each named part of an observation.
+        substeps: The number of time steps in a step of the environment.
 
     Raises:
         InputError: An argument has another type or value, or a range is not among the task's.
@@ -252,12 +253,12 @@ class SoftEnv(VectorEnv):
         depend on the number of worlds."""
         # The stiffest tissue bounds steps; episodes write their own stiffness.
         stiffest = self.ranges["young"][1] * max(self.ranges.get("ratio", (1.0, 1.0))[1], 1.0)
-        self._count, steps, law = IMPLICIT_STEPS, None, None
+        self.substeps, steps, law = IMPLICIT_STEPS, None, None
         if integrator == "explicit":
             _, single, law = self._simulated(1, stiffest, SymplecticEuler(damping=DAMPING))
-            self._count = int(np.ceil(1.0 / (RATE * SAFETY * single.stable_dt)))
-            steps = SymplecticEuler(dt=1.0 / (RATE * self._count), damping=DAMPING)
-        euler = BackwardEuler(dt=1.0 / (RATE * self._count))
+            self.substeps = int(np.ceil(1.0 / (RATE * SAFETY * single.stable_dt)))
+            steps = SymplecticEuler(dt=1.0 / (RATE * self.substeps), damping=DAMPING)
+        euler = BackwardEuler(dt=1.0 / (RATE * self.substeps))
         self.scene, self.sim, self._contact = self._simulated(self.num_envs, stiffest, steps or euler)
         if law is not None:
             self._contact.take_law(law)
@@ -349,7 +350,7 @@ class SoftEnv(VectorEnv):
         worlds.lost.zero_()
         self.launch_actions()
         self._launch(kernels.pace_tools, worlds.targets.shape, [1.0 / RATE, worlds.targets, motions])
-        self.sim.recorded.launch(Segment(self._count, adopts=True, publishes=True))
+        self.sim.recorded.launch(Segment(self.substeps, adopts=True, publishes=True))
         inputs = [body.world_node_count, FARTHEST, body.state.displacements, worlds]
         self._launch(kernels.find_lost, body.node_count, inputs)
         if self.task.feels_stress:
@@ -380,7 +381,7 @@ class SoftEnv(VectorEnv):
 
     def _launch_observation(self) -> None:
         body, obstacles = self.sim.body, self._contact.obstacles
-        inputs = [len(self.scene.tools), 1.0 / (RATE * self._count), obstacles.motions]
+        inputs = [len(self.scene.tools), 1.0 / (RATE * self.substeps), obstacles.motions]
         inputs += [obstacles.wrenches, None if self._grasp is None else self._grasp.wrench, self._points]
         inputs += [body.world_node_count, body.state.rest, body.state.displacements, self.worlds]
         self._launch(kernels.observe, self.num_envs, inputs)

@@ -14,6 +14,7 @@ import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.contacts import Contacts
+from warp_corot.contact.mass_split import solver_of
 from warp_corot.contact.options import Contact
 from warp_corot.contact.reading import ContactPoint, contact_points
 from warp_corot.contact.tool import Obstacle
@@ -154,7 +155,7 @@ class Simulation(Cutting):
         for field in self.fields:
             field.divide()
         self.system = System(self.bodies, self.fields, self.pace, self.gravity, self.ranks)
-        loading = self._load_kernels(touches=touching is not None)
+        loading = self._load_kernels(touching)
         stable = self._find_stable_steps()
         #: Keeps bodies out of obstacles and out of one another; None without contact.
         self.contact: Contacts | None = None
@@ -178,17 +179,19 @@ class Simulation(Cutting):
         #: Makes the steps.
         self.running = Running(self)
 
-    def _load_kernels(self, touches: bool) -> list[Future]:
+    def _load_kernels(self, touching: tuple[tuple[Obstacle, ...], Contact] | None) -> list[Future]:
         """Load the kernels that steps are known to launch, several modules at a time; returns those to wait for."""
         explicit, chosen, on_cpu = not self.integrator.is_implicit, self.integrator.dt is None, self.device.is_cpu
         names = [*(STEPS_ON_CPU if on_cpu else STEPS), *(EXPLICIT if chosen else ()), *(() if explicit else IMPLICIT)]
-        if touches and explicit:
+        if touching and explicit:
             names = [*CONTACT, *names]
         if not explicit and any(body.discretization.element_kind is ForestElements for body in self.bodies):
             names += IMPLICIT_ON_FORESTS
         kernels: list[LoadedKernel] = [STEP_SYMPLECTIC_EULER[wp.vec4]] if explicit else []
         kernels += [find_strains(body.discretization.element_kind) for body in self.bodies if chosen]
-        kernels += [count_crushed(body.discretization.element_kind) for body in self.bodies if touches]
+        kernels += [count_crushed(body.discretization.element_kind) for body in self.bodies if touching]
+        if touching and explicit:
+            kernels.append(solver_of(self.device, *touching, len(self.bodies)))
         kernels += [kernel for field in self.fields for kernel in field.kernels]
         # Explicit steps need the forces at once, to find their length.
         load(names, self.device, kernels if explicit else ())
