@@ -16,7 +16,7 @@ from gymnasium.utils.env_checker import check_env  # noqa: E402
 from gymnasium.vector import AutoresetMode  # noqa: E402
 
 import warp_corot as wc  # noqa: E402
-from warp_corot.envs import TASKS, Lift, Reach, Retract, SingleEnv  # noqa: E402
+from warp_corot.envs import TASKS, Lift, Reach, Retract, SingleEnv, Thread  # noqa: E402
 
 KINDS = list(TASKS.values())
 #: A task without much in it, for what is the same in all.
@@ -315,6 +315,15 @@ def test_steps_are_implicit_if_asked():
     env = QUICK(4, device="cpu", integrator="implicit")
     assert isinstance(env.sim.integrator, wc.BackwardEuler)
     assert succeeded(env, seed=0).sum() >= 3
+
+
+@pytest.mark.parametrize("kind", [Lift, Thread], ids=lambda kind: kind.__name__)
+def test_fast_thin_tools_have_more_implicit_steps(kind):
+    """Fingers and the plate of the gripper could pass through tissue in one of two steps."""
+    env = kind(1, device="cpu", integrator="implicit")
+    env.reset(seed=0)
+    env.step(np.ones((1, env.task.actions), np.float32))
+    assert env.substeps > 2
 
 
 def test_a_single_environment_is_a_world():

@@ -50,7 +50,8 @@ class Lift(SoftEnv):
         x, y, z = BLOCK
         points = nodes_at(mesh, [(i * x, j * y, k * z) for i in (0, 1) for j in (0, 1) for k in (0, 1)])
         shapes = [Box(FINGER, position=(side, 0.5 * y, 0.05), friction=0.9) for side in (-0.01, x + 0.01)]
-        fingers = [Tool(shape, speed=4.0 * SPEED) for shape in shapes]
+        # Along all axes at once, and together along x.
+        fingers = [Tool(shape, speed=2.5 * SPEED) for shape in shapes]
         return Scene(mesh, None, fingers, [Ground()], points, (0.5 * x, 0.5 * y, 0.0))
 
     def launch_actions(self) -> None:

@@ -21,6 +21,7 @@ except ImportError as error:
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.contacts import Contacts
 from warp_corot.contact.grasp import Grasp
+from warp_corot.contact.obstacles import LARGEST_SHARE
 from warp_corot.contact.options import Contact
 from warp_corot.discretization.discretization import centroids
 from warp_corot.elasticity import Corotated
@@ -39,7 +40,7 @@ from .task import Scene, Task
 ARRAYS = ("numpy", "torch", "warp")
 AUTORESETS = {"next_step": AutoresetMode.NEXT_STEP, "same_step": AutoresetMode.SAME_STEP}
 INTEGRATORS = ("explicit", "implicit")
-#: Steps of the environment in a second, and of implicit integrators in a step of the environment.
+#: Steps of the environment in a second, and the least number of steps of implicit integrators in each of them.
 RATE, IMPLICIT_STEPS = 50, 2
 #: Explicit steps over the largest stable one of the stiffest tissue at rest: strained tissue is stiffer.
 SAFETY = 0.6
@@ -69,8 +70,8 @@ class SoftEnv(VectorEnv):
         ranges: Lowest and highest values of numbers that are drawn for each episode, in place of those in
             ``task.ranges``.
         max_episode_steps: Steps after which an episode is cut off; None: the task's own.
-        integrator: "explicit", or "implicit": two steps of ``BackwardEuler`` in each step, without time steps that
-            depend on the stiffest tissue.
+        integrator: "explicit", or "implicit": two steps of ``BackwardEuler`` in each step, or more where tools could
+            pass through tissue in one, without time steps that depend on the stiffest tissue.
         deterministic: Whether explicit steps on CUDA give the same result every time, which takes time; see
             ``Simulation``.
         device: The device; None for Warp's default.
@@ -253,7 +254,9 @@ class SoftEnv(VectorEnv):
         depend on the number of worlds."""
         # The stiffest tissue bounds steps; episodes write their own stiffness.
         stiffest = self.ranges["young"][1] * max(self.ranges.get("ratio", (1.0, 1.0))[1], 1.0)
-        self.substeps, steps, law = IMPLICIT_STEPS, None, None
+        rate = max(tool.speed / tool.shape.thickness for tool in self.make_scene().tools)
+        self.substeps = max(IMPLICIT_STEPS, int(np.ceil(1.01 * rate / (LARGEST_SHARE * RATE))))
+        steps, law = None, None
         if integrator == "explicit":
             _, single, law = self._simulated(1, stiffest, SymplecticEuler(damping=DAMPING))
             self.substeps = int(np.ceil(1.0 / (RATE * SAFETY * single.stable_dt)))
