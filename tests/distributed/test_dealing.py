@@ -1,6 +1,7 @@
 """The division of work among ranks: elements, sums in any order, numbers of nodes. One process is enough."""
 
 import math
+import pickle
 from contextlib import nullcontext
 from itertools import pairwise
 from types import SimpleNamespace
@@ -14,13 +15,12 @@ import warp_corot as wc
 from warp_corot.discretization.awaited import Awaited
 from warp_corot.discretization.groups import group_numbers
 from warp_corot.discretization.planning.fixed import ForcePlan
+from warp_corot.distributed.divided_mesh import divide, pack_part, rejoined, whole_of
+from warp_corot.distributed.exchange import Places, reproducible_sums
+from warp_corot.distributed.meshes import dealt
+from warp_corot.distributed.part import Part
 from warp_corot.distributed.partition import Partition
-from warp_corot.distributed.parts import Part, numbered_part
-from warp_corot.distributed.places import Places
-from warp_corot.distributed.rejoining import pack_part, rejoined
-from warp_corot.distributed.reproducible_sums import reproducible_sums
-from warp_corot.distributed.scatter_mesh import dealt, pieces_of
-from warp_corot.distributed.unsupported import check_supported
+from warp_corot.distributed.simulation import check_supported
 from warp_corot.mesh.scattered import normal_numbers
 
 
@@ -73,7 +73,7 @@ def test_rotations_are_shared_within_ranks(level):
         needed = dealt.needed(mesh, rank)
         assert not np.isin(above[needed], above[~needed]).any()
         assert not np.isin(dealt.sharing[needed], dealt.sharing[~needed]).any()
-        part, _ = numbered_part(mesh, dealt, rank)
+        part = divide(mesh, dealt, rank)
         np.testing.assert_array_equal(part.ancestors(level), above[needed])
 
 
@@ -124,7 +124,8 @@ def test_nodes_of_parts_sum_what_they_sum_in_the_whole(make):
     def differ(grouped):
         whole, count = terms_of(mesh, grouped, np.arange(len(mesh.tets))), 0
         for rank in range(3):
-            part, numbers = numbered_part(mesh, division, rank)
+            part = divide(mesh, division, rank)
+            numbers = part.numbers
             here = terms_of(part, grouped, numbers.elements)
             count += sum(here[k] != whole[numbers.nodes[k]] for k in np.flatnonzero(numbers.owner == rank))
         return count
@@ -162,9 +163,10 @@ def test_a_part_without_subtrees_has_the_forces_of_the_whole():
 def test_a_divided_forest_is_made_whole_again():
     mesh = wc.TetForest.from_domain(wc.Domain.sphere(0.05), target_elements=1000)
     parts, fewest = [], len(mesh.tree.level)
-    for (kind, place, options), _ in pieces_of(mesh, dealt(mesh, 3)):
+    division, known = dealt(mesh, 3), whole_of(mesh)
+    for rank in range(3):
         parts.append({})
-        part = kind(*place, **options)
+        part = pickle.loads(pickle.dumps(divide(mesh, division, rank, known)))
         told = pack_part(part, parts[-1])
         fewest = min(fewest, len(part.tree.level))
     whole = rejoined(told, parts)

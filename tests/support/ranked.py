@@ -18,8 +18,8 @@ wp.config.enable_backward = False
 import grown_parts  # noqa: E402
 
 import warp_corot as wc  # noqa: E402
-from warp_corot.distributed import mpi, root_facade, simulation  # noqa: E402
-from warp_corot.distributed.timeout import TimedCommunicator, longest_wait  # noqa: E402
+from warp_corot.distributed import mpi, simulation  # noqa: E402
+from warp_corot.distributed.mpi import TimedCommunicator, longest_wait  # noqa: E402
 
 
 def graded() -> wc.TetForest:
@@ -350,25 +350,6 @@ def general_loaded(file: Path) -> np.ndarray | None:
     return wd.gather(body.positions)
 
 
-def led(kept: Path) -> np.ndarray | None:
-    """The run "forest" of a body that only rank 0 has whole, saved; other ranks get parts."""
-    everybody = mpi.world()
-    if everybody.rank > 0:
-        root_facade.Workers.joined("cpu").serve()
-        return None
-    body = body_of(graded(), 0.49)
-    sim = root_facade.RootSimulation(body, in_parts=True, deterministic=True)
-    moved(sim, body)
-    sim.save(kept)
-    positions, called = body.positions.numpy().copy(), []
-    sim.on_step(lambda sim: called.append(sim.time), every=1)
-    sim.advance_steps(2)
-    sim.end()
-    assert len(called) == 2
-    assert called[-1] == sim.time
-    return positions
-
-
 def worlds_in_parts(stage: Path) -> dict[str, np.ndarray | None]:
     """The run "worlds" with a mesh of which each rank holds a part, recorded; and once more with no disk space on the
     last rank."""
@@ -457,8 +438,7 @@ def make_all(folder: Path, size: int, names: list[str]) -> None:
             if path.stem.split(".")[0] in names and path.exists():
                 found |= resumed(path)
         if "forest" in names:
-            found |= made("forest", False, None) | {"led.x": led(folder / "led.3.npz")}
-            found |= resumed(folder / "led.3.npz")
+            found |= made("forest", False, None)
             found["divided.x"] = forest_divided(folder / "divided.3.npz")
             found |= resumed(folder / "divided.3.npz")
         if "newmark" in names:

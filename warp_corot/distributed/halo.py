@@ -16,12 +16,10 @@ from warp_corot.discretization.awaited import Awaited
 from warp_corot.kernels.distributed import exchange as kernels
 from warp_corot.solvers.halo import Floats, Halo, Owned, V
 
-from .cards import CardExchange, add_up, take_most
 from .divided_mesh import DividedMesh
-from .exchange import ExchangeLists, HostExchange, in_worlds
+from .exchange import CardExchange, ExchangeLists, HostExchange, in_worlds, reduce_on_cards, reproducible_sums
 from .multigrid import MultigridOfParts, has_multigrid
-from .parts import Part
-from .reproducible_sums import reproducible_sums
+from .part import Part
 
 #: Number of times that a row of exchanges is timed.
 TIMED = 5
@@ -40,29 +38,24 @@ class CommHalo(Halo):
         self.comm = comm
 
     def max(self, value: V) -> V:
-        if isinstance(value, wp.array):
-            if value.device.is_cuda:
-                take_most(value)
-            else:
-                own = value.numpy()
-                own[...] = np.max(self.comm.allgather(own), axis=0)
-            return value
-        everybody = self.comm.allgather(value)
-        return np.max(everybody, axis=0) if isinstance(value, np.ndarray) else max(everybody)
+        return self._reduced(value, np.max, "MAX")
 
     def sum(self, value: V, addends: npt.NDArray[np.float64] | None = None) -> V:
-        if isinstance(value, wp.array):
-            if value.device.is_cuda:
-                add_up(value.view(wp.float64).flatten())
-            else:
-                own = value.numpy()
-                own[...] = np.sum(self.comm.allgather(own), axis=0)
-            return value
         if addends is None:
-            everybody = self.comm.allgather(value)
-            return np.sum(everybody, axis=0) if isinstance(value, np.ndarray) else sum(everybody)
+            return self._reduced(value, np.sum, "SUM")
         total = reproducible_sums(addends.reshape(len(addends), -1), self.comm)
         return total.reshape(value.shape) if isinstance(value, np.ndarray) else type(value)(total[0])
+
+    def _reduced(self, value: V, combined: Callable[..., Any], operation: str) -> V:
+        if isinstance(value, wp.array):
+            if value.device.is_cuda:
+                reduce_on_cards(value.view(wp.float64).flatten() if operation == "SUM" else value, operation)
+            else:
+                own = value.numpy()
+                own[...] = combined(self.comm.allgather(own), axis=0)
+            return value
+        found = combined(self.comm.allgather(value), axis=0)
+        return found if isinstance(value, np.ndarray) else type(value)(found)
 
 
 class OwnedPart(Owned):
