@@ -13,9 +13,7 @@ from warp_corot.contact.skin import has_own_surface
 from warp_corot.discretization.elements import Mesh
 from warp_corot.errors import InputError
 from warp_corot.mesh import TetForest, TetMesh, Tree
-from warp_corot.mesh.lattice import LATTICE_BITS
 from warp_corot.mesh.numbering import in_order_of_leaves, live_or_void, pruned, renumbered, with_virtual
-from warp_corot.mesh.surfaces.boundary import boundary_faces
 from warp_corot.mesh.tree import LIVE, VOID
 
 from .partition import Partition
@@ -61,8 +59,7 @@ class DividedMesh:
         element_count: Number of elements of the whole mesh.
         bounds: Lowest and highest coordinates of the whole mesh [m], float64 [2, 3].
         smallest_volume: Volume of the smallest element of the whole mesh [m^3].
-        outer: The triangles of the part's nodes on the surface of the whole mesh, int32 [F, 3]; None: the mesh is a
-            box, uniformly bisected.
+        is_box: Whether the whole mesh is a box, uniformly bisected.
         is_embedded: Whether the whole mesh was made from a domain, whose surface lies within the tetrahedra.
     """
 
@@ -70,7 +67,7 @@ class DividedMesh:
     element_count: int
     bounds: npt.NDArray[np.float64]
     smallest_volume: float
-    outer: Ints | None
+    is_box: bool = False
     is_embedded: bool = False
     points: npt.NDArray[np.float64]
     tets: Ints
@@ -78,14 +75,9 @@ class DividedMesh:
 
     def _belong(self, of_whole: dict[str, Any]) -> None:
         """Set this part's place in the whole mesh: the attributes above."""
-        self.__dict__.update({"outer": None} | of_whole)
+        self.__dict__.update(of_whole)
         if "smallest_volume" not in of_whole:
             self.__dict__["smallest_volume"] = float(np.min(self.volumes))
-
-    @property
-    def is_box(self) -> bool:
-        """Whether the whole mesh is a box, uniformly bisected."""
-        return self.outer is None
 
     def check_whole(self) -> None:
         """Check that this part is the whole, as on one rank.
@@ -98,14 +90,6 @@ class DividedMesh:
                 f"the mesh is a part, {len(self.tets)} of {self.element_count} elements, of a mesh that several ranks "
                 "hold; only warp_corot.distributed can compute and record it"
             )
-
-    def are_outer(self, triangles: Ints) -> Bools:
-        """Which triangles, int32 [F, 3], lie on the surface of the whole mesh; others are faces to elements
-        elsewhere."""
-        assert self.outer is not None
-        base = np.array([len(self.points) ** 2, len(self.points), 1], np.int64)
-        given, outer = (np.sort(each, axis=1).astype(np.int64) @ base for each in (triangles, self.outer))
-        return np.isin(given, outer)
 
     def check_expression(self, expression: str) -> None:
         """Check that an expression can be evaluated at the nodes of one part.
@@ -132,13 +116,6 @@ class DividedForest(DividedMesh, TetForest):
         """
         raise InputError("a forest in parts cannot be refined; make it finer")
 
-    def are_outer(self, triangles: Ints) -> Bools:
-        if self.outer is not None:
-            return super().are_outer(triangles)
-        corners = self.lattice[triangles]
-        ends = np.array([np.zeros(3, np.int64), np.array(self.cells) << LATTICE_BITS])
-        return np.any([(corners == end).all(axis=1).any(axis=1) for end in ends], axis=0)
-
 
 class DividedTetMesh(DividedMesh, TetMesh):
     """A rank's part of a general mesh."""
@@ -153,14 +130,12 @@ class DividedTetMesh(DividedMesh, TetMesh):
 
 
 def whole_of(mesh: Mesh) -> dict[str, Any]:
-    """What parts of a mesh know of it, if the rank keeps nothing else: attributes of ``DividedMesh``, but the surface
-    by the nodes of the whole."""
+    """What parts of a mesh know of it, if the rank keeps nothing else: attributes of ``DividedMesh``."""
     used = mesh.points[np.unique(mesh.tets)]
     return {
         "element_count": len(mesh.tets),
         "bounds": np.stack([used.min(axis=0), used.max(axis=0)]),
         "smallest_volume": float(np.min(mesh.volumes)),
-        "outer": boundary_faces(mesh.tets)[0],
         "is_embedded": isinstance(mesh, TetForest) and has_own_surface(mesh),
     }
 
@@ -185,8 +160,6 @@ def divide(
     def place(nodes: Ints, **others: Ints) -> dict[str, Any]:
         counted = division.rank_of_element[elements] == rank
         numbers = Numbers(nodes, elements, division.rank_of_node[nodes], counted, len(mesh.points), **others)
-        if whole is not None:
-            own["outer"] = _here(whole["outer"], nodes, len(mesh.points))
         return own | {"numbers": numbers}
 
     if isinstance(mesh, TetForest):
@@ -224,14 +197,6 @@ def branches_of(forest: TetForest, kept: Bools, *, prunes: bool) -> tuple[Any, .
     ends, tree = renumbered(order, forest.node_ends, tree)
     fill = None if forest.fill is None else forest.fill[kept]
     return forest.lattice[order], ends, tree, fill, order.astype(np.int32), stays.astype(np.int32)
-
-
-def _here(faces: Ints, nodes: Ints, count: int) -> Ints:
-    """The triangles with all corners among some nodes, by the numbers that they have there, int32 [F, 3]."""
-    number = np.full(count, -1, np.int32)
-    number[nodes] = np.arange(len(nodes), dtype=np.int32)
-    found = number[faces]
-    return found[(found >= 0).all(axis=1)]
 
 
 # --- put together ----------------------------------------------------------------------------------------------------

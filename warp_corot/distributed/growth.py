@@ -30,7 +30,6 @@ from warp_corot.mesh.growing.slivers import without_slivers
 from warp_corot.mesh.growing.strays import strays
 from warp_corot.mesh.lattice import LATTICE_BITS, checked_cell_size
 from warp_corot.mesh.numbering import by_levels, in_order_of_leaves, live_or_void, pruned, renumbered, with_virtual
-from warp_corot.mesh.surfaces.boundary import boundary_faces
 from warp_corot.mesh.tree import LIVE, VOID
 from warp_corot.mesh.uniform import halvings
 
@@ -281,19 +280,6 @@ class GrowingTogether(Growing):
 # --- ghosts ---------------------------------------------------------------------------------------------------------
 
 
-def _outer_faces(own: TetForest, partition: RootCubePartition) -> Ints:
-    """This rank's elements' triangles on the surface of the whole mesh, int32 [F, 3]; all ranks must call this."""
-    triangles, _ = boundary_faces(own.tets)
-    # The corners in one order name a face on all ranks.
-    keys = np.sort(partition.keys(own.lattice[triangles.ravel()]).reshape(-1, 3), axis=1)
-    places = partition.across(own.lattice[triangles])
-    inner = np.zeros(len(triangles), bool)
-    for mine, theirs in zip(places, partition.comm.alltoall([keys[each] for each in places]), strict=True):
-        _, number = np.unique(np.concatenate([keys[mine], theirs]), axis=0, return_inverse=True)
-        inner[mine] |= np.isin(number.ravel()[: len(mine)], number.ravel()[len(mine) :])
-    return triangles[~inner]
-
-
 def _with_ghosts(own: TetForest, partition: RootCubePartition) -> DividedForest:
     """This rank's part of the mesh that all ranks' leaves make together; all ranks must call this.
 
@@ -308,16 +294,13 @@ def _with_ghosts(own: TetForest, partition: RootCubePartition) -> DividedForest:
     owner = _owners(own, keys, partition)
     numbers, node_count = numbered_points(owner, keys, comm)
     groups = group_numbers(own, np.arange(len(own.tets)))
-    outer = _outer_faces(own, partition)
 
     def branch(kept: npt.NDArray[np.bool_]) -> Arrays:
         """Some leaves with the tree above them, as arrays by number in the whole mesh."""
         lattice, ends, tree, fill, points, stays = branches_of(own, kept, prunes=True)
-        inner = np.isin(outer, points[: int(tree.leaf_tets.max()) + 1]).all(axis=1)
         found = pack_tree(lattice, ends, tree, tree.leaves, first_row + stays.astype(np.int64), numbers[points])
         found |= {"owner": owner[points], "elements": first + np.flatnonzero(kept), "groups": first + groups[kept]}
-        found |= {"fill": fill} | ({} if own.labels is None else {"labels": own.labels[kept]})
-        return found | {"outer": numbers[outer[inner]]}
+        return found | {"fill": fill} | ({} if own.labels is None else {"labels": own.labels[kept]})
 
     given: list[Arrays | None] = [None] * comm.size
     # The first rank around a node moves it, so that copies go to ranks before this one.
@@ -359,11 +342,9 @@ def _together(own: TetForest, branches: list[Arrays], *, node_count: int, **whol
         owner[np.searchsorted(points, each["points"])] = each["owner"]
     order = with_virtual(in_order_of_leaves(tree), tree, lattice)
     ends, tree = renumbered(order, ends, tree)
-    place = np.full(len(points), -1, np.int32)
-    place[order] = np.arange(len(order), dtype=np.int32)
     joined: Arrays = {
         name: np.concatenate([each[name] for each in branches])
-        for name in ("elements", "groups", "outer", "fill", "labels")
+        for name in ("elements", "groups", "fill", "labels")
         if name in branches[0]
     }
     nodes, elements = order[: int(tree.leaf_tets.max()) + 1], joined["elements"]
@@ -381,7 +362,7 @@ def _together(own: TetForest, branches: list[Arrays], *, node_count: int, **whol
         labels=joined.get("labels"),
         label_names=own.label_names,
         leaf_groups=np.unique(joined["groups"], return_inverse=True)[1].ravel().astype(np.int32),
-        of_whole=whole | {"numbers": numbers, "outer": place[np.searchsorted(points, joined["outer"])]},
+        of_whole=whole | {"numbers": numbers},
     )
 
 
@@ -425,24 +406,13 @@ class RootCubePartition:
         """For each rank, the lattice points [n, 3] that are on its cubes; none for this rank."""
         near = np.flatnonzero((lattice & ((1 << LATTICE_BITS) - 1) == 0).any(axis=1))
         low, high = (lattice[near] - 1) >> LATTICE_BITS, lattice[near] >> LATTICE_BITS
-        return [near[each] for each in self._of_ranks(low, high)]
-
-    def across(self, corners: Ints) -> list[npt.NDArray[np.intp]]:
-        """For each rank, the triangles [n, 3, 3] that are on its cubes; none for this rank."""
-        flat = (corners == corners[:, :1]).all(axis=1) & (corners[:, 0] & ((1 << LATTICE_BITS) - 1) == 0)
-        near = np.flatnonzero(flat.any(axis=1))
-        inner = corners[near].min(axis=1) >> LATTICE_BITS
-        return [near[each] for each in self._of_ranks(inner - flat[near], inner)]
-
-    def _of_ranks(self, low: Ints, high: Ints) -> list[npt.NDArray[np.intp]]:
-        """For each rank, the places of ranges of cubes, at most two along each axis, that have one of its cubes."""
         ranks = np.full((len(low), 8), -1)
         for k, choice in enumerate(itertools.product((False, True), repeat=3)):
             cube = np.where(choice, high, low)
             inside = ((cube >= 0) & (cube < self._cells)).all(axis=1)
             place = (cube[:, 0].astype(np.int64) * self._cells[1] + cube[:, 1]) * self._cells[2] + cube[:, 2]
             ranks[inside, k] = np.searchsorted(self.starts, place[inside], side="right") - 1
-        found = [np.flatnonzero((ranks == rank).any(axis=1)) for rank in range(self.comm.size)]
+        found = [near[(ranks == rank).any(axis=1)] for rank in range(self.comm.size)]
         found[self.comm.rank] = np.zeros(0, np.intp)
         return found
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -20,9 +18,6 @@ from .divided_mesh import DividedMesh
 from .exchange import CardExchange, ExchangeLists, HostExchange, in_worlds, reduce_on_cards, reproducible_sums
 from .multigrid import MultigridOfParts, has_multigrid
 from .part import Part
-
-#: Number of times that a row of exchanges is timed.
-TIMED = 5
 
 
 class CommHalo(Halo):
@@ -124,14 +119,11 @@ class MpiHalo(CommHalo):
         wholes: The bodies.
         parts: This rank's part of each.
         reproducible: Whether sums are the same bit for bit for any number of ranks.
-        records: Whether steps are recorded on cards.
     """
 
-    def __init__(
-        self, comm: Any, wholes: Sequence[SoftBody], parts: Sequence[Part], *, reproducible: bool, records: bool
-    ):
+    def __init__(self, comm: Any, wholes: Sequence[SoftBody], parts: Sequence[Part], *, reproducible: bool):
         super().__init__(comm)
-        self.is_reproducible, self._records, self._parts = reproducible, records, parts
+        self.is_reproducible, self._parts = reproducible, parts
         self.device = parts[0].device
         self.lists = [ExchangeLists.of(p.numbers.nodes, p.numbers.owner, p.worlds, comm) for p in parts]
         self._exchanges = [self.exchange_of(lists, k) for k, lists in enumerate(self.lists)]
@@ -178,28 +170,3 @@ class MpiHalo(CommHalo):
         owner[taken] = giver[np.searchsorted(given[order], numbers[taken])]
         self._connected += 1
         return self.exchange_of(ExchangeLists.of(numbers, owner, 1, self.comm), self._connected).launch
-
-    def exchange_seconds(self, vectors: Sequence[wp.array], count: int) -> float:
-        """The mean time of an exchange of a nodal array of each body, over ``count`` of them in a row [s]; on cards
-        they are recorded."""
-
-        def exchange() -> None:
-            for _ in range(count):
-                for k, each in enumerate(vectors):
-                    self.exchange(k, each)
-
-        made = exchange
-        if self.device.is_cuda and self._records:
-            exchange()
-            with wp.ScopedCapture(device=self.device) as capture:
-                exchange()
-            made = functools.partial(wp.capture_launch, capture.graph)
-        times = []
-        for _ in range(TIMED):
-            wp.synchronize_device(self.device)
-            self.comm.Barrier()
-            began = time.perf_counter()
-            made()
-            wp.synchronize_device(self.device)
-            times.append(time.perf_counter() - began)
-        return sorted(times)[TIMED // 2] / count

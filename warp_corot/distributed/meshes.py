@@ -83,6 +83,7 @@ def box(
         of_whole={
             "numbers": numbers,
             "element_count": count,
+            "is_box": True,
             "bounds": np.array([origin, np.asarray(origin) + highest]),
         },
     )

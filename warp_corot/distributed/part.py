@@ -124,7 +124,7 @@ class PartSync:
     """
 
     def __init__(self, whole: SoftBody, part: Part, comm: Any):
-        self.whole, self.part, self._comm = whole, part, comm
+        self.whole, self.part, self.rank, self._comm = whole, part, comm.rank, comm
         n, count, worlds = len(part.numbers.nodes), whole.world_node_count, whole.worlds
         everywhere = in_worlds(part.places, worlds, count)
         own = np.tile(part.numbers.owner == comm.rank, worlds)

@@ -18,7 +18,6 @@ from warp_corot.io.write.animate import Progress, Recording, frame_count, make_f
 from warp_corot.io.write.skins import Skin
 from warp_corot.mesh.surfaces.bound import SurfaceMesh
 
-from .divided_mesh import DividedMesh
 from .mpi import all_or_none
 from .part import PartSync
 from .simulation import Simulation
@@ -208,16 +207,20 @@ class Piece:
     def __init__(self, syncs: Sequence[PartSync], world: int):
         self._syncs, self._world = syncs, world
         self.up_axis = syncs[0].whole.mesh.up_axis
-        #: The elements of each body that this rank counts, among those of its part; and the nodes of these.
+        #: The elements of each body that this rank counts, among those of its part; and the nodes of these and of
+        #: the faces.
         self._elements = [np.flatnonzero(each.part.numbers.counted) for each in syncs]
         self._nodes, tets, faces, first = [], [], [], 0
         for each, elements in zip(syncs, self._elements, strict=True):
-            own = each.part.mesh.tets[elements]
-            nodes = np.unique(own)
+            own, (triangles, _) = each.part.mesh.tets[elements], each.part.surface_faces
+            # Of the ranks that move a corner, the first draws the face.
+            owner = each.part.numbers.owner[triangles].min(axis=1)
+            triangles = triangles[owner == each.rank]
+            nodes = np.unique(np.concatenate([own.ravel(), triangles.ravel()]))
             number = np.full(each.part.world_node_count, -1, np.int32)
             number[nodes] = np.arange(first, first + len(nodes), dtype=np.int32)
             tets.append(number[own])
-            faces.append(number[_outer_faces(each)])
+            faces.append(number[triangles])
             self._nodes.append(nodes)
             first += len(nodes)
         self.points = np.concatenate([e.part.mesh.points[n] for e, n in zip(syncs, self._nodes, strict=True)])
@@ -265,27 +268,9 @@ class Piece:
             values.append(everywhere[self._world, elements])
         joined = np.concatenate(values).astype(np.float64)
         # A piece of a mesh that changes may get elements of other materials.
-        varies = any(np.ptp(getattr(e.whole.material.isotropic, name)) > 0 for e in self._syncs if _changes(e))
+        changing = [each.whole for each in self._syncs if each.whole.changing is not None]
+        varies = any(np.ptp(getattr(whole.material.isotropic, name)) > 0 for whole in changing)
         return float(joined[0]) if (joined == joined[0]).all() and not varies else joined
-
-
-def _changes(sync: PartSync) -> bool:
-    return sync.whole.changing is not None
-
-
-def _outer_faces(sync: PartSync) -> Ints:
-    """The triangles of the whole body's surface that are faces of elements that this rank counts, by the part's
-    nodes."""
-    whole, numbers = sync.whole, sync.part.numbers
-    triangles, parents = whole.surface_faces
-    if isinstance(whole.mesh, DividedMesh):
-        own = numbers.counted[parents] & whole.mesh.are_outer(triangles)
-        return triangles[own]
-    is_own = np.zeros(whole.world_element_count, bool)
-    is_own[sync.part.element_places[numbers.counted]] = True
-    number = np.full(whole.world_node_count, -1, np.int32)
-    number[sync.part.places] = np.arange(len(sync.part.places), dtype=np.int32)
-    return number[triangles[is_own[parents]]]
 
 
 def _skin(points: npt.NDArray[np.float64], faces: Ints) -> Skin:

@@ -171,8 +171,7 @@ class Simulation(on_one.Simulation):
             self._trial = None
         for each in self.syncs:
             each.take_over()
-        records = not self.integrator.is_implicit
-        self.ranks = MpiHalo(comm, self.bodies, parts, reproducible=self.deterministic, records=records)
+        self.ranks = MpiHalo(comm, self.bodies, parts, reproducible=self.deterministic)
         return parts
 
     def _divide_anew(self) -> None:
@@ -286,16 +285,6 @@ class Simulation(on_one.Simulation):
         ranks' elements."""
         counted = [part.numbers.counted for part in self.parts]
         return sum(map(len, counted)), sum(int((~each).sum()) for each in counted)
-
-    @property
-    def sent_bytes(self) -> int:
-        """The bytes that this rank sends in one exchange."""
-        return sum(each.sent_bytes for each in self.ranks.lists)
-
-    def exchange_seconds(self, count: int) -> float:
-        """The mean time of one exchange alone, over ``count`` of them in a row [s]; all ranks must call this."""
-        probes = [wp.zeros_like(part.state.displacements) for part in self.parts]
-        return self.ranks.exchange_seconds(probes, checked_count(count, "count", least=1))
 
     def measured_costs(self, count: int = 20) -> list[float]:
         """The time that the forces of an element take on each rank [s], the median of ``count`` measurements.
