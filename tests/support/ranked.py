@@ -18,7 +18,7 @@ wp.config.enable_backward = False
 import grown_parts  # noqa: E402
 
 import warp_corot as wc  # noqa: E402
-from warp_corot.distributed import mpi, simulation  # noqa: E402
+from warp_corot.distributed import mpi  # noqa: E402
 from warp_corot.distributed.mpi import TimedCommunicator, longest_wait  # noqa: E402
 
 
@@ -476,7 +476,6 @@ def main() -> None:
     alone = everybody.rank == 2
     some = TimedCommunicator(mpi.library().COMM_WORLD.Split(int(alone)), longest_wait())
     mpi.world = lambda: some  # type: ignore[assignment]
-    simulation.compile_once = lambda *_, **__: None
     if alone:
         make_all(folder, 1, names)
     mpi.meet(everybody)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 
 from warp_corot.inputs.processes import process_count, process_number
 
@@ -43,21 +42,3 @@ def end_others(status: int) -> None:
 def let_others_speak() -> None:
     """Wait before a failed rank ends, because ``mpirun`` then ends all others: rank 0 first reports the error."""
     time.sleep(WAIT)
-
-
-@contextmanager
-def one_first() -> Iterator[None]:
-    """Run the block on rank 0 first, then on all other ranks together, which find the kernels that rank 0 compiled."""
-    if not are_several():
-        yield
-        return
-    from warp_corot.distributed import mpi
-
-    comm = mpi.world()
-    if comm.rank > 0:
-        mpi.meet(comm)
-    try:
-        yield
-    finally:
-        if comm.rank == 0:
-            mpi.meet(comm)

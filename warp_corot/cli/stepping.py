@@ -18,7 +18,7 @@ from .bodies import RunBody, gravity_of
 from .exit_status import as_options
 from .implicit import integrator_name, is_static
 from .options.defaults import IMPLICIT_DT
-from .ranks import are_several, one_first
+from .ranks import are_several
 from .remesh import ARGUMENTS
 from .static import check_static, static_integrator
 from .tool_paths import make_blade
@@ -46,8 +46,7 @@ def make_simulation(args: argparse.Namespace, bodies: Sequence[RunBody], touched
         steps = steps_per_frame(args.fps, args.dt or IMPLICIT_DT)
         integrator = INTEGRATORS[integrator_name(args)](1.0 / (args.fps * steps), damping, viscosity)  # type: ignore[call-arg]
     else:
-        with one_first():
-            tried = min(_tried_step(body, damping, viscosity) for body in bodies)
+        tried = min(_tried_step(body, damping, viscosity) for body in bodies)
         steps = steps_per_frame(args.fps, args.dt or tried)  # refuses an excessive number
         integrator = SymplecticEuler(None if args.dt is None else 1.0 / (args.fps * steps), damping, viscosity)
     cuts = blades_of(args, bodies)

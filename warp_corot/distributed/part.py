@@ -6,7 +6,7 @@ import dataclasses
 import functools
 import operator
 import weakref
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -23,7 +23,7 @@ from warp_corot.materials.isotropic import Material
 
 from .divided_mesh import DividedMesh, divide
 from .exchange import Places, in_worlds
-from .partition import Partition
+from .partition import Partition, places_of
 
 Ints = npt.NDArray[np.int32]
 M = TypeVar("M", bound=Material)
@@ -128,23 +128,21 @@ class PartSync:
         n, count, worlds = len(part.numbers.nodes), whole.world_node_count, whole.worlds
         everywhere = in_worlds(part.places, worlds, count)
         own = np.tile(part.numbers.owner == comm.rank, worlds)
-        #: This rank's nodes among those of all worlds of the whole body, int32, and of its part.
-        self.own_nodes = everywhere[own]
+        #: This rank's nodes among those of all worlds of the whole body, and of its part, int32.
+        self.own_nodes, self.part_nodes = everywhere[own], np.flatnonzero(own).astype(np.int32)
         devices = whole.device, part.device
         self._all = Places(everywhere, np.arange(worlds * n, dtype=np.int32), *devices)
-        self._own = Places(self.own_nodes, np.flatnonzero(own).astype(np.int32), *devices)
+        self._own = Places(self.own_nodes, self.part_nodes, *devices)
         elements = in_worlds(part.element_places, worlds, whole.world_element_count)
         self._elements = Places(elements, np.arange(len(elements), dtype=np.int32), *devices)
         #: The numbers of this rank's nodes in the whole mesh, int64; and the number of nodes of the whole mesh.
         self.numbers = part.numbers.in_worlds(worlds)[own]
         self._total = worlds * part.numbers.node_count
-        #: The number in the part of each node that this rank moves, -1 for others.
-        self._number = np.full(worlds * count, -1, np.int32)
-        self._number[self.own_nodes] = np.flatnonzero(own)
         self._trajectories: list[Followed] = []
         self._activations: list[Followed] = []
         #: Triangles of the surface around this rank's nodes; None before there is contact.
         self._triangles: Places | None = None
+        _known[id(whole)] = self
 
     @property
     def is_in_parts(self) -> bool:
@@ -264,7 +262,7 @@ class PartSync:
         element, and in the room for nodes of a body that is remeshed. None elsewhere.
         """
         room = None if self.is_in_parts else np.zeros((len(self.whole.state.displacements), *values.shape[1:]))
-        return self._together(values[self._number[self.own_nodes]], room)
+        return self._together(values[self.part_nodes], room)
 
     def _together(self, own: npt.NDArray[Any], elsewhere: npt.NDArray[Any] | None) -> npt.NDArray[Any] | None:
         given = self._comm.gather((self.numbers, own), root=0)
@@ -278,10 +276,8 @@ class PartSync:
 
     def part_values(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """Values of the part's nodes from those of all nodes of the whole mesh; zero at ghosts."""
-        if self.is_in_parts:
-            values = values[self.part.numbers.in_worlds(self.part.worlds)]
         found = np.zeros((self.part.node_count, *values.shape[1:]), values.dtype)
-        found[self._number[self.own_nodes]] = values[self.own_nodes]
+        found[self.part_nodes] = values[self.numbers]
         return found
 
     def owns(self, array: wp.array) -> bool:
@@ -310,7 +306,7 @@ class PartSync:
             part.use_loads(part.loads, False)
 
     def _take_keyframes(self) -> None:
-        found = self._followed(self._trajectories, self.whole.conditions.trajectories, self._number)
+        found = self._followed(self._trajectories, self.whole.conditions.trajectories, self._own)
         if found is not None:
             self.part.conditions.set_trajectories(found)
 
@@ -320,39 +316,26 @@ class PartSync:
             return
         part.conditions.make_activation()
         self._elements.to_part(whole.discretization.activation, part.discretization.activation)
-        number = np.full(whole.worlds * whole.world_element_count, -1, np.int32)
-        number[self._elements.whole] = self._elements.part
-        found = self._followed(self._activations, whole.conditions.activations, number)
+        found = self._followed(self._activations, whole.conditions.activations, self._elements)
         if found is not None:
             part.conditions.set_activations(found)
 
-    def _followed(
-        self, known: list[Followed], given: Sequence[Followed], number: npt.NDArray[np.int32]
-    ) -> list[Followed] | None:
-        """The part's share of keyframes of the whole body, from the numbers in the part; None if they are known."""
+    def _followed(self, known: list[Followed], given: Sequence[Followed], places: Places) -> list[Followed] | None:
+        """The part's share of keyframes of the whole body; None if they are known."""
         if len(given) == len(known) and all(map(operator.is_, given, known)):
             return None
         known[:] = given
-        places = [number[each.host_numbers] for each in given]
-        found = [each.of(there >= 0, there, self.part.device) for each, there in zip(given, places, strict=True)]
+        found = []
+        for each in given:
+            here = places_of(each.host_numbers, places.whole)
+            found.append(each.of(here >= 0, places.part[here], self.part.device))
         return [each for each in found if each is not None]
 
 
 # --- gathering -------------------------------------------------------------------------------------------------------
 
-_all: weakref.WeakSet[PartSync] = weakref.WeakSet()
-
-
-def register(syncs: Iterable[PartSync]) -> None:
-    """Register bodies and their parts for ``gather``."""
-    for each in syncs:
-        _all.add(each)
-
-
-def forget(syncs: Iterable[PartSync]) -> None:
-    """Forget bodies and their former parts."""
-    for each in syncs:
-        _all.discard(each)
+#: The last ``PartSync`` of each body, by its identity.
+_known: weakref.WeakValueDictionary[int, PartSync] = weakref.WeakValueDictionary()
 
 
 def gather(array: wp.array) -> npt.NDArray[Any] | None:
@@ -369,10 +352,10 @@ def gather(array: wp.array) -> npt.NDArray[Any] | None:
     """
     if not isinstance(array, wp.array):
         raise InputError(f"array is {shown(array)}; it must be a nodal array of a body, such as body.positions")
-    known = [each for each in _all if each.owns(array)]
+    known = [each for each in _known.values() if each.owns(array)]
     if not known:
         # Only the length of a copy, such as body.displacements, tells to which body it belongs.
-        known = [each for each in _all if len(array) == each.whole.node_count]
+        known = [each for each in _known.values() if len(array) == each.whole.node_count]
     if len(known) != 1:
         raise InputError(
             f"the array [{len(array)}] is of {'no body' if not known else 'several bodies'} in a simulation on several "

@@ -7,9 +7,8 @@ import dataclasses
 import functools
 import statistics
 import time
-import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from os import PathLike
 from typing import Any, NamedTuple, NoReturn
 
@@ -24,7 +23,7 @@ from warp_corot.contact.tool import Obstacle, Tool
 from warp_corot.cutting.blade import Blade
 from warp_corot.elasticity import Corotated, ForceField, Linear, Model, NeoHookean, StVenantKirchhoff
 from warp_corot.elasticity.dilatation.options import ELEMENT, SHARED, shares_dilatation
-from warp_corot.errors import InputError, UnstableError
+from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_count
 from warp_corot.inputs.device import checked_device
 from warp_corot.mesh import TetForest
@@ -35,24 +34,19 @@ from warp_corot.simulation import simulation as on_one
 from warp_corot.simulation.energy import WorldEnergies
 from warp_corot.simulation.parts import checked_bodies, checked_integrator, checked_models, chosen_worlds
 from warp_corot.solvers import Integrator, SymplecticEuler
-from warp_corot.solvers.halo import Halo
 from warp_corot.solvers.steps.pace import Pace
 from warp_corot.solvers.steps.safe_step import ANY_STEP
 
 from . import checkpoint, mpi
 from .divided_mesh import DividedForest, DividedMesh
 from .halo import CommHalo, MpiHalo
-from .part import Part, PartSync, forget, register
+from .part import Part, PartSync
 from .partition import Partition
 
 #: Models whose forces need only the elements around a node.
 MODELS = (Corotated, Linear, NeoHookean, StVenantKirchhoff)
 #: The preconditioner of linear solves with meshes that no rank holds whole.
 DIAGONAL = "diagonal"
-#: If parts have at most this many elements, one rank tries its own first; larger ones take longer than compiling on
-#: several ranks.
-FEW_ELEMENTS = 200_000
-TRIED_STEPS = 10
 
 
 class Passes(NamedTuple):
@@ -132,12 +126,8 @@ class Simulation(on_one.Simulation):
         check_supported(wholes, models, integrator, others, cards)
         models = tuple(_model_of_whole(m, body, comm) for m, body in zip(models, wholes, strict=True))
         self._costs, self._here, self.syncs = costs, here, list[PartSync]()
-        #: The options of a trial of this rank's parts; None after it.
-        self._trial: dict[str, Any] | None = {"model": models, "integrator": integrator, "gravity": gravity}
-        self._trial |= {name: value for name, value in others.items() if name != "remesh"}
         options: dict[str, Any] = {"integrator": integrator, "gravity": gravity, "deterministic": deterministic}
         super().__init__(wholes, model=models, **options, **others)
-        register(self.syncs)
 
     # --- parts -----------------------------------------------------------------------------------------------------
 
@@ -164,11 +154,6 @@ class Simulation(on_one.Simulation):
         for part in parts:
             part.discretization.sums_by_subtrees = self.deterministic
         self.syncs = [PartSync(body, part, comm) for body, part in zip(self.bodies, parts, strict=True)]
-        if self._trial is not None:
-            for each in self.syncs:
-                each.take_over()
-            compile_once(comm, parts, **self._trial)
-            self._trial = None
         for each in self.syncs:
             each.take_over()
         self.ranks = MpiHalo(comm, self.bodies, parts, reproducible=self.deterministic)
@@ -176,7 +161,6 @@ class Simulation(on_one.Simulation):
 
     def _divide_anew(self) -> None:
         """Go on with parts of the present meshes; the whole bodies have the state of all nodes."""
-        forget(self.syncs)
         for body in self.bodies:
             if body.state.is_touched:
                 body.state.make_contact_forces()
@@ -198,7 +182,6 @@ class Simulation(on_one.Simulation):
             self.safe_step.find_rest(self.stable_steps)
         self.guard.resume(**guard)
         self.running.begin_again()
-        register(self.syncs)
 
     def follow_motion(self) -> bool:
         """Make the passes that are due over the whole bodies, on all ranks alike, and divide the new meshes."""
@@ -416,32 +399,6 @@ def part_of(body: SoftBody, model: Model, comm: Any, costs: npt.ArrayLike | None
                 "it must be a tolerance or None"
             )
     return part
-
-
-class _Tried(on_one.Simulation):
-    """A simulation of one rank's parts that exchanges nothing."""
-
-    ranks = Halo()
-
-
-def compile_once(comm: Any, parts: Sequence[Part], **options: Any) -> None:
-    """Let one rank of each machine compile the kernels in some steps of its parts; the others wait and then find them
-    in the cache.
-    """
-    if comm.size == 1 or comm.allreduce(max(part.element_count for part in parts), op=max) > FEW_ELEMENTS:
-        return
-    here = comm.Split_type(mpi.library().COMM_TYPE_SHARED)
-    free = all((part.conditions.inverse_mass.numpy() > 0.0).any() for part in parts)
-    if here.rank == 0 and free:
-        with warnings.catch_warnings(), suppress(UnstableError, InputError):
-            warnings.simplefilter("ignore")
-            tried = _Tried(parts, **(options | {"obstacles": of_their_own(options.get("obstacles", ()))}))
-            tried.advance_steps(1 if tried.integrator.is_implicit else TRIED_STEPS)
-            tried.energy()
-        for part in parts:
-            part.state.reactions.zero_()
-    mpi.meet(here)
-    here.Free()
 
 
 def of_their_own(obstacles: Obstacle | Sequence[Obstacle]) -> list[Obstacle]:
