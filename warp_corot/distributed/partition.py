@@ -192,7 +192,7 @@ def _along_curve(mesh: TetMesh, ranks: int, shares: npt.NDArray[np.float64]) -> 
     return rank
 
 
-def places_of(wanted: Longs, keys: Longs) -> Longs:
+def places_of(wanted: npt.NDArray[np.integer], keys: npt.NDArray[np.integer]) -> Longs:
     """The places of numbers in others, all different, int64 [n]; -1 for those that are not there."""
     if not len(keys):
         return np.full(len(wanted), -1, np.int64)
