@@ -19,7 +19,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from functools import partial
-from importlib.util import find_spec
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -41,8 +40,6 @@ Call = Callable[[Share], list[Row]]
 
 #: Number of runs given at a time to a user's engine, whose size is not known.
 HANDED_OVER = 256
-#: Maximum number of columns that are drawn.
-MOST_DRAWN = 6
 
 
 def sweep(
@@ -65,7 +62,7 @@ def sweep(
         function: Called as ``function(young=1e3, poisson=0.45)``; returns a number, or a dictionary of numbers and
             texts. It must be at the top of a module, because other processes must find it.
         parameters: Values of each parameter, for all combinations; or a list with the parameters of each run.
-        folder: The folder for the journal, tables (CSV and, with pyarrow, Parquet) and a picture.
+        folder: The folder for the journal and the table, ``table.csv``.
         workers: Number of processes; None: one for each card, or for each core without cards.
         retries: How often a run is repeated that failed or whose process died.
         together: How many runs one call makes at most, such as the worlds of one simulation: the function is called
@@ -102,7 +99,7 @@ def sweep(
             show(1)
     rows = [journal.row(run) for run in runs]
     if folder is not None:
-        write_tables(rows, list(runs[0]), Path(folder))
+        _write_table(rows, list(runs[0]), Path(folder) / "table.csv")
     return rows
 
 
@@ -341,63 +338,11 @@ class Journal:
                 os.fsync(file.fileno())
 
 
-def write_tables(rows: Sequence[Row], parameters: Sequence[str], folder: Path) -> list[Path]:
-    """Write ``table.csv``; with pyarrow ``table.parquet``; with matplotlib ``results.png``. Each is written whole.
-
-    Args:
-        rows: The rows of all runs.
-        parameters: Names of the parameters, which come first.
-        folder: The folder.
-
-    Returns:
-        The files.
-    """
+def _write_table(rows: Sequence[Row], parameters: Sequence[str], path: Path) -> None:
+    """Write the rows of all runs to a CSV file, whole; the parameters come first."""
     names = list(dict.fromkeys([*parameters, *(name for row in rows for name in row)]))
     names = [name for name in names if name not in ("seconds", "error")] + ["seconds", "error"]
-    written = [folder / "table.csv"]
-    with written_whole(written[0]) as part, part.open("w", newline="", encoding="utf-8") as file:
+    with written_whole(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         table = csv.DictWriter(file, names, restval="")
         table.writeheader()
         table.writerows(rows)
-    if find_spec("pyarrow") is not None:
-        import pyarrow
-        import pyarrow.parquet
-
-        columns = {name: [row.get(name) for row in rows] for name in names}
-        written.append(folder / "table.parquet")
-        with written_whole(written[-1]) as part:
-            pyarrow.parquet.write_table(pyarrow.table(columns), part)
-    results = [name for name in names if name not in (*parameters, "seconds", "error")]
-    drawn = [name for name in results if all(_is_number(row.get(name)) for row in rows)][:MOST_DRAWN]
-    if drawn and find_spec("matplotlib") is not None:
-        written.append(folder / "results.png")
-        _draw(rows, parameters, drawn, written[-1])
-    return written
-
-
-def _draw(rows: Sequence[Row], parameters: Sequence[str], drawn: Sequence[str], path: Path) -> None:
-    """Draw each result over the first parameter, with a line for each combination of the others."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    first, others = parameters[0], parameters[1:]
-    figure = Figure(figsize=(6.4, 2.6 * len(drawn)), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(len(drawn), squeeze=False)[:, 0]
-    lines = list(dict.fromkeys(tuple(row[name] for name in others) for row in rows))
-    for axis, name in zip(axes, drawn, strict=True):
-        for line in lines:
-            of_line = [row for row in rows if tuple(row[other] for other in others) == line]
-            said = ", ".join(f"{other} {value}" for other, value in zip(others, line, strict=True))
-            values = np.array([row[name] for row in of_line], float)
-            axis.plot([row[first] for row in of_line], values, marker=".", label=said or None)
-        axis.set_ylabel(name)
-    axes[-1].set_xlabel(first)
-    if others and len(lines) <= 12:
-        axes[0].legend(fontsize="small")
-    with written_whole(path) as part:
-        figure.savefig(part, format="png", dpi=120)
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
