@@ -29,8 +29,8 @@ def counts_of(name):
     return [len(each.GetTetVertexIndicesAttr().Get()) for each in tets], stage.GetEndTimeCode()
 
 
-def assert_as_alone(words, said="", **tolerances):
-    """Two ranks have the summary, the table and the stage of one process."""
+def assert_as_alone(words, said="", columns=None, **tolerances):
+    """Two ranks have the summary, the table, whose first columns are compared, and the stage of one process."""
     on_two = on_ranks(2, "-m", "warp_corot", "simulate", *words, "--csv", "two.csv", "-o", "two.usda")
     assert on_two.returncode == 0, on_two.stderr
     assert "2 ranks" in on_two.stdout
@@ -39,7 +39,7 @@ def assert_as_alone(words, said="", **tolerances):
     with open("one.csv", newline="") as a, open("two.csv", newline="") as b:
         assert next(csv.reader(a)) == next(csv.reader(b))
     assert counts_of("two.usda") == counts_of("one.usda")
-    np.testing.assert_allclose(last_row("two.csv"), last_row("one.csv"), **tolerances)
+    np.testing.assert_allclose(last_row("two.csv")[:columns], last_row("one.csv")[:columns], **tolerances)
 
 
 @pytest.mark.slow
@@ -71,9 +71,9 @@ def test_two_ranks_mesh_a_scan_of_several_materials(folder):
 def test_two_ranks_press_a_body_that_begins_at_rest(folder):
     """The pressure changes with time, and every rank finds the state of rest."""
     bear = ("warp:bear", "--press", "top", "300", "--ramp", "0.05", "--probe", "top", "--device", "cpu")
-    # The bear's top sinks by 3 cm.
-    assert_as_alone((*bear, "--duration", "0.1"), rtol=1e-3, atol=1e-4)
-    assert_as_alone((*bear, "--static", "--duration", "0.05"), "at rest after", rtol=1e-3, atol=1e-4)
+    # The bear's top sinks by 3 cm. Both runs choose their own steps.
+    assert_as_alone((*bear, "--duration", "0.1"), columns=4, rtol=1e-3, atol=1e-5)
+    assert_as_alone((*bear, "--static", "--duration", "0.05"), "at rest after", columns=4, rtol=1e-3, atol=1e-5)
     wrong = on_ranks(2, "-m", "warp_corot", "simulate", *bear, "--fix", "nonsense", "-o", "out.usda", timeout=120.0)
     assert wrong.returncode != 0
     assert sum(line.startswith("warp-corot: error:") for line in wrong.stderr.splitlines()) == 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import gc
 import operator
 import weakref
 from collections.abc import Callable, Sequence
@@ -354,7 +355,8 @@ def gather(array: wp.array) -> npt.NDArray[Any] | None:
         raise InputError(f"array is {shown(array)}; it must be a nodal array of a body, such as body.positions")
     known = [each for each in _known.values() if each.owns(array)]
     if not known:
-        # Only the length of a copy, such as body.displacements, tells to which body it belongs.
+        # Only the length of a copy, such as body.displacements, tells to which body it belongs. Former ones must be gone.
+        gc.collect()
         known = [each for each in _known.values() if len(array) == each.whole.node_count]
     if len(known) != 1:
         raise InputError(
