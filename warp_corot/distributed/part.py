@@ -355,7 +355,7 @@ def gather(array: wp.array) -> npt.NDArray[Any] | None:
         raise InputError(f"array is {shown(array)}; it must be a nodal array of a body, such as body.positions")
     known = [each for each in _known.values() if each.owns(array)]
     if not known:
-        # Only the length of a copy, such as body.displacements, tells to which body it belongs. Former ones must be gone.
+        # Only the length of a copy, such as body.displacements, tells to which body it belongs. Former ones must go.
         gc.collect()
         known = [each for each in _known.values() if len(array) == each.whole.node_count]
     if len(known) != 1:
