@@ -32,6 +32,7 @@ from warp_corot.remesh.online import OnlineRemesh
 from warp_corot.remesh.remeshing import Remeshing
 from warp_corot.simulation import simulation as on_one
 from warp_corot.simulation.energy import WorldEnergies
+from warp_corot.simulation.hooks import Hooks
 from warp_corot.simulation.parts import checked_bodies, checked_integrator, checked_models, chosen_worlds
 from warp_corot.solvers import Integrator, SymplecticEuler
 from warp_corot.solvers.steps.pace import Pace
@@ -68,6 +69,14 @@ def _refused(name: str) -> Callable[..., NoReturn]:
         raise InputError(f"{name} does not work on several ranks yet, only on one process")
 
     return refused
+
+
+class _Hooks(Hooks):
+    """Functions that every rank calls with the whole bodies, which they may change."""
+
+    def _call(self, callback: Callable[[Any], None], sim: Simulation) -> None:
+        with sim.shown():
+            super()._call(callback, sim)
 
 
 class Simulation(on_one.Simulation):
@@ -128,6 +137,7 @@ class Simulation(on_one.Simulation):
         self._costs, self._here, self.syncs = costs, here, list[PartSync]()
         options: dict[str, Any] = {"integrator": integrator, "gravity": gravity, "deterministic": deterministic}
         super().__init__(wholes, model=models, **options, **others)
+        self.hooks = _Hooks()
 
     # --- parts -----------------------------------------------------------------------------------------------------
 
@@ -213,6 +223,13 @@ class Simulation(on_one.Simulation):
         yield
         self._publish()
 
+    @contextmanager
+    def shown(self) -> Iterator[None]:
+        """Let the block see the bodies after the last step, and take its changes of them to the parts."""
+        self._publish()
+        yield
+        self._take_over()
+
     def step(self) -> None:
         """Advance by one time step, like ``warp_corot.Simulation.step``. All ranks must call this."""
         with self._led():
@@ -227,22 +244,6 @@ class Simulation(on_one.Simulation):
         """Advance by ``count`` time steps, like ``advance``."""
         with self._led():
             super().advance_steps(count)
-
-    def on_step(self, callback: Callable[[Simulation], None], every: int = 1) -> None:
-        """Call ``callback(sim)`` on every rank after every ``every``-th step, counted from the beginning.
-
-        Raises:
-            InputError: ``every`` is not a positive whole number, or the callback cannot be called.
-        """
-        if not callable(callback):
-            raise InputError(f"callback is {callback!r}; it must be a function of the simulation")
-
-        def called(_: object) -> None:
-            self._publish()
-            callback(self)
-            self._take_over()
-
-        super().on_step(called, every)
 
     def reset(self, worlds: npt.ArrayLike | wp.array | None = None) -> None:
         """Reset worlds to their initial state, like ``warp_corot.Simulation.reset``.
