@@ -20,7 +20,9 @@ from warp_corot.distributed.exchange import Places, reproducible_sums
 from warp_corot.distributed.meshes import dealt
 from warp_corot.distributed.part import Part
 from warp_corot.distributed.partition import Partition
+from warp_corot.distributed.recording import skin_of
 from warp_corot.distributed.simulation import check_supported
+from warp_corot.io.write.usd.writer import UsdWriter
 from warp_corot.mesh.scattered import normal_numbers
 
 
@@ -181,6 +183,21 @@ def test_a_divided_forest_is_made_whole_again():
     with pytest.raises(wc.InputError, match="no rank has the surface"):
         check_supported([body], [], wc.SymplecticEuler(), touching)
     check_supported([body], [], wc.SymplecticEuler(), touching | {"contact": wc.Contact(on="tetrahedra")})
+
+
+def test_a_piece_within_the_body_has_no_surface(tmp_path):
+    from pxr import Usd, UsdGeom
+
+    mesh = wc.TetForest.box(level=3)
+    skin = skin_of(mesh.points, np.zeros((0, 3), np.int32))
+    with UsdWriter(tmp_path / "piece.usda", mesh, fps=10.0, skins=[skin], tets=True) as writer:
+        writer.write(mesh.points.astype(np.float32), von_mises=np.zeros(len(mesh.tets), np.float32))
+    stage = Usd.Stage.Open(str(tmp_path / "piece.usda"))
+    prims = list(stage.Traverse())
+    (surface,) = (UsdGeom.Mesh(prim) for prim in prims if prim.GetTypeName() == "Mesh")
+    assert len(surface.GetPointsAttr().Get(0.0)) == 0
+    (solid,) = (UsdGeom.TetMesh(prim) for prim in prims if prim.GetTypeName() == "TetMesh")
+    assert len(solid.GetTetVertexIndicesAttr().Get()) == len(mesh.tets)
 
 
 def test_groups_that_wait_for_nodes_are_separate():

@@ -226,7 +226,7 @@ class Piece:
         self.points = np.concatenate([e.part.mesh.points[n] for e, n in zip(syncs, self._nodes, strict=True)])
         self.tets = np.concatenate(tets).astype(np.int32)
         self.fixed = self._nodal("held") > 0
-        self.skin = _skin(self.points, np.concatenate(faces))
+        self.skin = skin_of(self.points, np.concatenate(faces))
         for name in ("young", "poisson", "density"):
             setattr(self, name, self._property(name))
 
@@ -273,7 +273,8 @@ class Piece:
         return float(joined[0]) if (joined == joined[0]).all() and not varies else joined
 
 
-def _skin(points: npt.NDArray[np.float64], faces: Ints) -> Skin:
+def skin_of(points: npt.NDArray[np.float64], faces: Ints) -> Skin:
+    """Triangles of a mesh's points [F, 3], drawn as its boundary."""
     used, triangles = np.unique(faces, return_inverse=True)
     weights = np.tile([1.0, 0.0, 0.0, 0.0], (len(used), 1))
     nodes = np.repeat(used[:, None], 4, axis=1).astype(np.int32)
