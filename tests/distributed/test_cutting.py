@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 import warp_corot as wc
-from warp_corot.distributed import boxes
-from warp_corot.distributed.cutting import cut_box
-from warp_corot.distributed.partition import Partition
-from warp_corot.distributed.parts import numbered_part
-from warp_corot.distributed.root_cube_partition import numbered_points
+from warp_corot.distributed import meshes
+from warp_corot.distributed.divided_mesh import divide
+from warp_corot.distributed.meshes import cut_box
+from warp_corot.distributed.partition import Partition, numbered_points
 from warp_corot.mesh.lattice import LATTICE_BITS
 from warp_corot.mesh.tree import Tree
 from warp_corot.mesh.uniform import halvings
@@ -33,8 +32,8 @@ def test_parts_are_those_of_the_whole(cells, level, ranks, costs):
     dealt, first = Partition.of(mesh, ranks, costs), 0
     for rank in range(ranks):
         kept = dealt.needed(mesh, rank)
-        part, there = numbered_part(mesh, dealt, rank)
-        nodes = there.nodes
+        part = divide(mesh, dealt, rank)
+        nodes = part.numbers.nodes
         cut = cut_box(cells, level, ranks, rank, costs)
         np.testing.assert_array_equal(cut.elements, np.flatnonzero(kept))
         np.testing.assert_array_equal(cut.counted, dealt.rank_of_element[kept] == rank)
@@ -105,7 +104,7 @@ def test_copies_get_their_numbers_from_the_ranks_that_move_them():
 
         comm = SimpleNamespace(rank=rank, size=3, allgather=lambda _: counts, alltoall=alltoall)
         numbers, count = numbered_points(cut.owner, cut.keys, comm)
-        nodes = numbered_part(mesh, dealt, rank)[1].nodes
+        nodes = divide(mesh, dealt, rank).numbers.nodes
         np.testing.assert_array_equal(numbers, nodes)
         assert count == len(mesh.points)
 
@@ -118,8 +117,8 @@ def test_a_part_is_refused_as_a_whole_body(monkeypatch):
         return [np.zeros(0, np.int64)] * 2 if len(asked) == 1 else [np.arange(len(keys)) for keys in asked[0]]
 
     comm = SimpleNamespace(rank=1, size=2, allgather=lambda value: [value, value], alltoall=alltoall)
-    monkeypatch.setattr(boxes.mpi, "world", lambda: comm)
-    body = wc.SoftBody(boxes.box((1, 1, 2), 0.1, 3), wc.Isotropic(1e3, 0.3, 1000.0), device="cpu")
+    monkeypatch.setattr(meshes.mpi, "world", lambda: comm)
+    body = wc.SoftBody(meshes.box((1, 1, 2), 0.1, 3), wc.Isotropic(1e3, 0.3, 1000.0), device="cpu")
     np.testing.assert_allclose(body.mesh.bounds, [[0, 0, 0], [0.1, 0.1, 0.2]])
     # Bounds are those of the whole box, of which this part has one half.
     assert len(body.node_indices("z <= zmin")) == 0
@@ -138,6 +137,6 @@ def test_a_part_is_refused_as_a_whole_body(monkeypatch):
     [({"level": 2}, "at least 3"), ({"level": 48, "cells": (9, 9, 9)}, "at most"), ({"level": 3.5}, "whole number")],
 )
 def test_bad_boxes_are_refused(given, said, monkeypatch):
-    monkeypatch.setattr(boxes.mpi, "world", lambda: SimpleNamespace(rank=0, size=1))
+    monkeypatch.setattr(meshes.mpi, "world", lambda: SimpleNamespace(rank=0, size=1))
     with pytest.raises(wc.InputError, match=said):
-        boxes.box(**given)
+        meshes.box(**given)

@@ -1,6 +1,7 @@
 """The division of work among ranks: elements, sums in any order, numbers of nodes. One process is enough."""
 
 import math
+import pickle
 from contextlib import nullcontext
 from itertools import pairwise
 from types import SimpleNamespace
@@ -14,13 +15,14 @@ import warp_corot as wc
 from warp_corot.discretization.awaited import Awaited
 from warp_corot.discretization.groups import group_numbers
 from warp_corot.discretization.planning.fixed import ForcePlan
+from warp_corot.distributed.divided_mesh import divide, pack_part, rejoined, whole_of
+from warp_corot.distributed.exchange import Places, reproducible_sums
+from warp_corot.distributed.meshes import dealt
+from warp_corot.distributed.part import Part
 from warp_corot.distributed.partition import Partition
-from warp_corot.distributed.parts import Part, numbered_part
-from warp_corot.distributed.places import Places
-from warp_corot.distributed.rejoining import pack_part, rejoined
-from warp_corot.distributed.reproducible_sums import reproducible_sums
-from warp_corot.distributed.scatter_mesh import dealt, pieces_of
-from warp_corot.distributed.unsupported import check_supported
+from warp_corot.distributed.recording import skin_of
+from warp_corot.distributed.simulation import check_supported
+from warp_corot.io.write.usd.writer import UsdWriter
 from warp_corot.mesh.scattered import normal_numbers
 
 
@@ -73,7 +75,7 @@ def test_rotations_are_shared_within_ranks(level):
         needed = dealt.needed(mesh, rank)
         assert not np.isin(above[needed], above[~needed]).any()
         assert not np.isin(dealt.sharing[needed], dealt.sharing[~needed]).any()
-        part, _ = numbered_part(mesh, dealt, rank)
+        part = divide(mesh, dealt, rank)
         np.testing.assert_array_equal(part.ancestors(level), above[needed])
 
 
@@ -124,7 +126,8 @@ def test_nodes_of_parts_sum_what_they_sum_in_the_whole(make):
     def differ(grouped):
         whole, count = terms_of(mesh, grouped, np.arange(len(mesh.tets))), 0
         for rank in range(3):
-            part, numbers = numbered_part(mesh, division, rank)
+            part = divide(mesh, division, rank)
+            numbers = part.numbers
             here = terms_of(part, grouped, numbers.elements)
             count += sum(here[k] != whole[numbers.nodes[k]] for k in np.flatnonzero(numbers.owner == rank))
         return count
@@ -162,9 +165,10 @@ def test_a_part_without_subtrees_has_the_forces_of_the_whole():
 def test_a_divided_forest_is_made_whole_again():
     mesh = wc.TetForest.from_domain(wc.Domain.sphere(0.05), target_elements=1000)
     parts, fewest = [], len(mesh.tree.level)
-    for (kind, place, options), _ in pieces_of(mesh, dealt(mesh, 3)):
+    division, known = dealt(mesh, 3), whole_of(mesh)
+    for rank in range(3):
         parts.append({})
-        part = kind(*place, **options)
+        part = pickle.loads(pickle.dumps(divide(mesh, division, rank, known)))
         told = pack_part(part, parts[-1])
         fewest = min(fewest, len(part.tree.level))
     whole = rejoined(told, parts)
@@ -179,6 +183,21 @@ def test_a_divided_forest_is_made_whole_again():
     with pytest.raises(wc.InputError, match="no rank has the surface"):
         check_supported([body], [], wc.SymplecticEuler(), touching)
     check_supported([body], [], wc.SymplecticEuler(), touching | {"contact": wc.Contact(on="tetrahedra")})
+
+
+def test_a_piece_within_the_body_has_no_surface(tmp_path):
+    from pxr import Usd, UsdGeom
+
+    mesh = wc.TetForest.box(level=3)
+    skin = skin_of(mesh.points, np.zeros((0, 3), np.int32))
+    with UsdWriter(tmp_path / "piece.usda", mesh, fps=10.0, skins=[skin], tets=True) as writer:
+        writer.write(mesh.points.astype(np.float32), von_mises=np.zeros(len(mesh.tets), np.float32))
+    stage = Usd.Stage.Open(str(tmp_path / "piece.usda"))
+    prims = list(stage.Traverse())
+    (surface,) = (UsdGeom.Mesh(prim) for prim in prims if prim.GetTypeName() == "Mesh")
+    assert len(surface.GetPointsAttr().Get(0.0)) == 0
+    (solid,) = (UsdGeom.TetMesh(prim) for prim in prims if prim.GetTypeName() == "TetMesh")
+    assert len(solid.GetTetVertexIndicesAttr().Get()) == len(mesh.tets)
 
 
 def test_groups_that_wait_for_nodes_are_separate():

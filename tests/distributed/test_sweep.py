@@ -2,7 +2,6 @@
 
 import csv
 from concurrent.futures import ThreadPoolExecutor
-from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -28,12 +27,6 @@ def test_every_combination_is_made_once_and_has_a_row(folder):
         table = list(csv.DictReader(file))
     assert [float(row["sum"]) for row in table] == [row["sum"] for row in rows]
     assert list(table[0]) == ["a", "b", "folder", "product", "sum", "seconds", "error"]
-    if find_spec("pyarrow") is not None:
-        import pyarrow.parquet
-
-        assert pyarrow.parquet.read_table("results/table.parquet").column("product").to_pylist() == [
-            row["product"] for row in rows
-        ]
     # More of the same: what is done is not done again.
     with ThreadPoolExecutor(2) as engine:
         wd.sweep(swept.product, grid | {"a": [1, 2, 3, 4]}, folder="results", executor=engine)

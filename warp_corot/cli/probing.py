@@ -17,7 +17,6 @@ from warp_corot.io.files.whole import writing
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
-    from warp_corot.distributed import Simulation as OnRanks
     from warp_corot.simulation.simulation import Simulation
 
     from .patches import BodyPatches
@@ -101,7 +100,7 @@ def probes_body(text: str, patches: BodyPatches) -> bool:
 
 
 class Table:
-    """A CSV file with one row for each frame; each row is written at once.
+    """A CSV file with one row for each frame; each row is written at once, by the first of several ranks.
 
     Args:
         path: The file; a former one stays until the first row.
@@ -116,7 +115,7 @@ class Table:
     def __init__(
         self,
         path: Path,
-        sim: Simulation | OnRanks,
+        sim: Simulation,
         probes: Sequence[Probe],
         obstacles: Mapping[str, Obstacle] | None = None,
     ):
@@ -134,6 +133,8 @@ class Table:
         values = [value for probe in self._probes for value in probe.values()]
         values += [value for each in self._obstacles.values() for value in _felt(each)]
         row = [self._sim.time, *values, energy.kinetic, energy.elastic, energy.gravitational, self._sim.dt]
+        if not self._sim.is_root:
+            return
         with writing(self.path):
             if self._file is None:
                 self._file = self.path.open("w", newline="")

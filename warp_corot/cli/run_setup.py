@@ -34,7 +34,6 @@ from .implicit import integrator_name, is_static
 from .loading import ramp_of
 from .pressing import press_patches
 from .probing import Probe
-from .ranks import WaitingRanks
 from .static import moves
 from .stepping import make_simulation
 from .touching import RunContact, place_ground, say_overlaps, say_reach, touched_by
@@ -67,7 +66,6 @@ class RunSetup:
 
 def set_up(
     options: Sequence[argparse.Namespace],
-    others: WaitingRanks | None = None,
     *,
     touches: bool = False,
     chooses: bool = True,
@@ -76,12 +74,11 @@ def set_up(
 
     Args:
         options: Options of each input.
-        others: The ranks that get parts of the bodies, if there are any.
         touches: Whether something may come that the bodies touch.
         chooses: Whether steps may be implicit if the user does not say; otherwise all runs of a kind are explicit.
     """
     with warnings.catch_warnings(record=True) as heard:
-        ready = _made_ready(options, others, touches, chooses)
+        ready = _made_ready(options, touches, chooses)
     for body in ready.bodies:
         name = f"{body.subject.name}: " if len(ready.bodies) > 1 else ""
         for note in body.subject.notes:
@@ -91,9 +88,7 @@ def set_up(
     return ready
 
 
-def _made_ready(
-    options: Sequence[argparse.Namespace], others: WaitingRanks | None, touches: bool, chooses: bool
-) -> RunSetup:
+def _made_ready(options: Sequence[argparse.Namespace], touches: bool, chooses: bool) -> RunSetup:
     shared = options[0]
     device = checked_device(shared.device)
     touched = touched_by(options)
@@ -117,7 +112,7 @@ def _made_ready(
     if chooses:
         choose_steps(shared, bodies, touched, device)
     with waiting("preparing the simulation"):
-        sim = make_simulation(shared, bodies, touched, others)
+        sim = make_simulation(shared, bodies, touched)
         say_overlaps(touched, bodies, sim)
         say_reach(bodies, sim)
     for body in bodies:

@@ -14,10 +14,8 @@ from warp_corot.simulation.simulation import Simulation
 from .about import about
 from .bodies import RunBody
 from .exit_status import early_end
-from .in_parts import is_in_parts, run_in_parts
 from .previews import Previews, check_preview
 from .probing import Table
-from .ranks import WaitingRanks, hands_out, leads, serve
 from .run_file import bodies_of, check_run_path, write_run
 from .run_setup import RunSetup, set_up
 from .static import rest
@@ -37,20 +35,15 @@ def run(args: argparse.Namespace) -> int:
     """
     from warp_corot.io.write.animate import Recording
 
-    leading, options = leads(), bodies_of(args)
-    if is_in_parts(options):
-        _check_output(args, options[0])
-        return run_in_parts(options[0])
-    if not leading:
-        return _serve(args, options)
+    options = bodies_of(args)
     shared = options[0]
-    ready = _prepared(args, options)
+    _check_output(args, shared)
+    ready = set_up(options)
     done = Recording(shared.output)
-    end = getattr(ready.sim, "end", lambda: None)
     table = Table(shared.csv, ready.sim, ready.probes, ready.touched.obstacles) if shared.csv else None
-    previews = Previews(shared, ready.count) if shared.preview else None
+    previews = Previews(shared, ready.count) if shared.preview and ready.sim.is_root else None
     try:
-        if args.write_run is not None:
+        if args.write_run is not None and ready.sim.is_root:
             write_run(args.write_run, options)
         with WATCH.part("solving"):
             rested = rest(shared, ready.sim)
@@ -60,22 +53,8 @@ def run(args: argparse.Namespace) -> int:
                 previews.draw(ready.bodies, title_of(ready.bodies, ready.sim.gravity))
     except (KeyboardInterrupt, UnstableError, OSError) as error:
         return early_end(error, done)
-    finally:
-        end()
     print(summary(ready.bodies, ready.sim, done, ready.touched.rows, rested))
     return 0
-
-
-def _prepared(args: argparse.Namespace, options: list[argparse.Namespace]) -> RunSetup:
-    """The run of the only rank, or of rank 0, which ends the others if the run cannot be made."""
-    others = WaitingRanks() if hands_out(options) else None
-    try:
-        _check_output(args, options[0])
-        return set_up(options, others)
-    except InputError as error:
-        if others is not None:
-            others.dismiss(error)
-        raise
 
 
 def simulated(args: argparse.Namespace) -> Recording:
@@ -96,19 +75,6 @@ def simulated(args: argparse.Namespace) -> Recording:
     rest(shared, ready.sim)
     _record(args, shared, ready, done, table, None)
     return done
-
-
-def _serve(args: argparse.Namespace, options: list[argparse.Namespace]) -> int:
-    """``run`` on a rank that computes its part of the steps, and neither prints nor writes; returns the exit status."""
-    try:
-        if hands_out(options):
-            serve(options[0].device)
-        else:
-            _check_output(args, options[0])
-            set_up(options).sim.serve()  # type: ignore[attr-defined]
-    except UnstableError:
-        return 3
-    return 0
 
 
 def _check_output(args: argparse.Namespace, shared: argparse.Namespace) -> None:

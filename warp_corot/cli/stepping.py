@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from .bodies import RunBody, gravity_of
 from .exit_status import as_options
 from .implicit import integrator_name, is_static
 from .options.defaults import IMPLICIT_DT
-from .ranks import WaitingRanks, are_several, led_simulation, one_first
+from .ranks import are_several
 from .remesh import ARGUMENTS
 from .static import check_static, static_integrator
 from .tool_paths import make_blade
@@ -29,13 +28,8 @@ from .touching import RunContact
 LONG = 3.0
 
 
-def make_simulation(
-    args: argparse.Namespace, bodies: Sequence[RunBody], touched: RunContact, others: WaitingRanks | None = None
-) -> Simulation:
-    """The simulation, its kernels compiled; a given step is shortened until a whole number of them makes a frame.
-
-    ``others`` are the ranks that get parts of the bodies, if there are any.
-    """
+def make_simulation(args: argparse.Namespace, bodies: Sequence[RunBody], touched: RunContact) -> Simulation:
+    """The simulation, its kernels compiled; a given step is shortened until a whole number of them makes a frame."""
     from warp_corot.io.write.animate import shortening, steps_per_frame
 
     check_static(args, touches=touched.contact is not None, remeshes=any(body.remesh for body in bodies))
@@ -52,14 +46,12 @@ def make_simulation(
         steps = steps_per_frame(args.fps, args.dt or IMPLICIT_DT)
         integrator = INTEGRATORS[integrator_name(args)](1.0 / (args.fps * steps), damping, viscosity)  # type: ignore[call-arg]
     else:
-        with one_first(others):
-            tried = min(_tried_step(body, damping, viscosity) for body in bodies)
+        tried = min(_tried_step(body, damping, viscosity) for body in bodies)
         steps = steps_per_frame(args.fps, args.dt or tried)  # refuses an excessive number
         integrator = SymplecticEuler(None if args.dt is None else 1.0 / (args.fps * steps), damping, viscosity)
     cuts = blades_of(args, bodies)
     with as_options(ARGUMENTS):
-        make: Any = led_simulation if are_several() else Simulation
-        made: Simulation = (make if others is None else others.simulation)(
+        made: Simulation = (_on_ranks() if are_several() else Simulation)(
             bodies=[body.soft for body in bodies],
             model=[body.model for body in bodies],
             integrator=integrator,
@@ -67,9 +59,16 @@ def make_simulation(
             remesh=[body.remesh for body in bodies] if any(body.remesh for body in bodies) else None,
             obstacles=list(touched.obstacles.values()),
             contact=touched.contact,
-            **({"cuts": cuts} if cuts else {}),
+            cuts=cuts or None,
         )
         return made
+
+
+def _on_ranks() -> type[Simulation]:
+    """The simulation that all ranks step."""
+    from warp_corot.distributed import Simulation as OnRanks
+
+    return OnRanks
 
 
 def blades_of(args: argparse.Namespace, bodies: Sequence[RunBody]) -> list[Blade]:

@@ -18,7 +18,7 @@ from warp_corot.io.files.whole import written_whole
 from .exit_status import complain, interrupt_status
 
 if TYPE_CHECKING:
-    from warp_corot.distributed.journal import Row
+    from warp_corot.distributed.sweeps import Row
 
 #: Options that a sweep sets itself.
 OWN = ("input", "output", "csv", "preview", "also", "write_run")
@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: Bad options; nothing was simulated.
     """
-    from warp_corot.distributed.sweeping import combinations, sweep
+    from warp_corot.distributed.sweeps import combinations, sweep
 
     from .input_file import open_input
     from .run_file import bodies_of

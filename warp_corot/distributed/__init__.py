@@ -5,13 +5,12 @@
 """
 
 from . import mpi
-from .boxes import box
-from .parallel_growth import from_domain
-from .part_sync import gather
+from .growth import from_domain
+from .meshes import box, divided, load
+from .part import gather
 from .recording import record
-from .scatter_mesh import divided, load
 from .simulation import Simulation
-from .sweeping import sweep
+from .sweeps import sweep
 
 __all__ = ["Simulation", "box", "divided", "from_domain", "gather", "load", "record", "sweep"]
 

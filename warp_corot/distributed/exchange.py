@@ -1,7 +1,14 @@
-"""Lists of the nodes whose values are sent to each neighbour, and the exchange through the host's memory."""
+"""Exchanges of arrays' entries between ranks, through the host's memory or NCCL, and between a body and its part; and
+sums over ranks that are the same bit for bit for any number of ranks.
+
+NCCL is imported here only.
+"""
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,9 +16,19 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_corot.errors import InputError
+from warp_corot.kernels.distributed import exchange as kernels
+
+from . import mpi
+
 Ints = npt.NDArray[np.int32]
+Floats = npt.NDArray[np.float64]
 #: A buffer for each neighbour.
 Room = dict[int, npt.NDArray[Any]]
+
+#: Bits of the whole numbers into which addends are split, so that sums of 2**32 of them fit into int64; and the number
+#: of splits.
+BITS, ROUNDS = 30, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,3 +134,168 @@ class HostExchange:
 def in_worlds(places: Ints, worlds: int, count: int) -> Ints:
     """Places of one world, of ``count``, in all worlds, int32 [worlds * n]."""
     return (places + count * np.arange(worlds, dtype=np.int32)[:, None]).ravel()
+
+
+@functools.cache
+def nccl_of(alias: str) -> Any:
+    """NCCL's communicator of all ranks; this rank has the card of this name.
+
+    Raises:
+        InputError: ``nccl4py`` is not installed.
+    """
+    try:
+        import nccl.core as nccl
+    except ImportError as error:
+        raise InputError(f'runs on several cards need nccl4py ({error}); pip install "warp-corot[cards]"') from None
+    comm = mpi.world()
+    with wp.ScopedDevice(alias):
+        name = comm.bcast(nccl.get_unique_id() if comm.rank == 0 else None, root=0)
+        comm.Barrier()
+        return nccl.Communicator.init(nranks=comm.size, rank=comm.rank, unique_id=name)
+
+
+class CardExchange:
+    """The exchange of a part's nodal values between cards.
+
+    Args:
+        halo: The lists of nodes to send and to receive.
+        device: The card.
+        kinds: The types of values that it exchanges.
+    """
+
+    def __init__(self, halo: ExchangeLists, device: wp.Device, kinds: Sequence[Any] = kernels.EXCHANGED):
+        self._nccl, self._device = nccl_of(device.alias), device
+        self._sent, self._received = (_joined(lists, device) for lists in (halo.sent, halo.received))
+        #: The stream on which it runs beside other launches, with a higher priority.
+        self.aside = wp.Stream(device, priority=-1)
+        self.is_under_way = False
+        self._rooms = {kind: self._room_for(kind) for kind in kinds}
+
+    def launch(self, nodal: wp.array) -> None:
+        """Launch the exchange that gives ghosts their values, in a nodal array of one of the kinds; may be
+        recorded."""
+        import nccl.core as nccl
+
+        stream, (received, by), (nodes, to) = wp.get_stream(self._device), self._received, self._sent
+        out, given = self._rooms[nodal.dtype]
+        wp.launch(kernels.GATHER[nodal.dtype], len(nodes), [nodes, nodal], [out], device=self._device)
+        with nccl.group():
+            for rank, start, end in to:
+                self._nccl.send(_floats(out, start, end), rank, stream=stream)
+            for rank, start, end in by:
+                self._nccl.recv(_floats(given, start, end), rank, stream=stream)
+        wp.launch(kernels.SCATTER[nodal.dtype], len(received), [received, given], [nodal], device=self._device)
+
+    def begin(self, nodal: wp.array) -> None:
+        """Launch the exchange so that it runs beside the following launches."""
+        with wp.ScopedStream(self.aside):
+            self.launch(nodal)
+        self.is_under_way = True
+
+    def end(self) -> None:
+        """Let the following launches wait for the exchange that was begun."""
+        if self.is_under_way:
+            wp.get_stream(self._device).wait_stream(self.aside)
+            self.is_under_way = False
+
+    @contextmanager
+    def later(self) -> Iterator[None]:
+        """Launches in the block run after the exchange that was begun, and before the launches after the block."""
+        with wp.ScopedStream(self.aside, sync_enter=not self.is_under_way, sync_exit=True):
+            yield
+        self.is_under_way = False
+
+    def _room_for(self, kind: Any) -> tuple[wp.array, wp.array]:
+        """The buffers for sent and received values."""
+        out, given = (
+            wp.zeros(len(nodes), dtype=kind, device=self._device) for nodes in (self._sent[0], self._received[0])
+        )
+        return out, given
+
+
+def reduce_on_cards(values: wp.array, operation: str) -> None:
+    """Replace the values of an array on a card by their ``SUM`` or ``MAX`` over all ranks; may be recorded."""
+    import nccl.core as nccl
+
+    own, stream = nccl_of(values.device.alias), wp.get_stream(values.device)
+    own.allreduce(values, values, getattr(nccl, operation), stream=stream)
+
+
+def _joined(lists: dict[int, Any], device: wp.Device) -> tuple[wp.array, list[tuple[int, int, int]]]:
+    """All lists in one array, and the begin and the end of each rank's list."""
+    ends = np.cumsum([len(nodes) for nodes in lists.values()])
+    nodes = np.concatenate([*lists.values(), np.zeros(0, np.int32)]).astype(np.int32)
+    places = [(rank, int(end) - len(lists[rank]), int(end)) for rank, end in zip(lists, ends, strict=True)]
+    return wp.array(nodes, dtype=wp.int32, device=device), places
+
+
+def _floats(vectors: wp.array, start: int, end: int) -> wp.array:
+    part = vectors[start:end]
+    words = part.size * wp.types.type_size_in_bytes(part.dtype) // 4
+    return wp.array(ptr=part.ptr, dtype=wp.float32, shape=(words,), device=part.device)
+
+
+class Places:
+    """The places of some values in arrays of the whole body, and in those of its part.
+
+    Args:
+        whole, part: The places, int32 [n] both.
+        whole_device, part_device: The devices of the arrays.
+        direct: Whether values go from one array to the other in one launch; None: if both are on one device.
+    """
+
+    def __init__(
+        self, whole: Ints, part: Ints, whole_device: wp.Device, part_device: wp.Device, *, direct: bool | None = None
+    ):
+        self.whole, self.part = whole, part
+        self._direct = whole_device == part_device if direct is None else direct
+        self._in_whole = wp.array(whole, dtype=wp.int32, device=whole_device)
+        self._in_part = wp.array(part, dtype=wp.int32, device=part_device)
+
+    def to_part(self, whole: wp.array, part: wp.array) -> None:
+        """Copy the values of an array of the whole body to one of the part."""
+        self._copy(whole, self._in_whole, self.whole, part, self._in_part)
+
+    def to_whole(self, part: wp.array, whole: wp.array) -> None:
+        """Copy the values of an array of the part to one of the whole body."""
+        self._copy(part, self._in_part, self.part, whole, self._in_whole)
+
+    def _copy(self, source: wp.array, sources: wp.array, numbers: Ints, found: wp.array, targets: wp.array) -> None:
+        if self._direct:
+            inputs = [sources, targets, source]
+            wp.launch(kernels.move_values, len(numbers), inputs, [found], device=found.device)
+            return
+        values = wp.array(source.numpy()[numbers], dtype=source.dtype, device=found.device)
+        wp.launch(kernels.scatter_values, len(numbers), [targets, values], [found], device=found.device)
+
+
+def reproducible_sums(addends: Floats, comm: Any) -> Floats:
+    """The sums of all ranks' addends, [n, columns] -> [columns], the same in any order; NaN where any addend is not
+    finite.
+
+    Each addend is split into whole numbers of smaller and smaller units, powers of two below the largest addend of all
+    ranks. Sums of whole numbers are exact.
+    """
+    columns = addends.shape[1]
+    sizes = np.abs(addends).max(axis=0, initial=0.0)
+    bad = ~np.isfinite(sizes)
+    most = np.where(bad, 0.0, sizes)
+    everywhere = np.array(comm.allgather(np.stack([most, bad])))
+    most, bad = everywhere[:, 0].max(axis=0), everywhere[:, 1].max(axis=0) > 0
+    left = np.where(bad, 0.0, addends)
+    unit = np.ldexp(1.0, np.frexp(most)[1])
+    total = np.zeros(columns)
+    parts = np.zeros((ROUNDS, columns), np.int64)
+    units = np.zeros((ROUNDS, columns))
+    for number in range(ROUNDS):
+        unit = np.ldexp(unit, -BITS)
+        units[number] = unit
+        known = unit > 0.0
+        whole = np.where(known, np.rint(left / np.where(known, unit, 1.0)), 0.0)
+        left = left - whole * unit
+        parts[number] = whole.astype(np.int64).sum(axis=0)
+    together = np.array(comm.allgather(parts)).sum(axis=0)
+    # Add the smallest units first.
+    for number in reversed(range(ROUNDS)):
+        total += together[number] * units[number]
+    return np.where(bad, np.nan, total)

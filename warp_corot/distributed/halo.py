@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -16,15 +14,10 @@ from warp_corot.discretization.awaited import Awaited
 from warp_corot.kernels.distributed import exchange as kernels
 from warp_corot.solvers.halo import Floats, Halo, Owned, V
 
-from .cards import CardExchange, add_up, take_most
 from .divided_mesh import DividedMesh
-from .exchange import ExchangeLists, HostExchange, in_worlds
+from .exchange import CardExchange, ExchangeLists, HostExchange, in_worlds, reduce_on_cards, reproducible_sums
 from .multigrid import MultigridOfParts, has_multigrid
-from .parts import Part
-from .reproducible_sums import reproducible_sums
-
-#: Number of times that a row of exchanges is timed.
-TIMED = 5
+from .part import Part
 
 
 class CommHalo(Halo):
@@ -40,29 +33,24 @@ class CommHalo(Halo):
         self.comm = comm
 
     def max(self, value: V) -> V:
-        if isinstance(value, wp.array):
-            if value.device.is_cuda:
-                take_most(value)
-            else:
-                own = value.numpy()
-                own[...] = np.max(self.comm.allgather(own), axis=0)
-            return value
-        everybody = self.comm.allgather(value)
-        return np.max(everybody, axis=0) if isinstance(value, np.ndarray) else max(everybody)
+        return self._reduced(value, np.max, "MAX")
 
     def sum(self, value: V, addends: npt.NDArray[np.float64] | None = None) -> V:
-        if isinstance(value, wp.array):
-            if value.device.is_cuda:
-                add_up(value.view(wp.float64).flatten())
-            else:
-                own = value.numpy()
-                own[...] = np.sum(self.comm.allgather(own), axis=0)
-            return value
         if addends is None:
-            everybody = self.comm.allgather(value)
-            return np.sum(everybody, axis=0) if isinstance(value, np.ndarray) else sum(everybody)
+            return self._reduced(value, np.sum, "SUM")
         total = reproducible_sums(addends.reshape(len(addends), -1), self.comm)
         return total.reshape(value.shape) if isinstance(value, np.ndarray) else type(value)(total[0])
+
+    def _reduced(self, value: V, combined: Callable[..., Any], operation: str) -> V:
+        if isinstance(value, wp.array):
+            if value.device.is_cuda:
+                reduce_on_cards(value.view(wp.float64).flatten() if operation == "SUM" else value, operation)
+            else:
+                own = value.numpy()
+                own[...] = combined(self.comm.allgather(own), axis=0)
+            return value
+        found = combined(self.comm.allgather(value), axis=0)
+        return found if isinstance(value, np.ndarray) else type(value)(found)
 
 
 class OwnedPart(Owned):
@@ -131,14 +119,11 @@ class MpiHalo(CommHalo):
         wholes: The bodies.
         parts: This rank's part of each.
         reproducible: Whether sums are the same bit for bit for any number of ranks.
-        records: Whether steps are recorded on cards.
     """
 
-    def __init__(
-        self, comm: Any, wholes: Sequence[SoftBody], parts: Sequence[Part], *, reproducible: bool, records: bool
-    ):
+    def __init__(self, comm: Any, wholes: Sequence[SoftBody], parts: Sequence[Part], *, reproducible: bool):
         super().__init__(comm)
-        self.is_reproducible, self._records, self._parts = reproducible, records, parts
+        self.is_reproducible, self._parts = reproducible, parts
         self.device = parts[0].device
         self.lists = [ExchangeLists.of(p.numbers.nodes, p.numbers.owner, p.worlds, comm) for p in parts]
         self._exchanges = [self.exchange_of(lists, k) for k, lists in enumerate(self.lists)]
@@ -185,28 +170,3 @@ class MpiHalo(CommHalo):
         owner[taken] = giver[np.searchsorted(given[order], numbers[taken])]
         self._connected += 1
         return self.exchange_of(ExchangeLists.of(numbers, owner, 1, self.comm), self._connected).launch
-
-    def exchange_seconds(self, vectors: Sequence[wp.array], count: int) -> float:
-        """The mean time of an exchange of a nodal array of each body, over ``count`` of them in a row [s]; on cards
-        they are recorded."""
-
-        def exchange() -> None:
-            for _ in range(count):
-                for k, each in enumerate(vectors):
-                    self.exchange(k, each)
-
-        made = exchange
-        if self.device.is_cuda and self._records:
-            exchange()
-            with wp.ScopedCapture(device=self.device) as capture:
-                exchange()
-            made = functools.partial(wp.capture_launch, capture.graph)
-        times = []
-        for _ in range(TIMED):
-            wp.synchronize_device(self.device)
-            self.comm.Barrier()
-            began = time.perf_counter()
-            made()
-            wp.synchronize_device(self.device)
-            times.append(time.perf_counter() - began)
-        return sorted(times)[TIMED // 2] / count

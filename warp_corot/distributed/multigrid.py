@@ -26,10 +26,9 @@ from warp_corot.solvers.implicit.multigrid.multigrid import MOST_DENSE
 from warp_corot.solvers.implicit.operator import LinearOperator
 
 from .divided_mesh import DividedMesh
-from .exchange import ExchangeLists, in_worlds
+from .exchange import ExchangeLists, Places, in_worlds
+from .part import Part
 from .partition import sharing_groups
-from .parts import Part
-from .places import Places
 
 if TYPE_CHECKING:
     from .halo import MpiHalo

@@ -1,9 +1,10 @@
-"""The division of a mesh among ranks: which elements each rank computes, which nodes it moves, and which elements of
-other ranks it needs."""
+"""The division of a mesh among ranks: which elements each rank computes, which nodes it moves, which elements of other
+ranks it needs, and the numbers of nodes of parts in the whole mesh."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +19,7 @@ from warp_corot.mesh.growing.cut import linked
 from warp_corot.mesh.tree import UniformTree
 
 Ints = npt.NDArray[np.int32]
+Longs = npt.NDArray[np.int64]
 
 #: Bits of each coordinate on the curve along which general elements are divided.
 CURVE_BITS = 20
@@ -188,3 +190,39 @@ def _along_curve(mesh: TetMesh, ranks: int, shares: npt.NDArray[np.float64]) -> 
     rank = np.empty(len(order), np.int32)
     rank[order] = _without_gaps(turn, ranks)
     return rank
+
+
+def places_of(wanted: npt.NDArray[np.integer], keys: npt.NDArray[np.integer]) -> Longs:
+    """The places of numbers in others, all different, int64 [n]; -1 for those that are not there."""
+    if not len(keys):
+        return np.full(len(wanted), -1, np.int64)
+    order = np.argsort(keys)
+    place = order[np.searchsorted(keys, wanted, sorter=order).clip(max=len(keys) - 1)]
+    return np.where(keys[place] == wanted, place, -1)
+
+
+def numbered_points(owner: Ints, keys: Longs, comm: Any) -> tuple[Longs, int]:
+    """The numbers of lattice points in the whole mesh, int64, and the number of its nodes; all ranks must call this.
+
+    Nodes are in the order in which the leaves of the whole mesh first name them, so that those of a rank have
+    consecutive numbers; lattice points that no leaf names follow, rank after rank.
+
+    Args:
+        owner: The rank that moves each point, plus the number of ranks if no leaf names the point, int32 [n].
+        keys: The points' keys, the same on all ranks, int64 [n].
+        comm: The ranks.
+    """
+    found = np.full(len(owner), -1, np.int64)
+    before = 0
+    for claim in (comm.rank, comm.rank + comm.size):
+        mine = np.flatnonzero(owner == claim)
+        counts = comm.allgather(len(mine))
+        found[mine] = before + sum(counts[: comm.rank]) + np.arange(len(mine))
+        if claim == comm.rank:
+            before = total = sum(counts)
+    ghosts = [np.flatnonzero((owner % comm.size == rank) & (found < 0)) for rank in range(comm.size)]
+    asked = comm.alltoall([keys[each] for each in ghosts])
+    told = comm.alltoall([found[places_of(each, keys)] for each in asked])
+    for places, numbers in zip(ghosts, told, strict=True):
+        found[places] = numbers
+    return found, total

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
-import time
+from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
+import warp as wp
 
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_path
 from warp_corot.io.files.whole import written_whole
-from warp_corot.io.write.animate import Progress, Recording, frame_count
+from warp_corot.io.write.animate import Progress, Recording, frame_count, make_frames
+from warp_corot.io.write.skins import Skin
+from warp_corot.mesh.surfaces.bound import SurfaceMesh
 
 from .mpi import all_or_none
-from .pieces import Piece
+from .part import PartSync
 from .simulation import Simulation
+
+Ints = npt.NDArray[np.int32]
 
 
 def record(
@@ -93,7 +99,7 @@ class _Pieces:
                 material=self._piece,
                 skins=[self._piece.skin],
                 tets=tets,
-                changing=sim.remeshing is not None,
+                changing=sim.remeshing.every > 0,
                 gravity=sim.gravity if sim.rank == 0 else None,
                 obstacles=sim.obstacles if sim.rank == 0 else (),
                 world=world,
@@ -103,24 +109,18 @@ class _Pieces:
 
     def record(self, count: int, progress: Progress | None) -> Recording:
         """Write the present frame and ``count`` more."""
-        sim, done, writer = self._sim, self.done, self._writer
-        first_step, first_time = sim.total_steps, sim.total_time
+        writer, done = self._writer, self.done
+
+        def write() -> None:
+            self._write_frame()
+            done.frames += 1
+            if done.frames == 1:
+                # From now on the joining stage shows the frames written so far.
+                all_or_none(writer.flush, self._comm)
+                all_or_none(lambda: self._join(count + 1), self._comm)
+
         try:
-            for frame in range(count + 1):
-                started = time.perf_counter()
-                sim.advance_until(first_time + frame / self._fps)
-                stepped = time.perf_counter()
-                self._write_frame()
-                if frame == 0:
-                    # From now on the joining stage shows the frames written so far.
-                    all_or_none(writer.flush, self._comm)
-                    all_or_none(lambda: self._join(count + 1), self._comm)
-                done.stepping += stepped - started
-                done.writing += time.perf_counter() - stepped
-                done.frames = frame + 1
-                done.steps, done.simulated = sim.total_steps - first_step, sim.total_time - first_time
-                if progress is not None:
-                    progress(frame, count)
+            make_frames(self._sim, self._fps, count, done, write, progress or (lambda *_: None))
         except BaseException as error:
             # Write the waiting frames; the first error is the one to raise.
             writer.__exit__(type(error), error, error.__traceback__)
@@ -141,7 +141,9 @@ class _Pieces:
         piece = self._piece
         displacements, velocities = (piece.state(name, sim.completed) for name in ("displacements", "velocities"))
         positions = (piece.points + displacements).astype(np.float32)
-        stress = piece.of_elements(sim.von_mises())
+        stress = piece.of_elements(
+            [field.von_mises(sim.completed(k, "displacements")) for k, field in enumerate(sim.fields)]
+        )
         self._writer.widen_range(max(self._comm.allgather(self._writer.range_for(stress))))
         all_or_none(lambda: self._writer.write(positions, velocities=velocities, von_mises=stress), self._comm)
         lengths = np.linalg.norm(positions.astype(np.float64) - piece.points, axis=1)
@@ -186,3 +188,95 @@ class _Pieces:
 
 def _name(rank: int) -> str:
     return f"rank-{rank:04d}.usdc"
+
+
+class Piece:
+    """A rank's piece of all bodies in one world, body after body, as one mesh and one material.
+
+    Args:
+        syncs: The bodies and this rank's parts of them.
+        world: The world.
+
+    Attributes:
+        points, tets: The mesh at rest [m], [N, 3], and [T, 4].
+        fixed: Whether each node is held, bool [N].
+        young, poisson, density: The elements' material [Pa], -, [kg/m^3], a number or [T].
+        skin: The faces on the bodies' surface.
+    """
+
+    def __init__(self, syncs: Sequence[PartSync], world: int):
+        self._syncs, self._world = syncs, world
+        self.up_axis = syncs[0].whole.mesh.up_axis
+        #: The elements of each body that this rank counts, among those of its part; and the nodes of these and of
+        #: the faces.
+        self._elements = [np.flatnonzero(each.part.numbers.counted) for each in syncs]
+        self._nodes, tets, faces, first = [], [], [], 0
+        for each, elements in zip(syncs, self._elements, strict=True):
+            own, (triangles, _) = each.part.mesh.tets[elements], each.part.surface_faces
+            # Of the ranks that move a corner, the first draws the face.
+            owner = each.part.numbers.owner[triangles].min(axis=1)
+            triangles = triangles[owner == each.rank]
+            nodes = np.unique(np.concatenate([own.ravel(), triangles.ravel()]))
+            number = np.full(each.part.world_node_count, -1, np.int32)
+            number[nodes] = np.arange(first, first + len(nodes), dtype=np.int32)
+            tets.append(number[own])
+            faces.append(number[triangles])
+            self._nodes.append(nodes)
+            first += len(nodes)
+        self.points = np.concatenate([e.part.mesh.points[n] for e, n in zip(syncs, self._nodes, strict=True)])
+        self.tets = np.concatenate(tets).astype(np.int32)
+        self.fixed = self._nodal("held") > 0
+        self.skin = skin_of(self.points, np.concatenate(faces))
+        for name in ("young", "poisson", "density"):
+            setattr(self, name, self._property(name))
+
+    def state(self, name: str, completed: Callable[[int, str], wp.array]) -> npt.NDArray[np.float32]:
+        """A nodal array of the state at the piece's nodes, float32 [N, 3].
+
+        Args:
+            name: The name of the array.
+            completed: Gives the array of a body's part with the values of other ranks' nodes.
+        """
+        found = []
+        for k, nodes in enumerate(self._nodes):
+            first = self._world * self._syncs[k].part.world_node_count
+            found.append(completed(k, name).numpy()[first + nodes, :3])
+        return np.concatenate(found)
+
+    def of_elements(self, values: Sequence[npt.NDArray[np.float32]]) -> npt.NDArray[np.float32]:
+        """Values of the piece's elements, from those of all elements of each part in all worlds."""
+        found = []
+        for each, elements, given in zip(self._syncs, self._elements, values, strict=True):
+            found.append(given.reshape(each.part.worlds, -1)[self._world, elements])
+        return np.concatenate(found)
+
+    def _nodal(self, name: str) -> npt.NDArray[np.uint8]:
+        """A condition of the nodes, from the bodies that users hold."""
+        found = []
+        for each, nodes in zip(self._syncs, self._nodes, strict=True):
+            first = self._world * each.whole.world_node_count
+            values = getattr(each.whole.conditions, name).numpy()
+            found.append(values[first + each.part.places[nodes]])
+        return np.concatenate(found)
+
+    def _property(self, name: str) -> float | npt.NDArray[np.float64]:
+        values = []
+        for each, elements in zip(self._syncs, self._elements, strict=True):
+            body = each.part
+            shape = (body.worlds, body.world_element_count)
+            everywhere = np.broadcast_to(getattr(body.material.isotropic, name), shape)
+            values.append(everywhere[self._world, elements])
+        joined = np.concatenate(values).astype(np.float64)
+        # A piece of a mesh that changes may get elements of other materials.
+        changing = [each.whole for each in self._syncs if each.whole.changing is not None]
+        varies = any(np.ptp(getattr(whole.material.isotropic, name)) > 0 for whole in changing)
+        return float(joined[0]) if (joined == joined[0]).all() and not varies else joined
+
+
+def skin_of(points: npt.NDArray[np.float64], faces: Ints) -> Skin:
+    """Triangles of a mesh's points [F, 3], drawn as its boundary."""
+    used, triangles = np.unique(faces, return_inverse=True)
+    weights = np.tile([1.0, 0.0, 0.0, 0.0], (len(used), 1))
+    nodes = np.repeat(used[:, None], 4, axis=1).astype(np.int32)
+    surface = SurfaceMesh(points[used], nodes, weights, triangles.reshape(-1, 3).astype(np.int32))
+    return Skin("surface", surface, is_boundary=True)

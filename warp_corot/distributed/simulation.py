@@ -2,45 +2,84 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+import statistics
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from os import PathLike
-from typing import Any
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
-from warp_corot.contact.contacts import Contacts
-from warp_corot.contact.tool import Obstacle
-from warp_corot.elasticity import Corotated, Model
+from warp_corot.contact.options import SURFACE, TETRAHEDRA
+from warp_corot.contact.shapes import Shape
+from warp_corot.contact.tool import Obstacle, Tool
+from warp_corot.cutting.blade import Blade
+from warp_corot.elasticity import Corotated, ForceField, Linear, Model, NeoHookean, StVenantKirchhoff
+from warp_corot.elasticity.dilatation.options import ELEMENT, SHARED, shares_dilatation
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_count, checked_path
+from warp_corot.inputs.checks import checked_count
 from warp_corot.inputs.device import checked_device
+from warp_corot.mesh import TetForest
+from warp_corot.mesh.uniform_part import SUBTREE_DEPTH
 from warp_corot.remesh.online import OnlineRemesh
+from warp_corot.remesh.remeshing import Remeshing
 from warp_corot.simulation import simulation as on_one
-from warp_corot.simulation.clock import Clock
-from warp_corot.simulation.energy import Energy, WorldEnergies
-from warp_corot.simulation.parts import (
-    checked_bodies,
-    checked_gravity,
-    checked_integrator,
-    checked_models,
-    chosen_worlds,
-)
-from warp_corot.simulation.solves import Solves
+from warp_corot.simulation.energy import WorldEnergies
+from warp_corot.simulation.hooks import Hooks
+from warp_corot.simulation.parts import checked_bodies, checked_integrator, checked_models, chosen_worlds
 from warp_corot.solvers import Integrator, SymplecticEuler
+from warp_corot.solvers.steps.pace import Pace
+from warp_corot.solvers.steps.safe_step import ANY_STEP
 
 from . import checkpoint, mpi
+from .divided_mesh import DividedForest, DividedMesh
 from .halo import CommHalo, MpiHalo
-from .part_simulation import PartSimulation, Passes, compile_once, model_of_whole, of_their_own, part_of
-from .part_sync import PartSync, forget, register
-from .parts import Part
-from .unsupported import check_supported
+from .part import Part, PartSync
+from .partition import Partition
+
+#: Models whose forces need only the elements around a node.
+MODELS = (Corotated, Linear, NeoHookean, StVenantKirchhoff)
+#: The preconditioner of linear solves with meshes that no rank holds whole.
+DIAGONAL = "diagonal"
 
 
-class Simulation(Clock):
+class Passes(NamedTuple):
+    """Passes of remeshing over whole bodies, which go on from a checkpoint.
+
+    Attributes:
+        remeshing: The passes.
+        fields: The force fields of the whole bodies.
+    """
+
+    remeshing: Remeshing
+    fields: tuple[ForceField, ...]
+
+
+def _refused(name: str) -> Callable[..., NoReturn]:
+    """A method that does not work on several ranks."""
+
+    def refused(*_: Any, **__: Any) -> NoReturn:
+        raise InputError(f"{name} does not work on several ranks yet, only on one process")
+
+    return refused
+
+
+class _Hooks(Hooks):
+    """Functions that every rank calls with the whole bodies, which they may change."""
+
+    def _call(self, callback: Callable[[Any], None], sim: Simulation) -> None:
+        with sim.shown():
+            super()._call(callback, sim)
+
+
+class Simulation(on_one.Simulation):
     """One or several soft bodies, stepped together by all ranks of an MPI run.
 
     Every rank makes the same bodies and calls the same methods in the same order. A rank computes its part of every
@@ -59,6 +98,8 @@ class Simulation(Clock):
 
     Attributes:
         bodies: Tuple of the whole bodies.
+        parts: This rank's part of each.
+        syncs: Copies between each body and its part.
         rank, size, comm: This rank's number, the number of ranks, and their MPI communicator.
         worlds, device, stable_dt, gravity: As for ``warp_corot.Simulation``.
 
@@ -66,6 +107,10 @@ class Simulation(Clock):
         InputError: MPI is not installed, an argument does not work on several ranks, a body has fewer groups of
             elements than there are ranks, or as for ``warp_corot.Simulation``.
     """
+
+    parts: tuple[Part, ...]
+    ranks: MpiHalo
+    cut, tear, forces, contacts, add_forces = map(_refused, ("cut", "tear", "forces", "contacts", "add_forces"))
 
     def __init__(
         self,
@@ -79,184 +124,151 @@ class Simulation(Clock):
         device: str | wp.Device | None = None,
         **others: Any,
     ):
-        self._comm = self.comm = comm = mpi.world()
-        self.rank, self.size = comm.rank, comm.size
-        self.bodies = checked_bodies(bodies, CommHalo(comm))
-        models = checked_models(Corotated() if model is None else model, len(self.bodies))
+        self.comm = comm = mpi.world()
+        self.rank, self.size, self.is_root = comm.rank, comm.size, comm.rank == 0
+        self.ranks = CommHalo(comm)  # type: ignore[assignment]
+        wholes = checked_bodies(bodies, self.ranks)
+        models = checked_models(Corotated() if model is None else model, len(wholes))
         integrator = checked_integrator(SymplecticEuler() if integrator is None else integrator)
         here = None if device is None else checked_device(device)
-        cards = comm.size if deterministic and (here or self.bodies[0].device).is_cuda else 0
-        check_supported(self.bodies, models, integrator, others, cards)
-        models = tuple(model_of_whole(m, body, comm) for m, body in zip(models, self.bodies, strict=True))
-        self.gravity = checked_gravity(gravity, self.bodies[0].mesh.up_axis)
-        self._division = costs, here
-        self._passes: Passes | None = None
-        if (remesh := others.pop("remesh", None)) is not None:
-            self._passes = Passes.of(self.bodies, models, remesh, deterministic=deterministic)
-        self._options: dict[str, Any] = {"model": models, "integrator": integrator, "gravity": self.gravity} | others
-        self._options["deterministic"] = deterministic
-        parts = self._divided(models, deterministic)
-        compile_once(comm, parts, **{name: value for name, value in self._options.items() if name != "deterministic"})
-        self._parts = self._made(parts)
-        if self._passes is not None:
-            self._parts.take_remeshing(self._passes.remeshing, self._remesh)
-        register(self._syncs)
+        cards = comm.size if deterministic and (here or wholes[0].device).is_cuda else 0
+        check_supported(wholes, models, integrator, others, cards)
+        models = tuple(_model_of_whole(m, body, comm) for m, body in zip(models, wholes, strict=True))
+        self._costs, self._here, self.syncs = costs, here, list[PartSync]()
+        options: dict[str, Any] = {"integrator": integrator, "gravity": gravity, "deterministic": deterministic}
+        super().__init__(wholes, model=models, **options, **others)
+        self.hooks = _Hooks()
 
-    def _divided(self, models: Sequence[Model], deterministic: bool) -> list[Part]:
-        """This rank's parts of the bodies as they are now."""
-        comm, (costs, here) = self._comm, self._division
-        parts = [part_of(body, m, comm, costs, here) for body, m in zip(self.bodies, models, strict=True)]
+    # --- parts -----------------------------------------------------------------------------------------------------
+
+    def _found_device(self) -> wp.Device:
+        return self._here or self.bodies[0].device
+
+    def _made_passes(self, remesh: Any, blades: tuple[Blade, ...] | None) -> Remeshing:
+        if not isinstance(remesh, Passes):
+            made = super()._made_passes(remesh, blades)
+            bound = zip(self.models, self.bodies, strict=True) if made.every else ()
+            remesh = Passes(made, tuple(m.bind(body, deterministic=self.deterministic) for m, body in bound))
+            if made.every:
+                made.serve(remesh.fields)
+        #: The force fields of whole bodies that are remeshed.
+        self.whole_fields = remesh.fields
+        return remesh.remeshing
+
+    def _divided(self) -> tuple[Part, ...]:
+        comm = self.comm
+        parts = tuple(
+            part_of(body, model, comm, self._costs, self._here)
+            for body, model in zip(self.bodies, self.models, strict=True)
+        )
         for part in parts:
-            part.discretization.sums_by_subtrees = bool(deterministic)
-        self._syncs = [PartSync(body, part, comm) for body, part in zip(self.bodies, parts, strict=True)]
-        for each in self._syncs:
+            part.discretization.sums_by_subtrees = self.deterministic
+        self.syncs = [PartSync(body, part, comm) for body, part in zip(self.bodies, parts, strict=True)]
+        for each in self.syncs:
             each.take_over()
+        self.ranks = MpiHalo(comm, self.bodies, parts, reproducible=self.deterministic)
         return parts
-
-    def _made(self, parts: list[Part]) -> PartSimulation:
-        """The simulation of these parts."""
-        for each in self._syncs:
-            each.take_over()
-        reproducible, records = bool(self._options["deterministic"]), not self._options["integrator"].is_implicit
-        ranks = MpiHalo(self._comm, self.bodies, parts, reproducible=reproducible, records=records)
-        return PartSimulation(ranks, parts, **self._options)
-
-    def _remesh(self) -> None:
-        """Make the passes that are due over the whole bodies, on all ranks alike, and divide the new meshes."""
-        assert self._passes is not None
-        remeshing = self._passes.remeshing
-        self._publish()
-        self.collect()
-        before = [body.version for body in self.bodies]
-        remeshing.run(self._parts.steps)
-        remeshing.step_may_change()
-        if before != [body.version for body in self.bodies]:
-            self._divide_anew()
 
     def _divide_anew(self) -> None:
         """Go on with parts of the present meshes; the whole bodies have the state of all nodes."""
-        forget(self._syncs)
         for body in self.bodies:
             if body.state.is_touched:
                 body.state.make_contact_forces()
                 body.state.contact_forces.zero_()
-        parts = self._divided(self._options["model"], self._options["deterministic"])
-        if self._parts.contact is not None:
-            self._parts.contact.obstacles.let_go()
-        self._parts.become(self._made(parts))
-        register(self._syncs)
+        contact, stepper, touching = self.contact, self.stepper, None
+        if contact is not None:
+            contact.obstacles.let_go()
+            touching = contact.obstacles.given, contact.options
+        self.guard.forget()
+        known, guard = self.pace.known, self.guard.state
+        guard["counted"] = np.full_like(guard["counted"], np.nan)
+        self.pace = Pace(ANY_STEP if self.integrator.dt is None else float(self.integrator.dt), self.device)
+        self._make_steps(touching, None)
+        if self.contact is not None and contact is not None:
+            self.contact.continue_from(contact)
+        self.stepper.continue_from(stepper)
+        self.pace.put_back(known)
+        if self.safe_step is not None:
+            self.safe_step.find_rest(self.stable_steps)
+        self.guard.resume(**guard)
+        self.running.begin_again()
 
-    def __getattr__(self, name: str) -> Any:
-        if not name.startswith("_") and hasattr(on_one.Simulation, name):
-            raise AttributeError(f"{name} does not work on several ranks yet, only on one process")
-        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+    def follow_motion(self) -> bool:
+        """Make the passes that are due over the whole bodies, on all ranks alike, and divide the new meshes."""
+        self._publish()
+        self.collect()
+        before = [body.version for body in self.bodies]
+        self.remeshing.run(self.steps)
+        self.remeshing.step_may_change()
+        if before != [body.version for body in self.bodies]:
+            self._divide_anew()
+        return True
+
+    def _take_over(self) -> None:
+        for k, each in enumerate(self.syncs):
+            each.take_over()
+            self.ranks.exchange(k, each.part.state.displacements)
+            each.part.state.publish_positions()
+
+    def _publish(self) -> None:
+        for each in self.syncs:
+            each.publish()
 
     # --- stepping --------------------------------------------------------------------------------------------------
 
+    @contextmanager
+    def _led(self) -> Iterator[None]:
+        """Take users' changes of the bodies to the parts, and steps of the parts to the bodies."""
+        self._take_over()
+        yield
+        self._publish()
+
+    @contextmanager
+    def shown(self) -> Iterator[None]:
+        """Let the block see the bodies after the last step, and take its changes of them to the parts."""
+        self._publish()
+        yield
+        self._take_over()
+
     def step(self) -> None:
         """Advance by one time step, like ``warp_corot.Simulation.step``. All ranks must call this."""
-        self._lead(self._parts.step)
-
-    def advance(self, seconds: float) -> None:
-        """Advance by ``seconds``, like ``warp_corot.Simulation.advance``. All ranks must call this."""
-        self._lead(self._parts.advance, seconds)
+        with self._led():
+            super().step()
 
     def advance_until(self, total_time: float) -> None:
         """Advance until ``total_time`` [s], like ``advance``; do nothing if that time is past."""
-        self._lead(self._parts.advance_until, total_time)
+        with self._led():
+            super().advance_until(total_time)
 
     def advance_steps(self, count: int) -> None:
         """Advance by ``count`` time steps, like ``advance``."""
-        self._lead(self._parts.advance_steps, count)
-
-    def _lead(self, act: Callable[..., None], *amount: float) -> None:
-        self._take_over()
-        act(*amount)
-        self._publish()
-
-    def on_step(self, callback: Callable[[Simulation], None], every: int = 1) -> None:
-        """Call ``callback(sim)`` on every rank after every ``every``-th step, counted from the beginning.
-
-        Raises:
-            InputError: ``every`` is not a positive whole number, or the callback cannot be called.
-        """
-        if not callable(callback):
-            raise InputError(f"callback is {callback!r}; it must be a function of the simulation")
-
-        def called(_: object) -> None:
-            self._publish()
-            callback(self)
-            self._take_over()
-
-        self._parts.on_step(called, checked_count(every, "every", least=1))
+        with self._led():
+            super().advance_steps(count)
 
     def reset(self, worlds: npt.ArrayLike | wp.array | None = None) -> None:
         """Reset worlds to their initial state, like ``warp_corot.Simulation.reset``.
 
         The meshes to which bodies return that are remeshed are divided anew.
         """
-        self._take_over()
-        if self._passes is not None:
-            self._restore_meshes(worlds)
-        for each in self._syncs:
-            each.take_initial()
-        self._parts.reset(worlds)
-        self._publish()
-
-    def _restore_meshes(self, worlds: npt.ArrayLike | wp.array | None) -> None:
-        """Put the meshes of bodies that are remeshed back to those of their initial states, and divide these."""
-        if not chosen_worlds(worlds, self.worlds, self.device).numpy()[0]:
-            return
-        self._publish()
-        self.collect()
-        for body in self.bodies:
-            if body.changing is not None:
-                body.changing.restore()
-        self._divide_anew()
+        with self._led():
+            if self.remeshing.every and chosen_worlds(worlds, self.worlds, self.device).numpy()[0]:
+                self._publish()
+                self.collect()
+                for changing in self.remeshing.changed:
+                    changing.restore()
+                self._divide_anew()
+            for each in self.syncs:
+                each.take_initial()
+            super().reset(worlds)
 
     # --- looking ---------------------------------------------------------------------------------------------------
-
-    @property
-    def body(self) -> SoftBody:
-        """The first body."""
-        return self.bodies[0]
-
-    @property
-    def clock(self) -> PartSimulation:
-        """This rank's simulation of its parts."""
-        return self._parts
-
-    @property
-    def worlds(self) -> int:
-        """Number of copies of the bodies."""
-        return self._parts.worlds
-
-    @property
-    def device(self) -> wp.Device:
-        """The device of this rank."""
-        return self._parts.device
-
-    @property
-    def stable_dt(self) -> float:
-        """Largest linearly stable step at rest [s], estimated."""
-        return self._parts.stable_dt
 
     @property
     def elements_here(self) -> tuple[int, int]:
         """Elements that this rank computes in one world, over all bodies, and how many of these are copies of other
         ranks' elements."""
-        counted = [each.part.numbers.counted for each in self._syncs]
+        counted = [part.numbers.counted for part in self.parts]
         return sum(map(len, counted)), sum(int((~each).sum()) for each in counted)
-
-    @property
-    def sent_bytes(self) -> int:
-        """The bytes that this rank sends in one exchange."""
-        return sum(each.sent_bytes for each in self._parts.ranks.lists)
-
-    def exchange_seconds(self, count: int) -> float:
-        """The mean time of one exchange alone, over ``count`` of them in a row [s]; all ranks must call this."""
-        probes = [wp.zeros_like(each.part.state.displacements) for each in self._syncs]
-        return self._parts.ranks.exchange_seconds(probes, checked_count(count, "count", least=1))
 
     def measured_costs(self, count: int = 20) -> list[float]:
         """The time that the forces of an element take on each rank [s], the median of ``count`` measurements.
@@ -264,69 +276,46 @@ class Simulation(Clock):
         The result is meant for ``costs`` of another simulation of the same bodies. All ranks must call this.
         """
         self._take_over()
-        return self._parts.measured_costs(checked_count(count, "count", least=1))
-
-    def energy(self) -> Energy:
-        """Kinetic, elastic and gravitational energy of all bodies on all ranks in the present state [J]."""
-        return self.world_energies().together
+        times = []
+        for _ in range(checked_count(count, "count", least=1) + 1):
+            wp.synchronize_device(self.device)
+            began = time.perf_counter()
+            for part, field in zip(self.parts, self.fields, strict=True):
+                with field.state_kept():
+                    field.add_forces(part.state.displacements, part.state.forces)
+            wp.synchronize_device(self.device)
+            times.append(time.perf_counter() - began)
+        for part in self.parts:
+            part.state.forces.zero_()
+        elements = sum(part.element_count for part in self.parts)
+        # The first time may compile.
+        return self.comm.allgather(statistics.median(times[1:]) / elements)
 
     def world_energies(self) -> WorldEnergies:
-        """The same energies of each world [J], float64 [worlds]."""
+        """The energies of each world on all ranks [J], float64 [worlds]; all ranks must call this."""
         self._take_over()
-        own = self._parts.world_energies()
-        return WorldEnergies(*np.sum(self._comm.allgather(np.array(own)), axis=0))
+        return super().world_energies()
+
+    def von_mises(self, body: SoftBody | None = None) -> npt.NDArray[np.float32]:
+        """Von Mises stress of each element in the present state [Pa], float32 [worlds * T]; if no rank holds the whole
+        mesh, of those of this rank's part. All ranks must call this."""
+        self._take_over()
+        return self.syncs[self._index(body)].of_elements(super().von_mises(body))
 
     def collect(self) -> None:
         """Bring the state of all nodes into the bodies of all ranks; all ranks must call this.
 
         If no rank holds the whole mesh, these are the nodes of this rank's part.
         """
-        for k, each in enumerate(self._syncs):
-            if each.is_in_parts:
-                each.take_ghosts(functools.partial(self.completed, k))
-                continue
-            state = each.whole.state
-            for array in (state.displacements, state.velocities, state.reactions):
-                array.assign(self._comm.bcast(each.gather(array), root=0))
-            state.publish_positions()
-            each.collect_touch()
+        for k, each in enumerate(self.syncs):
+            each.collect(functools.partial(self.completed, k))
 
     def completed(self, k: int, name: str) -> wp.array:
         """A nodal array of the state of this rank's part of the k-th body, with the values of other ranks' nodes.
 
         It is valid until the next call. All ranks must call this.
         """
-        return self._parts.ranks.exchange(k, getattr(self._syncs[k].part.state, name), copies=True)
-
-    @property
-    def syncs(self) -> list[PartSync]:
-        """The bodies, each with this rank's part of it."""
-        return self._syncs
-
-    @property
-    def remeshing(self) -> Passes | None:
-        """The passes over the whole bodies, and the force fields of these; None without remeshing."""
-        return self._passes
-
-    def von_mises(self) -> list[npt.NDArray[np.float32]]:
-        """Von Mises stress of each element of this rank's part of each body [Pa], float32 [worlds * t]."""
-        self._take_over()
-        return [self._parts.von_mises(each.part) for each in self._syncs]
-
-    @property
-    def solves(self) -> Solves | None:
-        """The cost of an implicit integrator's solves so far, like ``warp_corot.Simulation.solves``."""
-        return self._parts.solves
-
-    @property
-    def contact(self) -> Contacts | None:
-        """The contact of this rank's parts; None without contact."""
-        return self._parts.contact
-
-    @property
-    def obstacles(self) -> tuple[Obstacle, ...]:
-        """Shapes and tools that bodies touch, as they were given."""
-        return self._parts.obstacles
+        return self.ranks.exchange(k, getattr(self.parts[k].state, name), copies=True)
 
     # --- keeping ---------------------------------------------------------------------------------------------------
 
@@ -340,9 +329,8 @@ class Simulation(Clock):
             InputError: On all ranks, if rank 0 cannot write to the folder.
         """
         self._take_over()
-        if not all(each.is_in_parts for each in self._syncs):
-            self.collect()
-        checkpoint.save(path, self._parts, self._syncs, self._comm)
+        self.collect()
+        checkpoint.save(path, self)
 
     @classmethod
     def load(
@@ -358,45 +346,124 @@ class Simulation(Clock):
         A resumed deterministic run gives the same bits as an uninterrupted one.
 
         Args:
-            path: The file, which every rank reads; of bodies in parts rank 0 alone, which hands out parts.
+            path: The file, which every rank reads. Of bodies in parts each rank then keeps its part only.
             device: The device; None: the one on which it was saved, or the rank's own card.
             remesh: As for ``warp_corot.Simulation.load``.
 
         Raises:
             InputError: As for ``warp_corot.Simulation.load``, or a run that does not work on several ranks.
         """
-        loaded: Any
-        where = checkpoint.device_of_parts(checked_path(path, "path"))
-        if where is not None:
-            bodies, loaded = checkpoint.load_in_parts(path, where if device is None else device, mpi.world())
-            others = loaded.touching
-        else:
-            loaded, others = on_one.Simulation.load(path, device=device, remesh=remesh), {}
-            bodies = loaded.bodies
-            if loaded.contact is not None:
-                given = of_their_own(loaded.contact.obstacles.given)
-                others |= {"obstacles": given, "contact": loaded.contact.options}
-            if any(loaded.remesh):
-                others["remesh"] = Passes(loaded.remeshing, loaded.fields)
-        made = cls(
-            bodies,
-            model=loaded.models,
-            integrator=loaded.integrator,
-            gravity=loaded.gravity,
-            deterministic=loaded.deterministic,
-            **others,
-        )
-        checkpoint.resume(loaded, made._parts, made._syncs)
+        bodies, loaded = checkpoint.load(path, device, remesh, mpi.world())
+        others: dict[str, Any] = {}
+        if loaded.contact is not None:
+            others = {"obstacles": of_their_own(loaded.obstacles), "contact": loaded.contact.options}
+        if any(loaded.remesh):
+            others["remesh"] = Passes(loaded.remeshing, loaded.fields)
+        given = {name: getattr(loaded, name) for name in ("integrator", "gravity", "deterministic")}
+        made = cls(bodies, model=loaded.models, **given, **others)
+        checkpoint.resume(loaded, made)
         return made
 
-    # --- pieces ----------------------------------------------------------------------------------------------------
 
-    def _take_over(self) -> None:
-        for k, each in enumerate(self._syncs):
-            each.take_over()
-            self._parts.ranks.exchange(k, each.part.state.displacements)
-            each.part.state.publish_positions()
+# --- making ----------------------------------------------------------------------------------------------------------
 
-    def _publish(self) -> None:
-        for each in self._syncs:
-            each.publish()
+
+def part_of(body: SoftBody, model: Model, comm: Any, costs: npt.ArrayLike | None, device: wp.Device | None) -> Part:
+    """This rank's part of a body, on a device; None: where the body is.
+
+    Raises:
+        InputError: As ``Partition.of``, costs of a body that is in parts already, or rotations that are shared by
+            elements of several ranks.
+    """
+    level = getattr(model, "level", None)
+    if isinstance(body.mesh, DividedMesh):
+        if costs is not None:
+            raise InputError("the mesh is divided already; give costs to warp_corot.distributed.box or divided")
+        if level is not None and not body.mesh.is_box:
+            raise InputError(f"rotation_level is {level}; of a divided mesh it must be a tolerance or None")
+        if level is not None and isinstance(body.mesh, DividedForest):
+            least = int(body.mesh.tree.leaf_levels[0]) - SUBTREE_DEPTH
+            if level < least:
+                raise InputError(
+                    f"rotation_level is {level}; of a box in parts it must be at least {least}, {SUBTREE_DEPTH} levels "
+                    "above the elements"
+                )
+        return Part(body, None, comm.rank, device)
+    grouped = getattr(model, "dilatation", ELEMENT) == SHARED
+    partition = Partition.of(body.mesh, comm.size, costs, grouped=grouped, rotation_level=level)
+    part = Part(body, partition, comm.rank, device)
+    if level is not None and isinstance(part.mesh, TetForest) and isinstance(body.mesh, TetForest):
+        everywhere = body.mesh.ancestors(level)[part.numbers.elements]
+        if any(comm.allgather(not np.array_equal(part.mesh.ancestors(level), everywhere))):
+            raise InputError(
+                f"rotation_level {level} does not work on several ranks where elements above are cut by the surface; "
+                "it must be a tolerance or None"
+            )
+    return part
+
+
+def of_their_own(obstacles: Obstacle | Sequence[Obstacle]) -> list[Obstacle]:
+    """The same obstacles for another simulation."""
+    given = [obstacles] if isinstance(obstacles, Shape | Tool) else list(obstacles)
+    return [each.released() if isinstance(each, Tool) else copy.copy(each) for each in given]
+
+
+def _model_of_whole(model: Model, body: SoftBody, comm: Any) -> Model:
+    """The model with the meaning of "auto" for the whole body, because a part may have other materials."""
+    if not hasattr(model, "dilatation"):
+        return model
+    shares = any(comm.allgather(shares_dilatation(model.dilatation, body.discretization)))
+    return dataclasses.replace(model, dilatation=SHARED if shares else ELEMENT)  # type: ignore[type-var]
+
+
+def check_supported(
+    bodies: Sequence[SoftBody], models: Sequence[Model], integrator: Integrator, others: dict[str, Any], cards: int = 0
+) -> None:
+    """Check that a simulation can be made on several ranks.
+
+    Args:
+        bodies, models, integrator: As for ``Simulation``.
+        cards: The number of cards, if the run must give the same bits for any number of them; otherwise 0.
+        others: Its other arguments, by name.
+
+    Raises:
+        InputError: It cannot.
+    """
+    in_parts = any(isinstance(body.mesh, DividedMesh) for body in bodies)
+    if others.get("remesh") and in_parts:
+        raise InputError(
+            "remeshing of meshes that no rank holds whole does not work yet; leave remesh out, let every rank make the "
+            "whole mesh, or run on one process"
+        )
+    if others.get("cuts") is not None:
+        raise InputError("cutting does not work on several ranks; leave cuts out, or run on one process")
+    contact = others.get("contact")
+    meets = getattr(contact, "self_contact", False) or (len(bodies) > 1 and (contact or others.get("obstacles")))
+    if meets and (in_parts or integrator.is_implicit):
+        raise InputError(
+            "contact of soft surfaces does not work on several ranks yet in implicit steps, or with meshes that no "
+            "rank holds whole; use one body without self_contact, or explicit steps of whole meshes, or one process"
+        )
+    touches = bool(contact or others.get("obstacles"))
+    embedded = any(isinstance(body.mesh, DividedMesh) and body.mesh.is_embedded for body in bodies)
+    if touches and embedded and not integrator.is_implicit and getattr(contact, "on", SURFACE) == SURFACE:
+        raise InputError(
+            f"no rank has the surface of a divided mesh; contact must be Contact(on={TETRAHEDRA!r}), which touches the "
+            "tetrahedra around it, or every rank must make the whole mesh"
+        )
+    if getattr(integrator, "preconditioner", None) not in (None, DIAGONAL) and in_parts:
+        raise InputError(
+            f"the preconditioner {integrator.preconditioner!r} does not work yet with meshes that no rank holds whole; "  # type: ignore[attr-defined]
+            f"it must be None or {DIAGONAL!r}"
+        )
+    if cards > 1 and touches:
+        raise InputError(
+            "contact on several cards is not the same bit for bit as on one yet; deterministic must be False, or take "
+            "ranks on the CPU, or one card"
+        )
+    for model in models:
+        if not isinstance(model, MODELS):
+            raise InputError(f"{type(model).__name__} does not work on several ranks yet; take a law of elements")
+    for body in bodies:
+        if body.changing is not None and not isinstance(others.get("remesh"), Passes):
+            raise InputError("a body that is remeshed does not work on several ranks yet")

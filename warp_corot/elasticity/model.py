@@ -274,18 +274,26 @@ class ForceField(ABC):
         """Strain energy of the body in all worlds together [J]."""
         return float(self.elastic_energies(u).sum())
 
-    def elastic_energies(self, u: wp.array) -> npt.NDArray[np.float64]:
-        """Strain energy of the body in each world [J], float64 [worlds]."""
-        return self._sums(self.write_energies, u)
+    def elastic_energies(self, u: wp.array, clear: Callable[[wp.array], None] | None = None) -> npt.NDArray[np.float64]:
+        """Strain energy of the body in each world [J], float64 [worlds]; ``clear`` resets those of elements that do not
+        count."""
+        return self._sums(self.write_energies, u, clear)
 
     def potentials(self, u: wp.array) -> npt.NDArray[np.float64]:
         """The energy of ``write_potentials`` in each world [J], float64 [worlds]."""
         return self._sums(self.write_potentials, u)
 
-    def _sums(self, write: Callable[[wp.array, wp.array], None], u: wp.array) -> npt.NDArray[np.float64]:
+    def _sums(
+        self,
+        write: Callable[[wp.array, wp.array], None],
+        u: wp.array,
+        clear: Callable[[wp.array], None] | None = None,
+    ) -> npt.NDArray[np.float64]:
         energies = wp.zeros(self.energy_count, dtype=wp.float64, device=self.device)
         with self.state_kept():
             write(u, energies)
+        if clear is not None:
+            clear(energies)
         return energies.numpy().reshape(self.discretization.worlds, -1).sum(axis=1)
 
     def von_mises(self, u: wp.array) -> npt.NDArray[np.float32]:

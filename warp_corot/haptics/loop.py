@@ -78,8 +78,8 @@ class HapticLoop:
         most_force: float = 10.0,
         energy_bound: float = 1e-3,
     ):
-        if not isinstance(sim, Simulation):
-            raise InputError(f"sim is {shown(sim)}; it must be a Simulation")
+        if not isinstance(sim, Simulation) or not sim.ranks.is_alone:
+            raise InputError(f"sim is {shown(sim)}; it must be a Simulation on one process")
         given = () if sim.contact is None else sim.contact.obstacles.given
         if not any(each is tool for each in given):
             raise InputError(f"tool is {shown(tool)}; it must be a Tool among the simulation's obstacles")

@@ -10,7 +10,6 @@ from warp_corot.contact.tool import Tool
 from warp_corot.errors import InputError
 
 from .loaded import LoadedBody
-from .parts import check_whole
 from .resting import Rest, rest_on
 from .simulation import Simulation
 
@@ -28,10 +27,10 @@ def bring_to_rest(sim: Simulation) -> Rest:
         sim: The simulation, with contact.
 
     Raises:
-        InputError: Meshes change, or a body is a rank's part of one.
+        InputError: Meshes change, or several ranks have parts of the bodies.
     """
-    for body in sim.bodies:
-        check_whole(body)
+    if not sim.ranks.is_alone:
+        raise InputError("several ranks cannot bring bodies to rest in contact; one process can")
     if sim.remeshing.every:
         raise InputError("a body is remeshed; to begin at rest, all meshes must stay as they are")
     assert sim.contact is not None

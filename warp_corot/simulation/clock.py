@@ -22,38 +22,33 @@ class Clock:
     time_before_reset: float = 0.0
 
     @property
-    def clock(self) -> Clock:
-        """The simulation whose clock this is; of one that others step, that of these."""
-        return self
-
-    @property
     def dt(self) -> float:
         """The time step [s]; if none was given, the one that the present state allows."""
-        safe_step = self.clock.safe_step
-        return self.clock.pace.dt if safe_step is None else safe_step.allowed
+        safe_step = self.safe_step
+        return self.pace.dt if safe_step is None else safe_step.allowed
 
     @property
     def dt_range(self) -> tuple[float, float]:
         """The shortest and the longest time step so far [s]."""
-        safe_step = self.clock.safe_step
+        safe_step = self.safe_step
         return (self.dt, self.dt) if safe_step is None else safe_step.range
 
     @property
     def steps(self) -> int:
         """Time steps since the last ``reset()``, or since the beginning."""
-        return self.clock.pace.steps
+        return self.pace.steps
 
     @property
     def total_steps(self) -> int:
         """Time steps since the beginning; resets do not change it."""
-        return self.clock.steps_before_reset + self.steps
+        return self.steps_before_reset + self.steps
 
     @property
     def time(self) -> float:
         """Simulated time since the last ``reset()``, or since the beginning [s]."""
-        return self.clock.pace.time
+        return self.pace.time
 
     @property
     def total_time(self) -> float:
         """Simulated time since the beginning [s]; resets do not change it."""
-        return self.clock.time_before_reset + self.time
+        return self.time_before_reset + self.time

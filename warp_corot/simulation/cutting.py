@@ -40,13 +40,14 @@ class Cutting(Clock):
     """The part of a simulation that changes its meshes.
 
     Attributes:
-        bodies, fields, integrator, ranks, grasps, system, remeshing, guard: The simulation's.
+        bodies, parts, fields, integrator, ranks, grasps, system, remeshing, guard: The simulation's.
         contact, blades: None without.
         stable_dt: As of ``Simulation``.
         stable_steps: The same of each body.
     """
 
     bodies: tuple[SoftBody, ...]
+    parts: tuple[SoftBody, ...]
     fields: tuple[ForceField, ...]
     integrator: Integrator
     ranks: Halo = ALONE
@@ -152,7 +153,7 @@ class Cutting(Clock):
             self.stable_dt = math.inf
             self.stable_steps = [math.inf] * len(self.bodies)
             return self.stable_steps
-        bound = enumerate(zip(self.bodies, self.fields, strict=True))
+        bound = enumerate(zip(self.parts, self.fields, strict=True))
         frequencies = [largest_frequency(body, f.stiffest, self.ranks, k) for k, (body, f) in bound]
         added = self._added_curvature
         steps = [self.integrator.stable_step(math.sqrt(frequency**2 + added)) for frequency in frequencies]

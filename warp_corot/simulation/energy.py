@@ -11,6 +11,7 @@ import numpy.typing as npt
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
     from warp_corot.elasticity import ForceField
+    from warp_corot.solvers.halo import Halo
 
 
 class Energy(NamedTuple):
@@ -43,13 +44,14 @@ class WorldEnergies(NamedTuple):
 
 
 def find_energies(
-    bodies: Sequence[SoftBody], fields: Sequence[ForceField], gravity: tuple[float, float, float]
+    bodies: Sequence[SoftBody], fields: Sequence[ForceField], gravity: tuple[float, float, float], ranks: Halo
 ) -> WorldEnergies:
-    """Energies of bodies in their present state; waits for the device.
+    """Energies of what this process moves and counts of bodies in their present state; waits for the device.
 
     Args:
         bodies, fields: The bodies, all with the same number of worlds, and the force field of each.
         gravity: [m/s^2].
+        ranks: The processes with other parts of the bodies.
     """
     worlds = bodies[0].worlds
     kinetic, elastic, gravitational = (np.zeros(worlds) for _ in range(3))
@@ -60,6 +62,6 @@ def find_energies(
         u = body.state.displacements[: body.node_count].numpy()[:, :3].astype(np.float64)
         height = (body.rest_positions + u) @ np.asarray(gravity)
         kinetic += 0.5 * np.einsum("wn,wn->w", masses, np.einsum("ni,ni->n", v, v).reshape(worlds, -1))
-        elastic += field.elastic_energies(body.state.displacements)
+        elastic += field.elastic_energies(body.state.displacements, ranks.owned(body).clear_copies)
         gravitational -= np.einsum("wn,wn->w", masses, height.reshape(worlds, -1))
     return WorldEnergies(kinetic, elastic, gravitational)

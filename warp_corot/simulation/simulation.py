@@ -124,7 +124,7 @@ class Simulation(Cutting):
     ):
         with SIMULATION_LOCK:
             self.bodies = checked_bodies(bodies, self.ranks)
-            self.device, self.worlds = self.bodies[0].device, self.bodies[0].worlds
+            self.device, self.worlds = self._found_device(), self.bodies[0].worlds
             self.deterministic = checked_flag(deterministic, "deterministic")
             self.models = checked_models(Corotated() if model is None else model, len(self.bodies))
             self.integrator = checked_integrator(SymplecticEuler() if integrator is None else integrator)
@@ -147,14 +147,38 @@ class Simulation(Cutting):
         blades: tuple[Blade, ...] | None,
     ) -> None:
         """Make all that makes steps of the bodies as they are now."""
-        self.remeshing = Remeshing(self.bodies, self.models, remesh, deterministic=self.deterministic, blades=blades)
+        self.remeshing = self._made_passes(remesh, blades)
+        self._make_steps(touching, blades)
+        #: Makes the steps.
+        self.running = Running(self)
+
+    def _made_passes(
+        self, remesh: OnlineRemesh | Sequence[OnlineRemesh | None] | None, blades: tuple[Blade, ...] | None
+    ) -> Remeshing:
+        """The passes over the bodies' meshes."""
+        return Remeshing(self.bodies, self.models, remesh, deterministic=self.deterministic, blades=blades)
+
+    def _found_device(self) -> wp.Device:
+        """The device of the steps."""
+        return self.bodies[0].device
+
+    def _divided(self) -> tuple[SoftBody, ...]:
+        """The bodies as this process steps them: whole, or its parts of them."""
+        return self.bodies
+
+    def _make_steps(
+        self, touching: tuple[tuple[Obstacle, ...], Contact] | None, blades: tuple[Blade, ...] | None
+    ) -> None:
+        """Make all of this that does not go on when parts of bodies are divided anew."""
+        self.parts = self._divided()
         given = self.integrator.dt
-        bound = zip(self.models, self.bodies, strict=True)
+        bound = zip(self.models, self.parts, strict=True)
         self.fields = tuple(m.bind(body, deterministic=self.deterministic) for m, body in bound)
-        self.remeshing.serve(self.fields)
+        if self.parts is self.bodies:
+            self.remeshing.serve(self.fields)
         for field in self.fields:
             field.divide()
-        self.system = System(self.bodies, self.fields, self.pace, self.gravity, self.ranks)
+        self.system = System(self.parts, self.fields, self.pace, self.gravity, self.ranks)
         loading = self._load_kernels(touching)
         stable = self._find_stable_steps()
         #: Keeps bodies out of obstacles and out of one another; None without contact.
@@ -176,8 +200,6 @@ class Simulation(Cutting):
         wait_for(loading)
         check_constraints(self.system, self.stepper, self.integrator)
         self.recorded = RecordedSteps(self.system, self.stepper, self.guard, self.safe_step)
-        #: Makes the steps.
-        self.running = Running(self)
 
     def _load_kernels(self, touching: tuple[tuple[Obstacle, ...], Contact] | None) -> list[Future]:
         """Load the kernels that steps are known to launch, several modules at a time; returns those to wait for."""
@@ -185,13 +207,13 @@ class Simulation(Cutting):
         names = [*(STEPS_ON_CPU if on_cpu else STEPS), *(EXPLICIT if chosen else ()), *(() if explicit else IMPLICIT)]
         if touching and explicit:
             names = [*CONTACT, *names]
-        if not explicit and any(body.discretization.element_kind is ForestElements for body in self.bodies):
+        if not explicit and any(body.discretization.element_kind is ForestElements for body in self.parts):
             names += IMPLICIT_ON_FORESTS
         kernels: list[LoadedKernel] = [STEP_SYMPLECTIC_EULER[wp.vec4]] if explicit else []
-        kernels += [find_strains(body.discretization.element_kind) for body in self.bodies if chosen]
-        kernels += [count_crushed(body.discretization.element_kind) for body in self.bodies if touching]
+        kernels += [find_strains(body.discretization.element_kind) for body in self.parts if chosen]
+        kernels += [count_crushed(body.discretization.element_kind) for body in self.parts if touching]
         if touching and explicit:
-            kernels.append(solver_of(self.device, *touching, len(self.bodies)))
+            kernels.append(solver_of(self.device, *touching, len(self.parts)))
         kernels += [kernel for field in self.fields for kernel in field.kernels]
         # Explicit steps need the forces at once, to find their length.
         load(names, self.device, kernels if explicit else ())
@@ -329,7 +351,7 @@ class Simulation(Cutting):
                 self.safe_step.restart()
             self.system.bad_step.fill_(NEVER)
             self.guard.restart()
-        for body, field in zip(self.bodies, self.fields, strict=True):
+        for body, field in zip(self.parts, self.fields, strict=True):
             body.reset(chosen, self.pace)
             field.reset(chosen)
         for constraint in self.system.constraints:
@@ -348,7 +370,11 @@ class Simulation(Cutting):
     @under_lock
     def world_energies(self) -> WorldEnergies:
         """The energies of each world [J], float64 [worlds]."""
-        return find_energies(self.bodies, self.fields, self.gravity)
+        own = find_energies(self.parts, self.fields, self.gravity, self.ranks)
+        return WorldEnergies(*self.ranks.sum(np.array(own)))
+
+    def collect(self) -> None:
+        """Bring the state of all nodes into the bodies; of a simulation on one process it is there already."""
 
     @under_lock
     def forces(self, body: SoftBody | None = None) -> wp.array:
@@ -362,8 +388,8 @@ class Simulation(Cutting):
     def von_mises(self, body: SoftBody | None = None) -> npt.NDArray[np.float32]:
         """Von Mises stress of each element in the present state [Pa], float32 [worlds * T]."""
         chosen = self._index(body)
-        self.bodies[chosen].state.adopt_positions()
-        return self.fields[chosen].von_mises(self.bodies[chosen].state.displacements)
+        self.parts[chosen].state.adopt_positions()
+        return self.fields[chosen].von_mises(self.parts[chosen].state.displacements)
 
     @property
     def obstacles(self) -> tuple[Obstacle, ...]:

@@ -63,8 +63,8 @@ class View:
         run_file: Callable[[Simulation], bytes] | None = None,
         title: str = "warp_corot",
     ):
-        if not isinstance(sim, Simulation):
-            raise InputError(f"sim is {as_shown(sim)}; it must be a Simulation, as Simulation(body) makes one")
+        if not isinstance(sim, Simulation) or not sim.ranks.is_alone:
+            raise InputError(f"sim is {as_shown(sim)}; it must be a Simulation on one process: Simulation(body)")
         gate = AccessControl(host, token if token is not None or is_loopback(host) else new_token())
         self._lock, self._over, self._title = threading.RLock(), threading.Event(), title
         self._thread: threading.Thread | None = None

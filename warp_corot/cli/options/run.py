@@ -74,7 +74,7 @@ class BodyOptions:
             and prims, blocks and instances of tetrahedra, are separate bodies)
         level (L): number of bisections of the cubes of the box; three halve the edge (default: {BOX_LEVEL}). For
             surfaces and scans, in place of --tets: of the cubes at the surface, {CUBES_OF_LEVEL} along the longest side
-            if --cell-size is not given; several ranks then make the mesh in parts if --fix and --young are given
+            if --cell-size is not given
         scale (S): multiply the coordinates by this, after --unit
         offset (DX DY DZ): move the body by this much before the run starts [m], after --scale; this places the bodies
             of a run file

@@ -11,8 +11,8 @@ EPILOG = """examples:
   warp-corot sweep box --vary young=500,1kPa,2kPa -o results
   warp-corot sweep run.toml --vary young=1kPa:100kPa:64:log --vary poisson=0.3,0.45,0.49 -o results
 
-the folder gets table.csv, table.parquet (with pyarrow), results.png, runs.jsonl with the finished runs, and in runs/ a
-stage and a table for each run. Results are the last row of each run's table, and the largest displacement."""
+the folder gets table.csv, runs.jsonl with the finished runs, and in runs/ a stage and a table for each run. Results are
+the last row of each run's table, and the largest displacement."""
 
 
 @dataclass(kw_only=True)

@@ -20,6 +20,7 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, checked_path, shown
 from warp_corot.inputs.simulation_lock import under_lock
 from warp_corot.inputs.stopwatch import WATCH
+from warp_corot.simulation.parts import check_whole
 from warp_corot.simulation.progress import bar_of, hidden
 from warp_corot.simulation.simulation import Simulation
 
@@ -197,7 +198,7 @@ def record(
     remeshed, each frame shows the current mesh; smooth surfaces stay the same and are bound to it. Obstacles and tools
     are drawn, too, with the forces on tools. Frame k shows the state at k / fps, or, for a simulation with a given
     step, after the nearest whole number of steps. If the run is interrupted, the written frames stay: Ctrl-C and
-    SIGTERM wait while a frame is being written.
+    SIGTERM wait while a frame is being written. On several ranks, all must call this, and the first one writes.
 
     Args:
         sim: The simulation; it continues from its current state.
@@ -236,45 +237,77 @@ def record(
         raise InputError(f"sim is {shown(sim)}; it must be a Simulation, for example Simulation(body)")
     checked_path(path, "path")
     count = 0 if duration is None else frame_count(duration, fps)
-    others = [also_writer(Path(other)) for other in also]
+    for body in sim.bodies:
+        check_whole(body)
+    others = [also_writer(Path(other)) for other in also if sim.is_root]
     if world is None and sim.worlds > 1:
         raise InputError(f"the simulation has {sim.worlds} worlds; choose the one to draw, for example world=0")
     joined = _Joined(sim, world or 0)
     skins = joined.skins(surface, tets, labels)
-    writer = UsdWriter(
-        Path(path),
-        joined,
-        fps=fps,
-        fixed=joined.fixed,
-        material=joined,
-        skins=skins.on(joined.meshes) if skins else (),
-        tets=True if tets is None and joined.are_plain(surface, labels) else tets,
-        changing=any(joined.changing),
-        gravity=sim.gravity,
-        obstacles=() if sim.contact is None else sim.contact.obstacles.given,
-        world=world or 0,
-    )
+    writer: Any = _Unwritten(Path(path))
+    if sim.is_root:
+        writer = UsdWriter(
+            Path(path),
+            joined,
+            fps=fps,
+            fixed=joined.fixed,
+            material=joined,
+            skins=skins.on(joined.meshes) if skins else (),
+            tets=True if tets is None and joined.are_plain(surface, labels) else tets,
+            changing=any(joined.changing),
+            gravity=sim.gravity,
+            obstacles=() if sim.contact is None else sim.contact.obstacles.given,
+            world=world or 0,
+        )
     told = {**provenance(sim, joined.fixed), **(about or {})}
     done = Recording(writer.path) if recording is None else recording
-    first_step, first_time = sim.total_steps, sim.total_time
+    first_time = sim.total_time
+
+    def write() -> None:
+        sim.collect()
+        if joined.has_changed():
+            bound = skins.on(joined.meshes) if skins else ()
+            writer.change_mesh(joined, fixed=joined.fixed, material=joined, skins=bound)
+        writer.about = {**told, **steps_made(sim)}
+        _write_frame(writer, sim, joined, done)
+        if also:
+            fields = fields_of(sim, joined.worlds, sim.total_time - first_time)
+            for other in others:
+                other.write(fields)
+
     with _closed_whole(writer, done, others), progress_bar(count, wanted=progress is None) as bar:
-        for frame in range(count + 1):
-            with WATCH.part("stepping", into=done):
-                sim.advance_until(first_time + frame / fps)
-            with WATCH.part("writing", into=done), signals_held_back():
-                if joined.has_changed():
-                    bound = skins.on(joined.meshes) if skins else ()
-                    writer.change_mesh(joined, fixed=joined.fixed, material=joined, skins=bound)
-                writer.about = {**told, **steps_made(sim)}
-                _write_frame(writer, sim, joined, done)
-                if others:
-                    fields = fields_of(sim, joined.worlds, sim.total_time - first_time)
-                    for other in others:
-                        other.write(fields)
-            done.steps = sim.total_steps - first_step
-            done.simulated = sim.total_time - first_time
-            (progress or bar)(frame, count)
+        make_frames(sim, fps, count, done, write, progress or bar)
     return done
+
+
+def make_frames(
+    sim: Simulation, fps: float, count: int, done: Recording, write: Callable[[], None], progress: Progress
+) -> None:
+    """Advance a simulation from frame to frame, and write the present state and those of ``count`` more frames."""
+    first_step, first_time = sim.total_steps, sim.total_time
+    for frame in range(count + 1):
+        with WATCH.part("stepping", into=done):
+            sim.advance_until(first_time + frame / fps)
+        with WATCH.part("writing", into=done), signals_held_back():
+            write()
+        done.steps = sim.total_steps - first_step
+        done.simulated = sim.total_time - first_time
+        progress(frame, count)
+
+
+class _Unwritten:
+    """In place of a writer, on ranks other than the first."""
+
+    def __init__(self, path: Path):
+        self.path, self.frames, self.about = path, 0, dict[str, Any]()
+
+    def write(self, *_: Any, **__: Any) -> None:
+        self.frames += 1
+
+    def close(self, *_: Any, **__: Any) -> None:
+        pass
+
+    change_mesh = __exit__ = close
 
 
 @contextmanager

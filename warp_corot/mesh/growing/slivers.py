@@ -1,12 +1,7 @@
-"""Nearly empty elements at a body's surface: given up, where that breaks no piece of the mesh.
-
-Elements may stand for several: far from the nearly empty ones it does not matter which elements a part of the mesh has.
-So the choice can be made from few numbers, though ranks hold different parts of the mesh.
-"""
+"""Nearly empty elements at a body's surface: given up, where that breaks no piece of the mesh."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,18 +14,6 @@ Array = np.ndarray
 FEW_ELEMENTS, LITTLE = 4, 1.0e-3
 
 
-class LumpedError(Exception):
-    """Elements that stand for several decide where a way is.
-
-    Attributes:
-        lumps: These elements.
-    """
-
-    def __init__(self, lumps: Array):
-        super().__init__(f"{len(lumps)} elements stand for several")
-        self.lumps = lumps
-
-
 @dataclass(frozen=True, eq=False)
 class Filling:
     """The parts of a body in elements.
@@ -39,32 +22,13 @@ class Filling:
         pairs: Pairs of elements that share a face [m, 2].
         held: Volume of the body in each element [n].
         least: Elements that hold less than this are small [n].
-        counts: The number of elements for which each stands [n]; small ones and their neighbours stand for themselves.
         total: About the volume of all elements.
-        anchors: A function of a mask of elements, bool [n]: for each of these the last other element that shares a
-            node with it, -1 if there is none.
     """
 
     pairs: Array
     held: Array
     least: Array
-    counts: Array
     total: float
-    anchors: Callable[[Array], Array]
-
-    @classmethod
-    def of(cls, tets: Array, held: Array, volume: Array, sliver: float) -> Filling:
-        """Of elements [n, 4] with these volumes [n], of which those filled by less than a fraction are small."""
-
-        def anchors(suspects: Array) -> Array:
-            last = np.full(int(tets.max()) + 1, -1)
-            rest = np.flatnonzero(~suspects)
-            last[tets[rest]] = rest[:, None]
-            found: Array = last[tets[suspects]].max(axis=1)
-            return found
-
-        ones = np.ones(len(tets), np.int64)
-        return cls(face_pairs(tets), held, sliver * volume, ones, float(volume.sum()), anchors)
 
     def exact(self, volumes: Array) -> Array:
         """Volumes as whole numbers, whose sums do not depend on the order [n]."""
@@ -74,7 +38,7 @@ class Filling:
         """The rest, in the same order, with other volumes."""
         kept, number = np.flatnonzero(~left_out), np.cumsum(~left_out) - 1
         pairs = number[self.pairs[~left_out[self.pairs].any(axis=1)]]
-        return replace(self, pairs=pairs, held=held[kept], least=self.least[kept], counts=self.counts[kept])
+        return replace(self, pairs=pairs, held=held[kept], least=self.least[kept])
 
 
 def merged(pairs: Array, held: Array, small: Array) -> tuple[Array, Array]:
@@ -126,32 +90,19 @@ def without_slivers(tets: Array, held: Array, volume: Array, sliver: float) -> t
     Returns:
         The new volumes of the body in elements, and the mask of elements that are given up.
     """
-    if (held >= sliver * volume).all():
-        return held, np.zeros(len(tets), bool)
-    return without_small(Filling.of(tets, held, volume, sliver))
-
-
-def without_small(filling: Filling) -> tuple[Array, Array]:
-    """`without_slivers` of elements that may stand for several.
-
-    Raises:
-        LumpedError: Some of these must stand for themselves.
-    """
-    held, small = filling.held, filling.held < filling.least
+    small = held < sliver * volume
     if not small.any():
         return held, small
-    crumbs, held = _crumbs(filling, linked(filling.pairs, len(held)), small)
+    filling = Filling(face_pairs(tets), held, sliver * volume, float(volume.sum()))
+    crumbs, held = _crumbs(tets, filling, linked(filling.pairs, len(held)), small)
     volumes, given_up = np.zeros(len(held)), crumbs.copy()
     kept = np.flatnonzero(~crumbs)
-    try:
-        volumes[kept], given_up[kept] = _without(filling.without(crumbs, held) if crumbs.any() else filling)
-    except LumpedError as error:
-        raise LumpedError(kept[error.lumps]) from None
+    volumes[kept], given_up[kept] = _without(filling.without(crumbs, held) if crumbs.any() else filling)
     return volumes, given_up
 
 
 def _without(filling: Filling) -> tuple[Array, Array]:
-    """`without_small` of elements that are connected to others through faces, or not at all."""
+    """`without_slivers` of elements that are connected to others through faces, or not at all."""
     pairs, held = filling.pairs, filling.held
     small = held < filling.least
     if not small.any():
@@ -174,7 +125,7 @@ def _broken(filling: Filling, piece: Array, kept: Array, volumes: Array) -> tupl
     """
     count, pairs, volumes = len(piece), filling.pairs, filling.exact(volumes)
     part = linked(pairs[kept[pairs].all(axis=1)], count)
-    sizes, held = np.bincount(part, kept * filling.counts), np.bincount(part, volumes)
+    sizes, held = np.bincount(part, kept), np.bincount(part, volumes)
     whole = np.bincount(piece, volumes)
     of_part = np.zeros(len(sizes), np.int64)
     of_part[part] = piece
@@ -186,11 +137,7 @@ def _broken(filling: Filling, piece: Array, kept: Array, volumes: Array) -> tupl
 
 
 def _ways(filling: Filling, piece: Array, kept: Array, broken: Array) -> Array:
-    """Elements through which the parts of broken pieces are connected by the shortest ways, bool [n].
-
-    Raises:
-        LumpedError: Elements outside the largest part of a broken piece stand for several.
-    """
+    """Elements through which the parts of broken pieces are connected by the shortest ways, bool [n]."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import breadth_first_order
 
@@ -199,13 +146,11 @@ def _ways(filling: Filling, piece: Array, kept: Array, broken: Array) -> Array:
     if not broken.any():
         return found
     part = linked(pairs[kept[pairs].all(axis=1)], count)
-    sizes = np.bincount(part, kept * filling.counts)
+    sizes = np.bincount(part, kept)
     largest = np.zeros(int(piece.max()) + 1, np.int64)
     by_size = np.argsort(sizes[part], kind="stable")
     largest[piece[by_size]] = part[by_size]
     apart = broken & (part != largest[piece])
-    if (lumps := np.flatnonzero(apart & (filling.counts > 1))).size:
-        raise LumpedError(lumps)
     # An additional node, linked to the largest part of each piece, allows one search for all pieces. Of ways of one
     # length it finds the one through the first elements.
     pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
@@ -225,7 +170,7 @@ def _ways(filling: Filling, piece: Array, kept: Array, broken: Array) -> Array:
     return found
 
 
-def _crumbs(filling: Filling, piece: Array, small: Array) -> tuple[Array, Array]:
+def _crumbs(tets: Array, filling: Filling, piece: Array, small: Array) -> tuple[Array, Array]:
     """Pieces of few or only small elements that are connected to others only through nodes, about which they would
     rotate.
 
@@ -233,14 +178,17 @@ def _crumbs(filling: Filling, piece: Array, small: Array) -> tuple[Array, Array]
         The mask of their elements, bool [n], and the volumes after they are added to the connected elements.
     """
     held, exact = filling.held, filling.exact(filling.held)
-    sizes, volumes = np.bincount(piece, filling.counts), np.bincount(piece, exact)
+    sizes, volumes = np.bincount(piece), np.bincount(piece, exact)
     little = volumes < LITTLE * volumes.sum()
     tiny = (sizes <= FEW_ELEMENTS) & little | (np.bincount(piece, ~small) == 0)
     suspects = tiny[piece]
     if not suspects.any() or suspects.all():
         return np.zeros(len(piece), bool), held
+    # For each suspect the last other element that shares a node with it.
+    last, rest = np.full(int(tets.max()) + 1, -1), np.flatnonzero(~suspects)
+    last[tets[rest]] = rest[:, None]
     to = np.full(len(sizes), -1)
-    np.maximum.at(to, piece[suspects], filling.anchors(suspects))
+    np.maximum.at(to, piece[suspects], last[tets[suspects]].max(axis=1))
     crumbs = suspects & (to[piece] >= 0)
     held = held.copy()
     np.add.at(held, to[piece[crumbs]], held[crumbs])

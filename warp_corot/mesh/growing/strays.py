@@ -29,24 +29,10 @@ def strays(tets: np.ndarray, held: np.ndarray, given_up: np.ndarray, domain: Dom
         given_up: Which are not part of the mesh, bool [n].
         domain: The body.
     """
-    if not _are_sought(domain, len(tets)):
-        return np.zeros(len(tets), bool), ""
-    return strays_among(face_pairs(tets), held, given_up, np.ones(len(tets), np.int64), domain)
-
-
-def strays_among(
-    pairs: np.ndarray, held: np.ndarray, given_up: np.ndarray, counts: np.ndarray, domain: Domain
-) -> tuple[np.ndarray, str]:
-    """`strays` of elements that may stand for several; all elements of a group are strays, or none.
-
-    Args:
-        pairs: Pairs of elements that share a face [m, 2].
-        held, given_up, domain: As for `strays`.
-        counts: The number of elements for which each stands [n].
-    """
     found = np.zeros(len(held), bool)
-    if not _are_sought(domain, int(counts.sum())):
+    if getattr(domain.kind, "closed", None) is None or len(tets) > MOST_ELEMENTS:
         return found, ""
+    pairs = face_pairs(tets)
     kept = np.flatnonzero(~given_up)
     _, piece = np.unique(linked(pairs[~given_up[pairs].any(axis=1)], len(held))[kept], return_inverse=True)
     # Parts of a surface that touch or cross are one piece of the body.
@@ -63,8 +49,3 @@ def strays_among(
         f"{np.count_nonzero(stray)} pieces of the mesh, tips of the body that are thinner than its tetrahedra, touch "
         f"the rest by less than a face and are left out: {share:.2%} of the volume; more tetrahedra would help"
     )
-
-
-def _are_sought(domain: Domain, elements: int) -> bool:
-    """Whether a mesh with this many elements loses its strays."""
-    return getattr(domain.kind, "closed", None) is not None and elements <= MOST_ELEMENTS

@@ -183,7 +183,7 @@ def vertex_normals(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
         [np.bincount(triangles.ravel(), np.repeat(face[:, axis], 3), len(points)) for axis in range(3)]
     )
     length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+    return np.divide(normals, length, out=np.zeros(normals.shape), where=length > 0)
 
 
 def bound(points: np.ndarray, nodes: np.ndarray, weights: np.ndarray, triangles: npt.ArrayLike | None) -> BoundPoints:

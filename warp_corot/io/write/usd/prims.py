@@ -239,6 +239,8 @@ def floats(values: Any, shape: tuple[int, ...], name: str) -> NDArray[np.float32
 
 
 def extent(points: NDArray[np.float32]) -> Vt.Vec3fArray:
-    """Lowest and highest coordinates."""
+    """Lowest and highest coordinates; those of no points are the origin."""
+    if not len(points):
+        points = np.zeros((1, 3), np.float32)
     axes = np.ascontiguousarray(points.T)  # NumPy reduces long rows several times as fast as short ones
     return Vt.Vec3fArray.FromNumpy(np.stack([axes.min(axis=1), axes.max(axis=1)]))

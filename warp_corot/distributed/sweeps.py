@@ -1,30 +1,45 @@
-"""Sweeps: many runs with different parameters at the same time, which of them are finished, and their results."""
+"""Sweeps: many runs with different parameters at the same time, each in a process of its own, and a table of their
+results.
+
+A journal has a line of JSON for each finished run, on the disk before the next one is noted.
+"""
 
 from __future__ import annotations
 
+import csv
 import itertools
+import json
 import math
+import multiprocessing
+import os
 import pickle
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import warp as wp
+
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_count, checked_path, shown
+from warp_corot.inputs.cpu_threads import core_count, share_cores
+from warp_corot.inputs.starting import start_warp
+from warp_corot.io.files.whole import written_whole
 
-from .journal import Journal, Row, key_of
-from .tables import write_tables
-from .workers import local_executor, timed, worker_count
-
+Row = dict[str, Any]
 Parameters = Mapping[str, Sequence[Any]] | Sequence[Mapping[str, Any]]
 #: The parameters of runs that one call makes, and such a call.
 Share = tuple[dict[str, Any], ...]
 Call = Callable[[Share], list[Row]]
+
+#: Number of runs given at a time to a user's engine, whose size is not known.
+HANDED_OVER = 256
 
 
 def sweep(
@@ -47,7 +62,7 @@ def sweep(
         function: Called as ``function(young=1e3, poisson=0.45)``; returns a number, or a dictionary of numbers and
             texts. It must be at the top of a module, because other processes must find it.
         parameters: Values of each parameter, for all combinations; or a list with the parameters of each run.
-        folder: The folder for the journal, tables (CSV and, with pyarrow, Parquet) and a picture.
+        folder: The folder for the journal and the table, ``table.csv``.
         workers: Number of processes; None: one for each card, or for each core without cards.
         retries: How often a run is repeated that failed or whose process died.
         together: How many runs one call makes at most, such as the worlds of one simulation: the function is called
@@ -84,7 +99,7 @@ def sweep(
             show(1)
     rows = [journal.row(run) for run in runs]
     if folder is not None:
-        write_tables(rows, list(runs[0]), Path(folder))
+        _write_table(rows, list(runs[0]), Path(folder) / "table.csv")
     return rows
 
 
@@ -193,3 +208,141 @@ def _bar(count: int, wanted: bool | None) -> Iterator[Callable[[int], Any]]:
 
     with tqdm(desc="sweep", total=count, unit="run", disable=None if wanted is None else not wanted) as bar:
         yield bar.update
+
+
+# --- processes of this machine: one for each card, or for each core without cards -----------------------------------
+
+
+def worker_count(workers: int | None, runs: int, executor: Executor | None) -> int:
+    """The number of runs at a time."""
+    if workers is not None:
+        return checked_count(workers, "workers", least=1)
+    if executor is not None:
+        return HANDED_OVER
+    return max(min(wp.get_cuda_device_count() or core_count(), runs), 1)
+
+
+def local_executor(workers: int) -> ProcessPoolExecutor:
+    """New processes, because CUDA and Warp do not work in forked ones."""
+    context = multiprocessing.get_context("spawn")
+    turn = context.Value("i", 0)
+    return ProcessPoolExecutor(workers, mp_context=context, initializer=_begin, initargs=(turn, workers))
+
+
+def timed(function: Callable[..., Any], together: bool, runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """The results of a function for the parameters of the runs that one call makes, as rows of a table; each has an
+    equal share of the time.
+
+    Args:
+        function: The function.
+        together: Whether it takes and returns lists for all runs; otherwise there is one run.
+        runs: The parameters of each run.
+
+    Raises:
+        InputError: The function returns neither numbers nor dictionaries of numbers and texts, or no lists of them.
+    """
+    began = time.perf_counter()
+    found = function(**({name: [run[name] for run in runs] for name in runs[0]} if together else runs[0]))
+    seconds = (time.perf_counter() - began) / len(runs)
+    found = found if isinstance(found, Mapping) else {"result": found}
+    for name, values in found.items() if together else ():
+        if isinstance(values, str) or not hasattr(values, "__len__") or len(values) != len(runs):
+            raise InputError(f"the function gives {name} = {values!r}; it must be a list of {len(runs)}, one a run")
+    return [
+        {name: _checked(values[k] if together else values, name, run) for name, values in found.items()}
+        | {"seconds": seconds}
+        for k, run in enumerate(runs)
+    ]
+
+
+def _checked(value: Any, name: str, run: Mapping[str, Any]) -> Any:
+    """A number or text of Python's own."""
+    value = value.item() if isinstance(value, np.generic) else value
+    if name in run or name in ("seconds", "error") or not isinstance(value, str | int | float | bool | None):
+        raise InputError(f"the function gives {name} = {value!r}; it must be a number or text of another name")
+    return value
+
+
+def _begin(turn: Any, workers: int) -> None:
+    """Choose a card for this process, if there are cards, and its share of the cores."""
+    share_cores(workers)
+    with turn.get_lock():
+        number, turn.value = turn.value, turn.value + 1
+    wp.config.log_level = wp.LOG_ERROR
+    start_warp()
+    count = wp.get_cuda_device_count()
+    if count:
+        wp.set_device(f"cuda:{number % count}")
+
+
+# --- journal and tables ---------------------------------------------------------------------------------------------
+
+
+def key_of(run: Mapping[str, Any]) -> str:
+    """The name of a run: its parameters, in any order."""
+    return json.dumps(dict(run), sort_keys=True)
+
+
+class Journal:
+    """Rows of runs, kept in a folder.
+
+    Args:
+        folder: The folder, made if necessary; None: rows are kept in memory only.
+
+    Raises:
+        InputError: The folder or its journal cannot be written to, or the journal is of another kind.
+    """
+
+    NAME = "runs.jsonl"
+
+    def __init__(self, folder: Path | None):
+        self._rows: dict[str, Row] = {}
+        self._path = None if folder is None else folder / self.NAME
+        if self._path is None:
+            return
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            self._path.touch()
+            data = self._path.read_bytes()
+        except OSError as error:
+            raise InputError(f"{self._path}: {error.strerror or error}") from None
+        whole, _, torn = data.rpartition(b"\n")
+        for number, line in enumerate(whole.splitlines(), start=1):
+            try:
+                found = json.loads(line)
+                self._rows[key_of(found["parameters"])] = found["row"]
+            except (ValueError, KeyError, TypeError):
+                raise InputError(f"{self._path}, line {number}: is no line of a sweep's journal") from None
+        if torn:  # a sweep was ended within a line
+            os.truncate(self._path, len(data) - len(torn))
+
+    def is_done(self, run: Mapping[str, Any]) -> bool:
+        """Whether a run has succeeded."""
+        return self._rows.get(key_of(run), {"error": "not made"})["error"] == ""
+
+    def row(self, run: Mapping[str, Any]) -> Row:
+        """The row of a run."""
+        return self._rows[key_of(run)]
+
+    def note(self, run: Mapping[str, Any], row: Row) -> None:
+        """Keep the row of a run; it is on the disk when the call returns.
+
+        Raises:
+            OSError: It cannot be written, for example because the disk is full.
+        """
+        self._rows[key_of(run)] = row
+        if self._path is not None:
+            with self._path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps({"parameters": dict(run), "row": row}) + "\n")
+                file.flush()
+                os.fsync(file.fileno())
+
+
+def _write_table(rows: Sequence[Row], parameters: Sequence[str], path: Path) -> None:
+    """Write the rows of all runs to a CSV file, whole; the parameters come first."""
+    names = list(dict.fromkeys([*parameters, *(name for row in rows for name in row)]))
+    names = [name for name in names if name not in ("seconds", "error")] + ["seconds", "error"]
+    with written_whole(path) as part, part.open("w", newline="", encoding="utf-8") as file:
+        table = csv.DictWriter(file, names, restval="")
+        table.writeheader()
+        table.writerows(rows)

@@ -1,11 +1,14 @@
-"""A whole body, which users hold on every rank, and the part of it that the rank computes."""
+"""A rank's part of a body, and the copies between it and the body that users hold on every rank."""
 
 from __future__ import annotations
 
+import dataclasses
+import functools
+import gc
 import operator
 import weakref
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -13,16 +16,101 @@ import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.body.trajectory import Followed
+from warp_corot.discretization.discretization import Discretization
+from warp_corot.discretization.elements import Mesh
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import shown
+from warp_corot.materials.isotropic import Material
 
-from .divided_mesh import DividedMesh
-from .exchange import in_worlds
-from .parts import Part
-from .places import Places
+from .divided_mesh import DividedMesh, divide
+from .exchange import Places, in_worlds
+from .partition import Partition, places_of
+
+Ints = npt.NDArray[np.int32]
+M = TypeVar("M", bound=Material)
 
 #: The nodal arrays that a step changes.
 STATE = ("displacements", "velocities", "reactions")
+
+
+class Part(SoftBody):
+    """A rank's part of a body. Ghosts have no mass, so steps do not move them.
+
+    Args:
+        whole: The body.
+        partition: The division of its mesh; None if this rank holds only its part.
+        rank: The rank of the part.
+        device: The device of the part; None: that of the body.
+
+    Attributes:
+        numbers: The numbers of its nodes and elements in the whole mesh.
+        places, element_places: Their places in ``whole``, int32 [n] and [t].
+        is_own: Whether this rank moves each node, bool [worlds * n].
+    """
+
+    def __init__(self, whole: SoftBody, partition: Partition | None, rank: int, device: wp.Device | None = None):
+        self._whole = whole
+        mesh, material = whole.mesh, whole.material
+        if not isinstance(mesh, DividedMesh):
+            assert partition is not None
+            mesh = divide(mesh, partition, rank)
+            material = part_of_material(material, mesh.numbers.elements, mesh.element_count)
+        self.numbers = mesh.numbers
+        numbers = self.numbers.nodes, self.numbers.elements
+        is_whole = mesh is not whole.mesh
+        self.places, self.element_places = (
+            (each if is_whole else np.arange(len(each))).astype(np.int32) for each in numbers
+        )
+        self.is_own = np.tile(self.numbers.owner == rank, whole.worlds)
+        super().__init__(mesh, material, worlds=whole.worlds, device=device or whole.device, threads=1)
+        self.threads = whole.threads  # for checkpoints
+        of_whole = whole.mesh if isinstance(whole.mesh, DividedMesh) else whole.discretization
+        self.discretization.smallest_volume = of_whole.smallest_volume
+
+    def _discretized(self, mesh: Mesh, material: Material) -> Discretization:
+        shared = mesh is self._whole.mesh and self.device == self._whole.device
+        return self._whole.discretization if shared else super()._discretized(mesh, material)
+
+    @property
+    def masses(self) -> npt.NDArray[np.float64]:
+        """Lumped masses of the nodes that this rank moves [kg], float64 [worlds * n]; zero for ghosts."""
+        if isinstance(self._whole.mesh, DividedMesh):
+            return np.where(self.is_own, super().masses, 0.0)
+        # Nodes of a remeshed body have what they carry.
+        return np.where(self.is_own, self._whole.masses[self.numbers.in_worlds(self._whole.worlds)], 0.0)
+
+    @property
+    def surface_faces(self) -> tuple[Ints, Ints]:
+        """The triangles of the whole body's surface around the nodes that this rank moves, int32 [f, 3], in the whole
+        body's order; and the element of each, [f]."""
+        return self._surface[1:]
+
+    @property
+    def surface_here(self) -> Ints:
+        """The numbers of ``surface_faces`` among the triangles of the whole body's surface, int32 [f]."""
+        return self._surface[0]
+
+    @functools.cached_property
+    def _surface(self) -> tuple[Ints, Ints, Ints]:
+        triangles, parents = self._whole.surface_faces
+        number = np.full(self._whole.world_node_count, -1, np.int32)
+        own = self.is_own[: len(self.numbers.nodes)]
+        number[self.places[own]] = 1
+        here = np.flatnonzero((number[triangles] >= 0).any(axis=1)).astype(np.int32)
+        number[self.places] = np.arange(len(self.numbers.nodes), dtype=np.int32)
+        elements = np.searchsorted(self.element_places, parents[here]).astype(np.int32)
+        return here, number[triangles[here]], elements
+
+
+def part_of_material(material: M, elements: npt.NDArray[np.integer], count: int) -> M:
+    """The material of some of ``count`` elements."""
+    found: dict[str, Any] = {}
+    for field in dataclasses.fields(material):  # type: ignore[arg-type]
+        values, tail = getattr(material, field.name), material.components.get(field.name, ())
+        axis = np.ndim(values) - len(tail) - 1
+        if axis >= 0 and np.shape(values)[axis] == count > 1:
+            found[field.name] = np.take(values, elements, axis=axis)
+    return dataclasses.replace(material, **found) if found else material  # type: ignore[type-var]
 
 
 class PartSync:
@@ -37,42 +125,65 @@ class PartSync:
     """
 
     def __init__(self, whole: SoftBody, part: Part, comm: Any):
-        self.whole, self.part, self._comm = whole, part, comm
+        self.whole, self.part, self.rank, self._comm = whole, part, comm.rank, comm
         n, count, worlds = len(part.numbers.nodes), whole.world_node_count, whole.worlds
         everywhere = in_worlds(part.places, worlds, count)
         own = np.tile(part.numbers.owner == comm.rank, worlds)
-        #: This rank's nodes among those of all worlds of the whole body, int32, and of its part.
-        self.own_nodes = everywhere[own]
+        #: This rank's nodes among those of all worlds of the whole body, and of its part, int32.
+        self.own_nodes, self.part_nodes = everywhere[own], np.flatnonzero(own).astype(np.int32)
         devices = whole.device, part.device
         self._all = Places(everywhere, np.arange(worlds * n, dtype=np.int32), *devices)
-        self._own = Places(self.own_nodes, np.flatnonzero(own).astype(np.int32), *devices)
+        self._own = Places(self.own_nodes, self.part_nodes, *devices)
         elements = in_worlds(part.element_places, worlds, whole.world_element_count)
         self._elements = Places(elements, np.arange(len(elements), dtype=np.int32), *devices)
         #: The numbers of this rank's nodes in the whole mesh, int64; and the number of nodes of the whole mesh.
         self.numbers = part.numbers.in_worlds(worlds)[own]
         self._total = worlds * part.numbers.node_count
-        #: The number in the part of each node that this rank moves, -1 for others.
-        self._number = np.full(worlds * count, -1, np.int32)
-        self._number[self.own_nodes] = np.flatnonzero(own)
         self._trajectories: list[Followed] = []
         self._activations: list[Followed] = []
         #: Triangles of the surface around this rank's nodes; None before there is contact.
         self._triangles: Places | None = None
+        _known[id(whole)] = self
 
     @property
     def is_in_parts(self) -> bool:
         """Whether no rank holds the whole mesh."""
         return isinstance(self.whole.mesh, DividedMesh)
 
-    def take_ghosts(self, completed: Callable[[str], wp.array]) -> None:
-        """Copy the state of all nodes of the part, with those that other ranks move, to the body.
+    def collect(self, completed: Callable[[str], wp.array]) -> None:
+        """Bring the state of all nodes into the body; if no rank holds the whole mesh, of the part's nodes. All ranks
+        must call this.
 
         Args:
             completed: Gives an array of the part's state, by its name, with the values of other ranks' nodes.
         """
+        state = self.whole.state
         for name in STATE:
-            self._all.to_whole(completed(name), getattr(self.whole.state, name))
-        self.whole.state.publish_positions()
+            if self.is_in_parts:
+                self._all.to_whole(completed(name), getattr(state, name))
+            else:
+                getattr(state, name).assign(self._comm.bcast(self.gather(getattr(state, name)), root=0))
+        state.publish_positions()
+        if self._triangles is None or self.is_in_parts:
+            return
+        state.contact_forces.assign(self._comm.bcast(self.gather(state.contact_forces), root=0))
+        found = state.contact_pressures.numpy()
+        own = self._triangles.whole
+        for triangles, pressures in self._comm.allgather((own, found[own])):
+            found[triangles] = pressures
+        state.contact_pressures.assign(found)
+
+    def of_elements(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Values of all elements of the body, from those of the part's [worlds * t]; if no rank holds the whole mesh,
+        the same. All ranks must call this."""
+        if self.is_in_parts:
+            return values
+        counted = np.flatnonzero(self.part.numbers.counted)
+        found = np.zeros((self.whole.worlds, self.whole.world_element_count), values.dtype)
+        own = values.reshape(self.whole.worlds, -1)[:, counted]
+        for elements, of_rank in self._comm.allgather((self.part.element_places[counted], own)):
+            found[:, elements] = of_rank
+        return found.ravel()
 
     def take_over(self) -> None:
         """Copy users' changes to the part: the state, supports, loads and keyframes."""
@@ -124,18 +235,6 @@ class PartSync:
         """Copy contact forces of the last step to the part."""
         self._own.to_part(self.whole.state.contact_forces, self.part.state.contact_forces)
 
-    def collect_touch(self) -> None:
-        """Bring contact forces and pressures together on all ranks."""
-        state = self.whole.state
-        if self._triangles is None:
-            return
-        state.contact_forces.assign(self._comm.bcast(self.gather(state.contact_forces), root=0))
-        found = state.contact_pressures.numpy()
-        own = self._triangles.whole
-        for triangles, pressures in self._comm.allgather((own, found[own])):
-            found[triangles] = pressures
-        state.contact_pressures.assign(found)
-
     def take_initial(self) -> None:
         """Copy the state that a reset restores to the part."""
         state = self.whole.state
@@ -164,7 +263,7 @@ class PartSync:
         element, and in the room for nodes of a body that is remeshed. None elsewhere.
         """
         room = None if self.is_in_parts else np.zeros((len(self.whole.state.displacements), *values.shape[1:]))
-        return self._together(values[self._number[self.own_nodes]], room)
+        return self._together(values[self.part_nodes], room)
 
     def _together(self, own: npt.NDArray[Any], elsewhere: npt.NDArray[Any] | None) -> npt.NDArray[Any] | None:
         given = self._comm.gather((self.numbers, own), root=0)
@@ -177,9 +276,9 @@ class PartSync:
         return found
 
     def part_values(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """Values of the part's nodes from those of all nodes of the whole body; zero at ghosts."""
+        """Values of the part's nodes from those of all nodes of the whole mesh; zero at ghosts."""
         found = np.zeros((self.part.node_count, *values.shape[1:]), values.dtype)
-        found[self._number[self.own_nodes]] = values[self.own_nodes]
+        found[self.part_nodes] = values[self.numbers]
         return found
 
     def owns(self, array: wp.array) -> bool:
@@ -208,7 +307,7 @@ class PartSync:
             part.use_loads(part.loads, False)
 
     def _take_keyframes(self) -> None:
-        found = self._followed(self._trajectories, self.whole.conditions.trajectories, self._number)
+        found = self._followed(self._trajectories, self.whole.conditions.trajectories, self._own)
         if found is not None:
             self.part.conditions.set_trajectories(found)
 
@@ -218,39 +317,26 @@ class PartSync:
             return
         part.conditions.make_activation()
         self._elements.to_part(whole.discretization.activation, part.discretization.activation)
-        number = np.full(whole.worlds * whole.world_element_count, -1, np.int32)
-        number[self._elements.whole] = self._elements.part
-        found = self._followed(self._activations, whole.conditions.activations, number)
+        found = self._followed(self._activations, whole.conditions.activations, self._elements)
         if found is not None:
             part.conditions.set_activations(found)
 
-    def _followed(
-        self, known: list[Followed], given: Sequence[Followed], number: npt.NDArray[np.int32]
-    ) -> list[Followed] | None:
-        """The part's share of keyframes of the whole body, from the numbers in the part; None if they are known."""
+    def _followed(self, known: list[Followed], given: Sequence[Followed], places: Places) -> list[Followed] | None:
+        """The part's share of keyframes of the whole body; None if they are known."""
         if len(given) == len(known) and all(map(operator.is_, given, known)):
             return None
         known[:] = given
-        places = [number[each.host_numbers] for each in given]
-        found = [each.of(there >= 0, there, self.part.device) for each, there in zip(given, places, strict=True)]
+        found = []
+        for each in given:
+            here = places_of(each.host_numbers, places.whole)
+            found.append(each.of(here >= 0, places.part[here], self.part.device))
         return [each for each in found if each is not None]
 
 
 # --- gathering -------------------------------------------------------------------------------------------------------
 
-_all: weakref.WeakSet[PartSync] = weakref.WeakSet()
-
-
-def register(syncs: Iterable[PartSync]) -> None:
-    """Register bodies and their parts for ``gather``."""
-    for each in syncs:
-        _all.add(each)
-
-
-def forget(syncs: Iterable[PartSync]) -> None:
-    """Forget bodies and their former parts."""
-    for each in syncs:
-        _all.discard(each)
+#: The last ``PartSync`` of each body, by its identity.
+_known: weakref.WeakValueDictionary[int, PartSync] = weakref.WeakValueDictionary()
 
 
 def gather(array: wp.array) -> npt.NDArray[Any] | None:
@@ -267,10 +353,11 @@ def gather(array: wp.array) -> npt.NDArray[Any] | None:
     """
     if not isinstance(array, wp.array):
         raise InputError(f"array is {shown(array)}; it must be a nodal array of a body, such as body.positions")
-    known = [each for each in _all if each.owns(array)]
+    known = [each for each in _known.values() if each.owns(array)]
     if not known:
-        # Only the length of a copy, such as body.displacements, tells to which body it belongs.
-        known = [each for each in _all if len(array) == each.whole.node_count]
+        # Only the length of a copy, such as body.displacements, tells to which body it belongs. Former ones must go.
+        gc.collect()
+        known = [each for each in _known.values() if len(array) == each.whole.node_count]
     if len(known) != 1:
         raise InputError(
             f"the array [{len(array)}] is of {'no body' if not known else 'several bodies'} in a simulation on several "
