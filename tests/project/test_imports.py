@@ -24,7 +24,7 @@ LARGEST_CIRCLE = 3
 #: Maximum number of imports from a lower floor to a higher one, and what they are: a simulation saves and loads itself,
 #: and a report names the package's version.
 MOST_UPWARDS = 6
-UPWARDS = {("simulation.simulation", "io.checkpoint.archive"), ("experiments.report", "__init__")}
+UPWARDS = {("simulation.simulation", "io.checkpoint.archive")}
 
 
 def test_no_force_law_knows_remeshing():

@@ -12,8 +12,6 @@ import numpy as np
 
 from warp_corot.body.places import named_nodes
 from warp_corot.errors import InputError
-from warp_corot.experiments import paper
-from warp_corot.inputs.choices import SHORT_DURATION
 from warp_corot.io.read.tetrahedra import LoadedMesh
 from warp_corot.mesh import TetForest, TetMesh
 
@@ -30,6 +28,9 @@ if TYPE_CHECKING:
     from warp_corot.mesh.surfaces.bound import SurfaceMesh
 
     from .label_materials import LabelMaterial
+
+#: The box, the beam of Tagawa et al. 2013: its cubes, and their edge [m].
+CELLS, CELL_SIZE = (1, 1, 3), 0.064
 
 
 @dataclass
@@ -172,7 +173,7 @@ def _listed(names: Sequence[str]) -> str:
 
 def _box(scale: float, level: int, offset: np.ndarray) -> InputMesh:
     x, y, z = offset.tolist()
-    return box_subject(TetForest.box(paper.CELLS, paper.CELL_SIZE * scale, level, origin=(x, y, z)))
+    return box_subject(TetForest.box(CELLS, CELL_SIZE * scale, level, origin=(x, y, z)))
 
 
 def box_subject(mesh: TetForest) -> InputMesh:
@@ -180,11 +181,11 @@ def box_subject(mesh: TetForest) -> InputMesh:
     return InputMesh(
         mesh,
         "box",
-        young=paper.MATERIAL["young"],
-        poisson=paper.MATERIAL["poisson"],
-        density=paper.MATERIAL["density"],
+        young=500.0,
+        poisson=0.49,
+        density=10.0,
         fix="z <= zmin",
-        gravity=paper.GRAVITY,
-        damping=paper.Settings.damping,
-        duration=SHORT_DURATION,
+        gravity=(0.0, -9.8, 0.0),
+        damping=15.0,
+        duration=4.0,
     )

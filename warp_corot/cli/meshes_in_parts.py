@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 
 from warp_corot.errors import InputError
-from warp_corot.experiments import paper
 from warp_corot.io.read.volumes import LoadedVolume
 from warp_corot.materials.isotropic import Isotropic
 
 from .exit_status import as_options, complain
 from .input_file import offset_of, open_input, with_unit
-from .input_mesh import InputMesh, box_subject
+from .input_mesh import CELL_SIZE, CELLS, InputMesh, box_subject
 from .label_materials import LabelMaterial, covers_all, label_material, numbers_by_name, parse_labels
 from .multibody import bodies_in
 from .option_rules import refuse_options
@@ -48,7 +47,7 @@ def box_in_parts(args: argparse.Namespace) -> InputMesh:
 
     scale, (x, y, z) = 1.0 if args.scale is None else args.scale, offset_of(args).tolist()
     level = BOX_LEVEL if args.level is None else args.level
-    return box_subject(wd.box(paper.CELLS, paper.CELL_SIZE * scale, level, origin=(x, y, z)))
+    return box_subject(wd.box(CELLS, CELL_SIZE * scale, level, origin=(x, y, z)))
 
 
 def organ_in_parts(args: argparse.Namespace) -> InputMesh:

@@ -13,7 +13,6 @@ COMMANDS = {
     "scene": "step a USD stage: soft bodies, rigid bodies, ground",
     "warm-up": "compile the kernels of frequent runs, so that these start at once",
     "verify": "run cases with known answers, and print a table of results, references and errors",
-    "paper": "run the paper's experiment: a table, results.json and figures 5 to 8",
 }
 
 
