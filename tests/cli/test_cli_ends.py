@@ -13,8 +13,7 @@ import pytest
 from command_line import SHORT, run, simulate
 from stages import frames
 
-from warp_corot.cli.exit_status import interrupt_status
-from warp_corot.cli.signals import terminable
+from warp_corot.cli.terminal import interrupt_status, terminable
 
 OPTIONS = ["young", "poisson", "density", "model", "rotation-level", "fix", "scale", "gravity", "duration", "fps", "dt"]
 OPTIONS += ["damping", "device", "preview", "unit", "tets", "cell-size", "max-level", "surface-error", "labels"]

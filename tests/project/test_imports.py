@@ -9,7 +9,7 @@ import pytest
 from imports import Import, against_the_floors, circles, floor_of, imports, modules
 
 from warp_corot import elasticity, solvers
-from warp_corot.cli.parsing import COMMANDS
+from warp_corot.cli.options import COMMANDS
 from warp_corot.inputs import choices
 from warp_corot.inputs.importing import modules_of_names, public_name
 
@@ -64,7 +64,7 @@ def test_imports_go_down_the_floors():
 
 
 def test_an_import_of_a_higher_floor_is_seen():
-    up, down = Import("mesh.forest", "cli.exit_status", "lazy", 1), Import("cli.exit_status", "mesh.forest", "load", 1)
+    up, down = Import("mesh.forest", "cli.terminal", "lazy", 1), Import("cli.terminal", "mesh.forest", "load", 1)
     assert against_the_floors([up, down]) == [up]
 
 

@@ -20,9 +20,6 @@ from warp_corot.simulation.parts import checked_gravity
 from warp_corot.solvers import SymplecticEuler
 
 from .bodies import model_of
-from .compiling import tell_compiling
-from .exit_status import complain, early_end
-from .loading import Load, loads_of, ramp_of
 from .meshes_in_parts import (
     OF_ORGANS,
     box_in_parts,
@@ -32,9 +29,11 @@ from .meshes_in_parts import (
     needs_young,
     organ_in_parts,
 )
-from .probing import Probe, Table
+from .patches import Load, loads_of, ramp_of
 from .ranks import are_several, hands_out
+from .results import Probe, Table
 from .summary import aligned, milliseconds, speed, wall_time
+from .terminal import complain, early_end, tell_compiling
 
 if TYPE_CHECKING:
     from warp_corot.distributed import Simulation

@@ -11,15 +11,24 @@ from warp_corot.errors import InputError
 from warp_corot.io.read.volumes import LoadedVolume
 from warp_corot.materials.isotropic import Isotropic
 
-from .exit_status import as_options, complain
-from .input_file import offset_of, open_input, with_unit
-from .input_mesh import CELL_SIZE, CELLS, InputMesh, box_subject
-from .label_materials import LabelMaterial, covers_all, label_material, numbers_by_name, parse_labels
-from .multibody import bodies_in
-from .option_rules import refuse_options
-from .options.defaults import BOX_LEVEL
-from .organs import ARGUMENTS, domain_of, fineness_of
+from .input_file import bodies_in, offset_of, open_input, refuse_options, with_unit
+from .input_mesh import (
+    ARGUMENTS,
+    CELL_SIZE,
+    CELLS,
+    InputMesh,
+    LabelMaterial,
+    box_subject,
+    covers_all,
+    domain_of,
+    fineness_of,
+    label_material,
+    numbers_by_name,
+    parse_labels,
+)
+from .options import BOX_LEVEL
 from .summary import values_line
+from .terminal import as_options, complain
 
 #: The options of surfaces and scans beside those of boxes.
 OF_ORGANS = {"unit", "up", "cell_size", "surface_error", "threshold", "smoothing", "join", "labels", "materials"}

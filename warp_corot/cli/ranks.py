@@ -85,7 +85,7 @@ def hands_out(options: Sequence[argparse.Namespace]) -> bool:
     rotations and multigrid require."""
     from warp_corot.solvers import INTEGRATORS
 
-    from .implicit import integrator_name, is_static
+    from .options import integrator_name, is_static
 
     args = options[0]
     touches = (args.tool, args.tool_path, args.blade, args.drop, args.touch, args.self_contact)

@@ -18,7 +18,7 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.likely import meant
 from warp_corot.io.files.whole import check_output, written_whole
 
-from .exit_status import complain
+from .terminal import complain
 
 if TYPE_CHECKING:
     from warp_corot.experiments import Row
@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
     from warp_corot.inputs.device import checked_device
     from warp_corot.simulation.progress import hidden
 
-    from .compiling import tell_compiling
+    from .terminal import tell_compiling
 
     if args.list:
         for case in CASES.values():
