@@ -5,8 +5,7 @@ import pytest
 from hands import TOP, block
 
 import warp_corot as wc
-from warp_corot.viewing.hands import HANDS
-from warp_corot.viewing.implicit_springs import ImplicitSprings, springs_of
+from warp_corot.viewing.hands import HANDS, ImplicitSprings, springs_of
 from warp_corot.viewing.session import Session
 from warp_corot.viewing.shown import ELEMENTS, Shown, surfaces_of
 

@@ -6,9 +6,8 @@ import warp as wp
 from hands import TOP, block
 
 import warp_corot as wc
-from warp_corot.viewing.hands import HANDS, DragHand, patch_around
+from warp_corot.viewing.hands import HANDS, HARDEST, MOST_HANDS, MOST_POINTS, DragHand, Springs, patch_around
 from warp_corot.viewing.shown import ELEMENTS, Shown, surfaces_of
-from warp_corot.viewing.springs import HARDEST, MOST_HANDS, MOST_POINTS, Springs
 
 
 def under_hands(sim):

@@ -34,8 +34,7 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: Bad options, or a page that cannot be opened.
     """
-    from warp_corot.viewing.access_control import check_port
-    from warp_corot.viewing.server import library
+    from warp_corot.viewing.server import check_port, library
     from warp_corot.viewing.view import View
 
     library()
