@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -17,13 +17,10 @@ import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.kernels.viewing import hands as kernels
-from warp_corot.kernels.viewing import implicit_hands as implicit_kernels
 from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import SymplecticEuler, largest_frequency
 
 from .shown import Pick, Shown
-
-# --- springs ---------------------------------------------------------------------------------------------------------
 
 #: Maximum number of hands on a body at the same time, and of points in a patch: one thread loops over them.
 MOST_HANDS, MOST_POINTS = 8, 64
@@ -50,8 +47,8 @@ class HeldPatch:
     area: float
 
 
-class AllSprings:
-    """The springs of all hands of a simulation. ``sim.system.forces`` has one of these.
+class Springs:
+    """The springs of all hands of a simulation, among the forces of its system from the first hold on.
 
     Args:
         sim: The simulation.
@@ -64,21 +61,12 @@ class AllSprings:
     def __init__(self, sim: Simulation, shown: Sequence[Shown]):
         self.sim, self.shown, self.revision = sim, shown, 0
         self._bodies: dict[int, BodySprings] = {}
-        sim.system.forces.append(self)
-
-    def _springs_of(self, body: int) -> BodySprings:
-        """The springs that hold a body, none yet."""
-        raise NotImplementedError
 
     def close(self) -> None:
         """Let everything go and leave the simulation."""
-        self.sim.system.forces.remove(self)
+        if self in self.sim.system.forces:
+            self.sim.system.forces.remove(self)
         self._bodies.clear()
-
-    def add_forces(self) -> None:
-        """Launch the forces of all hands; may be recorded."""
-        for springs in self._bodies.values():
-            springs.launch()
 
     def hold(self, body: int, patch: HeldPatch, *, rigid: bool, strength: float = 1.0) -> Spring:
         """Take hold of a patch as it is now.
@@ -92,8 +80,10 @@ class AllSprings:
         Raises:
             LookupError: The maximum number of hands hold the body already.
         """
+        if not self._bodies:
+            self.sim.system.forces.append(self)
         if body not in self._bodies:
-            self._bodies[body] = self._springs_of(body)
+            self._bodies[body] = BodySprings(self.sim, self.shown[body])
             self.revision += 1
         return self._bodies[body].hold(patch, rigid, strength)
 
@@ -102,21 +92,30 @@ class AllSprings:
         for springs in self._bodies.values():
             springs.refit()
 
+    # --- as forces of the system; all launches may be recorded ------------------------------------------------------
 
-class Springs(AllSprings):
-    """The springs of explicit steps, which count their work themselves."""
-
-    def _springs_of(self, body: int) -> ExplicitSprings:
-        return ExplicitSprings(self.sim, self.shown[body])
-
-    def complete_work(self) -> None:
-        """Launch the count of the work of all hands up to the present state; may be recorded."""
+    def add_forces(self) -> None:
+        """Launch the forces of all hands."""
         for springs in self._bodies.values():
-            springs.launch_completion()
+            state = springs.body.state
+            inputs = [*springs.places, springs.starts, state.displacements, state.velocities]
+            springs.launch(kernels.pull, [*inputs, state.forces, springs.found, springs.softened])
+
+    def add_stiffness(self, body: SoftBody, p: wp.array, y: wp.array) -> None:
+        """Launch y += K p, where K are springs as soft as their limits make them."""
+        for springs in self._bodies.values():
+            if springs.body is body:
+                springs.launch(kernels.add_products, [*springs.places, springs.softened, p, y])
+
+    def add_diagonal(self, body: SoftBody, blocks: wp.array) -> None:
+        """Launch the addition of the blocks on K's diagonal."""
+        for springs in self._bodies.values():
+            if springs.body is body:
+                springs.launch(kernels.add_blocks, [*springs.places, springs.softened, blocks])
 
 
 class Spring:
-    """The spring of one hand; see ``AllSprings.hold``.
+    """The spring of one hand; see ``Springs.hold``.
 
     Attributes:
         stiffness: Stiffness of the spring, for the whole patch [N/m].
@@ -144,17 +143,24 @@ class Spring:
     @property
     def force(self) -> npt.NDArray[np.float64]:
         """The force on the body in the last step [N], float64 [3]; waits for the device."""
-        return self._owner.found()[self.slot, 0]
+        return self._owner.found.numpy()[self.slot, 0].astype(np.float64)
 
     @property
     def ends(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """The middle of the patch, and the place to which the hand pulls it [m], float64 [3] each."""
         middle = self.patch.shares @ self._owner.shown.rest[self.patch.points]
-        return middle + self._owner.found()[self.slot, 1], middle + self.start + self.motion
+        moved = self._owner.found.numpy()[self.slot, 1].astype(np.float64)
+        return middle + moved, middle + self.start + self.motion
 
 
 class BodySprings:
-    """The springs that hold one body."""
+    """The springs that hold one body.
+
+    Attributes:
+        starts: Displacements of the points of each patch when a hand took hold [m], vec3 [hands, points].
+        found: Force [N] and mean displacement [m] of every hand in the last step, vec3 [hands, 2].
+        softened: Stiffness of the springs as their limits make them [N/m], float32 [hands, points].
+    """
 
     def __init__(self, sim: Simulation, shown: Shown):
         self.sim, self.shown, self.body = sim, shown, shown.body
@@ -163,16 +169,18 @@ class BodySprings:
         self._springs = wp.zeros(MOST_HANDS, dtype=kernels.Spring, device=device)
         self._patches = wp.zeros(size, dtype=wp.int32, device=device)
         self._shares = wp.zeros(size, dtype=wp.float32, device=device)
-        self._starts = wp.zeros(size, dtype=wp.vec3, device=device)
-        self._parts = wp.zeros(size, dtype=wp.vec4, device=device)
-        self._found = wp.zeros((MOST_HANDS, 2), dtype=wp.vec3, device=device)
+        self.starts = wp.zeros(size, dtype=wp.vec3, device=device)
+        self.found = wp.zeros((MOST_HANDS, 2), dtype=wp.vec3, device=device)
+        self.softened = wp.zeros(size, dtype=wp.float32, device=device)
+        self._explicit_dt: float | None = None
 
-    def launch(self) -> None:
-        """Launch the forces of the hands."""
-        raise NotImplementedError
+    @property
+    def places(self) -> list[wp.array]:
+        """The first inputs of all launches."""
+        return [self._springs, self._patches, self._shares, self.shown.nodes, self.shown.binding.weights]
 
-    def launch_completion(self) -> None:
-        """Launch the count of their work up to the present state, if they count it."""
+    def launch(self, kernel: wp.Kernel, inputs: list[wp.array]) -> None:
+        wp.launch(kernel, MOST_HANDS, inputs, device=self.body.device)
 
     def hold(self, patch: HeldPatch, rigid: bool, strength: float) -> Spring:
         if None not in self._held:
@@ -183,15 +191,11 @@ class BodySprings:
         self._patches[slot, :count].assign(patch.points.astype(np.int32))
         self._shares[slot, :count].assign(patch.shares.astype(np.float32))
         inputs = [self._patches[slot], self.shown.nodes, self.shown.binding.weights, self.body.state.displacements]
-        wp.launch(kernels.take_hold, count, inputs, [self._starts[slot]], device=self.body.device)
-        spring.start = patch.shares @ self._starts[slot].numpy()[:count]
-        self._begin(slot)
+        wp.launch(kernels.take_hold, count, inputs, [self.starts[slot]], device=self.body.device)
+        spring.start = patch.shares @ self.starts[slot].numpy()[:count]
         self._fit(spring)
         self.write(slot)
         return spring
-
-    def _begin(self, slot: int) -> None:
-        """Forget what an earlier hand left."""
 
     def release(self, slot: int, spring: Spring) -> None:
         if self._held[slot] is spring:
@@ -215,19 +219,13 @@ class BodySprings:
         given = wp.array(row, dtype=kernels.Spring, device=self.body.device)
         wp.copy(self._springs, given, dest_offset=slot, count=1)
 
-    def found(self) -> npt.NDArray[np.float64]:
-        """Force [N] and mean displacement [m] of every hand in the last step, float64 [hands, 2, 3]."""
-        return self._found.numpy().astype(np.float64)
-
     def _fit(self, spring: Spring) -> None:
         """The stiffness and the damping that are stable at the time step."""
         # Copied, since a view of a device's array may be the array itself.
         nodes = np.array(self.shown.nodes.numpy()[spring.patch.points])
         weights = np.array(self.shown.binding.weights.numpy()[spring.patch.points], dtype=np.float64)
         weights *= spring.patch.shares[:, None]
-        used, place, visits = np.unique(nodes, return_inverse=True, return_counts=True)
-        place = place.reshape(nodes.shape)
-        self._parts[spring.slot, : len(nodes)].assign((1.0 / visits[place]).astype(np.float32))
+        used, place = np.unique(nodes, return_inverse=True)
         total = np.bincount(place.ravel(), np.abs(weights).ravel(), len(used))
         mass = self.body.masses[used]
         # The largest eigenvalue of the spring over masses for a stiffness of one: exact if the hand holds the mean,
@@ -236,116 +234,19 @@ class BodySprings:
         dt = self._longest_step()
         spring.stiffness = spring.strength * STIFF / (dt**2 * softness)
         spring.limit = HARDEST * float(np.mean(self.body.material.isotropic.young)) * spring.patch.area
-        spring.damping = 2.0 * DAMPED * (spring.stiffness / softness) ** 0.5
+        if not self.sim.system.is_implicit:
+            spring.damping = 2.0 * DAMPED * (spring.stiffness / softness) ** 0.5
 
     def _longest_step(self) -> float:
-        """The explicit step that the springs must bear [s]."""
-        safe = self.sim.safe_step
-        return self.sim.dt if safe is None else safe.at_rest
-
-
-class ExplicitSprings(BodySprings):
-    """The springs that hold one body in explicit steps."""
-
-    def __init__(self, sim: Simulation, shown: Shown):
-        super().__init__(sim, shown)
-        device = self.body.device
-        self._counted = wp.zeros(MOST_HANDS, dtype=wp.float32, device=device)
-        self._last = wp.zeros((MOST_HANDS, MOST_POINTS), dtype=wp.vec3, device=device)
-
-    def launch(self) -> None:
-        system, state, shown = self.sim.system, self.body.state, self.shown
-        inputs = [self._springs, self._patches, self._shares, self._starts, self._parts, shown.nodes]
-        inputs += [shown.binding.weights, system.pace.arrays, system.offset, system.gravity]
-        inputs += [self.body.conditions.inverse_mass, state.displacements, state.velocities]
-        outputs = [self._last, self._counted, state.forces, self._found, system.support_work]
-        wp.launch(kernels.pull, MOST_HANDS, inputs, outputs, device=self.body.device)
-
-    def launch_completion(self) -> None:
-        system, shown = self.sim.system, self.shown
-        inputs = [self._springs, self._patches, shown.nodes, shown.binding.weights]
-        inputs += [system.pace.arrays, self.body.state.velocities]
-        outputs = [self._last, self._counted, system.support_work]
-        wp.launch(kernels.complete_work, MOST_HANDS, inputs, outputs, device=self.body.device)
-
-    def _begin(self, slot: int) -> None:
-        self._last[slot].zero_()
-
-
-# --- springs of implicit steps ---------------------------------------------------------------------------------------
-
-
-def springs_of(sim: Simulation, shown: Sequence[Shown]) -> AllSprings:
-    """The springs of all hands of a simulation, for its kind of steps.
-
-    Args:
-        sim: The simulation.
-        shown: The shown surface of each body.
-    """
-    return (ImplicitSprings if sim.system.is_implicit else Springs)(sim, shown)
-
-
-class ImplicitSprings(AllSprings):
-    """The springs of implicit steps, as stiff as those of explicit ones."""
-
-    def _springs_of(self, body: int) -> StiffSprings:
-        return StiffSprings(self.sim, self.shown[body])
-
-    def add_stiffness(self, body: SoftBody, p: wp.array, y: wp.array) -> None:
-        """Launch y += K p, where K are springs as soft as their limits make them; may be recorded."""
-        for springs in self._on(body):
-            springs.launch_product(p, y)
-
-    def add_diagonal(self, body: SoftBody, blocks: wp.array) -> None:
-        """Launch the addition of the blocks on K's diagonal; may be recorded."""
-        for springs in self._on(body):
-            springs.launch_blocks(blocks)
-
-    def _on(self, body: SoftBody) -> list[StiffSprings]:
-        return [cast("StiffSprings", springs) for springs in self._bodies.values() if springs.body is body]
-
-
-class StiffSprings(BodySprings):
-    """The springs that hold one body in implicit steps."""
-
-    def __init__(self, sim: Simulation, shown: Shown):
-        super().__init__(sim, shown)
-        shape = (MOST_HANDS, MOST_POINTS)
-        self._softened = wp.zeros(shape, dtype=wp.float32, device=self.body.device)
-        self._explicit_dt: float | None = None
-
-    def launch(self) -> None:
-        state = self.body.state
-        inputs = [*self._places, self._starts, state.displacements]
-        self._launch(implicit_kernels.pull, [*inputs, state.forces, self._found, self._softened])
-
-    def launch_product(self, p: wp.array, y: wp.array) -> None:
-        """Launch y += K p."""
-        self._launch(implicit_kernels.add_products, [*self._places, self._softened, p, y])
-
-    def launch_blocks(self, blocks: wp.array) -> None:
-        """Launch the addition of the blocks on K's diagonal."""
-        self._launch(implicit_kernels.add_blocks, [*self._places, self._softened, blocks])
-
-    @property
-    def _places(self) -> list[wp.array]:
-        shown = self.shown
-        return [self._springs, self._patches, self._shares, shown.nodes, shown.binding.weights]
-
-    def _longest_step(self) -> float:
+        """The explicit step that the springs must bear [s]; those of implicit steps are as stiff."""
+        sim = self.sim
+        if not sim.system.is_implicit:
+            return sim.dt if sim.safe_step is None else sim.safe_step.at_rest
         if self._explicit_dt is None:
-            sim, k = self.sim, self.sim.bodies.index(self.body)
+            k = sim.bodies.index(self.body)
             frequency = largest_frequency(self.body, sim.fields[k].stiffest, sim.ranks, k)
             self._explicit_dt = SymplecticEuler().stable_step(frequency)
         return self._explicit_dt
-
-    def _launch(self, kernel: wp.Kernel, inputs: list[wp.array]) -> None:
-        wp.launch(kernel, MOST_HANDS, inputs, device=self.body.device)
-
-
-# --- hands -----------------------------------------------------------------------------------------------------------
-
-Vector = npt.NDArray[np.float64]
 
 
 class SpringHand:
@@ -362,28 +263,28 @@ class SpringHand:
     rigid: ClassVar[bool] = False
     stays: ClassVar[bool] = False
 
-    def __init__(self, springs: AllSprings, shown: Shown, pick: Pick, radius: float, strength: float = 1.0):
+    def __init__(self, springs: Springs, shown: Shown, pick: Pick, radius: float, strength: float = 1.0):
         self.pick = pick
         self._inward = -shown.normal(pick)
         self._spring = springs.hold(pick.body, patch_around(shown, pick, radius), rigid=self.rigid, strength=strength)
-        self._before: Vector = np.zeros(3)
+        self._before: npt.NDArray[np.float64] = np.zeros(3)
 
     def begin(self) -> None:
         """Take hold again: motion counts from here."""
         self._before = self._spring.motion
 
-    def move(self, motion: Vector) -> None:
+    def move(self, motion: npt.NDArray[np.float64]) -> None:
         self._spring.move(self._before + motion)
 
     def release(self) -> None:
         self._spring.release()
 
     @property
-    def force(self) -> Vector:
+    def force(self) -> npt.NDArray[np.float64]:
         return self._spring.force
 
     @property
-    def ends(self) -> tuple[Vector, Vector]:
+    def ends(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         return self._spring.ends
 
 
@@ -396,7 +297,7 @@ class PressHand(SpringHand):
 
     rigid = True
 
-    def move(self, motion: Vector) -> None:
+    def move(self, motion: npt.NDArray[np.float64]) -> None:
         self._spring.move(float(np.linalg.norm(motion)) * self._inward)
 
 

@@ -24,7 +24,7 @@ from warp_corot.simulation.remade import remade, tools_lent
 from warp_corot.simulation.simulation import Simulation
 
 from .colors import Range, Source, sources
-from .hands import HANDS, SpringHand, springs_of
+from .hands import HANDS, SpringHand, Springs
 from .shown import Plane, Shown, cut, surfaces_of
 from .tools import ToolHand, new_tool
 
@@ -353,9 +353,8 @@ class Session:
     def prepare(self) -> None:
         """Compile what frames, hands and the page's tools launch, several modules at a time."""
         explicit = not self.sim.system.is_implicit
-        hands = "viewing.hands" if explicit else "viewing.implicit_hands"
         contact = CONTACT if explicit and not self.sim.device.is_cuda else ()
-        load(["viewing.values", hands, *contact], self.sim.device)
+        load(["viewing.values", "viewing.hands", *contact], self.sim.device)
         self.sim.advance_steps(1)
         self.frame()
 
@@ -457,7 +456,7 @@ class Session:
             self._close()
         pairs = zip(self.sim.bodies, self.surfaces, strict=True)
         self.shown = [Shown(body, self._surface(body.mesh, surfaces), self.controls.world) for body, surfaces in pairs]
-        self.springs = springs_of(self.sim, self.shown)
+        self.springs = Springs(self.sim, self.shown)
         self.number += 1
         for shown in self.shown:
             shown.read()
