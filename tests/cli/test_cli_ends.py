@@ -79,7 +79,7 @@ def test_a_file_for_paraview_that_cannot_be_written_is_named(folder, capsys, mon
     assert len(frames(folder / "a.usd")) >= 1
 
 
-@pytest.mark.parametrize("args", [["--help"], ["simulate", "--help"], ["paper", "--help"]])
+@pytest.mark.parametrize("args", [["--help"], ["simulate", "--help"], ["verify", "--help"]])
 def test_help(args, capsys):
     assert run(*args) == 0
     said = capsys.readouterr().out

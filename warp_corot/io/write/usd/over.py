@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +16,8 @@ from warp_corot.io.files.usd import reason, usd_name
 from warp_corot.io.files.whole import sync
 from warp_corot.io.read.usd.scene import Scene, TetPrim
 
-from .colored import ColoredStage
 from .over_prims import BodyOver, PointsOver, TetsOver, bind_look, draw_ground
-from .pieces import PieceStore, Samples
+from .pieces import ColoredStage, Samples
 
 #: Metadata that the stage on top copies from the stage below.
 _OWN = ("subLayers", "subLayerOffsets", "startTimeCode", "endTimeCode", "timeCodesPerSecond", "framesPerSecond")
@@ -94,7 +92,8 @@ class SceneWriter(ColoredStage):
         show_stress: bool = False,
         flatten: bool = False,
     ):
-        super().__init__(_Store(path, scene.path))
+        super().__init__(path)
+        self._below = _way(self.path, scene.path.resolve())
         if self.path.exists() and self.path.samefile(scene.path):
             raise InputError(f"{self.path}: is the input; it must be another file")
         if scene.uses(self.path):
@@ -120,7 +119,7 @@ class SceneWriter(ColoredStage):
         """
         self._check_open()
         if not self.frames:
-            self._store.declare(self._layer)
+            self.declare(self._layer)
         samples: Samples = {}
         for index, soft in enumerate(self._soft):
             samples |= soft.samples(state.positions[index], state.velocities[index], state.von_mises[index])
@@ -137,38 +136,22 @@ class SceneWriter(ColoredStage):
             OSError: It could not be written; former frames stay and play.
         """
         was_open = not self._closed
+        if self._static is not None:
+            self._static.subLayerPaths = [self._below]
         super().close()
         if was_open and self._flatten and self.frames:
             _flatten(self.path)
+
+    def _root_layer(self, pieces: list[tuple[float, float]]) -> Sdf.Layer:
+        root = super()._root_layer(pieces)
+        root.subLayerPaths.append(self._below)
+        return root
 
     def _colors(self, samples: Samples, nodal: NDArray[np.float64] | None = None) -> Samples:
         colors: Samples = {}
         for soft in self._soft:
             colors |= soft.colors(samples, self.stress_range[1])
         return colors
-
-
-class _Store(PieceStore):
-    """Frames over a stage, which lies beneath all layers; the pieces give values to all its root prims."""
-
-    def __init__(self, path: str | Path, below: Path):
-        super().__init__(path)
-        self._below = below.resolve()
-
-    def finish(self, transform: Callable[[Samples], Mapping[str, Any]] | None = None) -> None:
-        if self._static is not None:
-            self._static.subLayerPaths = [_way(self.path, self._below)]
-        super().finish(transform)
-
-    def _root_layer(self, pieces: list[tuple[float, float]]) -> Sdf.Layer:
-        root = super()._root_layer(pieces)
-        if len(root.subLayerPaths) == 1:
-            root.subLayerPaths.append(_way(self.path, self._below))
-        clips = root.GetPrimAtPath(f"/{root.defaultPrim}").GetInfo("clips")
-        for name in sorted({f"/{path.split('/')[1].split('.')[0]}" for path in self._varying}):
-            own = {key: dict(values) | {"primPath": name} for key, values in clips.items()}
-            Sdf.CreatePrimInLayer(root, name).SetInfo("clips", own)
-        return root
 
 
 def _base_layer(scene: Scene, fps: float) -> Sdf.Layer:
