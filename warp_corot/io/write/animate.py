@@ -27,7 +27,7 @@ from .provenance import provenance, steps_made
 from .skins import BoundSkins, has_domain
 
 if TYPE_CHECKING:
-    from warp_corot.io.write.usd.touched import Touched
+    from warp_corot.io.write.usd.prims import Touched
     from warp_corot.io.write.usd.writer import UsdWriter
 
     from .paraview import Writer
@@ -305,7 +305,7 @@ def _write_frame(writer: UsdWriter, sim: Simulation, joined: _Joined, done: Reco
 
 def _touched(sim: Simulation, joined: _Joined) -> Touched | None:
     """Contact on the drawn bodies, if there is any in the simulation."""
-    from warp_corot.io.write.usd.touched import Touched
+    from warp_corot.io.write.usd.prims import Touched
 
     if sim.contact is None:
         return None

@@ -16,12 +16,9 @@ from warp_corot.io.write.provenance import KEY
 from warp_corot.io.write.skins import Skin
 from warp_corot.mesh.surfaces.boundary import right_handed, signed_volumes
 
-from .materials import declare_physics
-from .obstacles import ObstaclePrim, obstacle_prims
+from .physics import ObstaclePrim, declare_physics, obstacle_prims
 from .pieces import ColoredStage, Samples
-from .prims import ROOT, SURFACE, TETS, Frame, Present, SkinPrim, Statics, floats, skin_paths
-from .tets import TetPrims
-from .touched import Touched
+from .prims import ROOT, SURFACE, TETS, Frame, Present, SkinPrim, Statics, TetPrims, Touched, floats, skin_paths
 
 __all__ = ["ROOT", "SURFACE", "TETS", "Mesh", "UsdWriter"]
 
@@ -47,7 +44,7 @@ class UsdWriter(ColoredStage):
     ``contactPressure`` [Pa] (vertex, in each frame). Both show the stress as ``displayColor``: averages over the
     tetrahedra around each node, as indices into the 256 colours of `colors.stress_colors`; custom
     data of ``/SoftBody`` name the map and its range. ``/SoftBody/physics`` has the physics materials, and with
-    ``gravity`` a physics scene, see `usd.materials.declare_physics`.
+    ``gravity`` a physics scene, see `usd.physics.declare_physics`.
 
     Mirrored tetrahedra are written with two indices swapped, so that all are right-handed as the schema requires.
 
@@ -64,7 +61,7 @@ class UsdWriter(ColoredStage):
     their ``velocities``, as the schema defines it for meshes that change.
 
     Obstacles are prims below ``/SoftBody/obstacles``: a Sphere, Capsule, Cylinder, Cube or Plane each; a tool has its
-    place, its turn and the force and torque on it in each frame (`usd.obstacles.ObstaclePrim`).
+    place, its turn and the force and torque on it in each frame (`usd.physics.ObstaclePrim`).
 
     Args:
         path: The output: .usd or .usdc (binary) or .usda (text). A former file stays until the first frames are
