@@ -72,7 +72,7 @@ def test_a_file_for_paraview_that_cannot_be_written_is_named(folder, capsys, mon
         raise OSError(errno.ENOSPC, "a long story of HDF5")
 
     monkeypatch.setattr("meshio.write", lambda *_, **__: fail())
-    monkeypatch.setattr("warp_corot.io.write.xdmf.XdmfWriter._stored", fail)
+    monkeypatch.setattr("warp_corot.io.write.paraview.XdmfWriter._stored", fail)
     assert simulate("box", "-o", "a.usd", "--also", name, *SHORT) == 1
     named = "a_frames/a_00000.vtu" if name == "a.pvd" else name
     assert capsys.readouterr().err == f"warp-corot: error: {named}: cannot be written: No space left on device\n"

@@ -9,8 +9,7 @@ from pictures import CUBE, FACES, picture_of, render_preview, render_strip
 from PIL import Image, ImageChops
 
 from warp_corot.io.pictures.film import write_film
-from warp_corot.io.pictures.lettering import fit_line
-from warp_corot.io.pictures.preview import Picture
+from warp_corot.io.pictures.preview import Picture, fit_line
 
 RUN = ["box", "-o", "a.usd", *SHORT]  # frames 0, 1 and 2
 

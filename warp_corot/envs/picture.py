@@ -9,9 +9,8 @@ import numpy.typing as npt
 
 from warp_corot.contact.tool import Obstacle
 from warp_corot.errors import InputError
-from warp_corot.io.pictures.camera import Camera
 from warp_corot.io.pictures.colors import VertexAverage
-from warp_corot.io.pictures.drawing import draw_body
+from warp_corot.io.pictures.drawing import Camera, draw_body
 from warp_corot.io.write.solids import poses_of, shape_of, solid_of
 
 if TYPE_CHECKING:

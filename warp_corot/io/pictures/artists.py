@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.artist import Artist
 from numpy.typing import NDArray
 
-from .camera import Array
+from .drawing import Array
 
 
 class Triangles(Artist):

@@ -4,7 +4,10 @@ A surface is drawn as triangles, back to front (painter's algorithm): faces that
 cut into pieces small enough for smooth shading, whose corners are shaded and colours between them interpolated.
 """
 
+from __future__ import annotations
+
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -12,12 +15,119 @@ from numpy.typing import ArrayLike, NDArray
 
 from warp_corot.errors import InputError
 
-from .camera import Array, Camera
 from .colors import STEEL, TISSUE, color_index, round_limit, srgb_to_linear, stress_colors
-from .shadow import draw_shadow
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+# --- the camera ------------------------------------------------------------------------------------------------------
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A mild perspective view. The viewer looks along ``-axes[2]``; picture coordinates are right and up.
+
+    Attributes:
+        center: Point in the middle of the picture [m], [3].
+        axes: Rows: right, up, towards the viewer; [3, 3].
+        distance: From the viewer to ``center`` [m].
+        world_up: The stage's up direction, [3].
+    """
+
+    center: Array
+    axes: Array
+    distance: float
+    world_up: Array
+
+    @classmethod
+    def fit(cls, points: ArrayLike, up_axis: str = "Y", azimuth: float = 35.0, elevation: float = 14.0) -> Camera:
+        """A camera that sees all of ``points`` [n, 3] from ``azimuth`` [°] round the up axis and ``elevation`` [°].
+
+        Azimuth 0 looks along −Z where Y is up, along +Y where Z is up, along −Y where X is up.
+        """
+        right, up, front = _world_axes(up_axis)
+        a, e = math.radians(azimuth), math.radians(elevation)
+        towards = math.cos(e) * (math.cos(a) * front + math.sin(a) * right) + math.sin(e) * up
+        across = math.cos(a) * right - math.sin(a) * front
+        x = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+        low, high = x.min(axis=0), x.max(axis=0)
+        size = float(np.linalg.norm(high - low)) or 1.0
+        axes = np.stack([across, np.cross(towards, across), towards])
+        return cls((low + high) / 2.0, axes, 3.5 * size, up)
+
+    def project(self, points: Array) -> tuple[Array, Array]:
+        """Picture coordinates [..., 2] and depth [...] (larger is nearer) of points [..., 3]."""
+        seen = ((points - self.center).reshape(-1, 3) @ self.axes.T).reshape(points.shape)
+        depth = seen[..., 2]
+        return seen[..., :2] * (self.distance / (self.distance - depth))[..., None], depth
+
+    def rays(self, points: Array) -> Array:
+        """Unit vectors from points [..., 3] to the viewer."""
+        towards = self.center + self.distance * self.axes[2] - points
+        return towards / np.linalg.norm(towards, axis=-1, keepdims=True)
+
+    def sees_outside(self, points: Array, faces: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which triangles [n, 3] of points [N, 3] show their outer side."""
+        u, v = self.project(points)[0].T
+        a, b, c = faces.T
+        return (u[b] - u[a]) * (v[c] - v[a]) > (v[b] - v[a]) * (u[c] - u[a])
+
+
+def _world_axes(up_axis: str) -> tuple[Array, Array, Array]:
+    """Right, up and front (towards a viewer at azimuth 0), a right-handed triple."""
+    if up_axis not in ("X", "Y", "Z"):
+        raise InputError(f"up_axis is {up_axis!r}; it must be X, Y or Z")
+    x, y, z = np.eye(3)
+    return {"Y": (x, y, z), "Z": (x, z, -y), "X": (z, x, y)}[up_axis]
+
+
+# --- soft shadows on the ground --------------------------------------------------------------------------------------
+
+
+def draw_shadow(ax: Axes, triangles: Array, camera: Camera, height: float, cells: int = 120) -> Array:
+    """Draw a soft shadow on the ground: the body's points projected along the light, counted in cells and blurred.
+
+    Returns the picture coordinates [n, 2] of the cells that are visibly dark.
+    """
+    from matplotlib.collections import QuadMesh
+    from scipy.ndimage import gaussian_filter
+
+    up = camera.world_up
+    right = camera.axes[0]
+    back = np.cross(up, right)  # with ``right`` it spans the ground
+    bary = np.random.default_rng(0).dirichlet((1.0, 1.0, 1.0), size=max(1, 40_000 // len(triangles)))
+    points = np.einsum("sb,fbx->fsx", bary, triangles).reshape(-1, 3)
+    dropped = dropped_shadow(points, camera, height)
+    flat = np.stack([dropped @ right, dropped @ back], axis=1)
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    margin = 0.22 * float((high - low).max()) + 1e-12
+    low, high = low - margin, high + margin
+    dark = np.zeros((cells, cells))
+    dark[tuple(np.minimum((flat - low) / (high - low) * cells, cells - 1).astype(int).T)] = 1.0
+    # Two widths: a tight contact shadow within a wide soft one.
+    dark = 0.5 * gaussian_filter(dark, 0.012 * cells) + 0.5 * gaussian_filter(dark, 0.05 * cells)
+    middles = low + (np.arange(cells)[:, None] + 0.5) / cells * (high - low)
+    u, v = np.meshgrid(*middles.T, indexing="ij")
+    ground = u[..., None] * right + v[..., None] * back + height * up
+    picture, _ = camera.project(ground)
+    # Opaque on white: transparent cells that overlap by part of a pixel would show their seams.
+    tint = 1.0 - 0.26 * dark[..., None] * (1.0 - np.array([0.20, 0.20, 0.27]))
+    mesh = QuadMesh(picture, facecolor=tint[:-1, :-1].reshape(-1, 3), antialiased=False, zorder=0)
+    ax.add_collection(mesh, autolim=False)
+    return picture[dark > 0.2]
+
+
+def dropped_shadow(points: Array, camera: Camera, height: float) -> Array:
+    """Projections of points [n, 3] along the light onto the ground [n, 3]."""
+    up, right = camera.world_up, camera.axes[0]
+    light = -0.30 * right + 1.0 * up - 0.12 * np.cross(up, right)
+    lift = np.maximum(points @ up - height, 0.0)
+    return points - lift[:, None] / (light @ up) * light
+
+
+# --- the body --------------------------------------------------------------------------------------------------------
 
 INK = "#3b3640"
 _PIECES = 30_000  # approximate number of triangles of a body
@@ -28,7 +138,7 @@ _GHOST, _GHOST_LINE = (0.90, 0.91, 0.93), (0.74, 0.76, 0.80)
 
 
 def draw_body(
-    ax: "Axes",
+    ax: Axes,
     positions: ArrayLike,
     faces: ArrayLike,
     *,
@@ -209,7 +319,7 @@ def _shade(base: Array, normals: Array, rays: Array, camera: Camera) -> Array:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
-def draw_silhouette(ax: "Axes", x: Array, tri: NDArray[np.int64], camera: Camera) -> None:
+def draw_silhouette(ax: Axes, x: Array, tri: NDArray[np.int64], camera: Camera) -> None:
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path
 
@@ -224,7 +334,7 @@ def draw_silhouette(ax: "Axes", x: Array, tri: NDArray[np.int64], camera: Camera
 
 
 def _draw_outline(
-    ax: "Axes", x: Array, front: NDArray[np.int64], color: Any, camera: Camera, *, width: float, order: int
+    ax: Axes, x: Array, front: NDArray[np.int64], color: Any, camera: Camera, *, width: float, order: int
 ) -> None:
     """Draw lines along edges of only one of the faces that face the viewer [n, 3]; inner ones are drawn over."""
     from matplotlib.collections import LineCollection
@@ -237,7 +347,7 @@ def _draw_outline(
     ax.add_collection(drawn, autolim=False)
 
 
-def _fill(ax: "Axes", polygons: Array, face: Any, edge: Any, *, width: float, order: int) -> None:
+def _fill(ax: Axes, polygons: Array, face: Any, edge: Any, *, width: float, order: int) -> None:
     from matplotlib.collections import PolyCollection
 
     collection = PolyCollection(
@@ -246,7 +356,7 @@ def _fill(ax: "Axes", polygons: Array, face: Any, edge: Any, *, width: float, or
     ax.add_collection(collection, autolim=False)
 
 
-def _draw_dots(ax: "Axes", x: Array, faces: NDArray[np.int64], held: NDArray[np.bool_], camera: Camera) -> None:
+def _draw_dots(ax: Axes, x: Array, faces: NDArray[np.int64], held: NDArray[np.bool_], camera: Camera) -> None:
     """Draw dots on held nodes of the faces that face the viewer, where nothing hides them, and far enough apart."""
     marked = np.unique(faces[held[faces]])
     if not len(marked):

@@ -12,7 +12,7 @@ from pxr import Kind, Sdf, Usd, UsdGeom
 from warp_corot.contact.tool import Obstacle
 from warp_corot.errors import InputError
 from warp_corot.io.pictures.colors import VertexAverage
-from warp_corot.io.write.provenance import KEY
+from warp_corot.io.write.animate import KEY
 from warp_corot.io.write.skins import Skin
 from warp_corot.mesh.surfaces.boundary import right_handed, signed_volumes
 
