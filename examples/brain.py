@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from scipy.ndimage import binary_closing
 
 import warp_corot as wc
-from warp_corot.io.pictures.preview import draw_body
+from warp_corot.io.pictures.drawing import draw_body
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--device", help="cpu or cuda:0")

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from scipy.ndimage import binary_dilation, binary_erosion
 
 import warp_corot as wc
-from warp_corot.io.pictures.preview import draw_body
+from warp_corot.io.pictures.drawing import draw_body
 from warp_corot.io.read.volumes import load_volume
 
 parser = argparse.ArgumentParser(description=__doc__)

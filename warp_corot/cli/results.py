@@ -270,8 +270,8 @@ def _ground(sim: Simulation, points: np.ndarray) -> np.ndarray:
 # --- pictures of frames from several sides, or a film of all of them -------------------------------------------------
 
 MOST_PANELS, MOST_COLUMNS = 12, 4
-#: Pixels of each view of a film, and its approximate number of polygons.
-FILM_SIZE, FILM_PIECES = (640, 540), 15_000
+#: Pixels of each view of a film.
+FILM_SIZE = (640, 540)
 #: Directions in which points may lie farthest out, [3, 26].
 OUTWARDS = np.array([each for each in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(each)]).T
 
@@ -360,7 +360,6 @@ class Previews:
                     titled=True,
                     value_range=(0.0, self._highest),
                     size=(FILM_SIZE[0] * sides, FILM_SIZE[1]) if film else (1200, 900) if one else None,
-                    fineness=1 if film else 2,
                     columns=sides if film or 1 < sides < len(pictures) else min(len(pictures), MOST_COLUMNS),
                 )
             yield strip.draw(pictures, title)
@@ -388,8 +387,6 @@ class Previews:
         options: dict[str, Any] = {"held": shown.held} if shown.held.any() else {}
         if len(shown.ground):
             options["square"] = shown.ground
-        if is_film(self.args.preview):
-            options["pieces"] = FILM_PIECES
         return [
             Picture(shown.positions, shown.triangles, shown.values, shown.rest, words, options, view)
             for view, words in zip(self.views, titles, strict=True)
