@@ -18,7 +18,7 @@ from warp_corot.body.places import TAKEN, named_nodes
 from warp_corot.domain.units import in_units
 from warp_corot.errors import InputError
 from warp_corot.holding.regions import LOWEST, BodyShape, flat_region
-from warp_corot.inputs.keys import checked_times
+from warp_corot.inputs.checks import checked_times
 from warp_corot.inputs.selection import select_nodes
 from warp_corot.mesh.surfaces.bodies import boundary_surface
 from warp_corot.mesh.surfaces.boundary import boundary_faces

@@ -134,7 +134,7 @@ class Table:
         """
         energy = self._sim.energy()
         values = [value for probe in self._probes for value in probe.values()]
-        values += [value for each in self._obstacles.values() for value in _felt(each)]
+        values += [value for each in self._obstacles.values() for value in _felt(each).values()]
         row = [self._sim.time, *values, energy.kinetic, energy.elastic, energy.gravitational, self._sim.dt]
         with writing(self.path):
             if self._file is None:
@@ -154,25 +154,18 @@ class Table:
             of = f"body {bodies.index(probe.body) + 1}: " if len(bodies) > 1 else ""
             names += [f"{of}{probe.text} {column}" for column in COLUMNS]
         for name, each in self._obstacles.items():
-            names += [f"{name} {column}" for column in _felt_columns(each)]
+            names += [f"{name} {column}" for column in _felt(each)]
         return [*names, "kinetic [J]", "elastic [J]", "gravitational [J]", "dt [s]"]
 
 
-def _felt_columns(obstacle: Obstacle) -> list[str]:
-    """Names and units of `_felt`."""
-    forces = [f"force {axis} [N]" for axis in "xyz"]
-    if not isinstance(obstacle, Tool):
-        return forces
-    return [f"{axis} [m]" for axis in "xyz"] + forces + [f"torque {axis} [N m]" for axis in "xyz"]
-
-
-def _felt(obstacle: Obstacle) -> list[float]:
-    """The force on an obstacle in the last step [N]; for a tool its place [m] before, and the torque about it [N m]
+def _felt(obstacle: Obstacle) -> dict[str, float]:
+    """The force on an obstacle in the last step by columns; for a tool its place before, and the torque about it
     after."""
-    wrench = [float(value) for value in obstacle.wrench.numpy()[0]]
+    names = [*(f"force {axis} [N]" for axis in "xyz"), *(f"torque {axis} [N m]" for axis in "xyz")]
+    felt = dict(zip(names, map(float, obstacle.wrench.numpy()[0]), strict=True))
     if not isinstance(obstacle, Tool):
-        return wrench[:3]
-    return [*obstacle.present_pose[0, :3].tolist(), *wrench]
+        return {name: felt[name] for name in names[:3]}
+    return dict(zip((f"{axis} [m]" for axis in "xyz"), obstacle.present_pose[0, :3].tolist(), strict=True)) | felt
 
 
 # --- what pictures show at one time ----------------------------------------------------------------------------------
@@ -209,15 +202,24 @@ class DrawnBodies:
 
     def frame(self, sim: Simulation) -> PreviewFrame:
         """The current state."""
-        u, held = (np.concatenate(each) for each in zip(*map(_state_of, self._soft), strict=True))
+        from warp_corot.io.write.solids import ground_corners, poses_of, shape_of, solid_of
+
+        u = np.concatenate([soft.displacements.numpy() for soft in self._soft])
+        held = np.concatenate([soft.constrained.astype(float) for soft in self._soft])
         stress = np.concatenate([self._stress(k, sim) for k in range(len(self._soft))])
         parts: list[tuple[np.ndarray, ...]] = [
             (skin.surface.moved(u), skin.surface.triangles, skin.values(stress), skin.surface.points, skin.values(held))
             for skin in self._skins.on([soft.mesh for soft in self._soft])
         ]
-        ground = _ground(sim, np.concatenate([part[3] for part in parts]))
-        for points, faces in _solids(sim):
-            parts.append((points, faces, np.full(len(points), np.nan), points, np.zeros(len(points))))
+        rests, ground = np.concatenate([part[3] for part in parts]), np.zeros((0, 3))
+        obstacles = () if sim.contact is None else sim.contact.obstacles.given
+        for each, pose in zip(obstacles, poses_of(obstacles), strict=True):
+            shape = shape_of(each)
+            if isinstance(shape, Ground) and not len(ground):
+                ground = ground_corners(shape, rests)
+            if (solid := solid_of(shape)) is not None:
+                points = solid.at(pose)
+                parts.append((points, solid.triangles, np.full(len(points), np.nan), points, np.zeros(len(points))))
         firsts = np.cumsum([0, *(len(part[0]) for part in parts)])
         moved, faces, values, rest, fixed = zip(*parts, strict=True)
         return PreviewFrame(
@@ -240,31 +242,6 @@ class DrawnBodies:
             volumes = np.abs(signed_volumes(mesh.points, mesh.tets))
             self._averages[k] = mesh, VertexAverage(mesh.tets, volumes, len(mesh.points))
         return self._averages[k][1](sim.von_mises(self._soft[k]))
-
-
-def _state_of(soft: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Displacements [m], [N, 3], and one where nodes are held, [N]."""
-    return soft.displacements.numpy(), soft.constrained.astype(float)
-
-
-def _solids(sim: Simulation) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Points [m] and triangles of the obstacles where they are."""
-    from warp_corot.io.write.solids import poses_of, shape_of, solid_of
-
-    given = () if sim.contact is None else sim.contact.obstacles.given
-    for each, pose in zip(given, poses_of(given), strict=True):
-        solid = solid_of(shape_of(each))
-        if solid is not None:
-            yield solid.at(pose), solid.triangles
-
-
-def _ground(sim: Simulation, points: np.ndarray) -> np.ndarray:
-    """Corners of a square of the first ground below the bodies [4, 3]; [0, 3] without."""
-    from warp_corot.io.write.solids import ground_corners, shape_of
-
-    given = () if sim.contact is None else sim.contact.obstacles.given
-    grounds = [shape for shape in map(shape_of, given) if isinstance(shape, Ground)]
-    return ground_corners(grounds[0], points) if grounds else np.zeros((0, 3))
 
 
 # --- pictures of frames from several sides, or a film of all of them -------------------------------------------------

@@ -10,11 +10,11 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import fields
 from types import FrameType
-from typing import TYPE_CHECKING, Any, NoReturn, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.stopwatch import KERNELS, WATCH
@@ -64,21 +64,15 @@ def as_options(names: Mapping[str, str]) -> Iterator[None]:
         warnings.warn(named(str(warning.message)), warning.category, stacklevel=3)
 
 
-def kept_so_far(done: Recording) -> str:
-    """The result of a run that ended early."""
-    if not done.frames:
-        return "no frame was written"
-    frames = "1 frame is" if done.frames == 1 else f"{done.frames} frames, {done.simulated:.3g} s, are"
-    return f"{frames} kept in {done.path}"
-
-
 def early_end(error: BaseException, done: Recording) -> int:
     """Say what ended a recording early, and what is kept; returns the exit status."""
+    frames = "1 frame is" if done.frames == 1 else f"{done.frames} frames, {done.simulated:.3g} s, are"
+    kept = f"{frames} kept in {done.path}" if done.frames else "no frame was written"
     if isinstance(error, KeyboardInterrupt):
-        complain(f"interrupted; {kept_so_far(done)}", kind="")
+        complain(f"interrupted; {kept}", kind="")
         return interrupt_status(error)
     if isinstance(error, UnstableError):
-        complain(f"{as_option(str(error))}; {kept_so_far(done)}")
+        complain(f"{as_option(str(error))}; {kept}")
         return 3
     complain(str(error))
     return 1
@@ -87,17 +81,13 @@ def early_end(error: BaseException, done: Recording) -> int:
 def complain(message: str, kind: str = "error") -> None:
     """Print ``warp-corot: KIND: MESSAGE``, always as one line."""
     text = " ".join(message.split())
+    bars = getattr(sys.modules.get("tqdm"), "tqdm", None)  # None also during its import
     try:
-        with _bars_aside():
+        # Progress bars, if any, are shown again below what is printed.
+        with nullcontext() if bars is None else bars.external_write_mode(file=sys.stderr):
             print(f"warp-corot: {kind}: {text}" if kind else f"warp-corot: {text}", file=sys.stderr, flush=True)
     except OSError:  # the message cannot be shown; the simulation must not be lost because of that
         silence(sys.stderr)
-
-
-def _bars_aside() -> AbstractContextManager[Any]:
-    """Hide progress bars, if any, and show them again below what is printed inside."""
-    bars = getattr(sys.modules.get("tqdm"), "tqdm", None)  # None also during its import
-    return nullcontext() if bars is None else bars.external_write_mode(file=sys.stderr)
 
 
 def open_streams() -> None:
@@ -133,17 +123,30 @@ def terminable() -> Iterator[None]:
     """Let SIGINT and SIGTERM end the block by an exception, after the current import or destructor, if any.
 
     During an import, USD's modules swallow the exception, and the run would continue; NumPy's turn it into
-    another one. Python itself ignores exceptions of destructors.
+    another one. Python itself ignores exceptions of destructors. Signals that are ignored, as they are in background
+    processes, stay so.
     """
 
-    def interrupt() -> NoReturn:
-        raise KeyboardInterrupt
+    def handle(number: int, frame: FrameType | None) -> None:
+        if _is_heard(frame):
+            raise Terminated if number == signal.SIGTERM else KeyboardInterrupt
+        if _may_leave:
+            complain("interrupted", kind="")
+            os._exit(128 + number)
+        again = threading.Timer(WAIT, _thread.interrupt_main, [number])
+        again.daemon = True
+        again.start()
 
-    def terminate() -> NoReturn:
-        raise Terminated
-
-    with _handled(_when_heard(interrupt), signal.SIGINT), _handled(_when_heard(terminate), signal.SIGTERM):
+    mine = threading.current_thread() is threading.main_thread()
+    before = {each: signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)} if mine else {}
+    before = {number: handler for number, handler in before.items() if handler not in (signal.SIG_IGN, None)}
+    try:
+        for number in before:
+            signal.signal(number, handle)
         yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @contextmanager
@@ -157,20 +160,6 @@ def leaving_at_once() -> Iterator[None]:
         _may_leave = before
 
 
-def _when_heard(end: Callable[[], NoReturn]) -> Callable[[int, FrameType | None], None]:
-    def handle(number: int, frame: FrameType | None) -> None:
-        if _is_heard(frame):
-            end()
-        if _may_leave:
-            complain("interrupted", kind="")
-            os._exit(128 + number)
-        again = threading.Timer(WAIT, _thread.interrupt_main, [number])
-        again.daemon = True
-        again.start()
-
-    return handle
-
-
 def _is_heard(frame: FrameType | None) -> bool:
     """Whether an exception ends the run: neither an import nor a destructor called from ``main`` is under way."""
     while frame is not None and not (frame.f_code.co_name == "main" and frame.f_globals.get("__name__") == __package__):
@@ -178,21 +167,6 @@ def _is_heard(frame: FrameType | None) -> bool:
             return False
         frame = frame.f_back
     return True
-
-
-@contextmanager
-def _handled(handler: Callable[[int, FrameType | None], None], number: signal.Signals) -> Iterator[None]:
-    """Set another handler for a signal unless it is ignored, as it is in background processes."""
-    before = signal.getsignal(number)
-    mine = threading.current_thread() is threading.main_thread()
-    changed = mine and before not in (signal.SIG_IGN, None)
-    if changed:
-        signal.signal(number, handler)
-    try:
-        yield
-    finally:
-        if changed:
-            signal.signal(number, before)
 
 
 # --- progress --------------------------------------------------------------------------------------------------------
@@ -226,21 +200,17 @@ def _show(what: str, over: threading.Event) -> None:
         return
     from tqdm import tqdm
 
+    from warp_corot.inputs.loading import progress
+
     with tqdm(desc=what, leave=False, file=sys.stderr, bar_format="{desc}, {elapsed}") as line:
         line.start_t -= SILENT
         while not over.wait(EVERY):
-            line.set_description_str(what + _left_to_compile())
-
-
-def _left_to_compile() -> str:
-    from warp_corot.inputs.loading import progress
-
-    found = progress()
-    if found is None:
-        return ""
-    done, count, left = found
-    words = f", compiling {done + 1} of {count} modules"
-    return words if left is None else f"{words}, about {max(left, 1.0):.0f} s left"
+            words, found = what, progress()
+            if found is not None:
+                done, count, left = found
+                words += f", compiling {done + 1} of {count} modules"
+                words += "" if left is None else f", about {max(left, 1.0):.0f} s left"
+            line.set_description_str(words)
 
 
 # --- compiling -------------------------------------------------------------------------------------------------------
@@ -290,15 +260,13 @@ def _listen() -> None:
 
 def _heard(event: str, args: tuple[Any, ...]) -> None:
     global has_compiled, _device
-    if event == "os.mkdir" and _in_kernel_cache(args[0]):
+    if event != "os.mkdir":
+        return
+    import warp as wp
+
+    cache = wp.config.kernel_cache_dir  # set when Warp starts
+    if cache and os.fsdecode(args[0]).startswith(os.path.join(cache, "")):
         has_compiled = True
         device, _device = _device, ""
         if device:
             complain(f"compiling kernels for {device}, once: this takes some seconds ...", kind="")
-
-
-def _in_kernel_cache(path: Any) -> bool:
-    import warp as wp
-
-    cache = wp.config.kernel_cache_dir  # set when Warp starts
-    return bool(cache) and os.fsdecode(path).startswith(os.path.join(cache, ""))
