@@ -66,11 +66,6 @@ class Camera:
         depth = seen[..., 2]
         return seen[..., :2] * (self.distance / (self.distance - depth))[..., None], depth
 
-    def rays(self, points: Array) -> Array:
-        """Unit vectors from points [..., 3] to the viewer."""
-        towards = self.center + self.distance * self.axes[2] - points
-        return towards / np.linalg.norm(towards, axis=-1, keepdims=True)
-
     def sees_outside(self, points: Array, faces: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Which triangles [n, 3] of points [N, 3] show their outer side."""
         u, v = self.project(points)[0].T
