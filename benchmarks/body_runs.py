@@ -31,9 +31,8 @@ def measured(path: Path, options: list[str], tets: int, device: str) -> dict[str
     import warp as wp
 
     from warp_corot.cli import make_parser
-    from warp_corot.cli.input_file import open_input
-    from warp_corot.cli.multibody import bodies_in
-    from warp_corot.cli.organs import find_organ
+    from warp_corot.cli.input_file import bodies_in, open_input
+    from warp_corot.cli.input_mesh import find_organ
     from warp_corot.errors import InputError
     from warp_corot.io.read.tetrahedra import load_tets
 
@@ -91,7 +90,7 @@ def _load_kernels(device: str) -> None:
 
     from warp_corot.cli import make_parser
     from warp_corot.cli.input_file import open_input
-    from warp_corot.cli.organs import find_organ
+    from warp_corot.cli.input_mesh import find_organ
 
     with warnings.catch_warnings(), tempfile.TemporaryDirectory() as folder:
         warnings.simplefilter("ignore")

@@ -20,11 +20,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+import paper_beam as paper
 import warp as wp
 from measure import Parser, machine, number, save, table, tell
 
 import warp_corot as wc
-from warp_corot.experiments import paper
 from warp_corot.inputs.device import checked_device
 
 #: The time is divided into parts [s]. The first ones record the steps and are not timed.

@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from paper_figures import FAINT, INK, LINEAR, OWN_COLOR, STYLE
 
 from warp_corot.domain import Domain
 from warp_corot.errors import InputError
-from warp_corot.experiments.figures import FAINT, INK, LINEAR, OWN_COLOR, STYLE
 from warp_corot.io.files.whole import check_output, written_whole
 from warp_corot.mesh import TetForest
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+import paper_beam as paper
 import warp as wp
 import work
 from measure import Case, kind
@@ -13,7 +14,6 @@ from problem import SUBTREE_LEVELS, Problem, Sample, oracle, padded, relative_er
 import warp_corot as wc
 from warp_corot.body.worlds import World
 from warp_corot.elasticity import ForceField, Model
-from warp_corot.experiments import paper
 from warp_corot.solvers.steps.pace import Pace
 from warp_corot.solvers.system import System
 

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import paper_beam as paper
 import warp as wp
 from measure import kind
 
 import warp_corot as wc
-from warp_corot.experiments import paper
 
 #: A soft tissue whose elements have a dilatation each by default; Young's modulus [Pa], density [kg/m^3]. From a
 #: Poisson's ratio of 0.45 on elements share it.

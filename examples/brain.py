@@ -11,12 +11,12 @@ import time
 from importlib.util import find_spec
 
 import numpy as np
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from scipy.ndimage import binary_closing
 
 import warp_corot as wc
-from warp_corot.io.pictures.preview import draw_body
-from warp_corot.io.pictures.sections import Section
+from warp_corot.io.pictures.drawing import draw_body
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--device", help="cpu or cuda:0")
@@ -35,7 +35,6 @@ look = mesh.bind(look.points, look.triangles)  # the drawn surface
 print(*brain.report(), *mesh.summary(), f"meshed after {time.process_time():.1f} s", sep="\n")
 closed = binary_closing(np.pad(brain.numbers[::2, ::2, ::2] > 0, 9), np.ones((3, 3, 3)), iterations=6)[9:-9, 9:-9, 9:-9]
 skull = wc.Domain.from_labels(closed, affine=brain.affine @ np.diag([2, 2, 2, 1]), smoothing=2e-3)
-
 across, up = np.array([[0.8, 0.0, -0.6], [0.6, 0.0, 0.8]])
 top = look.points[np.argmax(look.points @ up)]
 dry = (mesh.points - top) @ up > -args.drained
@@ -47,14 +46,16 @@ done = wc.record(sim, args.output, duration=args.duration, fps=12.0, surface=loo
 u = body.displacements.numpy()
 sag = 1e3 * (look.points - look.moved(u)) @ up
 print(f"{done.steps} steps in {done.stepping:.1f} s; the brain sags by up to {sag.max():.1f} mm")
-
-section = Section(mesh, brain, top, across, up, [[-0.12, 0.09], [-0.15, 0.015]], 5e-4)
-x, y, bone = section.right, section.above, skull.phi(section.points).reshape(section.right.shape)
+x, y = np.meshgrid(np.arange(-0.12, 0.09, 5e-4), np.arange(-0.15, 0.015, 5e-4))  # a plane, in squares
+plane, table = top + np.stack([x.ravel(), y.ravel()], axis=1) @ [across, up], ListedColormap(["#c98f86", "#f3e7d3"])
+bone, tissue = skull.phi(plane).reshape(x.shape), np.ma.masked_equal(brain.labels_at(plane).reshape(x.shape), 0)
 axes = (figure := Figure(figsize=(12, 4.2), layout="constrained")).subplots(1, 3)
 for ax, moved, level in ((axes[0], None, 0.0), (axes[1], u, -args.drained)):
     ax.contourf(x, y, np.maximum(bone, y - level), [-1.0, 1e-3], colors=["#cfe3ee"])
     ax.contourf(x, y, np.where((np.abs(x) < 0.035) & (y > -0.04), np.nan, bone), [1e-3, 7e-3], colors=["#a9a294"])
-    section.draw(ax, moved, {"grey": "#c98f86", "white": "#f3e7d3"})
+    at = (plane if moved is None else mesh.bind(plane).moved(moved)) - top
+    ax.pcolormesh((at @ across).reshape(x.shape), (at @ up).reshape(x.shape), tissue[1:, 1:], cmap=table)
+    ax.set(xlim=(-0.12, 0.09), ylim=(-0.15, 0.015), aspect="equal", frame_on=False, xticks=[], yticks=[])
 front = look.moved(u) @ np.stack([-across, [0.0, -1.0, 0.0], up], axis=1)
 draw_body(axes[2], front, look.triangles, scalars=np.maximum(sag, 0), up_axis="Z", ground=False)
 figure.savefig(args.output.rpartition(".")[0] + ".png", dpi=150)

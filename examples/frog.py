@@ -10,12 +10,12 @@ import time
 from importlib.util import find_spec
 
 import numpy as np
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from scipy.ndimage import binary_dilation, binary_erosion
 
 import warp_corot as wc
-from warp_corot.io.pictures.preview import draw_body
-from warp_corot.io.pictures.sections import Section
+from warp_corot.io.pictures.drawing import draw_body
 from warp_corot.io.read.volumes import load_volume
 
 parser = argparse.ArgumentParser(description=__doc__)
@@ -39,7 +39,6 @@ labels = {name: numbers for name, (numbers, _, _) in tissues.items()}
 frog = wc.Domain.from_labels(voxels, affine=np.diag([0.4, -0.4, -0.6, 1]), unit="mm", labels=labels, smoothing=4e-4)
 mesh = wc.TetForest.from_domain(frog, 0.012, max_level=8, surface_error=6e-4)
 print(*frog.report(), *mesh.summary(), f"meshed after {time.process_time():.1f} s", sep="\n")
-
 x, middle = mesh.points, frog.bounds.mean(axis=0)[1]
 young = 1e3 * np.array([modulus for _, modulus, _ in tissues.values()])[mesh.labels - 1]
 body = wc.SoftBody(mesh, wc.Isotropic(young, poisson=0.45, density=1050.0), device=args.device)
@@ -48,13 +47,16 @@ body.fix(mesh.nodes_of("bone") & back)
 sim = wc.Simulation(body, integrator=wc.SymplecticEuler(damping=4.0))
 done = wc.record(sim, args.output, duration=args.duration, tets=True)
 print(f"{done.steps} steps in {done.stepping:.1f} s; it hangs down by up to {100 * done.final_displacement:.1f} cm")
-
 u, look = body.displacements.numpy(), mesh.surface()
-section = Section(mesh, frog, [0, middle, 0], [1, 0, 0], [0, 0, 1], [[0.0, 0.105], [-0.055, 0.0]], 4e-4)
+right, above = np.meshgrid(np.arange(0.0, 0.105, 4e-4), np.arange(-0.055, 0.0, 4e-4))  # a plane, in squares
+plane, shape = np.stack([right, np.full_like(right, middle), above], axis=-1).reshape(-1, 3), right.shape
+tissue = np.ma.masked_equal(frog.labels_at(plane).reshape(shape)[1:, 1:], 0)
+table = ListedColormap([colour for _, _, colour in tissues.values()])
 axes = (figure := Figure(figsize=(12, 3.8), layout="constrained")).subplots(1, 3)
 for ax, moved in ((axes[0], None), (axes[1], u)):
-    section.draw(ax, moved, {name: colour for name, (_, _, colour) in tissues.items()})
-    ax.set_ylim(-0.09, 0.0)
+    at = plane if moved is None else mesh.bind(plane).moved(moved)
+    ax.pcolormesh(at[:, 0].reshape(shape), at[:, 2].reshape(shape), tissue, cmap=table, vmin=0.5, vmax=10.5)
+    ax.set(xlim=(0.0, 0.105), ylim=(-0.09, 0.0), aspect="equal", frame_on=False, xticks=[], yticks=[])
 draw_body(axes[2], look.moved(u), look.triangles, rest=look.points, up_axis="Z", ground=False)
 figure.savefig(args.output.rpartition(".")[0] + ".png", dpi=150)
 print(f"wrote {args.output}")

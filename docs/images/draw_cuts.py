@@ -15,8 +15,7 @@ import numpy as np
 from PIL import Image
 
 import warp_corot as wc
-from warp_corot.io.pictures.camera import Camera
-from warp_corot.io.pictures.drawing import draw_body
+from warp_corot.io.pictures.drawing import Camera, draw_body
 
 IMAGES = Path(__file__).resolve().parent
 #: Pixels of a frame's sides, colours of a film, and the time that each frame is shown [ms].

@@ -21,8 +21,8 @@ from PIL import Image
 
 import warp_corot as wc
 from warp_corot.cli import main as warp_corot
-from warp_corot.cli.preview_frame import DrawnBodies
-from warp_corot.io.pictures.preview import Camera, draw_body
+from warp_corot.cli.results import DrawnBodies
+from warp_corot.io.pictures.drawing import Camera, draw_body
 
 ROOT = Path(__file__).resolve().parents[2]
 IMAGES, EXAMPLES = ROOT / "docs" / "images", ROOT / "examples"

@@ -13,8 +13,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from PIL import Image
 
-from warp_corot.experiments.verification import CASES, Setup
-from warp_corot.io.pictures.preview import Camera, draw_body
+from warp_corot.experiments import CASES, Setup
+from warp_corot.io.pictures.drawing import Camera, draw_body
 from warp_corot.io.write.solids import poses_of, shape_of, solid_of
 
 #: Cases, and azimuth and elevation of the camera [°].

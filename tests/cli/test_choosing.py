@@ -7,7 +7,7 @@ import pytest
 from command_line import simulate
 
 import warp_corot as wc
-from warp_corot.cli.choosing import _stable_step
+from warp_corot.cli.run_setup import _stable_step
 
 
 def steps_of(capsys, *options):

@@ -10,7 +10,7 @@ from pxr import UsdGeom
 from stages import frames, opened
 
 import warp_corot as wc
-from warp_corot.cli.options.run import CHOICES
+from warp_corot.cli.options import CHOICES
 
 CUBE = wc.TetForest.box((1, 1, 1), 0.1, 3)
 

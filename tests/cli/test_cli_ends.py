@@ -13,8 +13,7 @@ import pytest
 from command_line import SHORT, run, simulate
 from stages import frames
 
-from warp_corot.cli.exit_status import interrupt_status
-from warp_corot.cli.signals import terminable
+from warp_corot.cli.terminal import interrupt_status, terminable
 
 OPTIONS = ["young", "poisson", "density", "model", "rotation-level", "fix", "scale", "gravity", "duration", "fps", "dt"]
 OPTIONS += ["damping", "device", "preview", "unit", "tets", "cell-size", "max-level", "surface-error", "labels"]
@@ -73,14 +72,14 @@ def test_a_file_for_paraview_that_cannot_be_written_is_named(folder, capsys, mon
         raise OSError(errno.ENOSPC, "a long story of HDF5")
 
     monkeypatch.setattr("meshio.write", lambda *_, **__: fail())
-    monkeypatch.setattr("warp_corot.io.write.xdmf.XdmfWriter._stored", fail)
+    monkeypatch.setattr("warp_corot.io.write.paraview.XdmfWriter._stored", fail)
     assert simulate("box", "-o", "a.usd", "--also", name, *SHORT) == 1
     named = "a_frames/a_00000.vtu" if name == "a.pvd" else name
     assert capsys.readouterr().err == f"warp-corot: error: {named}: cannot be written: No space left on device\n"
     assert len(frames(folder / "a.usd")) >= 1
 
 
-@pytest.mark.parametrize("args", [["--help"], ["simulate", "--help"], ["paper", "--help"]])
+@pytest.mark.parametrize("args", [["--help"], ["simulate", "--help"], ["verify", "--help"]])
 def test_help(args, capsys):
     assert run(*args) == 0
     said = capsys.readouterr().out

@@ -114,7 +114,7 @@ def test_folder_without_permission(folder, capsys):
 
 
 def test_preview_without_matplotlib(folder, capsys, monkeypatch):
-    monkeypatch.setattr("warp_corot.cli.previews.find_spec", lambda name: None)
+    monkeypatch.setattr("warp_corot.cli.results.find_spec", lambda name: None)
     assert simulate("box", "-o", "a.usd", "--preview", "a.png", *SHORT) == 2
     assert "warp-corot[plot]" in capsys.readouterr().err
     assert list(folder.iterdir()) == []

@@ -17,7 +17,7 @@ from stages import SURFACE, TETS, drawn, prims
 import warp_corot as wc
 import warp_corot.cli.run_setup as command
 from warp_corot.cli import bodies
-from warp_corot.cli.organs import DETAIL
+from warp_corot.cli.input_mesh import DETAIL
 from warp_corot.domain import Domain
 
 

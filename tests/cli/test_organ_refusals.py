@@ -9,7 +9,7 @@ import trimesh
 from command_line import assert_refused
 from input_files import write_scan, write_surface
 
-from warp_corot.cli.label_materials import parse_labels, parse_pressure
+from warp_corot.cli.input_mesh import parse_labels, parse_pressure
 
 
 def refused_files(folder: Path) -> None:

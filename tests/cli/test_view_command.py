@@ -14,9 +14,7 @@ from command_line import run
 
 import warp_corot as wc
 from warp_corot.cli import make_parser
-from warp_corot.cli.options.declared import add_declared
-from warp_corot.cli.options.run import RunOptions
-from warp_corot.cli.parsing import StrictParser
+from warp_corot.cli.options import RunOptions, StrictParser, add_declared
 from warp_corot.cli.run_file import bodies_of
 from warp_corot.cli.run_setup import set_up
 from warp_corot.cli.view import _carry_over, run_text

@@ -14,11 +14,11 @@ termios = pytest.importorskip("termios")
 
 SLOW_SCAN = """
 import sys, time
-from warp_corot.cli import main, run_setup, waiting
-waiting.SILENT = waiting.EVERY = 0.05
+from warp_corot.cli import main, run_setup, terminal
+terminal.SILENT = terminal.EVERY = 0.05
 found = run_setup.find_body
 def slow(body):
-    from warp_corot.cli.exit_status import complain
+    from warp_corot.cli.terminal import complain
     time.sleep(1.0)
     complain("of something", kind="note")
     time.sleep(1.0)

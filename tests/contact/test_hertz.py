@@ -6,7 +6,7 @@ import pytest
 from half_balls import half_ball
 
 import warp_corot as wc
-from warp_corot.experiments.verification.half_spaces import CONTACT, POISSON, RADIUS, YOUNG
+from warp_corot.experiments.half_spaces import CONTACT, POISSON, RADIUS, YOUNG
 
 
 @pytest.mark.parametrize("finest", [(12, 9), pytest.param((15, 12), marks=pytest.mark.slow)])

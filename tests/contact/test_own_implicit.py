@@ -7,7 +7,7 @@ from organs import BALL, SOFT, ball_mesh, brick_mesh, crossing, fork_mesh, groun
 from soft_blocks import DOWN, force_on, weight
 
 import warp_corot as wc
-from warp_corot.experiments.verification.half_spaces import (
+from warp_corot.experiments.half_spaces import (
     CONTACT,
     DEPTH,
     FORCE,

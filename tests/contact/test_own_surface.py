@@ -6,7 +6,7 @@ import warp as wp
 from organs import BALL, SOFT, ball_mesh, brick_mesh, crossing, fork_mesh, ground
 
 import warp_corot as wc
-from warp_corot.experiments.verification.half_spaces import (
+from warp_corot.experiments.half_spaces import (
     CONTACT,
     DEPTH,
     FORCE,

@@ -6,7 +6,7 @@ from half_balls import half_ball
 from soft_surfaces import DOWN, block, folded, force_on, roof, weight
 
 import warp_corot as wc
-from warp_corot.experiments.verification.half_spaces import CONTACT, POISSON, RADIUS, YOUNG
+from warp_corot.experiments.half_spaces import CONTACT, POISSON, RADIUS, YOUNG
 
 EULER = wc.BackwardEuler(dt=0.016)
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 import warp as wp
 
-from warp_corot.cli import compiling
+from warp_corot.cli import terminal
 from warp_corot.inputs import stopwatch
 from warp_corot.inputs.stopwatch import KERNELS, WATCH, Stopwatch
 from warp_corot.kernels.stepping import pace
@@ -53,7 +53,7 @@ def test_other_threads_do_not_count(now):
 
 def test_loading_kernels_is_no_stepping():
     """Once the command listens, whichever launch comes first."""
-    compiling._listen()
+    terminal._listen()
     module = wp.get_module(pace.__name__)
     module.unload()
     WATCH.begin("", 0.0)

@@ -8,7 +8,6 @@ from pxr import Usd, UsdGeom
 from stages import SURFACE, TETS, assert_whole, edges_meet_in_pairs, faults, prims
 
 import warp_corot as wc
-from warp_corot.io.pictures.sections import Section
 from warp_corot.io.read.tetrahedra import load_tets
 from warp_corot.io.write.animate import Recording, record
 
@@ -135,22 +134,6 @@ def test_smooth_surfaces_stay_whole(device, tmp_path, labels):
             assert np.linalg.norm(after - before, axis=1).max() < 1.2 * 2.0 / 400
         volumes = [np.linalg.det(x[triangles]).sum() / 6.0 for x in frames]
         assert min(volumes) > 0.5 * volumes[0]
-
-
-def test_sections_go_along_with_the_present_mesh():
-    domain = core("cpu")
-    sim = pulled_ball(domain, "cpu")
-    body = sim.body
-    section = Section(body.mesh, domain, [0, 0, 0], [1, 0, 0], [0, 1, 0], [[-0.06, 0.06], [-0.06, 0.06]], 4e-3)
-    numbers, count = section.numbers.copy(), body.element_count
-    sim.advance_steps(100)
-    assert body.element_count != count
-    gradient = np.array([[0.2, 0.1, 0.0], [0.0, -0.1, 0.0], [0.3, 0.0, 0.1]])
-    section.rebind(body.mesh)
-    right, above = section.moved(body.mesh.points @ gradient.T)
-    expected = section.points @ (np.eye(3) + gradient).T
-    np.testing.assert_allclose(np.stack([right.ravel(), above.ravel()], axis=1), expected[:, :2], atol=1e-12)
-    np.testing.assert_array_equal(section.numbers, numbers)
 
 
 def test_frames_are_kept_however_a_run_ends(tmp_path):

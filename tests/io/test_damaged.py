@@ -62,7 +62,7 @@ def test_triangles_whose_areas_are_too_small_for_a_number():
 
 
 def test_two_dashes_are_no_value(tmp_path, capsys):
-    for command in (["paper", f"--output={tmp_path}/out", "--device=--"], ["simulate", "box", "--output=--"]):
+    for command in (["verify", f"--json={tmp_path}/out.json", "--device=--"], ["simulate", "box", "--output=--"]):
         with pytest.raises(SystemExit) as left:
             main(command)
         assert left.value.code == 2

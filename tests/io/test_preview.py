@@ -1,6 +1,5 @@
 """Pictures: visible parts are in the right place and colour."""
 
-import builtins
 import sys
 
 import numpy as np
@@ -13,7 +12,9 @@ pytest.importorskip("matplotlib")
 from matplotlib.figure import Figure
 from pictures import CUBE, FACES, SIZE, picture_of, render_preview, render_strip
 
-from warp_corot.io.pictures.preview import Camera, Picture, draw_body
+from warp_corot.io.pictures import preview
+from warp_corot.io.pictures.drawing import Camera, draw_body
+from warp_corot.io.pictures.preview import Picture
 
 
 def body_pixels(path) -> np.ndarray:
@@ -130,8 +131,8 @@ def test_drawing_into_a_users_axes():
     left, right = figure.subplots(1, 2)
     camera = draw_body(left, CUBE, FACES, scalars=np.arange(8.0), edges=True)
     assert draw_body(right, 0.5 * CUBE, FACES, camera=camera, ground=-0.5) is camera
-    assert left.collections
-    assert right.collections
+    assert left.images
+    assert right.images
     assert "matplotlib.pyplot" not in sys.modules or not sys.modules["matplotlib.pyplot"].get_fignums()
 
 
@@ -160,13 +161,8 @@ def test_bad_input_is_refused_and_keeps_the_picture(tmp_path, monkeypatch):
         with pytest.raises(InputError, match=match):
             render_preview(*arguments, size=SIZE, **options)
 
-    def without_matplotlib(name, *args, **kwargs):
-        if name.startswith("matplotlib"):
-            raise ImportError(name)
-        return original(name, *args, **kwargs)
-
-    original = builtins.__import__
-    monkeypatch.setattr(builtins, "__import__", without_matplotlib)
+    monkeypatch.setattr(preview, "find_spec", lambda name: None)
+    preview.font_of.cache_clear()
     with pytest.raises(InputError, match=r'pip install "warp-corot\[plot\]"'):
         render_preview(path, CUBE, FACES, size=SIZE)
     assert path.read_bytes() == good
@@ -195,6 +191,6 @@ def test_dots_are_hidden_by_what_is_before_them(tmp_path):
         # From along that diagonal, so that the corner is behind the middle of the first.
         azimuth, elevation = np.degrees([np.arctan2(1.0, 2.0), np.arctan2(1.0, np.sqrt(5.0))])
         view = (azimuth, elevation)
-        render_preview(tmp_path / "a.png", both, faces, held=held, size=SIZE, pieces=1, view=view)
+        render_preview(tmp_path / "a.png", both, faces, held=held, size=SIZE, view=view)
         pictures[name] = picture_of(tmp_path / "a.png").astype(int)
     np.testing.assert_array_equal(pictures["hidden"], pictures["none"])

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from foreign_meshes import VOLUME, grid
 
-from warp_corot.io.read.filemesh import Block
-from warp_corot.io.read.split import fan, split_polyhedron, split_solids, triangles_of
+from warp_corot.io.read.filemesh import Block, fan, split_polyhedron, split_solids, triangles_of
 from warp_corot.mesh.surfaces.boundary import boundary_faces, signed_volumes
 
 

@@ -9,7 +9,7 @@ import pytest
 from imports import Import, against_the_floors, circles, floor_of, imports, modules
 
 from warp_corot import elasticity, solvers
-from warp_corot.cli.parsing import COMMANDS
+from warp_corot.cli.options import COMMANDS
 from warp_corot.inputs import choices
 from warp_corot.inputs.importing import modules_of_names, public_name
 
@@ -24,7 +24,7 @@ LARGEST_CIRCLE = 3
 #: Maximum number of imports from a lower floor to a higher one, and what they are: a simulation saves and loads itself,
 #: and a report names the package's version.
 MOST_UPWARDS = 6
-UPWARDS = {("simulation.simulation", "io.checkpoint.archive"), ("experiments.report", "__init__")}
+UPWARDS = {("simulation.simulation", "io.checkpoint.archive")}
 
 
 def test_no_force_law_knows_remeshing():
@@ -64,7 +64,7 @@ def test_imports_go_down_the_floors():
 
 
 def test_an_import_of_a_higher_floor_is_seen():
-    up, down = Import("mesh.forest", "cli.exit_status", "lazy", 1), Import("cli.exit_status", "mesh.forest", "load", 1)
+    up, down = Import("mesh.forest", "cli.terminal", "lazy", 1), Import("cli.terminal", "mesh.forest", "load", 1)
     assert against_the_floors([up, down]) == [up]
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from warp_corot.cli import main
-from warp_corot.experiments.verification import CASES, Row, Setup, run_case
+from warp_corot.experiments import CASES, Row, Setup, run_case
 
 
 @pytest.mark.parametrize("full", [False, pytest.param(True, marks=pytest.mark.slow)])

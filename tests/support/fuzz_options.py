@@ -33,12 +33,12 @@ def _options(command: str) -> list[argparse.Action]:
 
 def random_options(rng: np.random.Generator) -> list[str]:
     """The words of a command."""
-    command = str(rng.choice(["simulate"] * 8 + ["scene", "paper"]))
+    command = str(rng.choice(["simulate"] * 8 + ["scene"]))
     line = [command]
-    if rng.random() < 0.95 and command != "paper":
+    if rng.random() < 0.95:
         line.append("scene.usda" if command == "scene" and rng.random() < 0.7 else str(rng.choice(INPUTS)))
     if rng.random() < 0.95:
-        line += ["-o", {"simulate": "out.usd", "scene": "out.usd", "paper": "out"}[command]]
+        line += ["-o", "out.usd"]
     if command == "simulate" and rng.random() < 0.6:
         line += ["--tets", "300"]
     options = _options(command)

@@ -98,7 +98,6 @@ def prepared(scenes: bool) -> None:
     from warp_corot.body.soft_body import SoftBody
     from warp_corot.cli import bodies, scene, simulate  # noqa: F401 (all modules that read files)
     from warp_corot.domain import surface
-    from warp_corot.experiments import paper
     from warp_corot.io.read import files
     from warp_corot.io.write import animate
     from warp_corot.mesh import TetForest
@@ -141,7 +140,6 @@ def prepared(scenes: bool) -> None:
     SoftBody.__init__ = body  # type: ignore[method-assign]
     TetForest.from_domain = mesh  # type: ignore[method-assign]
     animate.record = stop
-    paper.beam = stop
     cli.make_parser = functools.cache(cli.make_parser)
     read = files.read_with
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 import warp_corot as wc
-from warp_corot.experiments.verification.half_spaces import (
+from warp_corot.experiments.half_spaces import (
     CONTACT,
     HALF,
     POISSON,

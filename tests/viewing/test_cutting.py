@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 import warp_corot as wc
-from warp_corot.viewing.cutting import Plane, cut
-from warp_corot.viewing.shown import MARCHED, surfaces_of
+from warp_corot.viewing.shown import MARCHED, Plane, cut, surfaces_of
 
 
 def box():

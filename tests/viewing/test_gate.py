@@ -11,7 +11,7 @@ import pytest
 from hands import block
 
 import warp_corot as wc
-from warp_corot.viewing.access_control import AccessControl, is_loopback
+from warp_corot.viewing.server import AccessControl, is_loopback
 from warp_corot.viewing.view import View
 
 WEBSOCKET = {

@@ -5,8 +5,7 @@ import pytest
 from hands import TOP, block
 
 import warp_corot as wc
-from warp_corot.viewing.hands import HANDS
-from warp_corot.viewing.implicit_springs import ImplicitSprings, springs_of
+from warp_corot.viewing.hands import HANDS, Springs
 from warp_corot.viewing.session import Session
 from warp_corot.viewing.shown import ELEMENTS, Shown, surfaces_of
 
@@ -15,9 +14,7 @@ EULER, DAMPED = wc.BackwardEuler(dt=1 / 60), wc.BackwardEuler(dt=1 / 60, damping
 
 def hand_at(sim, kind, place=TOP):
     shown = Shown(sim.body, surfaces_of(sim.body.mesh)[ELEMENTS])
-    springs = springs_of(sim, [shown])
-    assert isinstance(springs, ImplicitSprings)
-    return HANDS[kind](springs, shown, shown.pick(0, place), 0.02)
+    return HANDS[kind](Springs(sim, [shown]), shown, shown.pick(0, place), 0.02)
 
 
 @pytest.mark.parametrize("kind", HANDS)

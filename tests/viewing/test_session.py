@@ -8,10 +8,8 @@ import pytest
 from hands import TOP, block, session
 
 import warp_corot as wc
-from warp_corot.viewing.cutting import Plane
-from warp_corot.viewing.real_time_factor import RealTimeFactor
-from warp_corot.viewing.session import Session
-from warp_corot.viewing.shown import ELEMENTS, INPUT, MARCHED
+from warp_corot.viewing.session import RealTimeFactor, Session
+from warp_corot.viewing.shown import ELEMENTS, INPUT, MARCHED, Plane
 
 UP = np.array([0.0, 0.0, 0.004])
 
@@ -150,7 +148,7 @@ def test_time_runs_as_requested_or_as_fast_as_it_can(rate, speed, reading, expec
     """On a clock of the test: steps take their time at ``rate``, frames are read, and the page waits for the next one.
     The last case has no time to wait: it steps for the rest of each period."""
     clock, pace, period, due = 100.0, RealTimeFactor(), 1 / 30, 100.0
-    monkeypatch.setattr("warp_corot.viewing.real_time_factor.time.perf_counter", lambda: clock)
+    monkeypatch.setattr("warp_corot.viewing.session.time.perf_counter", lambda: clock)
     simulated = 0.0
     for frame in range(600):
         wanted = pace.wanted(speed, period)

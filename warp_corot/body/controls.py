@@ -12,7 +12,7 @@ from warp_corot.discretization.elements import Mesh
 from warp_corot.discretization.nodal import vec3_view
 from warp_corot.discretization.sizes import Sizes
 from warp_corot.errors import InputError
-from warp_corot.inputs.indices import checked_indices
+from warp_corot.inputs.checks import checked_indices
 from warp_corot.inputs.simulation_lock import under_lock
 from warp_corot.materials.directional import Directional
 from warp_corot.materials.isotropic import Material

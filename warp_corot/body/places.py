@@ -16,9 +16,8 @@ import warp as wp
 
 from warp_corot.discretization.elements import Mesh
 from warp_corot.errors import InputError, depth_of_user
-from warp_corot.inputs.checks import FLOAT32, shown
-from warp_corot.inputs.device_arrays import vectors_on_device
-from warp_corot.inputs.indices import checked_indices
+from warp_corot.inputs.checks import FLOAT32, checked_indices, shown
+from warp_corot.inputs.device import vectors_on_device
 from warp_corot.inputs.selection import CONSTANTS, FUNCTIONS, REGIONS, select_nodes
 
 #: Names with a meaning of their own in expressions.

@@ -9,8 +9,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_numbers
-from warp_corot.inputs.keys import checked_times
+from warp_corot.inputs.checks import checked_numbers, checked_times
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,10 +19,17 @@ from warp_corot.inputs.importing import uncollected
 from warp_corot.inputs.likely import meant
 from warp_corot.inputs.stopwatch import WATCH
 
-from .exit_status import EXIT_CODES, as_option, complain, interrupt_status, open_streams, silence
-from .parsing import COMMANDS, StrictParser
+from .options import COMMANDS, EXIT_CODES, StrictParser, add_command
 from .ranks import end_others, fall_silent, let_others_speak, speaks
-from .signals import leaving_at_once, terminable
+from .terminal import (
+    as_option,
+    complain,
+    interrupt_status,
+    leaving_at_once,
+    open_streams,
+    silence,
+    terminable,
+)
 
 #: Exit statuses of runs that failed, and not by a signal.
 FAILED = (1, 2, 3)
@@ -69,8 +76,6 @@ def make_parser(needed: Collection[str] = COMMANDS) -> argparse.ArgumentParser:
     """
     from warp_corot import __version__
 
-    from .options import add_command
-
     parser = Parser(
         prog="warp-corot",
         description="Corotational finite elements for soft tissue, on CPU and CUDA.",
@@ -80,11 +85,11 @@ def make_parser(needed: Collection[str] = COMMANDS) -> argparse.ArgumentParser:
         "--version", action="version", version=f"warp-corot {__version__} (warp {version('warp-lang')})"
     )
     subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=Parser)
-    for name, line in COMMANDS.items():
+    for name, command in COMMANDS.items():
         if name in needed:
             add_command(subparsers, name)
         else:
-            subparsers.add_parser(name, help=line)
+            subparsers.add_parser(name, help=command.line)
     return parser
 
 
@@ -184,7 +189,7 @@ def _run(argv: Sequence[str] | None) -> int:
             )
             return 1
         if args.command in ("simulate", "view"):
-            from .compiling import begin_compiling
+            from .terminal import begin_compiling
 
             begin_compiling(args.device)
         module = subcommand(args.command)

@@ -1,35 +1,33 @@
-"""The bodies of a run: from options and an input to a mesh with its material, supports and loads."""
+"""The bodies of a run: from options and an input to a mesh with its material, supports, loads and remeshing."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.elasticity import MODELS, Corotated, Model
 from warp_corot.errors import InputError
+from warp_corot.holding.choice import supports_of
 from warp_corot.materials.isotropic import Isotropic
 from warp_corot.remesh.online import OnlineRemesh
 from warp_corot.simulation.parts import checked_gravity
 
-from .holding import FixedNodes, held_as_told, held_by_default, up_of
-from .implicit import is_static
-from .input_file import InputFile, open_input, with_unit
-from .input_mesh import InputMesh, find_subject
-from .label_materials import covers_all, label_material, region_material
-from .loading import Load, loads_of, move_patches, ramp_of
-from .multibody import bodies_in
-from .option_rules import refuse_options
-from .organs import find_organ
-from .patches import BodyPatches
-from .probing import probes_body
-from .remesh import remesh_of
+from .input_file import InputFile, bodies_in, open_input, refuse_options, with_unit
+from .input_mesh import InputMesh, covers_all, find_organ, find_subject, label_material, region_material
+from .options import is_static, stands_free
+from .patches import BodyPatches, Load, loads_of, move_patches, probes_body, ramp_of, up_of
 from .summary import pressure
-from .touching import stands_free
+from .terminal import as_options
+
+if TYPE_CHECKING:
+    from .input_mesh import InputMesh
+    from .patches import BodyPatches
 
 #: A density below this [kg/m^3] is most likely meant in g/cm^3.
 LIGHT = 5.0
@@ -184,3 +182,137 @@ def _material(
     if args.region:
         material = region_material(subject.mesh, patches.tetrahedra, args.region, material)
     return material, chosen
+
+
+# --- fixed nodes: by ``--fix``, or chosen if it is not given ---------------------------------------------------------
+
+#: Factor on the stiffness that is needed at least.
+MORE = 1.05
+
+
+@dataclass(frozen=True, eq=False)
+class FixedNodes:
+    """The fixed nodes.
+
+    Attributes:
+        nodes: Mask bool [N].
+        words: Text for the summary: "standing on its lowest 10 %", "free".
+        lies: Whether the body needs a ground to lie on.
+    """
+
+    nodes: npt.NDArray[np.bool_]
+    words: str
+    lies: bool = False
+
+    @property
+    def count(self) -> int:
+        return int(self.nodes.sum())
+
+
+def held_as_told(subject: InputMesh, patches: BodyPatches, expressions: Sequence[str], pulled: bool) -> FixedNodes:
+    """The nodes of ``--fix``, from all its patches.
+
+    Args:
+        subject: Gets a note if no node is fixed.
+        patches: The body's patches.
+        expressions: One or several expressions.
+        pulled: Whether another option moves nodes.
+
+    Raises:
+        InputError: A bad expression, or no node is left free.
+    """
+    nodes = np.logical_or.reduce([patches.nodes(expression) for expression in expressions])
+    said = " or ".join(expressions)
+    if nodes.sum() == len(patches.used):
+        raise InputError(f"expression {said!r}: holds all {nodes.sum()} nodes; at least one must be free to move")
+    if not nodes.any():
+        if not pulled:
+            subject.notes.append(f"no node is held ({said!r}): the body falls freely")
+        return FixedNodes(nodes, "free, nothing is held")
+    return FixedNodes(nodes, f"held where {said}")
+
+
+def held_by_default(
+    subject: InputMesh, material: Isotropic, gravity: npt.NDArray[np.float64], *, may_stiffen: bool, may_lie: bool
+) -> tuple[FixedNodes, float]:
+    """The support of the body, and a factor on its stiffness: above one if no patch would support it with its present
+    stiffness.
+
+    Args:
+        subject: Gets notes on the choice and its reasons.
+        material: The body's material.
+        gravity: Acceleration [m/s^2].
+        may_stiffen: Whether Young's modulus was not given.
+        may_lie: Whether the body may lie on a ground.
+    """
+    holds = supports_of(
+        subject.mesh,
+        young=material.young,
+        density=material.density,
+        gravity=gravity,
+        surface=subject.surface,
+        may_lie=may_lie,
+    )
+    if holds.lies:
+        subject.notes.append(
+            f"the body lies on a ground, since {holds.lies}, and nothing is fixed (--no-ground or --fix holds it)"
+        )
+        return FixedNodes(holds.nodes, "lying on a ground", lies=True), 1.0
+    lines = holds.reasons()
+    subject.notes += [*lines[:-1], f"{lines[-1]} (--fix chooses others)"]
+    held = FixedNodes(holds.nodes, holds.words)
+    if not (1.0 < holds.stiffer < np.inf):
+        return held, 1.0
+    if may_stiffen:
+        subject.notes.append(
+            f"it is {holds.stiffer:.2g} times as stiff as the default for its weight, so that this supports it"
+        )
+        return held, MORE * holds.stiffer
+    sag = max(hold.sag for hold in holds.pieces)
+    subject.notes.append(
+        f"the body is so soft that it sags by about {sag:.0%} of its height; make it {holds.stiffer:.2g} times as "
+        "stiff (--young), or fix more of it (--fix)"
+    )
+    return held, 1.0
+
+
+# --- ``--remesh`` ----------------------------------------------------------------------------------------------------
+
+#: Names of Python's arguments on the command line.
+REMESH_ARGUMENTS = {
+    "refine_above": "--refine-above",
+    "simplify_below": "--simplify-below",
+    "min_level": "--remesh-levels MIN",
+    "max_level": "--remesh-levels MAX",
+    "every": "--remesh-every",
+    "capacity": "--capacity",
+}
+#: Options that need ``--remesh``.
+REMESH_OPTIONS = ("refine_above", "simplify_below", "remesh_levels", "remesh_every", "capacity")
+
+
+def remesh_of(args: argparse.Namespace, kind: str) -> OnlineRemesh | None:
+    """The remeshing that the options request, None for none.
+
+    Args:
+        args: The command's arguments.
+        kind: Kind of input: "box", "tets", "surface" or "scan".
+
+    Raises:
+        InputError: An option that is out of its range or has no effect, or a mesh that cannot be remeshed.
+    """
+    if not args.remesh:
+        for name in REMESH_OPTIONS:
+            if getattr(args, name) is not None:
+                raise InputError(f"--{name.replace('_', '-')} is for --remesh, which is not given")
+        return None
+    if kind == "tets":
+        raise InputError(
+            f"--remesh is for box, surfaces and scans, whose meshes are bisected cubes; {args.input} has its own "
+            "tetrahedra"
+        )
+    asked = {name: getattr(args, name) for name in ("refine_above", "simplify_below", "capacity")}
+    asked |= {"every": args.remesh_every}
+    asked |= dict(zip(("min_level", "max_level"), args.remesh_levels or (None, None), strict=True))
+    with as_options(REMESH_ARGUMENTS):
+        return OnlineRemesh(**{name: value for name, value in asked.items() if value is not None})

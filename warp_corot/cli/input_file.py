@@ -1,13 +1,15 @@
-"""The input: read once, classified by its content, and placed by unit, scale and up axis."""
+"""The input: read once, classified by its content, placed by unit, scale and up axis, and divided into bodies."""
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from warp_corot.domain.units import length, likely_unit, metres_per_unit, unlikely_size
 from warp_corot.errors import InputError
@@ -16,6 +18,8 @@ from warp_corot.io.read.assets import Asset, find_asset
 from warp_corot.io.read.surfaces import LoadedSurface, load_surface, read_file
 from warp_corot.io.read.tetrahedra import LoadedMesh, check_file, load_tets
 from warp_corot.io.read.volumes import LoadedVolume, volume_of_image
+
+from .options import TETS
 
 
 @dataclass
@@ -156,3 +160,173 @@ def longest_side(points: np.ndarray) -> float:
 def _longest(points: np.ndarray, cells: np.ndarray) -> float:
     """The longest side of the box around the points that cells name."""
     return longest_side(points[np.unique(cells)])
+
+
+# --- an option without effect on this input is refused, with the reason ----------------------------------------------
+
+
+class Rule(NamedTuple):
+    """A rule for when options have an effect.
+
+    Attributes:
+        options: Their names in Python.
+        applies: Whether they have an effect, given the command's arguments and the input.
+        purpose: Their purpose, to follow "--NAME is for".
+    """
+
+    options: tuple[str, ...]
+    applies: Callable[[argparse.Namespace, InputFile], bool]
+    purpose: str
+
+
+RULES = (
+    Rule(
+        ("skin",),
+        lambda args, opened: opened.kind == "surface" or (opened.kind == "scan" and args.skin == "marched"),
+        "surfaces",
+    ),
+    Rule(("level",), lambda _, opened: opened.kind != "tets", "the box, surfaces and scans"),
+    Rule(("unit", "up"), lambda _, opened: opened.kind != "box", "files"),
+    Rule(("rotation_level",), lambda _, opened: opened.kind != "tets", "box, surfaces and scans"),
+    Rule(
+        ("join",),
+        lambda args, opened: opened.kind == "tets" or len(getattr(opened.loaded, "objects", ())) > 1,
+        "surfaces of several objects and meshes of tetrahedra",
+    ),
+    Rule(("labels", "smoothing"), lambda _, opened: opened.kind == "scan", "scans"),
+    Rule(
+        ("threshold",),
+        lambda args, opened: opened.kind == "scan" and args.labels is None and args.materials is None,
+        "scans without --labels and --materials",
+    ),
+    Rule(
+        ("cell_size", "max_level", "surface_error", "tets", "min_layers", "draw_tets"),
+        lambda _, opened: opened.kind in ("surface", "scan"),
+        "surfaces and scans",
+    ),
+    Rule(
+        ("materials",),
+        lambda args, opened: (opened.kind == "scan" and args.labels is None) or opened.has_regions,
+        "scans without --labels and meshes of tetrahedra whose file numbers regions",
+    ),
+    Rule(
+        ("regions_by",),
+        lambda args, opened: args.materials is not None and opened.has_regions,
+        "--materials on meshes of tetrahedra whose file numbers regions",
+    ),
+    Rule(
+        ("draw_labels",),
+        lambda args, opened: opened.has_regions or opened.kind == "scan",
+        "scans and meshes of tetrahedra whose file numbers regions",
+    ),
+)
+
+
+def refuse_options(args: argparse.Namespace, opened: InputFile) -> None:
+    """Check that every given option has an effect.
+
+    Raises:
+        InputError: An option has none; the message names it and its purpose.
+    """
+    for rule in RULES:
+        for name in rule.options:
+            given = getattr(args, name, None)
+            if given is not None and given is not False and not rule.applies(args, opened):
+                option = f"--{name.replace('_', '-')}"
+                instead = "; use --scale" if name == "unit" else ""
+                raise InputError(f"{option} is for {rule.purpose}, and {args.input} is not one{instead}")
+    if opened.kind != "box" and args.level is not None and (args.tets is not None or args.max_level is not None):
+        raise InputError("--level is given, with which neither --tets nor --max-level has an effect")
+    if args.labels is not None and args.young is not None:
+        raise InputError("--young is given, but --labels gives each label its own")
+    if args.draw_labels and args.labels is None and args.materials is None:
+        raise InputError("--draw-labels draws the labels that --labels or --materials names")
+
+
+# --- several bodies of one file --------------------------------------------------------------------------------------
+
+#: More objects are joined: otherwise each would be a body with its own mesh.
+MOST_BODIES = 32
+#: Minimum number of tetrahedra of each of several bodies that share a number.
+FEWEST_TETS = 100
+#: Points of an object that are closer than this fraction of its length are merged.
+SAME = 1.0e-6
+
+
+def bodies_in(opened: InputFile, args: argparse.Namespace) -> list[tuple[InputFile, argparse.Namespace]]:
+    """The bodies of an input with their options.
+
+    The objects of a surface's file are separate bodies if each is closed, none is a cavity of another, and
+    ``--join`` is not given. They share the number of tetrahedra by volume. Prims, blocks and instances of
+    tetrahedra are separate bodies, too.
+    """
+    loaded = opened.loaded
+    several = isinstance(loaded, LoadedMesh | LoadedSurface) and 2 <= len(loaded.objects) <= MOST_BODIES
+    if args.join or not several:
+        return [(opened, args)]
+    assert isinstance(loaded, LoadedMesh | LoadedSurface)
+    parts, shares = _parts(loaded), np.zeros(0)
+    if isinstance(loaded, LoadedSurface):
+        from warp_corot.domain.closing import close_surface
+
+        try:
+            whole, *closed = (close_surface(part.points, part.triangles) for part in (loaded, *parts))
+        except InputError:
+            return [(opened, args)]
+        if whole.cavities or any(part.caps for part in closed):
+            return [(opened, args)]
+        shares = np.array([part.volume for part in closed])
+        shares /= shares.sum()
+    names = ", ".join(part.name for part in parts[:8]) + (", ..." if len(parts) > 8 else "")
+    opened.notes.append(f"{len(parts)} separate bodies: {names} (--join makes them one)")
+    fineness = (args.level, args.max_level, args.surface_error, args.cell_size)
+    found = []
+    for place, part in enumerate(parts):
+        own = argparse.Namespace(**vars(args))
+        if len(shares) and (args.tets is not None or all(given is None for given in fineness)):
+            own.tets = max(FEWEST_TETS, int((args.tets or TETS) * shares[place]))
+        found.append((replace(opened, loaded=part, notes=opened.notes if place == 0 else []), own))
+    return found
+
+
+def _parts(loaded: LoadedMesh | LoadedSurface) -> list[Any]:
+    """The objects of a file, which share no nodes."""
+    cells = loaded.tets if isinstance(loaded, LoadedMesh) else loaded.triangles
+    ends = np.cumsum([count for _, count in loaded.objects])
+    parts: list[LoadedMesh | LoadedSurface] = []
+    for (name, count), chosen in zip(loaded.objects, np.split(np.arange(len(cells)), ends[:-1]), strict=True):
+        if not count:
+            continue
+        used, renumbered = np.unique(cells[chosen], return_inverse=True)
+        own = np.asarray(renumbered.reshape(-1, cells.shape[1]), dtype=np.int32)
+        part = replace(loaded, points=loaded.points[used], name=name, objects=[])
+        if isinstance(part, LoadedSurface):
+            parts.append(replace(part, triangles=own))
+            continue
+        sets = {known: np.flatnonzero(np.isin(used, nodes)) for known, nodes in part.node_sets.items()}
+        regions = part.regions
+        parts.append(
+            replace(
+                part,
+                tets=own,
+                regions=None if regions is None else replace(regions, of_tet=regions.of_tet[chosen]),
+                notes=[] if parts else part.notes,
+                node_sets={known: nodes for known, nodes in sets.items() if len(nodes)},
+            )
+        )
+    return parts
+
+
+def merged_nodes(
+    points: npt.NDArray[np.float64], tets: npt.NDArray[np.int32]
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int32], npt.NDArray[np.int64]]:
+    """Tetrahedra with coincident nodes merged, and the new node of each point."""
+    kept, place = _welded(points)
+    return points[kept], place[tets].astype(np.int32), place
+
+
+def _welded(points: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """The first point at each position, and the position of each point among them."""
+    step = SAME * longest_side(points) or 1.0
+    _, kept, place = np.unique(np.round(points / step), axis=0, return_index=True, return_inverse=True)
+    return kept, place.reshape(-1)

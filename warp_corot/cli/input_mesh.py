@@ -1,35 +1,44 @@
-"""The mesh of an input, and defaults for options that were not given."""
+"""The mesh of an input, with its labels, and defaults for options that were not given."""
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+import math
+import re
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from warp_corot.body.places import named_nodes
+from warp_corot.domain.units import in_units
 from warp_corot.errors import InputError
-from warp_corot.experiments import paper
-from warp_corot.inputs.choices import SHORT_DURATION
+from warp_corot.inputs.stopwatch import WATCH
+from warp_corot.io.read.surfaces import LoadedSurface
 from warp_corot.io.read.tetrahedra import LoadedMesh
+from warp_corot.materials.isotropic import Isotropic
 from warp_corot.mesh import TetForest, TetMesh
+from warp_corot.mesh.lattice import checked_level
 
-from .input_file import InputFile, offset_of, placed
-from .label_materials import of_regions, parse_labels
-from .multibody import merged_nodes
-from .options.defaults import BOX_LEVEL, STIFFNESS_PER_WEIGHT
+from .input_file import InputFile, merged_nodes, offset_of, placed
+from .options import BOX_LEVEL, CUBES_OF_LEVEL, LABEL, MAX_LEVEL_FOR_ERROR, STIFFNESS_PER_WEIGHT, TETS
+from .terminal import as_options
 
 if TYPE_CHECKING:
+    from warp_corot.discretization.elements import Mesh
     from warp_corot.domain import Domain
     from warp_corot.domain.fidelity import Fidelity
     from warp_corot.io.read.assets import Asset
+    from warp_corot.io.read.regions import Regions
+    from warp_corot.io.read.volumes import LoadedVolume
     from warp_corot.io.write.skins import OwnSurface
-    from warp_corot.mesh.surfaces.bound import SurfaceMesh
+    from warp_corot.mesh import SurfaceMesh
 
-    from .label_materials import LabelMaterial
+#: The box, the beam of Tagawa et al. 2013: its cubes, and their edge [m].
+CELLS, CELL_SIZE = (1, 1, 3), 0.064
 
 
 @dataclass
@@ -172,7 +181,7 @@ def _listed(names: Sequence[str]) -> str:
 
 def _box(scale: float, level: int, offset: np.ndarray) -> InputMesh:
     x, y, z = offset.tolist()
-    return box_subject(TetForest.box(paper.CELLS, paper.CELL_SIZE * scale, level, origin=(x, y, z)))
+    return box_subject(TetForest.box(CELLS, CELL_SIZE * scale, level, origin=(x, y, z)))
 
 
 def box_subject(mesh: TetForest) -> InputMesh:
@@ -180,11 +189,417 @@ def box_subject(mesh: TetForest) -> InputMesh:
     return InputMesh(
         mesh,
         "box",
-        young=paper.MATERIAL["young"],
-        poisson=paper.MATERIAL["poisson"],
-        density=paper.MATERIAL["density"],
+        young=500.0,
+        poisson=0.49,
+        density=10.0,
         fix="z <= zmin",
-        gravity=paper.GRAVITY,
-        damping=paper.Settings.damping,
-        duration=SHORT_DURATION,
+        gravity=(0.0, -9.8, 0.0),
+        damping=15.0,
+        duration=4.0,
     )
+
+
+# --- surfaces and scans, which have no tetrahedra --------------------------------------------------------------------
+
+#: With a surface error or a level instead of a number of tetrahedra: the default number for each root cube in a cube of
+#: the body's length, which gives the size of root cubes.
+TETS_PER_CUBE = 30
+#: With a surface error: the number of further levels for details between nodes.
+DETAIL = 6
+#: Root cubes extend beyond the body by this fraction of its length.
+MARGIN = 1.0e-3
+#: Names of Python's arguments on the command line.
+ARGUMENTS = {
+    name: f"--{name.replace('_', '-')}"
+    for name in ("unit", "cell_size", "max_level", "surface_error", "min_layers", "smoothing")
+} | {"target_elements": "--tets"}
+#: A scan with more distinct values, or with negative ones, holds intensities, not labels.
+MOST_LABELS = 256
+#: Number of voxels that are checked for this.
+LOOKED_AT = 10**6
+
+
+def find_organ(opened: InputFile, args: argparse.Namespace) -> InputMesh:
+    """Mesh the body that a surface or a scan encloses.
+
+    Args:
+        opened: The input, a surface or a scan.
+        args: The command's arguments.
+
+    Raises:
+        InputError: It encloses no body, or an option is out of its range.
+    """
+    with as_options(ARGUMENTS):
+        started = WATCH.clock()
+        entries: list[LabelMaterial] = []
+        domain = domain_of(opened, args, entries)
+        meshing = WATCH.clock()
+        mesh = _mesh(args, domain)
+        surface = mesh.surface()
+        done = WATCH.clock()
+        measured = _measured(args, mesh, domain, surface)
+        skin = _own_surface(opened, args, domain)
+    asset, loaded = opened.asset, opened.loaded
+    assert loaded is not None
+    subject = InputMesh(
+        mesh,
+        loaded.name.encode(errors="replace").decode(),
+        opened.source,
+        domain=domain,
+        surface=surface,
+        fidelity=measured,
+        skin=skin,
+        labels=entries,
+        times={"domain": meshing - started, "mesh": done - meshing, "measuring": WATCH.clock() - done},
+        notes=opened.notes,
+    )
+    if asset:
+        subject.take(asset, args)
+    return subject
+
+
+def domain_of(opened: InputFile, args: argparse.Namespace, entries: list[LabelMaterial]) -> Domain:
+    """The domain of a surface or a scan; ``entries`` are filled with the materials of its labels."""
+    return _scan(opened, args, entries) if opened.kind == "scan" else _surface(opened, args)
+
+
+def fineness_of(args: argparse.Namespace, domain: Domain) -> dict[str, Any]:
+    """The arguments of ``from_domain`` for a level."""
+    size = args.cell_size
+    if size is None:
+        size = float(np.ptp(domain.bounds, axis=0).max()) * (1.0 + MARGIN) / CUBES_OF_LEVEL
+    checked_level(args.level, "--level")
+    return {"cell_size": size, "max_level": args.level, "surface_error": args.surface_error, "device": args.device}
+
+
+def _surface(opened: InputFile, args: argparse.Namespace) -> Domain:
+    from warp_corot.domain import Domain
+
+    return Domain.from_surface(placed(opened, args), unit=opened.unit, device=args.device)
+
+
+def _scan(opened: InputFile, args: argparse.Namespace, entries: list[LabelMaterial]) -> Domain:
+    """The domain of a scan; ``entries`` are filled with the materials of its labels."""
+    from warp_corot.domain import Domain
+
+    volume, unit = placed(opened, args), opened.unit
+    if args.threshold is None:
+        volume = _without_nan(volume, opened.notes)
+    option, text = ("--labels", args.labels) if args.labels is not None else ("--materials", args.materials)
+    numbers: dict[str, Any] | None = None
+    if text is not None:
+        entries += parse_labels(text, option)
+        numbers, said = numbers_by_name(entries, volume)
+        opened.notes += [said] if said else []
+        if option == "--materials":
+            # The other labels are part of the body, too.
+            named = {number for of_name in numbers.values() for number in of_name}
+            numbers |= {f"{n:g}": (n,) for n in np.unique(volume.values).tolist() if n != 0 and n not in named}
+    elif args.threshold is not None:
+        inside = (volume.values >= args.threshold.low) & (volume.values <= args.threshold.high)
+        volume = replace(volume, values=inside.astype(np.uint8))
+    else:
+        _see_labels(volume)
+    smoothing = args.smoothing or 0.0
+    up = args.up or "Z"
+    return Domain.from_labels(volume, labels=numbers, unit=unit, smoothing=smoothing, up_axis=up, device=args.device)
+
+
+def _without_nan(volume: LoadedVolume, notes: list[str]) -> LoadedVolume:
+    """The volume with 0, which is outside, in place of values that are not numbers."""
+    if volume.values.dtype.kind != "f" or not (missing := np.isnan(volume.values)).any():
+        return volume
+    notes.append(f"{np.count_nonzero(missing)} voxels are not a number and count as outside")
+    return replace(volume, values=np.where(missing, 0.0, volume.values))
+
+
+def _see_labels(volume: LoadedVolume) -> None:
+    """Check that a scan holds labels.
+
+    Raises:
+        InputError: It holds intensities.
+    """
+    values = np.ravel(volume.values)
+    found = np.unique(values[:: max(1, len(values) // LOOKED_AT)])
+    fractions = found[found != np.round(found)]
+    if len(fractions):
+        raise InputError(
+            f"{volume.source}: has values such as {fractions[0]:g}, as probabilities and intensities do, not labels; "
+            "give --threshold LOW[:HIGH] for the voxels that make up the body"
+        )
+    if np.isfinite(found).all() and (len(found) > MOST_LABELS or found[0] < 0):
+        raise InputError(
+            f"{volume.source}: has {len(found)} different values or more, {found[0]:g} to {found[-1]:g}, as "
+            "intensities do, not labels; give --threshold LOW[:HIGH] for the voxels that make up the body, or --labels"
+        )
+
+
+def _mesh(args: argparse.Namespace, domain: Domain) -> TetForest:
+    if args.level is not None:
+        return TetForest.from_domain(domain, **fineness_of(args, domain))
+    count = args.tets
+    if count is None and args.max_level is None and args.surface_error is None:
+        count = TETS
+    size, level, detail = args.cell_size, args.max_level, 0
+    if count is None:
+        detail = DETAIL
+        if size is None:
+            cubes = max(1, round((TETS / TETS_PER_CUBE) ** (1.0 / 3.0)))
+            size = float(np.ptp(domain.bounds, axis=0).max()) * (1.0 + MARGIN) / cubes
+        if level is None:
+            level = MAX_LEVEL_FOR_ERROR
+    layers = {} if args.min_layers is None else {"min_layers": args.min_layers}
+    try:
+        return TetForest.from_domain(
+            domain,
+            size,
+            max_level=level,
+            surface_error=args.surface_error,
+            target_elements=count,
+            detail=detail,
+            device=args.device,
+            **layers,
+        )
+    except InputError as error:
+        unsaid = count is not None and count >= 1 and args.surface_error is None and "target_elements" not in str(error)
+        with_tets = f"with --tets {count}, " if unsaid else ""
+        raise InputError(f"{with_tets}{error}") from None
+
+
+def _own_surface(opened: InputFile, args: argparse.Namespace, domain: Domain) -> OwnSurface | None:
+    """The input surface, if it is to be drawn."""
+    if not isinstance(opened.loaded, LoadedSurface) or args.skin == "marched":
+        return None
+    from warp_corot.io.write.skins import OwnSurface
+
+    found = OwnSurface.of_domain(opened.source, opened.loaded, domain.bounds, offset_of(args))
+    if found is None:
+        opened.notes.append("the surface was changed when it was closed: the marched one is drawn")
+    return found
+
+
+def _measured(args: argparse.Namespace, mesh: TetForest, domain: Domain, surface: SurfaceMesh) -> Fidelity:
+    """Measure how well the mesh approximates the body, and warn of deviations."""
+    from warp_corot.domain.fidelity import fidelity
+    from warp_corot.domain.units import length
+
+    found = fidelity(mesh, domain, surface=surface)
+    more, through = 2 * len(mesh.tets), ""
+    if found.needed > more:
+        more = int(float(f"{found.needed:.1e}"))
+        through = ", of which one fits through the thinnest walls"
+    for doubt in found.doubts():
+        said = doubt.replace("more tetrahedra", f"more tetrahedra (--tets {more}{through})")
+        warnings.warn(said.replace("tetrahedra in all", "tetrahedra in all (--tets)"), stacklevel=2)
+    off = max(found.distance_95)
+    if args.surface_error is not None and off > args.surface_error:
+        helps = (
+            "a larger --tets"
+            if args.tets is not None
+            else f"--{'max-' * (args.level is None)}level {int(mesh.levels.max()) + 3}"
+        )
+        warnings.warn(
+            f"--surface-error is {length(args.surface_error)}, and 95 % of the surface are within {length(off)}; "
+            f"{helps} would bring it nearer",
+            stacklevel=2,
+        )
+    return found
+
+
+# --- materials by label or region ------------------------------------------------------------------------------------
+
+_ENTRY = re.compile(r"\s*(?P<name>[^@=:]+?)\s*(?:@\s*(?P<numbers>\d+(?:\s*\+\s*\d+)*)\s*)?=(?P<values>.*)")
+
+
+@dataclass(frozen=True)
+class LabelMaterial:
+    """A label and its material.
+
+    Attributes:
+        name: Name for the mesh and the summary.
+        numbers: Numbers of its voxels; () if only a name was given.
+        young: Young's modulus [Pa].
+        poisson: Poisson's ratio, None if not given.
+        density: Density [kg/m^3], None if not given.
+    """
+
+    name: str
+    numbers: tuple[int, ...]
+    young: float
+    poisson: float | None
+    density: float | None
+
+
+def parse_labels(text: str, option: str = "--labels") -> list[LabelMaterial]:
+    """The labels that an option names.
+
+    Raises:
+        InputError: Another form, or a label given twice.
+    """
+    found = [_entry(part, option) for part in text.split(",")]
+    for what, given in (
+        ("label", [entry.name for entry in found]),
+        ("number", [str(number) for entry in found for number in entry.numbers]),
+    ):
+        twice = [value for value in given if given.count(value) > 1]
+        if twice:
+            raise InputError(f"{option} {text!r}: the {what} {twice[0]} is given twice")
+    return found
+
+
+def parse_pressure(text: str) -> float:
+    """A pressure [Pa] from "3kPa", "0.1 MPa" or "500".
+
+    Raises:
+        InputError: Not a number, or another unit.
+    """
+    return _quantity(text, "Pa", "Young's modulus", "500, 3kPa or 0.1MPa")
+
+
+def _entry(part: str, option: str, form: str | None = None) -> LabelMaterial:
+    match = _ENTRY.fullmatch(part)
+    values = match["values"].split(":") if match else []
+    if not match or not 1 <= len(values) <= 3:
+        raise InputError(form or f"{option} {part.strip()!r}: it must be {LABEL}, for example3kPa:0.45=3kPa:0.45")
+    name = match["name"]
+    numbers = tuple(int(number) for number in (match["numbers"] or "").split("+") if number)
+    if not numbers and name.isdecimal():
+        numbers = (int(name),)
+    try:
+        young = parse_pressure(values[0])
+        poisson = _quantity(values[1], "", "Poisson's ratio", "0.45") if len(values) > 1 else None
+        density = _quantity(values[2], "kg/m^3", "density", "1060 or 1.06g/cm3") if len(values) > 2 else None
+        Isotropic(young, 0.0 if poisson is None else poisson, 1.0 if density is None else density)
+    except InputError as error:
+        said = f"{option} {part.strip()!r}" if form is None else form.split(": it must")[0]
+        raise InputError(f"{said}: {error}") from None
+    return LabelMaterial(name, numbers, young, poisson, density)
+
+
+def _quantity(text: str, unit: str, what: str, such_as: str) -> float:
+    try:
+        value = in_units(text, unit)
+    except InputError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise InputError(f"{what} is {text.strip()!r}; it must be a value like {such_as}")
+    return value
+
+
+def numbers_by_name(
+    entries: Sequence[LabelMaterial], volume: LoadedVolume
+) -> tuple[dict[str, tuple[int, ...]], str | None]:
+    """The numbers of each label in a volume, and a note for the user.
+
+    If only names are given, as many as the volume has labels, they are its labels in ascending order.
+
+    Raises:
+        InputError: Only some names have numbers, or there are more or fewer names than labels.
+    """
+    bare = [entry.name for entry in entries if not entry.numbers]
+    if not bare:
+        return {entry.name: entry.numbers for entry in entries}, None
+    values = np.unique(volume.values)
+    there = [number for number in values.tolist() if number != 0]
+    if len(bare) != len(entries) or len(there) != len(bare):
+        known = ", ".join(f"{number:g}" for number in there[:40]) or "none"
+        raise InputError(
+            f"{volume.source}: the number of label {bare[0]!r} is not known; it must be given, as in {bare[0]}@1=3kPa; "
+            f"the volume's labels: {known}"
+        )
+    pairs = dict(zip(bare, there, strict=True))
+    said = ", ".join(f"{name} is {number:g}" for name, number in pairs.items())
+    return (
+        {name: (number,) for name, number in pairs.items()},
+        f"the volume's labels are taken in ascending order: {said} ({bare[0]}@NUMBER=... names others)",
+    )
+
+
+def of_regions(entries: Sequence[LabelMaterial], regions: Regions) -> tuple[tuple[str, ...], list[LabelMaterial]]:
+    """A mesh's regions with the names in the entries, and an entry for each region that one names.
+
+    Entries name regions by number if they have any, else by name; case does not matter.
+
+    Raises:
+        InputError: An entry names no region, or two name the same; the message lists the regions.
+    """
+    names, taken, found = list(regions.names), dict[int, str](), list[LabelMaterial]()
+    for entry in entries:
+        keys: Sequence[object] = regions.numbers if entry.numbers else [name.lower() for name in regions.names]
+        wanted: Sequence[object] = entry.numbers or (entry.name.lower(),)
+        missing = [key for key in wanted if key not in keys]
+        if missing:
+            known = ", ".join(
+                name if name == str(number) else f"{name} ({number})"
+                for name, number in zip(regions.names[:40], regions.numbers, strict=False)
+            )
+            rest = "; 0 is none of them and has --young, --poisson and --density" if missing[0] == 0 else ""
+            raise InputError(
+                f"--materials names {missing[0]!r}, not a region by {regions.array!r}; there are: {known}{rest}"
+            )
+        places = [keys.index(key) for key in wanted]
+        if len(places) == 1 and not entry.name.isdecimal() and entry.name not in names:
+            names[places[0]] = entry.name
+        for place in places:
+            if place in taken:
+                raise InputError(f"--materials gives {names[place]} to both {taken[place]!r} and {entry.name!r}")
+            taken[place] = entry.name
+            found.append(replace(entry, name=names[place]))
+    return tuple(names), found
+
+
+def label_material(
+    mesh: TetForest | TetMesh, entries: Sequence[LabelMaterial], young: float, poisson: float, density: float
+) -> Isotropic:
+    """The material of each element by its label.
+
+    Args:
+        mesh: A mesh with labels.
+        entries: Materials by label.
+        young: Young's modulus [Pa] of elements without a label, or whose label has no entry.
+        poisson: Poisson's ratio of these elements, and of entries without one.
+        density: Density [kg/m^3] of these elements, and of entries without one.
+    """
+    of_label = {name: number for number, name in enumerate(mesh.label_names, start=1)}
+    table = np.repeat([[young], [poisson], [density]], len(mesh.label_names) + 1, axis=1)
+    for entry in entries:
+        own = (entry.poisson, poisson), (entry.density, density)
+        table[:, of_label[entry.name]] = [entry.young, *(default if given is None else given for given, default in own)]
+    assert mesh.labels is not None
+    youngs, poissons, densities = table[:, mesh.labels]
+    return Isotropic(youngs, poissons, densities)
+
+
+def covers_all(mesh: TetForest | TetMesh, entries: Sequence[LabelMaterial]) -> bool:
+    """Whether each element's label has an entry."""
+    assert mesh.labels is not None
+    named = {entry.name for entry in entries}
+    return all(number and mesh.label_names[number - 1] in named for number in np.unique(mesh.labels).tolist())
+
+
+def region_material(
+    mesh: Mesh, inside: Callable[[str], np.ndarray], regions: Sequence[Sequence[str]], base: Isotropic
+) -> Isotropic:
+    """The material with those that ``--region`` gives to tetrahedra.
+
+    Args:
+        mesh: The body's mesh.
+        inside: Which tetrahedra are in a patch, bool [T].
+        regions: Pairs of a patch and ``YOUNG[:POISSON[:DENSITY]]``; the last one that contains a tetrahedron is used.
+        base: The material of other tetrahedra, and the source of omitted values.
+
+    Raises:
+        InputError: Another form, or no tetrahedron in a region.
+    """
+    count = len(mesh.tets)
+    values = [np.array(np.broadcast_to(value, count)) for value in (base.young, base.poisson, base.density)]
+    for expression, text in regions:
+        option = f"--region {expression!r} {text!r}"
+        entry = _entry(f"region={text}", "--region", f"{option}: it must be PATCH YOUNG[:POISSON[:DENSITY]]")
+        chosen = inside(expression)
+        if not chosen.any():
+            raise InputError(f"--region {expression!r}: there is no tetrahedron in it")
+        for array, value in zip(values, (entry.young, entry.poisson, entry.density), strict=True):
+            if value is not None:
+                array[chosen] = value
+    return Isotropic(*values)

@@ -1,11 +1,13 @@
-"""Parts of a body that options name: expressions, regions of every body, and patches of ``--patch``."""
+"""Parts of a body that options name: expressions, regions, patches of ``--patch``; and the loads on them."""
 
 from __future__ import annotations
 
+import argparse
 import keyword
+import math
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
@@ -13,17 +15,27 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_corot.body.places import TAKEN, named_nodes
+from warp_corot.domain.units import in_units
 from warp_corot.errors import InputError
 from warp_corot.holding.regions import LOWEST, BodyShape, flat_region
+from warp_corot.inputs.checks import checked_times
 from warp_corot.inputs.selection import select_nodes
+from warp_corot.mesh.surfaces.bodies import boundary_surface
 from warp_corot.mesh.surfaces.boundary import boundary_faces
 
+from .options import LOADS
+
 if TYPE_CHECKING:
+    from warp_corot.body.soft_body import SoftBody
     from warp_corot.discretization.elements import Mesh
     from warp_corot.mesh.surfaces.bound import SurfaceMesh
+    from warp_corot.simulation.simulation import Simulation
 
     from .input_mesh import InputMesh
 
+#: A point, three numbers.
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+POINT = re.compile(rf"\s*({_NUMBER})[\s,]+({_NUMBER})[\s,]+({_NUMBER})\s*")
 Mask = npt.NDArray[np.bool_]
 
 
@@ -132,3 +144,274 @@ class BodyPatches:
         inside = np.zeros(len(self.subject.mesh.points), bool)
         inside[self.used] = nodes()
         return np.einsum("vn,vn->v", surface.weights, inside[surface.nodes]) >= 0.5
+
+
+def probes_body(text: str, patches: BodyPatches) -> bool:
+    """Whether a body has the patch, or contains the point in its box.
+
+    Raises:
+        InputError: As in `BodyPatches.nodes`.
+    """
+    match = POINT.fullmatch(text)
+    if match is None:
+        return bool(patches.nodes(text).any())
+    point, (low, high) = np.array([float(part) for part in match.groups()]), patches.subject.bounds
+    return bool(((low <= point) & (point <= high)).all())
+
+
+def up_of(subject: InputMesh, gravity: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """The unit vector against gravity; the mesh's up axis without gravity."""
+    if not gravity.any():
+        return np.eye(3)["XYZ".index(subject.mesh.up_axis)]
+    return -gravity / np.linalg.norm(gravity)
+
+
+# --- loads over time: ``--pull``, ``--twist`` and ``--press`` --------------------------------------------------------
+
+#: Units of values that have none.
+UNITS = {"pull": "m", "twist": "degree", "press": "Pa"}
+#: Largest angle between keyframes of a twist [degrees]: nodes move straight in between.
+KEY_ANGLE = 5.0
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Load:
+    """A load on a patch.
+
+    Attributes:
+        kind: "pull", "twist" or "press".
+        patch: The expression.
+        values: Displacement [m], angle [degrees] or pressure [Pa].
+        times: Increasing [s]; () for a ramp whose length is given elsewhere.
+        shares: Fractions of the values at these times; linear in between, constant before and after.
+        axis: Axis of a twist; None: the mean normal of the patch's surface.
+    """
+
+    kind: str
+    patch: str
+    values: tuple[float, ...]
+    times: tuple[float, ...] = ()
+    shares: tuple[float, ...] = ()
+    axis: tuple[float, float, float] | None = None
+
+    def curve(self, ramp: float) -> tuple[Array, Array]:
+        """Times [s] and fractions at them.
+
+        Raises:
+            InputError: Their numbers differ, or times do not increase.
+        """
+        if not self.times:
+            return np.array([0.0, ramp]), np.array([0.0, 1.0])
+        times, shares = checked_times(self.times), np.asarray(self.shares, dtype=np.float64)
+        if shares.shape != times.shape or not np.isfinite(shares).all():
+            raise InputError(f"{self.kind}: shares are {list(self.shares)}; they must be one number for each time")
+        return times, shares
+
+    def __str__(self) -> str:
+        return f"--{self.kind} {self.patch!r} {' '.join(f'{value:g}' for value in self.values)}"
+
+
+def loads_of(args: argparse.Namespace) -> list[Load]:
+    """The loads in the options.
+
+    Raises:
+        InputError: A value is not a number.
+    """
+    found = list(getattr(args, "curves", ()))
+    for kind in LOADS:
+        for patch, *texts in getattr(args, kind) or ():
+            try:
+                found.append(Load(kind, patch, tuple(value_of(kind, text) for text in texts)))
+            except InputError as error:
+                raise InputError(f"--{kind} {patch!r} {' '.join(texts)}: {error}") from None
+    if args.ramp is not None:
+        if not (math.isfinite(args.ramp) and args.ramp > 0.0):
+            raise InputError(f"--ramp is {args.ramp:g} s; it must be a positive time")
+        if not found:
+            raise InputError("--ramp is for --pull, --twist and --press, none of which is given")
+    return found
+
+
+def ramp_of(args: argparse.Namespace, duration: float) -> float:
+    """The time over which loads grow [s]."""
+    return 0.5 * duration if args.ramp is None else args.ramp
+
+
+def value_of(kind: str, text: str) -> float:
+    """A displacement [m], an angle [degrees] or a pressure [Pa], from a number with or without a unit.
+
+    Raises:
+        InputError: It is not a number.
+    """
+    value = in_units(text, UNITS[kind])
+    if not math.isfinite(value):
+        raise InputError(f"{text} must be a finite number")
+    return value
+
+
+def move_patches(
+    body: SoftBody, loads: Sequence[Load], patches: BodyPatches, ramp: float, fixed: npt.NDArray[np.bool_] | None
+) -> None:
+    """Prescribe the motion of the patches of ``--pull`` and ``--twist``.
+
+    Args:
+        body: The body.
+        loads: Its loads.
+        patches: Its patches.
+        ramp: Time over which loads without times grow [s].
+        fixed: Nodes of ``--fix``, bool [N]; None if it was not given. If a patch moves, its nodes among these move,
+            too.
+
+    Raises:
+        InputError: A patch without nodes, or without a direction if one is needed; a node in two patches; or a
+            patch with all nodes fixed.
+    """
+    taken = np.zeros(len(patches.subject.mesh.points), bool)
+    for load in loads:
+        if load.kind == "press":
+            continue
+        mask = patches.some(load.patch, f"--{load.kind}")
+        if (mask & taken).any():
+            raise InputError(f"{load}: {int((mask & taken).sum())} of its nodes are moved by another option, too")
+        taken |= mask
+        both = 0 if fixed is None else int((mask & fixed).sum())
+        if both == mask.sum():
+            raise InputError(f"{load}: all of its nodes are held by --fix")
+        if both:
+            patches.subject.notes.append(f"{load}: {both} of its nodes are named by --fix, too, and move")
+        times, shares = load.curve(ramp)
+        if load.kind == "pull":
+            moves = shares[:, None] * load.values
+        else:
+            times, moves = _turned(load, patches, mask, times, shares)
+        body.prescribe(mask, times=times, displacements=moves)
+    if taken.sum() == len(patches.used):
+        raise InputError("all nodes are moved by options; at least one must be free to move")
+
+
+def _turned(
+    load: Load, patches: BodyPatches, mask: npt.NDArray[np.bool_], times: Array, shares: Array
+) -> tuple[Array, Array]:
+    """Keyframes of a twist: times [K], and displacements [K, n, 3]."""
+    axis = (
+        -pressed(load, patches, surface_of(patches)).sum(axis=0)
+        if load.axis is None
+        else np.asarray(load.axis, dtype=np.float64)
+    )
+    length = np.linalg.norm(axis)
+    if not (np.isfinite(axis).all() and length > 0.0):
+        raise InputError(f"{load}: has no axis; it must be three numbers, not all zero")
+    from scipy.spatial.transform import Rotation
+
+    fine = [times[:1]]
+    for start, end, span in zip(times, times[1:], np.abs(np.diff(shares)) * abs(load.values[0]), strict=False):
+        fine.append(np.linspace(start, end, 1 + max(1, math.ceil(span / KEY_ANGLE)))[1:])
+    keys = np.concatenate(fine)
+    angles = np.radians(load.values[0]) * np.interp(keys, times, shares)
+    points = patches.subject.mesh.points[mask]
+    arms = points - points.mean(axis=0)
+    return keys, np.stack([Rotation.from_rotvec(angle * axis / length).apply(arms) - arms for angle in angles])
+
+
+# --- pressures as nodal forces that follow the mesh ------------------------------------------------------------------
+
+#: A changing pressure is updated at least this often.
+UPDATES = 200
+
+
+def press_patches(sim: Simulation, body: SoftBody, loads: Sequence[Load], patches: BodyPatches, ramp: float) -> None:
+    """Apply the pressures of ``--press``.
+
+    Args:
+        sim: The simulation.
+        body: One of its bodies; it may be remeshed.
+        loads: The body's loads.
+        patches: The body's patches.
+        ramp: Time over which loads without times grow [s].
+
+    Raises:
+        InputError: A patch contains no part of the surface.
+    """
+    pressing = [load for load in loads if load.kind == "press"]
+    if not pressing:
+        return
+    pressure = _Pressure(body, pressing, patches, ramp)
+    pressure.set(0.0)
+    sim.on_step(lambda sim: pressure.set(sim.time), every=max(1, int(pressure.span / UPDATES / sim.dt)))
+    for options in sim.remesh:
+        if options is not None:
+            sim.on_step(lambda sim: pressure.set(sim.time), every=options.every)
+
+
+class _Pressure:
+    """The pressures on a body over time.
+
+    Args:
+        body: The body.
+        loads: Pressures.
+        patches: The body's patches.
+        ramp: Time over which loads without times grow [s].
+
+    Attributes:
+        span: Time from the first to the last change of a pressure [s].
+    """
+
+    def __init__(self, body: SoftBody, loads: Sequence[Load], patches: BodyPatches, ramp: float):
+        surface = surface_of(patches)
+        forces = [load.values[0] * pressed(load, patches, surface) for load in loads]
+        self._curves = [load.curve(ramp) for load in loads]
+        self._first = min(times[0] for times, _ in self._curves)
+        self._last = max(times[-1] for times, _ in self._curves)
+        self.span = float(self._last - self._first)
+        self._body = body
+        there = np.any([each.any(axis=1) for each in forces], axis=0)
+        self._forces = np.stack([each[there] for each in forces])
+        follows = body.changing is not None
+        self._following = body.bind(surface.points[there]) if follows else None
+        self._nodes, self._weights = surface.nodes[there], surface.weights[there]
+        self._revision = -1
+        self._done = False
+
+    def set(self, time: float) -> None:
+        """Load the body's nodes for a time [s], if the loads have changed."""
+        if self._revision != self._body.version:
+            self._done = False
+        if self._done or (self._revision == self._body.version and time < self._first):
+            return
+        if self._following is not None and self._revision != self._body.version:
+            self._nodes, self._weights = self._following.nodes.numpy(), self._following.weights.numpy()
+        self._revision = self._body.version
+        shares = [np.interp(time, times, shares) for times, shares in self._curves]
+        at_points = np.einsum("p,pvx->vx", shares, self._forces)
+        self._body.load("all", nodal(at_points, self._nodes, self._weights, self._body.node_count))
+        self._done = time >= self._last
+
+
+def surface_of(patches: BodyPatches) -> SurfaceMesh:
+    """The surface of a body, bound to its nodes."""
+    return patches.subject.surface or boundary_surface(patches.subject.mesh)
+
+
+def pressed(load: Load, patches: BodyPatches, surface: SurfaceMesh) -> Array:
+    """The nodal forces of a pressure of one pascal on a patch, at the points of the surface [N], [V, 3].
+
+    Raises:
+        InputError: The patch contains no part of the surface.
+    """
+    inside = patches.on_surface(load.patch, surface)
+    triangles = surface.triangles[inside[surface.triangles].all(axis=1)]
+    if not len(triangles):
+        raise InputError(f"--{load.kind} {load.patch!r}: no part of the surface is in it")
+    a, b, c = np.moveaxis(surface.points[triangles], 1, 0)
+    forces = np.zeros_like(surface.points)
+    np.add.at(forces, triangles.ravel(), np.repeat(-np.cross(b - a, c - a) / 6.0, 3, axis=0))
+    return forces
+
+
+def nodal(forces: Array, nodes: npt.NDArray[np.integer], weights: npt.NDArray[np.floating], count: int) -> Array:
+    """Forces at bound points [N], [V, 3], distributed to the nodes [N], [count, 3]."""
+    found = np.zeros((count, 3))
+    np.add.at(found, nodes.ravel(), (weights[:, :, None] * forces[:, None]).reshape(-1, 3))
+    return found

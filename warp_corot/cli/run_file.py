@@ -14,11 +14,8 @@ from typing import Any, NoReturn
 from warp_corot.errors import InputError
 from warp_corot.io.files.whole import check_output, written_whole
 
-from .loading import Load, value_of
-from .options.declared import add_declared
-from .options.defaults import LOADS
-from .options.run import OF_THE_RUN, RunOptions
-from .parsing import StrictParser
+from .options import LOADS, OF_THE_RUN, RunOptions, StrictParser, add_declared
+from .patches import Load, value_of
 
 #: Keys in tables of loads, besides times and shares.
 VALUES = {"pull": "by", "twist": "degrees", "press": "pressure"}

@@ -5,10 +5,15 @@ from __future__ import annotations
 import argparse
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import numpy as np
 import warp as wp
 
+from warp_corot.body.soft_body import SoftBody
+from warp_corot.cutting.blade import Blade
+from warp_corot.elasticity import Corotated
+from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.device import checked_device
 from warp_corot.inputs.loading import (
     BODY,
@@ -23,21 +28,20 @@ from warp_corot.inputs.loading import (
     begin_loading,
 )
 from warp_corot.inputs.stopwatch import WATCH
+from warp_corot.mesh import TetForest
+from warp_corot.simulation.beginning import bring_to_rest
 from warp_corot.simulation.simulation import Simulation
-from warp_corot.solvers import INTEGRATORS
+from warp_corot.simulation.static import solve_static
+from warp_corot.solvers import INTEGRATORS, BackwardEuler, Integrator, QuasiStatic, SymplecticEuler
 
-from .bodies import RunBody, asked_bodies, find_body, find_patches, gravity_of, make_body
-from .choosing import choose_steps, may_choose
-from .compiling import tell_compiling
-from .exit_status import complain
-from .implicit import integrator_name, is_static
-from .loading import ramp_of
-from .pressing import press_patches
-from .probing import Probe
-from .static import moves
-from .stepping import make_simulation
-from .touching import RunContact, place_ground, say_overlaps, say_reach, touched_by
-from .waiting import waiting
+from .bodies import REMESH_ARGUMENTS, RunBody, asked_bodies, find_body, find_patches, gravity_of, make_body
+from .contact import RunContact, place_ground, say_overlaps, say_reach, touched_by
+from .options import IMPLICIT_DT, integrator_name, is_static
+from .patches import press_patches, ramp_of
+from .ranks import are_several
+from .results import Probe
+from .terminal import as_options, complain, tell_compiling, waiting
+from .tool_paths import make_blade
 
 #: The command warns that a run will take long if a frame has more steps than this.
 MANY_STEPS = 1e5
@@ -150,3 +154,254 @@ def _frames(args: argparse.Namespace, bodies: Sequence[RunBody], touched: RunCon
     if duration is None:
         duration = max(body.subject.duration for body in bodies)
     return duration, frame_count(duration, args.fps)
+
+
+# --- the simulation, with a tested time step -------------------------------------------------------------------------
+
+#: Length of a blade over the size of the largest body, unless the user says.
+LONG = 3.0
+
+
+def make_simulation(args: argparse.Namespace, bodies: Sequence[RunBody], touched: RunContact) -> Simulation:
+    """The simulation, its kernels compiled; a given step is shortened until a whole number of them makes a frame."""
+    from warp_corot.io.write.animate import shortening, steps_per_frame
+
+    check_static(args, touches=touched.contact is not None, remeshes=any(body.remesh for body in bodies))
+    first = bodies[0].subject
+    damping = first.damping if args.damping is None else args.damping
+    viscosity = args.viscosity or 0.0
+    SymplecticEuler(args.dt, damping, viscosity)  # checks all values; the step is shortened later
+    if args.dt is not None and (note := shortening(args.dt, args.fps)):
+        first.notes.append(note)
+    integrator: Integrator
+    if is_static(args):
+        integrator = static_integrator(args, bodies, touched)
+    elif INTEGRATORS[integrator_name(args)].is_implicit:
+        steps = steps_per_frame(args.fps, args.dt or IMPLICIT_DT)
+        integrator = INTEGRATORS[integrator_name(args)](1.0 / (args.fps * steps), damping, viscosity)  # type: ignore[call-arg]
+    else:
+        tried = min(_tried_step(body, damping, viscosity) for body in bodies)
+        steps = steps_per_frame(args.fps, args.dt or tried)  # refuses an excessive number
+        integrator = SymplecticEuler(None if args.dt is None else 1.0 / (args.fps * steps), damping, viscosity)
+    cuts = blades_of(args, bodies)
+    with as_options(REMESH_ARGUMENTS):
+        made: Simulation = (_on_ranks() if are_several() else Simulation)(
+            bodies=[body.soft for body in bodies],
+            model=[body.model for body in bodies],
+            integrator=integrator,
+            gravity=gravity_of(args, first),
+            remesh=[body.remesh for body in bodies] if any(body.remesh for body in bodies) else None,
+            obstacles=list(touched.obstacles.values()),
+            contact=touched.contact,
+            cuts=cuts or None,
+        )
+        return made
+
+
+def _on_ranks() -> type[Simulation]:
+    """The simulation that all ranks step."""
+    from warp_corot.distributed import Simulation as OnRanks
+
+    return OnRanks
+
+
+def blades_of(args: argparse.Namespace, bodies: Sequence[RunBody]) -> list[Blade]:
+    """The blades of ``--blade``.
+
+    Raises:
+        InputError: A file is no path, or there is a length and no blade.
+    """
+    if not args.blade and args.blade_length is not None:
+        raise InputError("--blade-length is for --blade, which is not given")
+    for body in bodies if args.blade else ():
+        kept = "--skin input" if body.args.skin == "input" else "--draw-labels" if body.args.draw_labels else None
+        if kept:
+            raise InputError(f"{kept} draws a surface that does not come apart; with --blade leave it out")
+    size = max(float(np.ptp(body.subject.mesh.points, axis=0).max()) for body in bodies)
+    return [make_blade(path, args.blade_length or LONG * size) for path in args.blade or ()]
+
+
+def _tried_step(one: RunBody, damping: float, viscosity: float) -> float:
+    """The length of a trial step [s], made at rest and without weight: it loads every kernel and moves nothing."""
+    tried = body = one.soft
+    model, remesh = one.model, one.remesh
+    if remesh:
+        # The body's own mesh must not change before the run begins.
+        tried, remesh = SoftBody(body.mesh, body.material, device=body.device, threads=1), replace(remesh, every=1)
+        tried.fix(body.constrained)
+    integrator = SymplecticEuler(damping=damping, viscosity=viscosity)
+    with as_options(REMESH_ARGUMENTS):
+        trial = Simulation(tried, model=model, integrator=integrator, gravity=(0, 0, 0), remesh=remesh)
+    dt = trial.dt
+    trial.step()
+    trial.von_mises()
+    if tried is body:
+        body.displacements = still = np.zeros_like(body.mesh.points)
+        body.state.set_velocities(still)
+    return dt
+
+
+# --- the choice between explicit and implicit steps, if the user makes none ------------------------------------------
+
+#: The steps that follow the state, over the largest stable one at rest.
+SHORTER = 0.75
+#: Bodies with shorter stable steps than this [s] are left to the explicit ones, which refuse them.
+SHORTEST = 1e-12
+#: Steps up to this length [s] are explicit if users give it.
+SHORT_STEP = 2e-3
+#: Implicit steps are chosen if they are faster by this factor, since explicit ones resolve more of the motion.
+FASTER = 2.0
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a step takes [s]: at least, for each element, and the factor of both with contact."""
+
+    least: float
+    element: float
+    touching: float
+
+    def of(self, elements: int, touches: bool) -> float:
+        return (self.least + self.element * elements) * (self.touching if touches else 1.0)
+
+
+#: Explicit and implicit steps of organs on a CPU core, and on an H200. They are rough: the choice must not depend on
+#: how busy a machine is.
+ON_CPU = Cost(3e-5, 25e-9, 2.4), Cost(1e-3, 0.7e-6, 6.0)
+ON_CUDA = Cost(12e-6, 25e-12, 40.0), Cost(1.5e-3, 50e-9, 3.0)
+
+
+def choose_steps(args: argparse.Namespace, bodies: Sequence[RunBody], touched: RunContact, device: wp.Device) -> None:
+    """Set ``integrator`` of a body's options to implicit steps if explicit ones would be slower than real time and
+    much slower than these, or unstable with the step that users give; a note of the body says so.
+
+    The choice is made for one body of the corotated law on a forest, which touches neither itself nor other bodies.
+    """
+    if not may_choose(bodies):
+        return
+    body = bodies[0]
+    model, mesh = body.model, body.soft.mesh
+    if not (isinstance(model, Corotated) and model.level is None and isinstance(mesh, TetForest)):
+        return
+    explicit, implicit = ON_CUDA if device.is_cuda else ON_CPU
+    size = len(mesh.tets), touched.contact is not None
+    step = _stable_step(body)
+    if step < SHORTEST:
+        return
+    slow = SHORTER * step / explicit.of(*size)
+    fast = (args.dt or IMPLICIT_DT) / implicit.of(*size)
+    if args.dt is not None and args.dt > FASTER * step:
+        why = f"unstable from about {1e3 * step:.2g} ms on"
+    elif args.dt is None and slow < 1.0 and fast >= FASTER * slow:
+        why = f"about {fast / slow:.1g} times as slow"
+    else:
+        return
+    args.integrator = "backward-euler"
+    body.subject.notes.append(
+        f"implicit steps, which damp vibrations, since explicit ones would be {why} "
+        "(--integrator symplectic-euler makes those)"
+    )
+
+
+def may_choose(bodies: Sequence[RunBody]) -> bool:
+    """Whether the options leave the choice open."""
+    args = bodies[0].args
+    is_short = args.dt is not None and args.dt <= SHORT_STEP
+    given = args.integrator or is_short or args.viscosity or is_static(args) or are_several()
+    return not (given or args.self_contact or len(bodies) > 1 or bodies[0].remesh is not None)
+
+
+def _stable_step(body: RunBody) -> float:
+    """An estimate of the largest stable step at rest [s]: the smallest height of an element over the speed of sound. It
+    was within 10 % for four uniform organs and a box, and is within 25 % where stiffness jumps."""
+    mesh, material = body.soft.mesh, body.soft.discretization
+    x = mesh.points[mesh.tets].astype(float)
+    faces = np.array([(1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2)])
+    a, b, c = np.moveaxis(x[:, faces], 2, 0)
+    areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=2)
+    volumes = np.abs(np.linalg.det(x[:, 1:] - x[:, :1])) / 6.0
+    heights = 3.0 * volumes / areas.max(axis=1)
+    stiffness = material.lam.numpy().astype(float) + 2.0 * material.mu.numpy()
+    return float((heights * np.sqrt(np.asarray(body.soft.material.density, dtype=float) / stiffness)).min())
+
+
+# --- ``--static`` ----------------------------------------------------------------------------------------------------
+
+
+def check_static(args: argparse.Namespace, *, touches: bool, remeshes: bool) -> None:
+    """Check the options for static answers.
+
+    Args:
+        args: The options.
+        touches, remeshes: Whether other options ask for contact, or for remeshing.
+
+    Raises:
+        InputError: Options that exclude each other.
+    """
+    if not is_static(args):
+        # The simulation reports what an integrator cannot do.
+        return
+    for name in ("integrator", "dt", "damping", "viscosity"):
+        if getattr(args, name) is not None:
+            raise InputError(f"--static has no steps in time; leave out --{name}")
+    if touches and args.drop is not None:
+        raise InputError("--static has no fall; leave out --drop (--ground lets the bodies stand on the ground)")
+    if touches and are_several():
+        raise InputError("--static with contact runs in one process, and there are several ranks")
+    if remeshes:
+        raise InputError("--static does not support remeshing; leave out --remesh")
+
+
+def rest(args: argparse.Namespace, sim: Simulation) -> list[str]:
+    """With --static, find where bodies are at rest before anything moves them; returns a line for each.
+
+    Raises:
+        UnstableError: No state at rest was found for a body.
+    """
+    if not is_static(args):
+        return []
+    if sim.contact is not None:
+        return [_rest_in_contact(sim)]
+    lines = []
+    for body, model in zip(sim.bodies, sim.models, strict=True):
+        report = solve_static(body, model=model, gravity=sim.gravity)
+        if not report.converged:
+            raise UnstableError(f"--static: {report.message}")
+        lines.append(
+            f"at rest after {report.iterations} iterations of Newton's method, {report.linear_iterations} linear, "
+            f"{report.time:.2f} s"
+        )
+    return lines
+
+
+def _rest_in_contact(sim: Simulation) -> str:
+    """Bring all bodies to rest on what they touch; returns a line."""
+    began = WATCH.clock()
+    found = bring_to_rest(sim)
+    if not found.converged.all():
+        raise UnstableError(f"--static: {found.message}")
+    return (
+        f"at rest in contact after {found.iterations} long steps, {found.linear_iterations} linear iterations, "
+        f"{WATCH.clock() - began:.2f} s"
+    )
+
+
+def static_integrator(args: argparse.Namespace, bodies: Sequence[RunBody], touched: RunContact) -> Integrator:
+    """The steps from one frame of a static answer to the next; there are none for bodies that only contact holds.
+
+    Raises:
+        InputError: They do not stay at rest, as something moves.
+    """
+    held = all(body.soft.conditions.held_mask().any() for body in bodies)
+    if touched.contact is None or held:
+        return QuasiStatic(1.0 / args.fps)
+    if moves(bodies, touched):
+        raise InputError(
+            "--static: tools and loads that move can only follow bodies that are held; add --fix, or leave out --static"
+        )
+    return BackwardEuler(1.0 / args.fps)  # makes no step
+
+
+def moves(bodies: Sequence[RunBody], touched: RunContact) -> bool:
+    """Whether loads or tools move, so that bodies at rest follow them from frame to frame."""
+    return touched.moves or any(body.loads for body in bodies)

@@ -14,10 +14,8 @@ from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.device import checked_device
 from warp_corot.inputs.stopwatch import WATCH
 
-from .compiling import tell_compiling
-from .exit_status import complain, early_end
-from .implicit import unfinished
-from .summary import aligned, milliseconds, pressure, speed, wall_time
+from .summary import aligned, milliseconds, pressure, speed, unfinished, wall_time
+from .terminal import complain, early_end, tell_compiling
 
 if TYPE_CHECKING:
     from warp_corot.io.write.animate import Recording

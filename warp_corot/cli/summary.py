@@ -1,4 +1,4 @@
-"""The summary at the end of ``warp-corot simulate``."""
+"""The summary at the end of a run."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from warp_corot.holding.choice import NAMED
 from warp_corot.inputs.processes import process_count
 from warp_corot.inputs.stopwatch import KERNELS, WATCH
 from warp_corot.mesh import TetForest
+from warp_corot.simulation.simulation import Simulation
+from warp_corot.simulation.solves import Solves
 from warp_corot.solvers import INTEGRATORS
 
-from . import compiling
-from .implicit import is_static, solved
-from .remesh import remesh_rows
+from . import terminal
+from .options import is_static
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     from warp_corot.discretization.elements import Mesh
     from warp_corot.io.write.animate import Recording
     from warp_corot.materials.isotropic import Isotropic
-    from warp_corot.simulation.simulation import Simulation
 
     from .bodies import RunBody
     from .input_mesh import InputMesh
@@ -87,7 +87,7 @@ def summary(
 def wall_time() -> str:
     """The wall time of the command so far, and its parts."""
     WATCH.switch("preparing")
-    names = {KERNELS: "compiling kernels" if compiling.has_compiled else "loading kernels"}
+    names = {KERNELS: "compiling kernels" if terminal.has_compiled else "loading kernels"}
     parts = [f"{spent:.2f} s {names.get(part, part)}" for part, spent in WATCH.parts.items() if spent >= 0.005]
     return f"{sum(WATCH.parts.values()):.2f} s: {', '.join(parts)}"
 
@@ -247,3 +247,38 @@ def _mesh(subject: InputMesh) -> str:
     remarks = [f"{repaired} wound wrongly and repaired"] if repaired else []
     remarks += [f"{unused} nodes in no tetrahedron"] if unused else []
     return f"{nodes} nodes, {len(subject.mesh.tets)} tetrahedra" + (f" ({', '.join(remarks)})" if remarks else "")
+
+
+def remesh_rows(sim: Simulation, done: Recording) -> list[tuple[str, str]]:
+    """The mesh's changes for the summary; empty without remeshing."""
+    changing = sim.remeshing.changing[0]
+    if changing is None or not done.elements:
+        return []
+    options, first, last = changing.options, done.elements[0], done.elements[-1]
+    limits = f"above {options.refine_above:g}, below {options.simplify_below:g}"
+    low = "that of the start" if options.min_level is None else options.min_level
+    levels = f"levels {low} to {options.max_level}"
+    counts = f"{first} tetrahedra in the first frame, {max(done.elements)} at most, {last} in the last"
+    return [("remeshing", counts), ("", f"every {options.every} steps, {limits}, {levels}")]
+
+
+# --- the cost of implicit steps --------------------------------------------------------------------------------------
+
+
+def solved(sim: Simulation, static: bool) -> str | None:
+    """The cost of implicit steps, or of the states of rest after the first, in words; None for explicit ones."""
+    solves = sim.solves
+    if solves is None or not solves.steps:
+        return None
+    words = f"{solves.iterations / solves.steps:.3g} iterations of Newton's method"
+    words += f" and {solves.linear_iterations / solves.steps:.3g} linear ones a {'frame' if static else 'step'}"
+    if static:
+        return words + unfinished(solves, "later frames", "show more frames (--fps), which are nearer to one another")
+    return words + unfinished(solves, "steps", "shorten the steps (--dt), or raise linear_iterations in Python")
+
+
+def unfinished(solves: Solves, what: str, cure: str) -> str:
+    """The number of unfinished solves, and what helps; empty if there are none."""
+    if not solves.unfinished:
+        return ""
+    return f"; {solves.unfinished} of {solves.steps} {what} ended before their linear solve converged; {cure}"

@@ -15,7 +15,7 @@ import numpy as np
 from warp_corot.errors import InputError
 from warp_corot.io.files.whole import written_whole
 
-from .exit_status import complain, interrupt_status
+from .terminal import complain, interrupt_status
 
 if TYPE_CHECKING:
     from warp_corot.distributed.sweeps import Row

@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import argparse
+import json
 import math
+import os
+import platform
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import warp as wp
 
 from warp_corot.errors import InputError
 from warp_corot.inputs.likely import meant
-from warp_corot.io.files.whole import check_output
+from warp_corot.io.files.whole import check_output, written_whole
 
-from .exit_status import complain
+from .terminal import complain
 
 if TYPE_CHECKING:
-    from warp_corot.experiments.verification import Row
+    from warp_corot.experiments import Row
 
 #: Exit status if a row does not pass.
 BEYOND = 4
@@ -27,12 +34,11 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: There is no such case or device, or the file cannot be written; nothing was run.
     """
-    from warp_corot.experiments.report import environment, write_json
-    from warp_corot.experiments.verification import CASES, Setup, run_case
+    from warp_corot.experiments import CASES, Setup, run_case
     from warp_corot.inputs.device import checked_device
     from warp_corot.simulation.progress import hidden
 
-    from .compiling import tell_compiling
+    from .terminal import tell_compiling
 
     if args.list:
         for case in CASES.values():
@@ -83,3 +89,46 @@ def _plain(value: Any) -> Any:
     if value is None or isinstance(value, str | bool):
         return value
     return float(value) if math.isfinite(value) else None
+
+
+def environment(device: wp.Device) -> dict:
+    """Versions, machine and device, as plain values."""
+    from warp_corot import __version__
+
+    return {
+        "versions": {
+            "warp_corot": __version__,
+            "warp": wp.config.version,
+            "numpy": np.__version__,
+            "python": platform.python_version(),
+        },
+        "machine": {"system": platform.system(), "processor": processor_name(), "cores": os.cpu_count()},
+        "device": {"alias": str(device), "name": device_name(device), "cuda": device.is_cuda},
+    }
+
+
+def write_json(path: Path, content: dict) -> None:
+    """Write a JSON file to a temporary file and rename it.
+
+    Raises:
+        OSError: It could not be written; a former file stays.
+    """
+    text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
+    with written_whole(path) as part:
+        part.write_text(text + "\n", encoding="utf-8")
+
+
+def device_name(device: wp.Device) -> str:
+    """Name of the GPU or the processor."""
+    return device.name if device.is_cuda else f"CPU ({processor_name()}, one core)"
+
+
+def processor_name() -> str:
+    """Name of the processor if the system gives it, else its architecture."""
+    try:
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()

@@ -18,12 +18,11 @@ from warp_corot.elasticity.dilatation import AUTO
 from warp_corot.errors import InputError
 from warp_corot.materials.isotropic import Isotropic
 
-from .exit_status import interrupt_status
-from .loading import ramp_of
-from .pressing import press_patches
+from .patches import press_patches, ramp_of
 from .run_file import bodies_of, write_run
 from .run_setup import RunSetup, set_up
 from .summary import names_of
+from .terminal import interrupt_status
 
 if TYPE_CHECKING:
     from warp_corot.simulation.simulation import Simulation
@@ -35,8 +34,7 @@ def run(args: argparse.Namespace) -> int:
     Raises:
         InputError: Bad options, or a page that cannot be opened.
     """
-    from warp_corot.viewing.access_control import check_port
-    from warp_corot.viewing.server import library
+    from warp_corot.viewing.server import check_port, library
     from warp_corot.viewing.view import View
 
     library()

@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 from warp_corot.inputs.device import checked_device
 
 from . import make_parser, simulate
-from .options.run import CHOICES
+from .options import CHOICES
 
 EXPLICIT, IMPLICIT = (["--integrator", name] for name in ("symplectic-euler", "backward-euler"))
 #: Options of runs, by what they are called.

@@ -11,8 +11,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_number, checked_numbers, shown
-from warp_corot.inputs.keys import checked_times
+from warp_corot.inputs.checks import checked_number, checked_numbers, checked_times, shown
 
 from .shapes import Shape, Vector, checked_quaternion, checked_vector
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,9 +10,8 @@ import numpy.typing as npt
 
 from warp_corot.contact.tool import Obstacle
 from warp_corot.errors import InputError
-from warp_corot.io.pictures.camera import Camera
 from warp_corot.io.pictures.colors import VertexAverage
-from warp_corot.io.pictures.drawing import draw_body
+from warp_corot.io.pictures.drawing import Camera, Window, render
 from warp_corot.io.write.solids import poses_of, shape_of, solid_of
 
 if TYPE_CHECKING:
@@ -27,13 +27,10 @@ def draw_world(env: SoftEnv, world: int = 0) -> npt.NDArray[np.uint8]:
     """Tissue, coloured by its von Mises stress, and tools, uint8 [height, width, 3]; waits for the device.
 
     Raises:
-        InputError: Matplotlib is not installed.
+        InputError: Pillow is not installed.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise InputError('pictures need Matplotlib: pip install "warp-corot[plot]"') from None
+    if find_spec("PIL") is None:
+        raise InputError('pictures need Pillow: pip install "warp-corot[plot]"')
     body, scene = env.sim.body, env.scene
     copy, mesh = body.world(world), env.scene.mesh
     average = VertexAverage(mesh.tets, mesh.volumes, len(mesh.points))
@@ -45,17 +42,11 @@ def draw_world(env: SoftEnv, world: int = 0) -> npt.NDArray[np.uint8]:
             faces.append(solid.triangles + sum(map(len, points)))
             points.append(solid.at(pose))
             values.append(np.full(len(points[-1]), np.nan))
-    figure = Figure((SIZE[0] / 100, SIZE[1] / 100), dpi=100)
-    canvas = FigureCanvasAgg(figure)
-    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     low, high = env.task.window
     camera = Camera.fit(np.array([low, high]), "Z", *env.task.view)
-    options: dict[str, Any] = {"value_range": (0.0, MOST), "camera": camera, "ground": 0.0}
-    draw_body(axes, np.concatenate(points), np.concatenate(faces), scalars=np.concatenate(values), **options)
     corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
     seen = camera.project(corners)[0]
     middle, half = 0.5 * (seen.min(axis=0) + seen.max(axis=0)), 0.5 * (np.ptp(seen, axis=0) / SIZE).max() * SIZE
-    left, right = middle - half, middle + half
-    axes.set(xlim=(left[0], right[0]), ylim=(left[1], right[1]))
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+    window = Window(middle - half, middle + half, (SIZE[0], SIZE[1]))
+    options: dict[str, Any] = {"value_range": (0.0, MOST), "ground": 0.0, "scalars": np.concatenate(values)}
+    return render(window, camera, np.concatenate(points), np.concatenate(faces), **options)

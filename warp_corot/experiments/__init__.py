@@ -1,5 +1,6 @@
-"""The paper's experiment, with its timing, claims, report and figures."""
+"""A suite of cases with known answers: elastic laws, contact, friction and impacts, each beside its reference."""
 
-from .paper import Results, Run, Settings, run_experiment
+from . import elastic, half_spaces, motion  # noqa: F401  (each adds its cases)
+from .case import CASES, Case, Row, Setup, run_case
 
-__all__ = ["Results", "Run", "Settings", "run_experiment"]
+__all__ = ["CASES", "Case", "Row", "Setup", "run_case"]

@@ -14,8 +14,7 @@ import numpy.typing as npt
 
 from warp_corot.contact.shapes import NO_TURN, checked_quaternion, checked_vector
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_numbers
-from warp_corot.inputs.keys import checked_times
+from warp_corot.inputs.checks import checked_numbers, checked_times
 
 Vector = Sequence[float] | npt.NDArray[np.floating]
 Floats = npt.NDArray[np.float64]

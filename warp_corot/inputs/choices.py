@@ -28,5 +28,3 @@ INTEGRATORS = {
 AUTO, ELEMENT, SHARED = "auto", "element", "shared"
 #: Online remeshing: thresholds of the elongation of an element's longest edge, and steps between passes.
 REFINE_ABOVE, SIMPLIFY_BELOW, REMESH_EVERY = 1.25, 1.08, 10
-#: Simulated times of the paper's experiment and of its short form [s].
-FULL_DURATION, SHORT_DURATION = 80.0, 4.0

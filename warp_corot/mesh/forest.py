@@ -15,8 +15,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import shown
-from warp_corot.inputs.indices import checked_indices
+from warp_corot.inputs.checks import checked_indices, shown
 
 from .forest_arrays import ForestArrays
 from .growing.refined import refined

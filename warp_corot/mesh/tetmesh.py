@@ -11,8 +11,14 @@ import numpy.typing as npt
 
 from warp_corot.domain.units import check_float32
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_axis, checked_number, checked_numbers, checked_strings, shown
-from warp_corot.inputs.indices import checked_indices
+from warp_corot.inputs.checks import (
+    checked_axis,
+    checked_indices,
+    checked_number,
+    checked_numbers,
+    checked_strings,
+    shown,
+)
 from warp_corot.kernels.tables.shapes import EDGES
 
 from .labelled import LabelledMesh

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from warp_corot.discretization.discretization import centroids, lumped_masses
 from warp_corot.errors import InputError
-from warp_corot.inputs.indices import checked_indices
+from warp_corot.inputs.checks import checked_indices
 from warp_corot.materials.isotropic import Isotropic
 from warp_corot.mesh import TetForest, TetMesh
 from warp_corot.mesh.surfaces.boundary import boundary_faces, signed_volumes

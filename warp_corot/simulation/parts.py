@@ -16,8 +16,7 @@ from warp_corot.contact.shapes import Shape
 from warp_corot.contact.tool import Obstacle, Tool
 from warp_corot.elasticity import Model
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_number, checked_things, shown
-from warp_corot.inputs.indices import checked_indices
+from warp_corot.inputs.checks import checked_indices, checked_number, checked_things, shown
 from warp_corot.solvers import Integrator, QuasiStatic, Stepper
 from warp_corot.solvers.halo import ALONE, Halo
 from warp_corot.solvers.system import System

@@ -10,11 +10,11 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_choice, checked_count, checked_flag, checked_number, checked_vector, shown
 from warp_corot.remesh.online import OnlineRemesh
 
-from .cutting import Plane
 from .hands import HANDS
 from .saving import Saving
 from .server import Visitor
 from .session import Session
+from .shown import Plane
 from .tissue import choices, collapses, present, switched
 
 Command = Callable[[], None]

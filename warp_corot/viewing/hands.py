@@ -1,20 +1,252 @@
-"""Hands: the ways in which a person acts on a body, a small class each, listed in ``HANDS``.
+"""Hands: the ways in which a person acts on a body, a small class each, listed in ``HANDS``, and their springs.
 
-A hand takes hold of a picked place, is moved, and reports the force that it exerts. The hands here are springs; a hand
-that moves a rigid tool needs the same few members.
+A hand takes hold of a picked place, is moved, and reports the force that it exerts. The hands here are springs between
+the mouse and the shown surface: forces of the system, launched within each step, whose matrix has their stiffness in
+implicit steps. A hand that moves a rigid tool needs the same few members.
 """
 
 from __future__ import annotations
 
-from typing import ClassVar
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
+import warp as wp
+
+from warp_corot.body.soft_body import SoftBody
+from warp_corot.kernels.viewing import hands as kernels
+from warp_corot.simulation.simulation import Simulation
+from warp_corot.solvers import SymplecticEuler, largest_frequency
 
 from .shown import Pick, Shown
-from .springs import MOST_POINTS, AllSprings, HeldPatch
 
-Vector = npt.NDArray[np.float64]
+#: Maximum number of hands on a body at the same time, and of points in a patch: one thread loops over them.
+MOST_HANDS, MOST_POINTS = 8, 64
+#: The square of the spring's own frequency times the longest step; the limit is 4, of which elasticity takes up to 3.3.
+STIFF = 0.2
+#: Damping of the spring over critical damping.
+DAMPED = 0.1
+#: The largest force on a patch over Young's modulus and the patch's area: beyond that, elements turn over for good.
+HARDEST = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class HeldPatch:
+    """Points of a shown surface, and the weight of each.
+
+    Attributes:
+        points: int32 [k], at most MOST_POINTS.
+        shares: The points' weights, which sum to one, float64 [k].
+        area: Area of the surface around the points at rest [m^2].
+    """
+
+    points: npt.NDArray[np.int32]
+    shares: npt.NDArray[np.float64]
+    area: float
+
+
+class Springs:
+    """The springs of all hands of a simulation, among the forces of its system from the first hold on.
+
+    Args:
+        sim: The simulation.
+        shown: The shown surface of each body.
+
+    Attributes:
+        revision: Changes when a body is first held, since its launches then begin.
+    """
+
+    def __init__(self, sim: Simulation, shown: Sequence[Shown]):
+        self.sim, self.shown, self.revision = sim, shown, 0
+        self._bodies: dict[int, BodySprings] = {}
+
+    def close(self) -> None:
+        """Let everything go and leave the simulation."""
+        if self in self.sim.system.forces:
+            self.sim.system.forces.remove(self)
+        self._bodies.clear()
+
+    def hold(self, body: int, patch: HeldPatch, *, rigid: bool, strength: float = 1.0) -> Spring:
+        """Take hold of a patch as it is now.
+
+        Args:
+            body: The number of the body.
+            patch: Points of its shown surface.
+            rigid: Whether every point is held; otherwise only their mean is.
+            strength: Stiffness over the largest stable one at the time step, 0 to 1.
+
+        Raises:
+            LookupError: The maximum number of hands hold the body already.
+        """
+        if not self._bodies:
+            self.sim.system.forces.append(self)
+        if body not in self._bodies:
+            self._bodies[body] = BodySprings(self.sim, self.shown[body])
+            self.revision += 1
+        return self._bodies[body].hold(patch, rigid, strength)
+
+    def refit(self) -> None:
+        """Find the stiffness again if the meshes or their nodes' masses have changed."""
+        for springs in self._bodies.values():
+            springs.refit()
+
+    # --- as forces of the system; all launches may be recorded ------------------------------------------------------
+
+    def add_forces(self) -> None:
+        """Launch the forces of all hands."""
+        for springs in self._bodies.values():
+            state = springs.body.state
+            inputs = [*springs.places, springs.starts, state.displacements, state.velocities]
+            springs.launch(kernels.pull, [*inputs, state.forces, springs.found, springs.softened])
+
+    def add_stiffness(self, body: SoftBody, p: wp.array, y: wp.array) -> None:
+        """Launch y += K p, where K are springs as soft as their limits make them."""
+        for springs in self._bodies.values():
+            if springs.body is body:
+                springs.launch(kernels.add_products, [*springs.places, springs.softened, p, y])
+
+    def add_diagonal(self, body: SoftBody, blocks: wp.array) -> None:
+        """Launch the addition of the blocks on K's diagonal."""
+        for springs in self._bodies.values():
+            if springs.body is body:
+                springs.launch(kernels.add_blocks, [*springs.places, springs.softened, blocks])
+
+
+class Spring:
+    """The spring of one hand; see ``Springs.hold``.
+
+    Attributes:
+        stiffness: Stiffness of the spring, for the whole patch [N/m].
+        limit: The largest force on it [N].
+        slot: Its place among the hands of the body.
+        motion: How far the hand has moved since it took hold [m], float64 [3].
+    """
+
+    def __init__(self, owner: BodySprings, slot: int, patch: HeldPatch, rigid: bool, strength: float):
+        self._owner, self.slot = owner, slot
+        self.patch, self.rigid, self.strength = patch, rigid, strength
+        self.stiffness = self.damping = self.limit = 0.0
+        self.motion: npt.NDArray[np.float64] = np.zeros(3)
+        self.start: npt.NDArray[np.float64] = np.zeros(3)
+
+    def move(self, motion: npt.ArrayLike) -> None:
+        """Set the hand's distance from where it took hold [m], [3]."""
+        self.motion = np.asarray(motion, dtype=np.float64)
+        self._owner.write(self.slot)
+
+    def release(self) -> None:
+        """Release; further calls do nothing."""
+        self._owner.release(self.slot, self)
+
+    @property
+    def force(self) -> npt.NDArray[np.float64]:
+        """The force on the body in the last step [N], float64 [3]; waits for the device."""
+        return self._owner.found.numpy()[self.slot, 0].astype(np.float64)
+
+    @property
+    def ends(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """The middle of the patch, and the place to which the hand pulls it [m], float64 [3] each."""
+        middle = self.patch.shares @ self._owner.shown.rest[self.patch.points]
+        moved = self._owner.found.numpy()[self.slot, 1].astype(np.float64)
+        return middle + moved, middle + self.start + self.motion
+
+
+class BodySprings:
+    """The springs that hold one body.
+
+    Attributes:
+        starts: Displacements of the points of each patch when a hand took hold [m], vec3 [hands, points].
+        found: Force [N] and mean displacement [m] of every hand in the last step, vec3 [hands, 2].
+        softened: Stiffness of the springs as their limits make them [N/m], float32 [hands, points].
+    """
+
+    def __init__(self, sim: Simulation, shown: Shown):
+        self.sim, self.shown, self.body = sim, shown, shown.body
+        device, size = self.body.device, (MOST_HANDS, MOST_POINTS)
+        self._held: list[Spring | None] = [None] * MOST_HANDS
+        self._springs = wp.zeros(MOST_HANDS, dtype=kernels.Spring, device=device)
+        self._patches = wp.zeros(size, dtype=wp.int32, device=device)
+        self._shares = wp.zeros(size, dtype=wp.float32, device=device)
+        self.starts = wp.zeros(size, dtype=wp.vec3, device=device)
+        self.found = wp.zeros((MOST_HANDS, 2), dtype=wp.vec3, device=device)
+        self.softened = wp.zeros(size, dtype=wp.float32, device=device)
+        self._explicit_dt: float | None = None
+
+    @property
+    def places(self) -> list[wp.array]:
+        """The first inputs of all launches."""
+        return [self._springs, self._patches, self._shares, self.shown.nodes, self.shown.binding.weights]
+
+    def launch(self, kernel: wp.Kernel, inputs: list[wp.array]) -> None:
+        wp.launch(kernel, MOST_HANDS, inputs, device=self.body.device)
+
+    def hold(self, patch: HeldPatch, rigid: bool, strength: float) -> Spring:
+        if None not in self._held:
+            raise LookupError(f"{MOST_HANDS} hands hold the body already")
+        slot = self._held.index(None)
+        spring = self._held[slot] = Spring(self, slot, patch, rigid, strength)
+        count = len(patch.points)
+        self._patches[slot, :count].assign(patch.points.astype(np.int32))
+        self._shares[slot, :count].assign(patch.shares.astype(np.float32))
+        inputs = [self._patches[slot], self.shown.nodes, self.shown.binding.weights, self.body.state.displacements]
+        wp.launch(kernels.take_hold, count, inputs, [self.starts[slot]], device=self.body.device)
+        spring.start = patch.shares @ self.starts[slot].numpy()[:count]
+        self._fit(spring)
+        self.write(slot)
+        return spring
+
+    def release(self, slot: int, spring: Spring) -> None:
+        if self._held[slot] is spring:
+            self._held[slot] = None
+            self.write(slot)
+
+    def refit(self) -> None:
+        for slot, spring in enumerate(self._held):
+            if spring is not None:
+                self._fit(spring)
+                self.write(slot)
+
+    def write(self, slot: int) -> None:
+        """Copy a hand to the device."""
+        spring = self._held[slot]
+        of_spring: Any = kernels.Spring
+        row: Any = np.zeros(1, dtype=of_spring.numpy_dtype())
+        if spring is not None:
+            row["motion"], row["stiffness"], row["damping"] = spring.motion, spring.stiffness, spring.damping
+            row["limit"], row["rigid"], row["count"] = spring.limit, int(spring.rigid), len(spring.patch.points)
+        given = wp.array(row, dtype=kernels.Spring, device=self.body.device)
+        wp.copy(self._springs, given, dest_offset=slot, count=1)
+
+    def _fit(self, spring: Spring) -> None:
+        """The stiffness and the damping that are stable at the time step."""
+        # Copied, since a view of a device's array may be the array itself.
+        nodes = np.array(self.shown.nodes.numpy()[spring.patch.points])
+        weights = np.array(self.shown.binding.weights.numpy()[spring.patch.points], dtype=np.float64)
+        weights *= spring.patch.shares[:, None]
+        used, place = np.unique(nodes, return_inverse=True)
+        total = np.bincount(place.ravel(), np.abs(weights).ravel(), len(used))
+        mass = self.body.masses[used]
+        # The largest eigenvalue of the spring over masses for a stiffness of one: exact if the hand holds the mean,
+        # else a bound.
+        softness = float((total / mass).max() if spring.rigid else (total**2 / mass).sum())
+        dt = self._longest_step()
+        spring.stiffness = spring.strength * STIFF / (dt**2 * softness)
+        spring.limit = HARDEST * float(np.mean(self.body.material.isotropic.young)) * spring.patch.area
+        if not self.sim.system.is_implicit:
+            spring.damping = 2.0 * DAMPED * (spring.stiffness / softness) ** 0.5
+
+    def _longest_step(self) -> float:
+        """The explicit step that the springs must bear [s]; those of implicit steps are as stiff."""
+        sim = self.sim
+        if not sim.system.is_implicit:
+            return sim.dt if sim.safe_step is None else sim.safe_step.at_rest
+        if self._explicit_dt is None:
+            k = sim.bodies.index(self.body)
+            frequency = largest_frequency(self.body, sim.fields[k].stiffest, sim.ranks, k)
+            self._explicit_dt = SymplecticEuler().stable_step(frequency)
+        return self._explicit_dt
 
 
 class SpringHand:
@@ -31,28 +263,28 @@ class SpringHand:
     rigid: ClassVar[bool] = False
     stays: ClassVar[bool] = False
 
-    def __init__(self, springs: AllSprings, shown: Shown, pick: Pick, radius: float, strength: float = 1.0):
+    def __init__(self, springs: Springs, shown: Shown, pick: Pick, radius: float, strength: float = 1.0):
         self.pick = pick
         self._inward = -shown.normal(pick)
         self._spring = springs.hold(pick.body, patch_around(shown, pick, radius), rigid=self.rigid, strength=strength)
-        self._before: Vector = np.zeros(3)
+        self._before: npt.NDArray[np.float64] = np.zeros(3)
 
     def begin(self) -> None:
         """Take hold again: motion counts from here."""
         self._before = self._spring.motion
 
-    def move(self, motion: Vector) -> None:
+    def move(self, motion: npt.NDArray[np.float64]) -> None:
         self._spring.move(self._before + motion)
 
     def release(self) -> None:
         self._spring.release()
 
     @property
-    def force(self) -> Vector:
+    def force(self) -> npt.NDArray[np.float64]:
         return self._spring.force
 
     @property
-    def ends(self) -> tuple[Vector, Vector]:
+    def ends(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         return self._spring.ends
 
 
@@ -65,7 +297,7 @@ class PressHand(SpringHand):
 
     rigid = True
 
-    def move(self, motion: Vector) -> None:
+    def move(self, motion: npt.NDArray[np.float64]) -> None:
         self._spring.move(float(np.linalg.norm(motion)) * self._inward)
 
 

@@ -12,9 +12,8 @@ from warp_corot.contact.tool import Tool
 from warp_corot.io.pictures.colors import STEEL, TISSUE, stress_colors
 from warp_corot.io.write.solids import Solid, solid_of
 
-from .frames import PageFrame
 from .server import packed
-from .session import Session
+from .session import PageFrame, Session
 from .tissue import TISSUES, choices, present
 from .tools import ToolHand
 

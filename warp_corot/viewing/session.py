@@ -8,8 +8,8 @@ from __future__ import annotations
 import queue
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -24,13 +24,144 @@ from warp_corot.simulation.remade import remade, tools_lent
 from warp_corot.simulation.simulation import Simulation
 
 from .colors import Range, Source, sources
-from .cutting import cut
-from .frames import PageControls, PageFrame, Vector
-from .hands import HANDS, SpringHand
-from .implicit_springs import springs_of
-from .real_time_factor import RealTimeFactor
-from .shown import Shown, surfaces_of
+from .hands import HANDS, SpringHand, Springs
+from .shown import Plane, Shown, cut, surfaces_of
 from .tools import ToolHand, new_tool
+
+# --- controls in one direction, frames in the other ------------------------------------------------------------------
+
+Vector: TypeAlias = npt.NDArray[np.float64]
+
+
+@dataclass
+class PageControls:
+    """The values of the page's controls.
+
+    Attributes:
+        running: Whether the simulation runs.
+        speed: Wanted simulated seconds for each second of wall time.
+        fps: The most frames per second.
+        hand: A name in ``HANDS``.
+        radius: Radius of a hand's patch over the body's size.
+        strength: Strength of a hand's spring, 0 to 1.
+        colors: A name in ``Session.sources``; "" for none.
+        surface: The name of the surface that is shown; bodies without it show their first.
+        plane: Where bodies are cut, if they are.
+        world: The number of the world that is shown.
+    """
+
+    running: bool = True
+    speed: float = 1.0
+    fps: float = 30.0
+    hand: str = "drag"
+    radius: float = 0.06
+    strength: float = 1.0
+    colors: str = "stress"
+    surface: str = ""
+    plane: Plane | None = None
+    world: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class PageFrame:
+    """The picture at one time.
+
+    Attributes:
+        number: The version of the surfaces' topology, which changes with the triangles.
+        positions: The shown points of each body [m], float32 [V, 3].
+        triangles: int32 [F, 3] for each body.
+        shades: The number of each point's colour in a table of 256, uint8 [V] for each body; None: without colours.
+        highest: The value of the last colour.
+        poses: Position [m] and quaternion (x, y, z, w) of each obstacle, float64 [7].
+        time: Simulated time [s].
+        ratio: Simulated over wall time, lately.
+        slow: Whether that is less than was requested.
+        forces: The force of each hand that holds something, by its owner [N], float64 [3].
+        ends: The two ends of each of these hands' springs [m].
+    """
+
+    number: int
+    positions: Sequence[npt.NDArray[np.float32]]
+    triangles: Sequence[npt.NDArray[np.int32]]
+    shades: Sequence[npt.NDArray[np.uint8] | None]
+    highest: float
+    poses: Sequence[Vector]
+    time: float
+    ratio: float
+    slow: bool
+    forces: dict[Any, Vector]
+    ends: dict[Any, tuple[Vector, Vector]]
+
+
+# --- simulated time over wall time -----------------------------------------------------------------------------------
+
+#: The least share of a frame's time for steps, however long the rest takes.
+STEPPING = 0.4
+#: Time is made up for that was lost within this many periods of frames.
+MOST_LATE = 4.0
+#: Time counts as slow below this share of the requested speed.
+SLOW = 0.9
+
+
+@dataclass
+class RealTimeFactor:
+    """The speed of simulated time.
+
+    Attributes:
+        rate: Simulated seconds per second of stepping, lately.
+        ratio: Simulated over wall time, lately.
+        rest: Wall time of a frame without its steps, lately [s].
+    """
+
+    rate: float = 0.0
+    ratio: float = 0.0
+    rest: float = 0.0
+    _owed: float = 0.0
+    _since: float = 0.0
+    _then: float = 0.0
+
+    def wanted(self, speed: float, period: float) -> float:
+        """Simulated seconds of the next frame: as many as requested since the last one began, and as are still owed
+        from those before, if there is time enough for them.
+
+        Args:
+            speed: Wanted simulated seconds for each second of wall time.
+            period: Period of frames [s].
+        """
+        now = time.perf_counter()
+        self._since, self._then = (now - self._then if self._then else period), now
+        late = MOST_LATE * period
+        self._owed = min(self._owed + speed * self._since, speed * late)
+        # Frames that were late may take longer, but less so each time.
+        length = 0.5 * (period + min(max(self._since, period), late))
+        return min(self._owed, self.rate * max(length - self.rest, STEPPING * period) if self.rate else self._owed)
+
+    def is_slow(self, speed: float) -> bool:
+        """Whether simulated time is slower than requested."""
+        return 0.0 < self.ratio < SLOW * speed
+
+    def took(self, simulated: float, stepping: float) -> None:
+        """Note an advance: its simulated time, and its time for steps [s]."""
+        self._owed = max(self._owed - simulated, 0.0)
+        if simulated > 0.0:
+            self.rate = _mean(self.rate, simulated / max(stepping, 1e-9), 0.3)
+        if self._since:
+            self.ratio = _mean(self.ratio, simulated / self._since, 0.1)
+
+    def showed(self, rest: float) -> None:
+        """Note how long a frame took to read and send [s]."""
+        self.rest = _mean(self.rest, rest, 0.3)
+
+    def interrupted(self) -> None:
+        """Forget the time before an interruption."""
+        self._owed = self._since = self._then = 0.0
+
+
+def _mean(before: float, now: float, share: float) -> float:
+    return now if not before else before + share * (now - before)
+
+
+# --- the session -----------------------------------------------------------------------------------------------------
 
 #: The way of a knife in a step over the size of the smallest element, at most.
 HALF_ELEMENT = 0.5
@@ -222,9 +353,8 @@ class Session:
     def prepare(self) -> None:
         """Compile what frames, hands and the page's tools launch, several modules at a time."""
         explicit = not self.sim.system.is_implicit
-        hands = "viewing.hands" if explicit else "viewing.implicit_hands"
         contact = CONTACT if explicit and not self.sim.device.is_cuda else ()
-        load(["viewing.values", hands, *contact], self.sim.device)
+        load(["viewing.values", "viewing.hands", *contact], self.sim.device)
         self.sim.advance_steps(1)
         self.frame()
 
@@ -326,7 +456,7 @@ class Session:
             self._close()
         pairs = zip(self.sim.bodies, self.surfaces, strict=True)
         self.shown = [Shown(body, self._surface(body.mesh, surfaces), self.controls.world) for body, surfaces in pairs]
-        self.springs = springs_of(self.sim, self.shown)
+        self.springs = Springs(self.sim, self.shown)
         self.number += 1
         for shown in self.shown:
             shown.read()

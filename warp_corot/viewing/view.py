@@ -14,13 +14,11 @@ from warp_corot.inputs.checks import checked_flag
 from warp_corot.inputs.checks import shown as as_shown
 from warp_corot.simulation.simulation import Simulation
 
-from .access_control import AccessControl, is_loopback, new_token
 from .commands import Commands
-from .frames import PageFrame
 from .messages import frame_told, page_told, topology
 from .saving import Saving
-from .server import Server, Visitor
-from .session import Session
+from .server import AccessControl, Server, Visitor, is_loopback, new_token
+from .session import PageFrame, Session
 
 #: The default port of the page.
 PORT = 8080

@@ -1,6 +1,6 @@
 """Checks of the options of remeshing: thresholds, levels, capacity, criterion and its numbers.
 
-All messages have one form, NAME is VALUE; it must be …, with Python's names. ``cli.remesh`` puts the options' names in
+All messages have one form, NAME is VALUE; it must be …, with Python's names. ``cli.bodies`` puts the options' names in
 their place.
 """
 

@@ -1,7 +1,12 @@
-"""Pictures of deformed bodies as PNG files: one body, or several side by side."""
+"""Pictures of deformed bodies as PNG files: one body, or several side by side, with titles and a colour bar."""
 
-from collections.abc import Iterator, Sequence
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,24 +16,79 @@ from numpy.typing import ArrayLike
 from warp_corot.errors import InputError
 from warp_corot.io.files.whole import written_whole
 
-from .camera import Array, Camera
-from .drawing import INK, checked_surface, draw_body, draw_silhouette, value_limits
-from .lettering import BAR, DPI, draw_color_bar, fit_line, needed_width
-from .shadow import dropped_shadow
+from .colors import stress_colors
+from .drawing import INK, Array, Camera, Window, framed, render
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from PIL.Image import Image
 
-__all__ = ["Camera", "Picture", "draw_body", "value_limits"]
+#: Pixels of the colour bar's width, of large, middle and small type, and of the smallest.
+BAR, LARGE, MIDDLE, SMALL, SMALLEST = 16, 27, 23, 17, 10
+#: Pixels drawn along each side of one, which are then averaged.
+FINENESS = 2
 
-#: Margin around what is drawn, over its size.
-ROOM = 0.06
+
+@functools.cache
+def font_of(size: int) -> Any:
+    """The type of Matplotlib's wheel, which has most alphabets, in a size [pixels]."""
+    from PIL import ImageFont
+
+    found = find_spec("matplotlib")
+    if found is None or found.origin is None:
+        raise InputError('pictures need Matplotlib: pip install "warp-corot[plot]"')
+    return ImageFont.truetype(str(Path(found.origin).parent / "mpl-data" / "fonts" / "ttf" / "DejaVuSans.ttf"), size)
+
+
+def fit_line(words: str, width: float, size: int) -> tuple[str, Any]:
+    """A line and its type, made smaller, and if necessary shorter, until it is no wider than a number of pixels.
+
+    A short text after its last semicolon is kept.
+    """
+    while font_of(size).getlength(words) > width and size > SMALL - 3:
+        size -= 1
+    end = "".join(re.findall(r"; [^;]{1,12}$", words))
+    begun, line = words.removesuffix(end), words
+    while font_of(size).getlength(line) > width and len(begun) > 8:
+        begun = begun[:-2]
+        line = f"{begun.rstrip()} …{end}"
+    return line, font_of(size)
+
+
+def color_bar(limits: tuple[float, float], label: str, width: int, height: int) -> Image:
+    """The colour bar with its numbers and its label, in kPa, MPa or GPa in place of so many Pa."""
+    from PIL import Image, ImageDraw
+
+    for unit, size in (("GPa", 1e9), ("MPa", 1e6), ("kPa", 1e3)):
+        if label.endswith("[Pa]") and max(map(abs, limits)) >= size:
+            label, limits = f"{label[:-4]}[{unit}]", (limits[0] / size, limits[1] / size)
+    (low, high), top, tall = limits, round(0.25 * height), round(0.55 * height)
+    least = max(high - low, 1e-30) / 6.0
+    power = 10.0 ** np.floor(np.log10(least))
+    step = next(power * each for each in (1.0, 2.0, 2.5, 5.0, 10.0) if power * each >= least * (1.0 - 1e-9))
+    ticks = low + step * np.arange(int((high - low) / step * (1.0 + 1e-9)) + 1)
+    numbers = [f"{value:,.6g}".replace(",", " ") for value in ticks.tolist()]
+    small, size = font_of(SMALL - 2), SMALL + 1
+    while font_of(size).getlength(label) > 0.9 * height and size > SMALLEST:
+        size -= 1
+    beside = BAR + 8 + round(max(map(small.getlength, numbers)))
+    needed = min(max(beside + 2 * size + 22, 130), round(0.7 * width))
+    image = Image.new("RGB", (needed, height), "white")
+    colors = np.rint(255.0 * stress_colors(tall)[::-1]).astype(np.uint8)
+    image.paste(Image.fromarray(np.repeat(colors[:, None], BAR, axis=1)), (0, top))
+    drawing = ImageDraw.Draw(image)
+    for value, number in zip(ticks.tolist(), numbers, strict=True):
+        drawing.text((BAR + 6, top + tall * (high - value) / (high - low)), number, INK, small, anchor="lm")
+    words = Image.new("RGB", (round(font_of(size).getlength(label)) + 4, round(1.4 * size)), "white")
+    ImageDraw.Draw(words).text((2, 0), label, INK, font_of(size))
+    turned = words.rotate(90, expand=True)
+    middle = top + tall // 2 - turned.height // 2
+    image.paste(turned, (beside + 6, min(max(middle, 3), max(height - turned.height - 3, 3))))
+    return image
 
 
 @dataclass
 class Picture:
-    """One body in a strip: `draw_body` explains the fields; ``view`` is azimuth and elevation [°]."""
+    """One body in a strip: `render` explains the fields; ``view`` is azimuth and elevation [°]."""
 
     positions: ArrayLike
     faces: ArrayLike
@@ -50,7 +110,6 @@ class Strip:
         scalar_label: Label of the colour bar.
         value_range: Values at the ends of the colour map; None: no colour bar.
         size: Pixels; None: 600 a picture, with the height that they need.
-        fineness: Factor on the pixels drawn along each side, which are then averaged.
         columns: Pictures in a row; None: all.
 
     Raises:
@@ -67,113 +126,67 @@ class Strip:
         scalar_label: str = "von Mises stress [Pa]",
         value_range: tuple[float, float] | None = None,
         size: tuple[int, int] | None = None,
-        fineness: int = 2,
         columns: int | None = None,
     ):
-        try:
-            from matplotlib.backends.backend_agg import FigureCanvasAgg
-            from matplotlib.figure import Figure
-        except ImportError:
-            raise InputError('pictures need Matplotlib: pip install "warp-corot[plot]"') from None
+        font_of(LARGE)
         self._cameras = [Camera.fit(seen, up_axis, *each.view) for each in pictures]
         squares = [each.options["square"] for each in pictures if "square" in each.options]
-        self._ground = float((np.concatenate([seen, *squares]) @ self._cameras[0].world_up).min())
-        low, high = self._window(np.concatenate([seen, *squares]), seen)
-        columns = columns or len(pictures)
-        rows = -(-len(pictures) // columns)
-        head, own_head = 56 * titled, 40 * any(each.title for each in pictures)
-        width, height = size or (600 * columns, 600 * rows)
-        self._figure = Figure((width / DPI, height / DPI), dpi=fineness * DPI, facecolor="white")
-        self._canvas = FigureCanvasAgg(self._figure)
-        self._limits, self._fineness, bar = value_range, fineness, 0.0
+        points = np.concatenate([seen, *squares])
+        self._ground = float((points @ self._cameras[0].world_up).min())
+        windows = [framed(camera, points, self._ground) for camera in self._cameras]
+        low, high = np.min([each.low for each in windows], axis=0), np.max([each.high for each in windows], axis=0)
+        self._columns = columns or len(pictures)
+        rows = -(-len(pictures) // self._columns)
+        self._head, self._own_head = 56 * titled, 40 * any(each.title for each in pictures)
+        width, height = size or (600 * self._columns, 600 * rows)
+        self._limits, self._legend = value_range, None
+        step = width // self._columns
         if value_range is not None:
-            legend = draw_color_bar(self._figure, value_range, scalar_label)
-            bar = needed_width(legend, width)
-            legend.set_position(((width - bar + 10) / width, 0.2, BAR / width, 0.55))
-        self._width, self._step = width - bar, (width - bar) / columns
+            needed = color_bar(value_range, scalar_label, width, height).width
+            step = (width - needed) // self._columns
         if size is None:
-            height = rows * (int(self._step * np.clip((high - low)[1] / (high - low)[0], 0.3, 1.6)) + own_head) + head
-            self._figure.set_size_inches(width / DPI, height / DPI)
-        row = (height - head) / rows
-        tall = row - own_head
+            tall = int(step * np.clip((high - low)[1] / (high - low)[0], 0.3, 1.6))
+            height = rows * (tall + self._own_head) + self._head
+        if value_range is not None:
+            self._legend = color_bar(value_range, scalar_label, width, height)
+        self._size, self._row = (width, height), (height - self._head) // rows
+        tall = self._row - self._own_head
         middle, half = 0.5 * (low + high), 0.5 * (high - low)
-        half = max(half[1], half[0] * tall / self._step) * np.array([self._step / tall, 1.0])
-        self._panels = []
-        for index in range(len(pictures)):
-            place = (index % columns * self._step / width, (rows - 1 - index // columns) * row / height)
-            ax = self._figure.add_axes((*place, self._step / width, tall / height))
-            (left, bottom), (right, top) = middle - half, middle + half
-            ax.set(xlim=(left, right), ylim=(bottom, top))
-            self._panels.append(ax)
-        self._title = self._figure.text(0.5 * self._width / width, 1.0 - 14 / height, "", ha="center", va="top")
-        self._rest: list[ArrayLike] = []
-        self._rest_pixels: Any = None
+        half = max(half[1], half[0] * tall / step) * np.array([step / tall, 1.0])
+        self._window = Window(middle - half, middle + half, (FINENESS * step, FINENESS * tall), 1.6 * FINENESS)
+        self._step = step
 
-    def draw(self, pictures: Sequence[Picture], title: str = "") -> "Image":
+    def draw(self, pictures: Sequence[Picture], title: str = "") -> Image:
         """Draw a frame: as many pictures as the first one has, and its title.
 
         Raises:
-            InputError: Positions or faces as in `draw_body`.
+            InputError: Positions or faces as in `render`.
         """
-        from PIL import Image
+        from PIL import Image, ImageDraw
 
-        from .artists import Pixels
-
-        self._draw_rest(pictures)
-        for ax, picture, camera in self._cleared(pictures):
-            ax.add_artist(Pixels(self._rest_pixels, order=2))
-            draw_body(
-                ax,
-                picture.positions,
-                picture.faces,
-                scalars=picture.scalars,
-                value_range=self._limits,
-                camera=camera,
-                **{"ground": self._ground, **picture.options},
-            )
+        image = Image.new("RGB", self._size, "white")
+        drawing = ImageDraw.Draw(image)
+        for index, (picture, camera) in enumerate(zip(pictures, self._cameras, strict=True)):
+            left, top = index % self._columns * self._step, self._head + index // self._columns * self._row
+            options = {"ground": self._ground, **picture.options}
+            options["ground"] = None if options["ground"] is False else options["ground"]
+            given = {"scalars": picture.scalars, "value_range": self._limits, "rest": picture.rest, **options}
+            panel = render(self._window, camera, picture.positions, picture.faces, **given)
+            image.paste(Image.fromarray(panel).reduce(FINENESS), (left, top + self._own_head))
             if picture.title:
-                fit_line(ax.set_title(picture.title, fontsize=11, color=INK, pad=4), self._step - 16)
+                line, font = fit_line(picture.title, self._step - 16, MIDDLE)
+                drawing.text((left + self._step // 2, top + self._own_head // 2 + 8), line, INK, font, anchor="mm")
+        room = self._size[0]
+        if self._legend is not None:
+            room -= self._legend.width
+            image.paste(self._legend, (room, 0))
         if title:
-            self._title.set(text=title, fontsize=13, color=INK)
-            fit_line(self._title, self._width - 16)
-        self._canvas.draw()
-        return Image.fromarray(np.asarray(self._canvas.buffer_rgba())[..., :3]).reduce(self._fineness)
-
-    def _draw_rest(self, pictures: Sequence[Picture]) -> None:
-        """Draw the rest shapes to pixels, which frames show until the shapes change."""
-        shapes = [each for p in pictures if p.rest is not None for each in (p.rest, p.faces)]
-        unchanged = len(shapes) == len(self._rest) and all(map(np.array_equal, shapes, self._rest))
-        if self._rest_pixels is not None and unchanged:
-            return
-        self._rest = shapes
-        for ax, picture, camera in self._cleared(pictures):
-            ax.set_axis_off()
-            if picture.rest is not None:
-                draw_silhouette(ax, *checked_surface(picture.rest, picture.faces, "rest"), camera)
-        self._figure.patch.set_visible(False)
-        self._canvas.draw()
-        self._rest_pixels = np.array(self._canvas.buffer_rgba())
-        self._figure.patch.set_visible(True)
-
-    def _cleared(self, pictures: Sequence[Picture]) -> Iterator[tuple["Axes", Picture, Camera]]:
-        """The empty axes of each picture, and its camera."""
-        for ax, picture, camera in zip(self._panels, pictures, self._cameras, strict=True):
-            for artist in [*ax.collections, *ax.lines, *ax.patches, *ax.artists]:
-                artist.remove()
-            yield ax, picture, camera
-
-    def _window(self, points: Array, seen: Array) -> tuple[Array, Array]:
-        """Lowest and highest picture coordinates of points and of their shadows on the ground, with a margin."""
-        flat = [
-            camera.project(np.concatenate([points, dropped_shadow(seen, camera, self._ground)]))[0]
-            for camera in self._cameras
-        ]
-        low, high = np.min(flat, axis=(0, 1)), np.max(flat, axis=(0, 1))
-        room = ROOM * float((high - low).max()) + 1e-12
-        return low - room, high + room
+            line, font = fit_line(title, room - 16, LARGE)
+            drawing.text((room // 2, self._head // 2), line, INK, font, anchor="mm")
+        return image
 
 
-def save_picture(picture: "Image", target: Path) -> None:
+def save_picture(picture: Image, target: Path) -> None:
     """Write to a temporary file and rename it, so that a failure does not destroy a good picture."""
     with written_whole(target) as part:
         picture.save(part, format="PNG")

@@ -1,7 +1,6 @@
 """Readers of mesh files, one module for each family of formats."""
 
-from .filemesh import Block, FileMesh
+from .filemesh import Block, FileMesh, split_solids, triangles_of
 from .files import SUFFIXES, read_mesh_file
-from .split import split_solids, triangles_of
 
 __all__ = ["SUFFIXES", "Block", "FileMesh", "read_mesh_file", "split_solids", "triangles_of"]

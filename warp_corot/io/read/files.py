@@ -18,17 +18,17 @@ from .filemesh import FileImage, FileMesh
 
 @dataclass(frozen=True)
 class Reader:
-    """A module of this folder with a function ``read(path)``.
+    """A function of a module of this folder that reads a path.
 
     Attributes:
         name: Its name in messages.
-        module: The module's name in this folder.
+        function: The function, after its module's name in this folder; ``read`` if it has only that.
         package: The Python package that it needs, if any.
         extra: The extra that installs this package, as in ``pip install "warp-corot[EXTRA]"``.
     """
 
     name: str
-    module: str
+    function: str
     package: str | None = None
     extra: str | None = None
 
@@ -38,8 +38,8 @@ GMSH = Reader("Gmsh", "gmsh_files", "gmsh", "gmsh")
 MESHIO = Reader("meshio", "meshio_files", "meshio", "mesh")
 NIBABEL = Reader("nibabel", "nibabel_files", "nibabel", "scans")
 ITK = Reader("SimpleITK", "itk_files", "SimpleITK", "scans")
-ABAQUS = Reader("the reader of Abaqus input files", "abaqus")
-TETGEN = Reader("the reader of TetGen's files", "tetgen")
+ABAQUS = Reader("the reader of Abaqus input files", "text_files.read_abaqus")
+TETGEN = Reader("the reader of TetGen's files", "text_files.read_tetgen")
 
 #: Readers by extension, starting with the most complete one.
 READERS: dict[str, tuple[Reader, ...]] = {
@@ -125,7 +125,7 @@ def read_mesh_file(path: Path) -> FileMesh | FileImage:
         if reader.package and importlib.util.find_spec(reader.package) is None:
             missing.append(reader)
             continue
-        found, reason = read_with(reader.module, path)
+        found, reason = read_with(reader.function, path)
         if isinstance(found, FileImage):
             return found
         if found is not None and len(found.points):
@@ -142,11 +142,11 @@ def read_mesh_file(path: Path) -> FileMesh | FileImage:
     raise InputError(f"{path}: {what} that can be read ({'; '.join(reasons)}){also}")
 
 
-def read_with(module: str, path: Path) -> tuple[Any, str | None]:
+def read_with(function: str, path: Path) -> tuple[Any, str | None]:
     """Let a reader read a file, without output of its library and with memory for no more than the file can need.
 
     Args:
-        module: Name of a module of this folder.
+        function: See `Reader`.
         path: The file.
 
     Returns:
@@ -154,7 +154,9 @@ def read_with(module: str, path: Path) -> tuple[Any, str | None]:
     """
     try:
         with quietly(), bounded(path):
-            return importlib.import_module(f".{module}", __package__).read(path), None
+            module, _, name = function.partition(".")
+            read = getattr(importlib.import_module(f".{module}", __package__), name or "read")
+            return read(path), None
     except MemoryError:
         return None, "it asks for more memory than such a file can need"
     except ModuleNotFoundError as error:

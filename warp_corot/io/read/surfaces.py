@@ -14,9 +14,8 @@ from warp_corot.errors import InputError
 from warp_corot.io.files.quiet import bounded, quietly
 
 from .assets import find_asset
-from .filemesh import FileImage, FileMesh, joined_triangles
+from .filemesh import FileImage, FileMesh, joined_triangles, triangles_of
 from .files import checked_mesh, read_mesh_file, suffix_of
-from .split import triangles_of
 from .tetrahedra import USD_SUFFIXES, check_file, check_finite, read_tetrahedra, short_name
 
 #: Formats read with trimesh, and the usual up axis if the format names none; glTF's is in its standard.
@@ -103,7 +102,7 @@ def read_surface(path: Path) -> FileMesh | FileImage:
     """
     suffix = path.suffix.lower()
     if suffix in USD_SUFFIXES:
-        from warp_corot.io.read.usd.surfaces import read_usd_surface
+        from warp_corot.io.read.usd.meshes import read_usd_surface
 
         return checked_mesh(read_usd_surface(path), path)
     if suffix in UP_AXES:

@@ -13,10 +13,9 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, checked_path
 
 from .assets import find_asset
-from .filemesh import FileImage, FileMesh
+from .filemesh import FileImage, FileMesh, split_solids
 from .files import read_mesh_file, suffix_of
 from .regions import Regions, find_regions
-from .split import split_solids
 
 USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 #: Formats that only hold surfaces, see `warp_corot.io.read.surfaces`.
@@ -155,7 +154,7 @@ def read_tetrahedra(path: Path) -> FileMesh | FileImage:
     """
     suffix = path.suffix.lower()
     if suffix in USD_SUFFIXES:
-        from warp_corot.io.read.usd.tetrahedra import read_usd_tets
+        from warp_corot.io.read.usd.meshes import read_usd_tets
 
         return read_usd_tets(path)
     if suffix in SURFACE_SUFFIXES:

@@ -28,10 +28,11 @@ from .filemesh import (
     FileMesh,
     Unreadable,
     corners_note,
+    fan,
     sets_of_numbers,
+    split_polyhedron,
     whole_numbers,
 )
-from .split import fan, split_polyhedron
 
 #: VTK's cell types by the kind that their corners make; corners come first in cells of any order.
 KINDS = {

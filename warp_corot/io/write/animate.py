@@ -7,13 +7,15 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import PackageNotFoundError, version
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+import warp as wp
 
 from warp_corot.contact.nodal import contact_at_nodes
 from warp_corot.errors import InputError
@@ -24,11 +26,10 @@ from warp_corot.simulation.parts import check_whole
 from warp_corot.simulation.progress import bar_of, hidden
 from warp_corot.simulation.simulation import Simulation
 
-from .provenance import provenance, steps_made
 from .skins import BoundSkins, has_domain
 
 if TYPE_CHECKING:
-    from warp_corot.io.write.usd.touched import Touched
+    from warp_corot.io.write.usd.prims import Touched
     from warp_corot.io.write.usd.writer import UsdWriter
 
     from .paraview import Writer
@@ -338,7 +339,7 @@ def _write_frame(writer: UsdWriter, sim: Simulation, joined: _Joined, done: Reco
 
 def _touched(sim: Simulation, joined: _Joined) -> Touched | None:
     """Contact on the drawn bodies, if there is any in the simulation."""
-    from warp_corot.io.write.usd.touched import Touched
+    from warp_corot.io.write.usd.prims import Touched
 
     if sim.contact is None:
         return None
@@ -383,3 +384,45 @@ def signals_held_back() -> Iterator[None]:
             signal.signal(number, handler)
         for number in held[:1]:
             signal.raise_signal(number)
+
+
+# --- the description of a simulation in the custom data of its stage's layer -----------------------------------------
+
+#: Key in the layer's custom data.
+KEY = "warp_corot"
+
+
+def provenance(sim: Simulation, held: npt.NDArray[np.bool_]) -> dict[str, Any]:
+    """Program, models, integrator, units, device and held nodes.
+
+    Args:
+        sim: The simulation.
+        held: Which nodes of the drawn body are held.
+    """
+    models = {}
+    for number, model in enumerate(sim.models, start=1):
+        options = ", ".join(f"{name}={value!r}" for name, value in vars(model).items() if value is not None)
+        models[f"body{number}"] = f"{type(model).__name__}({options})"
+    integrator = {name: value for name, value in asdict(sim.integrator).items() if value is not None}  # type: ignore
+    return {
+        "program": f"warp_corot {_version()}, warp {wp.__version__}",
+        "units": "metres, kilograms, seconds, pascals",
+        "device": f"{sim.device} ({sim.device.name})",
+        "models": models,
+        "integrator": {"name": type(sim.integrator).__name__, **integrator},
+        "gravity": " ".join(f"{g:.9g}" for g in sim.gravity),
+        "heldNodes": int(np.count_nonzero(held)),
+    }
+
+
+def steps_made(sim: Simulation) -> dict[str, Any]:
+    """The number of steps, and their lengths [s]."""
+    shortest, longest = sim.dt_range
+    return {"steps": sim.total_steps, "shortestStep": float(shortest), "longestStep": float(longest)}
+
+
+def _version() -> str:
+    try:
+        return version("warp-corot")
+    except PackageNotFoundError:
+        return "(not installed)"

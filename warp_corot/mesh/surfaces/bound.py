@@ -11,8 +11,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import InputError
-from warp_corot.inputs.checks import checked_numbers
-from warp_corot.inputs.indices import checked_indices
+from warp_corot.inputs.checks import checked_indices, checked_numbers
 from warp_corot.kernels.meshing import embedding as kernels
 
 from .locating import checked_points

@@ -1,54 +1,58 @@
 """A growing USD animation on disk that is valid at every moment, even if the writing process is killed.
 
-If a process dies while it saves a USD file in place, the file does not open. So frames are collected and
-written as *pieces*, complete binary files in a folder ``NAME.usd.pieces`` beside the stage, each written under a
-temporary name, synced to disk and renamed. After each piece a small root stage that plays all of them (value clips)
-replaces the file at the final path in one rename. A thread waits for the disk while the next frames are made. At the
-end everything is joined into one file, again written under a temporary name and renamed over the final path, and the
-pieces are removed.
+If a process dies while it saves a USD file in place, the file does not open. So frames are collected and written as
+*pieces*, complete binary files in a folder ``NAME.usd.pieces`` beside the stage, each written under a temporary name,
+synced to disk and renamed. After each piece a small root stage that plays all of them (value clips) replaces the file
+at the final path in one rename. At the end everything is joined into one file, again written under a temporary name and
+renamed over the final path, and the pieces are removed.
 
 Attributes that change only now and then, like the topology of a mesh, have a sample where they change. A clip does not
 play samples of former clips, so each piece begins with the current values. Between two samples of equal length OpenUSD
-interpolates floating-point arrays, even if their points differ; in that case, the former values
-are repeated just before the change.
+interpolates floating-point arrays, even if their points differ; in that case, the former values are repeated just
+before the change.
 """
+
+from __future__ import annotations
 
 import contextlib
 import os
 import re
 import time
 import uuid
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
-from pxr import Sdf, Tf
+import numpy as np
+from numpy.typing import NDArray
+from pxr import Sdf, Tf, Vt
 
 from warp_corot.errors import InputError
 from warp_corot.io.files.usd import check_stage_path, is_locked, reason, take_lock, usd_name
 from warp_corot.io.files.whole import WriteError, sync, writing
+from warp_corot.io.pictures.colors import COLORMAP_NAME, round_limit
 from warp_corot.simulation.progress import bar_of
 
-from .clips import declare_attributes, new_root, play_pieces, set_time_range, varying_attributes
-
-# All files that a run's folder ever holds; \w{6} is the ending of OpenUSD's own temporary files.
-_OURS = re.compile(r"(piece|part)-\d{6}\.usdc|(part-)?(static|manifest|root|joined)\.usd[ac]?|part-\w+\.\w{6}|lock")
+#: All files that a run's folder ever holds, with OpenUSD's own temporary ones.
+_OURS = re.compile(r"(piece-\d{6}|static|manifest)\.usd[ac]|part[-\w]*\.\w{3,6}|lock")
 #: How long before a frame [time codes] values that must not be interpolated are repeated.
 JUST_BEFORE = 2.0**-10
-
 Samples = dict[str, Any]
 """Values of one frame: attribute path → value."""
 
 
 class PieceStore:
-    """Keeps the frames of one stage: `add` each, then `finish`.
+    """Keeps the frames of one stage: `declare` what does not change, `add` each frame, then `finish`.
 
     Args:
         path: The stage, .usd, .usda or .usdc. A former file stays until the first piece is complete.
-        flush_seconds: Approximate wall time [s] of frames that a sudden end may lose, besides those of a piece that is
-            just being written. It is doubled, and more, if writing would otherwise take more than a fifth of the time.
+        flush_seconds: Approximate wall time [s] of frames that a sudden end may lose. It is doubled, and more, if
+            writing would otherwise take more than a fifth of the time.
         flush_bytes: A piece is also written when this much data waits.
+
+    Attributes:
+        custom_data: Custom data of the default prim at the last frame.
+        layer_data: Custom data of the layer at the last frame.
 
     Raises:
         InputError: Another extension, a folder with this name, an output folder that does not exist or is not writable,
@@ -61,28 +65,19 @@ class PieceStore:
         self.pieces_folder = self.path.with_name(self.path.name + ".pieces")
         self._run = self.pieces_folder / f"run-{uuid.uuid4().hex[:8]}"
         self._lock: IO[str] | None = None
-        self._is_open = False
         self._refuse_second_writer(InputError)
-
         self.custom_data: dict[str, Any] = {}
-        """Custom data of the default prim at the last frame."""
         self.layer_data: dict[str, Any] = {}
-        """Custom data of the layer at the last frame."""
         self._static: Sdf.Layer | None = None
         self._varying: dict[str, Sdf.ValueTypeName] = {}
-        self._root: Sdf.Layer | None = None
         self._follows: dict[str, str] = {}
         self._last: Samples = {}  # the latest value of each attribute
-        self._carried: Samples = {}  # the values at the time of the last written piece
+        self._carried: Samples = {}  # the values at the time of the last piece
         self._pieces: list[tuple[float, float]] = []  # first and last time code of each
         self._repeated: list[frozenset[str]] = []  # the initial values of each piece that are not its own samples
-        self._pending: list[tuple[float, Samples]] = []  # not yet in a complete piece
-        self._thread = ThreadPoolExecutor(1)
-        self._writing: tuple[int, Future[None]] | None = None  # the first waiting frames, which a thread writes now
+        self._pending: list[tuple[float, Samples]] = []  # not yet in a piece
         self._pending_bytes = 0
-        self._flush_seconds = flush_seconds
-        self._flush_bytes = flush_bytes
-        self._flush_cost = 0.0
+        self._flush_seconds, self._flush_bytes, self._flush_cost = flush_seconds, flush_bytes, 0.0
         self._last_flush = self._last_add = time.monotonic()
         self._broken = False
 
@@ -97,16 +92,20 @@ class PieceStore:
             follows: For attributes [n] whose things differ after a change, the attribute that a frame gives at that
                 change: values before and after it are not interpolated.
         """
-        self._static = static
-        self._follows = dict(follows or {})
-        self._varying = varying_attributes(static)
+        self._static, self._follows = static, dict(follows or {})
 
-    def add(self, time_code: float, samples: Samples, nbytes: int) -> None:
-        """Add the values of one frame, of size ``nbytes``, and write a piece when it is due.
+        def visit(path: Sdf.Path) -> None:
+            spec = static.GetAttributeAtPath(path) if path.IsPropertyPath() else None
+            if spec and not spec.HasInfo("default") and not spec.HasInfo("connectionPaths"):
+                self._varying[str(path)] = spec.typeName
+
+        static.Traverse(Sdf.Path.absoluteRootPath, visit)
+
+    def add(self, time_code: float, samples: Samples) -> None:
+        """Add the values of one frame, and write a piece when it is due.
 
         Raises:
-            OSError: It could not be written, for example because the disk is full; the frames that fit, from the first
-                one on, are kept and play.
+            OSError: It could not be written, for example because the disk is full; the pieces before play.
         """
         if self._broken:
             raise OSError(f"{self.path}: could not be written further, see the error before")
@@ -115,17 +114,18 @@ class PieceStore:
         now = time.monotonic()
         if not self._last:  # time before the first frame cannot lose a frame
             self._last_flush = self._last_add = now
-        held = self._held_over(samples)
+        changed = (path for path, what in self._follows.items() if what in samples and path in self._last)
+        held = {path: self._last[path] for path in changed if len(self._last[path]) == len(samples[path])}
         if held:
             self._pending.append((time_code - JUST_BEFORE, held))
         self._pending.append((time_code, samples))
-        self._pending_bytes += nbytes
+        self._pending_bytes += sum(map(_nbytes, samples.values()))
         self._last |= samples
         gap, self._last_add = now - self._last_add, now
         interval = max(self._flush_seconds, 4.0 * self._flush_cost)
         # The next frame comes after another gap of this length, which must not exceed the interval.
         if now - self._last_flush + gap > interval or self._pending_bytes >= self._flush_bytes:
-            self._flush(now)
+            self.flush()
 
     def flush(self) -> None:
         """Write the waiting frames as a piece and let the stage play it.
@@ -133,26 +133,21 @@ class PieceStore:
         Raises:
             OSError: As in `add`.
         """
-        self._flush(time.monotonic(), settled=True)
-
-    def _flush(self, now: float, settled: bool = False) -> None:
+        if not self._pending:
+            return
+        started = time.monotonic()
         try:
-            self._settle()
-            if self._pending:
-                self._begin_piece(len(self._pending))
-            if settled:
-                self._settle()
+            self._write_piece()
         except OSError as error:
             self._broken = True
-            self._keep_what_fits(len(self._pending) // 2)
+            if not self._pieces:
+                self._remove_run(self._run)
             raise OSError(f"{error}; {self._kept()}") from None
-        self._last_flush = now
+        self._last_flush = time.monotonic()
+        self._flush_cost = self._last_flush - started
 
-    def finish(self, transform: Callable[[Samples], Mapping[str, Any]] | None = None) -> None:
-        """Join all frames into one file at the final path and remove the pieces.
-
-        Args:
-            transform: Called with the values of each frame; returns the changed ones.
+    def finish(self) -> None:
+        """Join all frames, each changed by `last_look`, into one file at the final path and remove the pieces.
 
         Raises:
             OSError: The joined file could not be written. The pieces stay, and the stage plays them.
@@ -164,98 +159,100 @@ class PieceStore:
         joined = Sdf.Layer.CreateAnonymous(self.path.suffix)
         joined.TransferContent(self._static)
         opened: list[Sdf.Layer] = []  # kept open, because the joined layer uses arrays in their mapped files
+        count = len(self._pending) + round(sum(last - first + 1.0 for first, last in self._pieces))
         try:
-            self._settle()
-            for time_code, samples in self._with_bar(opened):
-                if transform:
-                    samples = {**samples, **transform(samples)}
-                for path, value in samples.items():
-                    joined.SetTimeSample(path, time_code, value)
-                set_time_range(joined, time_code)
+            with bar_of(count, "frames", f"joining {self.path.name}") as update:
+                for number, (time_code, samples) in enumerate(self._frames(opened), start=1):
+                    for path, value in (samples | self.last_look(samples)).items():
+                        joined.SetTimeSample(path, time_code, value)
+                    if not joined.HasStartTimeCode():
+                        joined.startTimeCode = time_code
+                    joined.endTimeCode = time_code
+                    update(number)
             self._annotate(joined)
             self._run.mkdir(parents=True, exist_ok=True)
-            self._write(joined, self.path, aside=f"part-joined{self.path.suffix}")
+            self._write(joined, self.path)
         except OSError as error:
             del joined
-            self._keep_what_fits(len(self._pending))
+            with contextlib.suppress(OSError):
+                self.flush()
             self._release()
             raise OSError(f"{error}; {self._kept()}") from None
         del joined
         opened.clear()
-        self._release()
         self._remove_run(self._run)
         self._remove_stale_runs()
 
-    def _begin_piece(self, count: int) -> None:
-        """Begin to write the first ``count`` waiting frames as a piece that the stage will play.
+    def last_look(self, samples: Samples) -> Samples:
+        """The values of a frame that change at the end."""
+        return {}
 
-        Raises:
-            OSError: The run's folder cannot be made.
-        """
-        if not self._is_open:
+    # --- layers ------------------------------------------------------------------------------------------------------
+
+    def _write_piece(self) -> None:
+        if self._lock is None:
             self._open_run()
-        frames = self._pending[:count]
+        frames = self._pending
         piece = self._run / f"piece-{len(self._pieces):06d}.usdc"
-        root = self._root_layer([*self._pieces, (frames[0][0], frames[-1][0])])
-        self._writing = count, self._thread.submit(self._write_piece, self._piece_layer(frames), piece, root)
-        self._pending_bytes = 0
-
-    def _write_piece(self, layer: Sdf.Layer, piece: Path, root: Sdf.Layer) -> None:
-        started = time.monotonic()
+        layer = Sdf.Layer.CreateAnonymous(".usdc")
+        self._declare_varying(layer)
+        (first, earliest), *later = frames
+        for time_code, samples in [(first, self._carried | earliest), *later]:
+            for path, value in samples.items():
+                layer.SetTimeSample(path, time_code, value)
+        layer.startTimeCode, layer.endTimeCode = first, frames[-1][0]
+        self._write(layer, piece)
+        pieces = [*self._pieces, (first, frames[-1][0])]
         try:
-            self._write(layer, piece)
-            self._write(root, self.path)
+            self._write(self._root_layer(pieces), self.path)
         except OSError:
-            with contextlib.suppress(OSError):
-                piece.unlink(missing_ok=True)
+            piece.unlink(missing_ok=True)
             raise
-        self._flush_cost = time.monotonic() - started
-
-    def _settle(self) -> None:
-        """Wait for the piece that is being written, if any.
-
-        Raises:
-            OSError: It could not be written; its frames still wait.
-        """
-        if self._writing is None:
-            return
-        count, written = self._writing
-        wait([written])
-        self._writing = None
-        written.result()
-        frames = self._pending[:count]
-        self._pieces.append((frames[0][0], frames[-1][0]))
-        self._repeated.append(frozenset(self._carried.keys() - frames[0][1].keys()))
-        for _, samples in frames:
-            self._carried |= samples
-        self._pending = self._pending[count:]
-        if len(self._pieces) == 1:
+        self._pieces = pieces
+        self._repeated.append(frozenset(self._carried.keys() - earliest.keys()))
+        self._carried = dict(self._last)
+        self._pending, self._pending_bytes = [], 0
+        if len(pieces) == 1:
             self._remove_stale_runs()
 
-    def _keep_what_fits(self, count: int) -> None:
-        """Write as many of the waiting frames as fit, from the first on, in ever smaller pieces."""
-        while self._pending and count:
-            times = [time_code for time_code, _ in self._pending]
-            if count < len(times) and times[count] - times[count - 1] == JUST_BEFORE:
-                count -= 1  # the values repeated just before a frame are written with it
-                continue
-            try:
-                self._begin_piece(count)
-                self._settle()
-            except OSError:
-                count //= 2
-            else:
-                count = min(count, len(self._pending))
-        if not self._pieces:
-            self._remove_run(self._run)
+    def _root_layer(self, pieces: list[tuple[float, float]]) -> Sdf.Layer:
+        """The small stage on top of the static layer, which plays pieces beside it, so that both can be moved."""
+        assert self._static is not None
+        folder = f"./{usd_name(Path(self.pieces_folder.name, self._run.name))}"
+        root = Sdf.Layer.CreateAnonymous(self.path.suffix)
+        for key in self._static.pseudoRoot.ListInfoKeys():
+            if key not in ("startTimeCode", "endTimeCode"):
+                root.pseudoRoot.SetInfo(key, self._static.pseudoRoot.GetInfo(key))
+        root.subLayerPaths.append(f"{folder}/static.usdc")
+        root.startTimeCode, root.endTimeCode = pieces[0][0], pieces[-1][1]
+        files = [Sdf.AssetPath(f"{folder}/piece-{index:06d}.usdc") for index in range(len(pieces))]
+        active = [(first, float(index)) for index, (first, _) in enumerate(pieces)]
+        clips = {
+            "assetPaths": Sdf.AssetPathArray(files),
+            "active": Vt.Vec2dArray(active),
+            "manifestAssetPath": Sdf.AssetPath(f"{folder}/manifest.usda"),
+        }
+        for name in sorted(
+            {f"/{root.defaultPrim}", *(f"/{path.split('/')[1].split('.')[0]}" for path in self._varying)}
+        ):
+            Sdf.CreatePrimInLayer(root, name).SetInfo("clips", {"default": {**clips, "primPath": name}})
+        self._annotate(root)
+        return root
 
-    def _kept(self) -> str:
-        """The result after a failure, in words."""
-        if not self._pieces:
-            return "no frame could be kept"
-        return (
-            f"the frames up to {self._pieces[-1][1]:g} are kept in {self.pieces_folder}, which {self.path.name} plays"
-        )
+    def _declare_varying(self, layer: Sdf.Layer) -> None:
+        """Declare the attributes that vary, without values, at the frame rate of the stage."""
+        assert self._static is not None
+        layer.timeCodesPerSecond = self._static.timeCodesPerSecond
+        layer.framesPerSecond = self._static.framesPerSecond
+        for path, type_name in self._varying.items():
+            prim = Sdf.CreatePrimInLayer(layer, Sdf.Path(path).GetPrimPath())
+            Sdf.AttributeSpec(prim, Sdf.Path(path).name, type_name)
+
+    def _annotate(self, layer: Sdf.Layer) -> None:
+        if self.custom_data:
+            layer.GetPrimAtPath(f"/{layer.defaultPrim}").SetInfo("customData", self.custom_data)
+        if self.layer_data:
+            layer.customLayerData = {**layer.customLayerData, **self.layer_data}
 
     def _frames(self, opened: list[Sdf.Layer]) -> Iterator[tuple[float, Samples]]:
         """All frames in order, from the pieces and from memory."""
@@ -275,49 +272,31 @@ class PieceStore:
                 yield time_code, {path: value for path, value in values if value is not None}
         yield from self._pending
 
-    def _with_bar(self, opened: list[Sdf.Layer]) -> Iterator[tuple[float, Samples]]:
-        """All frames; joining them takes as long as the disk needs, and terminals show a bar."""
-        count = len(self._pending) + round(sum(last - first + 1.0 for first, last in self._pieces))
-        with bar_of(count, "frames", f"joining {self.path.name}") as update:
-            for number, frame in enumerate(self._frames(opened), start=1):
-                yield frame
-                update(number)
+    # --- files -------------------------------------------------------------------------------------------------------
 
-    def _held_over(self, samples: Samples) -> Samples:
-        """Values that must be repeated just before a frame, so that they are not interpolated with those of the
-        frame."""
-        changed = (path for path, what in self._follows.items() if what in samples and path in self._last)
-        return {path: self._last[path] for path in changed if len(self._last[path]) == len(samples[path])}
+    def _write(self, layer: Sdf.Layer, target: Path) -> None:
+        """Write a layer completely or not at all: in the run's folder, synced, then renamed over the target."""
+        part = self._run / f"part{target.suffix}"
+        try:
+            if not layer.Export(usd_name(part)):
+                raise WriteError(f"{self.path}: writing {part.name} failed")
+            with writing(self.path):
+                sync(part)
+                os.replace(part, target)
+                sync(target.parent)
+        except Tf.ErrorException as error:
+            raise WriteError(f"{self.path}: cannot be written: {reason(error)}") from None
+        finally:
+            with contextlib.suppress(OSError):
+                part.unlink(missing_ok=True)
 
-    def _piece_layer(self, frames: list[tuple[float, Samples]]) -> Sdf.Layer:
-        layer = Sdf.Layer.CreateAnonymous(".usdc")
-        self._declare_varying(layer)
-        (first, earliest), *later = frames
-        for time_code, samples in [(first, self._carried | earliest), *later]:
-            for path, value in samples.items():
-                layer.SetTimeSample(path, time_code, value)
-        layer.startTimeCode = frames[0][0]
-        layer.endTimeCode = frames[-1][0]
-        return layer
-
-    def _declare_varying(self, layer: Sdf.Layer) -> None:
-        assert self._static is not None
-        declare_attributes(layer, self._static, self._varying)
-
-    def _root_layer(self, pieces: list[tuple[float, float]]) -> Sdf.Layer:
-        assert self._static is not None
-        folder = f"./{usd_name(Path(self.pieces_folder.name, self._run.name))}"
-        if self._root is None:
-            self._root = new_root(self.path.suffix, self._static, folder, pieces[0][0])
-        play_pieces(self._root, folder, pieces)
-        self._annotate(self._root)
-        return self._root
-
-    def _annotate(self, layer: Sdf.Layer) -> None:
-        if self.custom_data:
-            layer.GetPrimAtPath(f"/{layer.defaultPrim}").SetInfo("customData", self.custom_data)
-        if self.layer_data:
-            layer.customLayerData = {**layer.customLayerData, **self.layer_data}
+    def _kept(self) -> str:
+        """The result after a failure, in words."""
+        if not self._pieces:
+            return "no frame could be kept"
+        return (
+            f"the frames up to {self._pieces[-1][1]:g} are kept in {self.pieces_folder}, which {self.path.name} plays"
+        )
 
     def _open_run(self) -> None:
         """Make the folder of this run with the files that all its pieces share."""
@@ -334,25 +313,6 @@ class PieceStore:
         manifest = Sdf.Layer.CreateAnonymous(".usda")
         self._declare_varying(manifest)
         self._write(manifest, self._run / "manifest.usda")
-        self._is_open = True
-
-    def _write(self, layer: Sdf.Layer, target: Path, aside: str | None = None) -> None:
-        """Write a layer completely or not at all: in the run's folder, synced, then renamed over the target."""
-        part = self._run / (aside or (f"part-root{target.suffix}" if target == self.path else f"part-{target.name}"))
-        if part.name.startswith("part-piece-"):
-            part = part.with_name(part.name.replace("part-piece-", "part-"))
-        try:
-            if not layer.Export(usd_name(part)):
-                raise WriteError(f"{self.path}: writing {part.name} failed")
-            with writing(self.path):
-                sync(part)
-                os.replace(part, target)
-                sync(target.parent)
-        except Tf.ErrorException as error:
-            raise WriteError(f"{self.path}: cannot be written: {reason(error)}") from None
-        finally:
-            with contextlib.suppress(OSError):
-                part.unlink(missing_ok=True)
 
     def _refuse_second_writer(self, kind: type[Exception]) -> None:
         for run in self._other_runs():
@@ -386,5 +346,77 @@ class PieceStore:
         if self._lock:
             self._lock.close()
             self._lock = None
-        self._thread.shutdown()
-        self._pending, self._root = [], None
+        self._pending = []
+
+
+class ColoredStage(PieceStore):
+    """Frames coloured by stress, all in one range at the end.
+
+    The colour range starts at 0 and ends at the 99th percentile of the highest frame so far, rounded up to few digits
+    (`colors.round_limit`). On closing, earlier frames are coloured again with the last range. Custom data of the
+    default prim name the colour map and its range.
+
+    Attributes:
+        frames: The number of frames so far.
+        stress_range: Stresses [Pa] at the two ends of the colour map so far.
+    """
+
+    def __init__(self, path: str | Path, *, flush_seconds: float = 2.0):
+        super().__init__(path, flush_seconds=flush_seconds)
+        self.frames, self.stress_range = 0, (0.0, 0.0)
+        self._ranges_used: set[tuple[float, float]] = set()
+        self._closed = False
+
+    def widen_range(self, top: float) -> None:
+        """Let the colour range reach this stress [Pa]."""
+        self.stress_range = (0.0, max(top, self.stress_range[1]))
+
+    @staticmethod
+    def range_for(stress: NDArray[np.float32]) -> float:
+        """The end of the colour range that a frame with these stresses of its tetrahedra needs [Pa]."""
+        if len(stress) == 0:
+            return 0.0
+        rank = min(len(stress) - 1, int(0.99 * len(stress)))
+        return round_limit(float(np.partition(stress, rank)[rank]))
+
+    def close(self) -> None:
+        """Join all frames into one file and remove the pieces; further calls do nothing.
+
+        Raises:
+            OSError: The joined file could not be written; the pieces stay, and the stage plays them.
+        """
+        if not self._closed:
+            self._closed = True
+            self.finish()
+
+    def last_look(self, samples: Samples) -> Samples:
+        return self._colors(samples) if self._ranges_used - {self.stress_range} else {}
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise InputError(f"{self.path}: is closed; frames must be added before")
+
+    def _add(
+        self, samples: Samples, stress: NDArray[np.float32] | None, nodal: NDArray[np.float64] | None = None
+    ) -> None:
+        """Add a frame with stresses of tetrahedra [T] [Pa], if any, and their averages at nodes [N], if known."""
+        if stress is not None:
+            self.widen_range(self.range_for(stress))
+            self._ranges_used.add(self.stress_range)
+            lowest, highest = self.stress_range
+            legend = {"map": COLORMAP_NAME, "quantity": "von Mises stress", "unit": "Pa"}
+            self.custom_data["stressColors"] = legend | {"lowest": lowest, "highest": highest}
+            samples |= self._colors(samples, nodal)
+        self.add(float(self.frames), samples)
+        self.frames += 1
+
+    def _colors(self, samples: Samples, nodal: NDArray[np.float64] | None = None) -> Samples:
+        """Colours for the stresses of a frame, in the present range."""
+        raise NotImplementedError
+
+
+def _nbytes(value: Any) -> int:
+    try:
+        return memoryview(value).nbytes
+    except TypeError:  # a quaternion or a matrix
+        return 128

@@ -1,4 +1,4 @@
-"""Data of the prims of an animated body, and the prims of surfaces that are bound to it."""
+"""The prims of an animated body: its tetrahedra, their boundary, surfaces that are bound to it, and contact."""
 
 from __future__ import annotations
 
@@ -15,9 +15,42 @@ from warp_corot.io.files.usd import free_name
 from warp_corot.io.pictures.colors import TISSUE, VertexAverage, color_index, srgb_to_linear, stress_colors
 from warp_corot.io.write.skins import Skin
 from warp_corot.mesh.surfaces.bound import SurfaceMesh, vertex_normals
+from warp_corot.mesh.surfaces.boundary import boundary_faces, signed_volumes
 
 from .pieces import Samples
-from .touched import ATTRIBUTES, PRESSURE, Touched, declare_touched
+
+# --- contact as primvars: the force on each node, and the pressure ---------------------------------------------------
+
+FORCE, PRESSURE = "contactForce", "contactPressure"
+#: The attributes of a prim that change with its mesh.
+ATTRIBUTES = (f"primvars:{FORCE}", f"primvars:{PRESSURE}")
+
+
+class Touched(NamedTuple):
+    """Contact in a frame: forces on nodes [N], float32 [N, 3], and pressure averaged at nodes [Pa], float32 [N]."""
+
+    forces: NDArray[np.float32]
+    pressure: NDArray[np.float32]
+
+    def samples(self, path: str, nodes: NDArray[np.int32] | slice = slice(None)) -> Samples:
+        """The primvars of a prim with some of the nodes."""
+        return {
+            f"{path}.primvars:{FORCE}": Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(self.forces[nodes])),
+            f"{path}.primvars:{PRESSURE}": Vt.FloatArray.FromNumpy(np.ascontiguousarray(self.pressure[nodes])),
+        }
+
+
+def declare_touched(prim: Any, *, forces: bool = True) -> None:
+    """Declare the primvars, without values."""
+    primvars, types, vertex = UsdGeom.PrimvarsAPI(prim), Sdf.ValueTypeNames, UsdGeom.Tokens.vertex
+    if forces:
+        force = primvars.CreatePrimvar(FORCE, types.Vector3fArray, vertex)
+        force.GetAttr().SetDocumentation("Contact force on each node in the last step [N]")
+    pressure = primvars.CreatePrimvar(PRESSURE, types.FloatArray, vertex)
+    pressure.GetAttr().SetDocumentation("Contact pressure in the last step, averaged over the triangles around [Pa]")
+
+
+# --- what all prims share, and surfaces ------------------------------------------------------------------------------
 
 ROOT, TETS, SURFACE = "/SoftBody", "/SoftBody/tetrahedra", "/SoftBody/surface"
 MATERIALS = "/SoftBody/materials"
@@ -138,7 +171,7 @@ class SkinPrim:
             of_points = np.einsum("vn,vnc->vc", surface.weights, frame.velocities[surface.nodes])
             samples[f"{self._path}.velocities"] = Vt.Vec3fArray.FromNumpy(of_points.astype(np.float32))
         if self._changing:
-            if self._said is None or not _are_same(self._said.surface, surface):
+            if self._said is None or not _is_same_skin(self._said.surface, surface):
                 samples |= triangle_samples(self._path, surface.triangles)
                 if self._skin.is_cut:
                     inside = np.flatnonzero(surface.of_cut).astype(np.int32)
@@ -155,7 +188,7 @@ class SkinPrim:
         return {f"{self._path}.primvars:displayColor:indices": indices}
 
 
-def _are_same(one: SurfaceMesh, other: SurfaceMesh) -> bool:
+def _is_same_skin(one: SurfaceMesh, other: SurfaceMesh) -> bool:
     pairs = ((one.triangles, other.triangles), (one.points, other.points), (one.of_cut, other.of_cut))
     return all(np.array_equal(a, b) for a, b in pairs)
 
@@ -244,3 +277,180 @@ def extent(points: NDArray[np.float32]) -> Vt.Vec3fArray:
         points = np.zeros((1, 3), np.float32)
     axes = np.ascontiguousarray(points.T)  # NumPy reduces long rows several times as fast as short ones
     return Vt.Vec3fArray.FromNumpy(np.stack([axes.min(axis=1), axes.max(axis=1)]))
+
+
+# --- tetrahedra and their boundary, also of meshes that change -------------------------------------------------------
+
+INDICES = f"{TETS}.tetVertexIndices"
+FACES = f"{TETS}.surfaceFaceVertexIndices"
+REST = f"{TETS}.primvars:rest"
+STRESS = f"{TETS}.primvars:vonMises"
+UNITS = {"young": " [Pa]", "poisson": "", "density": " [kg/m³]"}
+
+
+class TetPrims:
+    """The TetMesh prim and, if it is drawn, the Mesh of the boundary.
+
+    Args:
+        present: The body at rest.
+        boundary: Whether the boundary is drawn.
+        changing: Whether the mesh may change.
+    """
+
+    def __init__(self, present: Present, *, boundary: bool, changing: bool):
+        self._boundary = boundary
+        self._changing = changing
+        self._uniform = [name for name in UNITS if np.size(getattr(present.material, name, 0.0)) == 1]
+        self._said: tuple[Present, SurfaceTriangles] | None = None
+        self.follow(present)
+
+    def follow(self, present: Present) -> None:
+        """Draw this mesh from the next frame on."""
+        self._present = present
+        self._surface = SurfaceTriangles(boundary_faces(present.tets)[0])
+
+    @property
+    def follows(self) -> dict[str, str]:
+        """See `PieceStore.declare`."""
+        moving = ("points", "velocities", *ATTRIBUTES)
+        own = [*moving, "primvars:rest", "primvars:vonMises", *(f"primvars:{name}" for name in UNITS)]
+        found = {f"{TETS}.{name}": INDICES for name in own}
+        return found | {f"{SURFACE}.{name}": f"{SURFACE}.faceVertexIndices" for name in moving}
+
+    def declare(self, stage: Any, statics: Statics) -> None:
+        """Declare everything that does not change, and the attributes that do, without values."""
+        tets = UsdGeom.TetMesh.Define(stage, TETS)
+        tets.CreateTetVertexIndicesAttr()
+        tets.CreateSurfaceFaceVertexIndicesAttr()
+        tets.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
+        # Beside its surface it would be drawn twice, and Hydra takes its uniform primvars for values per face.
+        tets.CreatePurposeAttr(UsdGeom.Tokens.guide)
+        if statics.velocities:
+            tets.CreateVelocitiesAttr()
+        self._declare_primvars(UsdGeom.PrimvarsAPI(tets), statics)
+        declare_moving(tets, statics.stress)
+        if statics.touched:
+            declare_touched(tets)
+        if self._boundary:
+            surface = UsdGeom.Mesh.Define(stage, SURFACE)
+            declare_triangles(surface)
+            declare_moving(surface, statics.stress)
+            if statics.velocities:
+                surface.CreateVelocitiesAttr()
+            if statics.touched:
+                declare_touched(surface)
+        if not self._changing:
+            for path, value in {**self._topology(), **self._surface_topology()}.items():
+                stage.GetAttributeAtPath(path).Set(value)
+
+    def samples(self, frame: Frame) -> Samples:
+        """Values of a frame without colours."""
+        x, v = frame.positions, frame.velocities
+        samples: Samples = {f"{TETS}.points": Vt.Vec3fArray.FromNumpy(x), f"{TETS}.extent": extent(x)}
+        if v is not None:
+            samples[f"{TETS}.velocities"] = Vt.Vec3fArray.FromNumpy(v)
+        if frame.stress is not None:
+            samples[STRESS] = Vt.FloatArray.FromNumpy(frame.stress)
+        if frame.touched is not None:
+            samples |= frame.touched.samples(TETS)
+            samples |= frame.touched.samples(SURFACE, self._surface.nodes) if self._boundary else {}
+        if self._boundary:
+            nodes = self._surface.nodes
+            samples |= {f"{SURFACE}.points": Vt.Vec3fArray.FromNumpy(x[nodes]), f"{SURFACE}.extent": extent(x[nodes])}
+            if v is not None:
+                samples[f"{SURFACE}.velocities"] = Vt.Vec3fArray.FromNumpy(v[nodes])
+        return samples | self._changes() if self._changing else samples
+
+    def colors(self, samples: Samples, limits: Limits, nodal: NDArray[np.float64] | None = None) -> Samples:
+        """Colours for the stresses of a frame, and the data of the mesh if it has changed."""
+        if STRESS not in samples:
+            return {}
+        if nodal is None:
+            nodal = self._averaged(samples)
+        indices = color_index(nodal, *limits)
+        colors = {f"{TETS}.primvars:displayColor:indices": Vt.IntArray.FromNumpy(indices)}
+        if self._boundary:
+            on_surface = Vt.IntArray.FromNumpy(indices[self._surface.nodes])
+            colors[f"{SURFACE}.primvars:displayColor:indices"] = on_surface
+        return colors
+
+    def _averaged(self, samples: Samples) -> NDArray[np.float64]:
+        stress = np.asarray(samples[STRESS])
+        if INDICES in samples and self._changing:
+            points, tets = np.asarray(samples[REST], dtype=np.float64), np.asarray(samples[INDICES])
+            average = VertexAverage(tets, np.abs(signed_volumes(points, tets)), len(points))
+            self._present = self._present._replace(points=points, tets=tets, average=average)
+            self._surface = SurfaceTriangles(np.asarray(samples[FACES]))
+        return self._present.average(stress)
+
+    def _changes(self) -> Samples:
+        """Changed values among those that do not change in every frame."""
+        before, self._said = self._said, (self._present, self._surface)
+        if before is not None and before[0] is self._present:
+            return {}
+        samples: Samples = {}
+        if before is None or not _are_same(before[0], self._present):
+            samples |= self._topology()
+        if before is None or not self._is_same_surface(*before):
+            samples |= self._surface_topology()
+        return samples
+
+    def _is_same_surface(self, present: Present, surface: SurfaceTriangles) -> bool:
+        return np.array_equal(surface.triangles, self._surface.triangles) and np.array_equal(
+            present.points[surface.nodes], self._present.points[self._surface.nodes]
+        )
+
+    def _topology(self) -> Samples:
+        present = self._present
+        samples: Samples = {
+            INDICES: Vt.Vec4iArray.FromNumpy(present.tets),
+            FACES: Vt.Vec3iArray.FromNumpy(self._surface.faces),
+            REST: Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(present.points, dtype=np.float32)),
+        }
+        if present.fixed is not None:
+            held = np.zeros(len(present.points), np.int32)
+            held[np.asarray(present.fixed)] = 1
+            samples[f"{TETS}.primvars:fixed"] = Vt.IntArray.FromNumpy(held)
+        for name in UNITS:
+            value = getattr(present.material, name, None)
+            if value is not None and name not in self._uniform:
+                given = np.broadcast_to(value, (len(present.tets),)) if np.ndim(value) == 0 else value
+                values = floats(given, (len(present.tets),), f"material.{name}")
+                samples[f"{TETS}.primvars:{name}"] = Vt.FloatArray.FromNumpy(values)
+        return samples
+
+    def _surface_topology(self) -> Samples:
+        return triangle_samples(SURFACE, self._surface.triangles) if self._boundary else {}
+
+    def _declare_primvars(self, primvars: Any, statics: Statics) -> None:
+        types, tokens = Sdf.ValueTypeNames, UsdGeom.Tokens
+        primvars.CreatePrimvar("rest", types.Point3fArray, tokens.vertex)
+        if statics.stress:
+            stress = primvars.CreatePrimvar("vonMises", types.FloatArray, tokens.uniform)
+            stress.GetAttr().SetDocumentation("Von Mises stress of each tetrahedron [Pa]")
+        if self._present.fixed is not None:
+            fixed = primvars.CreatePrimvar("fixed", types.IntArray, tokens.vertex)
+            fixed.GetAttr().SetDocumentation("1 where the node is held")
+        for name, unit in UNITS.items():
+            value = getattr(self._present.material, name, None)
+            if value is None:
+                continue
+            if name in self._uniform:
+                primvar = primvars.CreatePrimvar(name, types.Float, tokens.constant)
+                primvar.Set(float(np.asarray(value).reshape(())))
+            else:
+                primvar = primvars.CreatePrimvar(name, types.FloatArray, tokens.uniform)
+            primvar.GetAttr().SetDocumentation(f"Material: {name}{unit}")
+
+
+class SurfaceTriangles:
+    """The boundary of tetrahedra: its faces [F, 3] in the mesh's nodes, and its own nodes and triangles."""
+
+    def __init__(self, faces: NDArray[np.int32]):
+        self.faces = faces
+        self.nodes, compact = np.unique(faces, return_inverse=True)
+        self.triangles = compact.reshape(-1, 3).astype(np.int32)
+
+
+def _are_same(one: Present, other: Present) -> bool:
+    return np.array_equal(one.tets, other.tets) and np.array_equal(one.points, other.points)

@@ -12,17 +12,13 @@ from pxr import Kind, Sdf, Usd, UsdGeom
 from warp_corot.contact.tool import Obstacle
 from warp_corot.errors import InputError
 from warp_corot.io.pictures.colors import VertexAverage
-from warp_corot.io.write.provenance import KEY
+from warp_corot.io.write.animate import KEY
 from warp_corot.io.write.skins import Skin
 from warp_corot.mesh.surfaces.boundary import right_handed, signed_volumes
 
-from .colored import ColoredStage
-from .materials import declare_physics
-from .obstacles import ObstaclePrim, obstacle_prims
-from .pieces import PieceStore, Samples
-from .prims import ROOT, SURFACE, TETS, Frame, Present, SkinPrim, Statics, floats, skin_paths
-from .tets import TetPrims
-from .touched import Touched
+from .physics import ObstaclePrim, declare_physics, obstacle_prims
+from .pieces import ColoredStage, Samples
+from .prims import ROOT, SURFACE, TETS, Frame, Present, SkinPrim, Statics, TetPrims, Touched, floats, skin_paths
 
 __all__ = ["ROOT", "SURFACE", "TETS", "Mesh", "UsdWriter"]
 
@@ -48,7 +44,7 @@ class UsdWriter(ColoredStage):
     ``contactPressure`` [Pa] (vertex, in each frame). Both show the stress as ``displayColor``: averages over the
     tetrahedra around each node, as indices into the 256 colours of `colors.stress_colors`; custom
     data of ``/SoftBody`` name the map and its range. ``/SoftBody/physics`` has the physics materials, and with
-    ``gravity`` a physics scene, see `usd.materials.declare_physics`.
+    ``gravity`` a physics scene, see `usd.physics.declare_physics`.
 
     Mirrored tetrahedra are written with two indices swapped, so that all are right-handed as the schema requires.
 
@@ -65,7 +61,7 @@ class UsdWriter(ColoredStage):
     their ``velocities``, as the schema defines it for meshes that change.
 
     Obstacles are prims below ``/SoftBody/obstacles``: a Sphere, Capsule, Cylinder, Cube or Plane each; a tool has its
-    place, its turn and the force and torque on it in each frame (`usd.obstacles.ObstaclePrim`).
+    place, its turn and the force and torque on it in each frame (`usd.physics.ObstaclePrim`).
 
     Args:
         path: The output: .usd or .usdc (binary) or .usda (text). A former file stays until the first frames are
@@ -113,7 +109,7 @@ class UsdWriter(ColoredStage):
             raise InputError(f"up_axis is {up_axis!r}; it must be X, Y or Z")
         if not (np.isfinite(fps) and fps > 0.0):
             raise InputError(f"fps is {fps}; it must be a positive number")
-        super().__init__(PieceStore(path, flush_seconds=flush_seconds))
+        super().__init__(path, flush_seconds=flush_seconds)
         self._fps = float(fps)
         self._up_axis = up_axis
         self._changing = changing
@@ -174,7 +170,7 @@ class UsdWriter(ColoredStage):
         given = Statics(velocities is not None, von_mises is not None, touched is not None)
         if self._given is None:
             self._given = given
-            self._store.declare(self._static_layer(), self._follows())
+            self.declare(self._static_layer(), self._drawn_anew())
         elif given != self._given:
             raise InputError("velocities, von_mises and contact must be given either for every frame or for none")
 
@@ -184,7 +180,7 @@ class UsdWriter(ColoredStage):
         if von_mises is not None:
             stress = floats(von_mises, (len(self._present.tets),), "von_mises")
             nodal = self._present.average(stress)
-        self._store.layer_data = {KEY: self.about} if self.about else {}
+        self.layer_data = {KEY: self.about} if self.about else {}
         frame = Frame(x, v, stress, nodal, touched)
         samples: Samples = {}
         for prim in self._prims:
@@ -208,7 +204,7 @@ class UsdWriter(ColoredStage):
             colors |= prim.colors(samples, self.stress_range, nodal)
         return colors
 
-    def _follows(self) -> dict[str, str]:
+    def _drawn_anew(self) -> dict[str, str]:
         found: dict[str, str] = {}
         for prim in self._prims:
             found |= prim.follows

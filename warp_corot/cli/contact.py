@@ -1,4 +1,4 @@
-"""``--ground``, ``--drop``, ``--tool``, ``--tool-path`` and ``--touch``: what the bodies of a run touch."""
+"""What the bodies of a run touch: ``--ground``, ``--drop``, ``--tool``, ``--tool-path`` and ``--touch``; blades."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from warp_corot.contact.options import Contact, checked_friction
 from warp_corot.contact.shapes import Capsule, Cylinder, Ground
@@ -18,9 +19,8 @@ from warp_corot.domain.units import length
 from warp_corot.errors import InputError
 from warp_corot.solvers import INTEGRATORS
 
-from .holding import up_of
-from .implicit import integrator_name
-from .options.defaults import AUTO
+from .options import AUTO, integrator_name
+from .patches import up_of
 from .ranks import are_several
 from .tool_paths import make_tool
 
@@ -34,7 +34,7 @@ SMALL = 1e-5
 #: Tetrahedra that reach farther than this beyond the surface, relative to the height of the body, are said.
 FAR = 0.01
 
-Floats = np.ndarray
+Floats = npt.NDArray[np.float64]
 
 
 @dataclass(eq=False)
@@ -63,11 +63,6 @@ class RunContact:
         found.append("themselves and one another" if self.contact.self_contact else "one another")
         found[-1] += f"; friction {self.contact.friction:g}"
         return [("touches" if place == 0 else "", text) for place, text in enumerate(found)]
-
-
-def stands_free(args: argparse.Namespace) -> bool:
-    """Whether a ground carries the body in place of fixed nodes."""
-    return args.fix is None and (args.ground is not None or args.drop is not None)
 
 
 def touched_by(options: Sequence[argparse.Namespace]) -> RunContact:

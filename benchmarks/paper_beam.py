@@ -15,12 +15,12 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 import warp as wp
+from paper_timing import Stages, Times, measure_times
 
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.elasticity import Corotated, Linear, Model, NeoHookean, StVenantKirchhoff
 from warp_corot.elasticity.dilatation import ELEMENT
 from warp_corot.errors import InputError
-from warp_corot.inputs.choices import SHORT_DURATION
 from warp_corot.inputs.device import checked_device
 from warp_corot.materials.isotropic import Isotropic
 from warp_corot.mesh import TetForest
@@ -29,9 +29,10 @@ from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import SymplecticEuler
 from warp_corot.solvers.integrator import GRAPH_STEPS
 
-from .timing import Stages, Times, measure_times
-
 Array = npt.NDArray[np.float64]
+
+#: Simulated times of the experiment and of its short form [s].
+FULL_DURATION, SHORT_DURATION = 80.0, 4.0
 
 CELLS, CELL_SIZE = (1, 1, 3), 0.064
 #: The observed node [m]: the middle of the free end.

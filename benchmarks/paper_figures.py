@@ -9,15 +9,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from paper_beam import CELL_SIZE, CELLS, OWN, PEER, REFERENCE, Results, Run
+from paper_report import PUBLISHED_COROTATED, PUBLISHED_LINEAR, VOLUME_KEPT
 
+from warp_corot.cli.verify import device_name
 from warp_corot.errors import InputError
 from warp_corot.io.files.whole import written_whole
-from warp_corot.io.pictures.preview import Camera, draw_body
+from warp_corot.io.pictures.drawing import Camera, draw_body
 from warp_corot.mesh.surfaces.boundary import boundary_faces
-
-from .claims import PUBLISHED_COROTATED, PUBLISHED_LINEAR, VOLUME_KEPT
-from .paper import CELL_SIZE, CELLS, OWN, PEER, REFERENCE, Results, Run
-from .report import device_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

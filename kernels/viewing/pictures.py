@@ -1,0 +1,117 @@
+"""Pictures of surfaces on the CPU: the nearest triangle at each pixel, and its shaded colour."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+#: Pixels without a triangle.
+NOTHING = wp.constant(wp.int64(-1))
+
+
+@wp.func
+def twice_area(a: wp.vec3, b: wp.vec3, x: float, y: float):
+    """Twice the area of a triangle, positive if it runs counter-clockwise."""
+    return (b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0])
+
+
+@wp.func
+def shares_at(a: wp.vec3, b: wp.vec3, c: wp.vec3, x: float, y: float):
+    """Barycentric coordinates of a pixel."""
+    return wp.vec3(twice_area(b, c, x, y), twice_area(c, a, x, y), twice_area(a, b, x, y)) / twice_area(
+        a, b, c[0], c[1]
+    )
+
+
+@wp.kernel(enable_backward=False)
+def find_nearest(
+    # In
+    corners: wp.array2d[wp.vec3],
+    # In and out
+    nearest: wp.array2d[wp.int64],
+):
+    """Find the triangle that is nearest to the viewer at the middle of each pixel.
+
+    Args:
+        corners: Pixels to the right and down, and the inverse distance to the viewer over the largest one, which is
+            linear along lines of the picture, [F, 3].
+        nearest: That inverse distance in the upper half of the bits, and the triangle in the lower.
+    """
+    f = wp.tid()
+    a, b, c = corners[f, 0], corners[f, 1], corners[f, 2]
+    if twice_area(a, b, c[0], c[1]) == 0.0:
+        return
+    low, high = wp.min(wp.min(a, b), c), wp.max(wp.max(a, b), c)
+    left, top = wp.max(int(wp.ceil(low[0] - 0.5)), 0), wp.max(int(wp.ceil(low[1] - 0.5)), 0)
+    right = wp.min(int(wp.floor(high[0] - 0.5)), nearest.shape[1] - 1)
+    bottom = wp.min(int(wp.floor(high[1] - 0.5)), nearest.shape[0] - 1)
+    for row in range(top, bottom + 1):
+        for column in range(left, right + 1):
+            shares = shares_at(a, b, c, float(column) + 0.5, float(row) + 0.5)
+            if wp.min(shares) >= -1.0e-5:
+                near = wp.int64(1.0e9 * wp.dot(shares, wp.vec3(a[2], b[2], c[2])))
+                wp.atomic_max(nearest, row, column, (near << wp.int64(32)) | wp.int64(f))
+
+
+@wp.kernel(enable_backward=False)
+def shade(
+    # In
+    nearest: wp.array2d[wp.int64],
+    corners: wp.array2d[wp.vec3],
+    points: wp.array2d[wp.vec3],
+    normals: wp.array2d[wp.vec3],
+    values: wp.array2d[float],
+    table: wp.array[wp.vec3],
+    rigid: wp.vec3,
+    viewer: wp.vec3,
+    up: wp.vec3,
+    key: wp.vec3,
+    fill: wp.vec3,
+    edge: float,
+    # Out
+    image: wp.array3d[wp.uint8],
+):
+    """Shade the nearest triangles under a key light, a fill light and the sky.
+
+    Args:
+        points, normals: At the corners of triangles [F, 3].
+        values: Places in the table of colours from 0 to 1 [F, 3]; NaN for what is ``rigid``.
+        table: Linear colours.
+        viewer: Where the viewer is [m].
+        up, key, fill: Unit vectors up and to the lights.
+        edge: Half of the width of the lines along edges [pixels]; 0 for none.
+        image: sRGB, [height, width, 3]; other pixels stay.
+    """
+    row, column = wp.tid()
+    if nearest[row, column] == NOTHING:
+        return
+    f = int(nearest[row, column] & wp.int64(0xFFFFFFFF))
+    a, b, c = corners[f, 0], corners[f, 1], corners[f, 2]
+    x, y = float(column) + 0.5, float(row) + 0.5
+    flat = shares_at(a, b, c, x, y)
+    shares = wp.cw_mul(flat, wp.vec3(a[2], b[2], c[2]))
+    shares /= shares[0] + shares[1] + shares[2]
+    normal, point, value = wp.vec3(0.0), wp.vec3(0.0), float(0.0)
+    for k in range(3):
+        normal += shares[k] * normals[f, k]
+        point += shares[k] * points[f, k]
+        value += shares[k] * values[f, k]
+    normal = wp.normalize(normal)
+    base = rigid
+    if not wp.isnan(value):
+        base = table[int(wp.clamp(value, 0.0, 1.0) * float(table.shape[0] - 1) + 0.5)]
+    lambert = wp.max((wp.dot(normal, key) + 0.2) / 1.2, 0.0)
+    sky = 0.5 + 0.5 * wp.dot(normal, up)
+    # Ambient light is slightly rose: grey light would turn the colour map's yellows olive.
+    ambient = 0.13 + 0.24 * sky + 0.30 * wp.max(wp.dot(normal, fill), 0.0)
+    light = wp.vec3(1.06 * ambient, 0.96 * ambient, ambient) + wp.vec3(0.74 * lambert)
+    gloss = 0.06 * wp.pow(wp.max(wp.dot(normal, wp.normalize(key + wp.normalize(viewer - point))), 0.0), 24.0)
+    if edge > 0.0:
+        # The double area of a triangle with a corner here, over its base, is the distance to that edge.
+        sides = wp.vec3(wp.length(c - b), wp.length(a - c), wp.length(b - a))
+        away = wp.cw_div(wp.abs(twice_area(a, b, c[0], c[1])) * flat, sides)
+        if wp.min(away) < edge:
+            light *= 0.6
+    for k in range(3):
+        linear = wp.clamp(base[k] * light[k] + gloss, 0.0, 1.0)
+        encoded = wp.where(linear <= 0.0031308, 12.92 * linear, 1.055 * wp.pow(linear, 1.0 / 2.4) - 0.055)
+        image[row, column, k] = wp.uint8(255.0 * encoded + 0.5)

@@ -1,0 +1,437 @@
+"""More results of a run: the table of ``--probe`` and ``--csv``, and pictures and films of ``--preview``."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import csv
+import itertools
+import pickle
+import tempfile
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from warp_corot.contact.shapes import Ground
+from warp_corot.contact.tool import Obstacle, Tool
+from warp_corot.errors import InputError
+from warp_corot.io.files.whole import check_output, writing
+from warp_corot.io.pictures.film import FILMS, check_film, frames_shown, write_film
+from warp_corot.simulation.progress import bar_of
+
+from .options import VIEWS, is_static
+from .patches import POINT
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+    from warp_corot.body.soft_body import SoftBody
+    from warp_corot.io.pictures.colors import VertexAverage
+    from warp_corot.io.pictures.preview import Picture
+    from warp_corot.simulation.simulation import Simulation
+
+    from .bodies import RunBody
+    from .patches import BodyPatches
+
+#: A point outside by more than this fraction of the body's size is not moved to the nearest point inside.
+OUTSIDE = 0.05
+#: Names and units of the columns of a probe.
+COLUMNS = [f"{what}{axis} [{unit}]" for what, unit in (("u", "m"), ("v", "m/s")) for axis in "xyz"]
+COLUMNS += [f"reaction {axis} [N]" for axis in "xyz"]
+
+Array = npt.NDArray[np.float64]
+
+
+class Probe:
+    """A probed point or patch of a body.
+
+    A point interpolates the four nodes of its tetrahedron. A patch has the mass-weighted mean over its nodes, and the
+    sum of their reactions. Both are found again when the mesh has changed.
+
+    Args:
+        text: "X Y Z" [m] at rest, or a patch's expression.
+        body: The body.
+        patches: The body's patches.
+
+    Raises:
+        InputError: A point outside the body, a patch without nodes, or an invalid expression.
+    """
+
+    def __init__(self, text: str, body: SoftBody, patches: BodyPatches):
+        self.text, self.body, self._patches = text, body, patches
+        match = POINT.fullmatch(text)
+        self.point = np.array([float(part) for part in match.groups()] if match else 3 * [np.nan])
+        self.is_patch = match is None
+        self._find()
+
+    def values(self) -> list[float]:
+        """Displacement [m], velocity [m/s] and reaction [N], nine numbers."""
+        if self._revision != self.body.version:
+            self._find()
+        u, v = (array.numpy()[self._nodes].astype(float) for array in (self.body.displacements, self.body.velocities))
+        r = self.body.reactions.numpy()[self._nodes].astype(float)
+        share = np.ones(len(r)) if self.is_patch else self._weights
+        return [float(x) for x in (*(self._weights @ u), *(self._weights @ v), *(share @ r))]
+
+    def _find(self) -> None:
+        """Find the nodes in the current mesh, and their weights."""
+        self._revision = self.body.version
+        if not self.is_patch:
+            self._place()
+            return
+        mask = self._patches.of_mesh(self.body.mesh).some(self.text, "--probe")
+        weights = self.body.masses * mask
+        self._nodes = np.flatnonzero(mask)
+        self._weights = weights[self._nodes] / weights.sum()
+
+    def _place(self) -> None:
+        """Find the tetrahedron that contains the point, or the nearest one."""
+        mesh = self.body.mesh
+        (element,), (weights,) = mesh.embed(self.point[None])
+        inside = np.clip(weights, 0.0, None)
+        self._weights, self._nodes = inside / inside.sum(), mesh.tets[element]
+        away = float(np.linalg.norm(self._weights @ mesh.points[self._nodes] - self.point))
+        size = float(np.linalg.norm(np.ptp(mesh.points[mesh.tets.ravel()], axis=0)))
+        if away > OUTSIDE * size:
+            raise InputError(f"--probe {self.text!r}: the point is {away:.3g} m outside the body")
+
+
+class Table:
+    """A CSV file with one row for each frame; each row is written at once, by the first of several ranks.
+
+    Args:
+        path: The file; a former one stays until the first row.
+        sim: The simulation.
+        probes: Probes of its bodies.
+        obstacles: Obstacles by name; the forces on them and the places of tools have columns.
+
+    Raises:
+        InputError: Another extension, a folder with this name, or no folder to write to.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        sim: Simulation,
+        probes: Sequence[Probe],
+        obstacles: Mapping[str, Obstacle] | None = None,
+    ):
+        self.path, self._sim, self._probes = path, sim, probes
+        self._obstacles = dict(obstacles or {})
+        self._file: IO[str] | None = None
+
+    def add(self) -> None:
+        """Add a row with the current state.
+
+        Raises:
+            WriteError: It cannot be written.
+        """
+        energy = self._sim.energy()
+        values = [value for probe in self._probes for value in probe.values()]
+        values += [value for each in self._obstacles.values() for value in _felt(each).values()]
+        row = [self._sim.time, *values, energy.kinetic, energy.elastic, energy.gravitational, self._sim.dt]
+        if not self._sim.is_root:
+            return
+        with writing(self.path):
+            if self._file is None:
+                self._file = self.path.open("w", newline="")
+                csv.writer(self._file).writerow(self._header())
+            csv.writer(self._file).writerow([f"{value:.9g}" for value in row])
+            self._file.flush()
+
+    def close(self) -> None:
+        if self._file is not None:
+            self._file.close()
+
+    def _header(self) -> list[str]:
+        bodies = self._sim.bodies
+        names = ["time [s]"]
+        for probe in self._probes:
+            of = f"body {bodies.index(probe.body) + 1}: " if len(bodies) > 1 else ""
+            names += [f"{of}{probe.text} {column}" for column in COLUMNS]
+        for name, each in self._obstacles.items():
+            names += [f"{name} {column}" for column in _felt(each)]
+        return [*names, "kinetic [J]", "elastic [J]", "gravitational [J]", "dt [s]"]
+
+
+def _felt(obstacle: Obstacle) -> dict[str, float]:
+    """The force on an obstacle in the last step by columns; for a tool its place before, and the torque about it
+    after."""
+    names = [*(f"force {axis} [N]" for axis in "xyz"), *(f"torque {axis} [N m]" for axis in "xyz")]
+    felt = dict(zip(names, map(float, obstacle.wrench.numpy()[0]), strict=True))
+    if not isinstance(obstacle, Tool):
+        return {name: felt[name] for name in names[:3]}
+    return dict(zip((f"{axis} [m]" for axis in "xyz"), obstacle.present_pose[0, :3].tolist(), strict=True)) | felt
+
+
+# --- what pictures show at one time ----------------------------------------------------------------------------------
+
+
+@dataclass
+class PreviewFrame:
+    """A frame: moved points, triangles, values at the points (NaN on obstacles), rest positions, held nodes, corners of
+    the ground [4, 3] or [0, 3], and the time [s]."""
+
+    positions: np.ndarray
+    triangles: np.ndarray
+    values: np.ndarray
+    rest: np.ndarray
+    held: np.ndarray
+    ground: np.ndarray
+    time: float
+
+
+class DrawnBodies:
+    """What is drawn of bodies: their skins and their stresses, bound again when a mesh has changed."""
+
+    def __init__(self, bodies: Sequence[RunBody]):
+        from warp_corot.io.write.skins import BoundSkins
+
+        self._soft = [body.soft for body in bodies]
+        # All bodies of a simulation can be cut, or none.
+        are_cut = all(soft.changing is not None and soft.changing.is_cut for soft in self._soft)
+        own = [None if are_cut else body.subject.skin for body in bodies]
+        drawn = [skin or body.subject.surface for body, skin in zip(bodies, own, strict=True)]
+        changing = [body.soft.mesh is not body.subject.mesh for body in bodies]
+        self._skins = BoundSkins([soft.mesh for soft in self._soft], drawn, changing=changing, are_cut=are_cut)
+        self._averages: dict[int, tuple[Any, VertexAverage]] = {}
+
+    def frame(self, sim: Simulation) -> PreviewFrame:
+        """The current state."""
+        from warp_corot.io.write.solids import ground_corners, poses_of, shape_of, solid_of
+
+        u = np.concatenate([soft.displacements.numpy() for soft in self._soft])
+        held = np.concatenate([soft.constrained.astype(float) for soft in self._soft])
+        stress = np.concatenate([self._stress(k, sim) for k in range(len(self._soft))])
+        parts: list[tuple[np.ndarray, ...]] = [
+            (skin.surface.moved(u), skin.surface.triangles, skin.values(stress), skin.surface.points, skin.values(held))
+            for skin in self._skins.on([soft.mesh for soft in self._soft])
+        ]
+        rests, ground = np.concatenate([part[3] for part in parts]), np.zeros((0, 3))
+        obstacles = () if sim.contact is None else sim.contact.obstacles.given
+        for each, pose in zip(obstacles, poses_of(obstacles), strict=True):
+            shape = shape_of(each)
+            if isinstance(shape, Ground) and not len(ground):
+                ground = ground_corners(shape, rests)
+            if (solid := solid_of(shape)) is not None:
+                points = solid.at(pose)
+                parts.append((points, solid.triangles, np.full(len(points), np.nan), points, np.zeros(len(points))))
+        firsts = np.cumsum([0, *(len(part[0]) for part in parts)])
+        moved, faces, values, rest, fixed = zip(*parts, strict=True)
+        return PreviewFrame(
+            np.concatenate(moved).astype(np.float32),
+            np.concatenate([triangles + first for triangles, first in zip(faces, firsts, strict=False)]),
+            np.concatenate(values).astype(np.float32),
+            np.concatenate(rest),
+            np.concatenate(fixed) > 0.5,
+            ground,
+            sim.time,
+        )
+
+    def _stress(self, k: int, sim: Simulation) -> np.ndarray:
+        """Von Mises stress at the nodes of a body [Pa], [N]."""
+        from warp_corot.io.pictures.colors import VertexAverage
+        from warp_corot.mesh.surfaces.boundary import signed_volumes
+
+        mesh = self._soft[k].mesh
+        if k not in self._averages or self._averages[k][0] is not mesh:
+            volumes = np.abs(signed_volumes(mesh.points, mesh.tets))
+            self._averages[k] = mesh, VertexAverage(mesh.tets, volumes, len(mesh.points))
+        return self._averages[k][1](sim.von_mises(self._soft[k]))
+
+
+# --- pictures of frames from several sides, or a film of all of them -------------------------------------------------
+
+MOST_PANELS, MOST_COLUMNS = 12, 4
+#: Pixels of each view of a film.
+FILM_SIZE = (640, 540)
+#: Directions in which points may lie farthest out, [3, 26].
+OUTWARDS = np.array([each for each in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(each)]).T
+
+
+@dataclass
+class Previews:
+    """The pictures of ``--preview``: frames are stored during the run and drawn at its end.
+
+    Args:
+        args: The command's arguments.
+        count: Number of frames after the first one.
+
+    Raises:
+        InputError: Invalid frames or views, or a package is missing.
+    """
+
+    args: argparse.Namespace
+    count: int
+
+    def __post_init__(self) -> None:
+        path = self.args.preview
+        self.views = _views(self.args.preview_views)
+        self.frames, self.fps = _frames(self.args.preview_frames, self.count), self.args.fps
+        if is_film(path):
+            self.frames, self.fps = frames_shown(path, list(range(self.count + 1)), self.args.fps)
+        elif len(self.frames) * len(self.views) > MOST_PANELS:
+            panels = f"{len(self.frames)} frames from {len(self.views)} sides"
+            raise InputError(f"--preview would have {panels}; a picture has at most {MOST_PANELS} panels")
+        self._file: IO[bytes] | None = None
+        # Of all stored frames: points that lie farthest out [m], and the end of the colour map.
+        self._outermost: list[np.ndarray] = []
+        self._highest = 0.0
+
+    def add(self, frame: int, bodies: Sequence[RunBody], sim: Simulation) -> None:
+        """Store the current state if its frame is drawn."""
+        from warp_corot.io.pictures.drawing import value_limits
+
+        if frame not in self.frames:
+            return
+        if self._file is None:
+            self._file = tempfile.TemporaryFile()  # noqa: SIM115 (closed with this object)
+            self._bodies = DrawnBodies(bodies)
+        shown = self._bodies.frame(sim)
+        pickle.dump(shown, self._file, pickle.HIGHEST_PROTOCOL)
+        used = np.unique(shown.triangles)
+        seen = np.concatenate([shown.positions[used], shown.rest[used]])
+        self._outermost.append(seen[np.argmax(seen @ OUTWARDS, axis=0)])
+        self._highest = max(self._highest, value_limits(shown.values)[1])
+
+    def draw(self, bodies: Sequence[RunBody], name: str) -> None:
+        """Draw the stored frames.
+
+        Args:
+            bodies: The bodies of the run.
+            name: The title, before the time.
+
+        Raises:
+            OSError: It cannot be written.
+        """
+        if self._file is None:
+            return
+        from warp_corot.io.pictures.preview import save_picture
+
+        with (
+            bar_of(len(self._outermost), "frames", "drawing") as drawn,
+            contextlib.closing(self._images(name, bodies[0].soft.mesh.up_axis, drawn)) as images,
+        ):
+            if is_film(self.args.preview):
+                write_film(self.args.preview, images, self.fps)
+            else:
+                save_picture(next(images), self.args.preview)
+
+    def _images(self, name: str, up_axis: str, drawn: Callable[[float], None]) -> Generator[Image, None, None]:
+        """The frames of a film, or the only picture."""
+        from warp_corot.io.pictures.preview import Strip
+
+        film, sides = is_film(self.args.preview), len(self.views)
+        strip = None
+        for pictures, title in self._sheets(name, film, drawn):
+            if strip is None:
+                one = len(pictures) == 1
+                strip = Strip(
+                    pictures,
+                    np.concatenate(self._outermost),
+                    up_axis,
+                    titled=True,
+                    value_range=(0.0, self._highest),
+                    size=(FILM_SIZE[0] * sides, FILM_SIZE[1]) if film else (1200, 900) if one else None,
+                    columns=sides if film or 1 < sides < len(pictures) else min(len(pictures), MOST_COLUMNS),
+                )
+            yield strip.draw(pictures, title)
+
+    def _sheets(self, name: str, film: bool, drawn: Callable[[float], None]) -> Iterator[tuple[list[Picture], str]]:
+        """Pictures that are drawn side by side, and their title."""
+        static, several = is_static(self.args), len(self.frames) > 1
+        panels = []
+        for number, (frame, shown) in enumerate(zip(self.frames, self._kept(), strict=False), start=1):
+            if film:
+                yield self._pictures(shown, ""), name if static else f"{name}; {shown.time:.2f} s"
+            else:
+                when = f"frame {frame}" if static else f"{shown.time:.3g} s"
+                panels += self._pictures(shown, when if several else "")
+            drawn(number)
+        if not film:
+            yield panels, name if several or static else f"{name}; {shown.time:.3g} s"
+
+    def _pictures(self, shown: PreviewFrame, frame_title: str) -> list[Picture]:
+        """A frame from all sides."""
+        from warp_corot.io.pictures.preview import Picture
+
+        named = (self.args.preview_views or "").split(",") if len(self.views) > 1 else [""]
+        titles = [", ".join(filter(None, (name, frame_title))) for name in named]
+        options: dict[str, Any] = {"held": shown.held} if shown.held.any() else {}
+        if len(shown.ground):
+            options["square"] = shown.ground
+        return [
+            Picture(shown.positions, shown.triangles, shown.values, shown.rest, words, options, view)
+            for view, words in zip(self.views, titles, strict=True)
+        ]
+
+    def _kept(self) -> Iterator[PreviewFrame]:
+        assert self._file is not None
+        self._file.seek(0)
+        for _ in self._outermost:
+            yield pickle.load(self._file)
+
+
+def is_film(path: Path) -> bool:
+    return path.suffix.lower() in FILMS
+
+
+def check_preview(args: argparse.Namespace) -> None:
+    """Check, before a long run, that its picture can be drawn.
+
+    Raises:
+        InputError: It cannot.
+    """
+    if args.preview is None:
+        for name in ("preview_frames", "preview_views"):
+            if getattr(args, name) is not None:
+                raise InputError(f"--{name.replace('_', '-')} is for --preview, which is not given")
+        return
+    if find_spec("matplotlib") is None:
+        raise InputError('--preview needs Matplotlib: pip install "warp-corot[plot]"')
+    check_output(args.preview, (".png", *FILMS))
+    check_film(args.preview)
+    if is_film(args.preview) and args.preview_frames is not None:
+        raise InputError(f"--preview-frames is for a .png; {args.preview} is a film and has all frames")
+    _views(args.preview_views)
+
+
+def _frames(text: str | None, count: int) -> list[int]:
+    """Numbers of frames from 0 to ``count``, in rising order."""
+    if text is None:
+        return [count]
+    found = []
+    for word in text.split(","):
+        try:
+            number = int(word)
+        except ValueError:
+            raise InputError(f"--preview-frames {text!r}: {word!r} must be a whole number") from None
+        if not -count - 1 <= number <= count:
+            raise InputError(f"--preview-frames {text!r}: there is no frame {number}; the last one is {count}")
+        found.append(number % (count + 1))
+    return sorted(set(found))
+
+
+def _views(text: str | None) -> list[tuple[float, float]]:
+    """Azimuth and elevation [°] of each view."""
+    if text is None:
+        return [VIEWS["corner"]]
+    found = []
+    for word in text.split(","):
+        if word in VIEWS:
+            found.append(VIEWS[word])
+            continue
+        try:
+            azimuth, elevation = (float(number) for number in word.split(":"))
+        except ValueError:
+            azimuth = elevation = np.nan
+        if not (np.isfinite(azimuth) and abs(elevation) <= 90.0):
+            known = ", ".join(VIEWS)
+            raise InputError(f"--preview-views {text!r}: {word!r} must be {known} or AZIMUTH:ELEVATION in degrees")
+        found.append((azimuth, elevation))
+    return found
