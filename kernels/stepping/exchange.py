@@ -10,8 +10,11 @@ MOST_LOOKS = 1 << 22
 class Exchange:
     """The arrays through which blocks exchange displacements."""
 
-    published: wp.array[wp.vec4]  # [2 N] displacements of even and of odd steps; w holds the bits of the step's number
-    begun: wp.array[wp.uint32]  # [patches] the number of the next launch's first state
+    nodes: int  # of all worlds
+    published: wp.array[
+        wp.vec4
+    ]  # [2 nodes] displacements of even and of odd steps; w holds the bits of the step's number
+    begun: wp.array[wp.uint32]  # [worlds patches] the number of the next launch's first state
 
 
 @wp.func_native("""

@@ -8,6 +8,8 @@ import warp as wp
 
 #: A column of ``PatchBody.rest`` has the inverse of the matrix of rest edges, row by row, then the volume.
 VOLUME_ROW = 9
+#: Threads of whole worlds for which a multiprocessor's registers must have room.
+RESIDENT_THREADS = 768
 
 
 @dataclass(frozen=True)
@@ -22,6 +24,8 @@ class Layout:
             used.
         groups, members: Room for groups that share a dilatation and for the elements of each; zero if none do.
         overlaps: Whether a block computes the elements that need no halo before it waits for the halo.
+        whole: Whether a patch is a whole world. Then blocks exchange nothing, and read elements' constants, which are
+            the same in all worlds, at every step in place of keeping them, so that more blocks are resident.
     """
 
     threads: int
@@ -33,6 +37,12 @@ class Layout:
     groups: int = 0
     members: int = 0
     overlaps: bool = True
+    whole: bool = False
+
+    @property
+    def resident(self) -> int:
+        """Blocks for which a multiprocessor's registers must have room."""
+        return max(RESIDENT_THREADS // self.threads, 1) if self.whole else 1
 
     @property
     def vectors(self) -> int:
@@ -46,9 +56,10 @@ class Layout:
 
 @wp.struct
 class PatchBody:
-    """The patches of a body; see ``solvers.explicit.patch_layout.Patches``."""
+    """The patches of each world of a body; see ``solvers.explicit.patch_layout.Patches``."""
 
-    own: wp.array[wp.int32]  # [N]
+    element_count: int  # of the mesh
+    own: wp.array[wp.int32]  # [N] of one world, as all that is not said to be of others
     own_start: wp.array[wp.int32]  # [patches + 1], as the other starts
     halo: wp.array[wp.int32]
     halo_start: wp.array[wp.int32]
@@ -63,8 +74,8 @@ class PatchBody:
     base_start: wp.array[wp.int32]
     rest: wp.array2d[wp.float32]  # [10, E] see ``VOLUME_ROW``
     # Keyframes of all trajectories, one after another.
-    trajectory: wp.array[wp.int32]  # [N] the trajectory that a node follows, or -1
-    place: wp.array[wp.int32]  # [N] the node's column there
+    trajectory: wp.array[wp.int32]  # [worlds N] the trajectory that a node follows, or -1
+    place: wp.array[wp.int32]  # [worlds N] the node's column there
     key_start: wp.array[wp.int32]  # [trajectories + 1] into ``times``
     value_start: wp.array[wp.int32]  # [trajectories] into ``values``, whose rows have ``columns`` entries
     columns: wp.array[wp.int32]  # [trajectories]

@@ -8,9 +8,7 @@ import functools
 
 import warp as wp
 
-from warp_corot.kernels.corotated.algebraic import stretch_stress
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
-from warp_corot.kernels.elements.dilatation import VOLUME as VOLUME_CHANGE
 from warp_corot.kernels.elements.dilatation import Dilatation, mean_of, pressure_stress_of
 from warp_corot.kernels.elements.elements import Subtrees, root_of
 from warp_corot.kernels.elements.shapes import columns_of
@@ -25,22 +23,22 @@ wp.set_module_options({"enable_backward": False})
 
 
 @functools.cache
-def dilatation_sums_of(shape: int, uniform: bool, of: Dilatation, chosen: range = range(8)) -> wp.Function:
-    """The sums of lambda theta and of lambda over the chosen leaves, which have equal volumes.
+def dilatation_sums_of(shape: int, uniform: bool, of: Dilatation) -> wp.Function:
+    """The sums of lambda theta and of lambda over the eight leaves, which have equal volumes.
 
     The ten displacements are in the frame of ``forces.turn_in``.
     """
     measure, columns = of.measure, columns_of(shape)
-    leaves, begin, end = LEAVES[shape], chosen.start, chosen.stop
+    leaves = LEAVES[shape]
     into_leaf, _out_of_leaf = turns_of(shape)
 
     @wp.func
     def dilatation_sums(y: mat10, lam: wp.array[wp.float32], first: int):
-        _generated_from = wp.static(fingerprint(leaves, begin, end))
+        _generated_from = wp.static(fingerprint(leaves))
         k = lam[first]
         sum = float(0.0)
         weight = float(0.0)
-        for leaf in range(wp.static(begin), wp.static(end)):
+        for leaf in range(8):
             if wp.static(not uniform):
                 k = lam[first + leaf]
             b0, b1, b2 = columns(
@@ -68,23 +66,6 @@ def pressure_leaves(shape: int, of: Dilatation) -> wp.Function:
         return out_of_leaf(leaf, stress(into_leaf(leaf, g), pressure, area * material.lam[t])), True, True
 
     return pressure_leaf
-
-
-@functools.cache
-def dilating_leaves(shape: int) -> wp.Function:
-    """The corotated law of leaves with the pressure, which a leaf has even if its corotated stress may not be trusted.
-    ``lam`` is that of the pressure.
-    """
-    pressure_stress = pressure_stress_of(VOLUME_CHANGE)
-    into_leaf, out_of_leaf = turns_of(shape)
-
-    @wp.func
-    def dilating_leaf(material: IsotropicMaterial, pressure: float, leaf: int, t: int, area: float, g: wp.mat33):
-        a = into_leaf(leaf, g)
-        sigma, trusted = stretch_stress(a, area * material.mu[t], 0.0)
-        return out_of_leaf(leaf, sigma + pressure_stress(a, pressure, area * material.lam[t])), True, trusted
-
-    return dilating_leaf
 
 
 @functools.cache

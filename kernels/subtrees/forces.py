@@ -1,6 +1,6 @@
 """Corotated forces of one complete subtree in registers: ten displacements in, ten nodal forces out.
 
-Kernels that read and write their nodes in different ways share this code (``cuda``, ``stepping.block``). Stresses are
+Kernels that read and write their nodes in different ways share this code (``cuda``, ``laws``). Stresses are
 computed from displacement gradients, so that small strains keep their digits (``corotated.algebraic.stretch_stress``).
 A leaf that is flat, inverted or strained far beyond order one is left out and reported: bit k of the mask stands for
 leaf k in tree order.
@@ -91,23 +91,23 @@ def isotropic_leaves(shape: int, stress: wp.Function) -> wp.Function:
 
 
 @functools.cache
-def subtree_forces(shape: int, uniform: bool, law: wp.Function, chosen: range = range(8)) -> wp.Function:
-    """Forces of the chosen leaves under a law of leaves, and a mask of those that may not be trusted.
+def subtree_forces(shape: int, uniform: bool, law: wp.Function) -> wp.Function:
+    """Forces of the eight leaves under a law of leaves, and a mask of those that may not be trusted.
 
     ``y`` are ten displacements in the subtree's Maubach frame, or one that turns with it, in edge lengths h of a leaf;
     ``first`` is the place of the first leaf's material; unless ``uniform``, those of the other leaves follow.
     """
     columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
-    leaves, volume, begin, end = LEAVES[shape], VOLUME[shape], chosen.start, chosen.stop
+    leaves, volume = LEAVES[shape], VOLUME[shape]
 
     @wp.func
     def subtree_forces(y: mat10, h: float, material: Any, extra: Any, first: int):
-        _generated_from = wp.static(fingerprint(leaves, FRAMES[shape], begin, end))
+        _generated_from = wp.static(fingerprint(leaves, FRAMES[shape]))
         # P V / h is the stress times this.
         area = wp.static(volume) * h * h
         g = mat10()
         degenerate = int(0)
-        for leaf in range(wp.static(begin), wp.static(end)):
+        for leaf in range(8):
             b0, b1, b2 = columns(
                 y[wp.static(leaves[leaf][0])],
                 y[wp.static(leaves[leaf][1])],
@@ -159,14 +159,12 @@ def turn_out(g: mat10, q0: wp.vec3, q1: wp.vec3, q2: wp.vec3):
 
 
 @functools.cache
-def own_forces(
-    shape: int, uniform: bool, stress: wp.Function = stretch_stress, chosen: range = range(8)
-) -> wp.Function:
-    """Forces of the chosen leaves from ten displacements under an isotropic law, and a mask of those left out.
+def own_forces(shape: int, uniform: bool, stress: wp.Function = stretch_stress) -> wp.Function:
+    """Forces of the eight leaves from ten displacements under an isotropic law, and a mask of those left out.
 
     ``q`` is the subtree's frame, ``h`` a leaf's edge length, ``first`` the place of the first leaf's material.
     """
-    forces = subtree_forces(shape, uniform, isotropic_leaves(shape, stress), chosen)
+    forces = subtree_forces(shape, uniform, isotropic_leaves(shape, stress))
 
     @wp.func
     def own_forces(x: mat10, q: wp.mat33, h: float, mirror: float, material: IsotropicMaterial, first: int):

@@ -1,7 +1,6 @@
-"""Steps of small bodies in one thread block for each world, on CUDA, against the same steps launch by launch.
+"""Steps of small bodies by patches on CUDA, of many worlds with one patch each, against those launch by launch.
 
-Keyframes, even of one held node and all zero, make every step several launches: that is the other path. Both
-are float32 and sum in different orders; damped, they agree within ``ONE`` after a step and ``MANY`` after many.
+Both are float32 and sum in different orders; damped, they agree within ``ONE`` after a step and ``MANY`` after many.
 """
 
 import warnings
@@ -10,20 +9,20 @@ import numpy as np
 import oracle
 import pytest
 import warp as wp
-from cases import CUBE, jittered, mixed_forest, oracle_mesh, random_displacement
+from cases import CUBE, oracle_mesh, random_displacement
 
 import warp_corot as wc
 from warp_corot.elasticity.dilatation.field import DilatationField
-from warp_corot.solvers.explicit.block import BlockSteps
+from warp_corot.solvers.explicit.patches import PatchSteps
 from warp_corot.solvers.recorded import Segment
 
 DEVICES = [str(device) for device in wp.get_cuda_devices()]
-pytestmark = pytest.mark.skipif(not DEVICES, reason="blocks are for CUDA")
+pytestmark = pytest.mark.skipif(not DEVICES, reason="patches are stepped on CUDA")
 
 DAMPING, GRAVITY, DT = 10.0, (0.3, -9.8, 0.1), 1e-4
 ONE, MANY = 1e-5, 2e-5
 OWN = wc.Corotated()
-MANY_WORLDS = 300  # more than there are multiprocessors, for which a block is divided differently
+MANY_WORLDS = 300  # more than there are multiprocessors: each world is one patch
 
 #: A body for each type of subtree; the last is the paper's beam.
 BODIES = {
@@ -67,23 +66,18 @@ def made(device, mesh, *, launches, form="uniform", worlds=1, amount=0.1, dt=DT,
     body.prescribe(pulled, velocity=rng.normal(0, 0.1, (worlds, 1, 3)))
     if loads:
         body.load(np.arange(n), rng.normal(0, 0.01, (worlds, n, 3)))
-    if launches:
-        by_launches(body)
     integrator = wc.SymplecticEuler(dt=dt, damping=DAMPING)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", wc.StabilityWarning)
         model = wc.Corotated(dilatation="shared" if shared else "element")
         sim = wc.Simulation(body, model=model, integrator=integrator, gravity=GRAVITY)
-    assert BlockSteps.of(body, sim.fields[0]) is not None
+    many = sim.recorded._stepper._many
+    assert isinstance(many[0], PatchSteps)
+    assert many[0].layout.whole == (worlds == MANY_WORLDS or len(mesh.tets) < 64)
+    if launches:
+        many[0] = None
     assert isinstance(sim.fields[0], DilatationField) == shared
     return sim
-
-
-def by_launches(body):
-    """Force launches by keyframes of a held node that does not move in the first world."""
-    held = np.flatnonzero(body.constrained[: body.world_node_count])[:1]
-    place = body.displacements.numpy()[held]
-    body.prescribe(held, times=[0.0, 1.0], displacements=np.stack([place, place]), worlds=[0])
 
 
 def assert_near(sim, other, tolerance):
@@ -200,7 +194,7 @@ def test_crushed_and_mirrored_subtrees_are_repaired(worlds, shared, device):
 
 
 def test_single_crushed_subtrees_are_repaired(device):
-    """A few elements of one subtree are inverted: only some of a block's threads repair it."""
+    """A few elements of one subtree are inverted: only some of a patch's threads compute it again."""
     mesh = forest("beam")
     start = random_displacement(mesh, np.random.default_rng(1), 0.1)
     inside = np.linalg.norm(mesh.points - mesh.points.mean(axis=0), axis=1).argmin()
@@ -235,7 +229,7 @@ def test_supports_and_loads_may_change(device):
 
 
 def test_keyframes_for_a_while(device):
-    """From blocks to launches and back: nothing is lost in between."""
+    """They come and go between launches."""
     sims = pair(device, forest("type 1"), 0)
     top = np.flatnonzero(sims[0].body.mesh.points[:, 2] > CUBE - 1e-9)
     for sim in sims:
@@ -335,21 +329,17 @@ def test_a_world_that_is_not_finite_leaves_the_others(device):
     np.testing.assert_array_equal(a, b)
 
 
-def test_bodies_that_blocks_do_not_step(device):
-    """Too large, with several kinds of subtrees, without subtrees, with another law, or with shared rotations."""
+def test_bodies_that_patches_do_not_step(device):
+    """Worlds too large for one patch each, another law, or shared rotations."""
     beam = wc.TetForest.box((1, 1, 3), CUBE, 6)
     large = wc.TetForest.box((5, 5, 1), CUBE, 6)
     small = wc.Isotropic(5e3, 0.4, 1e3)
-    for mesh, model in (
-        (large, OWN),
-        (mixed_forest(), OWN),
-        (jittered(), OWN),
-        (beam, wc.Linear()),
-        (beam, wc.Corotated(rotation="svd")),
-        (beam, wc.Corotated(rotation_level=3)),
-        (beam, wc.Linear(dilatation="shared")),
+    for mesh, worlds, model in (
+        (large, MANY_WORLDS, OWN),
+        (beam, 1, wc.Linear()),
+        (beam, 1, wc.Corotated(rotation="svd")),
+        (beam, 1, wc.Corotated(rotation_level=3)),
+        (beam, 1, wc.Linear(dilatation="shared")),
     ):
-        body = wc.SoftBody(mesh, small, device=device)
-        assert BlockSteps.of(body, model.bind(body)) is None
-    body = wc.SoftBody(beam, small, device="cpu")
-    assert BlockSteps.of(body, OWN.bind(body)) is None
+        body = wc.SoftBody(mesh, small, worlds=worlds, device=device)
+        assert PatchSteps.of(body, model.bind(body)) is None
