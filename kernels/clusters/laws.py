@@ -17,7 +17,7 @@ from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.fibres import ReinforcedMaterial, stress_in_axes
 from warp_corot.kernels.math.rotation import ITERATIONS, byers_xu, column, identity3, newton_rotation
 
-from .elements import number_of
+from .memory import number_of
 
 wp.set_module_options({"enable_backward": False})
 

@@ -17,7 +17,7 @@ from warp_corot.kernels.stepping.block_memory import LOAD, STORE
 from warp_corot.kernels.stepping.threads import synchronize_block
 from warp_corot.kernels.tables.cluster_layout import QUAD_BYTES, PairLayout
 
-from .elements import number_of
+from .memory import add_sum, number_of, shared_quads, vector_of
 from .pair_elements import (
     first_matrix,
     first_scale,
@@ -28,7 +28,6 @@ from .pair_elements import (
     second_scale,
 )
 from .pairs import PairClusters, fetch_records
-from .single import add_sum, shared_quads, vector_of
 
 wp.set_module_options({"enable_backward": False})
 

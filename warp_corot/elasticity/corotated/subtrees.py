@@ -12,15 +12,13 @@ from typing import TYPE_CHECKING, TypeAlias
 import warp as wp
 
 from warp_corot.discretization.subtrees import Batch, Sharing
-from warp_corot.elasticity.backends.clusters import ChangingClusterScatter, ClusterScatter
+from warp_corot.elasticity.backends.clusters import ClusterScatter
 from warp_corot.elasticity.backends.in_lanes import InLanes
 from warp_corot.elasticity.backends.mean_dilatation import Dilating
 from warp_corot.elasticity.structs import Kept
 from warp_corot.elasticity.tangent import Tangent
 from warp_corot.inputs.cpu_threads import launch
 from warp_corot.inputs.loading import LoadedKernel, load
-from warp_corot.kernels.clusters.laws import isotropic_law
-from warp_corot.kernels.corotated.algebraic import corotated_stress
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
 from warp_corot.kernels.elements.simd8 import LANES
 from warp_corot.kernels.subtrees import cpu as subtree_cpu
@@ -57,17 +55,8 @@ class SubtreeField(InLanes, CorotatedField):
     def __init__(self, discretization: Discretization, model: CorotatedOptions, deterministic: bool):
         super().__init__(discretization, model, deterministic)
         self._uniform = discretization.material_stride == 0
-        #: Adds the forces of all leaves, also of those that come later.
-        self._clusters: ChangingClusterScatter | None = None
-        if self._listed and self.rotation_level is None:
-            self._clusters = ChangingClusterScatter.of(discretization, self.plan, isotropic_law(corotated_stress))
         self.follow()
         self.derive()
-
-    def derive(self) -> None:
-        super().derive()
-        if self._clusters is not None:
-            self._clusters.derive()
 
     @property
     def _force_kernels(self) -> list[LoadedKernel]:
@@ -123,8 +112,7 @@ class SubtreeField(InLanes, CorotatedField):
         self._own_launches: OwnLaunches | None = None
         if self._listed:
             if self.rotation_level is None and (OwnLaunches.suit(plan) or self.discretization.awaited is not None):
-                given = (self.isotropic, self._clusters, self.discretization.awaited)
-                self._own_launches = OwnLaunches(plan, *given)
+                self._own_launches = OwnLaunches(plan, self.isotropic, self.discretization.awaited)
                 self._degenerate = DegenerateLeaves(self._own_launches.places, [], self.device)
                 return
             self._degenerate = DegenerateLeaves.of(plan, self.device)
