@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 import warp_corot as wc
-from warp_corot.elasticity.viscosity import Viscosity
+from warp_corot.elasticity.added_stress import Viscosity
 from warp_corot.kernels.elements.forces import scatter_forces
 from warp_corot.kernels.elements.simd8 import LANES
 from warp_corot.kernels.elements.viscosity import ViscousMaterial, viscosity_stress

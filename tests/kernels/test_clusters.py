@@ -9,8 +9,8 @@ from pairs import add_dilatations, add_forces
 import warp_corot as wc
 from warp_corot.discretization.clusters import paired
 from warp_corot.discretization.elements import device_elements
-from warp_corot.elasticity.backends.clusters import ClusterScatter
-from warp_corot.elasticity.structs import isotropic_material
+from warp_corot.elasticity.clusters import ClusterScatter
+from warp_corot.elasticity.model import isotropic_material
 from warp_corot.kernels.clusters.laws import isotropic_law
 from warp_corot.kernels.clusters.pairs import SLOT_BITS, SLOT_MASK, WORD_SLOTS
 from warp_corot.kernels.corotated.algebraic import corotated_stress

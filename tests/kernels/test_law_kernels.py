@@ -15,10 +15,9 @@ from thousands import FORESTS, TOLERANCE, materials, meshed, turned
 
 import warp_corot as wc
 from warp_corot.discretization.planning.fixed import ForcePlan
-from warp_corot.elasticity.backends.clusters import ClusterScatter, clustered
-from warp_corot.elasticity.corotated.anisotropic import AnisotropicField
-from warp_corot.elasticity.corotated.anisotropic_cuda import active_material, as_bytes
-from warp_corot.elasticity.structs import isotropic_material
+from warp_corot.elasticity.anisotropic import AnisotropicField, active_material, as_bytes
+from warp_corot.elasticity.clusters import ClusterScatter, clustered
+from warp_corot.elasticity.model import isotropic_material
 from warp_corot.kernels.clusters.laws import ActiveMaterial, anisotropic_law, isotropic_law, reinforced_law
 from warp_corot.kernels.corotated.anisotropic import FibreMaterial, fibre_stress
 from warp_corot.kernels.corotated.well_conditioned import quaternions_of

@@ -10,7 +10,7 @@ from cases import CUBE
 import warp_corot as wc
 from warp_corot.discretization.deviatoric import deviatoric
 from warp_corot.discretization.planning.fixed import ForcePlan
-from warp_corot.elasticity.structs import isotropic_material
+from warp_corot.elasticity.model import isotropic_material
 from warp_corot.kernels.elements.dilatation import VOLUME
 from warp_corot.kernels.subtrees.dilatation import scatter_dilatation
 from warp_corot.kernels.subtrees.memory import BLOCK

@@ -12,7 +12,7 @@ import warp as wp
 from cases import CUBE, oracle_mesh, random_displacement
 
 import warp_corot as wc
-from warp_corot.elasticity.dilatation.field import DilatationField
+from warp_corot.elasticity.dilatation import DilatationField
 from warp_corot.solvers.explicit.patches import PatchSteps
 from warp_corot.solvers.recorded import Segment
 

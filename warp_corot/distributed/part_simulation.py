@@ -19,7 +19,7 @@ from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.shapes import Shape
 from warp_corot.contact.tool import Obstacle, Tool
 from warp_corot.elasticity import ForceField, Model
-from warp_corot.elasticity.dilatation.options import ELEMENT, SHARED, shares_dilatation
+from warp_corot.elasticity.dilatation import ELEMENT, SHARED, shares_dilatation
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.uniform_part import SUBTREE_DEPTH

@@ -16,13 +16,10 @@ from warp_corot.kernels.elements.native_laws import IsotropicLaw
 from warp_corot.materials.isotropic import Isotropic
 
 from .corotated.model import Corotated
-from .dilatation.field import DilatationField
-from .edge_stvk import EdgeStVK
-from .law_model import LawModel
-from .linear import Linear
-from .mass_spring import MassSpring
+from .dilatation import DilatationField
+from .laws import LawModel, Linear, Ogden
 from .model import Model
-from .ogden import Ogden
+from .springs import EdgeStVK, MassSpring
 
 Array = npt.NDArray[np.float64]
 #: An isotropic law's name or terms, as ``kernels.elements.native_laws`` has them.

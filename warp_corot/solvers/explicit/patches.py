@@ -11,9 +11,8 @@ import numpy as np
 import warp as wp
 
 from warp_corot.body.trajectory import Followed
-from warp_corot.elasticity.corotated.general import CorotatedGeneralField
-from warp_corot.elasticity.corotated.subtrees import SubtreeField
-from warp_corot.elasticity.dilatation.field import law_of
+from warp_corot.elasticity.corotated.fields import CorotatedGeneralField, SubtreeField
+from warp_corot.elasticity.dilatation import law_of
 from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.kernels.stepping.exchange import Exchange
 from warp_corot.kernels.stepping.patch_body import Layout, PatchBody
@@ -25,7 +24,7 @@ from .patch_layout import NO_SLOT, WARP, Patches
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
     from warp_corot.elasticity import ForceField
-    from warp_corot.elasticity.corotated.elements import CorotatedField
+    from warp_corot.elasticity.corotated.fields import CorotatedField
     from warp_corot.solvers.system import System
 
 #: The most elements of a world: patches of larger ones do not fit.

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from warp_corot.elasticity.viscosity import Viscosity
+from warp_corot.elasticity.added_stress import Viscosity
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number
 from warp_corot.inputs.cpu_threads import Regions

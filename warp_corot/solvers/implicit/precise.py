@@ -11,7 +11,7 @@ from scipy.sparse import block_array
 from scipy.sparse.linalg import SuperLU, splu
 
 from warp_corot.elasticity import ForceField, Model
-from warp_corot.elasticity.dilatation.field import DilatationField
+from warp_corot.elasticity.dilatation import DilatationField
 from warp_corot.elasticity.float64 import SharedDilatation, float64_law
 from warp_corot.errors import ConvergenceError, InputError
 from warp_corot.kernels.elements.native_laws import IsotropicLaw

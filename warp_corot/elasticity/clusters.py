@@ -14,6 +14,7 @@ from warp_corot.discretization.clusters import order_in_clusters, pairs_in_clust
 from warp_corot.discretization.elements import Elements, in_worlds
 from warp_corot.discretization.plan import Plan
 from warp_corot.discretization.subtrees import GROUPED_LEAVES, Batch
+from warp_corot.elasticity.cpu import as_general
 from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.clusters.laws import ActiveMaterial
 from warp_corot.kernels.clusters.pair_elements import GeneralPairs, LatticePairs
@@ -22,19 +23,12 @@ from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.elements import ForestElements, GeneralElements
 from warp_corot.kernels.elements.fibres import ReinforcedMaterial
 from warp_corot.kernels.elements.general_cpu import rest_matrices
-from warp_corot.kernels.tables.cluster_layout import (
-    AHEAD,
-    GENERAL,
-    LARGE,
-    LATTICE,
-    PairLayout,
-)
+from warp_corot.kernels.tables.cluster_layout import AHEAD, GENERAL, LARGE, LATTICE, PairLayout
 from warp_corot.mesh import TetForest
-
-from .simd8 import as_general
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
+
 
 #: Leaves of a subtree.
 SUBTREE = 8

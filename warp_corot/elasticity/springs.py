@@ -1,8 +1,8 @@
-"""Mass-spring network on the edges of the mesh: the classic baseline."""
+"""Springs: St. Venant-Kirchhoff elasticity on the edges of each tetrahedron, and the mass-spring network."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import warp as wp
@@ -11,6 +11,10 @@ from warp_corot.discretization.discretization import Discretization, Discretized
 from warp_corot.discretization.elements import in_worlds, repeated
 from warp_corot.discretization.plan import Plan
 from warp_corot.discretization.slots import Slots
+from warp_corot.elasticity.dilatation import ELEMENT, refuse_shared
+from warp_corot.elasticity.laws import StVenantKirchhoff
+from warp_corot.elasticity.model import ElementField, ForceField, Model, StressLaw, Tangent, isotropic_material
+from warp_corot.inputs.checks import checked_choice
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, stvk_stress
 from warp_corot.kernels.elements.forces import element_von_mises, law_cauchy
 from warp_corot.kernels.elements.springs import (
@@ -18,13 +22,52 @@ from warp_corot.kernels.elements.springs import (
     add_mass_spring_product,
     mass_spring_energies,
     scatter_mass_spring,
+    spring_density,
+    spring_differential,
+    spring_stress,
 )
 from warp_corot.kernels.tables.shapes import EDGES
 
-from .dilatation import ELEMENT, refuse_shared
-from .model import ForceField, Model
-from .structs import isotropic_material
-from .tangent import Tangent
+
+class SpringField(ElementField):
+    """Force field of quadratic springs, whose stress depends on where an element has its edges."""
+
+    @property
+    def stress_law(self) -> StressLaw:
+        return replace(super().stress_law, sees_shape=True)
+
+
+@dataclass(frozen=True)
+class EdgeStVK(Model):
+    """W = D^T K D / 2 over an element's six edges (Delingette 2008; Kikuuwe, Tabuchi and Yamamoto 2009).
+
+    Attributes:
+        springs: "biquadratic": D = l^2 - L^2, which is ``StVenantKirchhoff``, whose forces it has; "quadratic": D = 2 L
+            (l - L), its small-strain form.
+        dilatation: "element", the only value for springs.
+    """
+
+    springs: str = "biquadratic"
+    dilatation: str = ELEMENT
+
+    def __post_init__(self) -> None:
+        checked_choice(self.springs, "springs", ("biquadratic", "quadratic"))
+        refuse_shared(self.dilatation, "EdgeStVK")
+
+    def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:
+        if self.springs == "biquadratic":
+            return StVenantKirchhoff(ELEMENT).bind(body, deterministic=deterministic)
+        return SpringField(
+            body,
+            stress=spring_stress,
+            differential=spring_differential,
+            density=spring_density,
+            cauchy=law_cauchy(stvk_stress),
+            deterministic=deterministic,
+        )
+
+
+# --- Mass-spring network on the edges of the mesh: the classic baseline ---
 
 
 @dataclass(frozen=True)

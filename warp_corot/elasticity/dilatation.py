@@ -1,36 +1,117 @@
-"""The force field of a law whose elements share their dilatation; see ``kernels.elements.dilatation``."""
+"""Laws whose elements share their dilatation, so that nearly incompressible tissue does not lock; see
+``kernels.elements.dilatation``."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
 from warp_corot.discretization.deviatoric import deviatoric
-from warp_corot.discretization.discretization import Discretization
+from warp_corot.discretization.discretization import Discretization, discretization_of
 from warp_corot.discretization.members import Members
 from warp_corot.discretization.plan import Plan
 from warp_corot.discretization.subtrees import Batch
-from warp_corot.elasticity.backends.mean_dilatation import Dilating
-from warp_corot.elasticity.model import ForceField, SmallForces
-from warp_corot.elasticity.tangent import Tangent
+from warp_corot.elasticity.cpu import Dilating
+from warp_corot.elasticity.groups import ClusteredGroups, ElementGroups, elements_of, group_numbers
+from warp_corot.elasticity.model import ElementTangent, ForceField, SmallForces, Tangent
+from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_choice, shown
+from warp_corot.inputs.choices import AUTO, ELEMENT, SHARED
 from warp_corot.inputs.forwarding import forwards
 from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.elements import mean_dilatation as kernels
-from warp_corot.kernels.elements.dilatation import Dilatation
+from warp_corot.kernels.elements import mean_dilatation_rows as rows
+from warp_corot.kernels.elements.dilatation import SMALL, VOLUME, Dilatation, not_held
 from warp_corot.kernels.elements.mean_dilatation import DilatedMaterial
 from warp_corot.kernels.elements.native_laws import STRESSLESS
 from warp_corot.kernels.elements.simd8 import LANES
 from warp_corot.kernels.subtrees import dilatation as subtrees
 from warp_corot.kernels.subtrees.cpu import scatter_law_subtrees
 from warp_corot.kernels.subtrees.memory import BLOCK
+from warp_corot.materials.anisotropic import Anisotropic
 from warp_corot.mesh import TetForest
 
-from .clustered import ClusteredGroups
-from .element_groups import ElementGroups, elements_of, group_numbers
-from .tangent import SharedTangent
+if TYPE_CHECKING:
+    from warp_corot.discretization.discretization import Discretized
+
+
+class SharedTangent(Tangent):
+    """K of a field whose elements share their dilatation in groups.
+
+    Args:
+        field: The field.
+        exact: As for ``ForceField.tangent``.
+    """
+
+    field: DilatationField
+
+    def __init__(self, field: DilatationField, exact: bool):
+        super().__init__(field)
+        self.shear = field.shear.tangent(exact=exact)
+        # The differential of the gradient of a dilatation acts in each element separately.
+        self._turns = (exact or field.of is not VOLUME) and field.of is not SMALL
+        own = kernels.own_differential(field.of), self._material, DilatedMaterial
+        self._of_elements = ElementTangent(field, *own)
+        self._holds = field.of.holding is not not_held
+        self._version = -1
+        self._shared = wp.zeros(0, dtype=wp.vec4, device=field.device)
+
+    @property
+    def kernels(self) -> list[wp.Kernel]:
+        return [*self.shear.kernels, rows.write_rows(self.field.kind, self.field.of)]
+
+    def prepare(self, u: wp.array) -> None:
+        super().prepare(u)
+        self.shear.prepare(u)
+        self._of_elements.displacements = self.displacements
+        field, version = self.field, self.field.discretization.sizes.version
+        if self._version != version:
+            self._version = version
+            self._shared = wp.zeros(field.element_count, dtype=wp.vec4, device=field.device)
+            self._members = field.members()
+            self._rows = rows.GroupRows()
+            self._rows.rows = wp.zeros(self._members.entries, dtype=wp.vec4, device=field.device)
+            self._rows.factors = wp.zeros(self._members.count, dtype=wp.vec2, device=field.device)
+
+    def take(self, u: wp.array) -> None:
+        super().take(u)
+        self.shear.take(u)
+        field = self.field
+        inputs = [field.elements, field.isotropic, self.displacements, self._members.arrays]
+        outputs = [self._rows, self._shared]
+        field.launch(rows.write_rows(field.kind, field.of), self._members.count, inputs, outputs)
+
+    def add_product(self, p: wp.array, y: wp.array) -> None:
+        self.shear.add_product(p, y)
+        field = self.field
+        lanes = rows.THREADS if field.device.is_cuda else 1
+        groups, count = [self._members.arrays, self._rows], self._members.count
+        field.launch(rows.add_row_products, lanes * count, [lanes, *groups, p], [y])
+        if self._turns:
+            self._of_elements.add_product(p, y)
+        elif self._holds:
+            inputs = [field.elements, self.displacements, p, *groups, self._shared]
+            field.launch(rows.add_held(field.kind, field.of), count, inputs, [y])
+
+    def add_diagonal(self, blocks: wp.array) -> None:
+        self.shear.add_diagonal(blocks)
+        field = self.field
+        field.launch(rows.add_row_blocks, self._members.count, [self._members.arrays, self._rows], [blocks])
+        if self._turns or self._holds:
+            self._of_elements.add_diagonal(blocks)
+
+    def _material(self) -> DilatedMaterial:
+        material = DilatedMaterial()
+        material.isotropic, material.shared = self.field.isotropic, self._shared
+        material.turning = float(self._turns)
+        return material
+
+
+# --- The force field of a law whose elements share their dilatation; see ``rows.elements.dilatation`` ---
 
 
 @forwards("shear", "state", "reset", "energy_count", "divide")
@@ -338,3 +419,69 @@ class Unshared:
         """Add the forces [N] of displacements u to f; both vec4 [worlds * N]."""
         self._field.add_forces(u, f)
         self._field.unshare(u, f)
+
+
+# --- The option ``dilatation`` of models: whether elements share theirs, and the field that follows ---
+
+
+#: Poisson's ratio in any element from which "auto" means "shared".
+SHARED_FROM = 0.45
+
+
+def check_dilatation(dilatation: str) -> None:
+    """Check the option of a model.
+
+    Raises:
+        InputError: It is none of the values.
+    """
+    checked_choice(dilatation, "dilatation", (AUTO, ELEMENT, SHARED))
+
+
+def refuse_shared(dilatation: str, model: str) -> None:
+    """Check the option of a model of springs, which has no dilatation to share.
+
+    Raises:
+        InputError: It is not "element".
+    """
+    if not isinstance(dilatation, str) or dilatation != ELEMENT:
+        raise InputError(f"dilatation is {shown(dilatation)}; for {model}, which has springs, it must be {ELEMENT!r}")
+
+
+def shares_dilatation(dilatation: str, discretization: Discretization) -> bool:
+    """Whether the elements of a discretization share their dilatation under an option of the model.
+
+    Raises:
+        InputError: They should, and the material is anisotropic.
+    """
+    inseparable = isinstance(discretization.material, Anisotropic)
+    if dilatation == SHARED and inseparable:
+        name = type(discretization.material).__name__
+        raise InputError(f"dilatation is {SHARED!r} and the material is {name}; it must be {AUTO!r} or {ELEMENT!r}")
+    if dilatation != AUTO or inseparable:
+        return dilatation == SHARED
+    # The limit as a float32 number counts, too.
+    return float(np.max(discretization.material.poisson)) > SHARED_FROM - 1e-6
+
+
+def bind_law(
+    bind: Callable[[Discretization, bool], ForceField],
+    of: Dilatation,
+    dilatation: str,
+    body: Discretized | Discretization,
+    deterministic: bool,
+) -> ForceField:
+    """The field of a law on a body, with a dilatation of each element or a shared one.
+
+    Args:
+        bind: Makes the law's field of a discretization; the other argument is ``deterministic``.
+        of: The shared dilatation.
+        dilatation: The option of the model.
+        body, deterministic: As for every field.
+
+    Raises:
+        InputError: The dilatation should be shared, and the material is anisotropic.
+    """
+    discretization = discretization_of(body)
+    if shares_dilatation(dilatation, discretization):
+        return DilatationField(discretization, lambda part: bind(part, deterministic), of, deterministic)
+    return bind(discretization, deterministic)
