@@ -25,6 +25,10 @@ class DegenerateList:
     entries: wp.array[wp.vec2i]  # [LISTS room] first leaf of the subtree (own rotations) or the subtree, and its mask
 
 
+#: The argument of kernels that write no list.
+NO_LIST = DegenerateList()
+
+
 @wp.func_native(f"""
 #if defined(__CUDA_ARCH__)
     // One addition for all threads of a warp; nobody waits for it here.

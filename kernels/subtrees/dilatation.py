@@ -10,14 +10,11 @@ import warp as wp
 
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import Dilatation, mean_of, pressure_stress_of
-from warp_corot.kernels.elements.elements import Subtrees, root_of
 from warp_corot.kernels.elements.shapes import columns_of
-from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.tables.shapes import fingerprint
 from warp_corot.kernels.tables.subtree import LEAVES
 
-from .forces import mat10, maubach_frame, subtree_forces, turn_in, turn_out, turns_of
-from .memory import memory_of
+from .forces import mat10, turns_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -69,28 +66,13 @@ def pressure_leaves(shape: int, of: Dilatation) -> wp.Function:
 
 
 @functools.cache
-def scatter_dilatation(shape: int, grouped: bool, uniform: bool, of: Dilatation) -> wp.Kernel:
-    """Add the forces of the shared dilatation of subtrees on CUDA. Launch with block_dim ``memory.BLOCK``."""
-    load, add = memory_of(shape, grouped)
+def shared_pressure(shape: int, uniform: bool, of: Dilatation) -> wp.Function:
+    """w' of the dilatation that a subtree's leaves share."""
     sums, slope_of = dilatation_sums_of(shape, uniform, of), of.slope
-    forces = subtree_forces(shape, uniform, pressure_leaves(shape, of))
 
-    @unique_kernel(grid_stride=False)
-    def scatter_dilatation(
-        # In
-        subtrees: Subtrees,
-        material: IsotropicMaterial,
-        u: wp.array[wp.vec4],
-        # Out
-        f: wp.array[wp.vec4],
-    ):
-        s = wp.tid()
-        h, q, mirror = root_of(subtrees, s)
-        q0, q1, q2 = maubach_frame(q, mirror)
-        y = turn_in(load(subtrees, s, u), q0, q1, q2, 1.0 / h)
-        first = wp.where(wp.static(uniform), 0, subtrees.first[s])
+    @wp.func
+    def shared_pressure(material: IsotropicMaterial, y: mat10, first: int, q0: wp.vec3, q1: wp.vec3, q2: wp.vec3):
         sum, weight = sums(y, material.lam, first)
-        g, _degenerate = forces(y, h, material, slope_of(mean_of(sum, weight)), first)
-        add(subtrees, s, turn_out(g, q0, q1, q2), f)
+        return slope_of(mean_of(sum, weight))
 
-    return scatter_dilatation
+    return shared_pressure

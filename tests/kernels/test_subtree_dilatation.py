@@ -12,7 +12,8 @@ from warp_corot.discretization.deviatoric import deviatoric
 from warp_corot.discretization.planning.fixed import ForcePlan
 from warp_corot.elasticity.model import isotropic_material
 from warp_corot.kernels.elements.dilatation import VOLUME
-from warp_corot.kernels.subtrees.dilatation import scatter_dilatation
+from warp_corot.kernels.subtrees.cuda import scatter_dilatation
+from warp_corot.kernels.subtrees.degenerate import NO_LIST
 from warp_corot.kernels.subtrees.memory import BLOCK
 
 wp.set_module_options({"enable_backward": False})
@@ -57,5 +58,6 @@ def test_forces_of_pressure(shape, uniform, device, rng):
     found = wp.zeros_like(displacements)
     kernel = scatter_dilatation(shape, False, uniform, VOLUME)
     inputs = [subtrees, material_of(body), displacements]
-    wp.launch(kernel, count, inputs, [found], device=device, block_dim=BLOCK)
+    flagged = wp.zeros(count, dtype=wp.uint8, device=device)
+    wp.launch(kernel, count, inputs, [found, flagged, NO_LIST], device=device, block_dim=BLOCK)
     assert np.abs(found.numpy() - expected)[:, :3].max() < 5e-6 * np.abs(expected).max()

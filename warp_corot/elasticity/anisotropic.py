@@ -42,6 +42,7 @@ from warp_corot.kernels.elements.forces import element_energies, repair_forces
 from warp_corot.kernels.elements.native_laws import FIBRES
 from warp_corot.kernels.math.rotation import byers_xu, quick_rotation
 from warp_corot.kernels.subtrees.anisotropic import repair_leaves, scatter_anisotropic_subtrees, scatter_flat
+from warp_corot.kernels.subtrees.degenerate import NO_LIST
 from warp_corot.kernels.subtrees.memory import BLOCK
 from warp_corot.kernels.tables.cluster_layout import ANISOTROPIC
 from warp_corot.materials.anisotropic import TransverselyIsotropic
@@ -208,7 +209,7 @@ class AnisotropicCudaField(AnisotropicField):
         fibres, flat = self.fibres, self.plan.flat
         active = active_material(self.passive, self._quaternions, *self._activation)
         for batch, kernel, flags in zip(self._batches, self._kernels, self._flags, strict=True):
-            inputs, outputs = [batch.subtrees, active, u], [f, as_bytes(flags)]
+            inputs, outputs = [batch.subtrees, active, u], [f, as_bytes(flags), NO_LIST]
             wp.launch(kernel, batch.count, inputs=inputs, outputs=outputs, device=self.device, block_dim=BLOCK)
             inputs = [8, flags, batch.subtrees.first, self.elements, fibres, u]
             self.launch(repair_leaves, 8 * len(flags), inputs, [f])

@@ -29,8 +29,9 @@ from warp_corot.kernels.elements.dilatation import SMALL, VOLUME, Dilatation, no
 from warp_corot.kernels.elements.mean_dilatation import DilatedMaterial
 from warp_corot.kernels.elements.native_laws import STRESSLESS
 from warp_corot.kernels.elements.simd8 import LANES
-from warp_corot.kernels.subtrees import dilatation as subtrees
-from warp_corot.kernels.subtrees.cpu import scatter_law_subtrees
+from warp_corot.kernels.subtrees import cpu as subtree_cpu
+from warp_corot.kernels.subtrees import cuda as subtree_cuda
+from warp_corot.kernels.subtrees.degenerate import NO_LIST
 from warp_corot.kernels.subtrees.memory import BLOCK
 from warp_corot.materials.anisotropic import Anisotropic
 from warp_corot.mesh import TetForest
@@ -259,7 +260,7 @@ class DilatationField(ForceField):
         for batch in self._batches:
             kernel = self._kernel(batch.shape, batch.grouped)
             if self._lanes is None:
-                inputs, outputs, threads = [batch.subtrees, self.isotropic, u], [f], batch.count
+                inputs, outputs, threads = [batch.subtrees, self.isotropic, u], [f, batch.flagged, NO_LIST], batch.count
             else:
                 material = self._lanes.material(self.shear.isotropic)
                 inputs, outputs = [batch.subtrees, batch.count, material, u], [f, batch.flagged]
@@ -285,8 +286,8 @@ class DilatationField(ForceField):
 
     def _kernel(self, shape: int, grouped: bool) -> wp.Kernel:
         if self.device.is_cuda:
-            return subtrees.scatter_dilatation(shape, grouped, self.discretization.material_stride == 0, self.of)
-        return scatter_law_subtrees(shape, STRESSLESS, self.of)
+            return subtree_cuda.scatter_dilatation(shape, grouped, self.discretization.material_stride == 0, self.of)
+        return subtree_cpu.scatter_law_subtrees(shape, STRESSLESS, self.of)
 
     @property
     def _block(self) -> int:

@@ -34,8 +34,9 @@ from warp_corot.kernels.elements.constitutive import (
 )
 from warp_corot.kernels.elements.dilatation import GREEN, LOG_VOLUME, SMALL, Dilatation
 from warp_corot.kernels.elements.simd8 import LANES
-from warp_corot.kernels.subtrees.cpu import scatter_law_subtrees
-from warp_corot.kernels.subtrees.laws import scatter_subtrees
+from warp_corot.kernels.subtrees import cpu as subtree_cpu
+from warp_corot.kernels.subtrees import cuda as subtree_cuda
+from warp_corot.kernels.subtrees.degenerate import NO_LIST
 from warp_corot.kernels.subtrees.memory import BLOCK
 
 if TYPE_CHECKING:
@@ -82,13 +83,13 @@ class LawCudaField(LawField):
         return None if self._clusters is None else (self._clusters, self._batches)
 
     def _kernel(self, shape: int, grouped: bool) -> wp.Kernel:
-        return scatter_subtrees(shape, grouped, self._uniform, self.law.stress)
+        return subtree_cuda.scatter_law_subtrees(shape, grouped, self._uniform, self.law.stress)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         isotropic, flat = self.isotropic, self.plan.flat
         for batch, kernel in zip(self._batches, self._kernels, strict=True):
-            inputs = [batch.subtrees, isotropic, u]
-            wp.launch(kernel, batch.count, inputs=inputs, outputs=[f], device=self.device, block_dim=BLOCK)
+            inputs, outputs = [batch.subtrees, isotropic, u], [f, batch.flagged, NO_LIST]
+            wp.launch(kernel, batch.count, inputs, outputs, device=self.device, block_dim=BLOCK)
         if self._clusters is not None:
             self._clusters(isotropic, u, f)
         elif len(flat):
@@ -123,7 +124,9 @@ class LawSimd8Field(InLanes, LawField):
         load((), self.device, self._force_kernels)
 
     def _kernel(self, shape: int) -> wp.Kernel:
-        return scatter_law_subtrees(shape, self.lanes_law, None if self._dilating is None else self._dilating.of)
+        return subtree_cpu.scatter_law_subtrees(
+            shape, self.lanes_law, None if self._dilating is None else self._dilating.of
+        )
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
         material: Any = self.isotropic

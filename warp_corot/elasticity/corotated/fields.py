@@ -44,6 +44,7 @@ from warp_corot.kernels.elements.simd8 import LANES
 from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.kernels.subtrees import cpu as subtree_cpu
 from warp_corot.kernels.subtrees import cuda as subtree_cuda
+from warp_corot.kernels.subtrees.degenerate import NO_LIST
 from warp_corot.kernels.subtrees.repair import repair_elements, repair_own, repair_shared
 
 if TYPE_CHECKING:
@@ -409,7 +410,7 @@ class SubtreeField(InLanes, CorotatedField):
             else:
                 unit = self._no_unit if batch.unit is None else batch.unit
                 inputs = [batch.subtrees, self.isotropic, u, self._rotations, unit]
-            outputs.append(DegenerateLeaves.NONE if self._degenerate is None else self._degenerate.list_of(batch))
+            outputs.append(NO_LIST if self._degenerate is None else self._degenerate.list_of(batch))
         else:
             threads = -(-batch.count // LANES)
             inputs = [batch.subtrees, batch.count, material(), u]

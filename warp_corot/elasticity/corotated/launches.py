@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
-from typing import ClassVar
 
 import warp as wp
 
@@ -17,7 +16,7 @@ from warp_corot.kernels.clusters.laws import isotropic_law
 from warp_corot.kernels.corotated.algebraic import corotated_stress
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.subtrees.cuda import FLAT, WorkRange, scatter_body, scatter_subtrees_own
-from warp_corot.kernels.subtrees.degenerate import COUNT_STRIDE, LIST_BLOCK, LISTS, DegenerateList
+from warp_corot.kernels.subtrees.degenerate import COUNT_STRIDE, LIST_BLOCK, LISTS, NO_LIST, DegenerateList
 from warp_corot.kernels.subtrees.memory import BLOCK
 from warp_corot.kernels.subtrees.repair import repair_listed_own, repair_listed_shared
 
@@ -33,9 +32,6 @@ class DegenerateLeaves:
         own: The numbers of subtrees and single leaves of each launch that finds own rotations.
         shared: The batches that share their roots' rotations.
     """
-
-    #: The argument of kernels that write no list.
-    NONE: ClassVar[DegenerateList] = DegenerateList()
 
     def __init__(self, own: list[int], shared: list[Batch], device: wp.Device):
         self.own = _empty_lists(own, device)
@@ -57,7 +53,7 @@ class DegenerateLeaves:
         """The list that a batch's kernel appends to."""
         if batch.sharing is Sharing.OWN:
             return self.own
-        return next((listed for other, listed in self._shared if other is batch), self.NONE)
+        return next((listed for other, listed in self._shared if other is batch), NO_LIST)
 
     def repair(self, elements: Elements, material: IsotropicMaterial, u: wp.array, f: wp.array) -> None:
         """Add the forces of the leaves on the lists to f, and empty them."""
