@@ -19,17 +19,20 @@ from warp_corot.kernels.stepping.block_memory import LOAD, STORE
 from warp_corot.kernels.stepping.threads import synchronize_block
 from warp_corot.kernels.tables.cluster_layout import BANK_GROUPS, QUAD_BYTES, PairLayout
 
-from .memory import add_sum, number_of, shared_quads, vector_of
 from .pair_elements import (
     GENERAL_WORDS,
     LATTICE_WORDS,
     GeneralPairs,
     LatticePairs,
+    add_sum,
     half_word,
+    number_of,
     pair_forces,
     quad_of,
     record_of,
+    shared_quads,
     vec4u,
+    vector_of,
 )
 
 wp.set_module_options({"enable_backward": False})

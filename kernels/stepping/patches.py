@@ -28,10 +28,9 @@ from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.tables.shapes import fingerprint
 
 from .block_memory import LOAD, STORE, numbers_at, vectors_at
-from .exchange import Exchange, await_displacement, publish
 from .integrate import add_support_work, is_finite, symplectic_euler_velocity, vector_at
 from .pace import DONE, DT, Pace, length_before, time_after
-from .patch_body import VOLUME_ROW, Layout, PatchBody
+from .patch_body import VOLUME_ROW, Exchange, Layout, PatchBody, await_displacement, publish
 from .threads import lowest_bit, number_in, shuffle_down, synchronize_any, synchronize_block
 
 wp.set_module_options({"enable_backward": False})
@@ -51,7 +50,7 @@ def rest_inverse(c: row):
 
 @wp.func
 def key_from(times: wp.array[wp.float64], key: int, last: int, t: wp.float64):
-    """The same as ``keyframes.key_before``, but the search starts at an earlier key; ``last`` is the last key but
+    """The same as ``conditions.key_before``, but the search starts at an earlier key; ``last`` is the last key but
     one."""
     found = key
     while found < last and times[found + 1] <= t:

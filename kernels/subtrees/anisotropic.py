@@ -18,8 +18,8 @@ from warp_corot.kernels.math.rotation import ITERATIONS, byers_xu, column, ident
 from warp_corot.kernels.modules import unique_kernel
 
 from .cuda import scatter_subtrees
+from .degenerate import repair_flagged
 from .forces import handedness_of, mat10, turns_of
-from .repair import repair_flagged
 
 wp.set_module_options({"enable_backward": False})
 

@@ -6,8 +6,8 @@ Sums go to global memory as 16-byte vector reductions if the card has them. The 
 polynomial (``corotated.algebraic``), in the same way for small strains and large ones.
 
 A leaf that is flat, inverted or strained far beyond order one adds nothing. Its bit is set in its subtree's byte, and
-the subtree is put on a list; ``repair`` computes those leaves. A body whose subtrees are all of one type has a kernel
-for that type; any other body is one launch, in which each thread block looks up its work.
+the subtree is put on a list; ``degenerate`` computes those leaves. A body whose subtrees are all of one type has a
+kernel for that type; any other body is one launch, in which each thread block looks up its work.
 """
 
 import functools
@@ -21,17 +21,16 @@ from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.kernels.elements.elements import (
     ForestElements,
     Subtrees,
+    add_four_forces,
     frame,
     gradient_of,
     nodal_forces,
     node_displacements,
     root_of,
 )
-from warp_corot.kernels.elements.merging import add_four_forces
 from warp_corot.kernels.modules import unique_kernel
 
 from .degenerate import DegenerateList, append, list_of, reserve
-from .dilatation import pressure_leaves, shared_pressure
 from .forces import (
     always_trusted,
     isotropic_leaves,
@@ -39,7 +38,9 @@ from .forces import (
     mat10,
     maubach_frame,
     own_forces,
+    pressure_leaves,
     shared_forces,
+    shared_pressure,
     subtree_forces,
     turn_in,
     turn_out,

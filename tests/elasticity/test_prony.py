@@ -10,7 +10,7 @@ from tangents import assert_diagonal, assert_symmetric, on_device, product
 
 import warp_corot as wc
 from warp_corot.elasticity.float64 import displacement_gradients, green_strain
-from warp_corot.kernels.elements import prony
+from warp_corot.kernels.elements import added as prony
 from warp_corot.kernels.elements.forces import scatter_forces
 from warp_corot.kernels.elements.simd8 import LANES
 

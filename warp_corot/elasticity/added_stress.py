@@ -20,12 +20,11 @@ from warp_corot.elasticity.model import ElementMaterial, ElementTangent, ForceFi
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, checked_numbers, shown
 from warp_corot.inputs.forwarding import forwards
-from warp_corot.kernels.elements import prestress, prony
+from warp_corot.kernels.elements import added as kernels
+from warp_corot.kernels.elements.added import ViscousMaterial, relax_simd8, viscosity_stress
 from warp_corot.kernels.elements.forces import element_energies
 from warp_corot.kernels.elements.native_laws import PRESTRESS, PRONY, VISCOUS, NativeLaw
-from warp_corot.kernels.elements.prony_cpu import relax_simd8
 from warp_corot.kernels.elements.simd8 import LANES
-from warp_corot.kernels.elements.viscosity import ViscousMaterial, viscosity_stress
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
@@ -172,7 +171,7 @@ class SumTangent(Tangent):
             each.add_diagonal(blocks)
 
 
-# --- Viscoelastic tissue: an elastic law with a Prony series of Maxwell elements ---
+# --- viscoelastic tissue: a Prony series of Maxwell elements ---------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -248,8 +247,8 @@ class PronyField(AddedStressField):
     """
 
     def __init__(self, discretization: Discretization, model: Prony, law: ForceField):
-        functions = (prony.prony_stress, prony.prony_differential, prony.prony_density)
-        super().__init__(discretization, law, prony.PronyMaterial, *functions, lanes=PRONY)
+        functions = (kernels.prony_stress, kernels.prony_differential, kernels.prony_density)
+        super().__init__(discretization, law, kernels.PronyMaterial, *functions, lanes=PRONY)
         g, tau = (np.array(values, np.float32) for values in model.terms)
         self._carried, counts = model.carried, self.plan.counts
         #: The number of elements may grow if the mesh changes.
@@ -257,12 +256,12 @@ class PronyField(AddedStressField):
         self._g, self._tau = (wp.array(v, dtype=wp.float32, device=self.device) for v in (g, tau))
         self._elapsed = wp.zeros(1, dtype=wp.float32, device=self.device)
         self._known = wp.zeros(len(self._carried) * self._count, dtype=wp.float32, device=self.device)
-        relax = relax_simd8 if self.device.is_cpu else prony.relax
+        relax = relax_simd8 if self.device.is_cpu else kernels.relax
         self._relax = relax(discretization.element_kind)
 
     @property
-    def material(self) -> prony.PronyMaterial:
-        made = prony.PronyMaterial()
+    def material(self) -> kernels.PronyMaterial:
+        made = kernels.PronyMaterial()
         made.isotropic, made.g, made.tau = self.isotropic, self._g, self._tau
         made.elapsed, made.known, made.count = self._elapsed, self._known, self._count
         return made
@@ -287,14 +286,14 @@ class PronyField(AddedStressField):
         forest, present = cast("DevicePlan", self.plan).forest, self.discretization.sizes.elements
         first = forest.carriage.names.index(self._carried[0])
         inputs = [forest.pools.leaves, self._known, first, len(self._carried), self._count]
-        self.launch(prony.carry_values, present, inputs, [forest.carriage.arrays.values])
+        self.launch(kernels.carry_values, present, inputs, [forest.carriage.arrays.values])
 
     def derive(self) -> None:
         self.law.derive()
         plan = cast("DevicePlan", self.plan)
         threads, first = plan.forest.threads, plan.values_row(self._carried[0])
         inputs = [threads, plan.arrays, first, len(self._carried), self._count]
-        self.launch(prony.adopt_values, threads, inputs, [self._known])
+        self.launch(kernels.adopt_values, threads, inputs, [self._known])
 
     @contextmanager
     def at_rest(self) -> Iterator[None]:
@@ -310,10 +309,10 @@ class PronyField(AddedStressField):
     def reset(self, chosen: wp.array) -> None:
         self.law.reset(chosen)
         inputs = [chosen, self._count // self.discretization.worlds, self._count]
-        self.launch(prony.forget, len(self._known), inputs, [self._known])
+        self.launch(kernels.forget, len(self._known), inputs, [self._known])
 
 
-# --- Bodies with stress in their undeformed shape ---
+# --- stress in the undeformed shape ----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -371,20 +370,20 @@ class PrestressedField(AddedStressField):
     """
 
     def __init__(self, discretization: Discretization, model: Prestressed, law: ForceField):
-        functions = (prestress.prestress_stress, prestress.prestress_differential, prestress.prestress_density)
-        super().__init__(discretization, law, prestress.Prestress, *functions, lanes=PRESTRESS)
+        functions = (kernels.prestress_stress, kernels.prestress_differential, kernels.prestress_density)
+        super().__init__(discretization, law, kernels.Prestress, *functions, lanes=PRESTRESS)
         stress, count = np.array(model.stress), len(discretization.mesh.tets)
         if stress.ndim == 3 and len(stress) != count:
             raise InputError(f"stress has {len(stress)} tensors; the mesh has {count} elements")
         if discretization.fill is not None:
             stress = discretization.fill[:, None, None] * stress
-        self._material = prestress.Prestress()
+        self._material = kernels.Prestress()
         self._material.stride = int(stress.ndim == 3)
         every = np.tile(stress, (discretization.worlds, 1, 1)) if stress.ndim == 3 else stress[None]
         self._material.stress = wp.array(every.astype(np.float32), dtype=wp.mat33, device=self.device)
 
     @property
-    def material(self) -> prestress.Prestress:
+    def material(self) -> kernels.Prestress:
         return self._material
 
 
@@ -392,7 +391,7 @@ def _tuples(values: Sequence[Any]) -> tuple[Any, ...]:
     return tuple(_tuples(value) if isinstance(value, list) else value for value in values)
 
 
-# --- Viscous forces of a body, which damp changes of shape and leave rigid motion unchanged ---
+# --- viscous forces, which damp changes of shape and leave rigid motion unchanged ------------------------------------
 
 
 class Viscosity:

@@ -22,12 +22,12 @@ from warp_corot.kernels.corotated.anisotropic import (
     FibreMaterial,
     OrthotropicMaterial,
     active_density,
+    anisotropic_differential,
     fibre_cauchy,
     fibre_density,
     fibre_stress,
 )
 from warp_corot.kernels.corotated.anisotropic_simd8 import scatter_anisotropic_simd8, turn_changed, turn_elements
-from warp_corot.kernels.corotated.anisotropic_tangent import anisotropic_differential
 from warp_corot.kernels.corotated.well_conditioned import quaternions_of
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import LOG_VOLUME
@@ -173,7 +173,7 @@ def _first(elements: E, count: int) -> E:
     return some
 
 
-# --- Anisotropic materials on CUDA: subtrees, clusters, and elements one by one ---
+# --- on CUDA: subtrees, clusters, and elements one by one ------------------------------------------------------------
 
 
 class AnisotropicCudaField(AnisotropicField):
@@ -244,7 +244,7 @@ def as_bytes(flags: wp.array) -> wp.array:
     return wp.array(ptr=flags.ptr, dtype=wp.uint8, shape=8 * len(flags), device=flags.device)
 
 
-# --- The law of Holzapfel, Gasser and Ogden, for tissue with families of fibres ---
+# --- the law of Holzapfel, Gasser and Ogden, for tissue with families of fibres --------------------------------------
 
 
 @dataclass(frozen=True)

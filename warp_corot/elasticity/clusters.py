@@ -20,9 +20,9 @@ from warp_corot.kernels.clusters.laws import ActiveMaterial
 from warp_corot.kernels.clusters.pair_elements import GeneralPairs, LatticePairs
 from warp_corot.kernels.clusters.pairs import scatter_pairs
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
+from warp_corot.kernels.elements.cpu import rest_matrices
 from warp_corot.kernels.elements.elements import ForestElements, GeneralElements
 from warp_corot.kernels.elements.fibres import ReinforcedMaterial
-from warp_corot.kernels.elements.general_cpu import rest_matrices
 from warp_corot.kernels.tables.cluster_layout import AHEAD, GENERAL, LARGE, LATTICE, PairLayout
 from warp_corot.mesh import TetForest
 

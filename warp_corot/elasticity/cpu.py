@@ -17,11 +17,18 @@ from warp_corot.inputs.cpu_threads import Team, launch, part_of
 from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.corotated.anisotropic import FibreMaterial
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
+from warp_corot.kernels.elements.cpu import (
+    GROUPS,
+    GroupedMaterial,
+    order_elements,
+    rest_matrices,
+    scatter_grouped_elements,
+    scatter_law_elements,
+    scatter_listed_elements,
+)
 from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.kernels.elements.elements import GeneralElements
 from warp_corot.kernels.elements.forces import repair_forces, scatter_forces
-from warp_corot.kernels.elements.general_cpu import rest_matrices, scatter_law_elements, scatter_listed_elements
-from warp_corot.kernels.elements.grouped_simd8 import GROUPS, GroupedMaterial, order_elements, scatter_grouped_elements
 from warp_corot.kernels.elements.native_laws import IsotropicLaw, NativeLaw
 from warp_corot.kernels.elements.simd8 import LANES
 from warp_corot.kernels.subtrees.cpu import DilatingMaterial, scatter_subtrees
@@ -80,7 +87,7 @@ def as_general(elements: Elements, kernel: wp.Kernel, inputs: list) -> GeneralEl
     return general
 
 
-# --- A dilatation that elements share, for launches on the CPU that add its forces together with a law's ---
+# --- a shared dilatation, whose forces a law's launches add ----------------------------------------------------------
 
 
 class Dilating:
@@ -193,7 +200,7 @@ def _material(isotropic: IsotropicMaterial, lam: wp.array, tolerance: float | No
     return material
 
 
-# --- Isotropic laws on the CPU: complete subtrees, and other elements in the lanes of its vector registers ---
+# --- isotropic laws: complete subtrees, and other elements -----------------------------------------------------------
 
 
 class InLanes(ForceField):
@@ -273,7 +280,7 @@ class InLanes(ForceField):
         return nodes if self._lanes is None else [*nodes, self._lanes.elements.nodes]
 
 
-# --- Forces of all elements under a law: one by one, or eight at a time on the CPU if the law is in C++ ---
+# --- all elements under any law, one by one or eight at a time -------------------------------------------------------
 
 
 class ByElements:

@@ -112,7 +112,7 @@ class SharedTangent(Tangent):
         return material
 
 
-# --- The force field of a law whose elements share their dilatation; see ``rows.elements.dilatation`` ---
+# --- the force field -------------------------------------------------------------------------------------------------
 
 
 @forwards("shear", "state", "reset", "energy_count", "divide")
@@ -422,7 +422,7 @@ class Unshared:
         self._field.unshare(u, f)
 
 
-# --- The option ``dilatation`` of models: whether elements share theirs, and the field that follows ---
+# --- the option ``dilatation`` of models -----------------------------------------------------------------------------
 
 
 #: Poisson's ratio in any element from which "auto" means "shared".

@@ -19,7 +19,7 @@ from warp_corot.elasticity.clusters import ClusterScatter
 from warp_corot.elasticity.model import Kept
 from warp_corot.errors import InputError
 from warp_corot.inputs.loading import LoadedKernel
-from warp_corot.kernels.clusters.sharing import SharingMaterial, measure_pairs, shared_pressure, sharing_law
+from warp_corot.kernels.clusters.laws import SharingMaterial, measure_pairs, shared_pressure, sharing_law
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.mesh import TetForest
@@ -98,7 +98,7 @@ def group_numbers(groups: Sequence[npt.NDArray[np.int32]], count: int) -> npt.ND
     return numbers
 
 
-# --- A dilatation that elements in clusters share (CUDA); see ``kernels.clusters.sharing`` ---
+# --- groups in clusters (CUDA); see ``kernels.clusters.laws`` --------------------------------------------------------
 
 
 class ClusteredGroups:

@@ -138,7 +138,7 @@ class LawSimd8Field(InLanes, LawField):
         self.scatter_others(u, f)
 
 
-# --- The choice of kernels for a constitutive law ---
+# --- the choice of kernels -------------------------------------------------------------------------------------------
 
 
 def law_field(law: Law, discretization: Discretization, deterministic: bool = False) -> LawField:
@@ -153,7 +153,7 @@ def law_field(law: Law, discretization: Discretization, deterministic: bool = Fa
     return kind(discretization, law, deterministic=deterministic)
 
 
-# --- The common part of models of one constitutive law: the option ``dilatation`` and the choice of kernels ---
+# --- models of one law -----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ class LawModel(Model):
         return law_field(self.law, discretization, deterministic)
 
 
-# --- Linear elasticity: small strain of the whole displacement. Right for small rotations, swells in large ones ---
+# --- linear elasticity: right for small rotations, swells in large ones ----------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -203,7 +203,7 @@ class Linear(LawModel):
         return field
 
 
-# --- St. Venant-Kirchhoff: Hooke's law between Green strain and second Piola-Kirchhoff stress ---
+# --- St. Venant-Kirchhoff: Hooke's law between Green strain and second Piola-Kirchhoff stress ------------------------
 
 
 @dataclass(frozen=True)
@@ -223,7 +223,7 @@ class StVenantKirchhoff(LawModel):
     shared = GREEN
 
 
-# --- Compressible neo-Hookean material ---
+# --- neo-Hookean -----------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -248,7 +248,7 @@ class NeoHookean(LawModel):
     shared = LOG_VOLUME
 
 
-# --- Ogden's law ---
+# --- Ogden -----------------------------------------------------------------------------------------------------------
 
 
 #: With larger exponents, powers of stretches would exceed the range of float32.

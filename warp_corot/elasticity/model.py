@@ -22,6 +22,7 @@ from warp_corot.inputs.cpu_threads import Regions, Team, launch
 from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.corotated.anisotropic import FibreMaterial
 from warp_corot.kernels.corotated.tangent import KeptStrains
+from warp_corot.kernels.elements.added import Prestress, PronyMaterial
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
 from warp_corot.kernels.elements.fibres import ReinforcedMaterial
 from warp_corot.kernels.elements.forces import (
@@ -34,8 +35,6 @@ from warp_corot.kernels.elements.forces import (
 )
 from warp_corot.kernels.elements.mean_dilatation import DilatedMaterial
 from warp_corot.kernels.elements.native_laws import IsotropicLaw
-from warp_corot.kernels.elements.prestress import Prestress
-from warp_corot.kernels.elements.prony import PronyMaterial
 from warp_corot.kernels.elements.stiffness_products import (
     add_stiffness_diagonal,
     add_stiffness_product,
@@ -76,7 +75,7 @@ def isotropic_material(given: list) -> IsotropicMaterial:
     return material
 
 
-# --- The device functions of a field's law, for derivatives ---
+# --- laws for derivatives --------------------------------------------------------------------------------------------
 
 
 #: Structs of materials.
@@ -106,7 +105,7 @@ class StressLaw:
     sees_shape: bool = False
 
 
-# --- Elastic models: a small description of each, and the force field of a model on a discretization ---
+# --- force fields and models -----------------------------------------------------------------------------------------
 
 
 class SmallForces(Protocol):

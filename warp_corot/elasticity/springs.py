@@ -67,7 +67,7 @@ class EdgeStVK(Model):
         )
 
 
-# --- Mass-spring network on the edges of the mesh: the classic baseline ---
+# --- the mass-spring network, the classic baseline -------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

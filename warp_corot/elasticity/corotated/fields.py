@@ -27,6 +27,7 @@ from warp_corot.elasticity.model import ForceField, Kept, StressLaw, Tangent
 from warp_corot.inputs.cpu_threads import launch
 from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.clusters.laws import isotropic_law
+from warp_corot.kernels.corotated.algebraic import own_energies, own_von_mises
 from warp_corot.kernels.corotated.corotated import (
     extract_rotations,
     given_cauchy,
@@ -35,7 +36,6 @@ from warp_corot.kernels.corotated.corotated import (
     own_stress,
     scatter_matrix_product,
 )
-from warp_corot.kernels.corotated.energy import own_energies, own_von_mises
 from warp_corot.kernels.corotated.tangent import exact_differential
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
 from warp_corot.kernels.elements.forces import element_energies, element_von_mises, scatter_forces
@@ -44,8 +44,7 @@ from warp_corot.kernels.elements.simd8 import LANES
 from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.kernels.subtrees import cpu as subtree_cpu
 from warp_corot.kernels.subtrees import cuda as subtree_cuda
-from warp_corot.kernels.subtrees.degenerate import NO_LIST
-from warp_corot.kernels.subtrees.repair import repair_elements, repair_own, repair_shared
+from warp_corot.kernels.subtrees.degenerate import NO_LIST, repair_elements, repair_own, repair_shared
 
 if TYPE_CHECKING:
     from warp_corot.elasticity.corotated.model import CorotatedOptions
@@ -235,7 +234,7 @@ class Simd8Field(InLanes, CorotatedField):
         self.scatter_others(u, f)
 
 
-# --- The corotated law on CUDA on elements in clusters, whose forces may be summed in any order ---
+# --- elements in clusters on CUDA ------------------------------------------------------------------------------------
 
 
 class CorotatedGeneralField(LeafField):
@@ -258,7 +257,12 @@ class CorotatedGeneralField(LeafField):
         self._scatter(self.isotropic, u, f)
 
 
-# --- The fast path of the corotated model: complete subtrees of a forest as units of work; see ``plan`` ---
+# --- complete subtrees -----------------------------------------------------------------------------------------------
+#
+# The fast path of the corotated model: complete subtrees of a forest as units of work; see ``plan``.
+#
+# On CUDA with own rotations a body is at most three launches: subtrees, other leaves, and the leaves that the first
+# left out.
 
 
 #: The structs that kernels of lanes read.

@@ -16,9 +16,16 @@ from warp_corot.kernels.clusters.laws import isotropic_law
 from warp_corot.kernels.corotated.algebraic import corotated_stress
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.subtrees.cuda import FLAT, WorkRange, scatter_body, scatter_subtrees_own
-from warp_corot.kernels.subtrees.degenerate import COUNT_STRIDE, LIST_BLOCK, LISTS, NO_LIST, DegenerateList
+from warp_corot.kernels.subtrees.degenerate import (
+    COUNT_STRIDE,
+    LIST_BLOCK,
+    LISTS,
+    NO_LIST,
+    DegenerateList,
+    repair_listed_own,
+    repair_listed_shared,
+)
 from warp_corot.kernels.subtrees.memory import BLOCK
-from warp_corot.kernels.subtrees.repair import repair_listed_own, repair_listed_shared
 
 #: Thread blocks for each multiprocessor: as many as fit at the same time, so that a launch over an empty list ends
 #: soon.
@@ -83,7 +90,7 @@ def _empty_lists(launches: list[int], device: wp.Device) -> DegenerateList:
     return listed
 
 
-# --- Forces of a whole body on CUDA in one or two launches; see ``kernels.subtrees.cuda`` and ``kernels.clusters`` ---
+# --- a whole body in one or two launches -----------------------------------------------------------------------------
 
 
 #: Number of leaves of a uniform forest from which subtrees have a launch: clusters are faster for fewer leaves, above

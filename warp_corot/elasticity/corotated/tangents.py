@@ -11,16 +11,26 @@ import warp as wp
 from warp_corot.discretization.subtrees import Batch, Sharing
 from warp_corot.elasticity.cpu import as_general
 from warp_corot.elasticity.model import ElementTangent, Kept, Tangent
-from warp_corot.kernels.corotated import kept_exact
 from warp_corot.kernels.corotated import turned_subtrees as kernels
-from warp_corot.kernels.corotated.kept_gradients import PLACES, KeptGradients, add_kept_product, turn_gradients
-from warp_corot.kernels.corotated.tangent import KeptStrains, given_differential, keep_strains, kept_differential
+from warp_corot.kernels.corotated.tangent import (
+    EXACT_PLACES,
+    PLACES,
+    KeptGradients,
+    KeptStrains,
+    add_exact_product,
+    add_kept_product,
+    given_differential,
+    keep_elements,
+    keep_strains,
+    kept_differential,
+    turn_gradients,
+)
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
+from warp_corot.kernels.elements.cpu import rest_matrices
 from warp_corot.kernels.elements.elements import ForestElements, Subtrees
-from warp_corot.kernels.elements.general_cpu import rest_matrices
 from warp_corot.kernels.elements.simd8 import LANES
+from warp_corot.kernels.subtrees.degenerate import turn_listed
 from warp_corot.kernels.subtrees.memory import BLOCK
-from warp_corot.kernels.subtrees.repair import turn_listed
 
 if TYPE_CHECKING:
     from warp_corot.discretization.plan import Plan
@@ -101,14 +111,14 @@ class KeptTangent(Tangent):
         rotation = field.model.own_rotation
         self._diagonal = ExactTangent(field, rotation) if exact else RotatedTangent(field)
         self._exact = exact
-        self._keep = kept_exact.keep_elements(rotation) if exact else turn_gradients()
-        self._product = kept_exact.add_exact_product() if exact else add_kept_product()
+        self._keep = keep_elements(rotation) if exact else turn_gradients()
+        self._product = add_exact_product() if exact else add_kept_product()
         elements = field.elements
         is_forest = field.discretization.element_kind is ForestElements
         self._general = as_general(elements, rest_matrices, [elements]) if is_forest else elements
         self._count = field.element_count
         self._blocks = -(-self._count // LANES)
-        places = (kept_exact.PLACES if exact else PLACES) * self._blocks
+        places = (EXACT_PLACES if exact else PLACES) * self._blocks
         self._kept = wp.zeros(places, dtype=wp.vec4, device=field.device)
         self._numbers = wp.array(ptr=self._kept.ptr, dtype=wp.float32, shape=4 * places, device=field.device)
         self._listed = wp.zeros(self._count + 1, dtype=wp.int32, device=field.device)
@@ -147,7 +157,7 @@ def _kept_gradients(isotropic: IsotropicMaterial, gradients: wp.array) -> KeptGr
     return material
 
 
-# --- The stiffness R K R^T over complete subtrees, for large uniform bodies on CUDA ---
+# --- R K R^T over complete subtrees, for large uniform bodies on CUDA ------------------------------------------------
 
 
 #: The number of elements from which on products go over subtrees. On an H200, a product of 1,179,648 elements takes

@@ -14,8 +14,7 @@ from warp_corot.body.trajectory import Followed
 from warp_corot.elasticity.corotated.fields import CorotatedGeneralField, SubtreeField
 from warp_corot.elasticity.dilatation import law_of
 from warp_corot.kernels.math.rotation import quick_rotation
-from warp_corot.kernels.stepping.exchange import Exchange
-from warp_corot.kernels.stepping.patch_body import Layout, PatchBody
+from warp_corot.kernels.stepping.patch_body import Exchange, Layout, PatchBody
 from warp_corot.kernels.stepping.patches import step_patches
 from warp_corot.materials.directional import Directional
 

@@ -14,13 +14,14 @@ from typing import Any
 
 import warp as wp
 
-from warp_corot.kernels.math.matrices import identity3
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, corotated_strain, green_strain, hooke, symmetric
+from warp_corot.kernels.elements.elements import ForestElements, frame, local_gradient
+from warp_corot.kernels.elements.simd8 import headers, on_cpu
+from warp_corot.kernels.math.matrices import axial, identity3
+from warp_corot.kernels.math.rotation import byers_xu, identity3
 from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.plan.plan import Plan, extent, leaf_row
 from warp_corot.kernels.stepping.pace import DT, Pace
-
-from .constitutive import IsotropicMaterial, green_strain, symmetric
-from .elements import frame, local_gradient
 
 wp.set_module_options({"enable_backward": False})
 
@@ -221,3 +222,119 @@ def forget(
     i = wp.tid()
     if chosen[(i % count) // world_count] != 0:
         known[i] = 0.0
+
+
+# --- relaxation on the CPU, eight elements at a time; see ``simd8`` --------------------------------------------------
+
+
+@functools.cache
+def relax_simd8(Elements: type) -> wp.Kernel:
+    """Make the state at displacements u, after a step of the clock's length, the known one; a thread is eight
+    elements."""
+
+    traversal = "ForestEight" if Elements is ForestElements else "ListableGeneralEight"
+
+    @wp.func_native(on_cpu(f"corot::relax_eight<corot::{traversal}>(material, units, block, count, u, time);"))
+    def eight_elements(
+        units: Elements, block: int, count: int, u: wp.array[wp.vec4], time: float, material: PronyMaterial
+    ): ...
+
+    @unique_kernel(native=headers("elements8", "added"))
+    def relax_simd8(
+        # In
+        elements: Elements,
+        count: int,
+        u: wp.array[wp.vec4],
+        pace: Pace,
+        # In and out
+        material: PronyMaterial,
+    ):
+        block = wp.tid()
+        eight_elements(elements, block, count, u, float(pace.seconds[DT]), material)
+        if block == 0:
+            material.elapsed[0] = 0.0
+
+    return relax_simd8
+
+
+# --- prestress -------------------------------------------------------------------------------------------------------
+#
+# Stress that a body has at rest: a constant second Piola-Kirchhoff stress S of each element.
+#
+# P = F S is the derivative of the energy density S : E with Green's strain E; it turns with the body.
+
+
+@wp.struct
+class Prestress:
+    """S in the axes of rest space, one entry (stride 0) or one per element (stride 1)."""
+
+    stress: wp.array[wp.mat33]
+    stride: int
+
+
+@wp.func
+def prestress_stress(elements: Any, t: int, material: Prestress, u: wp.array[wp.vec4]):
+    s = material.stress[t * material.stride]
+    return (s + rest_gradient(elements, t, u) * s) * frame(elements, t)
+
+
+@wp.func
+def prestress_differential(elements: Any, t: int, material: Prestress, u: wp.array[wp.vec4], dg: wp.mat33):
+    q = frame(elements, t)
+    return dg * wp.transpose(q) * material.stress[t * material.stride] * q
+
+
+@wp.func
+def prestress_density(elements: Any, t: int, material: Prestress, u: wp.array[wp.vec4]):
+    return wp.ddot(material.stress[t * material.stride], green_strain(rest_gradient(elements, t, u)))
+
+
+# --- viscosity -------------------------------------------------------------------------------------------------------
+#
+# Viscous forces: a stress proportional to the rate at which an element's stretch changes, however it turns.
+#
+# With F = R U, Fdot = (du/dt) grad N and A = R^T Fdot, A = W U + Udot, where W = R^T Rdot is skew and Udot symmetric.
+# The skew part of A says W: (tr(U) I - U) w is the axial vector of A - A^T. Udot vanishes where a body turns as a
+# whole, at any strain. The stress s = eta (2 mu Udot + lambda tr(Udot) I) works against Udot; the force that does the
+# same work at the nodes is that of P = R (s + [a]x), with (tr(U) I - U) a the axial vector of U s - s U: it takes out
+# s : Udot >= 0 of power and has no torque.
+
+#: Below this determinant of tr(U) I - U, which is 8 at rest, the turning of a crushed or inverted element is hardly
+#: determined. With stretches a > 0 > b it is (a - b) / (a + b) times Udot and so faster than the nodes, which no
+#: explicit step survives. Below, the symmetric part of A stands for Udot, which still takes power out.
+LEAST = wp.constant(0.05)
+
+
+@wp.struct
+class ViscousMaterial:
+    """Lamé's parameters [Pa], viscosities over these [s], and the velocities of nodes [m/s]."""
+
+    isotropic: IsotropicMaterial
+    seconds: float
+    velocities: wp.array[wp.vec4]
+
+
+@wp.func
+def viscous_stress(u: wp.mat33, a: wp.mat33, mu: float, lam: float):
+    """R^T P of a stretch U, a rate A and viscosities [Pa s]."""
+    m = wp.trace(u) * identity3() - u
+    if wp.determinant(m) < LEAST or wp.determinant(u) < 0.0:
+        return hooke(symmetric(a), mu, lam)
+    inverse = wp.inverse(m)
+    rate = symmetric(a - wp.skew(inverse * axial(a)) * u)
+    s = hooke(rate, mu, lam)
+    return s + wp.skew(inverse * axial(u * s))
+
+
+@wp.func
+def viscosity_stress(elements: Any, t: int, material: ViscousMaterial, u: wp.array[wp.vec4]):
+    """The viscous stress of element t for the kernels of ``forces``; forces are the stiffness times seconds times
+    velocities, for small motions."""
+    g = local_gradient(elements, t, u)
+    q = frame(elements, t)
+    r = byers_xu(q + g)
+    stretch = identity3() + corotated_strain(g, q, r)
+    rate = wp.transpose(r) * local_gradient(elements, t, material.velocities)
+    eta = material.seconds
+    i = t * material.isotropic.stride
+    return r * viscous_stress(stretch, rate, eta * material.isotropic.mu[i], eta * material.isotropic.lam[i])
