@@ -18,7 +18,7 @@ from state_bodies import GRAVITY, MATERIAL, State, Subject
 import warp_corot as wc
 from warp_corot.discretization.elements import forest_elements
 from warp_corot.elasticity import ForceField, Model
-from warp_corot.elasticity.dilatation.field import DilatationField, law_of
+from warp_corot.elasticity.dilatation import DilatationField, law_of
 from warp_corot.errors import InputError
 
 #: Fibres along y, three times as stiff as across.

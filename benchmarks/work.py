@@ -12,7 +12,7 @@ multiply-add is two), without addressing, selection by type, or tests that fail.
 
 from __future__ import annotations
 
-from warp_corot.kernels.elements.stiffness import is_zero
+from warp_corot.kernels.elements.shapes import is_zero
 
 NODE = 16.0  # vec4
 INDICES = 16.0

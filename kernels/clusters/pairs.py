@@ -1,4 +1,9 @@
-"""Forces of pairs of elements in clusters, on CUDA: a cluster's nodes meet in shared memory; see ``single``.
+"""Forces of pairs of elements in clusters, on CUDA: a cluster's nodes are in shared memory, and each is read once and
+added to once.
+
+A thread block takes a stretch of elements that follow one another in the order of the tree and so share most of their
+nodes: half a node an element is left of four. Threads write their elements' forces to slots; then each sums up the
+slots of a node, and adds the sum to memory. Displacements and forces are read and written 16 bytes at once.
 
 The time of such a kernel is not arithmetic but waiting, so no thread looks anything up on the way. Each thread has a
 pair and a task: a node that it reads, and up to twelve slots of that node that it adds up. It reads both at once, at
@@ -14,19 +19,21 @@ from warp_corot.kernels.stepping.block_memory import LOAD, STORE
 from warp_corot.kernels.stepping.threads import synchronize_block
 from warp_corot.kernels.tables.cluster_layout import BANK_GROUPS, QUAD_BYTES, PairLayout
 
-from .elements import number_of
 from .pair_elements import (
     GENERAL_WORDS,
     LATTICE_WORDS,
     GeneralPairs,
     LatticePairs,
+    add_sum,
     half_word,
+    number_of,
     pair_forces,
     quad_of,
     record_of,
+    shared_quads,
     vec4u,
+    vector_of,
 )
-from .single import add_sum, shared_quads, vector_of
 
 wp.set_module_options({"enable_backward": False})
 

@@ -11,8 +11,8 @@ from typing import Any
 
 import warp as wp
 
+from warp_corot.kernels.elements.cpu import rest_inverse_of
 from warp_corot.kernels.elements.elements import ForestElements, GeneralElements, frame, rest_volume
-from warp_corot.kernels.elements.general_cpu import rest_inverse_of
 from warp_corot.kernels.elements.simd8 import headers, scatter_simd8
 from warp_corot.kernels.modules import unique_kernel
 

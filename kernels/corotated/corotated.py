@@ -28,8 +28,7 @@ from warp_corot.kernels.elements.elements import (
     mirror_sign,
     shape_of,
 )
-from warp_corot.kernels.elements.shapes import rest_shape
-from warp_corot.kernels.elements.stiffness import stiffness_product, vec12
+from warp_corot.kernels.elements.shapes import rest_shape, stiffness_product, vec12
 from warp_corot.kernels.math.rotation import identity3
 from warp_corot.kernels.modules import unique_kernel
 

@@ -12,7 +12,7 @@ h'' grows from 0 to 1 over ``RAMP``. Forces are exact derivatives: P_e = lambda_
 dF.
 
 Functions here take the displacement gradient A as ``constitutive`` has it. The kernels are in ``mean_dilatation``,
-those of subtrees' forces in ``subtrees.dilatation``.
+those of subtrees' forces in ``subtrees.forces``.
 """
 
 import functools

@@ -13,8 +13,7 @@ from warp_corot.kernels.corotated.algebraic import corotated_stress
 from warp_corot.kernels.math.rotation import column, identity3, quick_rotation
 
 from .constitutive import corotated_strain, hooke, stretch_strain
-from .elements import load_node
-from .merging import add_four_forces
+from .elements import add_four_forces, load_node
 
 wp.set_module_options({"enable_backward": False})
 

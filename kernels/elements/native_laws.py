@@ -34,12 +34,10 @@ STRESSLESS = "stressless"
 IsotropicLaw = str | tuple[tuple[float, float], ...]
 
 
-def elastic(law: IsotropicLaw, material: str = "material") -> NativeLaw:
-    """An isotropic law with an ``IsotropicMaterial``."""
-    if law == STRESSLESS:
-        return NativeLaw("corot::Stressless{}")
+def bare(law: IsotropicLaw) -> NativeLaw:
+    """An isotropic law whose stress takes Lamé's parameters."""
     if isinstance(law, str):
-        return NativeLaw(f"corot::elastic(corot::{LAWS[law]}{{}}, {material})", leaves_out=law == "corotated")
+        return NativeLaw(f"corot::{LAWS[law]}{{}}", leaves_out=law == "corotated")
     rows = []
     for share, alpha in law:
         low, high = ((stretch**2 - 1.0) / 2.0 for stretch in stretch_limits(alpha))
@@ -48,5 +46,12 @@ def elastic(law: IsotropicLaw, material: str = "material") -> NativeLaw:
         rows.append((m, rest, power, low, high, math.log1p(2.0 * low), math.log1p(2.0 * high)))
     terms = ", ".join("{" + ", ".join(f"{number!r}f" for number in row) + "}" for row in rows)
     volume_part = sum(part_of_volume(*term) for term in law)
-    ogden = f"corot::Ogden<{len(law)}>{{{{{terms}}}, {volume_part!r}f}}"
-    return NativeLaw(f"corot::elastic({ogden}, {material})", "law_ogden")
+    return NativeLaw(f"corot::Ogden<{len(law)}>{{{{{terms}}}, {volume_part!r}f}}", "law_ogden")
+
+
+def elastic(law: IsotropicLaw, material: str = "material") -> NativeLaw:
+    """An isotropic law with an ``IsotropicMaterial``."""
+    if law == STRESSLESS:
+        return NativeLaw("corot::Stressless{}")
+    of_numbers = bare(law)
+    return of_numbers._replace(code=f"corot::elastic({of_numbers.code}, {material})")

@@ -14,8 +14,8 @@ from warp_corot.kernels.math.rotation import column, identity3
 from warp_corot.kernels.tables.shapes import FIRST_NODE, SECOND_NODE
 
 from .constitutive import IsotropicMaterial, hooke, hooke_energy, symmetric
+from .cpu import rest_inverse_of
 from .elements import add_force, frame, load_node, local_gradient
-from .general_cpu import rest_inverse_of
 from .shapes import mat43
 
 wp.set_module_options({"enable_backward": False})

@@ -139,7 +139,7 @@ template <class S> COROT_INLINE Invariants<S> invariants_of(const S* e, const S&
 }
 
 // q, 16 at rest, below which R is not trusted: the root has lost digits, or is about to meet another.
-constexpr float INDEFINITE = 1.0f;
+template <class S> constexpr float INDEFINITE = IS_FINE<S> ? 1e-3f : 1.0f;
 
 // What polynomials of the stretch S are made of. With t = tr S - 3, j = J - 1 and the invariants a, b, c of E, t is the
 // largest root of the quartic (Cayley-Hamilton for S; x = t + 3 is the largest eigenvalue of Horn's 4x4 matrix)
@@ -164,8 +164,8 @@ template <class S> COROT_INLINE Stretch<S> stretch_of(const S* e, const S& det) 
     const S p5 = a * p4 - b * p3 + c * p2;
     t = s.of.small ? t - 0.125f * p2 + 0.0625f * p3 - 0.0390625f * p4 + 0.02734375f * p5 : t;
     mask_of<S> open = t == t;
-    const float settled = same<S, double>::value ? 1e-18f : 1e-8f;
-    for (int iteration = 0; iteration < 24; ++iteration) {
+    const float settled = IS_FINE<S> ? 1e-18f : 1e-8f;
+    for (int iteration = 0; iteration < (IS_FINE<S> ? 50 : 24); ++iteration) {
         const S value = (((t + 12.0f) * t + c2) * t + c1) * t + c0;
         const S slope = ((4.0f * t + 36.0f) * t + 2.0f * c2) * t + c1;
         const S step = value / slope;
@@ -173,9 +173,14 @@ template <class S> COROT_INLINE Stretch<S> stretch_of(const S* e, const S& det) 
         open &= step * step > settled * (t + 3.0f) * (t + 3.0f);
         if (!any(open)) break;
     }
+    if constexpr (same<S, dual>::value) {
+        // The derivative of the root, which lags behind it by an iteration.
+        const double x = t.value, slope = ((4.0 * x + 36.0) * x + 2.0 * c2.value) * x + c1.value;
+        t.slope = -((c2.slope * x + c1.slope) * x + c0.slope) / slope;
+    }
     s.t = t;
     s.q = 16.0f + t * (24.0f + t * (9.0f + t)) - a * (3.0f + t) - 2.0f * j;
-    s.valid = inverted(open) & (s.q > INDEFINITE) & (a < 1000.0f);
+    s.valid = inverted(open) & (s.q > INDEFINITE<S>) & (a < 1000.0f);
     return s;
 }
 

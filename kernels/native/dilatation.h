@@ -86,10 +86,11 @@ struct VolumeDilatation : VolumeChange, SquareEnergy {};
 // Neo-Hookean: w = (ln J)^2 / 2, continued below J0 = CONTINUED_BELOW.
 struct LogVolumeDilatation : VolumeChange {
     template <class S> static COROT_INLINE S pressure(const S& theta) {
-        const float j0 = CONTINUED_BELOW, log0 = LOG_CONTINUED;
+        const float j0 = CONTINUED_BELOW;
+        const S log0 = spread<S>(LOG_CONTINUED);
         const mask_of<S> crushed = theta < j0 - 1.0f;
         const S safe = crushed ? spread<S>(0.0f) : theta;
-        const S line = spread<S>(log0 / j0) + (1.0f - log0) / (j0 * j0) * (theta + (1.0f - j0));
+        const S line = log0 / j0 + (1.0f - log0) / (j0 * j0) * (theta + (1.0f - j0));
         return crushed ? line : log_of(safe) / (1.0f + safe);
     }
 };

@@ -72,7 +72,8 @@ struct Corotated {
 };
 
 // J below which the volumetric energy is its own Taylor polynomial of second order about this J, and its logarithm.
-constexpr float CONTINUED_BELOW = 0.5f, LOG_CONTINUED = -0.6931472f;
+constexpr float CONTINUED_BELOW = 0.5f;
+constexpr double LOG_CONTINUED = -0.6931471805599453;
 
 // P = cof F (mu E + lambda ln J) / J; below J0 = CONTINUED_BELOW mu F + U'(J) cof F, with U' continued linearly.
 struct NeoHookean {
@@ -92,8 +93,9 @@ struct NeoHookean {
         times(cofactor, sigma, p);
         if (any(crushed)) {
             const float j0 = CONTINUED_BELOW;
-            const S slope = handedness * ((k * LOG_CONTINUED - m) / j0
-                + (m + k * (1.0f - LOG_CONTINUED)) / (j0 * j0) * (j + (1.0f - j0)));
+            const S log0 = spread<S>(LOG_CONTINUED);
+            const S slope = handedness * ((k * log0 - m) / j0
+                + (m + k * (1.0f - log0)) / (j0 * j0) * (j + (1.0f - j0)));
             for (int i = 0; i < 3; ++i) p[i] = chosen(crushed, added(f[i] * m, slope, cofactor[i]), p[i]);
         }
         return every<S>();

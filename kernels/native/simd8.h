@@ -1,5 +1,5 @@
-// Scalars of laws: float, double, or ``lanes8``, eight floats in a CPU's vector registers; triples of these; and how lanes
-// are read and written.
+// Scalars of laws: float, double, ``dual``, a double with its derivative, or ``lanes8``, eight floats in a CPU's vector
+// registers; triples of these; and how lanes are read and written.
 #pragma once
 
 #if defined(__clang__)
@@ -26,11 +26,11 @@ template <class S> using mask_of = typename mask<S>::type;
 template <class A, class B> struct same { static constexpr bool value = false; };
 template <class A> struct same<A, A> { static constexpr bool value = true; };
 
-template <class S> struct constant { static COROT_INLINE S of(float a) { return a; } };
+template <class S> struct constant { static COROT_INLINE S of(double a) { return static_cast<S>(a); } };
 template <> struct constant<lanes8> {
     static COROT_INLINE lanes8 of(float a) { return lanes8{a, a, a, a, a, a, a, a}; }
 };
-template <class S> COROT_INLINE S spread(float a) { return constant<S>::of(a); }
+template <class S> COROT_INLINE S spread(double a) { return constant<S>::of(a); }
 template <class S> COROT_INLINE mask_of<S> every() { return spread<S>(0.0f) == spread<S>(0.0f); }
 
 COROT_INLINE bool any(bool a) { return a; }
@@ -58,10 +58,34 @@ COROT_INLINE lanes8 root(const lanes8& a) {
 #endif
 }
 
+// A double and its derivative in some direction, so that a law's stress has its differential.
+struct dual {
+    double value, slope;
+    COROT_INLINE dual() = default;
+    COROT_INLINE dual(double value, double slope = 0.0) : value(value), slope(slope) {}
+    COROT_INLINE dual operator-() const { return {-value, -slope}; }
+    COROT_INLINE dual& operator+=(const dual& b) { return *this = *this + b; }
+    COROT_INLINE dual& operator-=(const dual& b) { return *this = *this - b; }
+    friend COROT_INLINE dual operator+(const dual& a, const dual& b) { return {a.value + b.value, a.slope + b.slope}; }
+    friend COROT_INLINE dual operator-(const dual& a, const dual& b) { return {a.value - b.value, a.slope - b.slope}; }
+    friend COROT_INLINE dual operator*(const dual& a, const dual& b) {
+        return {a.value * b.value, a.slope * b.value + a.value * b.slope};
+    }
+    friend COROT_INLINE dual operator/(const dual& a, const dual& b) {
+        const double quotient = a.value / b.value;
+        return {quotient, (a.slope - quotient * b.slope) / b.value};
+    }
+    friend COROT_INLINE bool operator<(const dual& a, const dual& b) { return a.value < b.value; }
+    friend COROT_INLINE bool operator>(const dual& a, const dual& b) { return a.value > b.value; }
+    friend COROT_INLINE bool operator==(const dual& a, const dual& b) { return a.value == b.value; }
+};
+template <class S> constexpr bool IS_FINE = same<S, double>::value || same<S, dual>::value;
+
 // ln(1 + j) of positive 1 + j, to all its digits: for lanes twice the artanh of j / (2 + j), of what powers of two leave
 // within sqrt(2).
 COROT_INLINE float log_of(float j) { return __builtin_log1pf(j); }
 COROT_INLINE double log_of(double j) { return __builtin_log1p(j); }
+COROT_INLINE dual log_of(const dual& j) { return {__builtin_log1p(j.value), j.slope / (1.0 + j.value)}; }
 COROT_INLINE lanes8 log_of(const lanes8& j) {
     const lanes8 whole = 1.0f + j;
     const masks8 bits = reinterpret_cast<const masks8&>(whole);

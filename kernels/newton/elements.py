@@ -87,7 +87,7 @@ def place_in_model(ids: wp.array[wp.int32], first: int, t: int):
 @functools.cache
 def scatter_posed(rotation: wp.Function, damped: bool, rounds: int = 1) -> wp.Kernel:
     """All forces of tetrahedra, each with the rotation of its own deformation gradient; ``ids`` are their indices in
-    ``stepping.activation``; ``rounds``: see ``add_four_forces``."""
+    ``stepping.conditions``; ``rounds``: see ``add_four_forces``."""
     add = add_stress(rounds)
 
     @unique_kernel()

@@ -17,7 +17,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_corot.kernels.corotated.kept_gradients import keep_gradients
+from warp_corot.kernels.corotated.tangent import keep_gradients
 from warp_corot.kernels.elements.constitutive import hooke, symmetric
 from warp_corot.kernels.elements.elements import GeneralElements, load_node, store_node
 from warp_corot.kernels.math.rotation import byers_xu, identity3

@@ -1,4 +1,4 @@
-"""Numbers for slots: a place of its own for every force that a unit of work adds; see ``elements.reproducible``.
+"""Numbers for slots: a place of its own for every force that a unit of work adds; see ``elements.elements``.
 
 Slots of a world stand class after class, subtree after subtree or group after group, then those of the leaves in no
 subtree. A group has all its 40 places, those that it does not use included.

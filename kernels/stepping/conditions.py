@@ -10,8 +10,8 @@ from typing import Any
 import warp as wp
 
 from warp_corot.kernels.elements.elements import store_node
-
-from .integrate import by_vectors, write_vector
+from warp_corot.kernels.stepping.integrate import by_vectors, write_vector
+from warp_corot.kernels.stepping.pace import Pace, time_after
 
 wp.set_module_options({"enable_backward": False})
 
@@ -89,3 +89,49 @@ def load_nodes(
 
 
 LOAD_NODES = by_vectors(load_nodes, "loads")
+
+
+# --- active stress that follows keyframes ----------------------------------------------------------------------------
+
+
+@wp.kernel(enable_backward=False)
+def follow_activation(
+    # In
+    elements: wp.array[wp.int32],
+    times: wp.array[wp.float64],
+    stress: wp.array2d[wp.float32],
+    pace: Pace,
+    world_starts: wp.array[wp.float64],
+    world_element_count: int,
+    offset: int,
+    # Out
+    activation: wp.array[wp.float32],
+):
+    """Set the active stress [Pa] to the keyframes' value at the beginning of a step, ``offset`` steps after the last
+    counted one.
+    """
+    k = wp.tid()
+    t = elements[k]
+    start = world_starts[t // world_element_count]
+    now = time_after(pace, offset) - start
+    key, s = key_before(times, now)
+    row = wp.min(k, stress.shape[1] - 1)
+    a = stress[key, row]
+    activation[t] = a + s * (stress[key + 1, row] - a)
+
+
+# --- keyframes -------------------------------------------------------------------------------------------------------
+
+
+@wp.func
+def key_before(times: wp.array[wp.float64], t: wp.float64):
+    """The last key before t, and how far t is on the way to the next key, 0 to 1. There must be two keys or more.
+
+    Before all keys this is the first key, after them the last but one.
+    """
+    last = times.shape[0] - 1
+    key = int(0)
+    while key < last - 1 and times[key + 1] <= t:
+        key += 1
+    share = (t - times[key]) / (times[key + 1] - times[key])
+    return key, float(wp.clamp(share, wp.float64(0.0), wp.float64(1.0)))

@@ -8,6 +8,8 @@ import warp as wp
 
 #: A column of ``PatchBody.rest`` has the inverse of the matrix of rest edges, row by row, then the volume.
 VOLUME_ROW = 9
+#: Threads of whole worlds for which a multiprocessor's registers must have room.
+RESIDENT_THREADS = 768
 
 
 @dataclass(frozen=True)
@@ -22,6 +24,8 @@ class Layout:
             used.
         groups, members: Room for groups that share a dilatation and for the elements of each; zero if none do.
         overlaps: Whether a block computes the elements that need no halo before it waits for the halo.
+        whole: Whether a patch is a whole world. Then blocks exchange nothing, and read elements' constants, which are
+            the same in all worlds, at every step in place of keeping them, so that more blocks are resident.
     """
 
     threads: int
@@ -33,6 +37,12 @@ class Layout:
     groups: int = 0
     members: int = 0
     overlaps: bool = True
+    whole: bool = False
+
+    @property
+    def resident(self) -> int:
+        """Blocks for which a multiprocessor's registers must have room."""
+        return max(RESIDENT_THREADS // self.threads, 1) if self.whole else 1
 
     @property
     def vectors(self) -> int:
@@ -46,9 +56,10 @@ class Layout:
 
 @wp.struct
 class PatchBody:
-    """The patches of a body; see ``solvers.explicit.patch_layout.Patches``."""
+    """The patches of each world of a body; see ``solvers.explicit.patch_layout.Patches``."""
 
-    own: wp.array[wp.int32]  # [N]
+    element_count: int  # of the mesh
+    own: wp.array[wp.int32]  # [N] of one world, as all that is not said to be of others
     own_start: wp.array[wp.int32]  # [patches + 1], as the other starts
     halo: wp.array[wp.int32]
     halo_start: wp.array[wp.int32]
@@ -63,10 +74,59 @@ class PatchBody:
     base_start: wp.array[wp.int32]
     rest: wp.array2d[wp.float32]  # [10, E] see ``VOLUME_ROW``
     # Keyframes of all trajectories, one after another.
-    trajectory: wp.array[wp.int32]  # [N] the trajectory that a node follows, or -1
-    place: wp.array[wp.int32]  # [N] the node's column there
+    trajectory: wp.array[wp.int32]  # [worlds N] the trajectory that a node follows, or -1
+    place: wp.array[wp.int32]  # [worlds N] the node's column there
     key_start: wp.array[wp.int32]  # [trajectories + 1] into ``times``
     value_start: wp.array[wp.int32]  # [trajectories] into ``values``, whose rows have ``columns`` entries
     columns: wp.array[wp.int32]  # [trajectories]
     times: wp.array[wp.float64]
     values: wp.array[wp.vec3]
+
+
+# --- the exchange of displacements between blocks that run at the same time ------------------------------------------
+
+
+#: How often a block polls for a displacement before it gives up; this takes some seconds.
+MOST_LOOKS = 1 << 22
+
+
+@wp.struct
+class Exchange:
+    """The arrays through which blocks exchange displacements."""
+
+    nodes: int  # of all worlds
+    published: wp.array[
+        wp.vec4
+    ]  # [2 nodes] displacements of even and of odd steps; w holds the bits of the step's number
+    begun: wp.array[wp.uint32]  # [worlds patches] the number of the next launch's first state
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const unsigned long long low = ((unsigned long long)__float_as_uint(value[1]) << 32) | __float_as_uint(value[0]);
+    const unsigned long long high = ((unsigned long long)number << 32) | __float_as_uint(value[2]);
+    asm volatile("{ .reg .b128 all; mov.b128 all, {%1, %2}; st.relaxed.gpu.global.b128 [%0], all; }"
+        :: "l"(&wp::index(published, i)), "l"(low), "l"(high) : "memory");
+#endif
+""")
+def publish(published: wp.array[wp.vec4], i: int, value: wp.vec3, number: wp.uint32):
+    """Write a displacement and its number in one access."""
+    ...
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    unsigned long long low = 0, high = 0;
+    for (int look = 0; look < {MOST_LOOKS}; ++look) {{
+        asm volatile("{{ .reg .b128 all; ld.relaxed.gpu.global.b128 all, [%2]; mov.b128 {{%0, %1}}, all; }}"
+            : "=l"(low), "=l"(high) : "l"(&wp::index(published, i)) : "memory");
+        if ((unsigned)(high >> 32) == number)
+            return wp::vec_t<4, wp::float32>(__uint_as_float((unsigned)low), __uint_as_float((unsigned)(low >> 32)),
+                                             __uint_as_float((unsigned)high), 0.0f);
+    }}
+#endif
+    return wp::vec_t<4, wp::float32>(0.0f, 0.0f, 0.0f, 1.0f);
+""")
+def await_displacement(published: wp.array[wp.vec4], i: int, number: wp.uint32) -> wp.vec4:
+    """Wait for the displacement of the step ``number``; the last component is 0, or 1 if it did not arrive."""
+    ...

@@ -11,8 +11,9 @@ If elements share their dilatation, a block also measures the other elements of 
 writes its dilatation to the row of its group, one thread for each group sums the row, and a second pass adds the forces
 of the pressure.
 
-All blocks of a launch must be resident at the same time, one on each multiprocessor. Sums have a fixed order, so runs
-are reproducible bit for bit. CUDA only; ``solvers.explicit.patch_layout`` divides the work among blocks.
+All blocks of a launch must be resident at the same time, one on each multiprocessor. Small worlds are one patch each:
+their blocks exchange nothing, and a launch may have any number of them. Sums have a fixed order, so runs are
+reproducible bit for bit. CUDA only; ``solvers.explicit.patch_layout`` divides the work among blocks.
 """
 
 import functools
@@ -27,10 +28,9 @@ from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.tables.shapes import fingerprint
 
 from .block_memory import LOAD, STORE, numbers_at, vectors_at
-from .exchange import Exchange, await_displacement, publish
 from .integrate import add_support_work, is_finite, symplectic_euler_velocity, vector_at
 from .pace import DONE, DT, Pace, length_before, time_after
-from .patch_body import VOLUME_ROW, Layout, PatchBody
+from .patch_body import VOLUME_ROW, Exchange, Layout, PatchBody, await_displacement, publish
 from .threads import lowest_bit, number_in, shuffle_down, synchronize_any, synchronize_block
 
 wp.set_module_options({"enable_backward": False})
@@ -50,7 +50,7 @@ def rest_inverse(c: row):
 
 @wp.func
 def key_from(times: wp.array[wp.float64], key: int, last: int, t: wp.float64):
-    """The same as ``keyframes.key_before``, but the search starts at an earlier key; ``last`` is the last key but
+    """The same as ``conditions.key_before``, but the search starts at an earlier key; ``last`` is the last key but
     one."""
     found = key
     while found < last and times[found + 1] <= t:
@@ -62,12 +62,13 @@ def key_from(times: wp.array[wp.float64], key: int, last: int, t: wp.float64):
 @functools.cache
 def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
     """Symplectic Euler steps of the corotated model with own rotations; launch ``layout.threads`` threads for each
-    patch.
+    patch of each world.
 
     Args:
         load_vectors: The element type of the array of loads, vec3 or vec4.
     """
     threads, each, halo_each, lanes = layout.threads, layout.elements, layout.halo, layout.lanes
+    exchanges = keeps = not layout.whole
     slot, displacement = vectors_at(0), vectors_at(layout.slots + 1)
     # Weighted dilatations and weights of elements, inverse weights of groups, and pressures of groups.
     shares, groups, members = layout.groups > 0, layout.groups, layout.members
@@ -81,6 +82,19 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
     numbers = wp.types.matrix(shape=(each, CONSTANTS), dtype=wp.float32)
     places = wp.types.vector(length=halo_each, dtype=wp.int32)
     group_places = wp.types.vector(length=each, dtype=wp.int32)
+
+    @wp.func
+    def constants_of(
+        body: PatchBody, e: int, first: int, stride: int, mu: wp.array[wp.float32], lam: wp.array[wp.float32]
+    ):
+        t = (first + body.elements[e]) * stride
+        c = row()
+        for j in range(9):
+            c[j] = body.rest[j, e]
+        volume = body.rest[wp.static(VOLUME_ROW), e]
+        c[9] = volume * mu[t]
+        c[10] = volume * lam[t]
+        return c
 
     @wp.func
     def displacement_gradient(corners: wp.uint64, c: row):
@@ -114,6 +128,11 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
         add_to_slot(number_in(targets, 3), f3)
 
     @wp.func
+    def add_pressure(corners: wp.uint64, targets: wp.uint64, place: int, c: row):
+        pressure = pressure_of(wp.static(LOAD), place % wp.static(groups), 0.0)
+        add_forces(targets, c, pressure_stress(displacement_gradient(corners, c), pressure, c[10]))
+
+    @wp.func
     def sum_of_group(group: int):
         sum = float(0.0)
         for member in range(wp.static(members)):
@@ -128,7 +147,7 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
         slot(wp.static(STORE), number_in(targets, 2), f2)
         slot(wp.static(STORE), number_in(targets, 3), f3)
 
-    @unique_kernel(grid_stride=False, launch_bounds=(threads, 1))
+    @unique_kernel(grid_stride=False, launch_bounds=(threads, layout.resident))
     def step_patches(
         # In
         body: PatchBody,
@@ -156,18 +175,23 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
         _generated_from = wp.static(fingerprint(layout))
         block = wp.tid() // wp.static(threads)
         thread = wp.tid() % wp.static(threads)
-        node_count = body.own.shape[0]
+        patches = body.own_start.shape[0] - 1
+        world = block // patches
+        patch = block % patches
+        first_node = world * body.own.shape[0]
         dt = float(pace.seconds[DT])
         before = float(length_before(pace))
         damped = 1.0 / (1.0 + dt * damping)
-        number = exchange.begun[block]
+        number = wp.uint32(0)
+        if wp.static(exchanges):
+            number = exchange.begun[block]
 
         # The node whose forces the thread sums together with its neighbours; the first of them moves the node.
-        first_own = body.own_start[block]
-        own_count = body.own_start[block + 1] - first_own
+        first_own = body.own_start[patch]
+        own_count = body.own_start[patch + 1] - first_own
         place = thread // wp.static(lanes)
         moves = place < own_count and thread % wp.static(lanes) == 0
-        i = body.own[first_own + wp.min(place, own_count - 1)]
+        i = first_node + body.own[first_own + wp.min(place, own_count - 1)]
         x = load_node(u, i)
         velocity = load_node(v, i)
         w = inverse_mass[i]
@@ -181,40 +205,36 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
             key = body.key_start[trajectory]
             last_key = body.key_start[trajectory + 1] - 2
         warp = thread // wp.static(WARP)
-        bases = body.base_start[block]
-        warps = body.base_start[block + 1] - bases - 1
+        bases = body.base_start[patch]
+        warps = body.base_start[patch + 1] - bases - 1
         first_slot = body.bases[bases + wp.min(warp, warps)] + thread % wp.static(WARP)
         rows = (body.bases[bases + wp.min(warp + 1, warps)] - first_slot + thread % wp.static(WARP)) // wp.static(WARP)
 
-        halo_count = body.halo_start[block + 1] - body.halo_start[block]
+        halo_count = body.halo_start[patch + 1] - body.halo_start[patch]
         halo = places()
         for k in range(wp.static(halo_each)):
             at = thread + k * wp.static(threads)
             if at < halo_count:
-                halo[k] = body.halo[body.halo_start[block] + at]
+                halo[k] = first_node + body.halo[body.halo_start[patch] + at]
 
-        first_element = body.element_start[block]
-        element_count = body.element_start[block + 1] - first_element
-        computed_count = body.computed[block]
+        first_element = body.element_start[patch]
+        element_count = body.element_start[patch + 1] - first_element
+        computed_count = body.computed[patch]
         interior_count = int(0)
         if wp.static(layout.overlaps):
-            interior_count = body.interior[block]
+            interior_count = body.interior[patch]
         corners = words()
         targets = words()
         constants = numbers()
         group_place = group_places()
-        for k in range(wp.static(each)):
+        first_material = world * body.element_count
+        for k in range(wp.static(each if keeps else 0)):
             at = thread + k * wp.static(threads)
             if at < computed_count:
                 e = first_element + at
                 corners[k] = body.corners[e]
                 targets[k] = body.slots[e]
-                for j in range(9):
-                    constants[k, j] = body.rest[j, e]
-                volume = body.rest[wp.static(VOLUME_ROW), e]
-                t = body.elements[e] * stride
-                constants[k, 9] = volume * mu[t]
-                constants[k, 10] = volume * lam[t]
+                constants[k] = constants_of(body, e, first_material, stride, mu, lam)
                 if wp.static(shares):
                     group_place[k] = body.measures[e]
 
@@ -223,12 +243,14 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
         synchronize_block()
         if moves:
             displacement(wp.static(STORE), place, x)
-            publish(exchange.published, int(number & wp.uint32(1)) * node_count + i, x, number)
+            if wp.static(exchanges):
+                publish(exchange.published, int(number & wp.uint32(1)) * exchange.nodes + i, x, number)
         if wp.static(shares):
             at = thread
             while at < element_count:
                 e = first_element + at
-                weight = body.rest[wp.static(VOLUME_ROW), e] * lam[body.elements[e] * stride]
+                t = (first_material + body.elements[e]) * stride
+                weight = body.rest[wp.static(VOLUME_ROW), e] * lam[t]
                 measured(wp.static(STORE), body.measures[e], weight)
                 weight_of(wp.static(STORE), body.measures[e], weight)
                 at += wp.static(threads)
@@ -243,7 +265,7 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
         gave_up = int(0)
         step = int(0)
         while step < steps:
-            buffer = int(number & wp.uint32(1)) * node_count
+            buffer = int(number & wp.uint32(1)) * exchange.nodes
             # First the elements between own nodes, while the halo arrives, then the others.
             begin = int(0)
             end = int(interior_count)
@@ -255,7 +277,7 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                 else:
                     begin = interior_count
                     end = computed_count
-                    for k in range(wp.static(halo_each)):
+                    for k in range(wp.static(halo_each if exchanges else 0)):
                         at = thread + k * wp.static(threads)
                         if at < halo_count:
                             told = await_displacement(exchange.published, buffer + halo[k], number)
@@ -266,14 +288,26 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                 for k in range(wp.static(each)):
                     at = thread + k * wp.static(threads)
                     if at >= begin and at < end:
-                        c = constants[k]
-                        gradient = displacement_gradient(corners[k], c)
+                        c = row()
+                        gradient = wp.mat33()
+                        if wp.static(keeps):
+                            c = constants[k]
+                            gradient = displacement_gradient(corners[k], c)
+                        else:
+                            c = constants_of(body, first_element + at, first_material, stride, mu, lam)
+                            gradient = displacement_gradient(body.corners[first_element + at], c)
                         if wp.static(shares):
                             theta, _slope = measure(gradient)
-                            measured(wp.static(STORE), group_place[k], c[10] * theta)
+                            if wp.static(keeps):
+                                measured(wp.static(STORE), group_place[k], c[10] * theta)
+                            else:
+                                measured(wp.static(STORE), body.measures[first_element + at], c[10] * theta)
                         p, trusted = stretch_stress(gradient, c[9], law_lam(c))
                         if trusted:
-                            store_forces(targets[k], c, p)
+                            if wp.static(keeps):
+                                store_forces(targets[k], c, p)
+                            else:
+                                store_forces(body.slots[first_element + at], c, p)
                         else:
                             left_out |= wp.static(1 << k)
                 phase += 1
@@ -287,11 +321,16 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                 its_corners = corners[0]
                 its_targets = targets[0]
                 c = constants[0]
-                for k in range(1, wp.static(each)):
+                for k in range(1, wp.static(each if keeps else 1)):
                     if chosen == k:
                         its_corners = corners[k]
                         its_targets = targets[k]
                         c = constants[k]
+                if wp.static(not keeps):
+                    e = first_element + thread + chosen * wp.static(threads)
+                    its_corners = body.corners[e]
+                    its_targets = body.slots[e]
+                    c = constants_of(body, e, first_material, stride, mu, lam)
                 f = identity3() + displacement_gradient(its_corners, c)
                 store_forces(its_targets, c, turned_stress(f, c[9], law_lam(c)))
             if wp.static(shares):
@@ -313,11 +352,15 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                     pressure_of(wp.static(STORE), thread, slope_of(mean))
                 synchronize_block()
                 for k in range(wp.static(each)):
-                    if thread + k * wp.static(threads) < computed_count:
-                        c = constants[k]
-                        pressure = pressure_of(wp.static(LOAD), group_place[k] % wp.static(groups), 0.0)
-                        p = pressure_stress(displacement_gradient(corners[k], c), pressure, c[10])
-                        add_forces(targets[k], c, p)
+                    at = thread + k * wp.static(threads)
+                    if at < computed_count:
+                        if wp.static(keeps):
+                            c = constants[k]
+                            add_pressure(corners[k], targets[k], group_place[k], c)
+                        else:
+                            e = first_element + at
+                            c = constants_of(body, e, first_material, stride, mu, lam)
+                            add_pressure(body.corners[e], body.slots[e], body.measures[e], c)
                 synchronize_block()
 
             elastic = wp.vec3()
@@ -332,7 +375,7 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
             number = number + wp.uint32(1)
             if moves:
                 if trajectory >= 0:
-                    t_end = time_after(pace, step + 1) - world_starts[0]
+                    t_end = time_after(pace, step + 1) - world_starts[world]
                     key, share = key_from(body.times, key, last_key, t_end)
                     columns = body.columns[trajectory]
                     at = body.value_start[trajectory] + (key - body.key_start[trajectory]) * columns
@@ -353,7 +396,8 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                         store_node(reactions, i, -(force + mass[i] * gravity))
                 x = x + dt * velocity
                 displacement(wp.static(STORE), place, x)
-                publish(exchange.published, int(number & wp.uint32(1)) * node_count + i, x, number)
+                if wp.static(exchanges):
+                    publish(exchange.published, int(number & wp.uint32(1)) * exchange.nodes + i, x, number)
                 if not is_finite(x):
                     wp.atomic_min(bad_step, 0, pace.counts[DONE] + wp.int64(step + 1))
             before = dt
@@ -366,7 +410,7 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
         if moves:
             store_node(u, i, x)
             store_node(v, i, velocity)
-        if thread == 0:
+        if wp.static(exchanges) and thread == 0:
             exchange.begun[block] = exchange.begun[block] + wp.uint32(steps + 1)
 
     return step_patches

@@ -1,4 +1,4 @@
-"""Corotated forces of orthotropic materials by complete subtrees on CUDA; one thread a subtree, as in ``laws``.
+"""Corotated forces of orthotropic materials by complete subtrees on CUDA; one thread a subtree, as in ``cuda``.
 
 The law is that of ``corotated.anisotropic``. Each leaf is computed in its own frame, in which the columns of F - I are
 differences of displacements, and four unscaled iterations find its rotation. A leaf for which these find no rotation
@@ -13,13 +13,13 @@ import warp as wp
 from warp_corot.kernels.clusters.laws import ActiveMaterial
 from warp_corot.kernels.corotated.anisotropic import FibreMaterial, fibre_stress, filled, listed_stress
 from warp_corot.kernels.corotated.well_conditioned import definite_law, definite_strain, is_definite, load_axes
-from warp_corot.kernels.elements.elements import ForestElements, Subtrees, root_of, scatter_stress
+from warp_corot.kernels.elements.elements import ForestElements, scatter_stress
 from warp_corot.kernels.math.rotation import ITERATIONS, byers_xu, column, identity3, newton_rotation, quick_rotation
 from warp_corot.kernels.modules import unique_kernel
 
-from .forces import handedness_of, maubach_frame, subtree_forces, turn_in, turn_out, turns_of
-from .memory import BLOCK, memory_of
-from .repair import repair_flagged
+from .cuda import scatter_subtrees
+from .degenerate import repair_flagged
+from .forces import handedness_of, mat10, turns_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -57,39 +57,26 @@ def anisotropic_leaves(shape: int, transverse: bool, one_axes: bool, one_stiffne
 
 
 @functools.cache
-def scatter_anisotropic_subtrees(
-    shape: int, grouped: bool, transverse: bool, one_axes: bool, one_stiffness: bool, resident: int = 0
-) -> wp.Kernel:
-    """Add the forces of subtrees. Launch with block_dim BLOCK.
+def shared_axes(one_axes: bool) -> wp.Function:
+    """The subtree's frame, or the material's axes in it if ``one_axes``."""
 
-    ``axes`` are those of the material; ``flagged`` gets the leaves that were left out, a byte a subtree.
-    """
-    load, add = memory_of(shape, grouped)
-    forces = subtree_forces(shape, False, anisotropic_leaves(shape, transverse, one_axes, one_stiffness))
-    options = {"launch_bounds": (BLOCK, resident)} if resident else {}
-
-    @unique_kernel(grid_stride=False, **options)
-    def scatter_anisotropic_subtrees(
-        # In
-        subtrees: Subtrees,
-        material: ActiveMaterial,
-        u: wp.array[wp.vec4],
-        # Out
-        f: wp.array[wp.vec4],
-        flagged: wp.array[wp.uint8],
-    ):
-        s = wp.tid()
-        h, q, mirror = root_of(subtrees, s)
-        q0, q1, q2 = maubach_frame(q, mirror)
-        y = turn_in(load(subtrees, s, u), q0, q1, q2, 1.0 / h)
+    @wp.func
+    def shared_axes(material: ActiveMaterial, y: mat10, first: int, q0: wp.vec3, q1: wp.vec3, q2: wp.vec3):
         shared = wp.matrix_from_cols(q0, q1, q2)
         if wp.static(one_axes):
             shared = wp.transpose(shared) * wp.quat_to_matrix(load_axes(material.axes, 0))
-        g, degenerate = forces(y, h, material, shared, subtrees.first[s])
-        flagged[s] = wp.uint8(degenerate)
-        add(subtrees, s, turn_out(g, q0, q1, q2), f)
+        return shared
 
-    return scatter_anisotropic_subtrees
+    return shared_axes
+
+
+def scatter_anisotropic_subtrees(
+    shape: int, grouped: bool, transverse: bool, one_axes: bool, one_stiffness: bool
+) -> wp.Kernel:
+    """Add the forces of subtrees and flag the leaves that were left out; see ``cuda.scatter_subtrees``. The axes are
+    those of the material."""
+    leaves = anisotropic_leaves(shape, transverse, one_axes, one_stiffness)
+    return scatter_subtrees(shape, grouped, False, leaves, ActiveMaterial, shared_axes(one_axes), "flags")
 
 
 repair_leaves = repair_flagged(FibreMaterial, fibre_stress(byers_xu))

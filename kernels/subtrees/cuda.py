@@ -6,29 +6,45 @@ Sums go to global memory as 16-byte vector reductions if the card has them. The 
 polynomial (``corotated.algebraic``), in the same way for small strains and large ones.
 
 A leaf that is flat, inverted or strained far beyond order one adds nothing. Its bit is set in its subtree's byte, and
-the subtree is put on a list; ``repair`` computes those leaves. A body whose subtrees are all of one type has a kernel
-for that type; any other body is one launch, in which each thread block looks up its work.
+the subtree is put on a list; ``degenerate`` computes those leaves. A body whose subtrees are all of one type has a
+kernel for that type; any other body is one launch, in which each thread block looks up its work.
 """
 
 import functools
+from typing import Any
 
 import warp as wp
 
+from warp_corot.kernels.corotated.algebraic import stretch_stress
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
+from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.kernels.elements.elements import (
     ForestElements,
     Subtrees,
+    add_four_forces,
     frame,
     gradient_of,
     nodal_forces,
     node_displacements,
     root_of,
 )
-from warp_corot.kernels.elements.merging import add_four_forces
 from warp_corot.kernels.modules import unique_kernel
 
 from .degenerate import DegenerateList, append, list_of, reserve
-from .forces import leaf_stress, mat10, own_forces, shared_forces
+from .forces import (
+    always_trusted,
+    isotropic_leaves,
+    leaf_stress,
+    mat10,
+    maubach_frame,
+    own_forces,
+    pressure_leaves,
+    shared_forces,
+    shared_pressure,
+    subtree_forces,
+    turn_in,
+    turn_out,
+)
 from .memory import BLOCK, add_single, group_memory, load_single, memory_of
 
 wp.set_module_options({"enable_backward": False})
@@ -51,21 +67,43 @@ class WorkRange:
     flagged: wp.array[wp.uint8]
 
 
-@functools.cache
-def scatter_subtrees_own(shape: int, grouped: bool, uniform: bool, listed: bool) -> wp.Kernel:
-    """Corotated forces of subtrees of one type, every leaf with its own rotation. Launch with block_dim BLOCK.
+@wp.func
+def nothing_shared(material: Any, y: mat10, first: int, q0: wp.vec3, q1: wp.vec3, q2: wp.vec3):
+    return 0.0
 
-    If ``listed``, subtrees with left-out leaves are put on a list.
+
+@functools.cache
+def scatter_subtrees(
+    shape: int,
+    grouped: bool,
+    uniform: bool,
+    leaves: wp.Function,
+    Material: type = IsotropicMaterial,
+    shared: wp.Function = nothing_shared,
+    missed: str = "",
+    resident: int = 0,
+) -> wp.Kernel:
+    """Forces of subtrees of one type under a law of leaves (``forces``). Launch with block_dim BLOCK.
+
+    Args:
+        shape: The type.
+        grouped: Whether subtrees are in groups.
+        uniform: Whether all leaves have the first one's material.
+        leaves: The law; ``shared`` finds what the leaves of a subtree share from the material, the ten displacements,
+            the first leaf's place and the columns of the subtree's frame.
+        Material: The struct that the law reads.
+        missed: "": the law leaves no leaf out; "flags": left-out leaves are flagged; "list": and their subtrees listed.
+        resident: The number of blocks for which a multiprocessor's registers must have room; 0: any.
     """
     load, add = memory_of(shape, grouped)
-    forces = own_forces(shape, uniform)
-    resident = RESIDENT[shape] if uniform else min(RESIDENT)
+    forces = subtree_forces(shape, uniform, leaves)
+    listed, options = missed == "list", {"launch_bounds": (BLOCK, resident)} if resident else {}
 
-    @unique_kernel(grid_stride=False, launch_bounds=(BLOCK, resident))
-    def scatter_subtrees_own(
+    @unique_kernel(grid_stride=False, **options)
+    def scatter_subtrees(
         # In
         subtrees: Subtrees,
-        material: IsotropicMaterial,
+        material: Material,
         u: wp.array[wp.vec4],
         # Out
         f: wp.array[wp.vec4],
@@ -74,18 +112,39 @@ def scatter_subtrees_own(shape: int, grouped: bool, uniform: bool, listed: bool)
     ):
         s = wp.tid()
         h, q, mirror = root_of(subtrees, s)
-        x = load(subtrees, s, u)
-        leaf = wp.where(wp.static(uniform), 0, subtrees.first[s])
-        g, mask = forces(x, q, h, mirror, material, leaf)
-        flagged[s] = wp.uint8(mask)
+        q0, q1, q2 = maubach_frame(q, mirror)
+        y = turn_in(load(subtrees, s, u), q0, q1, q2, 1.0 / h)
+        first = wp.where(wp.static(uniform), 0, subtrees.first[s])
+        g, mask = forces(y, h, material, shared(material, y, first, q0, q1, q2), first)
+        if wp.static(missed != ""):
+            flagged[s] = wp.uint8(mask)
         reserved = int(0)
         if wp.static(listed):
             reserved = reserve(degenerate, list_of(s // BLOCK), mask != 0, subtrees.code.shape[0] - s)
-        add(subtrees, s, g, f)
+        add(subtrees, s, turn_out(g, q0, q1, q2), f)
         if wp.static(listed):
             append(degenerate, list_of(s // BLOCK), reserved, subtrees.first[s], mask, subtrees.code.shape[0] - s)
 
-    return scatter_subtrees_own
+    return scatter_subtrees
+
+
+def scatter_subtrees_own(shape: int, grouped: bool, uniform: bool, listed: bool) -> wp.Kernel:
+    """Corotated forces, every leaf with its own rotation."""
+    leaves, resident = isotropic_leaves(shape, stretch_stress), RESIDENT[shape] if uniform else min(RESIDENT)
+    missed = "list" if listed else "flags"
+    return scatter_subtrees(shape, grouped, uniform, leaves, missed=missed, resident=resident)
+
+
+def scatter_law_subtrees(shape: int, grouped: bool, uniform: bool, stress: wp.Function) -> wp.Kernel:
+    """Forces of a law of ``elements.constitutive``, which needs no rotation."""
+    return scatter_subtrees(shape, grouped, uniform, isotropic_leaves(shape, always_trusted(stress)))
+
+
+def scatter_dilatation(shape: int, grouped: bool, uniform: bool, of: Dilatation) -> wp.Kernel:
+    """Forces of the dilatation that the eight leaves of a subtree share."""
+    return scatter_subtrees(
+        shape, grouped, uniform, pressure_leaves(shape, of), shared=shared_pressure(shape, uniform, of)
+    )
 
 
 @functools.cache

@@ -1,6 +1,29 @@
-"""Lists of the subtrees with leaves that the subtree kernels left out; see ``repair``."""
+"""Lists of the subtrees with leaves that the subtree kernels left out; see ``degenerate``."""
+
+import functools
+from collections.abc import Callable
+from typing import Any
 
 import warp as wp
+
+from warp_corot.kernels.corotated.algebraic import corotated_stress
+from warp_corot.kernels.corotated.tangent import keep_gradients
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, rotated_stress
+from warp_corot.kernels.elements.elements import (
+    ForestElements,
+    GeneralElements,
+    add_four_forces,
+    frame,
+    local_gradient,
+    nodal_forces,
+    scatter_stress,
+)
+from warp_corot.kernels.elements.forces import repair_forces
+from warp_corot.kernels.math.matrices import identity3
+from warp_corot.kernels.math.rotation import rotation_out_of_line
+from warp_corot.kernels.modules import unique_kernel
+
+wp.set_module_options({"enable_backward": False})
 
 #: Number of leaves of a subtree.
 LEAVES = 8
@@ -23,6 +46,10 @@ class DegenerateList:
     counts: wp.array[wp.int32]  # [(LISTS + 1) COUNT_STRIDE]
     room: int  # capacity of a list
     entries: wp.array[wp.vec2i]  # [LISTS room] first leaf of the subtree (own rotations) or the subtree, and its mask
+
+
+#: The argument of kernels that write no list.
+NO_LIST = DegenerateList()
 
 
 @wp.func_native(f"""
@@ -149,3 +176,242 @@ def leaves_of_entries(lists: DegenerateList, begin: int, entries: int, k: int) -
     So every thread gets a leaf even if few leaves of each entry were left out.
     """
     ...
+
+
+# --- forces of listed and flagged leaves -----------------------------------------------------------------------------
+#
+# Forces of the leaves that the subtree kernels left out, mostly flat or inverted ones, with a rotation that is right
+# for every F.
+#
+# A byte for each subtree, with a bit for each leaf, says which these are. On CUDA the subtrees that have any are in
+# lists (``DegenerateList``), which one launch of a fixed size processes. On the CPU, and where sums must have a fixed
+# order, a thread reads the bytes of eight subtrees at a time, which are nearly always all zero, and processes their
+# leaves in order.
+
+
+#: Number of subtrees that one thread processes; the length of ``flagged`` is a multiple of it.
+SUBTREES = 8
+
+# More rounds would cost more arithmetic than the atomic additions that they save.
+add_pairs = add_four_forces(1)
+
+
+@wp.func
+def is_degenerate(flags: wp.uint64, leaf: int):
+    """Whether the ``leaf``-th of the 64 leaves of eight subtrees was left out."""
+    return ((flags >> wp.uint64(leaf)) & wp.uint64(1)) != wp.uint64(0)
+
+
+@wp.func
+def scatter_turned(
+    elements: ForestElements,
+    t: int,
+    r: wp.mat33,
+    material: IsotropicMaterial,
+    u: wp.array[wp.vec4],
+    f: wp.array[wp.vec4],
+):
+    """Add the forces of element t with a given rotation r from rest space."""
+    q = frame(elements, t)
+    m = material.mu[t * material.stride]
+    k = material.lam[t * material.stride]
+    scatter_stress(elements, t, rotated_stress(local_gradient(elements, t, u), q, r * q, m, k), f)
+
+
+@wp.func(inline=False)
+def stress_out_of_line(w: wp.mat33, mu: float, lam: float):
+    return corotated_stress(w, mu, lam)
+
+
+@wp.func
+def own_stress(elements: Any, t: int, material: IsotropicMaterial, u: wp.array[wp.vec4]):
+    """First Piola-Kirchhoff stress of element t with its own rotation, times Q, for any F."""
+    q = frame(elements, t)
+    w = wp.transpose(q) * local_gradient(elements, t, u)
+    m = material.mu[t * material.stride]
+    k = material.lam[t * material.stride]
+    return q * stress_out_of_line(w, m, k)
+
+
+@wp.func
+def root_rotation(roots: ForestElements, s: int, u: wp.array[wp.vec4]):
+    q = frame(roots, s)
+    return rotation_out_of_line(q + local_gradient(roots, s, u)) * wp.transpose(q)
+
+
+# --- by a list ------------------------------------------------------------------------------------------------------
+
+
+@unique_kernel(grid_stride=False)
+def repair_listed_own(
+    # In
+    threads: int,
+    elements: ForestElements,
+    material: IsotropicMaterial,
+    u: wp.array[wp.vec4],
+    # In and out
+    listed: DegenerateList,
+    # Out
+    f: wp.array[wp.vec4],
+):
+    """Add the forces of listed leaves, each with its own rotation, a thread a leaf.
+
+    Forces of neighbours are added up before they go to memory. Launch with block_dim LIST_BLOCK and ``threads``
+    threads, a multiple of LIST_BLOCK, or one.
+    """
+    if not any_degenerate(listed):
+        return
+    lanes = wp.min(threads, WARP)
+    warps = threads // lanes
+    warp = wp.tid() // lanes
+    # A warp processes one of the lists at a time, together with others.
+    at_a_time = wp.min(warps, LISTS)
+    list = warp % at_a_time
+    each_list = (warps - list + at_a_time - 1) // at_a_time
+    while list < LISTS:
+        count = entry_count(listed, list)
+        each = wp.clamp((count + each_list - 1) // each_list, 1, WARP)
+        begin = (warp // at_a_time) * each
+        while begin < count:
+            total = leaves_of_entries(listed, listed.room * list + begin, wp.min(each, count - begin), -1)
+            k = wp.tid() % lanes
+            # All threads of a warp stay together, because ``add_pairs`` sums the forces of neighbours.
+            while k - k % lanes < total:
+                t = int(0)
+                targets = wp.vec4i(-1, -1, -1, -1)
+                p = wp.mat33()
+                if k < total:
+                    t = leaves_of_entries(listed, 0, 0, k)
+                    targets = elements.targets[t]
+                    p = own_stress(elements, t, material, u)
+                f0, f1, f2, f3 = nodal_forces(elements, t, p)
+                add_pairs(f, targets, f0, f1, f2, f3)
+                k += lanes
+            begin += each_list * each
+        list += at_a_time
+    leave(listed, threads // LIST_BLOCK)
+
+
+@unique_kernel(grid_stride=False)
+def repair_listed_shared(
+    # In
+    threads: int,
+    first: wp.array[wp.int32],
+    roots: ForestElements,
+    elements: ForestElements,
+    material: IsotropicMaterial,
+    u: wp.array[wp.vec4],
+    # In and out
+    listed: DegenerateList,
+    # Out
+    f: wp.array[wp.vec4],
+):
+    """Add the forces of all leaves of listed subtrees with the rotation of the subtree's root, a thread a leaf.
+
+    Launch it like ``repair_listed_own``.
+    """
+    if not any_degenerate(listed):
+        return
+    at_a_time = wp.min(threads, LISTS)
+    list = wp.tid() % at_a_time
+    each_list = (threads - list + at_a_time - 1) // at_a_time
+    while list < LISTS:
+        i = wp.tid() // at_a_time
+        while i < entry_count(listed, list) * LEAVES:
+            s = listed.entries[listed.room * list + i // LEAVES][0]
+            t = first[s] + i % LEAVES
+            scatter_turned(elements, t, root_rotation(roots, s, u), material, u, f)
+            i += each_list
+        list += at_a_time
+    leave(listed, threads // LIST_BLOCK)
+
+
+# --- by bytes, in order ---------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def repair_flagged(Material: type, stress: wp.Function, kernel: Callable = unique_kernel) -> wp.Kernel:
+    """Add the forces of flagged leaves under a law of ``elements.forces`` that is right for every F.
+
+    So many ``lanes`` share a word of 64 bits, one for each leaf of eight subtrees; nearly always all bits are zero. In
+    one lane leaves come in order.
+    """
+
+    @kernel()
+    def repair_flagged(
+        # In
+        lanes: int,
+        flagged: wp.array[wp.uint64],
+        first: wp.array[wp.int32],
+        elements: ForestElements,
+        material: Material,
+        u: wp.array[wp.vec4],
+        # Out
+        f: wp.array[wp.vec4],
+    ):
+        i = wp.tid() // lanes
+        flags = flagged[i]
+        if flags == wp.uint64(0):
+            return
+        leaf = wp.tid() % lanes
+        while leaf < SUBTREES * LEAVES:
+            if is_degenerate(flags, leaf):
+                t = first[SUBTREES * i + leaf // LEAVES] + leaf % LEAVES
+                scatter_stress(elements, t, stress(elements, t, material, u), f)
+            leaf += lanes
+
+    return repair_flagged
+
+
+@wp.kernel(enable_backward=False)
+def turn_listed(
+    # In
+    elements: GeneralElements,
+    u: wp.array[wp.vec4],
+    # In and out
+    listed: wp.array[wp.int32],
+    # Out
+    gradients: wp.array[wp.vec4],
+):
+    """Write the kept gradients of listed elements, by one thread, which empties the list; see
+    ``corotated.tangent``."""
+    for i in range(listed[0]):
+        t = listed[i + 1]
+        turn = rotation_out_of_line(identity3() + local_gradient(elements, t, u))
+        keep_gradients(elements, t, turn, gradients)
+    listed[0] = 0
+
+
+@unique_kernel()
+def repair_shared(
+    # In
+    flagged: wp.array[wp.uint64],
+    first: wp.array[wp.int32],
+    roots: ForestElements,
+    elements: ForestElements,
+    material: IsotropicMaterial,
+    u: wp.array[wp.vec4],
+    # Out
+    f: wp.array[wp.vec4],
+):
+    """Add the forces of flagged leaves, each with the rotation of its subtree's root."""
+    i = wp.tid()
+    flags = flagged[i]
+    if flags == wp.uint64(0):
+        return
+    member = int(0)
+    while member < SUBTREES:
+        if is_degenerate(flags, LEAVES * member):
+            s = SUBTREES * i + member
+            rotation = root_rotation(roots, s, u)
+            leaf = int(0)
+            while leaf < LEAVES:
+                t = first[s] + leaf
+                scatter_turned(elements, t, rotation, material, u, f)
+                leaf += 1
+        member += 1
+
+
+#: Of corotated leaves with own rotations, and of listed general elements.
+repair_own = repair_flagged(IsotropicMaterial, own_stress, functools.partial(wp.kernel, enable_backward=False))
+repair_elements = repair_forces(GeneralElements, IsotropicMaterial, own_stress)

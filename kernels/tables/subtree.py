@@ -11,7 +11,7 @@ Plain Python tables, as ``shapes``.
 
 import itertools
 
-from warp_corot.kernels.elements.stiffness import STIFFNESS_LAMBDA, STIFFNESS_MU
+from warp_corot.kernels.elements.shapes import STIFFNESS_LAMBDA, STIFFNESS_MU
 
 from .shapes import GRADIENT, REST
 

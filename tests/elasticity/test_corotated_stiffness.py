@@ -23,8 +23,7 @@ from tangents import (
 )
 
 import warp_corot as wc
-from warp_corot.elasticity.corotated.subtree_tangent import SubtreeTangent, subtrees_of
-from warp_corot.elasticity.corotated.tangents import RotatedTangent
+from warp_corot.elasticity.corotated.tangents import RotatedTangent, SubtreeTangent, subtrees_of
 
 MU, LAM = oracle.lame(MATERIAL["young"], MATERIAL["poisson"])
 CASES = ("level 3", "level 4", "level 5", "mixed levels", "general")
@@ -223,7 +222,7 @@ def test_products_over_subtrees_are_the_same(level, device, rng):
 
 
 def test_large_bodies_on_cuda_have_products_over_subtrees(device, monkeypatch):
-    monkeypatch.setattr("warp_corot.elasticity.corotated.subtrees.FEWEST", 1)
+    monkeypatch.setattr("warp_corot.elasticity.corotated.fields.FEWEST", 1)
     field = bound(wc.TetForest.box((1, 1, 1), CUBE, 6), device)
     assert isinstance(field.tangent(), SubtreeTangent) == field.device.is_cuda
     assert not isinstance(field.tangent(exact=True), SubtreeTangent)

@@ -14,11 +14,9 @@ from tangents import diagonal
 import warp_corot as wc
 from warp_corot.discretization.deviatoric import deviatoric
 from warp_corot.discretization.discretization import FixedMesh
-from warp_corot.elasticity.backends.law_cuda import LawCudaField
-from warp_corot.elasticity.backends.law_simd8 import LawSimd8Field
-from warp_corot.elasticity.corotated.elements import Simd8Field
-from warp_corot.elasticity.corotated.subtrees import SubtreeField
-from warp_corot.elasticity.dilatation.field import DilatationField
+from warp_corot.elasticity.corotated.fields import Simd8Field, SubtreeField
+from warp_corot.elasticity.dilatation import DilatationField
+from warp_corot.elasticity.laws import LawCudaField, LawSimd8Field
 
 YOUNG, POISSON = 1e4, 0.4
 MODELS = {

@@ -6,7 +6,7 @@ import warp as wp
 from remesh_cases import CUBE, random_marks
 
 import warp_corot as wc
-from warp_corot.elasticity.structs import isotropic_material
+from warp_corot.elasticity.model import isotropic_material
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, stvk_stress
 from warp_corot.kernels.elements.forces import law_stress, scatter_forces
 

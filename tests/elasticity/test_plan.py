@@ -8,7 +8,7 @@ from plan_oracle import complete_subtrees
 import warp_corot as wc
 from warp_corot.discretization.planning.fixed import ForcePlan
 from warp_corot.discretization.subtrees import Sharing
-from warp_corot.kernels.elements.stiffness import STIFFNESS_LAMBDA, STIFFNESS_MU
+from warp_corot.kernels.elements.shapes import STIFFNESS_LAMBDA, STIFFNESS_MU
 from warp_corot.kernels.tables import subtree
 
 MATERIAL = wc.Isotropic(young=1e4, poisson=0.4, density=1000.0)

@@ -9,8 +9,8 @@ from cases import mixed_forest, random_displacement
 from tangents import assert_diagonal, assert_symmetric, on_device, product
 
 import warp_corot as wc
-from warp_corot.elasticity.tensors import gradients, green_strain
-from warp_corot.kernels.elements import prony
+from warp_corot.elasticity.float64 import displacement_gradients, green_strain
+from warp_corot.kernels.elements import added as prony
 from warp_corot.kernels.elements.forces import scatter_forces
 from warp_corot.kernels.elements.simd8 import LANES
 
@@ -192,7 +192,7 @@ def test_elements_carry_their_history_where_the_mesh_changes(device, tmp_path):
         if remesh is not None:
             assert body.element_count > 200
             known = sim.fields[0].state["prony"].numpy().reshape(12, -1)[:, : body.element_count]
-            f = gradients(body.mesh.points, body.mesh.tets, body.displacements.numpy())
+            f = displacement_gradients(body.mesh.points, body.mesh.tets, body.displacements.numpy())
             strain = green_strain(f)
             strain -= np.trace(strain, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
             assert np.abs(known[3] - strain[:, 0, 1]).max() < 0.02 * np.abs(strain).max()

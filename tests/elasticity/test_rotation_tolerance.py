@@ -8,8 +8,8 @@ from cases import edge_scale, oracle_mesh
 
 import warp_corot as wc
 from warp_corot.discretization.planning.fixed import ForcePlan
-from warp_corot.elasticity.corotated.options import AUTO_TOLERANCE
-from warp_corot.elasticity.structs import isotropic_material
+from warp_corot.elasticity.corotated.model import AUTO_TOLERANCE
+from warp_corot.elasticity.model import isotropic_material
 from warp_corot.kernels.subtrees import cpu as subtree_cpu
 
 MU, LAM = oracle.lame(1e4, 0.4)

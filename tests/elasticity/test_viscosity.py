@@ -5,10 +5,10 @@ import pytest
 import warp as wp
 
 import warp_corot as wc
-from warp_corot.elasticity.viscosity import Viscosity
+from warp_corot.elasticity.added_stress import Viscosity
+from warp_corot.kernels.elements.added import ViscousMaterial, viscosity_stress
 from warp_corot.kernels.elements.forces import scatter_forces
 from warp_corot.kernels.elements.simd8 import LANES
-from warp_corot.kernels.elements.viscosity import ViscousMaterial, viscosity_stress
 
 BOX = wc.TetForest.box((1, 1, 2), 0.1, 3)
 GENERAL = wc.TetMesh(BOX.points, BOX.tets)

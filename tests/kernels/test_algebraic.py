@@ -5,8 +5,7 @@ import oracle
 import pytest
 import warp as wp
 
-from warp_corot.kernels.corotated.algebraic import corotated_stress, stretch_stress
-from warp_corot.kernels.corotated.energy import corotated_energy
+from warp_corot.kernels.corotated.algebraic import corotated_energy, corotated_stress, stretch_stress
 
 MU, LAM = 1.0, 9.0
 

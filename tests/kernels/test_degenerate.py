@@ -13,8 +13,8 @@ from degenerate_launches import Launches
 
 import warp_corot as wc
 from warp_corot.discretization.planning.fixed import ForcePlan
-from warp_corot.elasticity.corotated.degenerate import DegenerateLeaves
-from warp_corot.elasticity.structs import isotropic_material
+from warp_corot.elasticity.corotated.launches import DegenerateLeaves
+from warp_corot.elasticity.model import isotropic_material
 from warp_corot.kernels.subtrees.degenerate import COUNT_STRIDE, LISTS
 
 TOLERANCE = 1e-5  # of the largest force, as in test_miscompile

@@ -15,10 +15,9 @@ from thousands import FORESTS, TOLERANCE, materials, meshed, turned
 
 import warp_corot as wc
 from warp_corot.discretization.planning.fixed import ForcePlan
-from warp_corot.elasticity.backends.clusters import ClusterScatter, clustered
-from warp_corot.elasticity.corotated.anisotropic import AnisotropicField
-from warp_corot.elasticity.corotated.anisotropic_cuda import active_material, as_bytes
-from warp_corot.elasticity.structs import isotropic_material
+from warp_corot.elasticity.anisotropic import AnisotropicField, active_material, as_bytes
+from warp_corot.elasticity.clusters import ClusterScatter, clustered
+from warp_corot.elasticity.model import isotropic_material
 from warp_corot.kernels.clusters.laws import ActiveMaterial, anisotropic_law, isotropic_law, reinforced_law
 from warp_corot.kernels.corotated.anisotropic import FibreMaterial, fibre_stress
 from warp_corot.kernels.corotated.well_conditioned import quaternions_of
@@ -30,7 +29,8 @@ from warp_corot.kernels.elements.general_cuda import corotated_law
 from warp_corot.kernels.elements.ogden import ogden
 from warp_corot.kernels.math.rotation import byers_xu, quick_rotation
 from warp_corot.kernels.subtrees.anisotropic import repair_leaves, scatter_anisotropic_subtrees, scatter_flat
-from warp_corot.kernels.subtrees.laws import scatter_subtrees
+from warp_corot.kernels.subtrees.cuda import scatter_law_subtrees
+from warp_corot.kernels.subtrees.degenerate import NO_LIST
 from warp_corot.kernels.subtrees.memory import BLOCK
 from warp_corot.kernels.tables.cluster_layout import ANISOTROPIC
 
@@ -97,9 +97,9 @@ def test_subtrees_one_by_one(name, law, device, rng):
     plan = ForcePlan.of_forest(mesh, None, wp.get_device(device), grouped=False)
     for batch in plan.batches:
         by_node(batch.subtrees, body.device)
-        kernel = scatter_subtrees(batch.shape, False, uniform, LAWS[law])
+        kernel = scatter_law_subtrees(batch.shape, False, uniform, LAWS[law])
         inputs = [batch.subtrees, isotropic_of(body.discretization), on_device]
-        wp.launch(kernel, batch.count, inputs=inputs, outputs=[f], device=device, block_dim=BLOCK)
+        wp.launch(kernel, batch.count, inputs, [f, batch.flagged, NO_LIST], device=device, block_dim=BLOCK)
     inside = np.ones(len(mesh.tets), bool)
     inside[plan.flat.leaves.numpy()] = False
     assert inside.sum() > 100
@@ -141,7 +141,7 @@ def test_anisotropic_subtrees_one_by_one(name, kind, device, rng):
         left = wp.zeros(-(-batch.count // 8), dtype=wp.uint64, device=device)
         kernel = scatter_anisotropic_subtrees(batch.shape, False, *options)
         inputs = [batch.subtrees, active_material(whole.passive, axes, 1, active), on_device]
-        wp.launch(kernel, batch.count, inputs=inputs, outputs=[f, as_bytes(left)], device=device, block_dim=BLOCK)
+        wp.launch(kernel, batch.count, inputs, [f, as_bytes(left), NO_LIST], device=device, block_dim=BLOCK)
         inputs = [8, left, batch.subtrees.first, body.discretization.elements, fibres, on_device]
         wp.launch(repair_leaves, 8 * len(left), inputs=inputs, outputs=[f], device=device)
         flags += np.unpackbits(as_bytes(left).numpy()).sum()

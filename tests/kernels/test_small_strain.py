@@ -13,7 +13,7 @@ from degenerate_launches import Launches
 
 import warp_corot as wc
 from warp_corot.discretization.planning.fixed import ForcePlan
-from warp_corot.elasticity.structs import isotropic_material
+from warp_corot.elasticity.model import isotropic_material
 from warp_corot.kernels.subtrees.cuda import scatter_subtrees_shared
 from warp_corot.kernels.subtrees.degenerate import DegenerateList
 

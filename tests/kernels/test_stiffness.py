@@ -6,7 +6,7 @@ import pytest
 from cases import CUBE, oracle_mesh, place, random_displacement, simulation
 
 import warp_corot as wc
-from warp_corot.kernels.elements.stiffness import STIFFNESS_LAMBDA, STIFFNESS_MU
+from warp_corot.kernels.elements.shapes import STIFFNESS_LAMBDA, STIFFNESS_MU
 
 ZEROS_OF_THE_TABLE = (70, 44, 72)
 ZEROS_OF_THE_AXES = (70, 44, 56)

@@ -9,8 +9,7 @@ import numpy as np
 
 from warp_corot.domain.units import length
 from warp_corot.elasticity import MODELS
-from warp_corot.elasticity.dilatation import ELEMENT
-from warp_corot.elasticity.dilatation.options import shares_dilatation
+from warp_corot.elasticity.dilatation import ELEMENT, shares_dilatation
 from warp_corot.holding.choice import NAMED
 from warp_corot.inputs.processes import process_count
 from warp_corot.inputs.stopwatch import KERNELS, WATCH

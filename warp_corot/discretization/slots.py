@@ -1,4 +1,4 @@
-"""Slots: one place for every force that a unit of work adds to a node; see ``kernels.elements.reproducible``."""
+"""Slots: one place for every force that a unit of work adds to a node; see ``kernels.elements.elements``."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import warp as wp
 
 from warp_corot.errors import InputError
 from warp_corot.inputs.cpu_threads import launch
-from warp_corot.kernels.elements.reproducible import gather_slots
+from warp_corot.kernels.elements.elements import gather_slots
 from warp_corot.kernels.plan.slots import find_starts, number_slots, order_slots
 
 from .elements import in_worlds

@@ -22,7 +22,7 @@ from warp_corot.contact.shapes import Shape
 from warp_corot.contact.tool import Obstacle, Tool
 from warp_corot.cutting.blade import Blade
 from warp_corot.elasticity import Corotated, ForceField, Linear, Model, NeoHookean, StVenantKirchhoff
-from warp_corot.elasticity.dilatation.options import ELEMENT, SHARED, shares_dilatation
+from warp_corot.elasticity.dilatation import ELEMENT, SHARED, shares_dilatation
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_count
 from warp_corot.inputs.device import checked_device

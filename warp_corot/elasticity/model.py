@@ -5,7 +5,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from typing import TYPE_CHECKING, ClassVar, NamedTuple, Protocol, cast
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Generic, NamedTuple, Protocol, TypeAlias, TypeVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -15,10 +16,15 @@ from warp_corot.discretization.discretization import Discretization, Discretized
 from warp_corot.discretization.members import Members
 from warp_corot.discretization.plan import FlatLeaves, Plan
 from warp_corot.discretization.subtrees import Batch, chosen
+from warp_corot.elasticity.divided import DividedForces, Piece
 from warp_corot.errors import InputError
 from warp_corot.inputs.cpu_threads import Regions, Team, launch
 from warp_corot.inputs.loading import LoadedKernel
-from warp_corot.kernels.elements.constitutive import IsotropicMaterial
+from warp_corot.kernels.corotated.anisotropic import FibreMaterial
+from warp_corot.kernels.corotated.tangent import KeptStrains
+from warp_corot.kernels.elements.added import Prestress, PronyMaterial
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
+from warp_corot.kernels.elements.fibres import ReinforcedMaterial
 from warp_corot.kernels.elements.forces import (
     element_energies,
     element_von_mises,
@@ -27,20 +33,79 @@ from warp_corot.kernels.elements.forces import (
     law_value,
     scatter_forces,
 )
+from warp_corot.kernels.elements.mean_dilatation import DilatedMaterial
 from warp_corot.kernels.elements.native_laws import IsotropicLaw
-from warp_corot.kernels.elements.stiffness_products import law_differential
-
-from .backends.divided import DividedForces, Piece
-from .stress_law import ElementMaterial, StressLaw
-from .structs import Kept, isotropic_material
-from .tangent import ElementTangent, Tangent
+from warp_corot.kernels.elements.stiffness_products import (
+    add_stiffness_diagonal,
+    add_stiffness_product,
+    law_differential,
+)
 
 if TYPE_CHECKING:
-    from warp_corot.discretization.discretization import Discretization
+    from warp_corot.elasticity.clusters import ClusterScatter
+    from warp_corot.elasticity.cpu import Dilating
     from warp_corot.kernels.stepping.pace import Pace
 
-    from .backends.clusters import ClusterScatter
-    from .backends.mean_dilatation import Dilating
+
+S = TypeVar("S")
+
+
+class Kept(Generic[S]):
+    """The struct of some values, made again if one of these is another object.
+
+    Args:
+        make: Makes the struct of the values.
+    """
+
+    def __init__(self, make: Callable[..., S]):
+        self._make = make
+        self._values: tuple = ()
+        self._struct: S | None = None
+
+    def __call__(self, *values: object) -> S:
+        if self._struct is None or any(a is not b for a, b in zip(values, self._values, strict=True)):
+            self._values, self._struct = values, self._make(*values)
+        return self._struct
+
+
+def isotropic_material(given: list) -> IsotropicMaterial:
+    """``kernels.elements.constitutive.IsotropicMaterial`` of mu, lambda and their stride."""
+    material = IsotropicMaterial()
+    material.mu, material.lam, material.stride = given
+    return material
+
+
+# --- laws for derivatives --------------------------------------------------------------------------------------------
+
+
+#: Structs of materials.
+ElementMaterial: TypeAlias = (
+    "IsotropicMaterial | RotatedMaterial | KeptStrains | FibreMaterial | ReinforcedMaterial | PronyMaterial "
+    "| Prestress | DilatedMaterial"
+)
+
+
+@dataclass(frozen=True)
+class StressLaw:
+    """First Piola-Kirchhoff stress of a law in each element.
+
+    Attributes:
+        stress: Device function (elements, t, material, u) -> P, see ``kernels.elements.forces``.
+        differential: Its exact derivative (elements, t, material, u, dg) -> dP, as
+            ``kernels.elements.stiffness_products`` takes it.
+        material: The struct that both read.
+        Material: Its type; for ``IsotropicMaterial`` the stress is linear in Lamé's parameters.
+        sees_shape: Whether the stress depends on an element's rest shape besides its deformation gradient.
+    """
+
+    stress: wp.Function
+    differential: wp.Function
+    material: ElementMaterial
+    Material: type = IsotropicMaterial
+    sees_shape: bool = False
+
+
+# --- force fields and models -----------------------------------------------------------------------------------------
 
 
 class SmallForces(Protocol):
@@ -485,3 +550,73 @@ class LawField(ElementField):
             cauchy=law_cauchy(law.stress) if law.cauchy is None else law_value(law.cauchy),
             deterministic=deterministic,
         )
+
+
+# --- The stiffness of a force field at stored displacements, for the many products of an iterative solver ---
+
+
+class Tangent(ABC):
+    """K(u) of a force field, with the same u from one ``take`` to the next.
+
+    Args:
+        field: The field.
+
+    Attributes:
+        displacements: u [m], vec4, with the length of the first one; ``take`` fills it.
+    """
+
+    def __init__(self, field: ForceField):
+        self.field = field
+        self.displacements = wp.zeros(0, dtype=wp.vec4, device=field.device)
+
+    @property
+    def kernels(self) -> list[wp.Kernel]:
+        """Kernels of factories that products launch; each that is named is loaded beside others."""
+        return []
+
+    def prepare(self, u: wp.array) -> None:
+        """Allocate memory for displacements like these; not while launches are recorded."""
+        if len(self.displacements) != len(u):
+            self.displacements = wp.zeros_like(u)
+
+    def take(self, u: wp.array) -> None:
+        """Launch the update of K to displacements u."""
+        wp.copy(self.displacements, u)
+
+    @abstractmethod
+    def add_product(self, p: wp.array, y: wp.array) -> None:
+        """Launch y += K p [N]; both vec4 [worlds * N]."""
+
+    @abstractmethod
+    def add_diagonal(self, blocks: wp.array) -> None:
+        """Launch the addition of the 3x3 blocks on K's diagonal to those of the nodes [N/m], mat33 [worlds * N]."""
+
+
+class ElementTangent(Tangent):
+    """K of a law, element by element on every path of forces; see ``kernels.elements.stiffness_products``.
+
+    Args:
+        field: The field.
+        differential: Device function (elements, t, material, u, dg) -> dP.
+        material: Gives the struct that it reads.
+        Material: The type of the struct.
+    """
+
+    def __init__(
+        self,
+        field: ForceField,
+        differential: wp.Function,
+        material: Callable[[], ElementMaterial],
+        Material: type = IsotropicMaterial,
+    ):
+        super().__init__(field)
+        self._material = material
+        self._generated_from = field.discretization.element_kind, Material, differential
+
+    def add_product(self, p: wp.array, y: wp.array) -> None:
+        inputs = [self.field.elements, self._material(), self.displacements, p]
+        self.field.launch(add_stiffness_product(*self._generated_from), self.field.element_count, inputs, [y])
+
+    def add_diagonal(self, blocks: wp.array) -> None:
+        inputs = [self.field.elements, self._material(), self.displacements]
+        self.field.launch(add_stiffness_diagonal(*self._generated_from), 4 * self.field.element_count, inputs, [blocks])

@@ -9,9 +9,8 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.elasticity import ForceField
-from warp_corot.elasticity.dilatation.field import DilatationField
-from warp_corot.elasticity.stress_law import StressLaw
-from warp_corot.elasticity.structs import isotropic_material
+from warp_corot.elasticity.dilatation import DilatationField
+from warp_corot.elasticity.model import StressLaw, isotropic_material
 from warp_corot.errors import InputError
 from warp_corot.kernels.corotated.anisotropic import FibreMaterial
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial

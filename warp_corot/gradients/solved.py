@@ -29,9 +29,9 @@ def solved_state(body: SoftBody, *, precision: str = FLOAT32, model: Model | Non
     if precision not in (FLOAT32, FLOAT64):
         raise InputError(f"precision is {shown(precision)}; it must be {FLOAT32!r} or {FLOAT64!r}")
     if precision == FLOAT64 and isinstance(body, SoftBody):
-        from warp_corot.solvers.implicit.precise import checked_host_law
+        from warp_corot.solvers.implicit.precise import checked_float64_law
 
-        checked_host_law(body, Corotated() if model is None else model)
+        checked_float64_law(body, Corotated() if model is None else model)
     solved = RestState(body, model=model, **options)
     if precision == FLOAT32:
         return solved

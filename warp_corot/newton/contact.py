@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warp_corot.elasticity.structs import Kept
+from warp_corot.elasticity.model import Kept
 from warp_corot.errors import InputError
 from warp_corot.kernels.newton import explicit_rows, records, rows
 from warp_corot.kernels.newton.pairs import PairLists

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 import numpy as np
 import warp as wp
 
-from warp_corot.elasticity.structs import isotropic_material
+from warp_corot.elasticity.model import isotropic_material
 from warp_corot.errors import InputError
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, linear_stress
 from warp_corot.kernels.elements.elements import GeneralElements

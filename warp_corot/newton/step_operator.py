@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import warp as wp
 
-from warp_corot.elasticity.structs import isotropic_material
-from warp_corot.kernels.corotated.kept_gradients import PLACES, KeptGradients, add_kept_product
+from warp_corot.elasticity.model import isotropic_material
+from warp_corot.kernels.corotated.tangent import PLACES, KeptGradients, add_kept_product
 from warp_corot.kernels.elements.elements import GeneralElements
 from warp_corot.kernels.elements.simd8 import LANES
 from warp_corot.kernels.elements.stiffness_products import add_stiffness_product

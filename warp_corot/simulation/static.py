@@ -208,9 +208,9 @@ def _check_precision(precision: str, body: SoftBody, law: Model, *, touches: boo
         raise InputError(f"precision is {shown(precision)}; it must be {FLOAT32!r} or {FLOAT64!r}")
     if precision == FLOAT32:
         return
-    from warp_corot.solvers.implicit.precise import checked_host_law
+    from warp_corot.solvers.implicit.precise import checked_float64_law
 
-    checked_host_law(body, law)
+    checked_float64_law(body, law)
     if touches:
         raise InputError("precision is 'float64'; with obstacles or contact it must be 'float32'")
     if not body.conditions.held_mask().reshape(body.worlds, -1).any(axis=1).all():

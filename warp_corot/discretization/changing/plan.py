@@ -14,8 +14,8 @@ from warp_corot.discretization.plan import LeafCounts, Units
 from warp_corot.discretization.planning.arrays import GRANULE, PlanArrays, Room
 from warp_corot.discretization.planning.planner import Planner
 from warp_corot.discretization.subtrees import Sharing
+from warp_corot.kernels.elements.cpu import rest_matrices
 from warp_corot.kernels.elements.elements import ForestElements
-from warp_corot.kernels.elements.general_cpu import rest_matrices
 from warp_corot.kernels.plan import changing as kernels
 from warp_corot.kernels.plan.plan import Plan
 from warp_corot.kernels.plan.tree import Tree

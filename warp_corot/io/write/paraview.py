@@ -15,7 +15,7 @@ from xml.sax.saxutils import escape, quoteattr
 import numpy as np
 import numpy.typing as npt
 
-from warp_corot.elasticity.tensors import cauchy_stress, gradients, green_strain, has_tensor
+from warp_corot.elasticity.float64 import cauchy_stress, displacement_gradients, green_strain, has_tensor
 from warp_corot.errors import InputError
 from warp_corot.io.files.whole import check_output, writing, written_whole
 from warp_corot.mesh.surfaces.boundary import right_handed, signed_volumes
@@ -67,15 +67,15 @@ def fields_of(sim: Simulation, worlds: Sequence[Any], time: float) -> Fields:
         nodal.setdefault("displacement", []).append(displacements.astype(np.float32))
         nodal.setdefault("velocity", []).append(world.velocities.numpy())
         nodal.setdefault("fixed", []).append(body.constrained[world.nodes].astype(np.int8))
-        f = gradients(mesh.points, mesh.tets, displacements)
-        elemental.setdefault("strain", []).append(green_strain(f).reshape(-1, 9).astype(np.float32))
+        a = displacement_gradients(mesh.points, mesh.tets, displacements)
+        elemental.setdefault("strain", []).append(green_strain(a).reshape(-1, 9).astype(np.float32))
         if tensors:
             count = len(mesh.tets)
             young, poisson = (
                 np.broadcast_to(getattr(body.material, name), (body.worlds, count))[world.index]
                 for name in ("young", "poisson")
             )
-            stress = cauchy_stress(model, f, young, poisson)
+            stress = cauchy_stress(model, a, young, poisson)
             elemental.setdefault("stress", []).append(stress.reshape(-1, 9).astype(np.float32))
         elemental.setdefault("von_mises", []).append(sim.von_mises(body)[world.elements])
         if labelled:

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from warp_corot.elasticity.corotated.elements import CorotatedField
-from warp_corot.elasticity.dilatation.field import DilatationField
+from warp_corot.elasticity.corotated.fields import CorotatedField
+from warp_corot.elasticity.dilatation import DilatationField
 from warp_corot.inputs.cpu_threads import Regions
 from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.elements.elements import ForestElements

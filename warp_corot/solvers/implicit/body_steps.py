@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 import warp as wp
 
-from warp_corot.elasticity.viscosity import Viscosity
+from warp_corot.elasticity.added_stress import Viscosity
 from warp_corot.errors import InputError
 from warp_corot.inputs.loading import load
-from warp_corot.kernels.elements.prony import set_elapsed
+from warp_corot.kernels.elements.added import set_elapsed
 from warp_corot.kernels.implicit import steps as kernels
 from warp_corot.solvers.halo import ALONE
 

@@ -11,10 +11,10 @@ from scipy.sparse import block_array
 from scipy.sparse.linalg import SuperLU, splu
 
 from warp_corot.elasticity import ForceField, Model
-from warp_corot.elasticity.dilatation.field import DilatationField
-from warp_corot.elasticity.dilatation.on_host import HostDilatation
-from warp_corot.elasticity.host_laws import HostLaw, host_law
+from warp_corot.elasticity.dilatation import DilatationField
+from warp_corot.elasticity.float64 import SharedDilatation, float64_law
 from warp_corot.errors import ConvergenceError, InputError
+from warp_corot.kernels.elements.native_laws import IsotropicLaw
 from warp_corot.materials.isotropic import Isotropic
 
 from .precise_elements import PreciseElements
@@ -70,7 +70,8 @@ class PreciseRest:
 
     Raises:
         InputError: The model or the material does not exist in float64.
-        ConvergenceError: Newton's method does not converge from the present state, or the stiffness is singular.
+        ConvergenceError: Newton's method does not converge from the present state, the stiffness is singular, or an
+            element is crushed so far that it has no rotation.
     """
 
     def __init__(
@@ -78,10 +79,10 @@ class PreciseRest:
     ):
         self._contacts = contacts
         self.pushes = [each.pushes for each in contacts]
-        of_host = checked_host_law(body, law)
-        shared = HostDilatation(field) if isinstance(field, DilatationField) else None
+        of_float64 = checked_float64_law(body, law)
+        shared = SharedDilatation(field) if isinstance(field, DilatationField) else None
         worlds, count = body.worlds, body.sizes.nodes
-        self.elements = [PreciseElements(body, of_host, shared, world) for world in range(worlds)]
+        self.elements = [PreciseElements(body, of_float64, shared, world) for world in range(worlds)]
         self._loads = loads.reshape(worlds, -1, 3)
         self.held = body.conditions.held_mask().reshape(worlds, -1)
         # Free nodes of no element stay where they are.
@@ -152,13 +153,13 @@ class PreciseRest:
             raise ConvergenceError("the stiffness is singular: the state of rest has no gradient") from None
 
 
-def checked_host_law(body: SoftBody, law: Model) -> HostLaw:
+def checked_float64_law(body: SoftBody, law: Model) -> IsotropicLaw:
     """The law in float64.
 
     Raises:
         InputError: The law does not exist in float64.
     """
-    found = host_law(law)
+    found = float64_law(law)
     if found is None or not isinstance(body.material, Isotropic):
         raise InputError(
             "precision is 'float64'; it needs an isotropic material and Linear, Corotated, StVenantKirchhoff, "

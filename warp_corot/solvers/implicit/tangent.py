@@ -13,7 +13,7 @@ from warp_corot.solvers.halo import ALONE, Halo
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
-    from warp_corot.elasticity.viscosity import Viscosity
+    from warp_corot.elasticity.added_stress import Viscosity
 
 
 class TangentOperator:

@@ -1,0 +1,340 @@
+"""Viscoelastic stresses of a Prony series: Maxwell elements beside the elastic law, in rest space.
+
+Element i has the shear modulus g_i mu and the relaxation time tau_i. Its overstrain s_i, symmetric and without trace,
+follows ds_i/dt = dE/dt - s_i / tau_i with E the deviator of Green's strain, and its second Piola-Kirchhoff stress is 2
+g_i mu s_i. None of this depends on how the body has turned. If E grows evenly over a time t, then exactly
+    s_i(t) = exp(-t / tau_i) s_i(0) + phi (E(t) - E(0)),  phi = (1 - exp(-t / tau_i)) tau_i / t.
+So forces t after a known state are those of an elastic law with the energy density
+    sum_i g_i mu (phi |E - E(0)|^2 + 2 exp(-t / tau_i) s_i(0) : (E - E(0)) + exp(-t / tau_i) |s_i(0)|^2),
+which at t = 0 is the energy that the Maxwell elements hold.
+"""
+
+import functools
+from typing import Any
+
+import warp as wp
+
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, corotated_strain, green_strain, hooke, symmetric
+from warp_corot.kernels.elements.elements import ForestElements, frame, local_gradient
+from warp_corot.kernels.elements.simd8 import headers, on_cpu
+from warp_corot.kernels.math.matrices import axial, identity3
+from warp_corot.kernels.math.rotation import byers_xu, identity3
+from warp_corot.kernels.modules import unique_kernel
+from warp_corot.kernels.plan.plan import Plan, extent, leaf_row
+from warp_corot.kernels.stepping.pace import DT, Pace
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class PronyMaterial:
+    """The elastic material, the series, and the known state of each element.
+
+    ``known`` has blocks of six numbers a tensor, each of ``count`` elements: E(0), and the overstrains in their order.
+    """
+
+    isotropic: IsotropicMaterial
+    g: wp.array[wp.float32]  # [terms]
+    tau: wp.array[wp.float32]  # [terms] [s]
+    elapsed: wp.array[wp.float32]  # [1] t [s]
+    known: wp.array[wp.float32]  # [6 (terms + 1) count]
+    count: int
+
+
+@wp.func
+def deviator(a: wp.mat33):
+    return a - (wp.trace(a) / 3.0) * identity3()
+
+
+@wp.func
+def read_tensor(material: PronyMaterial, block: int, t: int):
+    first = 6 * block * material.count + t
+    n = material.count
+    xx = material.known[first]
+    yy = material.known[first + n]
+    zz = material.known[first + 2 * n]
+    xy = material.known[first + 3 * n]
+    xz = material.known[first + 4 * n]
+    yz = material.known[first + 5 * n]
+    return wp.mat33(xx, xy, xz, xy, yy, yz, xz, yz, zz)
+
+
+@wp.func
+def write_tensor(material: PronyMaterial, block: int, t: int, a: wp.mat33):
+    first = 6 * block * material.count + t
+    n = material.count
+    material.known[first] = a[0, 0]
+    material.known[first + n] = a[1, 1]
+    material.known[first + 2 * n] = a[2, 2]
+    material.known[first + 3 * n] = a[0, 1]
+    material.known[first + 4 * n] = a[0, 2]
+    material.known[first + 5 * n] = a[1, 2]
+
+
+@wp.func
+def fading(time: float, tau: float):
+    """exp(-t / tau) and phi, to all their digits, also for an infinite time."""
+    x = time / tau
+    left = wp.exp(-x)
+    mean = 1.0 - 0.5 * x * (1.0 - x / 3.0 * (1.0 - 0.25 * x))
+    if x > 0.02:
+        mean = (1.0 - left) / x
+    return left, mean
+
+
+@wp.func
+def rest_gradient(elements: Any, t: int, u: wp.array[wp.vec4]):
+    """du/dX in the axes of rest space."""
+    return local_gradient(elements, t, u) * wp.transpose(frame(elements, t))
+
+
+@wp.func
+def second_stress(material: PronyMaterial, t: int, strain: wp.mat33):
+    """The second Piola-Kirchhoff stress of all terms, of E."""
+    change = strain - read_tensor(material, 0, t)
+    s = wp.mat33()
+    for i in range(material.g.shape[0]):
+        left, mean = fading(material.elapsed[0], material.tau[i])
+        s += material.g[i] * (left * read_tensor(material, i + 1, t) + mean * change)
+    return (2.0 * material.isotropic.mu[t * material.isotropic.stride]) * s
+
+
+@wp.func
+def prony_stress(elements: Any, t: int, material: PronyMaterial, u: wp.array[wp.vec4]):
+    a = rest_gradient(elements, t, u)
+    s = second_stress(material, t, deviator(green_strain(a)))
+    return (s + a * s) * frame(elements, t)
+
+
+@wp.func
+def prony_differential(elements: Any, t: int, material: PronyMaterial, u: wp.array[wp.vec4], dg: wp.mat33):
+    a = rest_gradient(elements, t, u)
+    da = dg * wp.transpose(frame(elements, t))
+    s = second_stress(material, t, deviator(green_strain(a)))
+    d_strain = deviator(symmetric(da + wp.transpose(a) * da))
+    stiffness = float(0.0)
+    for i in range(material.g.shape[0]):
+        _left, mean = fading(material.elapsed[0], material.tau[i])
+        stiffness += material.g[i] * mean
+    d_s = (2.0 * stiffness * material.isotropic.mu[t * material.isotropic.stride]) * d_strain
+    return (da * s + d_s + a * d_s) * frame(elements, t)
+
+
+@wp.func
+def prony_density(elements: Any, t: int, material: PronyMaterial, u: wp.array[wp.vec4]):
+    change = deviator(green_strain(rest_gradient(elements, t, u))) - read_tensor(material, 0, t)
+    density = float(0.0)
+    for i in range(material.g.shape[0]):
+        left, mean = fading(material.elapsed[0], material.tau[i])
+        s = read_tensor(material, i + 1, t)
+        own = mean * wp.ddot(change, change) + left * (2.0 * wp.ddot(s, change) + wp.ddot(s, s))
+        density += material.g[i] * own
+    return density * material.isotropic.mu[t * material.isotropic.stride]
+
+
+@functools.cache
+def relax(Elements: type) -> wp.Kernel:
+    """Make the state at displacements u, after a step of the clock's length, the known one."""
+
+    @unique_kernel()
+    def relax(
+        # In
+        elements: Elements,
+        u: wp.array[wp.vec4],
+        pace: Pace,
+        # In and out
+        material: PronyMaterial,
+    ):
+        t = wp.tid()
+        strain = deviator(green_strain(rest_gradient(elements, t, u)))
+        change = strain - read_tensor(material, 0, t)
+        time = float(pace.seconds[DT])
+        for i in range(material.g.shape[0]):
+            left, mean = fading(time, material.tau[i])
+            write_tensor(material, i + 1, t, left * read_tensor(material, i + 1, t) + mean * change)
+        write_tensor(material, 0, t, strain)
+        if t == 0:
+            material.elapsed[0] = 0.0
+
+    return relax
+
+
+@wp.kernel(enable_backward=False)
+def set_elapsed(
+    # In
+    begins: wp.array[wp.int32],
+    shares: wp.array3d[wp.float32],
+    row: int,
+    dt: float,
+    # Out
+    elapsed: wp.array[wp.float32],
+):
+    """The time of the stage of an implicit step after its beginning [s]; see ``implicit.steps``."""
+    elapsed[0] = shares[begins[0], row, 0] * dt
+
+
+@wp.kernel(enable_backward=False)
+def carry_values(
+    # In
+    leaves: wp.array[wp.int32],
+    known: wp.array[wp.float32],
+    first: int,
+    blocks: int,
+    count: int,
+    # Out
+    columns: wp.array2d[wp.float32],
+):
+    """Let the elements of a mesh that changes carry their known state, from column ``first`` on."""
+    i = wp.tid()
+    for k in range(blocks):
+        columns[leaves[i], first + k] = known[k * count + i]
+
+
+@wp.kernel(enable_backward=False)
+def adopt_values(
+    # In
+    threads: int,
+    plan: Plan,
+    first: int,
+    blocks: int,
+    count: int,
+    # Out
+    known: wp.array[wp.float32],
+):
+    """Take the known state that the leaves of a changed mesh carry from row ``first`` on, if the plan was just derived;
+    padding gets zeros.
+    """
+    for i in range(wp.tid(), extent(leaf_row(plan), plan), threads):
+        for k in range(blocks):
+            known[k * count + i] = plan.values[first + k, i]
+
+
+@wp.kernel(enable_backward=False)
+def forget(
+    # In
+    chosen: wp.array[wp.int32],
+    world_count: int,
+    count: int,
+    # Out
+    known: wp.array[wp.float32],
+):
+    """Forget the past of the chosen worlds: they are relaxed and at rest."""
+    i = wp.tid()
+    if chosen[(i % count) // world_count] != 0:
+        known[i] = 0.0
+
+
+# --- relaxation on the CPU, eight elements at a time; see ``simd8`` --------------------------------------------------
+
+
+@functools.cache
+def relax_simd8(Elements: type) -> wp.Kernel:
+    """Make the state at displacements u, after a step of the clock's length, the known one; a thread is eight
+    elements."""
+
+    traversal = "ForestEight" if Elements is ForestElements else "ListableGeneralEight"
+
+    @wp.func_native(on_cpu(f"corot::relax_eight<corot::{traversal}>(material, units, block, count, u, time);"))
+    def eight_elements(
+        units: Elements, block: int, count: int, u: wp.array[wp.vec4], time: float, material: PronyMaterial
+    ): ...
+
+    @unique_kernel(native=headers("elements8", "added"))
+    def relax_simd8(
+        # In
+        elements: Elements,
+        count: int,
+        u: wp.array[wp.vec4],
+        pace: Pace,
+        # In and out
+        material: PronyMaterial,
+    ):
+        block = wp.tid()
+        eight_elements(elements, block, count, u, float(pace.seconds[DT]), material)
+        if block == 0:
+            material.elapsed[0] = 0.0
+
+    return relax_simd8
+
+
+# --- prestress -------------------------------------------------------------------------------------------------------
+#
+# Stress that a body has at rest: a constant second Piola-Kirchhoff stress S of each element.
+#
+# P = F S is the derivative of the energy density S : E with Green's strain E; it turns with the body.
+
+
+@wp.struct
+class Prestress:
+    """S in the axes of rest space, one entry (stride 0) or one per element (stride 1)."""
+
+    stress: wp.array[wp.mat33]
+    stride: int
+
+
+@wp.func
+def prestress_stress(elements: Any, t: int, material: Prestress, u: wp.array[wp.vec4]):
+    s = material.stress[t * material.stride]
+    return (s + rest_gradient(elements, t, u) * s) * frame(elements, t)
+
+
+@wp.func
+def prestress_differential(elements: Any, t: int, material: Prestress, u: wp.array[wp.vec4], dg: wp.mat33):
+    q = frame(elements, t)
+    return dg * wp.transpose(q) * material.stress[t * material.stride] * q
+
+
+@wp.func
+def prestress_density(elements: Any, t: int, material: Prestress, u: wp.array[wp.vec4]):
+    return wp.ddot(material.stress[t * material.stride], green_strain(rest_gradient(elements, t, u)))
+
+
+# --- viscosity -------------------------------------------------------------------------------------------------------
+#
+# Viscous forces: a stress proportional to the rate at which an element's stretch changes, however it turns.
+#
+# With F = R U, Fdot = (du/dt) grad N and A = R^T Fdot, A = W U + Udot, where W = R^T Rdot is skew and Udot symmetric.
+# The skew part of A says W: (tr(U) I - U) w is the axial vector of A - A^T. Udot vanishes where a body turns as a
+# whole, at any strain. The stress s = eta (2 mu Udot + lambda tr(Udot) I) works against Udot; the force that does the
+# same work at the nodes is that of P = R (s + [a]x), with (tr(U) I - U) a the axial vector of U s - s U: it takes out
+# s : Udot >= 0 of power and has no torque.
+
+#: Below this determinant of tr(U) I - U, which is 8 at rest, the turning of a crushed or inverted element is hardly
+#: determined. With stretches a > 0 > b it is (a - b) / (a + b) times Udot and so faster than the nodes, which no
+#: explicit step survives. Below, the symmetric part of A stands for Udot, which still takes power out.
+LEAST = wp.constant(0.05)
+
+
+@wp.struct
+class ViscousMaterial:
+    """Lamé's parameters [Pa], viscosities over these [s], and the velocities of nodes [m/s]."""
+
+    isotropic: IsotropicMaterial
+    seconds: float
+    velocities: wp.array[wp.vec4]
+
+
+@wp.func
+def viscous_stress(u: wp.mat33, a: wp.mat33, mu: float, lam: float):
+    """R^T P of a stretch U, a rate A and viscosities [Pa s]."""
+    m = wp.trace(u) * identity3() - u
+    if wp.determinant(m) < LEAST or wp.determinant(u) < 0.0:
+        return hooke(symmetric(a), mu, lam)
+    inverse = wp.inverse(m)
+    rate = symmetric(a - wp.skew(inverse * axial(a)) * u)
+    s = hooke(rate, mu, lam)
+    return s + wp.skew(inverse * axial(u * s))
+
+
+@wp.func
+def viscosity_stress(elements: Any, t: int, material: ViscousMaterial, u: wp.array[wp.vec4]):
+    """The viscous stress of element t for the kernels of ``forces``; forces are the stiffness times seconds times
+    velocities, for small motions."""
+    g = local_gradient(elements, t, u)
+    q = frame(elements, t)
+    r = byers_xu(q + g)
+    stretch = identity3() + corotated_strain(g, q, r)
+    rate = wp.transpose(r) * local_gradient(elements, t, material.velocities)
+    eta = material.seconds
+    i = t * material.isotropic.stride
+    return r * viscous_stress(stretch, rate, eta * material.isotropic.mu[i], eta * material.isotropic.lam[i])

@@ -1,0 +1,155 @@
+"""Forces of tetrahedra one by one on the CPU, eight to the lanes of vector registers; see ``simd8``.
+
+For tetrahedra of a forest that are in no complete subtree, a rest matrix is worked out once. An element of which a law
+finds no rotation adds nothing and is put on a list, which ``forces.repair_forces`` goes through.
+"""
+
+import functools
+from typing import Any
+
+import warp as wp
+
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial
+from warp_corot.kernels.elements.dilatation import MOST, Dilatation
+from warp_corot.kernels.elements.elements import ForestElements, GeneralElements, frame, gradient_of, rest_volume
+from warp_corot.kernels.elements.native_laws import IsotropicLaw, NativeLaw, elastic
+from warp_corot.kernels.elements.simd8 import headers, on_cpu, scatter_simd8
+from warp_corot.kernels.modules import unique_kernel
+
+wp.set_module_options({"enable_backward": False})
+
+
+@functools.cache
+def scatter_law_elements(law: IsotropicLaw) -> wp.Kernel:
+    """Forces of general elements under an isotropic law; a thread is eight of them. Elements left out are listed."""
+    of_law = elastic(law)
+    call = f"corot::scatter_general({of_law.code}, units, block, count, u, f, missed)"
+    return scatter_simd8(call, GeneralElements, IsotropicMaterial, wp.int32, headers("elements8", of_law.header))
+
+
+@functools.cache
+def scatter_listed_elements(Elements: type, Material: type, law: NativeLaw) -> wp.Kernel:
+    """The same of elements of either kind under any law, or of those on a list if it is not empty."""
+    traversal = "ForestEight" if Elements is ForestElements else "ListableGeneralEight"
+    arguments = f"{law.code}, elements, block, count, listed, u, f, missed"
+
+    @wp.func_native(on_cpu(f"corot::scatter_listed<corot::{traversal}>({arguments});"))
+    def eight_elements(
+        elements: Elements,
+        block: int,
+        count: int,
+        listed: wp.array[wp.int32],
+        material: Material,
+        u: wp.array[wp.vec4],
+        f: wp.array[wp.vec4],
+        missed: wp.array[wp.int32],
+    ): ...
+
+    @unique_kernel(native=headers("elements8", law.header))
+    def scatter_listed_elements(
+        # In
+        elements: Elements,
+        count: int,
+        listed: wp.array[wp.int32],
+        material: Material,
+        u: wp.array[wp.vec4],
+        # Out
+        f: wp.array[wp.vec4],
+        missed: wp.array[wp.int32],
+    ):
+        eight_elements(elements, wp.tid(), count, listed, material, u, f, missed)
+
+    return scatter_listed_elements
+
+
+@wp.func
+def rest_inverse_of(elements: Any, t: int, turn: wp.mat33):
+    """B [3, 3] with G turn = (d1 d2 d3) B, where d are the displacements of the last three nodes from the first."""
+    # Linear in them: they enter by their rows, one at a time.
+    o = wp.vec3(0.0, 0.0, 0.0)
+    x = wp.vec3(1.0, 0.0, 0.0)
+    rows = wp.mat33()
+    rows[0] = (gradient_of(elements, t, o, x, o, o) * turn)[0]
+    rows[1] = (gradient_of(elements, t, o, o, x, o) * turn)[0]
+    rows[2] = (gradient_of(elements, t, o, o, o, x) * turn)[0]
+    return rows
+
+
+@wp.kernel(enable_backward=False)
+def rest_matrices(
+    # In
+    elements: ForestElements,
+    # Out
+    rest_inverse: wp.array[wp.mat33],
+    volume: wp.array[wp.float32],
+):
+    """What general elements keep, of elements of a forest."""
+    t = wp.tid()
+    rest_inverse[t] = rest_inverse_of(elements, t, wp.transpose(frame(elements, t)))
+    volume[t] = rest_volume(elements, t)
+
+
+# --- groups that share a dilatation ----------------------------------------------------------------------------------
+#
+# A dilatation that groups of elements share, on the CPU, eight elements to the lanes of vector registers.
+#
+# Elements stand group after group, and one launch computes the law and the shared dilatation: a thread takes a few
+# groups.
+
+
+#: Groups of a thread.
+GROUPS = 4
+
+
+@wp.struct
+class GroupedMaterial:
+    """Elements group after group, and their material, whose lambda the groups share: ``isotropic`` has none."""
+
+    isotropic: IsotropicMaterial
+    lam: wp.array[wp.float32]
+    starts: wp.array[wp.int32]  # [groups + 1] the first element of each group
+    live: wp.array[wp.int32]  # [1] how many groups there are; empty: all
+
+
+@functools.cache
+def scatter_grouped_elements(law: IsotropicLaw, of: Dilatation) -> wp.Kernel:
+    """Forces of a law of ``native_laws`` with a shared dilatation; a thread is ``GROUPS`` groups.
+
+    The corotated law lists what it leaves out.
+    """
+    of_law, kind = elastic(law, "material.isotropic"), f"corot::{of.lanes}, {GROUPS}, {MOST}"
+    call = f"corot::scatter_groups<{kind}>({of_law.code}, units, block, count, material, u, f, missed)"
+    return scatter_simd8(call, GeneralElements, GroupedMaterial, wp.int32, headers("groups8", of_law.header))
+
+
+@functools.cache
+def order_elements(Elements: type) -> wp.Kernel:
+    """Puts elements in the order of their groups."""
+
+    @unique_kernel()
+    def order_elements(
+        # In
+        elements: Elements,
+        material: IsotropicMaterial,
+        lam: wp.array[wp.float32],
+        members: wp.array[wp.int32],
+        live: wp.array[wp.int32],
+        # In and out
+        general: GeneralElements,
+        grouped: GroupedMaterial,
+    ):
+        k = wp.tid()
+        last = members.shape[0]
+        if live.shape[0] > 0:
+            last = grouped.starts[live[0]]
+        if k >= last:
+            return
+        t = members[k]
+        general.nodes[k] = elements.nodes[t]
+        general.rest_inverse[k] = rest_inverse_of(elements, t, wp.transpose(frame(elements, t)))
+        general.volume[k] = rest_volume(elements, t)
+        if material.stride > 0:
+            grouped.isotropic.mu[k] = material.mu[t]
+            grouped.lam[k] = lam[t]
+
+    return order_elements

@@ -1,0 +1,324 @@
+"""Materials with directions: corotated elasticity of anisotropic ones, the law of Holzapfel, Gasser and Ogden, and
+active stress along fibres."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import warp as wp
+
+from warp_corot.discretization.discretization import Discretization, discretization_of
+from warp_corot.discretization.elements import E, copied
+from warp_corot.discretization.plan import Plan
+from warp_corot.elasticity.clusters import divided
+from warp_corot.elasticity.cpu import ByElements, Lanes, as_general
+from warp_corot.elasticity.dilatation import AUTO, bind_law, check_dilatation
+from warp_corot.elasticity.model import ElementField, ForceField, Kept, Model
+from warp_corot.errors import InputError
+from warp_corot.inputs.loading import LoadedKernel
+from warp_corot.kernels.clusters.laws import ActiveMaterial, anisotropic_law, reinforced_law
+from warp_corot.kernels.corotated.anisotropic import (
+    FibreMaterial,
+    OrthotropicMaterial,
+    active_density,
+    anisotropic_differential,
+    fibre_cauchy,
+    fibre_density,
+    fibre_stress,
+)
+from warp_corot.kernels.corotated.anisotropic_simd8 import scatter_anisotropic_simd8, turn_changed, turn_elements
+from warp_corot.kernels.corotated.well_conditioned import quaternions_of
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial
+from warp_corot.kernels.elements.dilatation import LOG_VOLUME
+from warp_corot.kernels.elements.fibres import (
+    ReinforcedMaterial,
+    reinforced_cauchy,
+    reinforced_density,
+    reinforced_differential,
+    reinforced_stress,
+)
+from warp_corot.kernels.elements.forces import element_energies, repair_forces
+from warp_corot.kernels.elements.native_laws import FIBRES
+from warp_corot.kernels.math.rotation import byers_xu, quick_rotation
+from warp_corot.kernels.subtrees.anisotropic import repair_leaves, scatter_anisotropic_subtrees, scatter_flat
+from warp_corot.kernels.subtrees.degenerate import NO_LIST
+from warp_corot.kernels.subtrees.memory import BLOCK
+from warp_corot.kernels.tables.cluster_layout import ANISOTROPIC
+from warp_corot.materials.anisotropic import TransverselyIsotropic
+from warp_corot.materials.reinforced import FibreReinforced
+
+if TYPE_CHECKING:
+    from warp_corot.discretization.discretization import Discretized
+
+
+class FibreField(ElementField):
+    """Force field of a material with directions, along the first of which there may be an active stress.
+
+    Args:
+        discretization, functions: As for ``ElementField``.
+
+    Attributes:
+        passive: The material without the active stress.
+    """
+
+    takes_anisotropic: ClassVar[bool] = True
+
+    def __init__(self, discretization: Discretization, **functions: Any):
+        super().__init__(discretization, **functions)
+        self.passive = discretization.anisotropic_material()
+        self._fibres = Kept(fibre_material)
+
+    @property
+    def fibres(self) -> FibreMaterial:
+        """The material with directions, with the present active stress."""
+        return self._fibres(self.passive, *self._activation)
+
+    @property
+    def _activation(self) -> list:
+        return [int(self.discretization.has_activation), self.discretization.activation]
+
+    def write_energies(self, u: wp.array, energies: wp.array) -> None:
+        # In one part: ``part_of`` does not cut materials with directions.
+        self.launch(self._energies, self.element_count, [self.elements, self.material, u], [energies])
+
+    def write_potentials(self, u: wp.array, energies: wp.array) -> None:
+        self.write_energies(u, energies)
+        if self.discretization.has_activation:
+            kernel = element_energies(self.discretization.element_kind, FibreMaterial, active_density, adds=True)
+            self.launch(kernel, self.element_count, [self.elements, self.fibres, u], [energies])
+
+
+class AnisotropicField(FibreField):
+    """W = V/2 e : C : e with e = sym(R^T F) - I, R the element's own rotation, C fixed in rest space.
+
+    The force is the gradient of W, with the derivative of R, which isotropic materials do not need, and conserves
+    linear and angular momentum. If the rotation of F is ill-defined (F is inverted, or flattened to a sixth in two
+    directions, as by fibres that stretch 3.4 times; see ``kernels.corotated.anisotropic``), C blends into that of the
+    nearest isotropic material, and the force is the gradient of that energy.
+
+    The active stress of ``SoftBody.activation`` is added: P = s (F d) d^T along the fibres' direction d. It conserves
+    both momenta. It does work, and has no energy.
+
+    The stiffness is exact, with the derivative of R, at the present active stress; it is bounded if the rotation of F
+    is ill-defined (``kernels.corotated.tangent``).
+
+    Args:
+        discretization: A discretization with an ``Anisotropic`` material.
+        rotation: The device function that finds rotations.
+        deterministic: As for every field.
+    """
+
+    def __init__(self, discretization: Discretization, rotation: wp.Function, deterministic: bool):
+        super().__init__(
+            discretization,
+            stress=fibre_stress(rotation),
+            differential=anisotropic_differential(rotation),
+            density=fibre_density(rotation),
+            cauchy=fibre_cauchy(rotation),
+            Material=FibreMaterial,
+            deterministic=deterministic,
+        )
+
+    @property
+    def material(self) -> FibreMaterial:
+        return self.fibres
+
+    @property
+    def material_shown(self) -> FibreMaterial:
+        return self.fibres
+
+
+def fibre_material(passive: OrthotropicMaterial, is_active: int, activation: wp.array) -> FibreMaterial:
+    """An orthotropic material with an active stress."""
+    material = FibreMaterial()
+    material.passive, material.is_active, material.activation = passive, is_active, activation
+    return material
+
+
+class AnisotropicSimd8Field(AnisotropicField):
+    """On the CPU, eight elements at a time."""
+
+    def __init__(self, discretization: Discretization, rotation: wp.Function, deterministic: bool):
+        super().__init__(discretization, rotation, deterministic)
+        # The elements as general ones, with rest matrices in the material's axes.
+        inputs = [self.elements, self.passive]
+        self._general = as_general(self.elements, turn_elements(discretization.element_kind), inputs)
+        self.follow()
+
+    @property
+    def _force_kernels(self) -> list[LoadedKernel]:
+        repair = repair_forces(self.discretization.element_kind, FibreMaterial, fibre_stress(byers_xu))
+        return [scatter_anisotropic_simd8, repair]
+
+    def follow(self) -> None:
+        scatter, repair = self._force_kernels
+        elements, general = (_first(each, self.element_count) for each in (self.elements, self._general))
+        self._lanes = Lanes(elements, general, scatter=scatter, repair=repair)
+
+    def derive(self) -> None:
+        counts = self.plan.counts
+        assert counts is not None
+        inputs = [counts.threads, counts.goes, counts.now, counts.before, self.elements, self.passive]
+        self.launch(turn_changed, counts.threads, inputs, [self._general.rest_inverse, self._general.volume])
+
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
+        self._lanes.scatter_forces(self.fibres, u, f)
+
+
+def _first(elements: E, count: int) -> E:
+    """The first elements of either kind."""
+    some = copied(elements)
+    some.nodes = some.targets = elements.nodes[:count]
+    return some
+
+
+# --- on CUDA: subtrees, clusters, and elements one by one ------------------------------------------------------------
+
+
+class AnisotropicCudaField(AnisotropicField):
+    """Complete subtrees in batches; other elements one by one or, if the mesh never changes, in clusters. Forces may be
+    summed in any order.
+
+    Args:
+        discretization: A mesh with an ``Anisotropic`` material, on CUDA.
+    """
+
+    def __init__(self, discretization: Discretization):
+        super().__init__(discretization, quick_rotation, deterministic=False)
+        self._transverse = isinstance(discretization.material, TransverselyIsotropic)
+        self._quaternions = wp.empty(len(self.passive.axes), dtype=wp.quat, device=self.device)
+        self.derive()
+        self.follow()
+
+    _force_kernels: list[LoadedKernel] = []  # noqa: RUF012 (never changed)
+
+    def plan_of(self, discretization: Discretization) -> Plan:
+        return discretization.plan(subtrees=discretization.prefers_subtrees)
+
+    def load_kernels(self) -> None:
+        for shape, grouped, _sharing in self.plan.kinds:
+            wp.load_module(self._kernel(shape, grouped).module, self.device, block_dim=BLOCK)
+        for kernel in (scatter_flat, repair_leaves):
+            wp.load_module(kernel.module, self.device)
+
+    def derive(self) -> None:
+        self.launch(quaternions_of, len(self._quaternions), [self.passive.axes], [self._quaternions])
+
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
+        fibres, flat = self.fibres, self.plan.flat
+        active = active_material(self.passive, self._quaternions, *self._activation)
+        for batch, kernel, flags in zip(self._batches, self._kernels, self._flags, strict=True):
+            inputs, outputs = [batch.subtrees, active, u], [f, as_bytes(flags), NO_LIST]
+            wp.launch(kernel, batch.count, inputs=inputs, outputs=outputs, device=self.device, block_dim=BLOCK)
+            inputs = [8, flags, batch.subtrees.first, self.elements, fibres, u]
+            self.launch(repair_leaves, 8 * len(flags), inputs, [f])
+        if self._clusters is not None:
+            self._clusters(active, u, f)
+        elif len(flat):
+            self.launch(scatter_flat, len(flat), [flat.elements, flat.leaves, fibres, u], [f])
+
+    def follow(self) -> None:
+        law = anisotropic_law(self._transverse)
+        self._batches, self._clusters = divided(self.discretization, self.plan, law, ActiveMaterial, ANISOTROPIC)
+        self._kernels = [self._kernel(batch.shape, batch.grouped) for batch in self._batches]
+        self._flags = [wp.zeros(-(-b.count // 8), dtype=wp.uint64, device=self.device) for b in self._batches]
+
+    def _kernel(self, shape: int, grouped: bool) -> wp.Kernel:
+        one_axes, one_stiffness = self.passive.axes_stride == 0, self.passive.stride == 0
+        return scatter_anisotropic_subtrees(shape, grouped, self._transverse, one_axes, one_stiffness)
+
+
+def active_material(
+    passive: OrthotropicMaterial, axes: wp.array, is_active: int, activation: wp.array
+) -> ActiveMaterial:
+    """``kernels.clusters.laws.ActiveMaterial`` from its parts."""
+    material = ActiveMaterial()
+    material.passive, material.axes = passive, axes
+    material.is_active, material.activation = is_active, activation
+    return material
+
+
+def as_bytes(flags: wp.array) -> wp.array:
+    """The memory of uint64 [n] as uint8 [8 n]."""
+    return wp.array(ptr=flags.ptr, dtype=wp.uint8, shape=8 * len(flags), device=flags.device)
+
+
+# --- the law of Holzapfel, Gasser and Ogden, for tissue with families of fibres --------------------------------------
+
+
+@dataclass(frozen=True)
+class HolzapfelGasserOgden(Model):
+    """W = V (W_neo-Hookean + sum over families of k1 / (2 k2) (exp(k2 e^2) - 1)) for tissue with fibres.
+
+    The body's material must be ``FibreReinforced``: it has Young's modulus and Poisson's ratio of the matrix, and k1,
+    k2, the dispersion kappa and the directions a of the fibres. e = kappa (tr C - 3) + (1 - 3 kappa) (a . C a - 1), C =
+    F^T F; families with e < 0 carry no stress (Gasser, Ogden and Holzapfel 2006; with the whole C, so that fibres
+    respond to changes of volume, as Nolan et al. 2014 recommend). The matrix is ``NeoHookean``, which bounds the
+    stiffness of crushed and inverted elements; the stiffness of fibres is bounded at a thousand times k1 by a parabola
+    beyond e = sqrt(4.6 / k2).
+
+    Attributes:
+        dilatation: Dilatation of the matrix: "element", "shared" or "auto", as for ``NeoHookean``.
+    """
+
+    dilatation: str = AUTO
+
+    def __post_init__(self) -> None:
+        check_dilatation(self.dilatation)
+
+    def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:
+        discretization = discretization_of(body)
+        if not isinstance(discretization.material, FibreReinforced):
+            name = type(discretization.material).__name__
+            raise InputError(f"the material is {name}; for HolzapfelGasserOgden it must be FibreReinforced")
+        return bind_law(ReinforcedField, LOG_VOLUME, self.dilatation, discretization, deterministic)
+
+
+class ReinforcedField(FibreField):
+    """The forces of ``HolzapfelGasserOgden``; on the CPU of eight subtrees or elements at a time."""
+
+    def __init__(self, discretization: Discretization, deterministic: bool):
+        super().__init__(
+            discretization,
+            stress=reinforced_stress,
+            differential=reinforced_differential,
+            density=reinforced_density,
+            cauchy=reinforced_cauchy,
+            Material=ReinforcedMaterial,
+            deterministic=deterministic,
+        )
+        _, self._clusters = divided(discretization, self.plan, reinforced_law, ReinforcedMaterial)
+        self._by_elements = ByElements(discretization, self.plan, ReinforcedMaterial, reinforced_stress, FIBRES)
+        self._made = Kept(_material)
+
+    def plan_of(self, discretization: Discretization) -> Plan:
+        return discretization.plan(subtrees=self.device.is_cpu, deterministic=self.deterministic)
+
+    @property
+    def _force_kernels(self) -> list[LoadedKernel]:
+        return self._by_elements.kernels if self._clusters is None else [self._clusters.kernel]
+
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
+        if self._clusters is not None:
+            self._clusters(self.material, u, f)
+        else:
+            self._by_elements(self.element_count, self.material, u, f)
+
+    @property
+    def material(self) -> ReinforcedMaterial:
+        """The material with the present active stress."""
+        return self._made(self.isotropic, self.passive, *self._activation)
+
+    @property
+    def material_shown(self) -> ReinforcedMaterial:
+        return _material(self.isotropic_shown, self.passive, *self._activation)
+
+
+def _material(
+    matrix: IsotropicMaterial, fibres: OrthotropicMaterial, is_active: int, activation: wp.array
+) -> ReinforcedMaterial:
+    material = ReinforcedMaterial()
+    material.matrix, material.fibres = matrix, fibres
+    material.is_active, material.activation = is_active, activation
+    return material

@@ -1,0 +1,435 @@
+"""Force fields of the corotated model: leaf by leaf, general elements, and complete subtrees of a forest as units of
+work."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, TypeAlias
+
+import warp as wp
+
+from warp_corot.discretization.discretization import Discretization
+from warp_corot.discretization.plan import Plan, Units
+from warp_corot.discretization.subtrees import Batch, Sharing
+from warp_corot.elasticity.clusters import ClusterScatter, clustered
+from warp_corot.elasticity.corotated.launches import DegenerateLeaves, OwnLaunches
+from warp_corot.elasticity.corotated.tangents import (
+    FEWEST,
+    ExactTangent,
+    KeptTangent,
+    RotatedTangent,
+    SubtreeTangent,
+    subtrees_of,
+)
+from warp_corot.elasticity.cpu import Dilating, InLanes
+from warp_corot.elasticity.model import ForceField, Kept, StressLaw, Tangent
+from warp_corot.inputs.cpu_threads import launch
+from warp_corot.inputs.loading import LoadedKernel, load
+from warp_corot.kernels.clusters.laws import isotropic_law
+from warp_corot.kernels.corotated.algebraic import own_energies, own_von_mises
+from warp_corot.kernels.corotated.corotated import (
+    extract_rotations,
+    given_cauchy,
+    given_density,
+    given_stress,
+    own_stress,
+    scatter_matrix_product,
+)
+from warp_corot.kernels.corotated.tangent import exact_differential
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
+from warp_corot.kernels.elements.forces import element_energies, element_von_mises, scatter_forces
+from warp_corot.kernels.elements.general_cuda import corotated_law
+from warp_corot.kernels.elements.simd8 import LANES
+from warp_corot.kernels.math.rotation import quick_rotation
+from warp_corot.kernels.subtrees import cpu as subtree_cpu
+from warp_corot.kernels.subtrees import cuda as subtree_cuda
+from warp_corot.kernels.subtrees.degenerate import NO_LIST, repair_elements, repair_own, repair_shared
+
+if TYPE_CHECKING:
+    from warp_corot.elasticity.corotated.model import CorotatedOptions
+
+
+@dataclass(frozen=True)
+class Rotations:
+    """Units and their rotations, mat33 [units]."""
+
+    units: Units
+    rotations: wp.array
+
+    @classmethod
+    def of(cls, units: Units) -> Rotations:
+        return cls(units, wp.empty(units.count, dtype=wp.mat33, device=units.unit.device))
+
+
+def rotated_material(isotropic: IsotropicMaterial, rotations: wp.array, unit: wp.array) -> RotatedMaterial:
+    """Lamé's parameters with given rotations."""
+    material = RotatedMaterial()
+    material.isotropic, material.rotations, material.unit = isotropic, rotations, unit
+    return material
+
+
+class CorotatedField(ForceField):
+    """Forces by one kernel if each element uses its own rotation; otherwise by two, rotations first."""
+
+    #: Whether complete subtrees are units of work.
+    takes_subtrees: ClassVar[bool] = False
+
+    def __init__(self, discretization: Discretization, model: CorotatedOptions, deterministic: bool):
+        self.model = model
+        super().__init__(discretization, deterministic)
+        kind = discretization.element_kind
+        self._shared: Rotations | None = None
+        self._fused = model.level is None and model.stiffness == "factored"
+        self._rotated = Kept(rotated_material)
+        self._extract = extract_rotations(kind, model.own_rotation)
+        self._own = scatter_forces(kind, IsotropicMaterial, own_stress(model.own_rotation))
+        if model.stiffness == "factored":
+            self._forces = scatter_forces(kind, RotatedMaterial, given_stress)
+        else:
+            self._forces = scatter_matrix_product(model.stiffness == "sparse")
+        self._has_own_outputs = model.level is None and model.own_rotation is quick_rotation
+        if self._has_own_outputs:
+            self._energies, self._von_mises = own_energies(kind), own_von_mises(kind)
+        else:
+            self._energies = element_energies(kind, RotatedMaterial, given_density)
+            self._von_mises = element_von_mises(kind, RotatedMaterial, given_cauchy)
+
+    @property
+    def kernels(self) -> list[LoadedKernel]:
+        of_rotations = [] if self._has_own_outputs else [self._extract]
+        return [*self._force_kernels, *of_rotations, self._von_mises, self._energies]
+
+    @property
+    def _force_kernels(self) -> list[LoadedKernel]:
+        return [self._own if self._fused else self._forces]
+
+    @property
+    def rotation_level(self) -> int | None:
+        """Level of the tree at which rotations are shared, or None."""
+        return self.model.level
+
+    def plan_of(self, discretization: Discretization) -> Plan:
+        return discretization.plan(self.rotation_level, subtrees=self.takes_subtrees, deterministic=self.deterministic)
+
+    def follow(self) -> None:
+        self._shared = None
+
+    @property
+    def unit_count(self) -> int:
+        """The number of rotations."""
+        return self._sharing().units.count
+
+    def extract_rotations(self, u: wp.array) -> wp.array:
+        """The rotation of every unit, mat33 [units]."""
+        rotations = self._sharing().rotations
+        self.write_rotations(u, rotations)
+        return rotations
+
+    def add_rotated_forces(self, u: wp.array, f: wp.array) -> None:
+        """Add forces with the rotations that were extracted last."""
+        self._launch_with_rotations(self._forces, self.isotropic, u, f)
+
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
+        if self._fused:
+            self.launch(self._own, self.element_count, [self.elements, self.isotropic, u], [f])
+        else:
+            self.extract_rotations(u)
+            self.add_rotated_forces(u, f)
+
+    def tangent(self, *, exact: bool = False) -> Tangent:
+        """The paper's K = R K R^T, with the rotations that forces at u use, held fixed; it is positive semidefinite.
+
+        The exact derivative of the forces also has the derivative of the rotations, which vanishes if the body is not
+        strained. It can be indefinite, and is bounded if the rotation of F is ill-defined
+        (``kernels.corotated.tangent``). With shared rotations, K is never the exact derivative; with rotations within a
+        tolerance, K has each element's own.
+        """
+        if self.rotation_level is not None:
+            return RotatedTangent(self)
+        exact = exact and self.model.rotation_level is None
+        if self.device.is_cpu and self.plan.counts is None:
+            return KeptTangent(self, exact)
+        return ExactTangent(self, self.model.own_rotation) if exact else RotatedTangent(self)
+
+    def write_rotations(self, u: wp.array, rotations: wp.array) -> None:
+        """Write the rotation of every unit, mat33 [units]."""
+        units = self._sharing().units
+        self.launch(self._extract, units.count, [units.elements, u], [rotations])
+
+    def material_with(self, rotations: wp.array) -> RotatedMaterial:
+        """The material with these rotations of the units."""
+        return rotated_material(self.isotropic, rotations, self._sharing().units.unit)
+
+    @property
+    def stress_law(self) -> StressLaw | None:
+        """See ``ForceField.stress_law``; None with shared rotations."""
+        if self.model.rotation_level is not None:
+            return None
+        rotation = self.model.own_rotation
+        return StressLaw(own_stress(rotation), exact_differential(rotation), self.isotropic)
+
+    def write_energies(self, u: wp.array, energies: wp.array) -> None:
+        self._write(self._energies, self.isotropic, u, energies)
+
+    def write_von_mises(self, u: wp.array, stress: wp.array) -> None:
+        self._write(self._von_mises, self.isotropic_shown, u, stress)
+
+    def _write(self, kernel: wp.Kernel, isotropic: IsotropicMaterial, u: wp.array, output: wp.array) -> None:
+        if self._has_own_outputs:
+            self._launch_over_elements(kernel, isotropic, u, output)
+            return
+        self.extract_rotations(u)
+        self._launch_with_rotations(kernel, isotropic, u, output)
+
+    def _sharing(self) -> Rotations:
+        """The units whose rotations elements use; made on first use, because forces with own rotations do not need
+        them.
+        """
+        if self._shared is None:
+            self._shared = Rotations.of(self._units())
+        return self._shared
+
+    def _units(self) -> Units:
+        if self.rotation_level is None:
+            return Units.own(self.elements, self.element_count)
+        return self.plan.all_units
+
+    def _launch_with_rotations(
+        self, kernel: wp.Kernel, isotropic: IsotropicMaterial, u: wp.array, output: wp.array
+    ) -> None:
+        shared = self._sharing()
+        material = self._rotated(isotropic, shared.rotations, shared.units.unit)
+        self.launch(kernel, self.element_count, [self.elements, material, u], [output])
+
+
+class LeafField(CorotatedField):
+    """Leaf by leaf."""
+
+    def __init__(self, discretization: Discretization, model: CorotatedOptions, deterministic: bool):
+        super().__init__(discretization, model, deterministic)
+        if not self._fused:
+            self._sharing()
+
+    def follow(self) -> None:
+        super().follow()
+        if not self._fused:
+            self._sharing()
+
+
+class Simd8Field(InLanes, CorotatedField):
+    """General elements on the CPU."""
+
+    repair = repair_elements
+
+    def __init__(self, discretization: Discretization, model: CorotatedOptions, deterministic: bool):
+        super().__init__(discretization, model, deterministic)
+        self.follow()
+
+    @property
+    def _force_kernels(self) -> list[LoadedKernel]:
+        return self.other_kernels
+
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
+        self.scatter_others(u, f)
+
+
+# --- elements in clusters on CUDA ------------------------------------------------------------------------------------
+
+
+class CorotatedGeneralField(LeafField):
+    """General elements with own rotations."""
+
+    def __init__(self, discretization: Discretization, model: CorotatedOptions):
+        super().__init__(discretization, model, deterministic=False)
+        law = isotropic_law(corotated_law(model.own_rotation))
+        self._scatter = ClusterScatter(self.elements, law, chosen=clustered(discretization))
+
+    @property
+    def _force_kernels(self) -> list[LoadedKernel]:
+        return [self._scatter.kernel]
+
+    @property
+    def in_clusters(self) -> tuple[ClusterScatter, Sequence[Batch]]:
+        return self._scatter, ()
+
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
+        self._scatter(self.isotropic, u, f)
+
+
+# --- complete subtrees -----------------------------------------------------------------------------------------------
+#
+# The fast path of the corotated model: complete subtrees of a forest as units of work; see ``plan``.
+#
+# On CUDA with own rotations a body is at most three launches: subtrees, other leaves, and the leaves that the first
+# left out.
+
+
+#: The structs that kernels of lanes read.
+LanesMaterial: TypeAlias = (
+    "IsotropicMaterial | RotatedMaterial | subtree_cpu.ToleranceMaterial | subtree_cpu.DilatingMaterial"
+)
+
+
+class SubtreeField(InLanes, CorotatedField):
+    """The fast path: complete subtrees in batches, leaf by leaf only what is left over."""
+
+    takes_subtrees = True
+    repair = repair_elements
+
+    def __init__(self, discretization: Discretization, model: CorotatedOptions, deterministic: bool):
+        super().__init__(discretization, model, deterministic)
+        self._uniform = discretization.material_stride == 0
+        self.follow()
+        self.derive()
+
+    @property
+    def _force_kernels(self) -> list[LoadedKernel]:
+        if self._own_launches is not None:
+            return [*self._own_launches.kernels, DegenerateLeaves.kernel]
+        of_subtrees: list[LoadedKernel] = [(self._kernel(*kind), self._block) for kind in self.plan.kinds]
+        if self._dilating is not None or self._lanes is not None:
+            return [*of_subtrees, *self.other_kernels]
+        of_leaves = [self._own if self.plan.flat.unit is None else self._forces] if len(self.plan.flat) else []
+        return [*of_subtrees, *of_leaves]
+
+    def load_kernels(self) -> None:
+        one_launch = self._listed and self.rotation_level is None
+        kinds = () if one_launch else self.plan.kinds
+        found: list[LoadedKernel] = [(self._kernel(*kind), self._block) for kind in kinds]
+        found += [self._forces, self._own, self._extract, repair_own]
+        found += self.other_kernels if self.device.is_cpu else []
+        found += [DegenerateLeaves.kernel] if self._listed else []
+        load((), self.device, [*found, *([OwnLaunches.later_kernel(self._uniform)] if one_launch else [])])
+
+    def share_dilatation(self, dilating: Dilating) -> bool:
+        if any(sharing is not Sharing.OWN for _shape, _grouped, sharing in self.plan.kinds):
+            return False
+        return super().share_dilatation(dilating)
+
+    def tangent(self, *, exact: bool = False) -> Tangent:
+        own = self.model.level is None and self._tolerance is None
+        if not exact and own and self._listed and self.element_count >= FEWEST:
+            batches = subtrees_of(self.plan)
+            if batches is not None:
+                return SubtreeTangent(self, batches)
+        return super().tangent(exact=exact)
+
+    @property
+    def in_clusters(self) -> tuple[ClusterScatter, Sequence[Batch]] | None:
+        return None if self._own_launches is None else self._own_launches.in_clusters
+
+    @property
+    def _block(self) -> int:
+        return subtree_cuda.BLOCK if self.device.is_cuda else 256
+
+    def follow(self) -> None:
+        super().follow()
+        plan = self.plan
+        self._rotations = wp.empty(0, dtype=wp.mat33, device=self.device)
+        self._no_unit = wp.empty(0, dtype=wp.int32, device=self.device)
+        if plan.units is not None:
+            self._shared = Rotations.of(plan.units)
+            self._rotations = self._shared.rotations
+        elif self.rotation_level is not None:
+            self._sharing()
+        self._degenerate: DegenerateLeaves | None = None
+        self._own_launches: OwnLaunches | None = None
+        if self._listed:
+            if self.rotation_level is None and (OwnLaunches.suit(plan) or self.discretization.awaited is not None):
+                self._own_launches = OwnLaunches(plan, self.isotropic, self.discretization.awaited)
+                self._degenerate = DegenerateLeaves(self._own_launches.places, [], self.device)
+                return
+            self._degenerate = DegenerateLeaves.of(plan, self.device)
+        self._kernels = [self._kernel(batch.shape, batch.grouped, batch.sharing) for batch in plan.batches]
+        self._materials = [self._material(batch) for batch in plan.batches]
+        self._flat_rotated = Kept(rotated_material)
+
+    @property
+    def _tolerance(self) -> float | None:
+        """The model's tolerance on the CPU; on CUDA sharing within one gained 7 % at most, so there is none."""
+        return self.model.tolerance if self.device.is_cpu else None
+
+    @property
+    def _listed(self) -> bool:
+        """Whether kernels list the leaves that they leave out, in any order."""
+        return self.device.is_cuda and not self.deterministic
+
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
+        if self._own_launches is not None:
+            assert self._degenerate is not None
+            self._own_launches.scatter_forces(u, f, self._degenerate.own)
+            self._degenerate.repair(self.elements, self.isotropic, u, f)
+            return
+        if self.plan.units is not None:
+            self.extract_rotations(u)
+        for batch, kernel, material in zip(self.plan.batches, self._kernels, self._materials, strict=True):
+            self._launch_batch(batch, kernel, material, u, f)
+        flat = self.plan.flat
+        if self._dilating is not None or self._lanes is not None:
+            self.scatter_others(u, f)
+        elif len(flat) and flat.unit is not None:
+            rotated = self._flat_rotated(self._flat_material, self._rotations, flat.unit)
+            self.launch(self._forces, len(flat), [flat.elements, rotated, u], [f])
+        elif len(flat):
+            self.launch(self._own, len(flat), [flat.elements, self._flat_material, u], [f])
+        if self._degenerate is not None:
+            self._degenerate.repair(self.elements, self.isotropic, u, f)
+
+    def _kernel(self, shape: int, grouped: bool, sharing: Sharing) -> wp.Kernel:
+        given = sharing is Sharing.ABOVE
+        if self.device.is_cuda:
+            if sharing is Sharing.OWN:
+                return subtree_cuda.scatter_subtrees_own(shape, grouped, self._uniform, self._listed)
+            return subtree_cuda.scatter_subtrees_shared(shape, grouped, self._uniform, given, self._listed)
+        if sharing is Sharing.OWN:
+            dilatation = None if self._dilating is None else self._dilating.of
+            if self._tolerance is not None:
+                return subtree_cpu.scatter_subtrees_tolerance(shape, dilatation)
+            return subtree_cpu.scatter_law_subtrees(shape, shared=dilatation)
+        return subtree_cpu.scatter_subtrees_shared(shape, given)
+
+    def _material(self, batch: Batch) -> Callable[[], LanesMaterial]:
+        """The function that makes the struct that a kernel of lanes reads."""
+        if batch.sharing is not Sharing.OWN:
+            rotated, unit = Kept(rotated_material), self._no_unit if batch.unit is None else batch.unit
+            return lambda: rotated(self.isotropic, self._rotations, unit)
+        if self._dilating is not None:
+            dilating = self._dilating
+            return lambda: dilating.material(self.isotropic, self._tolerance)
+        if self._tolerance is not None:
+            near, tolerance = Kept(near_material), self._tolerance
+            return lambda: near(self.isotropic, tolerance)
+        return lambda: self.isotropic
+
+    def _launch_batch(
+        self, batch: Batch, kernel: wp.Kernel, material: Callable[[], LanesMaterial], u: wp.array, f: wp.array
+    ) -> None:
+        own = batch.sharing is Sharing.OWN
+        outputs = [f, batch.flagged]
+        if self.device.is_cuda:
+            threads = batch.count
+            if own:
+                inputs = [batch.subtrees, self.isotropic, u]
+            else:
+                unit = self._no_unit if batch.unit is None else batch.unit
+                inputs = [batch.subtrees, self.isotropic, u, self._rotations, unit]
+            outputs.append(NO_LIST if self._degenerate is None else self._degenerate.list_of(batch))
+        else:
+            threads = -(-batch.count // LANES)
+            inputs = [batch.subtrees, batch.count, material(), u]
+        launch(kernel, threads, inputs, outputs, device=self.device, block_dim=self._block)
+        if self._degenerate is not None or not batch.count:
+            return
+        flags = batch.flags_by_eights
+        inputs = [self.elements, self.isotropic, u]
+        if own:
+            self.launch(repair_own, len(flags), [1, flags, batch.subtrees.first, *inputs], [f])
+        elif batch.sharing is Sharing.ROOT:
+            self.launch(repair_shared, len(flags), [flags, batch.subtrees.first, batch.roots, *inputs], [f])
+
+
+def near_material(isotropic: IsotropicMaterial, tolerance: float) -> subtree_cpu.ToleranceMaterial:
+    material = subtree_cpu.ToleranceMaterial()
+    material.isotropic, material.tolerance = isotropic, tolerance
+    return material

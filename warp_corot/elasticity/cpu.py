@@ -1,0 +1,353 @@
+"""Forces on the CPU: subtrees and elements eight at a time in the lanes of its vector registers, and threads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import copy
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import warp as wp
+
+from warp_corot.discretization.elements import Elements, copied
+from warp_corot.discretization.plan import Plan
+from warp_corot.elasticity.divided import Piece
+from warp_corot.elasticity.model import ForceField, Kept, isotropic_material
+from warp_corot.inputs.cpu_threads import Team, launch, part_of
+from warp_corot.inputs.loading import LoadedKernel, load
+from warp_corot.kernels.corotated.anisotropic import FibreMaterial
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial
+from warp_corot.kernels.elements.cpu import (
+    GROUPS,
+    GroupedMaterial,
+    order_elements,
+    rest_matrices,
+    scatter_grouped_elements,
+    scatter_law_elements,
+    scatter_listed_elements,
+)
+from warp_corot.kernels.elements.dilatation import Dilatation
+from warp_corot.kernels.elements.elements import GeneralElements
+from warp_corot.kernels.elements.forces import repair_forces, scatter_forces
+from warp_corot.kernels.elements.native_laws import IsotropicLaw, NativeLaw
+from warp_corot.kernels.elements.simd8 import LANES
+from warp_corot.kernels.subtrees.cpu import DilatingMaterial, scatter_subtrees
+from warp_corot.mesh import TetForest
+
+if TYPE_CHECKING:
+    from warp_corot.discretization.discretization import Discretization
+
+
+class Lanes:
+    """Launches that add the forces of elements: first eight at a time, then those left out one by one.
+
+    Args:
+        elements: The elements, of either kind.
+        general: The same elements as general ones.
+        scatter: Kernel that computes the general ones eight at a time and lists those that it leaves out.
+        repair: Kernel that computes the listed ones among ``elements``; None if none are left out or listed.
+    """
+
+    def __init__(self, elements: Elements, general: Elements, *, scatter: wp.Kernel, repair: wp.Kernel | None = None):
+        self.count = len(elements.nodes)
+        self.elements = elements
+        self._general = general
+        self._scatter = scatter
+        self._repair = repair
+        #: Which of the material's values are those of the elements; None: all.
+        self._bounds: tuple[int, int] | None = None
+        #: How many, then which.
+        self._degenerate = wp.zeros(self.count + 1 if repair else 0, dtype=wp.int32, device="cpu")
+
+    def scatter_forces(self, material: IsotropicMaterial | FibreMaterial, u: wp.array, f: wp.array) -> None:
+        """Add the forces of displacements u to f, both vec4 [N]; ``material`` is the struct of all elements that
+        kernels read."""
+        if self._bounds is not None:
+            material = part_of(material, *self._bounds)
+        inputs = [self._general, self.count, material, u]
+        launch(self._scatter, -(-self.count // LANES), inputs, [f, self._degenerate], device="cpu")
+        if self._repair is not None:
+            launch(self._repair, 1, [self.elements, material, u], [self._degenerate, f], device="cpu")
+
+    def part(self, begin: int, end: int) -> Lanes:
+        """The launches of some of the elements."""
+        elements, general = (part_of(each, begin, end) for each in (self.elements, self._general))
+        part = Lanes(elements, general, scatter=self._scatter, repair=self._repair)
+        part._bounds = begin, end
+        return part
+
+
+def as_general(elements: Elements, kernel: wp.Kernel, inputs: list) -> GeneralElements:
+    """Elements of either kind as general ones; ``kernel`` finds their rest matrices and volumes from ``inputs``."""
+    count, device, general = len(elements.nodes), elements.nodes.device, GeneralElements()
+    general.nodes = general.targets = elements.nodes
+    general.rest_inverse = wp.empty(count, dtype=wp.mat33, device=device)
+    general.volume = wp.empty(count, dtype=wp.float32, device=device)
+    wp.launch(kernel, count, inputs, [general.rest_inverse, general.volume], device=device)
+    return general
+
+
+# --- a shared dilatation, whose forces a law's launches add ----------------------------------------------------------
+
+
+class Dilating:
+    """The shared dilatation of subtrees, and of other elements in groups, which are computed group after group.
+
+    Args:
+        of: The shared dilatation.
+        lam: Gives lambda [Pa] as elements hold it.
+        plan: The plan whose elements are grouped.
+        kind: The struct of these elements.
+        starts, members, live: The groups in the form of ``kernels.elements.mean_dilatation.share_in_groups``.
+
+    Attributes:
+        count: Number of groups in launches.
+    """
+
+    def __init__(
+        self,
+        of: Dilatation,
+        lam: Callable[[], wp.array],
+        plan: Plan,
+        kind: type,
+        starts: wp.array,
+        members: wp.array,
+        live: wp.array,
+    ):
+        self.of, self.count = of, 0
+        self._lam, self._plan, self._order = lam, plan, order_elements(kind)
+        self._of_subtrees = Kept(_material)
+        load(["elements.general_cpu"], wp.get_device("cpu"), [self._order])
+        self._members, self._live, most = members, live, len(members)
+        general = self._general = GeneralElements()
+        general.nodes = general.targets = wp.zeros(most, dtype=wp.vec4i, device="cpu")
+        general.rest_inverse = wp.zeros(most, dtype=wp.mat33, device="cpu")
+        general.volume = wp.zeros(most, dtype=wp.float32, device="cpu")
+        self._of_groups = GroupedMaterial()
+        self._of_groups.starts, self._of_groups.live = starts, live
+        #: How many, then which.
+        self._degenerate = wp.zeros(most + 1, dtype=wp.int32, device="cpu")
+
+    def material(self, isotropic: IsotropicMaterial, tolerance: float | None = None) -> DilatingMaterial:
+        """The struct of subtrees.
+
+        Args:
+            isotropic: The material, without lambda.
+            tolerance: For the corotated law, the largest angle at which the root's rotation is used [rad]; None: never.
+        """
+        made: DilatingMaterial = self._of_subtrees(isotropic, self._lam(), tolerance)
+        return made
+
+    def parts(self, team: Team, worlds: int) -> list[Dilating]:
+        """The same, each with some of the groups of all worlds, if the mesh does not change."""
+        if not self.count:
+            return [self] * team.parts
+        return [self._part(*bounds) for bounds in team.bounds(self.count, GROUPS, worlds)]
+
+    def _part(self, begin: int, end: int) -> Dilating:
+        part = copy(self)
+        part.count, part._of_groups, part._of_subtrees = end - begin, copied(self._of_groups), Kept(_material)
+        part._of_groups.starts = self._of_groups.starts[begin : end + 1]
+        part._degenerate = wp.zeros_like(self._degenerate)
+        return part
+
+    @property
+    def nodes(self) -> wp.array:
+        """The nodes of the elements in groups, vec4i."""
+        starts = self._of_groups.starts.numpy()
+        return self._general.nodes[int(starts[0]) : int(starts[-1])]
+
+    def derive(self, material: IsotropicMaterial) -> None:
+        """Launch the sorting of the groups' elements; may be recorded.
+
+        Args:
+            material: The material of all elements, without lambda.
+        """
+        grouped, most, lam = self._of_groups, len(self._members), self._lam()
+        if grouped.lam is None or (material.stride and len(grouped.lam) != most):
+            mu = none = material.mu
+            if material.stride:
+                mu, none, lam_here = (wp.zeros(most, dtype=wp.float32, device="cpu") for _ in range(3))
+            else:
+                none, lam_here = material.lam, lam
+            grouped.isotropic = isotropic_material([mu, none, material.stride])
+            grouped.lam = lam_here
+        inputs = [self._plan.elements, material, lam, self._members, self._live]
+        wp.launch(self._order, most, inputs, [self._general, grouped], device="cpu")
+
+    def kernel(self, law: IsotropicLaw) -> wp.Kernel:
+        """The kernel that adds the forces of groups under a law."""
+        return scatter_grouped_elements(law, self.of)
+
+    def scatter_groups(self, law: IsotropicLaw, u: wp.array, f: wp.array, repair: wp.Kernel | None = None) -> None:
+        """Add the forces of groups at displacements u to f, both vec4 [N].
+
+        Args:
+            law: A law of ``kernels.elements.native_laws``.
+            repair: Computes the elements that the law leaves out, if any.
+        """
+        if not self.count:
+            return
+        inputs = [self._general, self.count, self._of_groups, u]
+        launch(self.kernel(law), -(-self.count // GROUPS), inputs, [f, self._degenerate], device="cpu")
+        if repair is not None:
+            launch(repair, 1, [self._general, self._of_groups.isotropic, u], [self._degenerate, f], device="cpu")
+
+
+def _material(isotropic: IsotropicMaterial, lam: wp.array, tolerance: float | None) -> DilatingMaterial:
+    material = DilatingMaterial()
+    material.isotropic, material.lam, material.tolerance = isotropic, lam, tolerance or 0.0
+    return material
+
+
+# --- isotropic laws: complete subtrees, and other elements -----------------------------------------------------------
+
+
+class InLanes(ForceField):
+    """The part of a field of an isotropic law for the CPU, where threads can divide it.
+
+    With a shared dilatation the elements outside subtrees are in groups, and the field's own launches add its forces.
+    """
+
+    plan: Any
+    #: A law of ``kernels.elements.native_laws``, and the kernel for the elements that it leaves out.
+    lanes_law: IsotropicLaw = "corotated"
+    repair: wp.Kernel | None = None
+    _lanes: Lanes | None = None
+
+    def share_dilatation(self, dilating: Dilating) -> bool:
+        self._dilating = dilating
+        self.derive()
+        self.follow()
+        return True
+
+    def derive(self) -> None:
+        if self._dilating is not None:
+            self._dilating.derive(self.isotropic)
+
+    def follow(self) -> None:
+        super().follow()
+        flat, of_law = self.plan.flat, {"scatter": scatter_law_elements(self.lanes_law), "repair": self.repair}
+        self._lanes, self._flat_material = None, self.isotropic
+        if self._dilating is not None:
+            return
+        if not isinstance(self.discretization.mesh, TetForest):
+            self._lanes = Lanes(self.elements, self.elements, **of_law)
+        elif len(flat):
+            self._flat_material = self.isotropic_of(flat)
+            if self.device.is_cpu and flat.unit is None:
+                general = flat.general or as_general(flat.elements, rest_matrices, [flat.elements])
+                self._lanes = Lanes(general, general, **of_law)
+
+    @property
+    def other_kernels(self) -> list[LoadedKernel]:
+        """The kernels for elements outside subtrees."""
+        law, dilating = self.lanes_law, self._dilating
+        scatter = scatter_law_elements(law) if dilating is None else dilating.kernel(law)
+        return [scatter] if self.repair is None else [scatter, self.repair]
+
+    def scatter_others(self, u: wp.array, f: wp.array) -> None:
+        """Add the forces of elements outside subtrees."""
+        if self._dilating is not None:
+            self._dilating.scatter_groups(self.lanes_law, u, f, self.repair)
+        elif self._lanes is not None:
+            self._lanes.scatter_forces(self._flat_material, u, f)
+
+    def pieces(self, team: Team) -> list[Piece]:
+        """See ``ForceField``: copies of the field, each with some of the subtrees and of the other elements."""
+        if self.plan.counts is not None or self.plan.units is not None:
+            return []
+
+        worlds = self.discretization.worlds
+
+        def parts_of(whole: Any) -> list[Any]:
+            return [whole.part(*bounds) for bounds in team.bounds(whole.count, LANES, worlds)]
+
+        batches = [parts_of(batch) for batch in self.plan.batches]
+        dilating, lanes = self._dilating and self._dilating.parts(team, worlds), self._lanes and parts_of(self._lanes)
+        pieces: list[Any] = [copy(self) for _ in range(team.parts)]
+        for part, piece in enumerate(pieces):
+            piece.plan = replace(self.plan, batches=tuple(batch[part] for batch in batches))
+            piece._dilating, piece._lanes = dilating and dilating[part], lanes and lanes[part]
+        return pieces
+
+    @property
+    def nodes(self) -> list[wp.array]:
+        """See ``Piece``."""
+        nodes = [batch.subtrees.nodes for batch in self.plan.batches]
+        if self._dilating is not None:
+            return [*nodes, self._dilating.nodes] if self._dilating.count else nodes
+        return nodes if self._lanes is None else [*nodes, self._lanes.elements.nodes]
+
+
+# --- all elements under any law, one by one or eight at a time -------------------------------------------------------
+
+
+class ByElements:
+    """Launches that add the forces of a law.
+
+    In C++ a thread takes eight complete subtrees of a mesh that never changes, and eight of all other elements.
+
+    Args:
+        discretization: The mesh.
+        plan: The units of work.
+        Material: The struct that the law reads.
+        stress: The law, as ``kernels.elements.forces`` takes it.
+        lanes: The same law in C++, if it is there.
+        slotted: Whether each element's forces go to slots of their own first, so that sums are reproducible.
+    """
+
+    def __init__(
+        self,
+        discretization: Discretization,
+        plan: Plan,
+        Material: type,
+        stress: wp.Function,
+        lanes: NativeLaw | None = None,
+        *,
+        slotted: bool = False,
+    ):
+        kind, self._device = discretization.element_kind, discretization.device
+        own = discretization.plan(subtrees=False, deterministic=True) if slotted else plan
+        self._elements, self._slots = own.elements, own.slots if slotted else None
+        self._lanes = lanes if self._device.is_cpu else None
+        self.kernels: list[LoadedKernel]
+        if self._lanes is None:
+            self.kernels = [scatter_forces(kind, Material, stress)]
+            return
+        self._batches = tuple(plan.batches) if plan.counts is None else ()
+        subtrees = [scatter_subtrees(batch.shape, Material, self._lanes, wp.int32) for batch in self._batches]
+        #: The elements outside subtrees, if any are in subtrees.
+        self._listed = plan.flat.leaves if self._batches else wp.empty(0, dtype=wp.int32, device=self._device)
+        self.kernels = [*subtrees, scatter_listed_elements(kind, Material, self._lanes)]
+        self.kernels += [repair_forces(kind, Material, stress)] if self._lanes.leaves_out else []
+        #: How many are left out, then which.
+        self._degenerate = wp.zeros(1, dtype=wp.int32, device=self._device)
+
+    def __call__(self, count: int, material: Any, u: wp.array, f: wp.array) -> None:
+        """Add the forces [N] of the first ``count`` elements to f; ``material`` is the struct that the law reads."""
+        if self._slots is None:
+            self._scatter(count, material, u, f)
+            return
+        self._slots.values.zero_()
+        self._scatter(count, material, u, self._slots.values)
+        self._slots.gather(f)
+
+    def _scatter(self, count: int, material: Any, u: wp.array, f: wp.array) -> None:
+        kernels: list[Any] = list(self.kernels)
+        if self._lanes is None:
+            wp.launch(kernels[0], count, [self._elements, material, u], [f], device=self._device)
+            return
+        if self._lanes.leaves_out and len(self._degenerate) <= count:
+            self._degenerate = wp.zeros(count + 1, dtype=wp.int32, device=self._device)
+        outputs = [f, self._degenerate]
+        for batch in self._batches:
+            inputs = [batch.subtrees, batch.count, material, u]
+            wp.launch(kernels.pop(0), -(-batch.count // LANES), inputs, outputs, device=self._device)
+        single = len(self._listed) if self._batches else count
+        eights = kernels.pop(0)
+        if single:
+            inputs = [self._elements, single, self._listed, material, u]
+            wp.launch(eights, -(-single // LANES), inputs, outputs, device=self._device)
+        for repair in kernels:
+            wp.launch(repair, 1, [self._elements, material, u], [self._degenerate, f], device=self._device)

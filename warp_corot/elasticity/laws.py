@@ -1,0 +1,321 @@
+"""Isotropic laws that need no rotation: linear, St. Venant-Kirchhoff, neo-Hookean and Ogden's."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import warp as wp
+
+from warp_corot.discretization.discretization import Discretization
+from warp_corot.discretization.plan import Plan
+from warp_corot.elasticity.clusters import divided
+from warp_corot.elasticity.cpu import InLanes
+from warp_corot.elasticity.dilatation import AUTO, bind_law, check_dilatation
+from warp_corot.elasticity.model import ForceField, Law, LawField, Model
+from warp_corot.errors import InputError
+from warp_corot.inputs.checks import checked_number, shown
+from warp_corot.inputs.loading import LoadedKernel, load
+from warp_corot.kernels.clusters.laws import isotropic_law
+from warp_corot.kernels.elements import ogden as kernels
+from warp_corot.kernels.elements.constitutive import (
+    linear_differential,
+    linear_energy,
+    linear_stress,
+    neo_hookean_differential,
+    neo_hookean_energy,
+    neo_hookean_stress,
+    stvk_differential,
+    stvk_energy,
+    stvk_stress,
+)
+from warp_corot.kernels.elements.dilatation import GREEN, LOG_VOLUME, SMALL, Dilatation
+from warp_corot.kernels.elements.simd8 import LANES
+from warp_corot.kernels.subtrees import cpu as subtree_cpu
+from warp_corot.kernels.subtrees import cuda as subtree_cuda
+from warp_corot.kernels.subtrees.degenerate import NO_LIST
+from warp_corot.kernels.subtrees.memory import BLOCK
+
+if TYPE_CHECKING:
+    from warp_corot.discretization.discretization import Discretized
+    from warp_corot.discretization.subtrees import Batch
+    from warp_corot.elasticity.clusters import ClusterScatter
+
+
+class LawCudaField(LawField):
+    """Complete subtrees in batches, and other elements in clusters or one by one, under the same law.
+
+    Args:
+        discretization: A mesh on CUDA.
+        law, deterministic: As for ``LawField``.
+    """
+
+    def __init__(self, discretization: Discretization, law: Law, *, deterministic: bool = False):
+        super().__init__(discretization, law, deterministic=deterministic)
+        self._uniform = discretization.material_stride == 0
+        self.follow()
+
+    def plan_of(self, discretization: Discretization) -> Plan:
+        subtrees = self.deterministic or discretization.prefers_subtrees
+        return discretization.plan(subtrees=subtrees, deterministic=self.deterministic)
+
+    @property
+    def _force_kernels(self) -> list[LoadedKernel]:
+        of_subtrees: list[LoadedKernel] = [(kernel, BLOCK) for kernel in self._kernels]
+        if self._clusters is not None:
+            return [*of_subtrees, self._clusters.kernel]
+        return of_subtrees if self._batches and not len(self.plan.flat) else [*of_subtrees, self._forces]
+
+    def load_kernels(self) -> None:
+        kernels = [self._kernel(shape, grouped) for shape, grouped, _sharing in self.plan.kinds]
+        load((), self.device, [self._forces, *((kernel, BLOCK) for kernel in kernels)])
+
+    def follow(self) -> None:
+        self._batches, self._clusters = divided(self.discretization, self.plan, isotropic_law(self.law.stress))
+        self._kernels = [self._kernel(batch.shape, batch.grouped) for batch in self._batches]
+        self._flat_material = self.isotropic_of(self.plan.flat)
+
+    @property
+    def in_clusters(self) -> tuple[ClusterScatter, Sequence[Batch]] | None:
+        return None if self._clusters is None else (self._clusters, self._batches)
+
+    def _kernel(self, shape: int, grouped: bool) -> wp.Kernel:
+        return subtree_cuda.scatter_law_subtrees(shape, grouped, self._uniform, self.law.stress)
+
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
+        isotropic, flat = self.isotropic, self.plan.flat
+        for batch, kernel in zip(self._batches, self._kernels, strict=True):
+            inputs, outputs = [batch.subtrees, isotropic, u], [f, batch.flagged, NO_LIST]
+            wp.launch(kernel, batch.count, inputs, outputs, device=self.device, block_dim=BLOCK)
+        if self._clusters is not None:
+            self._clusters(isotropic, u, f)
+        elif len(flat):
+            self.launch(self._forces, len(flat), [flat.elements, self._flat_material, u], [f])
+        elif not self._batches:
+            super().scatter_forces(u, f)
+
+
+class LawSimd8Field(InLanes, LawField):
+    """Complete subtrees of a forest as units of work, other elements one by one, eight of each in the lanes.
+
+    Args:
+        discretization: On the CPU.
+        law: A law that is in C++.
+        deterministic: As for every field.
+    """
+
+    def __init__(self, discretization: Discretization, law: Law, *, deterministic: bool = False):
+        super().__init__(discretization, law, deterministic=deterministic)
+        assert law.lanes is not None
+        self.lanes_law = law.lanes
+        self.follow()
+
+    def plan_of(self, discretization: Discretization) -> Plan:
+        return discretization.plan()
+
+    @property
+    def _force_kernels(self) -> list[LoadedKernel]:
+        return [*(self._kernel(shape) for shape, _grouped, _sharing in self.plan.kinds), *self.other_kernels]
+
+    def load_kernels(self) -> None:
+        load((), self.device, self._force_kernels)
+
+    def _kernel(self, shape: int) -> wp.Kernel:
+        return subtree_cpu.scatter_law_subtrees(
+            shape, self.lanes_law, None if self._dilating is None else self._dilating.of
+        )
+
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
+        material: Any = self.isotropic
+        if self._dilating is not None:
+            material = self._dilating.material(material)
+        for batch in self.plan.batches:
+            inputs, threads = [batch.subtrees, batch.count, material, u], -(-batch.count // LANES)
+            self.launch(self._kernel(batch.shape), threads, inputs, [f, batch.flagged])
+        self.scatter_others(u, f)
+
+
+# --- the choice of kernels -------------------------------------------------------------------------------------------
+
+
+def law_field(law: Law, discretization: Discretization, deterministic: bool = False) -> LawField:
+    """The fastest force field of a law of the package on a discretization.
+
+    Args:
+        law: The law.
+        discretization: The mesh and the material.
+        deterministic: As for every field.
+    """
+    kind = LawSimd8Field if discretization.device.is_cpu else LawCudaField
+    return kind(discretization, law, deterministic=deterministic)
+
+
+# --- models of one law -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class LawModel(Model):
+    """A constitutive law of the package, whose elements can share their dilatation.
+
+    Class attributes:
+        law: The law.
+        shared: The dilatation that elements of this law share.
+    """
+
+    law: ClassVar[Law]
+    shared: ClassVar[Dilatation]
+
+    dilatation: str = AUTO
+
+    def __post_init__(self) -> None:
+        check_dilatation(self.dilatation)
+
+    def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:
+        return bind_law(self._field, self.shared, self.dilatation, body, deterministic)
+
+    def _field(self, discretization: Discretization, deterministic: bool) -> ForceField:
+        return law_field(self.law, discretization, deterministic)
+
+
+# --- linear elasticity: right for small rotations, swells in large ones ----------------------------------------------
+
+
+@dataclass(frozen=True)
+class Linear(LawModel):
+    """W = V (mu e:e + lambda/2 tr(e)^2) with e = sym(F) - I. Conserves linear but not angular momentum.
+
+    Attributes:
+        dilatation: "element": each element has its own, and nearly incompressible tissue is too stiff. "shared":
+            elements share it, see ``elasticity.dilatation``; slower. "auto": they do where Poisson's ratio is 0.45 or
+            more in any element, and the material is isotropic.
+    """
+
+    strained_safety: ClassVar[float] = 0.9  # its stiffness never changes
+    law = Law(linear_stress, linear_differential, linear_energy, "linear", linear_stress)
+    shared = SMALL
+
+    def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:
+        field = super().bind(body, deterministic=deterministic)
+        field.is_linear = True
+        return field
+
+
+# --- St. Venant-Kirchhoff: Hooke's law between Green strain and second Piola-Kirchhoff stress ------------------------
+
+
+@dataclass(frozen=True)
+class StVenantKirchhoff(LawModel):
+    """W = V (mu E:E + lambda/2 tr(E)^2) with E = (F^T F - I)/2, in total-Lagrangian form.
+
+    Stepped by explicit central differences (symplectic Euler is their leapfrog form) this is what the literature calls
+    TLED (Miller et al. 2007). Softens when compressed and lets elements invert at large strain; the paper's reference.
+
+    Attributes:
+        dilatation: "element": each element has its own, and nearly incompressible tissue is too stiff. "shared":
+            elements share it, see ``elasticity.dilatation``; slower. "auto": they do where Poisson's ratio is 0.45 or
+            more in any element, and the material is isotropic.
+    """
+
+    law = Law(stvk_stress, stvk_differential, stvk_energy, "stvk")
+    shared = GREEN
+
+
+# --- neo-Hookean -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class NeoHookean(LawModel):
+    """W = V (mu/2 (tr F^T F - 3) - mu ln J + lambda/2 (ln J)^2), P = mu (F - F^-T) + lambda ln J F^-T.
+
+    This holds for J >= 0.5, an element with at least half its volume. Below, the terms in J, U(J) = -mu ln J + lambda/2
+    (ln J)^2, continue as their second-order Taylor polynomial about 0.5. Energy, force and stiffness are continuous and
+    exist for every F, and an inverted element is pushed back. U'' stays at 4 mu + 6.8 lambda, so that the stiffness is
+    bounded: elements whose stretches do not exceed 1 have at most 29 mu + 44 lambda when turned over, and up to 4.5
+    times that at rest, 2 mu + 3 lambda, when crushed; a body's stable step shrinks by the root of that.
+
+    Total-Lagrangian too: with explicit central differences, TLED (Miller et al. 2007).
+
+    Attributes:
+        dilatation: "element": each element has its own, and nearly incompressible tissue is too stiff. "shared":
+            elements share it, see ``elasticity.dilatation``; slower. "auto": they do where Poisson's ratio is 0.45 or
+            more in any element, and the material is isotropic.
+    """
+
+    law = Law(neo_hookean_stress, neo_hookean_differential, neo_hookean_energy, "neo-hookean")
+    shared = LOG_VOLUME
+
+
+# --- Ogden -----------------------------------------------------------------------------------------------------------
+
+
+#: With larger exponents, powers of stretches would exceed the range of float32.
+LARGEST_EXPONENT = 60.0
+
+
+@dataclass(frozen=True)
+class Ogden(Model):
+    """W = V (sum_p 2 mu_p / alpha_p^2 (l1^alpha_p + l2^alpha_p + l3^alpha_p - 3 - alpha_p ln J) + lambda/2 (ln J)^2).
+
+    l1, l2, l3 are the principal stretches and J is their product (Ogden 1972; the compressible form is that of
+    ``NeoHookean``, which one term with alpha = 2 is equal to). The sum of all mu_p is the shear modulus of small
+    strains. The body's material gives this modulus and lambda in each element: ``mu`` gives only the ratios of the
+    terms. So material fields, worlds and shared dilatation work as for other laws.
+
+    The law holds for J >= 0.5 and principal stretches within ``stretch_limits``, at which a term is a thousand times as
+    stiff as at rest. Beyond, the energy continues as a parabola, in J as for ``NeoHookean`` and in squared stretches:
+    energy, force and stiffness are continuous and exist for every F, and inverted elements are pushed back.
+
+    Attributes:
+        mu: The shear moduli mu_p > 0 of the terms, in any unit; only their ratios count.
+        alpha: The exponents alpha_p, not zero, as many. Large positive ones stiffen in tension, negative ones in
+            compression.
+        dilatation: "element": each element has its own, and nearly incompressible tissue is too stiff. "shared":
+            elements share it, see ``elasticity.dilatation``; slower. "auto": they do where Poisson's ratio is 0.45 or
+            more in any element.
+
+    Raises:
+        InputError: A number out of its range, or as many ``mu`` as ``alpha`` are not given.
+    """
+
+    mu: float | Sequence[float] = (1.0,)
+    alpha: float | Sequence[float] = (8.0,)
+    dilatation: str = AUTO
+
+    def __post_init__(self) -> None:
+        check_dilatation(self.dilatation)
+        mu, alpha = (_numbers(getattr(self, name), name) for name in ("mu", "alpha"))
+        if len(mu) != len(alpha) or not mu:
+            raise InputError(f"there are {len(mu)} mu and {len(alpha)} alpha; there must be one of each for every term")
+        for value in mu:
+            if not 0.0 < value < math.inf:
+                raise InputError(f"mu is {shown(self.mu)}; each must be above zero, as a share of the shear modulus")
+        for value in alpha:
+            if not 0.05 <= abs(value) <= LARGEST_EXPONENT:
+                raise InputError(f"alpha is {shown(self.alpha)}; its size must be from 0.05 to {LARGEST_EXPONENT:g}")
+        object.__setattr__(self, "mu", mu)
+        object.__setattr__(self, "alpha", alpha)
+
+    @property
+    def terms(self) -> tuple[tuple[float, float], ...]:
+        """Share of the shear modulus and exponent of each term."""
+        mu, alpha = _numbers(self.mu, "mu"), _numbers(self.alpha, "alpha")
+        return tuple((value / math.fsum(mu), exponent) for value, exponent in zip(mu, alpha, strict=True))
+
+    @property
+    def stretch_limits(self) -> tuple[float, float]:
+        """Smallest and largest principal stretch at which every term is the plain law."""
+        low, high = zip(*(kernels.stretch_limits(alpha) for _share, alpha in self.terms), strict=True)
+        return max(low), min(high)
+
+    def bind(self, body: Discretized | Discretization, *, deterministic: bool = False) -> ForceField:
+        law = Law(**kernels.ogden(self.terms), lanes=self.terms)
+        return bind_law(partial(law_field, law), LOG_VOLUME, self.dilatation, body, deterministic)
+
+
+def _numbers(given: Any, name: str) -> tuple[float, ...]:
+    """One number or several."""
+    many = given if isinstance(given, Sequence) and not isinstance(given, str) else (given,)
+    return tuple(checked_number(each, name) for each in many)
