@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_corot.kernels.elements.elements import store_node
 from warp_corot.kernels.stepping.integrate import by_vectors, write_vector
-from warp_corot.kernels.stepping.pace import Pace, time_after
+from warp_corot.kernels.stepping.pace import Pace, key_before, time_after
 
 wp.set_module_options({"enable_backward": False})
 
@@ -118,20 +118,3 @@ def follow_activation(
     row = wp.min(k, stress.shape[1] - 1)
     a = stress[key, row]
     activation[t] = a + s * (stress[key + 1, row] - a)
-
-
-# --- keyframes -------------------------------------------------------------------------------------------------------
-
-
-@wp.func
-def key_before(times: wp.array[wp.float64], t: wp.float64):
-    """The last key before t, and how far t is on the way to the next key, 0 to 1. There must be two keys or more.
-
-    Before all keys this is the first key, after them the last but one.
-    """
-    last = times.shape[0] - 1
-    key = int(0)
-    while key < last - 1 and times[key + 1] <= t:
-        key += 1
-    share = (t - times[key]) / (times[key + 1] - times[key])
-    return key, float(wp.clamp(share, wp.float64(0.0), wp.float64(1.0)))

@@ -14,8 +14,7 @@ import warp as wp
 from warp_corot.kernels.elements.elements import load_node, store_node
 from warp_corot.kernels.modules import unique_kernel
 
-from .conditions import key_before
-from .pace import DONE, DT, Pace, length_before, time_after
+from .pace import DONE, DT, Pace, key_before, length_before, time_after
 
 wp.set_module_options({"enable_backward": False})
 

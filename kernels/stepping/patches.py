@@ -50,7 +50,7 @@ def rest_inverse(c: row):
 
 @wp.func
 def key_from(times: wp.array[wp.float64], key: int, last: int, t: wp.float64):
-    """The same as ``conditions.key_before``, but the search starts at an earlier key; ``last`` is the last key but
+    """The same as ``pace.key_before``, but the search starts at an earlier key; ``last`` is the last key but
     one."""
     found = key
     while found < last and times[found + 1] <= t:

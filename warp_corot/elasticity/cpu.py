@@ -117,7 +117,7 @@ class Dilating:
         self.of, self.count = of, 0
         self._lam, self._plan, self._order = lam, plan, order_elements(kind)
         self._of_subtrees = Kept(_material)
-        load(["elements.general_cpu"], wp.get_device("cpu"), [self._order])
+        load(["elements.cpu"], wp.get_device("cpu"), [self._order])
         self._members, self._live, most = members, live, len(members)
         general = self._general = GeneralElements()
         general.nodes = general.targets = wp.zeros(most, dtype=wp.vec4i, device="cpu")

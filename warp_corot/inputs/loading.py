@@ -26,14 +26,14 @@ MESHING = (
     *("meshing.coarsening", "meshing.surface_points", "meshing.leaves"),
 )
 #: Modules for bodies, for all steps, and for explicit ones whose length is chosen.
-BODY = ("plan.lists", "plan.batches", "stepping.team", "elements.general_cpu", "stepping.conditions")
+BODY = ("plan.lists", "plan.batches", "stepping.team", "elements.cpu", "stepping.conditions")
 STEPS = ("stepping.integrate", "stepping.balance", "stepping.pace")
-STEPS_ON_CPU = ("subtrees.repair", *STEPS, "stepping.subnormals")
+STEPS_ON_CPU = ("subtrees.degenerate", *STEPS, "stepping.subnormals")
 EXPLICIT = ("stepping.lanczos", "stepping.gauge")
 #: Modules for implicit steps, and for those of bodies on forests.
 IMPLICIT = (
     *("implicit.steps", "implicit.residual", "elements.mean_dilatation_rows", "implicit.tangent", "implicit.turning"),
-    *("implicit.conjugate_gradients", "implicit.sums", "implicit.increments", "elements.reproducible"),
+    *("implicit.conjugate_gradients", "implicit.sums", "implicit.increments", "elements.elements"),
 )
 IMPLICIT_ON_FORESTS = (
     *("implicit.multigrid.values", "implicit.multigrid.pattern", "plan.levels", "implicit.multigrid.shared"),
