@@ -1,4 +1,5 @@
-"""Tetrahedra of a Newton model: forces, rotations and stresses from nodal positions and inverse rest matrices.
+"""Tetrahedra of a Newton model: forces, current stiffness, rotations and stresses from nodal positions and inverse rest
+matrices.
 
 Newton's state consists of positions, and only its matrix defines an element's rest shape: there need be no consistent
 rest positions (a body may have been turned after it was built, or its elements strained against one another). So
@@ -9,8 +10,15 @@ import functools
 
 import warp as wp
 
-from warp_corot.kernels.elements.constitutive import IsotropicMaterial, rotated_stress, symmetric
+from warp_corot.kernels.elements.constitutive import (
+    IsotropicMaterial,
+    corotated_strain,
+    hooke,
+    rotated_stress,
+    symmetric,
+)
 from warp_corot.kernels.elements.elements import GeneralElements, load_node, scatter_stress
+from warp_corot.kernels.elements.forces import von_mises
 from warp_corot.kernels.elements.general_cuda import (
     PosedElements,
     add_stress,
@@ -22,6 +30,8 @@ from warp_corot.kernels.elements.native_laws import elastic
 from warp_corot.kernels.elements.simd8 import headers, scatter_simd8
 from warp_corot.kernels.math.rotation import byers_xu, cofactor, identity3
 from warp_corot.kernels.modules import unique_kernel
+from warp_corot.kernels.stepping.gauge import TURNS, keep_largest
+from warp_corot.kernels.stepping.pace import GROWTH, LEAST, SAFE, STABLE, STRAIN, safe_step
 
 wp.set_module_options({"enable_backward": False})
 
@@ -188,3 +198,125 @@ def scatter_damping_and_activation(damped: bool) -> wp.Kernel:
             scatter_stress(elements, t, p, f)
 
     return scatter_damping_and_activation
+
+
+# --- materials, rotations and stresses in Newton's arrays ------------------------------------------------------------
+
+
+@wp.kernel(enable_backward=False)
+def split_materials(
+    # In
+    materials: wp.array2d[wp.float32],
+    ids: wp.array[wp.int32],
+    mu_from_mu: float,
+    lam_from_mu: float,
+    # Out
+    mu: wp.array[wp.float32],
+    lam: wp.array[wp.float32],
+    k_lambda: wp.array[wp.float32],
+    k_damp: wp.array[wp.float32],
+):
+    """Lamé's parameters of chosen elements, mu = a k_mu, lambda = k_lambda + b k_mu, and the other values in Newton's
+    rows, in separate arrays."""
+    t = wp.tid()
+    row = place_in_model(ids, 0, t)
+    k_mu = materials[row, 0]
+    mu[t] = mu_from_mu * k_mu
+    lam[t] = materials[row, 1] + lam_from_mu * k_mu
+    k_lambda[t] = materials[row, 1]
+    k_damp[t] = materials[row, 2]
+
+
+@functools.cache
+def write_attributes(has_rotation: bool, has_stress: bool, has_von_mises: bool) -> wp.Kernel:
+    """Write rotation and Cauchy stress of every element, as far as the state has attributes for them."""
+
+    @unique_kernel()
+    def write_attributes(
+        # In
+        elements: GeneralElements,
+        mu: wp.array[wp.float32],
+        lam: wp.array[wp.float32],
+        fill: wp.array[wp.float32],
+        fill_stride: int,
+        q: wp.array[wp.vec3],
+        # Out
+        rotations: wp.array[wp.quat],
+        stresses: wp.array[wp.mat33],
+        equivalent: wp.array[wp.float32],
+    ):
+        t = wp.tid()
+        gradient = difference_gradient(elements, t, q)
+        r = byers_xu(gradient)
+        if wp.static(has_rotation):
+            rotations[t] = wp.normalize(wp.quat_from_matrix(r))
+        share = 1.0 / fill[t * fill_stride]
+        stress = share * hooke(corotated_strain(gradient - identity3(), identity3(), r), mu[t], lam[t])
+        if wp.static(has_stress):
+            stresses[t] = r * stress * wp.transpose(r)
+        if wp.static(has_von_mises):
+            equivalent[t] = von_mises(stress)
+
+    return write_attributes
+
+
+# --- current stiffness, as ``stepping.gauge`` ------------------------------------------------------------------------
+
+
+@wp.kernel(enable_backward=False)
+def find_posed_strains(
+    # In
+    elements: GeneralElements,
+    q: wp.array[wp.vec3],
+    qd: wp.array[wp.vec3],
+    ahead: float,
+    count: int,
+    turn: wp.array[wp.int32],
+    # Out
+    found: wp.array2d[wp.float32],
+):
+    """The largest entry of F^T F - I among one in ``TURNS`` elements, now and after ``ahead`` [s] at the current rate;
+    the next measurement checks others."""
+    t = wp.tid() * TURNS + turn[0] % TURNS
+    if t >= count:
+        return
+    f = difference_gradient(elements, t, q)
+    strain = wp.transpose(f) * f - identity3()
+    rate = wp.transpose(f) * difference_gradient(elements, t, qd)
+    later = strain + ahead * (rate + wp.transpose(rate))
+    most = float(0.0)
+    for i in range(3):
+        for j in range(3):
+            most = wp.max(most, wp.max(wp.abs(strain[i, j]), wp.abs(later[i, j])))
+    keep_largest(most, STRAIN, found[0])
+
+
+@wp.kernel(enable_backward=False)
+def take_safe_substep(
+    # In
+    at_rest: wp.array2d[wp.float64],
+    recorded: wp.float64,
+    # In and out
+    found: wp.array2d[wp.float32],
+    allowed: wp.array[wp.float64],
+    turn: wp.array[wp.int32],
+    excess: wp.array[wp.float32],
+    # Out
+    seen: wp.array[wp.float64],
+):
+    """Find the substep that is safe until the next measurement [s]: it shrinks at once and grows slowly.
+
+    Args:
+        recorded: Length of the substep of a recorded step [s]; zero if the host chooses the next one.
+        excess: Largest factor by which a recorded one was too long.
+        seen: The safe substep, in the host's memory.
+    """
+    longest = at_rest[0, SAFE] * at_rest[0, STABLE]
+    safe = wp.min(longest, safe_step(at_rest, found, 0))
+    safe = wp.min(wp.max(safe, LEAST * longest), GROWTH * allowed[0])
+    allowed[0] = safe
+    seen[0] = safe
+    excess[0] = wp.max(excess[0], float(recorded / safe))
+    for k in range(found.shape[1]):
+        found[0, k] = 0.0
+    turn[0] = (turn[0] + 1) % TURNS

@@ -24,10 +24,9 @@ import warp as wp
 from warp_corot.kernels.contact.law import held_back
 from warp_corot.kernels.contact.vertices import across
 
+from .particles import Bodies, Particles, is_fixed
 from .rows import (
-    Bodies,
     ContactLaw,
-    Particles,
     Row,
     add_to_particles,
     ease_off,
@@ -154,7 +153,7 @@ def scatter_rows(
         pose = bodies.q[body]
         velocity = wp.transform_vector(pose, velocity) + body_point_velocity(bodies.qd[body], arm)
         give = body_point_velocity(bodies.yielding[body], arm)
-        if (bodies.flags[body] & bodies.fixed_flag) == 0:
+        if not is_fixed(body, bodies):
             n = float(wp.max(bodies.places[body], 1))
             turn = wp.quat_to_matrix(wp.transform_get_rotation(pose))
             m.linear = n * bodies.inverse_mass[body]
@@ -214,7 +213,7 @@ def gather_springs(
     body = row.body
     if row.nodes[0] < 0 or body < 0:
         return
-    if (bodies.flags[body] & bodies.fixed_flag) != 0:
+    if is_fixed(body, bodies):
         return
     point, arm = point_and_arm(row, bodies)
     apart = sum_of(row, q) - point
@@ -274,7 +273,7 @@ def solve_yielding(
     s = slope[b]
     curvature[b] = wp.spatial_matrix()
     slope[b] = wp.spatial_vector()
-    if (bodies.flags[b] & bodies.fixed_flag) != 0:
+    if is_fixed(b, bodies):
         bodies.yielding[b] = wp.spatial_vector()
         return
     turn = wp.quat_to_matrix(wp.transform_get_rotation(bodies.q[b]))

@@ -15,10 +15,9 @@ if TYPE_CHECKING:
     from warp_corot.newton.stages.material import StageOptions
     from warp_corot.newton.stages.steps import StageSimulation
 
-    from .scene import Added, add_forest, add_mesh
+    from .scene import Added, add_forest, add_mesh, register_custom_attributes
     from .sensor import SensorSoftContact
     from .solver import SolverCorotated
-    from .state import register_custom_attributes
     from .viewing import open_viewer
 
 __all__ = [
@@ -42,7 +41,7 @@ _MODULES = {
     "add_forest": ".scene",
     "add_mesh": ".scene",
     "open_viewer": ".viewing",
-    "register_custom_attributes": ".state",
+    "register_custom_attributes": ".scene",
 }
 
 

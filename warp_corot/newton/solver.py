@@ -12,17 +12,14 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.checks import refuse_tape
 from warp_corot.simulation.solves import Solves
 
-from .arguments import Step, check_options, check_step, checked_dt, checked_mask
+from .checks import Elsewhere, Recordings, Step, check_options, check_step, checked_dt, checked_mask
 from .contact import Contacts
-from .elsewhere import Elsewhere
-from .following import Following
 from .implicit import ImplicitSteps
 from .library import CouplingInterface, SolverBase, newton
 from .others import Others
-from .recordings import Recordings
-from .stability import SAFETY, check_substep, stable_steps
-from .state import register_custom_attributes
+from .scene import register_custom_attributes
 from .steps import Steps
+from .substeps import SAFETY, Following, check_substep, stable_steps
 from .tetrahedra import Tetrahedra
 
 #: Factor by which a recorded substep may exceed the safe one; below the smallest margin of the safe substep.

@@ -22,7 +22,7 @@ from warp_corot.io.files.usd import first_message
 from warp_corot.io.read.usd.scene import Scene
 from warp_corot.io.write.usd.over import FollowingSurface
 from warp_corot.newton.library import newton
-from warp_corot.newton.state import register_custom_attributes
+from warp_corot.newton.scene import register_custom_attributes
 
 from .material import Body, StageOptions, contact_law, give_material
 from .start import check_colliders, check_ground, notes_of, staying, used_points

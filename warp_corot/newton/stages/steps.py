@@ -17,9 +17,9 @@ from warp_corot.inputs.device import checked_device
 from warp_corot.io.read.usd.scene import open_scene
 from warp_corot.io.write.animate import steps_per_frame
 from warp_corot.io.write.usd.over import SceneState, SceneWriter
-from warp_corot.newton.following import INTERVAL, RETRIES
 from warp_corot.newton.library import newton
 from warp_corot.newton.solver import SolverCorotated
+from warp_corot.newton.substeps import INTERVAL, RETRIES
 
 from .stage import StageOptions, stage_model
 from .start import warn_of_overlaps
