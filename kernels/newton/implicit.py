@@ -344,22 +344,18 @@ def turn_particles(
     turns: wp.array[wp.mat33],
     entry: wp.array[wp.int32],
     # In and out
-    x: wp.array[wp.vec4],
     u: wp.array[wp.vec4],
     # Out
     turned: wp.array[wp.vec3],
     way: wp.array[wp.vec4],
 ):
-    """Find the turned positions and the way to them; gathered positions are turned in the arrays that are not empty."""
+    """Find the turned positions and the way to them; gathered displacements are turned, too."""
     i = wp.tid()
     at = q[i]
     d = wp.vec3()
     piece = piece_of[i]
     if piece >= 0:
         d = turns[piece] * (at - centres[piece])
-        if x.shape[0] > 0:
-            store_node(x, i, at + d)
-        if u.shape[0] > 0:
-            store_node(u, i, load_node(u, i) + d)
+        store_node(u, i, load_node(u, i) + d)
     turned[i] = at + d
     store_node(way, entry[i], d)

@@ -131,15 +131,14 @@ def gather_particles(
     before: wp.array[wp.float32],
     after: wp.array[wp.float32],
     # Out
-    x: wp.array[wp.vec4],
     u: wp.array[wp.vec4],
     f: wp.array[wp.vec4],
     kept_q: wp.array[wp.vec3],
     kept_qd: wp.array[wp.vec3],
     trouble: wp.array[wp.int32],
 ):
-    """Gather positions, displacements from ``rest``, and copies into the arrays that are not empty; forces start with
-    the external ones [N]. A value that is not finite marks its world.
+    """Gather displacements from ``rest``, or positions if it is empty, and copies into the arrays that are not empty;
+    forces start with the external ones [N]. A value that is not finite marks its world.
 
     Args:
         before, after: What particles had in the last step, which is replaced, and have in this one; see ``records``.
@@ -152,10 +151,10 @@ def gather_particles(
     velocity = qd[i]
     force = external[i]
     store_node(f, i, force)
-    if x.shape[0] > 0:
-        store_node(x, i, at)
-    if u.shape[0] > 0:
-        store_node(u, i, at - load_node(rest, i))
+    from_rest = at
+    if rest.shape[0] > 0:
+        from_rest = at - load_node(rest, i)
+    store_node(u, i, from_rest)
     if kept_q.shape[0] > 0:
         store_vector(kept_q, i, at)
         store_vector(kept_qd, i, velocity)
@@ -167,14 +166,13 @@ def gather_particles(
 def gather_nodes(
     # In
     particles: wp.array[wp.int32],
-    x: wp.array[wp.vec4],
-    rest: wp.array[wp.vec4],
+    all: wp.array[wp.vec4],
     # Out
     u: wp.array[wp.vec4],
 ):
-    """Displacements of a forest's nodes from their rest positions."""
+    """Displacements of a forest's nodes."""
     k = wp.tid()
-    store_node(u, k, load_node(x, particles[k]) - load_node(rest, k))
+    store_node(u, k, load_node(all, particles[k]))
 
 
 @wp.kernel(enable_backward=False)

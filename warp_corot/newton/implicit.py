@@ -152,7 +152,7 @@ class TurnedPieces:
         outputs = [self._centres, self._turns, self._any_turns]
         sums.launch_scalars(turning.find_turns, [wp.float64(dt)], outputs)
         inputs = [self._piece, q, self._centres, self._turns, self._entry]
-        outputs = [tets.x, tets.u, self.positions, self.way]
+        outputs = [tets.u, self.positions, self.way]
         wp.launch(kernels.turn_particles, len(self.positions), inputs, outputs, device=sums.device)
 
 

@@ -210,7 +210,7 @@ class Steps:
         inputs = [now.particle_q, now.particle_qd, state_in.particle_f, self.contacts.particles, tets.rest, wrong]
         copies = self._particles_before if copied else self._nothing
         memory = self.contacts.memory if number == 0 else [self._no_numbers, self._no_numbers]
-        outputs = [*memory, tets.x, tets.u, self._f, *copies, self.report.trouble]
+        outputs = [*memory, tets.u, self._f, *copies, self.report.trouble]
         self._launch(kernels.gather_particles, model.particle_count, inputs, outputs)
 
     def _bodies_after(self, done: float, substep: Step, given: newton.State) -> newton.State:

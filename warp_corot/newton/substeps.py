@@ -22,8 +22,8 @@ from warp_corot.kernels.stepping import gauge
 from warp_corot.kernels.stepping.lanczos import add_scaled, scale_by
 from warp_corot.mesh.growing.cut import linked, node_pairs
 from warp_corot.solvers.guarding.mapped import Mapped
-from warp_corot.solvers.steps.gauge import REST_TURNS
-from warp_corot.solvers.steps.stable_step import PROBE, SmallForces, largest_eigenvalue
+from warp_corot.solvers.steps.gauge import Curvature
+from warp_corot.solvers.steps.stable_step import SmallForces, largest_eigenvalue
 
 from .contact import Contacts
 from .library import newton
@@ -182,13 +182,9 @@ class Following:
     def __init__(self, model: newton.Model, tetrahedra: Tetrahedra):
         self.model, self.tetrahedra = model, tetrahedra
         self.device = model.device
-        count = model.particle_count
-        self._directions, self._probed_x, self._probed_u, self._f, self._f_probed = (
-            wp.zeros(size, dtype=wp.vec4, device=self.device)
-            for size in (count, len(tetrahedra.x), len(tetrahedra.u), count, count)
-        )
+        self._f = wp.zeros(model.particle_count, dtype=wp.vec4, device=self.device)
         self._found = wp.zeros((1, 2), dtype=wp.float32, device=self.device)
-        self._of_model = self._found[0]
+        self._curvature = Curvature(model.particle_count, self._found[0])
         self._at_rest = wp.zeros((1, 4), dtype=wp.float64, device=self.device)
         self._allowed = wp.zeros(1, dtype=wp.float64, device=self.device)
         self._turn = wp.zeros(1, dtype=wp.int32, device=self.device)
@@ -207,17 +203,11 @@ class Following:
         inverse = np.where(active, model.particle_inv_mass.numpy(), 0.0)
         has_tets = np.zeros(len(inverse), bool)
         has_tets[tets.tets] = True
-        self._inverse_mass = self._on_device(inverse * has_tets)
-        chosen = np.zeros(len(inverse), bool)
-        chosen[tets.nodes_by_displacements] = True
-        self._by_displacements = self._on_device(inverse * chosen)
-        chosen = np.zeros(len(inverse), bool)
-        chosen[tets.nodes_by_positions] = True
-        self._by_positions = self._on_device(inverse * chosen)
-        lightest = float((inverse * has_tets).max())
-        size = float(tets.elements.volume.numpy().min()) ** (1.0 / 3.0)
-        self._scale = wp.full(1, PROBE * size / math.sqrt(lightest) if lightest > 0 else 0.0, wp.float32, self.device)
-        row = [stable, self._curvature_at_rest(), Corotated.step_safety, Corotated.strained_safety]
+        inverse *= has_tets
+        self._inverse_mass = wp.array(inverse, dtype=wp.float32, device=self.device)
+        self._curvature.fit(inverse, float(tets.elements.volume.numpy().min()))
+        curvature = self._curvature.at_rest(tets.add_linear_forces, self._inverse_mass, len(inverse))
+        row = [stable, curvature, Corotated.step_safety, Corotated.strained_safety]
         self._longest = stable * Corotated.step_safety
         if not math.isfinite(stable):
             row[0] = self._longest = 1e30
@@ -251,7 +241,7 @@ class Following:
         return due
 
     def measure(self, state: newton.State, dt: float, substep: float) -> None:
-        """Measure at a state whose positions and displacements have been gathered.
+        """Measure at a state whose displacements have been gathered.
 
         Args:
             state: The state.
@@ -259,20 +249,9 @@ class Following:
             substep: The planned length of a substep [s].
         """
         tets, model = self.tetrahedra, self.model
-        for base, probed, inverse_mass in (
-            (tets.x, self._probed_x, self._by_positions),
-            (tets.u, self._probed_u, self._by_displacements),
-        ):
-            if not len(base):
-                continue
-            self._f.zero_()
-            outputs = [self._directions, probed, self._f_probed]
-            self._launch(gauge.probe_directions, [self._scale, inverse_mass, base], outputs)
-            for at, f in ((base, self._f), (probed, self._f_probed)):
-                by_positions = base is tets.x
-                tets.add_elastic_forces(at if by_positions else None, None if by_positions else at, f)
-            inputs = [inverse_mass, base, probed, self._f, self._f_probed]
-            self._launch(gauge.find_curvatures, inputs, [self._directions, self._of_model])
+        self._f.zero_()
+        tets.add_elastic_forces(tets.u, self._f)
+        self._curvature.find(tets.add_elastic_forces, self._inverse_mass, tets.u, self._f, model.particle_count)
         ahead = max(dt, INTERVAL * substep)
         inputs = [tets.elements, state.particle_q, state.particle_qd, ahead, model.tet_count, self._turn]
         looked_at = -(-model.tet_count // int(gauge.TURNS))
@@ -294,31 +273,8 @@ class Following:
             self._excess.zero_()
         return excess
 
-    # --- pieces ----------------------------------------------------------------------------------------------------
-
-    def _curvature_at_rest(self) -> float:
-        """The largest curvature about rest shapes [1/s^2]; measurements start with its directions."""
-        tets = self.tetrahedra
-        u, probed = (wp.zeros(self.model.particle_count, dtype=wp.vec4, device=self.device) for _ in range(2))
-        self._directions.zero_()
-        self._f.zero_()
-        for _ in range(REST_TURNS):
-            self._found.zero_()
-            outputs = [self._directions, probed, self._f_probed]
-            self._launch(gauge.probe_directions, [self._scale, self._inverse_mass, u], outputs)
-            tets.add_linear_forces(probed, self._f_probed)
-            inputs = [self._inverse_mass, u, probed, self._f, self._f_probed]
-            self._launch(gauge.find_curvatures, inputs, [self._directions, self._of_model])
-        value = float(self._found.numpy()[0, 0])
-        self._found.zero_()
-        return value
-
-    def _on_device(self, values: npt.NDArray[np.floating]) -> wp.array:
-        return wp.array(values, dtype=wp.float32, device=self.device)
-
-    def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list, dim: int | None = None) -> None:
-        count = self.model.particle_count if dim is None else dim
-        wp.launch(kernel, dim=count, inputs=inputs, outputs=outputs, device=self.device)
+    def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list, dim: int) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
 
 def _size(model: newton.Model, tets: npt.NDArray[np.integer]) -> float:

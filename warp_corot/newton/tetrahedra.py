@@ -10,6 +10,7 @@ import warp as wp
 
 from warp_corot.discretization.discretization import FixedMesh
 from warp_corot.elasticity import Corotated
+from warp_corot.elasticity.backends.simd8 import Lanes
 from warp_corot.elasticity.dilatation import ELEMENT
 from warp_corot.elasticity.structs import Kept, isotropic_material
 from warp_corot.errors import InputError
@@ -17,7 +18,6 @@ from warp_corot.kernels.elements.constitutive import IsotropicMaterial, linear_s
 from warp_corot.kernels.elements.elements import GeneralElements
 from warp_corot.kernels.elements.forces import law_stress, repair_forces, scatter_forces
 from warp_corot.kernels.elements.general_cuda import BLOCK, PosedElements
-from warp_corot.kernels.elements.simd8 import LANES
 from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.kernels.newton.elements import (
     EACH,
@@ -76,7 +76,6 @@ class ForestGroup:
         self._parts: dict[int, wp.array] = {}
         if not self.follow_one_another:
             self._particles = wp.array(self.nodes, dtype=wp.int32, device=self.device)
-            self._rest = wp.array(self.rest, dtype=wp.vec4, device=self.device)
             self._u, self._f = (wp.zeros(self.count, dtype=wp.vec4, device=self.device) for _ in range(2))
 
     def set_material(self, mu: npt.NDArray[np.float64], lam: npt.NDArray[np.float64]) -> None:
@@ -86,16 +85,12 @@ class ForestGroup:
         made_of = FixedMesh.of_lame(self.forest, own_mu, own_lam, self.copies, self.device)
         self._field = Corotated(rotation_level=self.rotation_level, dilatation=ELEMENT).bind(made_of)
 
-    def add_forces(self, x: wp.array, u: wp.array, f: wp.array) -> None:
-        """Add the elastic forces of particles at x, displaced by u, to f, all vec4 [P].
-
-        It reads only one of x and u: displacements if its particles are contiguous, else positions.
-        """
+    def add_forces(self, u: wp.array, f: wp.array) -> None:
+        """Add the elastic forces of displaced particles to f, both vec4 [P]."""
         if self.follow_one_another:
             self._field.add_forces(self._part_of(u), self._part_of(f))
             return
-        inputs = [self._particles, x, self._rest]
-        wp.launch(gather_nodes, dim=self.count, inputs=inputs, outputs=[self._u], device=self.device)
+        wp.launch(gather_nodes, dim=self.count, inputs=[self._particles, u], outputs=[self._u], device=self.device)
         self._field.add_forces(self._u, self._f)
         wp.launch(add_nodes, dim=self.count, inputs=[self._particles, self._f], outputs=[f], device=self.device)
 
@@ -135,7 +130,7 @@ def _is_there(
     particles: npt.NDArray[np.integer],
     first: npt.NDArray[np.integer],
 ) -> bool:
-    """Whether a model's tetrahedra have the forest's nodes and rest shapes, in any orientation."""
+    """Whether a model's tetrahedra have the forest's nodes, which no others have, and its rest shapes, in any axes."""
     own = right_handed(forest)
     if not ((particles >= 0).all() and (particles + len(forest.points) <= model.particle_count).all()):
         return False
@@ -143,7 +138,11 @@ def _is_there(
     shapes = _shapes(np.linalg.inv(np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)))
     size = np.abs(shapes).max(axis=(1, 2), keepdims=True)
     poses = model.tet_poses.numpy().reshape(-1, 3, 3)
+    uses = np.bincount(tets.ravel(), minlength=model.particle_count)
+    own_uses = np.bincount(own.ravel(), minlength=len(forest.points))
     for p, t in zip(particles, first, strict=True):
+        if not np.array_equal(uses[p : p + len(forest.points)], own_uses):
+            return False
         if not np.array_equal(tets[t : t + len(own)], own + p):
             return False
         if not (np.abs(_shapes(poses[t : t + len(own)].astype(np.float64)) - shapes) < 1e-4 * size).all():
@@ -174,8 +173,8 @@ class Part:
 class Tetrahedra:
     """Forces, rotations and stresses of all tetrahedra of a model.
 
-    Forces use positions that have been gathered (see ``kernels.newton.particles``) into arrays that are empty if
-    no element needs them.
+    Forces use displacements that have been gathered; see ``kernels.newton.particles``. Tetrahedra outside forests have
+    no rest positions: only the rest matrix of each is known, and their particles' displacements are positions.
 
     Args:
         model: The model.
@@ -183,8 +182,8 @@ class Tetrahedra:
         rotation_level: Level of shared rotations in forests; see ``Corotated``.
 
     Attributes:
-        x: Positions of particles [m], vec4 [P]; for elements that are computed one by one.
-        rest, u: Rest positions and displacements of the particles of forests [m], vec4 [P].
+        rest: Rest positions of the particles of forests, zero for others [m], vec4 [P]; empty without forests.
+        u: Displacements of particles from there [m], vec4 [P].
 
     Raises:
         InputError: There are no tetrahedra, or a material is not positive definite.
@@ -209,7 +208,11 @@ class Tetrahedra:
         self._take_single(np.flatnonzero(single))
         everything = [Part(np.arange(model.tet_count), self.device)]
         self._others = [Part(group.tets, self.device) for group in self.groups] if self._fused else everything
-        self._make_room_for_nodes()
+        rest = np.zeros((model.particle_count if self.groups else 0, 4), np.float32)
+        for group in self.groups:
+            rest[group.nodes] = group.rest
+        self.rest = wp.array(rest, dtype=wp.vec4, device=self.device)
+        self.u = wp.zeros(model.particle_count, dtype=wp.vec4, device=self.device)
         fill = attribute_of(model, "fill")
         self._fill = wp.ones(1, dtype=wp.float32, device=self.device) if fill is None else fill
         self._nothing = {name: wp.empty(0, dtype=dtype, device=self.device) for name, dtype in STATE.items()}
@@ -260,9 +263,9 @@ class Tetrahedra:
         self._may_be_active = not looks or bool(activation.numpy().any())
 
     def add_forces(self, state: newton.State, activation: wp.array, f: wp.array) -> None:
-        """Add the forces [N] for a state, whose positions have been gathered, to f, vec4 [P]."""
+        """Add the forces [N] for a state, whose displacements have been gathered, to f, vec4 [P]."""
         q, v = state.particle_q, state.particle_qd
-        self._add_forces(self.x, self.u, activation, v, f)
+        self._add_forces(self.u, activation, v, f)
         if not (self.damped or self._may_be_active):
             return
         for part in self._others:
@@ -270,14 +273,9 @@ class Tetrahedra:
             threads = -(-part.count // int(EACH))
             self._launch(scatter_damping_and_activation(self.damped), threads, inputs, [f])
 
-    def add_elastic_forces(self, x: wp.array | None, u: wp.array | None, f: wp.array) -> None:
-        """Add the elastic forces [N] for given positions to f, vec4 [P].
-
-        Args:
-            x: Positions; None: elements that need them are left out.
-            u: Displacements; None: elements that need them are left out.
-        """
-        self._add_forces(x, u, self._no_activation, self._no_velocities, f)
+    def add_elastic_forces(self, u: wp.array, f: wp.array) -> None:
+        """Add the elastic forces of displacements [N] to f, both vec4 [P]."""
+        self._add_forces(u, self._no_activation, self._no_velocities, f)
 
     def add_linear_forces(self, u: wp.array, f: wp.array) -> None:
         """Add the elastic forces of small displacements from rest shapes [N] to f, vec4 [P]."""
@@ -289,16 +287,6 @@ class Tetrahedra:
     def k_damp(self) -> wp.array:
         """Viscosity of all tetrahedra [Pa s], float32 [T]."""
         return self._materials[3]
-
-    @property
-    def nodes_by_positions(self) -> npt.NDArray[np.integer]:
-        """Particles of elements whose forces are found from positions."""
-        return self._nodes[0]
-
-    @property
-    def nodes_by_displacements(self) -> npt.NDArray[np.integer]:
-        """Particles of elements whose forces are found from displacements."""
-        return self._nodes[1]
 
     def write_attributes(self, state: newton.State) -> None:
         """Write rotations and stresses for a state's positions, if it has attributes for them."""
@@ -320,68 +308,36 @@ class Tetrahedra:
         posed.volume = wp.array(self.elements.volume.numpy()[ids], dtype=wp.float32, device=self.device)
         return posed
 
-    def _add_forces(
-        self,
-        x: wp.array | None,
-        u: wp.array | None,
-        activation: wp.array,
-        v: wp.array,
-        f: wp.array,
-    ) -> None:
+    def _add_forces(self, u: wp.array, activation: wp.array, v: wp.array, f: wp.array) -> None:
         """Add elastic forces, and others in the same kernel."""
-        if self.single_count and x is not None:
-            if self._fused:
-                inputs = [self._single, *self._single_materials, self._single_ids, activation, x, v]
-                self._launch(scatter_posed(quick_rotation, self.damped), self.single_count, inputs, [f], BLOCK)
-            else:
-                material = self._single_isotropic(*self._single_materials[:2])
-                inputs = [self._single, self.single_count, material, x]
-                self._launch(scatter_posed_lanes, -(-self.single_count // LANES), inputs, [f, self._left_out])
-                repair = repair_forces(GeneralElements, IsotropicMaterial, posed_stress)
-                self._launch(repair, 1, [self._single, material, x], [self._left_out, f])
+        if self._fused and self.single_count:
+            inputs = [self._single, *self._single_materials, self._single_ids, activation, u, v]
+            self._launch(scatter_posed(quick_rotation, self.damped), self.single_count, inputs, [f], BLOCK)
+        elif self.single_count:
+            self._lanes.scatter_forces(self._single_isotropic(*self._single_materials[:2]), u, f)
         for group in self.groups:
-            at = u if group.follow_one_another else x
-            if at is not None:
-                group.add_forces(at, at, f)
+            group.add_forces(u, f)
 
     def _take_single(self, ids: npt.NDArray[np.integer]) -> None:
         """Set the tetrahedra that are computed one by one."""
-        self.single_count, self._single_places = len(ids), ids
+        self.single_count = len(ids)
         self._no_ids = wp.empty(0, dtype=wp.int32, device=self.device)
         # The kernel with damping and activation reads these, too.
         room = (self.model.tet_count, self.model.particle_count) if self._fused else (0, 0)
         self._no_activation = wp.zeros(room[0], dtype=wp.float32, device=self.device)
         self._no_velocities = wp.zeros(room[1], dtype=wp.vec3, device=self.device)
-        self._left_out = wp.zeros(len(ids) + 1, dtype=wp.int32, device=self.device)
         everything = len(ids) == self.model.tet_count
-        self._single: PosedElements | GeneralElements
         if self._fused:
             self._single = self.posed(ids)
         else:
-            self._single = self.elements if everything else self._elements(ids)
+            elements = self.elements if everything else self._elements(ids)
+            repair = repair_forces(GeneralElements, IsotropicMaterial, posed_stress)
+            self._lanes = Lanes(elements, elements, scatter=scatter_posed_lanes, repair=repair)
         self._single_ids, self._single_materials = self._no_ids, self._materials
         self._single_isotropic = Kept(lambda mu, lam: isotropic_material([mu, lam, 1]))
         if not everything:
             self._single_ids = wp.array(ids, dtype=wp.int32, device=self.device)
             self._single_materials = self._room_for_materials(len(ids))
-
-    def _make_room_for_nodes(self) -> None:
-        ranges = [group for group in self.groups if group.follow_one_another]
-        count = self.model.particle_count
-        one_by_one = bool(self.single_count) or len(ranges) < len(self.groups)
-        self.x = wp.zeros(count if one_by_one else 0, dtype=wp.vec4, device=self.device)
-        self.u = wp.zeros(count if ranges else 0, dtype=wp.vec4, device=self.device)
-        rest = np.zeros((len(self.u), 4), np.float32)
-        for group in ranges:
-            rest[group.nodes] = group.rest
-        of_positions = [group.nodes for group in self.groups if not group.follow_one_another]
-        if self.single_count:
-            of_positions.append(np.unique(self.tets[self._single_places]))
-        nobody = np.empty(0, int)
-        self._nodes = tuple(
-            np.concatenate([nobody, *nodes]) for nodes in (of_positions, [group.nodes for group in ranges])
-        )
-        self.rest = wp.array(rest, dtype=wp.vec4, device=self.device)
 
     def _room_for_materials(self, count: int) -> list[wp.array]:
         return [wp.empty(count, dtype=wp.float32, device=self.device) for _ in range(4)]
