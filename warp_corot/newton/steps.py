@@ -41,7 +41,7 @@ class Steps:
         damping: Rate of mass-proportional damping [1/s].
 
     Attributes:
-        report: Failures of kernels.
+        report: Failures of worlds.
         totals: The cost of implicit steps: steps, linear solves, iterations of these, and steps with a solve that did
             not converge, int64 [4].
     """

@@ -23,7 +23,7 @@ from warp_corot.kernels.stepping.lanczos import add_scaled, scale_by
 from warp_corot.mesh.growing.cut import linked, node_pairs
 from warp_corot.solvers.guarding.mapped import Mapped
 from warp_corot.solvers.steps.gauge import Curvature
-from warp_corot.solvers.steps.stable_step import SmallForces, largest_eigenvalue
+from warp_corot.solvers.steps.stable_step import largest_eigenvalue
 
 from .contact import Contacts
 from .library import newton
@@ -46,45 +46,31 @@ ENOUGH = 3.95
 
 
 class _SmallMotions:
-    """Forces of small displacements from rest, or of velocities there: of elements, of everything else, and of a
-    spring or damper at every particle.
+    """Forces -(a K + b C) u of small displacements from rest: of elements, of everything else, and of a spring and a
+    damper at every particle.
 
-    Elements turn with their rotations; if these are negligible, the model is linear elasticity.
+    Elements turn with their rotations; if these are negligible, the model is linear elasticity, and viscosity adds to
+    its moduli.
     """
 
-    def __init__(
-        self, elements: GeneralElements, mu: wp.array, lam: wp.array, others: Others, damping: bool, at_particles: float
-    ):
-        self.elements, self.others, self.damping, self.at_particles = elements, others, damping, at_particles
-        self.material = isotropic_material([mu, lam, 1])
-        self.kernel = scatter_forces(GeneralElements, IsotropicMaterial, law_stress(linear_stress))
+    def __init__(self, tets: Tetrahedra, others: Others, a: float, b: float, stiffness: float, damping: float):
+        self.elements, self.others, self._at_particles = tets.elements, others, a * stiffness + b * damping
+        mu, lam, viscosity = (array.numpy().astype(np.float64) for array in (tets.mu, tets.lam, tets.k_damp))
+        moduli = (a * mu + 0.5 * b * viscosity, a * lam + b * viscosity)
+        device = tets.device
+        self._material = isotropic_material([*(wp.array(m, dtype=wp.float32, device=device) for m in moduli), 1])
+        self._kernel = scatter_forces(GeneralElements, IsotropicMaterial, law_stress(linear_stress))
+        #: Scaled displacements, kept because launches may be recorded.
+        self._parts = [(f, k, wp.zeros_like(tets.u)) for k, f in enumerate((a, b)) if f and others.has_particles]
 
     def add_forces(self, u: wp.array, f: wp.array) -> None:
         count = len(self.elements.volume)
-        wp.launch(self.kernel, dim=count, inputs=[self.elements, self.material, u], outputs=[f], device=u.device)
-        self.others.add_linear_forces(u, f, self.damping)
-        wp.launch(add_scaled, dim=len(u), inputs=[-self.at_particles, u], outputs=[f], device=u.device)
-
-    @contextmanager
-    def state_kept(self) -> Iterator[None]:
-        yield
-
-
-class _Sum:
-    """dt^2 K + 2 dt C, as forces."""
-
-    def __init__(self, dt: float, elastic: _SmallMotions, viscous: _SmallMotions):
-        self.parts = (dt * dt, elastic), (2.0 * dt, viscous)
-        #: The scaled displacements of each part, kept because launches may be recorded.
-        self._scaled: list[wp.array] = []
-
-    def add_forces(self, u: wp.array, f: wp.array) -> None:
-        if not self._scaled:
-            self._scaled = [wp.empty_like(u) for _ in self.parts]
-        for (factor, motions), scaled in zip(self.parts, self._scaled, strict=True):
+        wp.launch(self._kernel, dim=count, inputs=[self.elements, self._material, u], outputs=[f], device=u.device)
+        for factor, damping, scaled in self._parts:
             wp.copy(scaled, u)
             wp.launch(scale_by, dim=len(u), inputs=[factor, scaled], device=u.device)
-            motions.add_forces(scaled, f)
+            self.others.add_linear_forces(scaled, f, bool(damping))
+        wp.launch(add_scaled, dim=len(u), inputs=[-self._at_particles, u], outputs=[f], device=u.device)
 
     @contextmanager
     def state_kept(self) -> Iterator[None]:
@@ -106,35 +92,36 @@ def stable_step(
         stiffness: Stiffness of a spring at every particle [N/m], for contact.
         damping: Damping of a damper at every particle [N s/m].
         of_bodies: Stiffness over mass at the other end of this spring [1/s^2]; 0: that end does not move. Bodies that
-            are touched in several places need no shorter steps; see ``kernels.newton.yielding``.
+            are touched in several places need no shorter steps; see ``kernels.newton.explicit_rows``.
     """
-    model = tets.model
-    active = (model.particle_flags.numpy() & int(newton.ParticleFlags.ACTIVE)) != 0
-    inverse = np.where(active, model.particle_inv_mass.numpy(), 0.0)
-    inverse_mass = wp.array(inverse, dtype=wp.float32, device=model.device)
+    inverse = free_inverse_masses(tets.model)
+    inverse_mass = wp.array(inverse, dtype=wp.float32, device=tets.device)
     smallest = float(tets.elements.volume.numpy().astype(np.float64).min())
 
-    def largest(motions: SmallForces) -> float:
-        return largest_eigenvalue(motions, inverse_mass, smallest, model.particle_count)
+    def largest(a: float, b: float) -> float:
+        motions = _SmallMotions(tets, others, a, b, stiffness, damping)
+        return largest_eigenvalue(motions, inverse_mass, smallest, len(inverse)) + a * of_bodies
 
-    elastic = _SmallMotions(tets.elements, tets.mu, tets.lam, others, False, stiffness)
-    w2 = largest(elastic) + of_bodies
+    w2 = largest(1.0, 0.0)
     if not (tets.damped or others.damped or damping > 0):
         return 2.0 / math.sqrt(w2) if w2 > 0 else math.inf
-    viscosity = model.tet_materials.numpy().reshape(-1, 3)[:, 2]
-    half, whole = (wp.array(s * viscosity, dtype=wp.float32, device=model.device) for s in (0.5, 1.0))
-    viscous = _SmallMotions(tets.elements, half, whole, others, True, damping)
-    c = largest(viscous)
+    c = largest(0.0, 1.0)
     if w2 == 0.0 and c == 0.0:
         return math.inf
     dt = 4.0 / (c + math.sqrt(c * c + 4.0 * w2))
     for _ in range(LENGTHENINGS if w2 > 0 and c > 0 else 0):
-        found = largest(_Sum(dt, elastic, viscous)) + dt * dt * of_bodies
+        found = largest(dt * dt, 2.0 * dt)
         if found >= ENOUGH:
             break
         # Eigenvalues grow no faster than dt^2.
         dt *= math.sqrt(4.0 / found)
     return dt
+
+
+def free_inverse_masses(model: newton.Model) -> npt.NDArray[np.floating]:
+    """Inverse masses of particles [1/kg], zero for those that do not move, float32 [P]."""
+    active = (model.particle_flags.numpy() & int(newton.ParticleFlags.ACTIVE)) != 0
+    return np.where(active, model.particle_inv_mass.numpy(), 0.0)
 
 
 def stable_steps(tets: Tetrahedra, others: Others, contacts: Contacts) -> tuple[float, float]:
@@ -198,9 +185,7 @@ class Following:
 
     def find_rest(self, stable: float) -> None:
         """Set the largest stable substep at rest [s], the reference of measurements."""
-        model, tets = self.model, self.tetrahedra
-        active = (model.particle_flags.numpy() & int(newton.ParticleFlags.ACTIVE)) != 0
-        inverse = np.where(active, model.particle_inv_mass.numpy(), 0.0)
+        tets, inverse = self.tetrahedra, free_inverse_masses(self.model)
         has_tets = np.zeros(len(inverse), bool)
         has_tets[tets.tets] = True
         inverse *= has_tets
