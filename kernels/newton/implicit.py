@@ -141,8 +141,8 @@ def begin_particles(
     falls = wp.vec3()
     if trouble_of(i, particles, trouble) == SOUND and is_active(i, particles):
         motion = dt * qd[i]
-        if particles.inverse_mass[i] > 0.0:
-            m = 1.0 / particles.inverse_mass[i]
+        if particles.inv_mass[i] > 0.0:
+            m = 1.0 / particles.inv_mass[i]
             free[k] = 1.0
             inertia[k] = (m * (1.0 / dt + damping) / dt) * wp.identity(3, dtype=wp.float32)
             g = gravity_of(i, particles)
@@ -190,7 +190,7 @@ def begin_bodies(
     angular = dt * wp.spatial_bottom(bodies.qd[i])
     store_node(d, k, linear)
     store_node(d, k + 1, angular)
-    w = bodies.inverse_mass[i]
+    w = bodies.inv_mass[i]
     if w == 0.0 or is_fixed(i, bodies):
         return
     g = gravity[place_of(bodies.world[i], gravity.shape[0])]
@@ -198,7 +198,7 @@ def begin_bodies(
     inertia[k] = (1.0 / (w * dt * dt)) * wp.identity(3, dtype=wp.float32)
     store_node(b, k, linear / (w * dt * dt) + wp.spatial_top(body_f[i]) + g / w)
     store_node(fall, k, (dt * dt) * g)
-    if wp.determinant(bodies.inverse_inertia[i]) > 0.0:
+    if wp.determinant(bodies.inv_inertia[i]) > 0.0:
         turn = wp.quat_to_matrix(wp.transform_get_rotation(bodies.q[i]))
         free[k + 1] = 1.0
         inertia[k + 1] = (turn * bodies.inertia[i] * wp.transpose(turn)) / (dt * dt)
@@ -291,7 +291,7 @@ def move_particles(
         return
     velocity = qd[i]
     if wrong == SOUND and is_active(i, particles):
-        if particles.inverse_mass[i] > 0.0:
+        if particles.inv_mass[i] > 0.0:
             velocity = load_node(d, entry[i]) / dt
         take_motion(i, q[i], velocity, dt, most, fastest, particles, q_out, qd_out, trouble)
     else:
@@ -324,7 +324,7 @@ def sum_motion(
     while k < first[piece + 1]:
         i = members[k]
         if is_moved(i, particles):
-            mass = wp.float64(1.0) / wp.float64(particles.inverse_mass[i])
+            mass = wp.float64(1.0) / wp.float64(particles.inv_mass[i])
             total += motion_of(mass, False, wp.vec3d(q[i]), wp.vec3d(qd[i]))
         else:
             total += motion_of(wp.float64(0.0), True, wp.vec3d(), wp.vec3d())

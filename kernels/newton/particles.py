@@ -33,23 +33,23 @@ RUNAWAY = wp.constant(1.0e5)
 
 @wp.struct
 class Particles:
-    """Particles of a model."""
+    """Particles of a model, with Newton's names."""
 
     flags: wp.array[wp.int32]
     world: wp.array[wp.int32]
-    inverse_mass: wp.array[wp.float32]
+    inv_mass: wp.array[wp.float32]
     gravity: wp.array[wp.vec3]  # of each world
 
 
 @wp.struct
 class Bodies:
-    """Rigid bodies of a model, and their state."""
+    """Rigid bodies of a model, with Newton's names, and their state."""
 
     fixed_flag: int  # of bodies with prescribed motion
     flags: wp.array[wp.int32]
     world: wp.array[wp.int32]
-    inverse_mass: wp.array[wp.float32]
-    inverse_inertia: wp.array[wp.mat33]
+    inv_mass: wp.array[wp.float32]
+    inv_inertia: wp.array[wp.mat33]
     inertia: wp.array[wp.mat33]
     com: wp.array[wp.vec3]
     places: wp.array[wp.int32]  # at how many places each is touched or held
@@ -72,7 +72,7 @@ def is_active(i: int, particles: Particles):
 @wp.func
 def is_moved(i: int, particles: Particles):
     """Whether forces move a particle."""
-    return is_active(i, particles) and particles.inverse_mass[i] > 0.0
+    return is_active(i, particles) and particles.inv_mass[i] > 0.0
 
 
 @wp.func
@@ -248,7 +248,7 @@ def step_particles(
         return
     velocity = qd[i]
     if wrong == SOUND and is_active(i, particles):
-        w = particles.inverse_mass[i]
+        w = particles.inv_mass[i]
         if w > 0.0:
             velocity = (velocity + dt * (w * load_node(f, i) + gravity_of(i, particles))) / (1.0 + dt * damping)
         take_motion(i, q[i], velocity, dt, most, fastest, particles, q_out, qd_out, trouble)

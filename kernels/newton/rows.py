@@ -150,7 +150,7 @@ def inverse_mass_of(row: Row, load: wp.array[wp.float32], particles: Particles):
         i = row.nodes[k]
         if i >= 0 and row.weights[k] != 0.0:  # noqa: SIM102 - the next value exists only then
             if is_moved(i, particles):
-                largest = wp.max(largest, particles.inverse_mass[i] * load_of(i, load))
+                largest = wp.max(largest, particles.inv_mass[i] * load_of(i, load))
     return largest
 
 
@@ -162,7 +162,7 @@ def pull_of(row: Row, dt: float, particles: Particles, before: wp.array[wp.vec4]
         i = row.nodes[k]
         if i >= 0:  # noqa: SIM102 - the next values exist only then
             if is_moved(i, particles):
-                push = particles.inverse_mass[i] * load_node(before, i)
+                push = particles.inv_mass[i] * load_node(before, i)
                 pull += row.weights[k] * dt * (push + gravity_of(i, particles))
     return pull
 
@@ -205,30 +205,30 @@ def count_loads(
 
 @wp.struct
 class Shapes:
-    """Shapes of a Newton model."""
+    """Shapes of a Newton model, with its names."""
 
     body: wp.array[wp.int32]
     margin: wp.array[wp.float32]
-    stiffness: wp.array[wp.float32]
-    damping: wp.array[wp.float32]
-    slope: wp.array[wp.float32]
-    friction: wp.array[wp.float32]
-    pose: wp.array[wp.transform]  # in its body's frame
+    material_ke: wp.array[wp.float32]
+    material_kd: wp.array[wp.float32]
+    material_kf: wp.array[wp.float32]
+    material_mu: wp.array[wp.float32]
+    transform: wp.array[wp.transform]  # in its body's frame
     scale: wp.array[wp.vec3]
-    mesh: wp.array[wp.uint64]
+    source_ptr: wp.array[wp.uint64]  # meshes
 
 
 @wp.struct
 class Records:
-    """Newton's records of contacts."""
+    """Newton's records of contacts, with its names."""
 
     count: wp.array[wp.int32]
     particle: wp.array[wp.int32]
-    nodes: wp.array[wp.vec3i]
-    weights: wp.array[wp.vec3]
+    indices: wp.array[wp.vec3i]
+    barycentric: wp.array[wp.vec3]
     shape: wp.array[wp.int32]
-    place: wp.array[wp.vec3]  # on the shape, in its body's frame
-    velocity: wp.array[wp.vec3]
+    body_pos: wp.array[wp.vec3]  # on the shape, in its body's frame
+    body_vel: wp.array[wp.vec3]
     normal: wp.array[wp.vec3]
     # Of meshes: kind, soft feature and mesh feature, kind -1 of other shapes; empty if there are no meshes.
     features: wp.array[wp.vec3i]
@@ -242,7 +242,7 @@ class Attachments:
 
     particle: wp.array[wp.int32]
     body: wp.array[wp.int32]
-    point: wp.array[wp.vec3]
+    body_point: wp.array[wp.vec3]
     stiffness: wp.array[wp.float32]
     damping: wp.array[wp.float32]
     enabled: wp.array[wp.bool]
@@ -258,8 +258,8 @@ def place_of_record(c: int, records: Records):
         row.nodes[0] = i
         row.weights = wp.vec4(1.0, 0.0, 0.0, 0.0)
         return row
-    n = records.nodes[c]
-    b = records.weights[c]
+    n = records.indices[c]
+    b = records.barycentric[c]
     row.nodes = wp.vec4i(n[0], n[1], n[2], -1)
     row.weights = wp.vec4(b[0], b[1], b[2], 0.0)
     if n[2] >= 0:
@@ -295,10 +295,10 @@ def is_of_nearest_triangle(c: int, x: wp.vec3, records: Records, shapes: Shapes)
     """Whether no triangle is nearer to the soft point x, in the frame of its shape's body, than that of record c."""
     shape = records.shape[c]
     scale = shapes.scale[shape]
-    y = wp.cw_div(wp.transform_point(wp.transform_inverse(shapes.pose[shape]), x), scale)
+    y = wp.cw_div(wp.transform_point(wp.transform_inverse(shapes.transform[shape]), x), scale)
     least = wp.min(wp.min(wp.abs(scale[0]), wp.abs(scale[1])), wp.abs(scale[2]))
-    reach = (wp.length(x - records.place[c]) * (1.0 + NEARLY) + TINY) / least
-    found = wp.mesh_query_point_no_sign(shapes.mesh[shape], y, reach)
+    reach = (wp.length(x - records.body_pos[c]) * (1.0 + NEARLY) + TINY) / least
+    found = wp.mesh_query_point_no_sign(shapes.source_ptr[shape], y, reach)
     return not found.result or found.face == records.features[c][2]
 
 
@@ -334,7 +334,7 @@ def counts(c: int, x: wp.vec3, records: Records, shapes: Shapes):
     rival = rival_of(feature, records.vertices)
     if rival < 0:
         return True
-    away = wp.length(x - records.place[c])
+    away = wp.length(x - records.body_pos[c])
     if (feature[0] & FAMILY) == OF_VERTEX:
         return records.nearest[rival] == code_of(away, feature[1])
     return away <= DEEPER * GRAIN * float(records.nearest[rival] / NUMBERS) + TINY
@@ -357,7 +357,7 @@ def find_nearest(
     rival = rival_of(feature, records.vertices)
     if rival >= 0:
         x = in_frame_of_body(sum_of(place_of_record(c, records), q), shapes.body[records.shape[c]], body_q)
-        wp.atomic_min(records.nearest, rival, code_of(wp.length(x - records.place[c]), feature[1]))
+        wp.atomic_min(records.nearest, rival, code_of(wp.length(x - records.body_pos[c]), feature[1]))
 
 
 # --- rows ------------------------------------------------------------------------------------------------------------
@@ -398,7 +398,7 @@ def fill_rows(
             row.weights = wp.vec4(1.0, 0.0, 0.0, 0.0)
             row.measure = 1.0
             row.body = attachments.body[a]
-            row.point = attachments.point[a]
+            row.point = attachments.body_point[a]
             row.stiffness = attachments.stiffness[a]
             row.damping = attachments.damping[a]
         rows[c] = row
@@ -417,8 +417,8 @@ def fill_rows(
             row = found
             row.counted = row.measure
             row.body = body
-            row.point = records.place[c]
-            row.velocity = records.velocity[c]
+            row.point = records.body_pos[c]
+            row.velocity = records.body_vel[c]
             row.normal = records.normal[c]
             row.offset = radius[row.nodes[0]]
             for k in range(1, 3):
@@ -426,10 +426,10 @@ def fill_rows(
                     row.offset = wp.max(row.offset, radius[row.nodes[k]])
             if shapes.margin.shape[0] > 0:
                 row.offset += shapes.margin[shape]
-            row.stiffness = 0.5 * (law.stiffness + shapes.stiffness[shape])
-            row.damping = 0.5 * (law.damping + shapes.damping[shape])
-            row.slope = 0.5 * (law.slope + shapes.slope[shape])
-            row.friction = 0.5 * (law.friction + shapes.friction[shape])
+            row.stiffness = 0.5 * (law.stiffness + shapes.material_ke[shape])
+            row.damping = 0.5 * (law.damping + shapes.material_kd[shape])
+            row.slope = 0.5 * (law.slope + shapes.material_kf[shape])
+            row.friction = 0.5 * (law.friction + shapes.material_mu[shape])
             i = records.particle[c]
             if i >= 0:
                 place = row.point

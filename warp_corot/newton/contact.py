@@ -34,20 +34,6 @@ ROUNDS = 4
 CROWD = 4.0
 #: Speed at which what was found too late is pushed out [m/s].
 RECOVERY = 0.25
-LAW = ("stiffness", "damping", "slope", "friction", "adhesion", "crowd", "recovery")
-#: A model's names of the fields of kernels' structs, and those of contacts.
-PARTICLES = {"inverse_mass": "particle_inv_mass", "gravity": "gravity"}
-PARTICLES |= {name: f"particle_{name}" for name in ("flags", "world")}
-SHAPES = {"body": "shape_body", "pose": "shape_transform", "scale": "shape_scale", "mesh": "shape_source_ptr"}
-SHAPES |= {"margin": "shape_margin", "stiffness": "shape_material_ke", "damping": "shape_material_kd"}
-SHAPES |= {"slope": "shape_material_kf", "friction": "shape_material_mu"}
-ATTACHMENTS = {name: name for name in ("particle", "body", "stiffness", "damping", "enabled")} | {"point": "body_point"}
-ATTACHMENTS = {name: f"attachment_particle_body_{given}" for name, given in ATTACHMENTS.items()}
-BODIES = {"inverse_mass": "body_inv_mass", "inverse_inertia": "body_inv_inertia"}
-BODIES |= {name: f"body_{name}" for name in ("flags", "world", "inertia", "com")}
-RECORDS = {"nodes": "indices", "weights": "barycentric", "place": "body_pos", "velocity": "body_vel"}
-RECORDS |= {name: name for name in ("count", "particle", "shape", "normal")}
-RECORDS = {name: f"soft_contact_{given}" for name, given in RECORDS.items()}
 
 
 class Contacts:
@@ -85,8 +71,9 @@ class Contacts:
             wp.zeros(bodies, dtype=wp.spatial_vectorf, device=self.device) for _ in range(3)
         )
         self._bodies = Kept(self._made_bodies)
-        self._particles, self._shapes = _FromModel(Particles, PARTICLES), _FromModel(rows.Shapes, SHAPES)
-        self._attachments, self._records = _FromModel(rows.Attachments, ATTACHMENTS), _FromModel(rows.Records, RECORDS)
+        self._particles, self._shapes = _Given(Particles, "particle_"), _Given(rows.Shapes, "shape_")
+        self._attachments = _Given(rows.Attachments, "attachment_particle_body_")
+        self._records = _Given(rows.Records, "soft_contact_")
         self._no_records, self.law = rows.Records(), rows.ContactLaw()
         self._law_values: list[float] = []
         self._nearest = wp.empty(0, dtype=wp.int64, device=self.device)
@@ -256,7 +243,8 @@ class Contacts:
         values += [model.particle_adhesion, CROWD, RECOVERY]
         if values != self._law_values:
             self._law_values, self.law = values, rows.ContactLaw()
-            for name, value in zip(LAW, values, strict=True):
+            names: Any = rows.ContactLaw
+            for name, value in zip(names.vars, values, strict=True):
                 setattr(self.law, name, value)
 
     def _can_touch(self, contacts: newton.Contacts) -> bool:
@@ -282,39 +270,40 @@ class Contacts:
         return made
 
     def _made_bodies(self, q: wp.array | None, qd: wp.array | None) -> Bodies:
-        made = Bodies()
+        made = _filled(Bodies, self.model, "body_")
         made.fixed_flag, made.places, made.yielding = KINEMATIC, self._places, self._yielding
         if self.model.body_count:
             made.q, made.qd = q, qd
-            for field, name in BODIES.items():
-                setattr(made, field, getattr(self.model, name))
         return made
 
     def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
 
-class _FromModel(Kept[Any]):
-    """A struct of a model's arrays, by the names of its fields; those that the model lacks stay empty.
+class _Given(Kept[Any]):
+    """A struct of arrays of a model or of contacts, made again where these have others.
 
     Args:
-        struct: The struct.
-        names: The model's name of each field.
+        struct: The struct, whose fields have Newton's names without the prefix.
+        prefix: The prefix.
     """
 
-    def __init__(self, struct: Any, names: dict[str, str]):
-        super().__init__(self._made)
-        self._struct_type, self._names = struct, names
+    def __init__(self, struct: Any, prefix: str):
+        super().__init__(lambda owner, *_: _filled(struct, owner, prefix))
+        self._names = [(prefix + name, name) for name in struct.vars]
 
-    def of(self, model: newton.Model | newton.Contacts) -> Any:
-        return self(*(getattr(model, name) for name in self._names.values()))
+    def of(self, owner: newton.Model | newton.Contacts) -> Any:
+        return self(owner, *(getattr(owner, name, None) for names in self._names for name in names))
 
-    def _made(self, *arrays: wp.array | None) -> Any:
-        made = self._struct_type()
-        for field, array in zip(self._names, arrays, strict=True):
-            if array is not None:
-                setattr(made, field, array)
-        return made
+
+def _filled(struct: Any, owner: Any, prefix: str) -> Any:
+    """A struct with those fields set that a model or contacts have."""
+    made = struct()
+    for name in struct.vars:
+        array = getattr(owner, prefix + name, getattr(owner, name, None))
+        if isinstance(array, wp.array):
+            setattr(made, name, array)
+    return made
 
 
 class SoftPairs:

@@ -17,7 +17,6 @@ from warp_corot.kernels.elements.elements import GeneralElements
 from warp_corot.kernels.elements.simd8 import LANES
 from warp_corot.kernels.elements.stiffness_products import add_stiffness_product
 from warp_corot.kernels.implicit import conjugate_gradients, turning
-from warp_corot.kernels.implicit.assembled import Couplings
 from warp_corot.kernels.implicit.tangent import add_vectors, find_rest
 from warp_corot.kernels.newton import implicit as kernels
 from warp_corot.kernels.newton import implicit_rows as rows
@@ -157,7 +156,8 @@ class TurnedPieces:
 
 
 class RowForces:
-    """Forces and stiffness of rows as functions of the motions in a step: an ``ObstacleContact`` of springs only.
+    """Forces and stiffness of rows as functions of the motions in a step: what ``ContactSolve`` asks of an
+    ``ObstacleContact`` of springs only.
 
     Args:
         model: The model.
@@ -216,12 +216,6 @@ class RowForces:
 
     # --- as a contact of solves, see ``ObstacleContact`` -------------------------------------------------------------
 
-    def prepare(self) -> None:
-        pass
-
-    def launch_begin(self, u: wp.array, d: wp.array, blocks: wp.array) -> None:
-        pass
-
     def launch_imposed(self, d: wp.array) -> None:
         pass
 
@@ -231,9 +225,6 @@ class RowForces:
     def launch_friction(self, d: wp.array, r: wp.array) -> None:
         self._update(d, is_solved=False)
         self._launch(rows.add_row_forces, [self._rows], [r])
-
-    def launch_couplings(self, couplings: Couplings) -> None:
-        raise NotImplementedError
 
     def add_slopes(
         self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array, *, apart: bool = False
@@ -249,9 +240,6 @@ class RowForces:
 
     def launch_end(self, d: wp.array) -> None:
         self._update(d, is_solved=True)
-
-    def launch_meetings(self, met: wp.array, begins: wp.array) -> None:
-        pass
 
     # --- pieces ------------------------------------------------------------------------------------------------------
 
@@ -391,9 +379,8 @@ class ImplicitSteps(Steps):
         self._rows = RowForces(model, contacts, unknowns, self._free)
         self._turned = TurnedPieces(model, tetrahedra, unknowns)
         self._operator = StepOperator(model, tetrahedra, unknowns, self._free, self._rows)
-        operators: list[Any] = [self._operator]
-        blocks = RowBlocks(operators[0])
-        self._system = BlockSystem(operators, [blocks], contacts=[self._rows], most=ITERATIONS)
+        parts: list[Any] = [self._operator, self._rows]
+        self._system = BlockSystem(parts[:1], [RowBlocks(parts[0])], contacts=parts[1:], most=ITERATIONS)
         self._system.solver.tolerance.fill_(TOLERANCE)
         self._solve = ContactSolve(self._system, [])
         self._change, self._product, self._rest, self._r = (
