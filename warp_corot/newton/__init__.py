@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from warp_corot.inputs.arguments import explained
 
 if TYPE_CHECKING:
-    from warp_corot.newton.stages.material import StageOptions
+    from warp_corot.newton.stages.stage import StageOptions
     from warp_corot.newton.stages.steps import StageSimulation
 
     from .scene import Added, add_forest, add_mesh, register_custom_attributes
@@ -36,7 +36,7 @@ _MODULES = {
     "Added": ".scene",
     "SensorSoftContact": ".sensor",
     "SolverCorotated": ".solver",
-    "StageOptions": ".stages.material",
+    "StageOptions": ".stages.stage",
     "StageSimulation": ".stages.steps",
     "add_forest": ".scene",
     "add_mesh": ".scene",
