@@ -85,19 +85,10 @@ def active_stress(f: wp.mat33, k: float):
     return k * cofactor(f)
 
 
-@wp.func
-def place_in_model(ids: wp.array[wp.int32], first: int, t: int):
-    """The model's index of the t-th tetrahedron of a part: from a list, or from a range if the list is empty."""
-    place = first + t
-    if ids.shape[0] > 0:
-        place = ids[t]
-    return place
-
-
 @functools.cache
 def scatter_posed(rotation: wp.Function, damped: bool, rounds: int = 1) -> wp.Kernel:
     """All forces of tetrahedra, each with the rotation of its own deformation gradient; ``ids`` are their indices in
-    ``stepping.activation``; ``rounds``: see ``add_four_forces``."""
+    ``activation``, or empty if they are all; ``rounds``: see ``add_four_forces``."""
     add = add_stress(rounds)
 
     @unique_kernel()
@@ -116,7 +107,10 @@ def scatter_posed(rotation: wp.Function, damped: bool, rounds: int = 1) -> wp.Ke
         f: wp.array[wp.vec4],
     ):
         t = wp.tid()
-        a = activation[place_in_model(ids, 0, t)]
+        place = int(t)
+        if ids.shape[0] > 0:
+            place = ids[t]
+        a = activation[place]
         n = load_four(elements.nodes, t)
         gradient = edge_differences(n, x) * rest_inverse_of(elements, t)
         p = corotated_stress(gradient, rotation(gradient), mu[t], lam[t])
@@ -157,8 +151,7 @@ def posed_stress(elements: GeneralElements, t: int, material: IsotropicMaterial,
 
 @functools.cache
 def scatter_damping_and_activation(damped: bool) -> wp.Kernel:
-    """Forces of damping and activation of ``count`` tetrahedra of a model whose elastic forces come from another
-    kernel.
+    """Forces of damping and activation of ``count`` tetrahedra whose elastic forces come from another kernel.
 
     A thread checks ``EACH`` of them, so that it waits for memory once if none is active or damped.
     """
@@ -169,8 +162,6 @@ def scatter_damping_and_activation(damped: bool) -> wp.Kernel:
         elements: GeneralElements,
         k_lambda: wp.array[wp.float32],
         k_damp: wp.array[wp.float32],
-        ids: wp.array[wp.int32],
-        first: int,
         count: int,
         activation: wp.array[wp.float32],
         q: wp.array[wp.vec3],
@@ -182,17 +173,15 @@ def scatter_damping_and_activation(damped: bool) -> wp.Kernel:
         threads = (count + EACH - 1) // EACH
         any_of = float(0.0)
         for j in range(EACH):
-            t = place_in_model(ids, first, wp.min(thread + j * threads, count - 1))
+            t = wp.min(thread + j * threads, count - 1)
             any_of += wp.abs(activation[t])
             if wp.static(damped):
                 any_of += k_damp[t]
         if any_of == 0.0:
             return
-        for k in range(thread, count, threads):
-            t = place_in_model(ids, first, k)
-            a = activation[t]
+        for t in range(thread, count, threads):
             gradient = difference_gradient(elements, t, q)
-            p = active_stress(gradient, k_lambda[t] * a)
+            p = active_stress(gradient, k_lambda[t] * activation[t])
             if wp.static(damped):
                 p += viscous_stress(gradient, difference_gradient(elements, t, v), k_damp[t])
             scatter_stress(elements, t, p, f)
@@ -200,64 +189,35 @@ def scatter_damping_and_activation(damped: bool) -> wp.Kernel:
     return scatter_damping_and_activation
 
 
-# --- materials, rotations and stresses in Newton's arrays ------------------------------------------------------------
+# --- rotations and stresses in Newton's arrays ------------------------------------------------------------------------
 
 
 @wp.kernel(enable_backward=False)
-def split_materials(
+def write_attributes(
     # In
-    materials: wp.array2d[wp.float32],
-    ids: wp.array[wp.int32],
-    mu_from_mu: float,
-    lam_from_mu: float,
-    # Out
+    elements: GeneralElements,
     mu: wp.array[wp.float32],
     lam: wp.array[wp.float32],
-    k_lambda: wp.array[wp.float32],
-    k_damp: wp.array[wp.float32],
+    fill: wp.array[wp.float32],
+    fill_stride: int,
+    q: wp.array[wp.vec3],
+    # Out
+    rotations: wp.array[wp.quat],
+    stresses: wp.array[wp.mat33],
+    equivalent: wp.array[wp.float32],
 ):
-    """Lamé's parameters of chosen elements, mu = a k_mu, lambda = k_lambda + b k_mu, and the other values in Newton's
-    rows, in separate arrays."""
+    """Write rotation and Cauchy stress of every element to the arrays that are not empty."""
     t = wp.tid()
-    row = place_in_model(ids, 0, t)
-    k_mu = materials[row, 0]
-    mu[t] = mu_from_mu * k_mu
-    lam[t] = materials[row, 1] + lam_from_mu * k_mu
-    k_lambda[t] = materials[row, 1]
-    k_damp[t] = materials[row, 2]
-
-
-@functools.cache
-def write_attributes(has_rotation: bool, has_stress: bool, has_von_mises: bool) -> wp.Kernel:
-    """Write rotation and Cauchy stress of every element, as far as the state has attributes for them."""
-
-    @unique_kernel()
-    def write_attributes(
-        # In
-        elements: GeneralElements,
-        mu: wp.array[wp.float32],
-        lam: wp.array[wp.float32],
-        fill: wp.array[wp.float32],
-        fill_stride: int,
-        q: wp.array[wp.vec3],
-        # Out
-        rotations: wp.array[wp.quat],
-        stresses: wp.array[wp.mat33],
-        equivalent: wp.array[wp.float32],
-    ):
-        t = wp.tid()
-        gradient = difference_gradient(elements, t, q)
-        r = byers_xu(gradient)
-        if wp.static(has_rotation):
-            rotations[t] = wp.normalize(wp.quat_from_matrix(r))
-        share = 1.0 / fill[t * fill_stride]
-        stress = share * hooke(corotated_strain(gradient - identity3(), identity3(), r), mu[t], lam[t])
-        if wp.static(has_stress):
-            stresses[t] = r * stress * wp.transpose(r)
-        if wp.static(has_von_mises):
-            equivalent[t] = von_mises(stress)
-
-    return write_attributes
+    gradient = difference_gradient(elements, t, q)
+    r = byers_xu(gradient)
+    if rotations.shape[0] > 0:
+        rotations[t] = wp.normalize(wp.quat_from_matrix(r))
+    share = 1.0 / fill[t * fill_stride]
+    stress = share * hooke(corotated_strain(gradient - identity3(), identity3(), r), mu[t], lam[t])
+    if stresses.shape[0] > 0:
+        stresses[t] = r * stress * wp.transpose(r)
+    if equivalent.shape[0] > 0:
+        equivalent[t] = von_mises(stress)
 
 
 # --- current stiffness, as ``stepping.gauge`` ------------------------------------------------------------------------

@@ -25,7 +25,6 @@ from warp_corot.kernels.newton.elements import (
     scatter_damping_and_activation,
     scatter_posed,
     scatter_posed_lanes,
-    split_materials,
     write_attributes,
 )
 from warp_corot.kernels.newton.particles import add_nodes, gather_nodes
@@ -161,15 +160,6 @@ def _squeezed(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64] | floa
     return one if np.allclose(values, one, rtol=2e-7, atol=0.0) else values
 
 
-class Part:
-    """A part of a model's tetrahedra for a kernel: a range, or a list."""
-
-    def __init__(self, tets: npt.NDArray[np.integer], device: wp.Device):
-        self.first, self.count = int(tets[0]), len(tets)
-        listed = tets if (np.diff(tets) != 1).any() else tets[:0]
-        self.ids = wp.array(listed, dtype=wp.int32, device=device)
-
-
 class Tetrahedra:
     """Forces, rotations and stresses of all tetrahedra of a model.
 
@@ -196,18 +186,18 @@ class Tetrahedra:
         self.device = model.device
         self.tets = model.tet_indices.numpy().reshape(-1, 4)
         self.elements = self._elements(np.arange(model.tet_count))
-        #: mu, lambda, k_lambda [Pa] and k_damp [Pa s] of all tetrahedra.
+        #: mu, lambda, k_lambda [Pa] and k_damp [Pa s] of all tetrahedra; and the last two for the kernel beside elastic
+        #: ones.
         self._materials = self._room_for_materials(model.tet_count)
-        self.mu, self.lam = self._materials[:2]
+        self.mu, self.lam, _, self.k_damp = self._materials
+        self._beside = self._room_for_materials(model.tet_count)[:2]
         self.groups: list[ForestGroup] = forest_groups(model, self.tets, rotation_level)
         #: Whether the elastic kernel of single tetrahedra includes activation and damping.
         self._fused, self._may_be_active = self.device.is_cuda, True
-        single = np.ones(model.tet_count, bool)
+        self._is_single = np.ones(model.tet_count, bool)
         for group in self.groups:
-            single[group.tets] = False
-        self._take_single(np.flatnonzero(single))
-        everything = [Part(np.arange(model.tet_count), self.device)]
-        self._others = [Part(group.tets, self.device) for group in self.groups] if self._fused else everything
+            self._is_single[group.tets] = False
+        self._take_single(np.flatnonzero(self._is_single))
         rest = np.zeros((model.particle_count if self.groups else 0, 4), np.float32)
         for group in self.groups:
             rest[group.nodes] = group.rest
@@ -246,10 +236,12 @@ class Tetrahedra:
         bad = np.flatnonzero(~(materials[:, 2] >= 0))
         if len(bad):
             raise InputError(f"tetrahedron {bad[0]} has k_damp {materials[bad[0], 2]:g} Pa s; it must not be negative")
-        self._launch(split_materials, len(materials), [self.model.tet_materials, self._no_ids, a, b], self._materials)
-        if self._single_materials is not self._materials:
-            inputs = [self.model.tet_materials, self._single_ids, a, b]
-            self._launch(split_materials, self.single_count, inputs, self._single_materials)
+        columns = [mu, lam, materials[:, 1], materials[:, 2]]
+        for arrays, chosen in ((self._materials, slice(None)), (self._single_materials, self._is_single)):
+            for array, column in zip(arrays, columns, strict=True):
+                array.assign(column[chosen].astype(np.float32))
+        for array, column in zip(self._beside, columns[2:], strict=True):
+            array.assign(np.where(self._fused & self._is_single, 0.0, column).astype(np.float32))
         self.damped = bool((materials[:, 2] > 0).any())
         for group in self.groups:
             group.set_material(mu, lam)
@@ -266,12 +258,10 @@ class Tetrahedra:
         """Add the forces [N] for a state, whose displacements have been gathered, to f, vec4 [P]."""
         q, v = state.particle_q, state.particle_qd
         self._add_forces(self.u, activation, v, f)
-        if not (self.damped or self._may_be_active):
-            return
-        for part in self._others:
-            inputs = [self.elements, *self._materials[2:], part.ids, part.first, part.count, activation, q, v]
-            threads = -(-part.count // int(EACH))
-            self._launch(scatter_damping_and_activation(self.damped), threads, inputs, [f])
+        count = self.model.tet_count
+        if (self.damped or self._may_be_active) and not (self._fused and self.single_count == count):
+            inputs = [self.elements, *self._beside, count, activation, q, v]
+            self._launch(scatter_damping_and_activation(self.damped), -(-count // int(EACH)), inputs, [f])
 
     def add_elastic_forces(self, u: wp.array, f: wp.array) -> None:
         """Add the elastic forces of displacements [N] to f, both vec4 [P]."""
@@ -283,21 +273,15 @@ class Tetrahedra:
         material = isotropic_material([self.mu, self.lam, 1])
         self._launch(kernel, self.model.tet_count, [self.elements, material, u], [f])
 
-    @property
-    def k_damp(self) -> wp.array:
-        """Viscosity of all tetrahedra [Pa s], float32 [T]."""
-        return self._materials[3]
-
     def write_attributes(self, state: newton.State) -> None:
         """Write rotations and stresses for a state's positions, if it has attributes for them."""
         there = {name: attribute_of(state, name) for name in STATE}
         if all(array is None for array in there.values()):
             return
-        kernel = write_attributes(*(array is not None for array in there.values()))
         fill = [self._fill, int(len(self._fill) == self.model.tet_count)]
         inputs = [self.elements, self.mu, self.lam, *fill, state.particle_q]
         outputs = [self._nothing[name] if array is None else array for name, array in there.items()]
-        self._launch(kernel, self.model.tet_count, inputs, outputs)
+        self._launch(write_attributes, self.model.tet_count, inputs, outputs)
 
     def posed(self, ids: npt.NDArray[np.integer]) -> PosedElements:
         """Chosen elements in the form for ``scatter_posed``."""
@@ -321,7 +305,6 @@ class Tetrahedra:
     def _take_single(self, ids: npt.NDArray[np.integer]) -> None:
         """Set the tetrahedra that are computed one by one."""
         self.single_count = len(ids)
-        self._no_ids = wp.empty(0, dtype=wp.int32, device=self.device)
         # The kernel with damping and activation reads these, too.
         room = (self.model.tet_count, self.model.particle_count) if self._fused else (0, 0)
         self._no_activation = wp.zeros(room[0], dtype=wp.float32, device=self.device)
@@ -333,7 +316,7 @@ class Tetrahedra:
             elements = self.elements if everything else self._elements(ids)
             repair = repair_forces(GeneralElements, IsotropicMaterial, posed_stress)
             self._lanes = Lanes(elements, elements, scatter=scatter_posed_lanes, repair=repair)
-        self._single_ids, self._single_materials = self._no_ids, self._materials
+        self._single_ids, self._single_materials = wp.empty(0, dtype=wp.int32, device=self.device), self._materials
         self._single_isotropic = Kept(lambda mu, lam: isotropic_material([mu, lam, 1]))
         if not everything:
             self._single_ids = wp.array(ids, dtype=wp.int32, device=self.device)

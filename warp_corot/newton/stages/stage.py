@@ -1,5 +1,5 @@
-"""USD stages as Newton's models: tetrahedra with the materials that Newton reads, or defaults, rigid bodies, colliders and a
-ground; and what users should know of the initial state: overlaps, and bodies that contact cannot feel.
+"""USD stages as Newton's models: tetrahedra with the materials that Newton reads, or defaults, rigid bodies, colliders
+and a ground; and what users should know of the initial state: overlaps, and bodies that contact cannot feel.
 
 A model is in its stage's own units: UsdPhysics gives all quantities in them, and Newton reads them unchanged. Only
 defaults, here or in Newton, are lengths or masses in SI and are converted.
