@@ -240,14 +240,9 @@ def clear_held(free: wp.array[wp.float32], a: wp.array[wp.vec4]):
 
 
 @wp.kernel(enable_backward=False)
-def add_counts(first: wp.array[wp.int32], counts: wp.array[wp.int32]):
-    w = wp.tid()
-    counts[w] = counts[w] + first[w]
-
-
-@wp.kernel(enable_backward=False)
 def count_solves(
     # In
+    first: wp.array[wp.int32],
     iterations: wp.array[wp.int32],
     rounds: wp.array[wp.int32],
     status: wp.array[wp.int32],
@@ -259,7 +254,7 @@ def count_solves(
     linear = int(0)
     unfinished = int(0)
     for world in range(status.shape[0]):
-        linear = wp.max(linear, iterations[world])
+        linear = wp.max(linear, first[world] + iterations[world])
         if status[world] != good:
             unfinished = 1
     totals[0] = totals[0] + wp.int64(1)

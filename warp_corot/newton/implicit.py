@@ -438,19 +438,18 @@ class ImplicitSteps(Steps):
         wp.copy(self._r, self._rest)
         rows.launch_friction(x, self._r)
         system.solve(self._r, self._change, guessed=True, like=system.b)
-        solver, iterations = system.solver, system.solver.iterations
+        wp.copy(self._first, system.solver.iterations)
         if rows.count:
             operator.apply(self._change, self._product)
             self._search.launch(self._rest, self._product, self._change, x)
-            wp.copy(self._first, iterations)
             self._solve.launch()
-            iterations = self._solve.iterations
-            self._launch(kernels.add_counts, len(iterations), [self._first], [iterations])
             rows.launch_end(x)
         else:
             self._launch(add_vectors, len(x), [self._change], [x])
             rows.solves.zero_()
-        inputs = [iterations, rows.solves, solver.status, int(conjugate_gradients.CONVERGED)]
+            self._solve.iterations.zero_()
+        inputs = [self._first, self._solve.iterations, rows.solves, system.solver.status]
+        inputs.append(int(conjugate_gradients.CONVERGED))
         self._launch(kernels.count_solves, 1, inputs, [self.totals])
 
     def _launch_motion(self, substep: Step, fastest: float) -> None:
