@@ -12,7 +12,7 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.checks import refuse_tape
 from warp_corot.simulation.solves import Solves
 
-from .checks import Elsewhere, Recordings, Step, check_options, check_step, checked_dt, checked_mask
+from .checks import Recordings, Step, check_options, check_step, checked_dt, checked_mask
 from .contact import Contacts
 from .implicit import ImplicitSteps
 from .library import CouplingInterface, SolverBase, newton
@@ -82,8 +82,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
         rotation_level: Level of shared rotations in forests; see ``Corotated``.
         rigid_solver: The solver of rigid bodies: "semi-implicit"; another solver, made for this model, which also gets
             their forces; or None: no solver, and reactions are added to ``state_in.body_f`` for another program, which
-            moves the bodies. If another program moves them in spite of a solver given here, both do: the first
-            steps warn of that.
+            moves the bodies. If another program moves them in spite of a solver given here, both do.
         particle_contact: Whether particles collide with one another, as in ``SolverSemiImplicit``. Newton's default
                 radius of 0.1 m makes the particles of finer meshes repel one another.
         self_contact_margin: Distance [m] at which the surfaces of soft bodies and cloth begin to push one another and
@@ -135,7 +134,6 @@ class SolverCorotated(SolverBase, CouplingInterface):
         self.tetrahedra = Tetrahedra(model, lame, rotation_level)
         self._contacts = Contacts(model, self_contact_margin)
         self._others = Others(model, rigid_solver, particle_contact)
-        self._elsewhere = Elsewhere(model, self._others.has_bodies)
         self._recordings = Recordings(self.device)
         self._is_implicit = integrator == "implicit"
         parts = (model, self.tetrahedra, self._contacts, self._others, damping)
@@ -219,13 +217,11 @@ class SolverCorotated(SolverBase, CouplingInterface):
         check_step(step, self.model)
         self._steps.report.check_earlier(following)
         self._see_surfaces(contacts)
-        self._elsewhere.look(state_in)
         count = self._count_for(dt)
         if following is not None and self.device.is_cpu and not self.device.is_capturing:
             self._steps.launch_retried(step, following)
         else:
             self._steps.launch(step, count, following)
-        self._elsewhere.keep(state_out)
         self._recordings.follow(state_in, state_out)
         if self.device.is_cpu and not self.device.is_capturing:
             self.check()
