@@ -71,9 +71,9 @@ class Contacts:
             wp.zeros(bodies, dtype=wp.spatial_vectorf, device=self.device) for _ in range(3)
         )
         self._bodies = Kept(self._made_bodies)
-        self._particles, self._shapes = _Given(Particles, "particle_"), _Given(rows.Shapes, "shape_")
-        self._attachments = _Given(rows.Attachments, "attachment_particle_body_")
-        self._records = _Given(rows.Records, "soft_contact_")
+        self._particles, self._shapes = _Given(Particles, "particle_", model), _Given(rows.Shapes, "shape_", model)
+        self._attachments = _Given(rows.Attachments, "attachment_particle_body_", model)
+        self._records: _Given | None = None
         self._no_records, self.law = rows.Records(), rows.ContactLaw()
         self._law_values: list[float] = []
         self._nearest = wp.empty(0, dtype=wp.int64, device=self.device)
@@ -251,6 +251,8 @@ class Contacts:
         return bool(contacts.soft_contact_max and self.model.shape_count)
 
     def _records_of(self, contacts: newton.Contacts, step: Step) -> rows.Records:
+        if self._records is None:
+            self._records = _Given(rows.Records, "soft_contact_", contacts)
         made = self._records.of(contacts)
         # These attributes are private to Newton; without features there are no records of meshes.
         features = getattr(contacts, "_soft_contact_mesh_features", None)
@@ -270,7 +272,7 @@ class Contacts:
         return made
 
     def _made_bodies(self, q: wp.array | None, qd: wp.array | None) -> Bodies:
-        made = _filled(Bodies, self.model, "body_")
+        made = _Given(Bodies, "body_", self.model).of(self.model)
         made.fixed_flag, made.places, made.yielding = KINEMATIC, self._places, self._yielding
         if self.model.body_count:
             made.q, made.qd = q, qd
@@ -284,26 +286,26 @@ class _Given(Kept[Any]):
     """A struct of arrays of a model or of contacts, made again where these have others.
 
     Args:
-        struct: The struct, whose fields have Newton's names without the prefix.
+        struct: The struct, whose fields have Newton's names without the prefix; those that Newton lacks stay empty.
         prefix: The prefix.
+        owner: The model, or contacts.
     """
 
-    def __init__(self, struct: Any, prefix: str):
-        super().__init__(lambda owner, *_: _filled(struct, owner, prefix))
-        self._names = [(prefix + name, name) for name in struct.vars]
+    def __init__(self, struct: Any, prefix: str, owner: Any):
+        super().__init__(self._made)
+        self._struct_type = struct
+        names = [(field, name) for field in struct.vars for name in (prefix + field, field) if hasattr(owner, name)]
+        self._names = {field: name for field, name in reversed(names)}
 
-    def of(self, owner: newton.Model | newton.Contacts) -> Any:
-        return self(owner, *(getattr(owner, name, None) for names in self._names for name in names))
+    def of(self, owner: Any) -> Any:
+        return self(*(getattr(owner, name) for name in self._names.values()))
 
-
-def _filled(struct: Any, owner: Any, prefix: str) -> Any:
-    """A struct with those fields set that a model or contacts have."""
-    made = struct()
-    for name in struct.vars:
-        array = getattr(owner, prefix + name, getattr(owner, name, None))
-        if isinstance(array, wp.array):
-            setattr(made, name, array)
-    return made
+    def _made(self, *arrays: Any) -> Any:
+        made = self._struct_type()
+        for field, array in zip(self._names, arrays, strict=True):
+            if isinstance(array, wp.array):
+                setattr(made, field, array)
+        return made
 
 
 class SoftPairs:
