@@ -20,6 +20,7 @@ from warp_corot.kernels.newton import explicit_rows, rows
 from warp_corot.kernels.newton.pairs import PairLists, Surfaces, count_pair_loads, scatter_pairs
 from warp_corot.kernels.newton.particles import NO_ROW, UNKNOWN_BEFORE, Bodies, Particles
 from warp_corot.mesh.growing.cut import linked, node_pairs
+from warp_corot.mesh.surfaces.boundary import boundary_faces
 
 from .checks import Step
 from .library import newton
@@ -332,7 +333,7 @@ class SoftPairs:
         self._surfaces = surfaces = Surfaces()
         surfaces.triangles, surfaces.edges = model.tri_indices, model.edge_indices
         surfaces.facing = self._on_device(facing, wp.float32)
-        surfaces.outward = self._on_device(_triangles_of_edges(triangles, edges, facing, count), wp.vec2i)
+        surfaces.outward = self._on_device(_triangles_of_edges(triangles, edges, facing), wp.vec2i)
         surfaces.part = self._on_device(_parts(model, triangles), wp.int32)
         surfaces.exposed = self._on_device(exposed, wp.int32)
         surfaces.rest = wp.clone(model.particle_q)
@@ -389,42 +390,26 @@ def _facing(model: newton.Model, triangles: npt.NDArray[np.int32]) -> npt.NDArra
     """Whether triangles' normals point out of tetrahedra (1) or into them (-1); 0: the triangle is a face of none, or
     of two.
     """
-    tets = model.tet_indices.numpy().reshape(-1, 4)
-    faces = np.concatenate([np.delete(tets, k, axis=1) for k in range(4)])
-    inner = np.concatenate([tets[:, k] for k in range(4)])
-    keys = np.sort(faces, axis=1)
-    _, first, times = np.unique(keys, axis=0, return_index=True, return_counts=True)
-    both = np.concatenate([keys[first], np.sort(triangles, axis=1)])
-    _, group = np.unique(both, axis=0, return_inverse=True)
-    group = np.ravel(group)
-    of_group = np.full(group.max() + 1, -1)
-    outer = times == 1
-    of_group[group[: len(first)][outer]] = first[outer]
-    face = of_group[group[len(first) :]]
-    x = model.particle_q.numpy().astype(np.float64)
-    a, b, c = (x[triangles[:, k]] for k in range(3))
-    inwards = x[inner[face]] - a
-    volume = np.einsum("ij,ij->i", np.cross(b - a, c - a), inwards)
-    return np.where(face < 0, 0.0, -np.sign(volume)).astype(np.float32)
+    faces = boundary_faces(model.tet_indices.numpy())[0]
+    place = _places(triangles, faces)
+    alike = [(np.roll(faces[place], k, axis=1) == triangles).all(axis=1) for k in range(3)]
+    return np.where(place < 0, 0.0, np.where(np.any(alike, axis=0), 1.0, -1.0)).astype(np.float32)
 
 
 def _triangles_of_edges(
-    triangles: npt.NDArray[np.int32], edges: npt.NDArray[np.int32], facing: npt.NDArray[np.float32], count: int
+    triangles: npt.NDArray[np.int32], edges: npt.NDArray[np.int32], facing: npt.NDArray[np.float32]
 ) -> npt.NDArray[np.int32]:
     """Two triangles of tetrahedra at each edge, or -1, int32 [E, 2]."""
-    sides = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]).astype(np.int64)
-    owner = np.tile(np.arange(len(triangles)), 3)
-    solid = facing[owner] != 0
-    keys, owner = (np.sort(sides, axis=1) @ [count, 1])[solid], owner[solid]
-    order = np.argsort(keys, kind="stable")
-    keys, owner = keys[order], owner[order]
-    wanted = np.sort(edges[:, 2:].astype(np.int64), axis=1) @ [count, 1]
-    found = np.full((len(edges), 2), -1, np.int32)
-    start, stop = np.searchsorted(keys, wanted, "left"), np.searchsorted(keys, wanted, "right")
-    for side in range(2):
-        there = start + side < stop
-        found[there, side] = owner[start[there] + side]
-    return found
+    found = np.stack([_places(edges[:, [k, 2, 3]], triangles) for k in range(2)], axis=1)
+    return np.where(facing[found] == 0.0, -1, found).astype(np.int32)
+
+
+def _places(wanted: npt.NDArray[np.integer], among: npt.NDArray[np.integer]) -> npt.NDArray[np.integer]:
+    """The place of each row among others with the same numbers in any order; -1: there is none."""
+    both = np.sort(np.concatenate([among, wanted]), axis=1)
+    _, first, group = np.unique(both, axis=0, return_index=True, return_inverse=True)
+    place = first[np.ravel(group)[len(among) :]]
+    return np.where(place < len(among), place, -1)
 
 
 def _parts(model: newton.Model, triangles: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
