@@ -26,7 +26,6 @@ from warp_corot.kernels.stepping.balance import sum_of_lanes
 
 from .elements import difference_gradient, viscous_product
 from .particles import (
-    BAD_INPUT,
     SOUND,
     Bodies,
     Particles,
@@ -35,8 +34,6 @@ from .particles import (
     is_fixed,
     is_moved,
     place_of,
-    store_vector,
-    take_motion,
     trouble_of,
 )
 
@@ -261,37 +258,6 @@ def count_solves(
     totals[1] = totals[1] + wp.int64(rounds[0] + 1)
     totals[2] = totals[2] + wp.int64(linear)
     totals[3] = totals[3] + wp.int64(unfinished)
-
-
-@wp.kernel(enable_backward=False)
-def move_particles(
-    # In
-    dt: float,
-    most: float,
-    fastest: float,
-    particles: Particles,
-    entry: wp.array[wp.int32],
-    d: wp.array[wp.vec4],
-    q: wp.array[wp.vec3],
-    qd: wp.array[wp.vec3],
-    # Out
-    q_out: wp.array[wp.vec3],
-    qd_out: wp.array[wp.vec3],
-    trouble: wp.array[wp.int32],
-):
-    """The state after motions d, as ``particles.step_particles`` writes it."""
-    i = wp.tid()
-    wrong = trouble_of(i, particles, trouble)
-    if wrong == BAD_INPUT:
-        return
-    velocity = qd[i]
-    if wrong == SOUND and is_active(i, particles):
-        if particles.inv_mass[i] > 0.0:
-            velocity = load_node(d, entry[i]) / dt
-        take_motion(i, q[i], velocity, dt, most, fastest, particles, q_out, qd_out, trouble)
-    else:
-        store_vector(q_out, i, q[i])
-        store_vector(qd_out, i, velocity)
 
 
 # --- how free pieces turn in a step; see ``kernels.implicit.turning`` ------------------------------------------------

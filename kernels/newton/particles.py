@@ -232,15 +232,20 @@ def step_particles(
     f: wp.array[wp.vec4],
     q: wp.array[wp.vec3],
     qd: wp.array[wp.vec3],
+    entry: wp.array[wp.int32],
+    d: wp.array[wp.vec4],
     # Out
     q_out: wp.array[wp.vec3],
     qd_out: wp.array[wp.vec3],
     trouble: wp.array[wp.int32],
 ):
-    """v <- (v + dt (f/m + g)) / (1 + dt damping); x <- x + dt v; see ``take_motion``.
+    """v <- (v + dt (f/m + g)) / (1 + dt damping), or d/dt of solved motions d; x <- x + dt v; see ``take_motion``.
 
     A particle without mass is kinematic: it keeps its velocity. An inactive one is frozen. In worlds marked before
     nothing moves.
+
+    Args:
+        entry, d: Where the motion of each particle is, and motions [m], see ``implicit``; empty in explicit steps.
     """
     i = wp.tid()
     wrong = trouble_of(i, particles, trouble)
@@ -249,7 +254,9 @@ def step_particles(
     velocity = qd[i]
     if wrong == SOUND and is_active(i, particles):
         w = particles.inv_mass[i]
-        if w > 0.0:
+        if w > 0.0 and d.shape[0] > 0:
+            velocity = load_node(d, entry[i]) / dt
+        elif w > 0.0:
             velocity = (velocity + dt * (w * load_node(f, i) + gravity_of(i, particles))) / (1.0 + dt * damping)
         take_motion(i, q[i], velocity, dt, most, fastest, particles, q_out, qd_out, trouble)
     else:

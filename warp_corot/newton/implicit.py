@@ -20,7 +20,7 @@ from warp_corot.kernels.implicit import conjugate_gradients, turning
 from warp_corot.kernels.implicit.tangent import add_vectors, find_rest
 from warp_corot.kernels.newton import implicit as kernels
 from warp_corot.kernels.newton import implicit_rows as rows
-from warp_corot.kernels.newton.particles import UNSTABLE, Particles
+from warp_corot.kernels.newton.particles import Particles
 from warp_corot.mesh.growing.cut import connected
 from warp_corot.solvers.implicit.block_diagonal import BlockDiagonal
 from warp_corot.solvers.implicit.block_system import BlockSystem
@@ -35,7 +35,7 @@ from .contact import Contacts
 from .library import newton
 from .others import Others
 from .scene import NAMESPACE
-from .steps import RUNAWAY, Steps
+from .steps import Steps
 from .tetrahedra import Tetrahedra
 
 #: Residual of the linear solves over their right side.
@@ -383,6 +383,7 @@ class ImplicitSteps(Steps):
         self._system = BlockSystem(parts[:1], [RowBlocks(parts[0])], contacts=parts[1:], most=ITERATIONS)
         self._system.solver.tolerance.fill_(TOLERANCE)
         self._solve = ContactSolve(self._system, [])
+        self._motions = [unknowns.particle, self._system.x]
         self._change, self._product, self._rest, self._r = (
             wp.zeros(count, dtype=wp.vec4, device=self.device) for _ in range(4)
         )
@@ -452,17 +453,5 @@ class ImplicitSteps(Steps):
         inputs.append(int(conjugate_gradients.CONVERGED))
         self._launch(kernels.count_solves, 1, inputs, [self.totals])
 
-    def _launch_motion(self, substep: Step, fastest: float) -> None:
-        model, others = self.model, self.others
-        now, out, dt = substep.state_in, substep.state_out, substep.dt
-        inputs = [dt, model.particle_max_velocity, min(fastest, RUNAWAY), self.contacts.particles]
-        inputs += [self._unknowns.particle, self._system.x, now.particle_q, now.particle_qd]
-        outputs = [out.particle_q, out.particle_qd, self.report.trouble]
-        self._launch(kernels.move_particles, model.particle_count, inputs, outputs)
-        if others.has_bodies:
-            count = math.ceil(dt / RIGID_STEP) if others.is_own else 1
-            part = substep._replace(dt=dt / count)
-            for _ in range(count):
-                others.step(part, self._body_f)
-                part = part._replace(state_in=out)
-            self._check_bodies(out, UNSTABLE)
+    def _steps_of_others(self, dt: float) -> int:
+        return math.ceil(dt / RIGID_STEP) if self.others.is_own else 1

@@ -60,6 +60,8 @@ class Steps:
         types = (wp.vec3, wp.vec3)
         self._particles_before = [wp.empty(p, dtype=dtype, device=self.device) for dtype in types]
         self._nothing = [wp.empty(0, dtype=dtype, device=self.device) for dtype in types]
+        #: Where particles' motions are and what they are, if they are solved for.
+        self._motions = [wp.empty(0, dtype=dtype, device=self.device) for dtype in (wp.int32, wp.vec4)]
         self._no_numbers = wp.empty(0, dtype=wp.float32, device=self.device)
         kept = p if others.has_particles else 0
         self._kept_particles = [wp.empty(kept, dtype=dtype, device=self.device) for dtype in types]
@@ -254,11 +256,14 @@ class Steps:
             self._launch(kernels.unpad, model.particle_count, [self._f], [others.particle_forces])
         else:
             inputs = [dt, self.damping, model.particle_max_velocity, fastest, self.contacts.particles, self._f]
-            inputs += [now.particle_q, now.particle_qd]
+            inputs += [now.particle_q, now.particle_qd, *self._motions]
             outputs = [out.particle_q, out.particle_qd, self.report.trouble]
             self._launch(kernels.step_particles, model.particle_count, inputs, outputs)
-        if others.has_bodies or others.has_particles:
-            others.step(substep, self._body_f if others.has_bodies else now.body_f)
+        count = self._steps_of_others(dt)
+        part = substep._replace(dt=dt / count)
+        for _ in range(count if others.has_bodies or others.has_particles else 0):
+            others.step(part, self._body_f if others.has_bodies else now.body_f)
+            part = part._replace(state_in=out)
         if others.has_particles and self.damping > 0:
             inputs = [dt, self.damping, self.contacts.particles]
             self._launch(kernels.damp_particles, model.particle_count, inputs, [out.particle_q, out.particle_qd])
@@ -267,6 +272,10 @@ class Steps:
         if others.has_particles:
             inputs = [out.particle_q, out.particle_qd, fastest, model.particle_world, int(kernels.UNSTABLE)]
             self._launch(OF_PARTICLES.check, model.particle_count, inputs, [self.report.trouble])
+
+    def _steps_of_others(self, dt: float) -> int:
+        """Number of steps in which everything else makes a substep."""
+        return 1
 
     def _check_bodies(self, state: newton.State, wrong: int) -> None:
         inputs = [state.body_q, state.body_qd, 0.0, self.model.body_world, int(wrong)]
