@@ -439,18 +439,3 @@ def report_trouble(
         wp.atomic_max(report, wrong, w + 1)
         seen[0] = wp.float64(1.0)
         trouble[w] = SOUND
-
-
-@wp.kernel(enable_backward=False)
-def reset_rotations(
-    # In
-    chosen: wp.array[wp.bool],
-    world: wp.array[wp.int32],
-    tets: wp.array[wp.vec4i],
-    # Out
-    rotations: wp.array[wp.quat],
-):
-    """Reset the rotations of elements in chosen worlds to the identity; an element is in the world of its nodes."""
-    t = wp.tid()
-    if chosen[place_of(world[tets[t][0]], chosen.shape[0])]:
-        rotations[t] = wp.quat_identity()

@@ -74,6 +74,7 @@ class Contacts:
         self._bodies = Kept(self._made_bodies)
         self._particles, self._shapes = _Given(Particles, "particle_", model), _Given(rows.Shapes, "shape_", model)
         self._attachments = _Given(rows.Attachments, "attachment_particle_body_", model)
+        self._of_bodies = _Given(Bodies, "body_", model)
         self._records: _Given | None = None
         self._no_records, self.law = rows.Records(), rows.ContactLaw()
         self._law_values: list[float] = []
@@ -273,7 +274,7 @@ class Contacts:
         return made
 
     def _made_bodies(self, q: wp.array | None, qd: wp.array | None) -> Bodies:
-        made = _Given(Bodies, "body_", self.model).of(self.model)
+        made = self._of_bodies.new(self.model)
         made.fixed_flag, made.places, made.yielding = KINEMATIC, self._places, self._yielding
         if self.model.body_count:
             made.q, made.qd = q, qd
@@ -300,6 +301,10 @@ class _Given(Kept[Any]):
 
     def of(self, owner: Any) -> Any:
         return self(*(getattr(owner, name) for name in self._names.values()))
+
+    def new(self, owner: Any) -> Any:
+        """Another one."""
+        return self._made(*(getattr(owner, name) for name in self._names.values()))
 
     def _made(self, *arrays: Any) -> Any:
         made = self._struct_type()

@@ -394,7 +394,6 @@ class ImplicitSteps(Steps):
         self._can_replay = False
 
     def _launch_forces(self, substep: Step, given: newton.State, share: float, done: float) -> None:
-        model, others = self.model, self.others
         now: Any = substep.state_in
         self._turned.launch(now, self.contacts.particles, substep.dt)
         # Viscous forces are those of the velocities after the step, which the solve finds.
@@ -407,11 +406,7 @@ class ImplicitSteps(Steps):
         self._launch_unknowns(substep, of_bodies, given)
         self._replays.launch((substep.dt, self.contacts.law.adhesion, self._operator.damped), self._launch_solve)
         self._rows.report(substep, share)
-        if others.has_bodies:
-            wp.copy(self._body_f, given.body_f)
-            self._add_wrenches(1.0, self._body_f)
-        elif model.body_count:
-            self._add_wrenches(share, given.body_f)
+        self._launch_reactions(given, share)
 
     def _launch_unknowns(self, substep: Step, of_bodies: newton.State, given: newton.State) -> None:
         """Launch the right side, the inertia, the first motions, and a guess of how gravity changes these."""

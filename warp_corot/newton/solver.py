@@ -258,7 +258,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
         world_mask: wp.array | None = None,
         flags: int | None = None,
     ) -> None:
-        """Reset chosen worlds of a state to the model's initial state, rotations included.
+        """Reset chosen worlds of a state to the model's initial state, rotations and stresses included.
 
         Args:
             state: The state, changed in place.

@@ -19,7 +19,6 @@ from .checks import Step
 from .contact import Contacts
 from .library import newton
 from .others import Others
-from .scene import attribute_of
 from .substeps import RETRIES, Following
 from .tetrahedra import Tetrahedra
 
@@ -154,10 +153,7 @@ class Steps:
             inputs = [mask, model.particle_world, *wanted, model.particle_q, model.particle_qd]
             outputs = [state.particle_q, state.particle_qd]
             self._launch(OF_PARTICLES.reset, model.particle_count, inputs, outputs)
-            rotations = attribute_of(state, "rotation")
-            if rotations is not None:
-                inputs = [mask, model.particle_world, self.tetrahedra.elements.nodes]
-                self._launch(kernels.reset_rotations, model.tet_count, inputs, [rotations])
+            self.tetrahedra.write_attributes(state)
         if self.others.has_bodies and flags & (bits.BODY_Q | bits.BODY_QD):
             wanted = [int(bool(flags & bit)) for bit in (bits.BODY_Q, bits.BODY_QD)]
             inputs = [mask, model.body_world, *wanted, model.body_q, model.body_qd]
@@ -239,15 +235,20 @@ class Steps:
             share: The substep's share of the step.
             done: Time of the step that has passed [s].
         """
-        model, others = self.model, self.others
         self.tetrahedra.add_forces(substep.state_in, self._activation, self._f)
         of_bodies = self._bodies_after(done, substep, given)
         self.contacts.add_forces(substep, of_bodies, self._f, self.report.trouble, share)
-        if others.has_bodies:
-            wp.copy(self._body_f, given.body_f)
-            self._add_wrenches(1.0, self._body_f)
-        elif model.body_count:
-            self._add_wrenches(share, given.body_f)
+        self._launch_reactions(given, share)
+
+    def _launch_reactions(self, given: newton.State, share: float) -> None:
+        """Launch the particles' forces on bodies."""
+        target = given.body_f
+        if self.others.has_bodies:
+            target, share = self._body_f, 1.0
+            wp.copy(target, given.body_f)
+        if self.model.body_count:
+            inputs = [share, self.contacts.reactions]
+            self._launch(kernels.add_wrenches, self.model.body_count, inputs, [target])
 
     def _launch_motion(self, substep: Step, fastest: float) -> None:
         model, others = self.model, self.others
@@ -292,9 +293,6 @@ class Steps:
         if self.others.has_bodies:
             inputs = [model.body_world, self.report.trouble, *bodies, *self._kept_bodies]
             self._launch(OF_BODIES.put_back, model.body_count, inputs, [out.body_q, out.body_qd])
-
-    def _add_wrenches(self, share: float, target: wp.array) -> None:
-        self._launch(kernels.add_wrenches, self.model.body_count, [share, self.contacts.reactions], [target])
 
     def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
