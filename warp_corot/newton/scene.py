@@ -265,38 +265,27 @@ def register_custom_attributes(builder: newton.ModelBuilder) -> None:
     evaluation a step. ``State.assign`` copies them. Newton 1.8's ``ViewerFile`` does not record namespaces, and could
     not load a model whose state attributes have none; ``SolverCorotated.write_attributes`` computes them again.
     """
+    of_states = newton.Model.AttributeAssignment.STATE
     for name, dtype in STATE.items():
-        builder.add_custom_attribute(
-            newton.ModelBuilder.CustomAttribute(
-                name=name,
-                dtype=dtype,
-                frequency=newton.Model.AttributeFrequency.TETRAHEDRON,
-                assignment=newton.Model.AttributeAssignment.STATE,
-                namespace=NAMESPACE,
-            )
-        )
+        _add_attribute(builder, name, dtype, assignment=of_states)
 
 
 def register_forests(builder: newton.ModelBuilder) -> None:
     """Add attributes to the model for the forest and the fill of each tetrahedron."""
     if f"{NAMESPACE}:forest" in builder.custom_attributes:
         return
-    attribute = newton.ModelBuilder.CustomAttribute
     builder.add_custom_frequency(newton.ModelBuilder.CustomFrequency(name="forest", namespace=NAMESPACE))
-    builder.add_custom_attribute(attribute(name="forest", dtype=str, frequency=FOREST, default="", namespace=NAMESPACE))
+    _add_attribute(builder, "forest", str, FOREST, default="")
     for name, references in (("forest_particle", "particle"), ("forest_tet", "tetrahedron")):
-        builder.add_custom_attribute(
-            attribute(name=name, dtype=wp.int32, frequency=FOREST, references=references, namespace=NAMESPACE)
-        )
-    builder.add_custom_attribute(
-        attribute(
-            name="fill",
-            dtype=wp.float32,
-            frequency=newton.Model.AttributeFrequency.TETRAHEDRON,
-            default=1.0,
-            namespace=NAMESPACE,
-        )
-    )
+        _add_attribute(builder, name, wp.int32, FOREST, references=references)
+    _add_attribute(builder, "fill", wp.float32, default=1.0)
+
+
+def _add_attribute(builder: newton.ModelBuilder, name: str, dtype: type, frequency: Any = None, **options: Any) -> None:
+    """Add an attribute, of every tetrahedron unless there is another frequency."""
+    frequency = newton.Model.AttributeFrequency.TETRAHEDRON if frequency is None else frequency
+    attribute = newton.ModelBuilder.CustomAttribute(name, dtype, frequency, namespace=NAMESPACE, **options)
+    builder.add_custom_attribute(attribute)
 
 
 def attribute_of(owner: Any, name: str) -> Any:
