@@ -20,7 +20,7 @@ from stable import Steppable
 
 import warp_corot as wc
 import warp_corot.newton as wn
-from warp_corot.newton.state import ForestName
+from warp_corot.newton.scene import ForestName
 
 #: Newton's own solvers are left out above this size.
 MOST_TETS = sys.maxsize

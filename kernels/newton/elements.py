@@ -1,4 +1,5 @@
-"""Tetrahedra of a Newton model: forces, rotations and stresses from nodal positions and inverse rest matrices.
+"""Tetrahedra of a Newton model: forces, current stiffness, rotations and stresses from nodal positions and inverse rest
+matrices.
 
 Newton's state consists of positions, and only its matrix defines an element's rest shape: there need be no consistent
 rest positions (a body may have been turned after it was built, or its elements strained against one another). So
@@ -9,8 +10,15 @@ import functools
 
 import warp as wp
 
-from warp_corot.kernels.elements.constitutive import IsotropicMaterial, rotated_stress, symmetric
+from warp_corot.kernels.elements.constitutive import (
+    IsotropicMaterial,
+    corotated_strain,
+    hooke,
+    rotated_stress,
+    symmetric,
+)
 from warp_corot.kernels.elements.elements import GeneralElements, load_node, scatter_stress
+from warp_corot.kernels.elements.forces import von_mises
 from warp_corot.kernels.elements.general_cuda import (
     PosedElements,
     add_stress,
@@ -22,6 +30,8 @@ from warp_corot.kernels.elements.native_laws import elastic
 from warp_corot.kernels.elements.simd8 import headers, scatter_simd8
 from warp_corot.kernels.math.rotation import byers_xu, cofactor, identity3
 from warp_corot.kernels.modules import unique_kernel
+from warp_corot.kernels.stepping.gauge import TURNS, keep_largest
+from warp_corot.kernels.stepping.pace import GROWTH, LEAST, SAFE, STABLE, STRAIN, safe_step
 
 wp.set_module_options({"enable_backward": False})
 
@@ -75,19 +85,10 @@ def active_stress(f: wp.mat33, k: float):
     return k * cofactor(f)
 
 
-@wp.func
-def place_in_model(ids: wp.array[wp.int32], first: int, t: int):
-    """The model's index of the t-th tetrahedron of a part: from a list, or from a range if the list is empty."""
-    place = first + t
-    if ids.shape[0] > 0:
-        place = ids[t]
-    return place
-
-
 @functools.cache
 def scatter_posed(rotation: wp.Function, damped: bool, rounds: int = 1) -> wp.Kernel:
     """All forces of tetrahedra, each with the rotation of its own deformation gradient; ``ids`` are their indices in
-    ``stepping.conditions``; ``rounds``: see ``add_four_forces``."""
+    ``activation``, or empty if they are all; ``rounds``: see ``add_four_forces``."""
     add = add_stress(rounds)
 
     @unique_kernel()
@@ -106,7 +107,10 @@ def scatter_posed(rotation: wp.Function, damped: bool, rounds: int = 1) -> wp.Ke
         f: wp.array[wp.vec4],
     ):
         t = wp.tid()
-        a = activation[place_in_model(ids, 0, t)]
+        place = int(t)
+        if ids.shape[0] > 0:
+            place = ids[t]
+        a = activation[place]
         n = load_four(elements.nodes, t)
         gradient = edge_differences(n, x) * rest_inverse_of(elements, t)
         p = corotated_stress(gradient, rotation(gradient), mu[t], lam[t])
@@ -147,8 +151,7 @@ def posed_stress(elements: GeneralElements, t: int, material: IsotropicMaterial,
 
 @functools.cache
 def scatter_damping_and_activation(damped: bool) -> wp.Kernel:
-    """Forces of damping and activation of ``count`` tetrahedra of a model whose elastic forces come from another
-    kernel.
+    """Forces of damping and activation of ``count`` tetrahedra whose elastic forces come from another kernel.
 
     A thread checks ``EACH`` of them, so that it waits for memory once if none is active or damped.
     """
@@ -159,8 +162,6 @@ def scatter_damping_and_activation(damped: bool) -> wp.Kernel:
         elements: GeneralElements,
         k_lambda: wp.array[wp.float32],
         k_damp: wp.array[wp.float32],
-        ids: wp.array[wp.int32],
-        first: int,
         count: int,
         activation: wp.array[wp.float32],
         q: wp.array[wp.vec3],
@@ -172,19 +173,110 @@ def scatter_damping_and_activation(damped: bool) -> wp.Kernel:
         threads = (count + EACH - 1) // EACH
         any_of = float(0.0)
         for j in range(EACH):
-            t = place_in_model(ids, first, wp.min(thread + j * threads, count - 1))
+            t = wp.min(thread + j * threads, count - 1)
             any_of += wp.abs(activation[t])
             if wp.static(damped):
                 any_of += k_damp[t]
         if any_of == 0.0:
             return
-        for k in range(thread, count, threads):
-            t = place_in_model(ids, first, k)
-            a = activation[t]
+        for t in range(thread, count, threads):
             gradient = difference_gradient(elements, t, q)
-            p = active_stress(gradient, k_lambda[t] * a)
+            p = active_stress(gradient, k_lambda[t] * activation[t])
             if wp.static(damped):
                 p += viscous_stress(gradient, difference_gradient(elements, t, v), k_damp[t])
             scatter_stress(elements, t, p, f)
 
     return scatter_damping_and_activation
+
+
+# --- rotations and stresses in Newton's arrays ------------------------------------------------------------------------
+
+
+@wp.kernel(enable_backward=False)
+def write_attributes(
+    # In
+    elements: GeneralElements,
+    mu: wp.array[wp.float32],
+    lam: wp.array[wp.float32],
+    fill: wp.array[wp.float32],
+    fill_stride: int,
+    q: wp.array[wp.vec3],
+    # Out
+    rotations: wp.array[wp.quat],
+    stresses: wp.array[wp.mat33],
+    equivalent: wp.array[wp.float32],
+):
+    """Write rotation and Cauchy stress of every element to the arrays that are not empty."""
+    t = wp.tid()
+    gradient = difference_gradient(elements, t, q)
+    r = byers_xu(gradient)
+    if rotations.shape[0] > 0:
+        rotations[t] = wp.normalize(wp.quat_from_matrix(r))
+    share = 1.0 / fill[t * fill_stride]
+    stress = share * hooke(corotated_strain(gradient - identity3(), identity3(), r), mu[t], lam[t])
+    if stresses.shape[0] > 0:
+        stresses[t] = r * stress * wp.transpose(r)
+    if equivalent.shape[0] > 0:
+        equivalent[t] = von_mises(stress)
+
+
+# --- current stiffness, as ``stepping.gauge`` ------------------------------------------------------------------------
+
+
+@wp.kernel(enable_backward=False)
+def find_posed_strains(
+    # In
+    elements: GeneralElements,
+    q: wp.array[wp.vec3],
+    qd: wp.array[wp.vec3],
+    ahead: float,
+    count: int,
+    turn: wp.array[wp.int32],
+    # Out
+    found: wp.array2d[wp.float32],
+):
+    """The largest entry of F^T F - I among one in ``TURNS`` elements, now and after ``ahead`` [s] at the current rate;
+    the next measurement checks others."""
+    t = wp.tid() * TURNS + turn[0] % TURNS
+    if t >= count:
+        return
+    f = difference_gradient(elements, t, q)
+    strain = wp.transpose(f) * f - identity3()
+    rate = wp.transpose(f) * difference_gradient(elements, t, qd)
+    later = strain + ahead * (rate + wp.transpose(rate))
+    most = float(0.0)
+    for i in range(3):
+        for j in range(3):
+            most = wp.max(most, wp.max(wp.abs(strain[i, j]), wp.abs(later[i, j])))
+    keep_largest(most, STRAIN, found[0])
+
+
+@wp.kernel(enable_backward=False)
+def take_safe_substep(
+    # In
+    at_rest: wp.array2d[wp.float64],
+    recorded: wp.float64,
+    # In and out
+    found: wp.array2d[wp.float32],
+    allowed: wp.array[wp.float64],
+    turn: wp.array[wp.int32],
+    excess: wp.array[wp.float32],
+    # Out
+    seen: wp.array[wp.float64],
+):
+    """Find the substep that is safe until the next measurement [s]: it shrinks at once and grows slowly.
+
+    Args:
+        recorded: Length of the substep of a recorded step [s]; zero if the host chooses the next one.
+        excess: Largest factor by which a recorded one was too long.
+        seen: The safe substep, in the host's memory.
+    """
+    longest = at_rest[0, SAFE] * at_rest[0, STABLE]
+    safe = wp.min(longest, safe_step(at_rest, found, 0))
+    safe = wp.min(wp.max(safe, LEAST * longest), GROWTH * allowed[0])
+    allowed[0] = safe
+    seen[0] = safe
+    excess[0] = wp.max(excess[0], float(recorded / safe))
+    for k in range(found.shape[1]):
+        found[0, k] = 0.0
+    turn[0] = (turn[0] + 1) % TURNS

@@ -23,11 +23,11 @@ import warp as wp
 
 from warp_corot.kernels.contact.law import held_back
 from warp_corot.kernels.contact.vertices import across
+from warp_corot.kernels.implicit.assembled import root_columns
 
+from .particles import Bodies, Particles, is_fixed
 from .rows import (
-    Bodies,
     ContactLaw,
-    Particles,
     Row,
     add_to_particles,
     ease_off,
@@ -154,17 +154,17 @@ def scatter_rows(
         pose = bodies.q[body]
         velocity = wp.transform_vector(pose, velocity) + body_point_velocity(bodies.qd[body], arm)
         give = body_point_velocity(bodies.yielding[body], arm)
-        if (bodies.flags[body] & bodies.fixed_flag) == 0:
+        if not is_fixed(body, bodies):
             n = float(wp.max(bodies.places[body], 1))
             turn = wp.quat_to_matrix(wp.transform_get_rotation(pose))
-            m.linear = n * bodies.inverse_mass[body]
-            m.angular = n * (turn * bodies.inverse_inertia[body] * wp.transpose(turn))
+            m.linear = n * bodies.inv_mass[body]
+            m.angular = n * (turn * bodies.inv_inertia[body] * wp.transpose(turn))
     apart = sum_of(row, q) - point
     v = sum_of(row, qd) - velocity
     force = wp.vec3()
     if is_attachment(row):
         # The sum over three directions exceeds any single one.
-        w = particles.inverse_mass[row.nodes[0]] + body_mobility(m, wp.vec3(1.0, 0.0, 0.0))
+        w = particles.inv_mass[row.nodes[0]] + body_mobility(m, wp.vec3(1.0, 0.0, 0.0))
         w += body_mobility(m, wp.vec3(0.0, 1.0, 0.0)) + body_mobility(m, wp.vec3(0.0, 0.0, 1.0))
         force = -row.stiffness * (apart - give) - wp.min(row.damping, largest_damping(w, dt)) * v
     else:
@@ -214,7 +214,7 @@ def gather_springs(
     body = row.body
     if row.nodes[0] < 0 or body < 0:
         return
-    if (bodies.flags[body] & bodies.fixed_flag) != 0:
+    if is_fixed(body, bodies):
         return
     point, arm = point_and_arm(row, bodies)
     apart = sum_of(row, q) - point
@@ -243,19 +243,6 @@ def gather_springs(
         wp.atomic_add(bodies.places, body, 1)
 
 
-@wp.func
-def factor_of(a: wp.mat33):
-    """L with L L^T = a, symmetric and positive semi-definite."""
-    r = wp.mat33()
-    for j in range(3):
-        rest = a[j, j] - r[j, 0] * r[j, 0] - r[j, 1] * r[j, 1] - r[j, 2] * r[j, 2]
-        if rest > 1.0e-6 * a[j, j]:
-            r[j, j] = wp.sqrt(rest)
-            for i in range(j + 1, 3):
-                r[i, j] = (a[i, j] - r[i, 0] * r[j, 0] - r[i, 1] * r[j, 1] - r[i, 2] * r[j, 2]) / r[j, j]
-    return r
-
-
 @wp.kernel(enable_backward=False)
 def solve_yielding(
     # In
@@ -274,12 +261,12 @@ def solve_yielding(
     s = slope[b]
     curvature[b] = wp.spatial_matrix()
     slope[b] = wp.spatial_vector()
-    if (bodies.flags[b] & bodies.fixed_flag) != 0:
+    if is_fixed(b, bodies):
         bodies.yielding[b] = wp.spatial_vector()
         return
     turn = wp.quat_to_matrix(wp.transform_get_rotation(bodies.q[b]))
-    angular = factor_of(turn * bodies.inverse_inertia[b] * wp.transpose(turn))
-    linear = wp.sqrt(bodies.inverse_mass[b])
+    angular = root_columns(turn * bodies.inv_inertia[b] * wp.transpose(turn))
+    linear = wp.sqrt(bodies.inv_mass[b])
     factor = wp.spatial_matrix()
     for i in range(3):
         factor[i, i] = dt * linear

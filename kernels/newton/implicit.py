@@ -20,12 +20,22 @@ import warp as wp
 from warp_corot.kernels.corotated.tangent import keep_gradients
 from warp_corot.kernels.elements.constitutive import hooke, symmetric
 from warp_corot.kernels.elements.elements import GeneralElements, load_node, store_node
+from warp_corot.kernels.implicit.turning import COLUMNS, Sums, motion_of
 from warp_corot.kernels.math.rotation import byers_xu, identity3
-from warp_corot.kernels.stepping.integrate import is_finite
+from warp_corot.kernels.stepping.balance import sum_of_lanes
 
 from .elements import difference_gradient, viscous_product
-from .particles import ACTIVE
-from .worlds import BAD_INPUT, SOUND, UNSTABLE, place_of
+from .particles import (
+    SOUND,
+    Bodies,
+    Particles,
+    gravity_of,
+    is_active,
+    is_fixed,
+    is_moved,
+    place_of,
+    trouble_of,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -39,7 +49,7 @@ class Linearised:
     rotation: wp.array[wp.mat33]  # [T]
     gradient: wp.array[wp.mat33]  # [T] F midway; empty where nothing is viscous
     viscosity: wp.array[wp.float32]  # [T] over dt and |F|^2 / 3 [Pa]
-    kept: wp.array[wp.vec4]  # turned gradients, see ``kept_gradients``; empty on CUDA
+    kept: wp.array[wp.vec4]  # turned gradients, see ``KeptGradients``; empty on CUDA
 
 
 @wp.kernel(enable_backward=False)
@@ -106,10 +116,7 @@ def begin_particles(
     # In
     dt: float,
     damping: float,
-    gravity: wp.array[wp.vec3],
-    inverse_mass: wp.array[wp.float32],
-    flags: wp.array[wp.int32],
-    world: wp.array[wp.int32],
+    particles: Particles,
     f: wp.array[wp.vec4],
     qd: wp.array[wp.vec3],
     trouble: wp.array[wp.int32],
@@ -129,13 +136,13 @@ def begin_particles(
     right = wp.vec3()
     motion = wp.vec3()
     falls = wp.vec3()
-    if trouble[place_of(world[i], trouble.shape[0])] == SOUND and (flags[i] & ACTIVE) != 0:
+    if trouble_of(i, particles, trouble) == SOUND and is_active(i, particles):
         motion = dt * qd[i]
-        if inverse_mass[i] > 0.0:
-            m = 1.0 / inverse_mass[i]
+        if particles.inv_mass[i] > 0.0:
+            m = 1.0 / particles.inv_mass[i]
             free[k] = 1.0
             inertia[k] = (m * (1.0 / dt + damping) / dt) * wp.identity(3, dtype=wp.float32)
-            g = gravity[place_of(world[i], gravity.shape[0])]
+            g = gravity_of(i, particles)
             right = (m / dt) * qd[i] + load_node(f, i) + m * g
             # A solve to a share of large forces would not find that a body falls freely.
             falls = (dt * dt / (1.0 + dt * damping)) * g
@@ -149,15 +156,8 @@ def begin_particles(
 def begin_bodies(
     # In
     dt: float,
-    fixed_flag: int,
-    flags: wp.array[wp.int32],
-    world: wp.array[wp.int32],
+    bodies: Bodies,
     gravity: wp.array[wp.vec3],
-    inverse_mass: wp.array[wp.float32],
-    inverse_inertia: wp.array[wp.mat33],
-    inertia_of: wp.array[wp.mat33],
-    q: wp.array[wp.transform],
-    qd: wp.array[wp.spatial_vector],
     body_f: wp.array[wp.spatial_vector],
     moves: int,
     trouble: wp.array[wp.int32],
@@ -176,35 +176,30 @@ def begin_bodies(
     """
     i = wp.tid()
     k = entry[i]
-    linear = wp.vec3()
-    angular = wp.vec3()
-    right = wp.vec3()
-    right_angular = wp.vec3()
-    falls = wp.vec3()
-    free[k] = 0.0
-    free[k + 1] = 0.0
-    if trouble[place_of(world[i], trouble.shape[0])] == SOUND and moves != 0:
-        linear = dt * wp.spatial_top(qd[i])
-        angular = dt * wp.spatial_bottom(qd[i])
-        w = inverse_mass[i]
-        if w > 0.0 and (flags[i] & fixed_flag) == 0:
-            free[k] = 1.0
-            inertia[k] = (1.0 / (w * dt * dt)) * wp.identity(3, dtype=wp.float32)
-            right = linear / (w * dt * dt) + wp.spatial_top(body_f[i])
-            g = gravity[place_of(world[i], gravity.shape[0])]
-            right += g / w
-            falls = (dt * dt) * g
-            if wp.determinant(inverse_inertia[i]) > 0.0:
-                turn = wp.quat_to_matrix(wp.transform_get_rotation(q[i]))
-                free[k + 1] = 1.0
-                inertia[k + 1] = (turn * inertia_of[i] * wp.transpose(turn)) / (dt * dt)
-                right_angular = inertia[k + 1] * angular + wp.spatial_bottom(body_f[i])
-    store_node(b, k, right)
+    for part in range(2):
+        free[k + part] = 0.0
+        store_node(b, k + part, wp.vec3())
+        store_node(d, k + part, wp.vec3())
+        store_node(fall, k + part, wp.vec3())
+    if trouble[place_of(bodies.world[i], trouble.shape[0])] != SOUND or moves == 0:
+        return
+    linear = dt * wp.spatial_top(bodies.qd[i])
+    angular = dt * wp.spatial_bottom(bodies.qd[i])
     store_node(d, k, linear)
-    store_node(fall, k, falls)
-    store_node(b, k + 1, right_angular)
     store_node(d, k + 1, angular)
-    store_node(fall, k + 1, wp.vec3())
+    w = bodies.inv_mass[i]
+    if w == 0.0 or is_fixed(i, bodies):
+        return
+    g = gravity[place_of(bodies.world[i], gravity.shape[0])]
+    free[k] = 1.0
+    inertia[k] = (1.0 / (w * dt * dt)) * wp.identity(3, dtype=wp.float32)
+    store_node(b, k, linear / (w * dt * dt) + wp.spatial_top(body_f[i]) + g / w)
+    store_node(fall, k, (dt * dt) * g)
+    if wp.determinant(bodies.inv_inertia[i]) > 0.0:
+        turn = wp.quat_to_matrix(wp.transform_get_rotation(bodies.q[i]))
+        free[k + 1] = 1.0
+        inertia[k + 1] = (turn * bodies.inertia[i] * wp.transpose(turn)) / (dt * dt)
+        store_node(b, k + 1, inertia[k + 1] * angular + wp.spatial_bottom(body_f[i]))
 
 
 @wp.kernel(enable_backward=False)
@@ -242,14 +237,9 @@ def clear_held(free: wp.array[wp.float32], a: wp.array[wp.vec4]):
 
 
 @wp.kernel(enable_backward=False)
-def add_counts(first: wp.array[wp.int32], counts: wp.array[wp.int32]):
-    w = wp.tid()
-    counts[w] = counts[w] + first[w]
-
-
-@wp.kernel(enable_backward=False)
 def count_solves(
     # In
+    first: wp.array[wp.int32],
     iterations: wp.array[wp.int32],
     rounds: wp.array[wp.int32],
     status: wp.array[wp.int32],
@@ -261,7 +251,7 @@ def count_solves(
     linear = int(0)
     unfinished = int(0)
     for world in range(status.shape[0]):
-        linear = wp.max(linear, iterations[world])
+        linear = wp.max(linear, first[world] + iterations[world])
         if status[world] != good:
             unfinished = 1
     totals[0] = totals[0] + wp.int64(1)
@@ -270,42 +260,63 @@ def count_solves(
     totals[3] = totals[3] + wp.int64(unfinished)
 
 
+# --- how free pieces turn in a step; see ``kernels.implicit.turning`` ------------------------------------------------
+#
+# A piece is all particles that tetrahedra connect. It is turned about its centre of mass, as it will turn in the step.
+
+
 @wp.kernel(enable_backward=False)
-def move_particles(
+def sum_motion(
     # In
-    dt: float,
-    most: float,
-    fastest: float,
-    inverse_mass: wp.array[wp.float32],
-    flags: wp.array[wp.int32],
-    world: wp.array[wp.int32],
-    entry: wp.array[wp.int32],
-    d: wp.array[wp.vec4],
+    first: wp.array[wp.int32],
+    members: wp.array[wp.int32],
+    particles: Particles,
     q: wp.array[wp.vec3],
     qd: wp.array[wp.vec3],
+    threads: int,
+    lanes: int,
     # Out
-    q_out: wp.array[wp.vec3],
-    qd_out: wp.array[wp.vec3],
-    trouble: wp.array[wp.int32],
+    parts: wp.array3d[wp.float64],
 ):
-    """The state after motions d, as ``particles.step_particles`` writes it."""
+    """Find parts of the sums of each piece, whose particles begin at ``first`` among the members."""
+    piece, thread = wp.tid()
+    total = Sums()
+    k = first[piece] + thread
+    while k < first[piece + 1]:
+        i = members[k]
+        if is_moved(i, particles):
+            mass = wp.float64(1.0) / wp.float64(particles.inv_mass[i])
+            total += motion_of(mass, False, wp.vec3d(q[i]), wp.vec3d(qd[i]))
+        else:
+            total += motion_of(wp.float64(0.0), True, wp.vec3d(), wp.vec3d())
+        k += threads
+    for column in range(COLUMNS):
+        part = sum_of_lanes(total[column])
+        if thread % lanes == 0:
+            parts[piece, thread / lanes, column] = part
+
+
+@wp.kernel(enable_backward=False)
+def turn_particles(
+    # In
+    piece_of: wp.array[wp.int32],
+    q: wp.array[wp.vec3],
+    centres: wp.array[wp.vec3],
+    turns: wp.array[wp.mat33],
+    entry: wp.array[wp.int32],
+    # In and out
+    u: wp.array[wp.vec4],
+    # Out
+    turned: wp.array[wp.vec3],
+    way: wp.array[wp.vec4],
+):
+    """Find the turned positions and the way to them; gathered displacements are turned, too."""
     i = wp.tid()
-    place = place_of(world[i], trouble.shape[0])
-    wrong = trouble[place]
-    if wrong == BAD_INPUT:
-        return
     at = q[i]
-    velocity = qd[i]
-    if wrong == SOUND and (flags[i] & ACTIVE) != 0:
-        if inverse_mass[i] > 0.0:
-            velocity = load_node(d, entry[i]) / dt
-        size = wp.max(wp.max(wp.abs(velocity)), 1.0)
-        speed = size * wp.length(velocity / size)
-        runs_away = speed >= fastest
-        if speed > most:
-            velocity = velocity * (most / speed)
-        at += dt * velocity
-        if runs_away or not is_finite(at):
-            wp.atomic_max(trouble, place, UNSTABLE)
-    q_out[i] = at
-    qd_out[i] = velocity
+    d = wp.vec3()
+    piece = piece_of[i]
+    if piece >= 0:
+        d = turns[piece] * (at - centres[piece])
+        store_node(u, i, load_node(u, i) + d)
+    turned[i] = at + d
+    store_node(way, entry[i], d)

@@ -13,7 +13,8 @@ from warp_corot.kernels.contact.vertices import across
 from warp_corot.kernels.elements.elements import add_force, load_node
 from warp_corot.kernels.implicit.line_search import TRIED
 
-from .rows import Bodies, ContactLaw, Row, ease_off, gap_of, is_attachment, point_and_arm, share_of, sum_of
+from .particles import Bodies
+from .rows import ContactLaw, Row, ease_off, gap_of, is_attachment, point_and_arm, share_of, sum_of
 
 wp.set_module_options({"enable_backward": False})
 

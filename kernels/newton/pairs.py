@@ -15,9 +15,9 @@ import warp as wp
 from warp_corot.kernels.contact.closest import on_triangle
 
 from .explicit_rows import Mobility, contact_force
+from .particles import TOO_MANY_PAIRS, Particles, mark
 from .rows import (
     ContactLaw,
-    Particles,
     add_load,
     add_to_particles,
     gap_of,
@@ -27,7 +27,6 @@ from .rows import (
     share_of,
     sum_of,
 )
-from .worlds import TOO_MANY_PAIRS, place_of
 
 wp.set_module_options({"enable_backward": False})
 
@@ -239,10 +238,9 @@ def scatter_pairs(
     """Forces of all pairs. A row that holds fewer pairs than were found marks the world."""
     n = wp.tid()
     if is_cut_short(lists.triangle_starts, lists.triangle_counts, n):
-        wp.atomic_max(trouble, place_of(particles.world[n], trouble.shape[0]), TOO_MANY_PAIRS)
+        mark(n, TOO_MANY_PAIRS, particles, trouble)
     if is_cut_short(lists.edge_starts, lists.edge_counts, n):
-        i = surfaces.edges[n, 2]
-        wp.atomic_max(trouble, place_of(particles.world[i], trouble.shape[0]), TOO_MANY_PAIRS)
+        mark(surfaces.edges[n, 2], TOO_MANY_PAIRS, particles, trouble)
     for c in range(pair_count(lists, n)):
         row, gap = listed_row(surfaces, lists, law, n, c, q)
         if gap < 0.0:

@@ -1,20 +1,95 @@
-"""Particles of a Newton model through a step: into padded arrays, one step of symplectic Euler, and out again.
+"""Particles and bodies of a Newton model through a step: into padded arrays, one step of symplectic Euler, and out
+again; worlds with a failure, which are found, restored and reported; and worlds that are reset.
 
-A world is stepped completely or not at all. A world with a value that is not finite is marked, and ``worlds``
-restores its input state. If the input was not finite, the world is not written at all.
+A world is stepped completely or not at all. A world with a value that is not finite is marked, and its input state is
+restored. If the input was not finite, the world is not written at all. Entities in no world (-1) use the last entry of
+arrays over worlds.
 """
+
+import functools
+from typing import NamedTuple
 
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
+from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.stepping.integrate import is_finite
-
-from .worlds import BAD_INPUT, NO_ROW, SOUND, UNSTABLE, place_of
 
 wp.set_module_options({"enable_backward": False})
 
 #: Newton's ``ParticleFlags.ACTIVE``.
 ACTIVE = wp.constant(1)
+# Failures of a world in this step; the report keeps the largest number of a world with a failure, plus one.
+# Of two failures, the graver one has the larger number.
+SOUND, UNSTABLE, TOO_MANY_CONTACTS, TOO_MANY_PAIRS, BAD_INPUT = (wp.constant(k) for k in range(5))
+REPORTS = 5
+
+#: What particles had in the last step, if not ``rows.Row.ease``: nobody knows; no row.
+UNKNOWN_BEFORE, NO_ROW = wp.constant(-2.0), wp.constant(-1.0)
+
+#: Newton's default for the largest speed of a particle [m/s]. Beyond it the state is a failure.
+RUNAWAY = wp.constant(1.0e5)
+
+
+@wp.struct
+class Particles:
+    """Particles of a model, with Newton's names."""
+
+    flags: wp.array[wp.int32]
+    world: wp.array[wp.int32]
+    inv_mass: wp.array[wp.float32]
+    gravity: wp.array[wp.vec3]  # of each world
+
+
+@wp.struct
+class Bodies:
+    """Rigid bodies of a model, with Newton's names, and their state."""
+
+    fixed_flag: int  # of bodies with prescribed motion
+    flags: wp.array[wp.int32]
+    world: wp.array[wp.int32]
+    inv_mass: wp.array[wp.float32]
+    inv_inertia: wp.array[wp.mat33]
+    inertia: wp.array[wp.mat33]
+    com: wp.array[wp.vec3]
+    places: wp.array[wp.int32]  # at how many places each is touched or held
+    yielding: wp.array[wp.spatial_vector]  # see ``explicit_rows``
+    q: wp.array[wp.transform]
+    qd: wp.array[wp.spatial_vector]
+
+
+@wp.func
+def place_of(world: int, count: int):
+    """A world's entry in an array over worlds; the last one stands for no world."""
+    return wp.where(world < 0, count - 1, world)
+
+
+@wp.func
+def is_active(i: int, particles: Particles):
+    return (particles.flags[i] & ACTIVE) != 0
+
+
+@wp.func
+def is_moved(i: int, particles: Particles):
+    """Whether forces move a particle."""
+    return is_active(i, particles) and particles.inv_mass[i] > 0.0
+
+
+@wp.func
+def gravity_of(i: int, particles: Particles):
+    return particles.gravity[place_of(particles.world[i], particles.gravity.shape[0])]
+
+
+@wp.func
+def trouble_of(i: int, particles: Particles, trouble: wp.array[wp.int32]):
+    """The failure of a particle's world."""
+    return trouble[place_of(particles.world[i], trouble.shape[0])]
+
+
+@wp.func
+def mark(i: int, wrong: int, particles: Particles, trouble: wp.array[wp.int32]):
+    """Mark the world of a particle."""
+    wp.atomic_max(trouble, place_of(particles.world[i], trouble.shape[0]), wrong)
 
 
 @wp.func_native("""
@@ -49,22 +124,21 @@ def gather_particles(
     q: wp.array[wp.vec3],
     qd: wp.array[wp.vec3],
     external: wp.array[wp.vec3],
-    world: wp.array[wp.int32],
+    particles: Particles,
     rest: wp.array[wp.vec4],
     wrong: int,
     # In and out
     before: wp.array[wp.float32],
     after: wp.array[wp.float32],
     # Out
-    x: wp.array[wp.vec4],
     u: wp.array[wp.vec4],
     f: wp.array[wp.vec4],
     kept_q: wp.array[wp.vec3],
     kept_qd: wp.array[wp.vec3],
     trouble: wp.array[wp.int32],
 ):
-    """Gather positions, displacements from ``rest``, and copies into the arrays that are not empty; forces start with
-    the external ones [N]. A value that is not finite marks its world.
+    """Gather displacements from ``rest``, or positions if it is empty, and copies into the arrays that are not empty;
+    forces start with the external ones [N]. A value that is not finite marks its world.
 
     Args:
         before, after: What particles had in the last step, which is replaced, and have in this one; see ``records``.
@@ -77,29 +151,28 @@ def gather_particles(
     velocity = qd[i]
     force = external[i]
     store_node(f, i, force)
-    if x.shape[0] > 0:
-        store_node(x, i, at)
-    if u.shape[0] > 0:
-        store_node(u, i, at - load_node(rest, i))
+    from_rest = at
+    if rest.shape[0] > 0:
+        from_rest = at - load_node(rest, i)
+    store_node(u, i, from_rest)
     if kept_q.shape[0] > 0:
         store_vector(kept_q, i, at)
         store_vector(kept_qd, i, velocity)
     if not (is_finite(at) and is_finite(velocity) and is_finite(force)):
-        wp.atomic_max(trouble, place_of(world[i], trouble.shape[0]), wrong)
+        mark(i, wrong, particles, trouble)
 
 
 @wp.kernel(enable_backward=False)
 def gather_nodes(
     # In
     particles: wp.array[wp.int32],
-    x: wp.array[wp.vec4],
-    rest: wp.array[wp.vec4],
+    all: wp.array[wp.vec4],
     # Out
     u: wp.array[wp.vec4],
 ):
-    """Displacements of a forest's nodes from their rest positions."""
+    """Displacements of a forest's nodes."""
     k = wp.tid()
-    store_node(u, k, load_node(x, particles[k]) - load_node(rest, k))
+    store_node(u, k, load_node(all, particles[k]))
 
 
 @wp.kernel(enable_backward=False)
@@ -118,6 +191,36 @@ def add_nodes(
     store_node(nodal, k, wp.vec3())
 
 
+@wp.func
+def take_motion(
+    i: int,
+    at: wp.vec3,
+    v: wp.vec3,
+    dt: float,
+    most: float,
+    fastest: float,
+    particles: Particles,
+    q_out: wp.array[wp.vec3],
+    qd_out: wp.array[wp.vec3],
+    trouble: wp.array[wp.int32],
+):
+    """Write an active particle's state after a step with a velocity, no faster than ``most`` [m/s].
+
+    One faster than ``fastest`` marks its world, like a value that is not finite.
+    """
+    # Scaled, so that nothing overflows.
+    size = wp.max(wp.max(wp.abs(v)), 1.0)
+    speed = size * wp.length(v / size)
+    velocity = v
+    if speed > most:
+        velocity = v * (most / speed)
+    to = at + dt * velocity
+    if speed >= fastest or not is_finite(to):
+        mark(i, UNSTABLE, particles, trouble)
+    store_vector(q_out, i, to)
+    store_vector(qd_out, i, velocity)
+
+
 @wp.kernel(enable_backward=False)
 def step_particles(
     # In
@@ -125,46 +228,40 @@ def step_particles(
     damping: float,
     most: float,
     fastest: float,
-    gravity: wp.array[wp.vec3],
-    inverse_mass: wp.array[wp.float32],
-    flags: wp.array[wp.int32],
-    world: wp.array[wp.int32],
+    particles: Particles,
     f: wp.array[wp.vec4],
     q: wp.array[wp.vec3],
     qd: wp.array[wp.vec3],
+    entry: wp.array[wp.int32],
+    d: wp.array[wp.vec4],
     # Out
     q_out: wp.array[wp.vec3],
     qd_out: wp.array[wp.vec3],
     trouble: wp.array[wp.int32],
 ):
-    """v <- (v + dt (f/m + g)) / (1 + dt damping), no faster than ``most``; x <- x + dt v.
+    """v <- (v + dt (f/m + g)) / (1 + dt damping), or d/dt of solved motions d; x <- x + dt v; see ``take_motion``.
 
-    A particle without mass is kinematic: it keeps its velocity. An inactive one is frozen. A particle faster
-    than ``fastest`` marks its world, like a value that is not finite; in worlds marked before nothing moves.
+    A particle without mass is kinematic: it keeps its velocity. An inactive one is frozen. In worlds marked before
+    nothing moves.
+
+    Args:
+        entry, d: Where the motion of each particle is, and motions [m], see ``implicit``; empty in explicit steps.
     """
     i = wp.tid()
-    place = place_of(world[i], trouble.shape[0])
-    wrong = trouble[place]
+    wrong = trouble_of(i, particles, trouble)
     if wrong == BAD_INPUT:
         return
-    at = q[i]
     velocity = qd[i]
-    if wrong == SOUND and (flags[i] & ACTIVE) != 0:
-        w = inverse_mass[i]
-        if w > 0.0:
-            g = gravity[place_of(world[i], gravity.shape[0])]
-            velocity = (velocity + dt * (w * load_node(f, i) + g)) / (1.0 + dt * damping)
-        # Scaled, so that nothing overflows.
-        size = wp.max(wp.max(wp.abs(velocity)), 1.0)
-        speed = size * wp.length(velocity / size)
-        runs_away = speed >= fastest
-        if speed > most:
-            velocity = velocity * (most / speed)
-        at += dt * velocity
-        if runs_away or not is_finite(at):
-            wp.atomic_max(trouble, place, UNSTABLE)
-    store_vector(q_out, i, at)
-    store_vector(qd_out, i, velocity)
+    if wrong == SOUND and is_active(i, particles):
+        w = particles.inv_mass[i]
+        if w > 0.0 and d.shape[0] > 0:
+            velocity = load_node(d, entry[i]) / dt
+        elif w > 0.0:
+            velocity = (velocity + dt * (w * load_node(f, i) + gravity_of(i, particles))) / (1.0 + dt * damping)
+        take_motion(i, q[i], velocity, dt, most, fastest, particles, q_out, qd_out, trouble)
+    else:
+        store_vector(q_out, i, q[i])
+        store_vector(qd_out, i, velocity)
 
 
 @wp.kernel(enable_backward=False)
@@ -172,15 +269,14 @@ def damp_particles(
     # In
     dt: float,
     damping: float,
-    inverse_mass: wp.array[wp.float32],
-    flags: wp.array[wp.int32],
+    particles: Particles,
     # In and out
     q: wp.array[wp.vec3],
     qd: wp.array[wp.vec3],
 ):
     """Apply the damping of ``step_particles`` after a step without it."""
     i = wp.tid()
-    if inverse_mass[i] > 0.0 and (flags[i] & ACTIVE) != 0:
+    if is_moved(i, particles):
         velocity = qd[i]
         slower = velocity / (1.0 + dt * damping)
         q[i] += dt * (slower - velocity)
@@ -191,3 +287,155 @@ def damp_particles(
 def unpad(a: wp.array[wp.vec4], b: wp.array[wp.vec3]):
     i = wp.tid()
     b[i] = load_node(a, i)
+
+
+# --- rigid bodies within a step, between the states that another solver gives ----------------------------------------
+
+
+@wp.func
+def is_fixed(b: int, bodies: Bodies):
+    """Whether a body's motion is prescribed."""
+    return (bodies.flags[b] & bodies.fixed_flag) != 0
+
+
+@wp.kernel(enable_backward=False)
+def move_bodies(elapsed: float, bodies: Bodies, moved: wp.array[wp.transform]):
+    """Poses after a time [s] at constant velocities of the centres of mass and constant angular velocities."""
+    b = wp.tid()
+    pose, twist = bodies.q[b], bodies.qd[b]
+    spin = wp.spatial_bottom(twist)
+    angle = elapsed * wp.length(spin)
+    rotation = wp.transform_get_rotation(pose)
+    if angle > 0.0:
+        rotation = wp.quat_from_axis_angle(wp.normalize(spin), angle) * rotation
+    centre = wp.transform_point(pose, bodies.com[b]) + elapsed * wp.spatial_top(twist)
+    moved[b] = wp.transform(centre - wp.quat_rotate(rotation, bodies.com[b]), rotation)
+
+
+@wp.kernel(enable_backward=False)
+def add_wrenches(
+    # In
+    share: float,
+    a: wp.array[wp.spatial_vector],
+    # In and out
+    b: wp.array[wp.spatial_vector],
+):
+    i = wp.tid()
+    b[i] = b[i] + share * a[i]
+
+
+# --- worlds ----------------------------------------------------------------------------------------------------------
+
+
+@wp.func
+def is_sound(q: wp.vec3, qd: wp.vec3, fastest: float):
+    return is_finite(q) and wp.max(wp.abs(qd)) < 0.5 * fastest
+
+
+@wp.func
+def is_sound(q: wp.transform, qd: wp.spatial_vector, fastest: float):
+    size = wp.dot(wp.abs(q[0:3]), wp.vec3(1.0)) + wp.dot(wp.abs(wp.spatial_top(qd)), wp.vec3(1.0))
+    size += wp.dot(wp.abs(wp.spatial_bottom(qd)), wp.vec3(1.0))
+    return size <= 3.0e38
+
+
+class StateKernels(NamedTuple):
+    """Kernels over states of particles or bodies."""
+
+    check: wp.Kernel
+    put_back: wp.Kernel
+    reset: wp.Kernel
+
+
+@functools.cache
+def state_kernels(Place: type, Velocity: type) -> StateKernels:
+    """The kernels for states with these types: of particles vec3 both, of bodies transforms and spatial vectors."""
+
+    @unique_kernel()
+    def check(
+        # In
+        q: wp.array[Place],
+        qd: wp.array[Velocity],
+        fastest: float,
+        world: wp.array[wp.int32],
+        wrong: int,
+        # Out
+        trouble: wp.array[wp.int32],
+    ):
+        """Mark worlds with a value that is not finite, or a particle that is too fast."""
+        i = wp.tid()
+        if not is_sound(q[i], qd[i], fastest):
+            wp.atomic_max(trouble, place_of(world[i], trouble.shape[0]), wrong)
+
+    @unique_kernel()
+    def put_back(
+        # In
+        world: wp.array[wp.int32],
+        trouble: wp.array[wp.int32],
+        before_q: wp.array[Place],
+        before_qd: wp.array[Velocity],
+        kept_q: wp.array[Place],
+        kept_qd: wp.array[Velocity],
+        # Out
+        q: wp.array[Place],
+        qd: wp.array[Velocity],
+    ):
+        """Undo what was written in marked worlds.
+
+        Args:
+            before_q, before_qd: The state before the step.
+            kept_q, kept_qd: Former values of the output state, for worlds whose input was not finite; or empty,
+                if those were not written.
+        """
+        i = wp.tid()
+        wrong = trouble[place_of(world[i], trouble.shape[0])]
+        if wrong == BAD_INPUT:
+            if kept_q.shape[0] > 0:
+                q[i] = kept_q[i]
+                qd[i] = kept_qd[i]
+        elif wrong != SOUND:
+            q[i] = before_q[i]
+            qd[i] = before_qd[i]
+
+    @unique_kernel()
+    def reset(
+        # In
+        chosen: wp.array[wp.bool],
+        world: wp.array[wp.int32],
+        with_q: int,
+        with_qd: int,
+        initial_q: wp.array[Place],
+        initial_qd: wp.array[Velocity],
+        # Out
+        q: wp.array[Place],
+        qd: wp.array[Velocity],
+    ):
+        i = wp.tid()
+        if chosen[place_of(world[i], chosen.shape[0])]:
+            if with_q != 0:
+                q[i] = initial_q[i]
+            if with_qd != 0:
+                qd[i] = initial_qd[i]
+
+    return StateKernels(check, put_back, reset)
+
+
+@wp.kernel(enable_backward=False)
+def report_trouble(
+    # In and out
+    trouble: wp.array[wp.int32],
+    # Out
+    report: wp.array[wp.int32],
+    seen: wp.array[wp.float64],
+):
+    """Record the failure and its world, and clear failures for the next step.
+
+    Args:
+        seen: Whether there was a failure, in the host's memory.
+    """
+    w = wp.tid()
+    wrong = trouble[w]
+    if wrong != SOUND:
+        wp.atomic_max(report, wrong, w + 1)
+        seen[0] = wp.float64(1.0)
+        trouble[w] = SOUND

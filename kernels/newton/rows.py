@@ -16,16 +16,32 @@ rows with a particle whose load is above ``crowd`` get only their share of crowd
 Newton finds contacts where things are when it is asked. A particle that had no row in the last step, and is deep in a
 shape now, has been found late: its whole spring would throw it out. So it begins to push where it is, and is let out at
 the speed ``recovery``.
+
+For a triangle mesh, Newton records every pair of a particle and a triangle, of a soft triangle and a vertex, and of two
+edges within the gap. Many of these repeat each other, and some are across the shape: a particle just below one face is
+deep below the others. So a particle counts for the nearest triangle only, and a vertex for the nearest soft triangle
+only. A soft edge that is inside counts for the edge that is nearest to it and for those up to ``DEEPER`` times as far
+away.
 """
 
 import warp as wp
 
 from warp_corot.kernels.elements.elements import add_force, load_node
 
-from .particles import ACTIVE
-from .worlds import place_of
+from .particles import ACTIVE, NO_ROW, TOO_MANY_CONTACTS, Bodies, Particles, gravity_of, is_moved
 
 wp.set_module_options({"enable_backward": False})
+
+#: See above.
+DEEPER = wp.constant(2.0)
+#: Distances are compared with this relative tolerance, and this absolute one [m].
+NEARLY, TINY = wp.constant(1.0e-4), wp.constant(1.0e-7)
+#: Families of Newton's records, its bits for the family, and its flags for a place inside and for a side that is not
+#: known; see Newton's ``soft_contacts_mesh``.
+OF_PARTICLE, OF_VERTEX, FAMILY, INSIDE, UNKNOWN = (wp.constant(k) for k in (0, 1, 7, 8, 32))
+#: Unit of distances as whole numbers [m], and how many times it a number of a feature counts.
+GRAIN, NUMBERS = wp.constant(1.0e-9), wp.constant(wp.int64(4294967296))
+FAR = wp.constant(wp.int64(9223372036854775807))
 
 
 @wp.struct
@@ -61,31 +77,6 @@ class Row:
     friction: float
 
 
-@wp.struct
-class Particles:
-    """Particles of a model."""
-
-    flags: wp.array[wp.int32]
-    world: wp.array[wp.int32]
-    inverse_mass: wp.array[wp.float32]
-    gravity: wp.array[wp.vec3]  # of each world
-
-
-@wp.struct
-class Bodies:
-    """Rigid bodies of a model, and their state."""
-
-    fixed_flag: int  # of bodies with prescribed motion
-    flags: wp.array[wp.int32]
-    inverse_mass: wp.array[wp.float32]
-    inverse_inertia: wp.array[wp.mat33]
-    com: wp.array[wp.vec3]
-    places: wp.array[wp.int32]  # at how many places each is touched or held
-    yielding: wp.array[wp.spatial_vector]  # see ``explicit_rows``
-    q: wp.array[wp.transform]
-    qd: wp.array[wp.spatial_vector]
-
-
 @wp.func
 def no_row():
     row = Row()
@@ -96,23 +87,6 @@ def no_row():
 @wp.func
 def is_attachment(row: Row):
     return row.normal == wp.vec3()
-
-
-@wp.func
-def is_moved(i: int, particles: Particles):
-    """Whether forces move a particle."""
-    return (particles.flags[i] & ACTIVE) != 0 and particles.inverse_mass[i] > 0.0
-
-
-@wp.func
-def is_active(row: Row, flags: wp.array[wp.int32]):
-    """Whether a particle of the row is active."""
-    active = bool(False)
-    for k in range(4):
-        if row.nodes[k] >= 0:  # noqa: SIM102 - the next value exists only then
-            if (flags[row.nodes[k]] & ACTIVE) != 0:
-                active = True
-    return active
 
 
 @wp.func
@@ -176,7 +150,7 @@ def inverse_mass_of(row: Row, load: wp.array[wp.float32], particles: Particles):
         i = row.nodes[k]
         if i >= 0 and row.weights[k] != 0.0:  # noqa: SIM102 - the next value exists only then
             if is_moved(i, particles):
-                largest = wp.max(largest, particles.inverse_mass[i] * load_of(i, load))
+                largest = wp.max(largest, particles.inv_mass[i] * load_of(i, load))
     return largest
 
 
@@ -188,8 +162,8 @@ def pull_of(row: Row, dt: float, particles: Particles, before: wp.array[wp.vec4]
         i = row.nodes[k]
         if i >= 0:  # noqa: SIM102 - the next values exist only then
             if is_moved(i, particles):
-                g = particles.gravity[place_of(particles.world[i], particles.gravity.shape[0])]
-                pull += row.weights[k] * dt * (particles.inverse_mass[i] * load_node(before, i) + g)
+                push = particles.inv_mass[i] * load_node(before, i)
+                pull += row.weights[k] * dt * (push + gravity_of(i, particles))
     return pull
 
 
@@ -224,3 +198,273 @@ def count_loads(
         point, _arm = point_and_arm(row, bodies)
         if gap_of(row, sum_of(row, q) - point) <= adhesion:
             add_load(row, load)
+
+
+# --- records of Newton's collision pipeline, and attachments ----------------------------------------------------------
+
+
+@wp.struct
+class Shapes:
+    """Shapes of a Newton model, with its names."""
+
+    body: wp.array[wp.int32]
+    margin: wp.array[wp.float32]
+    material_ke: wp.array[wp.float32]
+    material_kd: wp.array[wp.float32]
+    material_kf: wp.array[wp.float32]
+    material_mu: wp.array[wp.float32]
+    transform: wp.array[wp.transform]  # in its body's frame
+    scale: wp.array[wp.vec3]
+    source_ptr: wp.array[wp.uint64]  # meshes
+
+
+@wp.struct
+class Records:
+    """Newton's records of contacts, with its names."""
+
+    count: wp.array[wp.int32]
+    particle: wp.array[wp.int32]
+    indices: wp.array[wp.vec3i]
+    barycentric: wp.array[wp.vec3]
+    shape: wp.array[wp.int32]
+    body_pos: wp.array[wp.vec3]  # on the shape, in its body's frame
+    body_vel: wp.array[wp.vec3]
+    normal: wp.array[wp.vec3]
+    # Of meshes: kind, soft feature and mesh feature, kind -1 of other shapes; empty if there are no meshes.
+    features: wp.array[wp.vec3i]
+    nearest: wp.array[wp.int64]  # of each vertex of a mesh, and then of each soft edge, its nearest rival
+    vertices: int  # number of vertices of all meshes
+
+
+@wp.struct
+class Attachments:
+    """Attachments of particles to bodies, as a Newton model has them."""
+
+    particle: wp.array[wp.int32]
+    body: wp.array[wp.int32]
+    body_point: wp.array[wp.vec3]
+    stiffness: wp.array[wp.float32]
+    damping: wp.array[wp.float32]
+    enabled: wp.array[wp.bool]
+
+
+@wp.func
+def place_of_record(c: int, records: Records):
+    """A row with the particles of record c. A record of a particle needs no weights."""
+    row = no_row()
+    row.measure = 1.0
+    i = records.particle[c]
+    if i >= 0:
+        row.nodes[0] = i
+        row.weights = wp.vec4(1.0, 0.0, 0.0, 0.0)
+        return row
+    n = records.indices[c]
+    b = records.barycentric[c]
+    row.nodes = wp.vec4i(n[0], n[1], n[2], -1)
+    row.weights = wp.vec4(b[0], b[1], b[2], 0.0)
+    if n[2] >= 0:
+        row.measure = 27.0 * b[0] * b[1] * b[2]
+    elif n[1] >= 0:
+        row.measure = 4.0 * b[0] * b[1]
+    return row
+
+
+@wp.func
+def has_active(row: Row, flags: wp.array[wp.int32]):
+    """Whether a particle of the row is active."""
+    active = bool(False)
+    for k in range(4):
+        if row.nodes[k] >= 0:  # noqa: SIM102 - the next value exists only then
+            if (flags[row.nodes[k]] & ACTIVE) != 0:
+                active = True
+    return active
+
+
+# --- records of meshes -----------------------------------------------------------------------------------------------
+
+
+@wp.func
+def in_frame_of_body(x: wp.vec3, body: int, body_q: wp.array[wp.transform]):
+    if body >= 0:
+        return wp.transform_point(wp.transform_inverse(body_q[body]), x)
+    return x
+
+
+@wp.func
+def is_of_nearest_triangle(c: int, x: wp.vec3, records: Records, shapes: Shapes):
+    """Whether no triangle is nearer to the soft point x, in the frame of its shape's body, than that of record c."""
+    shape = records.shape[c]
+    scale = shapes.scale[shape]
+    y = wp.cw_div(wp.transform_point(wp.transform_inverse(shapes.transform[shape]), x), scale)
+    least = wp.min(wp.min(wp.abs(scale[0]), wp.abs(scale[1])), wp.abs(scale[2]))
+    reach = (wp.length(x - records.body_pos[c]) * (1.0 + NEARLY) + TINY) / least
+    found = wp.mesh_query_point_no_sign(shapes.source_ptr[shape], y, reach)
+    return not found.result or found.face == records.features[c][2]
+
+
+@wp.func
+def code_of(away: float, soft: int):
+    """A number that is smaller for a shorter distance, and then for a smaller number of the soft feature."""
+    return wp.int64(away / GRAIN) * NUMBERS + wp.int64(soft)
+
+
+@wp.func
+def rival_of(feature: wp.vec3i, vertices: int):
+    """The number of the vertex or the soft edge for which a record competes with others; -1: for none."""
+    family = feature[0] & FAMILY
+    if feature[0] < 0 or family == OF_PARTICLE:
+        return -1
+    if family == OF_VERTEX:
+        return feature[2]
+    if (feature[0] & INSIDE) == 0:
+        return -1
+    return vertices + feature[1]
+
+
+@wp.func
+def counts(c: int, x: wp.vec3, records: Records, shapes: Shapes):
+    """Whether record c counts, with the soft point x in the frame of its shape's body."""
+    feature = records.features[c]
+    if feature[0] < 0:
+        return True
+    if (feature[0] & UNKNOWN) != 0:
+        return False
+    if (feature[0] & FAMILY) == OF_PARTICLE:
+        return is_of_nearest_triangle(c, x, records, shapes)
+    rival = rival_of(feature, records.vertices)
+    if rival < 0:
+        return True
+    away = wp.length(x - records.body_pos[c])
+    if (feature[0] & FAMILY) == OF_VERTEX:
+        return records.nearest[rival] == code_of(away, feature[1])
+    return away <= DEEPER * GRAIN * float(records.nearest[rival] / NUMBERS) + TINY
+
+
+@wp.kernel(enable_backward=False)
+def find_nearest(
+    # In
+    shapes: Shapes,
+    q: wp.array[wp.vec3],
+    body_q: wp.array[wp.transform],
+    # In and out
+    records: Records,
+):
+    """Find the nearest soft triangle of each vertex of a mesh, and how far the nearest edge of each soft edge is."""
+    c = wp.tid()
+    if c >= wp.min(records.count[0], records.features.shape[0]):
+        return
+    feature = records.features[c]
+    rival = rival_of(feature, records.vertices)
+    if rival >= 0:
+        x = in_frame_of_body(sum_of(place_of_record(c, records), q), shapes.body[records.shape[c]], body_q)
+        wp.atomic_min(records.nearest, rival, code_of(wp.length(x - records.body_pos[c]), feature[1]))
+
+
+# --- rows ------------------------------------------------------------------------------------------------------------
+
+
+@wp.kernel(enable_backward=False)
+def fill_rows(
+    # In
+    contacts: int,
+    law: ContactLaw,
+    records: Records,
+    shapes: Shapes,
+    attachments: Attachments,
+    flags: wp.array[wp.int32],
+    radius: wp.array[wp.float32],
+    q: wp.array[wp.vec3],
+    body_q: wp.array[wp.transform],
+    eased: float,
+    before: wp.array[wp.float32],
+    # Out
+    after: wp.array[wp.float32],
+    rows: wp.array[Row],
+    trouble: wp.array[wp.int32],
+):
+    """Rows of so many records, and then of attachments. If there are more contacts than records, the worlds of the
+    missing ones are unknown, so none is stepped.
+
+    Args:
+        eased: How far contacts that were found late have been let out in the last step [m].
+        before, after: What particles had in the last step and have in this one; see ``worlds.NO_ROW``.
+    """
+    c = wp.tid()
+    row = no_row()
+    if c >= contacts:
+        a = c - contacts
+        if attachments.enabled[a]:
+            row.nodes[0] = attachments.particle[a]
+            row.weights = wp.vec4(1.0, 0.0, 0.0, 0.0)
+            row.measure = 1.0
+            row.body = attachments.body[a]
+            row.point = attachments.body_point[a]
+            row.stiffness = attachments.stiffness[a]
+            row.damping = attachments.damping[a]
+        rows[c] = row
+        return
+    if c == 0 and records.count[0] > contacts:
+        for w in range(trouble.shape[0]):
+            wp.atomic_max(trouble, w, TOO_MANY_CONTACTS)
+    if c < records.count[0]:
+        found = place_of_record(c, records)
+        shape = records.shape[c]
+        body = shapes.body[shape]
+        is_one = found.measure > 0.0 and has_active(found, flags)
+        if is_one and records.features.shape[0] > 0:
+            is_one = counts(c, in_frame_of_body(sum_of(found, q), body, body_q), records, shapes)
+        if is_one:
+            row = found
+            row.counted = row.measure
+            row.body = body
+            row.point = records.body_pos[c]
+            row.velocity = records.body_vel[c]
+            row.normal = records.normal[c]
+            row.offset = radius[row.nodes[0]]
+            for k in range(1, 3):
+                if row.nodes[k] >= 0:
+                    row.offset = wp.max(row.offset, radius[row.nodes[k]])
+            if shapes.margin.shape[0] > 0:
+                row.offset += shapes.margin[shape]
+            row.stiffness = 0.5 * (law.stiffness + shapes.material_ke[shape])
+            row.damping = 0.5 * (law.damping + shapes.material_kd[shape])
+            row.slope = 0.5 * (law.slope + shapes.material_kf[shape])
+            row.friction = 0.5 * (law.friction + shapes.material_mu[shape])
+            i = records.particle[c]
+            if i >= 0:
+                place = row.point
+                if body >= 0:
+                    place = wp.transform_point(body_q[body], place)
+                depth = -gap_of(row, q[i] - place)
+                if before[i] == NO_ROW:
+                    row.ease = wp.max(depth, 0.0)
+                elif before[i] > 0.0:
+                    row.ease = wp.clamp(before[i] - eased, 0.0, wp.max(depth, 0.0))
+                wp.atomic_max(after, i, row.ease)
+    rows[c] = row
+
+
+@wp.kernel(enable_backward=False)
+def sum_soft_contacts(
+    # In
+    count: wp.array[wp.int32],
+    contact_shape: wp.array[wp.int32],
+    contact_normal: wp.array[wp.vec3],
+    first_row: int,
+    wrenches: wp.array[wp.spatial_vector],
+    row_of_shape: wp.array[wp.int32],
+    # Out
+    force: wp.array[wp.vec3],
+    friction: wp.array[wp.vec3],
+):
+    """Add the forces on watched shapes, and their parts across the normals [N]; a row of -1 is not watched."""
+    c = wp.tid()
+    if c >= wp.min(count[0], contact_shape.shape[0]):
+        return
+    row = row_of_shape[contact_shape[c]]
+    if row < 0:
+        return
+    f = wp.spatial_top(wrenches[first_row + c])
+    n = contact_normal[c]
+    wp.atomic_add(force, row, f)
+    wp.atomic_add(friction, row, f - wp.dot(f, n) * n)

@@ -1,11 +1,9 @@
 """Bad input of ``add_forest``, ``add_mesh`` and, through Newton's own builder, of the solver: one clear line."""
 
-import warnings
-
 import numpy as np
 import pytest
 import warp as wp
-from newton_scenes import add_grid, builder, model_without_particles, semi_implicit, wc, wn
+from newton_scenes import add_grid, builder, wc, wn
 from scipy.spatial.transform import Rotation
 
 NAN = float("nan")
@@ -132,36 +130,3 @@ def test_a_step_of_years_is_refused():
     model = made.finalize(device="cpu")
     with pytest.raises(wc.InputError, match=r"dt is 1e\+09 s, which takes .* substeps of .* s; take a step"):
         wn.SolverCorotated(model).step(model.state(), model.state(), None, None, 1e9)
-
-
-class TestBodiesThatAnotherSolverMovesToo:
-    """A ball falls beside a block; Newton's own solver steps it between our steps."""
-
-    def model(self, device):
-        made = builder()
-        add_grid(made, dims=(1, 1, 1))
-        made.add_body(
-            xform=wp.transform(wp.vec3(2.0, 0.0, 0.3), wp.quat_identity()), mass=1.0, inertia=wp.mat33(np.eye(3))
-        )
-        return made.finalize(device=device)
-
-    def steps(self, device, rigid_solver, between, count=6):
-        model = self.model(device)
-        solver = wn.SolverCorotated(model, rigid_solver=rigid_solver)
-        other, now, after = semi_implicit(model_without_particles(model)), model.state(), model.state()
-        for step in range(count):
-            if between(step):
-                other.step(now, now, None, None, 1e-3)
-            solver.step(now, after, None, None, 1e-3)
-            now, after = after, now
-
-    def test_a_warning(self):
-        """On the CPU only, because steps on CUDA do not wait for the device."""
-        with pytest.warns(UserWarning, match="something else moves them, and so does rigid_solver in these steps"):
-            self.steps("cpu", "semi-implicit", lambda _: True)
-
-    def test_none_if_only_one_moves_them(self, device):
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            self.steps(device, None, lambda _: True)
-            self.steps(device, "semi-implicit", lambda step: step == 2)

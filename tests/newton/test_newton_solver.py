@@ -13,7 +13,7 @@ import pytest
 import warp as wp
 from newton_scenes import adaptive_forest, add_grid, builder, checked_step, grid_model, impulse, newton, run, wc, wn
 
-from warp_corot.newton.state import ForestName
+from warp_corot.newton.scene import ForestName
 
 PACKAGE = Path(wn.__file__).parent
 

@@ -12,13 +12,12 @@ from typing import TYPE_CHECKING, Any
 from warp_corot.inputs.arguments import explained
 
 if TYPE_CHECKING:
-    from warp_corot.newton.stages.material import StageOptions
+    from warp_corot.newton.stages.stage import StageOptions
     from warp_corot.newton.stages.steps import StageSimulation
 
-    from .scene import Added, add_forest, add_mesh
+    from .scene import Added, add_forest, add_mesh, register_custom_attributes
     from .sensor import SensorSoftContact
     from .solver import SolverCorotated
-    from .state import register_custom_attributes
     from .viewing import open_viewer
 
 __all__ = [
@@ -37,12 +36,12 @@ _MODULES = {
     "Added": ".scene",
     "SensorSoftContact": ".sensor",
     "SolverCorotated": ".solver",
-    "StageOptions": ".stages.material",
+    "StageOptions": ".stages.stage",
     "StageSimulation": ".stages.steps",
     "add_forest": ".scene",
     "add_mesh": ".scene",
     "open_viewer": ".viewing",
-    "register_custom_attributes": ".state",
+    "register_custom_attributes": ".scene",
 }
 
 

@@ -11,39 +11,30 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import warp as wp
 
 from warp_corot.elasticity.model import Kept
 from warp_corot.errors import InputError
-from warp_corot.kernels.newton import explicit_rows, records, rows
-from warp_corot.kernels.newton.pairs import PairLists
-from warp_corot.kernels.newton.worlds import NO_ROW, UNKNOWN_BEFORE
+from warp_corot.kernels.newton import explicit_rows, rows
+from warp_corot.kernels.newton.pairs import PairLists, Surfaces, count_pair_loads, scatter_pairs
+from warp_corot.kernels.newton.particles import NO_ROW, UNKNOWN_BEFORE, Bodies, Particles
+from warp_corot.mesh.growing.cut import linked, node_pairs
+from warp_corot.mesh.surfaces.boundary import boundary_faces
 
-from .arguments import Step
+from .checks import Step
 from .library import newton
-from .pairs import SoftPairs
 
 #: ``newton.BodyFlags.KINEMATIC``, for bodies with prescribed motion.
 KINEMATIC = int(newton.BodyFlags.KINEMATIC)
+#: Sine of an angle below which two edges are parallel, as in Newton's detector.
+PARALLEL = 1e-5
 #: Number of iterations that find which contacts still hold after bodies have yielded.
 ROUNDS = 4
 #: The stiffness of all contacts that share a particle is at most this many times the stiffness of one.
 CROWD = 4.0
 #: Speed at which what was found too late is pushed out [m/s].
 RECOVERY = 0.25
-LAW = ("stiffness", "damping", "slope", "friction", "adhesion", "crowd", "recovery")
-#: A model's names of the fields of kernels' structs, and those of contacts.
-PARTICLES = {"inverse_mass": "particle_inv_mass", "gravity": "gravity"}
-PARTICLES |= {name: f"particle_{name}" for name in ("flags", "world")}
-SHAPES = {"body": "shape_body", "pose": "shape_transform", "scale": "shape_scale", "mesh": "shape_source_ptr"}
-SHAPES |= {"margin": "shape_margin", "stiffness": "shape_material_ke", "damping": "shape_material_kd"}
-SHAPES |= {"slope": "shape_material_kf", "friction": "shape_material_mu"}
-ATTACHMENTS = {name: name for name in ("particle", "body", "stiffness", "damping", "enabled")} | {"point": "body_point"}
-ATTACHMENTS = {name: f"attachment_particle_body_{given}" for name, given in ATTACHMENTS.items()}
-
-RECORDS = {"nodes": "indices", "weights": "barycentric", "place": "body_pos", "velocity": "body_vel"}
-RECORDS |= {name: name for name in ("count", "particle", "shape", "normal")}
-RECORDS = {name: f"soft_contact_{given}" for name, given in RECORDS.items()}
 
 
 class Contacts:
@@ -81,12 +72,11 @@ class Contacts:
             wp.zeros(bodies, dtype=wp.spatial_vectorf, device=self.device) for _ in range(3)
         )
         self._bodies = Kept(self._made_bodies)
-        self._particles, self._shapes = _FromModel(rows.Particles, PARTICLES), _FromModel(records.Shapes, SHAPES)
-        self._attachments, self._records = (
-            _FromModel(records.Attachments, ATTACHMENTS),
-            _FromModel(records.Records, RECORDS),
-        )
-        self._no_records, self.law = records.Records(), rows.ContactLaw()
+        self._particles, self._shapes = _Given(Particles, "particle_", model), _Given(rows.Shapes, "shape_", model)
+        self._attachments = _Given(rows.Attachments, "attachment_particle_body_", model)
+        self._of_bodies = _Given(Bodies, "body_", model)
+        self._records: _Given | None = None
+        self._no_records, self.law = rows.Records(), rows.ContactLaw()
         self._law_values: list[float] = []
         self._nearest = wp.empty(0, dtype=wp.int64, device=self.device)
         #: What particles had in the last step and have in this one, float32 [P]; see ``kernels.newton.rows``.
@@ -179,7 +169,12 @@ class Contacts:
         inputs = [self.contact_count, self.law, those, self._shapes.of(model), self._attachments.of(model)]
         inputs += [model.particle_flags, model.particle_radius, state.particle_q, state.body_q]
         inputs += [eased, self._before_step, self._in_step]
-        self._launch(records.fill_rows, self.count, inputs, [self.rows, trouble])
+        self._launch(rows.fill_rows, self.count, inputs, [self.rows, trouble])
+
+    @property
+    def particles(self) -> Particles:
+        """The model's particles."""
+        return self._particles.of(self.model)
 
     @property
     def memory(self) -> list[wp.array]:
@@ -202,8 +197,7 @@ class Contacts:
         model, state, dt, reported = self.model, substep.state_in, substep.dt, substep.reported
         if self.contact_count or self._lists is not None:
             wp.copy(self._before, f)
-        load, bodies = self.count_loads(state, of_bodies), self.bodies(of_bodies)
-        particles = self._particles.of(model)
+        load, bodies, particles = self.count_loads(state, of_bodies), self.bodies(of_bodies), self.particles
         motion = [state.particle_q, state.particle_qd, self._before]
         if model.body_count:
             self.reactions.zero_()
@@ -231,11 +225,11 @@ class Contacts:
             self.pairs.count_loads(self._lists, self.law, state.particle_q, self._load)
         return self._load
 
-    def bodies(self, of_bodies: newton.State) -> rows.Bodies:
+    def bodies(self, of_bodies: newton.State) -> Bodies:
         """Bodies in a state."""
         return self._bodies(of_bodies.body_q, of_bodies.body_qd)
 
-    def _find_yielding(self, state: newton.State, bodies: rows.Bodies, load: wp.array, dt: float) -> None:
+    def _find_yielding(self, state: newton.State, bodies: Bodies, load: wp.array, dt: float) -> None:
         """Find how far bodies yield to springs, and at how many places they are touched."""
         self._places.zero_()
         for number in range(ROUNDS if self.contact_count else 1):
@@ -251,13 +245,16 @@ class Contacts:
         values += [model.particle_adhesion, CROWD, RECOVERY]
         if values != self._law_values:
             self._law_values, self.law = values, rows.ContactLaw()
-            for name, value in zip(LAW, values, strict=True):
+            names: Any = rows.ContactLaw
+            for name, value in zip(names.vars, values, strict=True):
                 setattr(self.law, name, value)
 
     def _can_touch(self, contacts: newton.Contacts) -> bool:
         return bool(contacts.soft_contact_max and self.model.shape_count)
 
-    def _records_of(self, contacts: newton.Contacts, step: Step) -> records.Records:
+    def _records_of(self, contacts: newton.Contacts, step: Step) -> rows.Records:
+        if self._records is None:
+            self._records = _Given(rows.Records, "soft_contact_", contacts)
         made = self._records.of(contacts)
         # These attributes are private to Newton; without features there are no records of meshes.
         features = getattr(contacts, "_soft_contact_mesh_features", None)
@@ -271,41 +268,157 @@ class Contacts:
             self._nearest = wp.empty(rivals, dtype=wp.int64, device=self.device)
         if made.nearest is not self._nearest:
             made.nearest = self._nearest
-        self._nearest.fill_(int(records.FAR))
+        self._nearest.fill_(int(rows.FAR))
         inputs = [self._shapes.of(self.model), step.state_in.particle_q, step.state_in.body_q, made]
-        self._launch(records.find_nearest, self.contact_count, inputs, [])
+        self._launch(rows.find_nearest, self.contact_count, inputs, [])
         return made
 
-    def _made_bodies(self, q: wp.array | None, qd: wp.array | None) -> rows.Bodies:
-        made, model = rows.Bodies(), self.model
+    def _made_bodies(self, q: wp.array | None, qd: wp.array | None) -> Bodies:
+        made = self._of_bodies.new(self.model)
         made.fixed_flag, made.places, made.yielding = KINEMATIC, self._places, self._yielding
-        if model.body_count:
-            made.flags, made.inverse_mass, made.com = model.body_flags, model.body_inv_mass, model.body_com
-            made.inverse_inertia, made.q, made.qd = model.body_inv_inertia, q, qd
+        if self.model.body_count:
+            made.q, made.qd = q, qd
         return made
 
     def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
 
-class _FromModel(Kept[Any]):
-    """A struct of a model's arrays, by the names of its fields; those that the model lacks stay empty.
+class _Given(Kept[Any]):
+    """A struct of arrays of a model or of contacts, made again where these have others.
 
     Args:
-        struct: The struct.
-        names: The model's name of each field.
+        struct: The struct, whose fields have Newton's names without the prefix; those that Newton lacks stay empty.
+        prefix: The prefix.
+        owner: The model, or contacts.
     """
 
-    def __init__(self, struct: Any, names: dict[str, str]):
+    def __init__(self, struct: Any, prefix: str, owner: Any):
         super().__init__(self._made)
-        self._struct_type, self._names = struct, names
+        self._struct_type = struct
+        names = [(field, name) for field in struct.vars for name in (prefix + field, field) if hasattr(owner, name)]
+        self._names = {field: name for field, name in reversed(names)}
 
-    def of(self, model: newton.Model | newton.Contacts) -> Any:
-        return self(*(getattr(model, name) for name in self._names.values()))
+    def of(self, owner: Any) -> Any:
+        return self(*(getattr(owner, name) for name in self._names.values()))
 
-    def _made(self, *arrays: wp.array | None) -> Any:
+    def new(self, owner: Any) -> Any:
+        """Another one."""
+        return self._made(*(getattr(owner, name) for name in self._names.values()))
+
+    def _made(self, *arrays: Any) -> Any:
         made = self._struct_type()
         for field, array in zip(self._names, arrays, strict=True):
-            if array is not None:
+            if isinstance(array, wp.array):
                 setattr(made, field, array)
         return made
+
+
+class SoftPairs:
+    """Forces of pairs of vertices and triangles, and of edges, that ``newton.CollisionPipeline`` has found.
+
+    Args:
+        model: A model with triangles.
+        margin: Distance at which surfaces begin to push one another [m].
+    """
+
+    def __init__(self, model: newton.Model, margin: float):
+        if not model.tri_count or not model.edge_count:
+            raise InputError(
+                "self_contact_margin is given, but the model has no triangles with edges that could touch: give "
+                "add_forest and add_mesh surface=True"
+            )
+        self.model, self.margin, self.device = model, margin, model.device
+        triangles = model.tri_indices.numpy().reshape(-1, 3)
+        edges = model.edge_indices.numpy().reshape(-1, 4)
+        count = model.particle_count
+        exposed = np.zeros(count, np.int32)
+        exposed[triangles] = 1
+        facing = _facing(model, triangles)
+        self._surfaces = surfaces = Surfaces()
+        surfaces.triangles, surfaces.edges = model.tri_indices, model.edge_indices
+        surfaces.facing = self._on_device(facing, wp.float32)
+        surfaces.outward = self._on_device(_triangles_of_edges(triangles, edges, facing), wp.vec2i)
+        surfaces.part = self._on_device(_parts(model, triangles), wp.int32)
+        surfaces.exposed = self._on_device(exposed, wp.int32)
+        surfaces.rest = wp.clone(model.particle_q)
+
+    def lists_of(self, contacts: newton.Contacts) -> PairLists:
+        """Newton's lists of pairs.
+
+        Raises:
+            InputError: The contacts have none.
+        """
+        data = contacts.soft_self_contact_data
+        if data is None:
+            raise InputError(
+                "contacts hold no pairs of soft bodies, which self_contact_margin needs: call "
+                "pipeline.init_soft_self_contact(margin=..., gap=...) before pipeline.contacts(), and "
+                "pipeline.collide(state, contacts, soft_self_contact=True)"
+            )
+        lists = PairLists()
+        lists.margin, lists.parallel = self.margin, PARALLEL
+        lists.triangle_starts = data.vertex_colliding_triangles_offsets
+        lists.triangle_counts = data.vertex_colliding_triangles_count
+        lists.triangles = data.vertex_colliding_triangles
+        lists.edge_starts = data.edge_colliding_edges_offsets
+        lists.edge_counts = data.edge_colliding_edges_count
+        lists.edges = data.edge_colliding_edges
+        return lists
+
+    def count_loads(self, lists: PairLists, law: rows.ContactLaw, q: wp.array, load: wp.array) -> None:
+        """Add to the loads of particles, float32 [P]."""
+        self._launch(count_pair_loads, [self._surfaces, lists, law, q], [load])
+
+    def add_forces(
+        self,
+        lists: PairLists,
+        law: rows.ContactLaw,
+        dt: float,
+        load: wp.array,
+        motion: list,
+        f: wp.array,
+        trouble: wp.array,
+    ) -> None:
+        """Add forces [N] to f, vec4 [P]; ``motion``: particles, positions, velocities, and forces before contacts'."""
+        self._launch(scatter_pairs, [self._surfaces, lists, law, dt, load, *motion], [f, trouble])
+
+    def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
+        dim = max(self.model.particle_count, self.model.edge_count)
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+
+    def _on_device(self, values: npt.NDArray[Any], dtype: type) -> wp.array:
+        return wp.array(values, dtype=dtype, device=self.device)
+
+
+def _facing(model: newton.Model, triangles: npt.NDArray[np.int32]) -> npt.NDArray[np.float32]:
+    """Whether triangles' normals point out of tetrahedra (1) or into them (-1); 0: the triangle is a face of none, or
+    of two.
+    """
+    faces = boundary_faces(model.tet_indices.numpy())[0]
+    place = _places(triangles, faces)
+    alike = [(np.roll(faces[place], k, axis=1) == triangles).all(axis=1) for k in range(3)]
+    return np.where(place < 0, 0.0, np.where(np.any(alike, axis=0), 1.0, -1.0)).astype(np.float32)
+
+
+def _triangles_of_edges(
+    triangles: npt.NDArray[np.int32], edges: npt.NDArray[np.int32], facing: npt.NDArray[np.float32]
+) -> npt.NDArray[np.int32]:
+    """Two triangles of tetrahedra at each edge, or -1, int32 [E, 2]."""
+    found = np.stack([_places(edges[:, [k, 2, 3]], triangles) for k in range(2)], axis=1)
+    return np.where(facing[found] == 0.0, -1, found).astype(np.int32)
+
+
+def _places(wanted: npt.NDArray[np.integer], among: npt.NDArray[np.integer]) -> npt.NDArray[np.integer]:
+    """The place of each row among others with the same numbers in any order; -1: there is none."""
+    both = np.sort(np.concatenate([among, wanted]), axis=1)
+    _, first, group = np.unique(both, axis=0, return_index=True, return_inverse=True)
+    place = first[np.ravel(group)[len(among) :]]
+    return np.where(place < len(among), place, -1)
+
+
+def _parts(model: newton.Model, triangles: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
+    """Number of the connected body of each particle, int32 [P]."""
+    tets = model.tet_indices.numpy().reshape(-1, 4)
+    pairs = np.concatenate([node_pairs(tets)] + [triangles[:, [0, k]] for k in (1, 2)])
+    return linked(pairs, model.particle_count).astype(np.int32)

@@ -6,28 +6,37 @@ import math
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
 import warp as wp
 
+from warp_corot.elasticity.model import isotropic_material
 from warp_corot.errors import InputError
-from warp_corot.kernels.implicit import conjugate_gradients
+from warp_corot.kernels.corotated.tangent import PLACES, KeptGradients, add_kept_product
+from warp_corot.kernels.elements.elements import GeneralElements
+from warp_corot.kernels.elements.simd8 import LANES
+from warp_corot.kernels.elements.stiffness_products import add_stiffness_product
+from warp_corot.kernels.implicit import conjugate_gradients, turning
 from warp_corot.kernels.implicit.tangent import add_vectors, find_rest
 from warp_corot.kernels.newton import implicit as kernels
+from warp_corot.kernels.newton import implicit_rows as rows
+from warp_corot.kernels.newton.particles import Particles
+from warp_corot.mesh.growing.cut import connected
+from warp_corot.solvers.implicit.block_diagonal import BlockDiagonal
 from warp_corot.solvers.implicit.block_system import BlockSystem
 from warp_corot.solvers.implicit.contact_solve import ContactSolve
 from warp_corot.solvers.implicit.line_search import LineSearch
+from warp_corot.solvers.implicit.operator import Springs
+from warp_corot.solvers.implicit.sums import WorldSums
 from warp_corot.solvers.steps.repeated import Replays
 
-from .arguments import Step
-from .contact import KINEMATIC, Contacts
+from .checks import Step
+from .contact import Contacts
 from .library import newton
-from .links import RowForces
 from .others import Others
-from .state import NAMESPACE
-from .step_operator import RowBlocks, StepOperator
-from .steps import RUNAWAY, Steps
+from .scene import NAMESPACE
+from .steps import Steps
 from .tetrahedra import Tetrahedra
-from .turning import TurnedPieces
-from .unknowns import Unknowns
 
 #: Residual of the linear solves over their right side.
 TOLERANCE = 1e-4
@@ -35,6 +44,311 @@ TOLERANCE = 1e-4
 ITERATIONS = 1000
 #: The longest step of Newton's semi-implicit solver of rigid bodies [s].
 RIGID_STEP = 5e-4
+#: Worlds are solved side by side if their vectors, all as long as the longest, have at most this many times as many
+#: entries as are needed.
+PADDING = 2
+#: Fields of a row.
+FIELDS = {"nodes": wp.vec4i, "weights": wp.vec4, "body": wp.int32, "law": wp.vec4, "stiffness": wp.mat33}
+FIELDS |= {"most": wp.float32, **dict.fromkeys(("arm", "normal", "gap", "slide", "force"), wp.vec3)}
+
+
+class Unknowns:
+    """Entries of vectors: one for each particle, two for each body, world after world.
+
+    Each world is solved by itself if everything that moves is in a world; otherwise all worlds are solved together.
+
+    Args:
+        model: The model.
+
+    Attributes:
+        worlds: Number of worlds that are solved side by side.
+        count: Number of entries of each.
+        particle, body: Entries of particles, and of bodies' translations, int32 [P], [B].
+        owner: The body of an entry, or -1, int32 [worlds * count].
+    """
+
+    def __init__(self, model: newton.Model):
+        particles, bodies = _worlds_of(model)
+        size = np.bincount(particles, minlength=1)
+        size = size + np.pad(2 * np.bincount(bodies, minlength=0), (0, len(size)))[: len(size)]
+        if len(size) * size.max() > PADDING * size.sum():
+            particles, bodies = np.zeros_like(particles), np.zeros_like(bodies)
+            size = np.array([len(particles) + 2 * len(bodies)])
+        self.worlds, self.count = len(size), int(size.max())
+        of_particles = particles * self.count + _places(particles)
+        first = np.bincount(particles, minlength=self.worlds)
+        of_bodies = bodies * self.count + first[bodies] + 2 * _places(bodies)
+        owner = np.full(self.worlds * self.count, -1, np.int32)
+        owner[of_bodies] = np.arange(len(bodies))
+        self.particle, self.body, self.owner = (
+            wp.array(values, dtype=wp.int32, device=model.device) for values in (of_particles, of_bodies, owner)
+        )
+
+    def __len__(self) -> int:
+        return self.worlds * self.count
+
+
+def _worlds_of(model: newton.Model) -> tuple[npt.NDArray[np.integer], npt.NDArray[np.integer]]:
+    """Worlds of particles and bodies, all zero if something that moves is in no world."""
+    particles = model.particle_world.numpy()
+    bodies = model.body_world.numpy() if model.body_count else np.zeros(0, np.int32)
+    if min(particles.min(initial=0), bodies.min(initial=0)) < 0:
+        return np.zeros_like(particles), np.zeros_like(bodies)
+    numbers, places = np.unique(np.concatenate([particles, bodies]), return_inverse=True)
+    if not len(numbers):
+        return particles, bodies
+    return places[: len(particles)], places[len(particles) :]
+
+
+def _places(worlds: npt.NDArray[np.integer]) -> npt.NDArray[np.integer]:
+    """The number of each entry among those of its world."""
+    order = np.argsort(worlds, kind="stable")
+    starts = np.searchsorted(worlds[order], worlds[order], "left")
+    places = np.empty_like(order)
+    places[order] = np.arange(len(worlds)) - starts
+    return places
+
+
+class TurnedPieces:
+    """A model whose free pieces are turned as they will turn in a step; see ``solvers.implicit.turning``.
+
+    Pieces with held particles are not turned.
+
+    Args:
+        model: The model.
+        tetrahedra: Its elements.
+        unknowns: The entries of vectors.
+
+    Attributes:
+        positions: Those of the turned particles [m], vec3 [P].
+        way: The way to them [m], vec4 [entries].
+    """
+
+    def __init__(self, model: newton.Model, tetrahedra: Tetrahedra, unknowns: Unknowns):
+        self._tetrahedra, self._entry, device = tetrahedra, unknowns.particle, model.device
+        piece = np.full(model.particle_count, -1, np.int32)
+        piece[tetrahedra.tets] = connected(tetrahedra.tets)[:, None]
+        members = np.argsort(piece, kind="stable")[np.count_nonzero(piece < 0) :]
+        first = np.cumsum(np.bincount(piece + 1))
+        first -= first[0]
+        count = len(first) - 1
+        self._sums = WorldSums(count, int(np.diff(first).max(initial=0)), turning.COLUMNS, device)
+        self._piece, self._members, self._first = (
+            wp.array(values, dtype=wp.int32, device=device) for values in (piece, members, first)
+        )
+        self._centres = wp.zeros(count, dtype=wp.vec3, device=device)
+        self._turns = wp.zeros(count, dtype=wp.mat33, device=device)
+        self._any_turns = wp.zeros(1, dtype=wp.int32, device=device)
+        self.positions = wp.zeros(model.particle_count, dtype=wp.vec3, device=device)
+        self.way = wp.zeros(len(unknowns), dtype=wp.vec4, device=device)
+
+    def launch(self, state: newton.State, particles: Particles, dt: float) -> None:
+        """Launch the turn in a step of dt [s]; the elements' gathered positions are turned, too."""
+        tets, sums, q = self._tetrahedra, self._sums, state.particle_q
+        _, threads, lanes = sums.sizes
+        inputs = [self._first, self._members, particles, q, state.particle_qd, threads, lanes]
+        wp.launch(kernels.sum_motion, sums.shape, inputs, [sums.parts], device=sums.device)
+        outputs = [self._centres, self._turns, self._any_turns]
+        sums.launch_scalars(turning.find_turns, [wp.float64(dt)], outputs)
+        inputs = [self._piece, q, self._centres, self._turns, self._entry]
+        outputs = [tets.u, self.positions, self.way]
+        wp.launch(kernels.turn_particles, len(self.positions), inputs, outputs, device=sums.device)
+
+
+class RowForces:
+    """Forces and stiffness of rows as functions of the motions in a step: what ``ContactSolve`` asks of an
+    ``ObstacleContact`` of springs only.
+
+    Args:
+        model: The model.
+        contacts: Its contacts.
+        unknowns: The entries of vectors.
+        free: Whether an entry is free, float32 [entries].
+
+    Attributes:
+        springs: What the preconditioner takes into account.
+    """
+
+    #: No node is held.
+    nodes = None
+
+    def __init__(self, model: newton.Model, contacts: Contacts, unknowns: Unknowns, free: wp.array):
+        self.device, self._contacts, self._unknowns = model.device, contacts, unknowns
+        self._no_wrenches = wp.empty(0, dtype=wp.spatial_vectorf, device=self.device)
+        self._rows, self._room = rows.RowSprings(), -1
+        self._rows.free = free
+        #: Nothing changes besides forces.
+        self.changed, self._rows.solves = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(2))
+        self._make_room()
+
+    @property
+    def solves(self) -> wp.array:
+        """Number of linear solves of the last step, int32 [1]."""
+        return self._rows.solves
+
+    @property
+    def count(self) -> int:
+        return self._contacts.count
+
+    def begin(self, step: Step, of_bodies: newton.State) -> bool:
+        """Launch the rows of a step from its first state; return whether their arrays are new."""
+        contacts, state = self._contacts, step.state_in
+        self._law = [step.dt, contacts.law.adhesion]
+        is_new = self.count != self._room
+        if is_new:
+            self._make_room()
+        inputs = [step.dt, contacts.law, contacts.rows, contacts.count_loads(state, of_bodies), state.particle_q]
+        inputs += [contacts.bodies(of_bodies), self._unknowns.particle, self._unknowns.body]
+        self._launch(rows.begin_springs, inputs, [self._rows])
+        return is_new
+
+    def report(self, step: Step, share: float) -> None:
+        """Launch the wrenches on bodies [N, N m], and add those of contacts, times ``share``, to the reported ones."""
+        contacts = self._contacts
+        contacts.reactions.zero_()
+        first = 0 if step.contacts is None else step.contacts.rigid_contact_max
+        inputs = [self._rows, contacts.contact_count, self._unknowns.owner, share, first]
+        reported = self._no_wrenches if step.reported is None else step.reported
+        self._launch(rows.report_rows, inputs, [contacts.reactions, reported])
+
+    def add_blocks(self, blocks: wp.array) -> None:
+        self._launch(rows.add_row_blocks, [self._rows], [blocks])
+
+    # --- as a contact of solves, see ``ObstacleContact`` -------------------------------------------------------------
+
+    def launch_imposed(self, d: wp.array) -> None:
+        pass
+
+    def launch_drag(self, x: wp.array, y: wp.array) -> None:
+        self._launch(rows.add_row_products, [self._rows, x], [y])
+
+    def launch_friction(self, d: wp.array, r: wp.array) -> None:
+        self._update(d, is_solved=False)
+        self._launch(rows.add_row_forces, [self._rows], [r])
+
+    def add_slopes(
+        self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array, *, apart: bool = False
+    ) -> None:
+        inputs = [*self._law, self._rows, self._unknowns.count, d, change, search]
+        self._launch(rows.add_row_slopes, inputs, [slopes])
+
+    def launch_judgement(self, b: wp.array, q: wp.array, d: wp.array) -> None:
+        self._update(d, is_solved=True)
+
+    def launch_going(self, d: wp.array, locates: wp.array, rounds: wp.array, most: int, going: wp.array) -> None:
+        wp.copy(self._rows.solves, rounds)
+
+    def launch_end(self, d: wp.array) -> None:
+        self._update(d, is_solved=True)
+
+    # --- pieces ------------------------------------------------------------------------------------------------------
+
+    def _update(self, d: wp.array, *, is_solved: bool) -> None:
+        self._launch(rows.update_springs, [*self._law, int(is_solved), d], [self._rows])
+
+    def _make_room(self) -> None:
+        self._room, made = self.count, self._rows
+        for name, dtype in FIELDS.items():
+            setattr(made, name, wp.zeros(self.count, dtype=dtype, device=self.device))
+        self.springs = Springs(made.nodes, made.weights, made.stiffness, update=lambda: None)
+
+    def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
+        if self.count:
+            wp.launch(kernel, dim=self.count, inputs=inputs, outputs=outputs, device=self.device)
+
+
+class StepOperator:
+    """M (1/dt^2 + damping/dt) + K + D/dt, of a system whose contact adds the stiffness of rows.
+
+    Rows of entries that are not free are zero, so that the others see how these move.
+
+    Args:
+        model: The model.
+        tetrahedra: Its elements.
+        unknowns: The entries of vectors.
+        free: Whether an entry is free, float32 [entries].
+        rows: Contacts and attachments, which are part of the blocks on the diagonal.
+
+    Attributes:
+        inverse_mass: ``free``.
+        inertia: The first term, mat33 [entries].
+        damped: Whether elements are viscous.
+    """
+
+    def __init__(
+        self, model: newton.Model, tetrahedra: Tetrahedra, unknowns: Unknowns, free: wp.array, rows: RowForces
+    ):
+        self.device, self.worlds, self.node_count = model.device, unknowns.worlds, unknowns.count
+        self._tetrahedra, self._rows, self._count = tetrahedra, rows, int(model.tet_count)
+        self.inverse_mass, self.damped = free, False
+        self.inertia, self._of_elements, self._blocks = (
+            wp.zeros(len(free), dtype=wp.mat33, device=self.device) for _ in range(3)
+        )
+        self._none, self._no_list = (wp.zeros(0, dtype=dtype, device=self.device) for dtype in (wp.vec4, wp.int32))
+        own, self._elements = tetrahedra.elements, GeneralElements()
+        self._elements.nodes = wp.array(unknowns.particle.numpy()[tetrahedra.tets], dtype=wp.vec4i, device=self.device)
+        self._elements.targets = self._elements.nodes
+        self._elements.rest_inverse, self._elements.volume = own.rest_inverse, own.volume
+        #: Eight elements each on the CPU.
+        self._lanes = -(-self._count // LANES) if self.device.is_cpu else 0
+        self._made = made = kernels.Linearised()
+        made.mu, made.lam = tetrahedra.mu, tetrahedra.lam
+        made.rotation = wp.zeros(self._count, dtype=wp.mat33, device=self.device)
+        self._make_room_for_viscosity(0)
+        made.kept = wp.zeros(PLACES * self._lanes, dtype=wp.vec4, device=self.device)
+        self._kept = KeptGradients()
+        self._kept.isotropic, self._kept.gradients = isotropic_material([made.mu, made.lam, 1]), made.kept
+
+    def take(self, q: wp.array, turned: wp.array, dt: float) -> None:
+        """Launch the linearisation where positions q are turned."""
+        tets, made = self._tetrahedra, self._made
+        self.damped = tets.damped
+        if self.damped and not len(made.viscosity):
+            self._make_room_for_viscosity(self._count)
+        inputs = [tets.elements, tets.k_damp, dt, q, turned]
+        self._launch(kernels.linearise, self._count, inputs, [made])
+
+    def take_diagonal(self) -> None:
+        """Launch the blocks of elements on the diagonal."""
+        self._of_elements.zero_()
+        self._launch(kernels.add_element_blocks, self._count, [self._elements, self._made], [self._of_elements])
+
+    def diagonal_blocks(self) -> wp.array:
+        """Launch the blocks on the diagonal, with those of rows, mat33 [entries]."""
+        wp.copy(self._blocks, self._of_elements)
+        self._rows.add_blocks(self._blocks)
+        self._launch(kernels.finish_blocks, len(self._blocks), [self.inverse_mass, self.inertia], [self._blocks])
+        return self._blocks
+
+    def apply(self, x: wp.array, y: wp.array) -> None:
+        """Launch y = A x."""
+        y.zero_()
+        self.add_product(x, y)
+        self._launch(kernels.finish_rows, len(y), [self.inverse_mass, self.inertia, x], [y])
+
+    def add_product(self, x: wp.array, y: wp.array) -> None:
+        """Launch y += (K + D/dt) x."""
+        if self._lanes and not self.damped:
+            inputs = [self._elements, self._count, self._kept, x]
+            self._launch(add_kept_product(), self._lanes, inputs, [y, self._no_list])
+            return
+        kernel = add_stiffness_product(GeneralElements, kernels.Linearised, kernels.linearised(self.damped))
+        self._launch(kernel, self._count, [self._elements, self._made, self._none, x], [y])
+
+    def _make_room_for_viscosity(self, count: int) -> None:
+        self._made.gradient = wp.zeros(count, dtype=wp.mat33, device=self.device)
+        self._made.viscosity = wp.zeros(count, dtype=wp.float32, device=self.device)
+
+    def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+
+
+class RowBlocks(BlockDiagonal):
+    """The inverses of the blocks on the diagonal of a step's matrix, with those of the rows that act."""
+
+    def take_springs(self) -> None:
+        """Launch the update to the rows as they are now."""
+        self.update(self._operator)
 
 
 class ImplicitSteps(Steps):
@@ -65,11 +379,11 @@ class ImplicitSteps(Steps):
         self._rows = RowForces(model, contacts, unknowns, self._free)
         self._turned = TurnedPieces(model, tetrahedra, unknowns)
         self._operator = StepOperator(model, tetrahedra, unknowns, self._free, self._rows)
-        operators: list[Any] = [self._operator]
-        blocks = RowBlocks(operators[0])
-        self._system = BlockSystem(operators, [blocks], contacts=[self._rows], most=ITERATIONS)
+        parts: list[Any] = [self._operator, self._rows]
+        self._system = BlockSystem(parts[:1], [RowBlocks(parts[0])], contacts=parts[1:], most=ITERATIONS)
         self._system.solver.tolerance.fill_(TOLERANCE)
         self._solve = ContactSolve(self._system, [])
+        self._motions = [unknowns.particle, self._system.x]
         self._change, self._product, self._rest, self._r = (
             wp.zeros(count, dtype=wp.vec4, device=self.device) for _ in range(4)
         )
@@ -80,9 +394,8 @@ class ImplicitSteps(Steps):
         self._can_replay = False
 
     def _launch_forces(self, substep: Step, given: newton.State, share: float, done: float) -> None:
-        model, others = self.model, self.others
         now: Any = substep.state_in
-        self._turned.launch(now, substep.dt)
+        self._turned.launch(now, self.contacts.particles, substep.dt)
         # Viscous forces are those of the velocities after the step, which the solve finds.
         at_rest: Any = SimpleNamespace(particle_q=self._turned.positions, particle_qd=self._still)
         setattr(at_rest, NAMESPACE, getattr(now, NAMESPACE, None))
@@ -93,23 +406,18 @@ class ImplicitSteps(Steps):
         self._launch_unknowns(substep, of_bodies, given)
         self._replays.launch((substep.dt, self.contacts.law.adhesion, self._operator.damped), self._launch_solve)
         self._rows.report(substep, share)
-        if others.has_bodies:
-            wp.copy(self._body_f, given.body_f)
-            self._add_wrenches(1.0, self._body_f)
-        elif model.body_count:
-            self._add_wrenches(share, given.body_f)
+        self._launch_reactions(given, share)
 
     def _launch_unknowns(self, substep: Step, of_bodies: newton.State, given: newton.State) -> None:
         """Launch the right side, the inertia, the first motions, and a guess of how gravity changes these."""
         model, now, dt, system = self.model, substep.state_in, substep.dt, self._system
         outputs = [self._free, self._operator.inertia, system.b, system.x, self._change]
-        inputs = [dt, self.damping, model.gravity, model.particle_inv_mass, model.particle_flags]
-        inputs += [model.particle_world, self._f, now.particle_qd, self.report.trouble, self._unknowns.particle]
+        inputs = [dt, self.damping, self.contacts.particles, self._f, now.particle_qd]
+        inputs += [self.report.trouble, self._unknowns.particle]
         self._launch(kernels.begin_particles, model.particle_count, inputs, outputs)
         if model.body_count:
-            inputs = [dt, KINEMATIC, model.body_flags, model.body_world, model.gravity, model.body_inv_mass]
-            inputs += [model.body_inv_inertia, model.body_inertia, of_bodies.body_q, of_bodies.body_qd, given.body_f]
-            inputs += [int(self.others.has_bodies), self.report.trouble, self._unknowns.body]
+            inputs = [dt, self.contacts.bodies(of_bodies), model.gravity, given.body_f, int(self.others.has_bodies)]
+            inputs += [self.report.trouble, self._unknowns.body]
             self._launch(kernels.begin_bodies, model.body_count, inputs, outputs)
         self._operator.take(now.particle_q, self._turned.positions, dt)
 
@@ -126,32 +434,19 @@ class ImplicitSteps(Steps):
         wp.copy(self._r, self._rest)
         rows.launch_friction(x, self._r)
         system.solve(self._r, self._change, guessed=True, like=system.b)
-        solver, iterations = system.solver, system.solver.iterations
+        wp.copy(self._first, system.solver.iterations)
         if rows.count:
             operator.apply(self._change, self._product)
             self._search.launch(self._rest, self._product, self._change, x)
-            wp.copy(self._first, iterations)
             self._solve.launch()
-            iterations = self._solve.iterations
-            self._launch(kernels.add_counts, len(iterations), [self._first], [iterations])
             rows.launch_end(x)
         else:
             self._launch(add_vectors, len(x), [self._change], [x])
             rows.solves.zero_()
-        inputs = [iterations, rows.solves, solver.status, int(conjugate_gradients.CONVERGED)]
+            self._solve.iterations.zero_()
+        inputs = [self._first, self._solve.iterations, rows.solves, system.solver.status]
+        inputs.append(int(conjugate_gradients.CONVERGED))
         self._launch(kernels.count_solves, 1, inputs, [self.totals])
 
-    def _launch_motion(self, substep: Step, fastest: float) -> None:
-        model, others = self.model, self.others
-        now, out, dt = substep.state_in, substep.state_out, substep.dt
-        inputs = [dt, model.particle_max_velocity, min(fastest, RUNAWAY), model.particle_inv_mass]
-        inputs += [model.particle_flags, model.particle_world, self._unknowns.particle, self._system.x]
-        outputs = [out.particle_q, out.particle_qd, self.report.trouble]
-        self._launch(kernels.move_particles, model.particle_count, [*inputs, now.particle_q, now.particle_qd], outputs)
-        if others.has_bodies:
-            count = math.ceil(dt / RIGID_STEP) if others.is_own else 1
-            part = substep._replace(dt=dt / count)
-            for _ in range(count):
-                others.step(part, self._body_f)
-                part = part._replace(state_in=out)
-            self._check_bodies(out)
+    def _steps_of_others(self, dt: float) -> int:
+        return math.ceil(dt / RIGID_STEP) if self.others.is_own else 1

@@ -17,7 +17,7 @@ import warp as wp
 from warp_corot.errors import InputError
 from warp_corot.kernels.newton.linear import scatter_bending, scatter_springs, scatter_triangles
 
-from .arguments import Step
+from .checks import Step
 from .library import ModelView, SolverBase, SolverSemiImplicit, newton
 
 #: Effective number of contacts of a particle with others in a heap, for their total stiffness. A pair that moves

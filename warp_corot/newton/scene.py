@@ -1,4 +1,5 @@
-"""This package's meshes in Newton's scenes."""
+"""This package's meshes in Newton's scenes, and the solver's data in models and states: custom attributes in the
+namespace ``warp_corot``."""
 
 from __future__ import annotations
 
@@ -8,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+import warp as wp
 from scipy.spatial.transform import Rotation
 
 from warp_corot.discretization.discretization import centroids, lumped_masses
@@ -18,7 +20,13 @@ from warp_corot.mesh import TetForest, TetMesh
 from warp_corot.mesh.surfaces.boundary import boundary_faces, signed_volumes
 
 from .library import newton
-from .state import NAMESPACE, ForestName, register_forests
+
+NAMESPACE = "warp_corot"
+
+FOREST = f"{NAMESPACE}:forest"
+
+#: Attributes of every tetrahedron in a state, with their types.
+STATE = {"rotation": wp.quat, "stress": wp.mat33, "von_mises": wp.float32}
 
 
 class Added(NamedTuple):
@@ -232,3 +240,54 @@ def _numbers(given: npt.ArrayLike) -> npt.NDArray[np.float64] | None:
         return np.asarray(given, dtype=np.float64).ravel()
     except (TypeError, ValueError):
         return None
+
+
+class ForestName(str):
+    """The name of a forest in builders and models, with a reference to the forest.
+
+    Newton keeps text unchanged; a model that was written to a file and read again has a plain ``str``.
+    """
+
+    forest: TetForest
+
+    @classmethod
+    def of(cls, forest: TetForest) -> ForestName:
+        name = cls(f"forest of {len(forest.tets)} tetrahedra")
+        name.forest = forest
+        return name
+
+
+def register_custom_attributes(builder: newton.ModelBuilder) -> None:
+    """Let states carry results for each tetrahedron, as ``state.warp_corot``; call it before ``finalize``.
+
+    ``rotation``: wp.quat [T], from rest to world. ``stress``: wp.mat33 [T], Cauchy stress in world axes [Pa].
+    ``von_mises``: wp.float32 [T] [Pa]. All belong to the positions in the same state. They cost about one force
+    evaluation a step. ``State.assign`` copies them. Newton 1.8's ``ViewerFile`` does not record namespaces, and could
+    not load a model whose state attributes have none; ``SolverCorotated.write_attributes`` computes them again.
+    """
+    of_states = newton.Model.AttributeAssignment.STATE
+    for name, dtype in STATE.items():
+        _add_attribute(builder, name, dtype, assignment=of_states)
+
+
+def register_forests(builder: newton.ModelBuilder) -> None:
+    """Add attributes to the model for the forest and the fill of each tetrahedron."""
+    if f"{NAMESPACE}:forest" in builder.custom_attributes:
+        return
+    builder.add_custom_frequency(newton.ModelBuilder.CustomFrequency(name="forest", namespace=NAMESPACE))
+    _add_attribute(builder, "forest", str, FOREST, default="")
+    for name, references in (("forest_particle", "particle"), ("forest_tet", "tetrahedron")):
+        _add_attribute(builder, name, wp.int32, FOREST, references=references)
+    _add_attribute(builder, "fill", wp.float32, default=1.0)
+
+
+def _add_attribute(builder: newton.ModelBuilder, name: str, dtype: type, frequency: Any = None, **options: Any) -> None:
+    """Add an attribute, of every tetrahedron unless there is another frequency."""
+    frequency = newton.Model.AttributeFrequency.TETRAHEDRON if frequency is None else frequency
+    attribute = newton.ModelBuilder.CustomAttribute(name, dtype, frequency, namespace=NAMESPACE, **options)
+    builder.add_custom_attribute(attribute)
+
+
+def attribute_of(owner: Any, name: str) -> Any:
+    """An attribute in a model's or a state's namespace, or None."""
+    return getattr(getattr(owner, NAMESPACE, None), name, None)

@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 
 from warp_corot.errors import InputError
-from warp_corot.kernels.newton.sensing import sum_soft_contacts
+from warp_corot.kernels.newton.rows import sum_soft_contacts
 
 from .library import SolverBase, newton
 

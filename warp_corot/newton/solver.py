@@ -12,17 +12,14 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.checks import refuse_tape
 from warp_corot.simulation.solves import Solves
 
-from .arguments import Step, check_options, check_step, checked_dt, checked_mask
+from .checks import Recordings, Step, check_options, check_step, checked_dt, checked_mask
 from .contact import Contacts
-from .elsewhere import Elsewhere
-from .following import Following
 from .implicit import ImplicitSteps
 from .library import CouplingInterface, SolverBase, newton
 from .others import Others
-from .recordings import Recordings
-from .stability import SAFETY, check_substep, stable_steps
-from .state import register_custom_attributes
+from .scene import register_custom_attributes
 from .steps import Steps
+from .substeps import SAFETY, Following, check_substep, stable_steps
 from .tetrahedra import Tetrahedra
 
 #: Factor by which a recorded substep may exceed the safe one; below the smallest margin of the safe substep.
@@ -85,8 +82,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
         rotation_level: Level of shared rotations in forests; see ``Corotated``.
         rigid_solver: The solver of rigid bodies: "semi-implicit"; another solver, made for this model, which also gets
             their forces; or None: no solver, and reactions are added to ``state_in.body_f`` for another program, which
-            moves the bodies. If another program moves them in spite of a solver given here, both do: the first
-            steps warn of that.
+            moves the bodies. If another program moves them in spite of a solver given here, both do.
         particle_contact: Whether particles collide with one another, as in ``SolverSemiImplicit``. Newton's default
                 radius of 0.1 m makes the particles of finer meshes repel one another.
         self_contact_margin: Distance [m] at which the surfaces of soft bodies and cloth begin to push one another and
@@ -138,7 +134,6 @@ class SolverCorotated(SolverBase, CouplingInterface):
         self.tetrahedra = Tetrahedra(model, lame, rotation_level)
         self._contacts = Contacts(model, self_contact_margin)
         self._others = Others(model, rigid_solver, particle_contact)
-        self._elsewhere = Elsewhere(model, self._others.has_bodies)
         self._recordings = Recordings(self.device)
         self._is_implicit = integrator == "implicit"
         parts = (model, self.tetrahedra, self._contacts, self._others, damping)
@@ -222,13 +217,11 @@ class SolverCorotated(SolverBase, CouplingInterface):
         check_step(step, self.model)
         self._steps.report.check_earlier(following)
         self._see_surfaces(contacts)
-        self._elsewhere.look(state_in)
         count = self._count_for(dt)
         if following is not None and self.device.is_cpu and not self.device.is_capturing:
             self._steps.launch_retried(step, following)
         else:
             self._steps.launch(step, count, following)
-        self._elsewhere.keep(state_out)
         self._recordings.follow(state_in, state_out)
         if self.device.is_cpu and not self.device.is_capturing:
             self.check()
@@ -265,7 +258,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
         world_mask: wp.array | None = None,
         flags: int | None = None,
     ) -> None:
-        """Reset chosen worlds of a state to the model's initial state, rotations included.
+        """Reset chosen worlds of a state to the model's initial state, rotations and stresses included.
 
         Args:
             state: The state, changed in place.

@@ -1,31 +1,34 @@
-"""The launches of a step, and their report."""
+"""The launches of a step, failures of worlds in it, and the reports of them to users."""
 
 from __future__ import annotations
 
+import warnings
 from functools import partial
 from types import SimpleNamespace
 
+import numpy as np
 import warp as wp
 
+from warp_corot.errors import InputError, UnstableError
 from warp_corot.kernels.newton import particles as kernels
-from warp_corot.kernels.newton import worlds as worlds
-from warp_corot.kernels.newton.bodies import add_wrenches, move_bodies
+from warp_corot.solvers.guarding.mapped import Mapped
 from warp_corot.solvers.steps.repeated import Replays
 from warp_corot.solvers.subnormals import FlushedSubnormals
 
-from .arguments import Step
+from .checks import Step
 from .contact import Contacts
-from .following import RETRIES, Following
 from .library import newton
 from .others import Others
-from .report import Report
-from .state import attribute_of
+from .substeps import RETRIES, Following
 from .tetrahedra import Tetrahedra
 
 #: A particle speed [m/s] that is a failure for any step.
-RUNAWAY = float(worlds.RUNAWAY)
+RUNAWAY = float(kernels.RUNAWAY)
 #: Fewer substeps are not recorded, since recording one takes as long as several.
 FEW = 32
+#: Kernels over the states of particles and of bodies.
+OF_PARTICLES = kernels.state_kernels(wp.vec3, wp.vec3)
+OF_BODIES = kernels.state_kernels(wp.transform, wp.spatial_vector)
 
 
 class Steps:
@@ -56,6 +59,8 @@ class Steps:
         types = (wp.vec3, wp.vec3)
         self._particles_before = [wp.empty(p, dtype=dtype, device=self.device) for dtype in types]
         self._nothing = [wp.empty(0, dtype=dtype, device=self.device) for dtype in types]
+        #: Where particles' motions are and what they are, if they are solved for.
+        self._motions = [wp.empty(0, dtype=dtype, device=self.device) for dtype in (wp.int32, wp.vec4)]
         self._no_numbers = wp.empty(0, dtype=wp.float32, device=self.device)
         kept = p if others.has_particles else 0
         self._kept_particles = [wp.empty(kept, dtype=dtype, device=self.device) for dtype in types]
@@ -147,15 +152,12 @@ class Steps:
             wanted = [int(bool(flags & bit)) for bit in (bits.PARTICLE_Q, bits.PARTICLE_QD)]
             inputs = [mask, model.particle_world, *wanted, model.particle_q, model.particle_qd]
             outputs = [state.particle_q, state.particle_qd]
-            self._launch(worlds.reset_particles, model.particle_count, inputs, outputs)
-            rotations = attribute_of(state, "rotation")
-            if rotations is not None:
-                inputs = [mask, model.particle_world, self.tetrahedra.elements.nodes]
-                self._launch(worlds.reset_rotations, model.tet_count, inputs, [rotations])
+            self._launch(OF_PARTICLES.reset, model.particle_count, inputs, outputs)
+            self.tetrahedra.write_attributes(state)
         if self.others.has_bodies and flags & (bits.BODY_Q | bits.BODY_QD):
             wanted = [int(bool(flags & bit)) for bit in (bits.BODY_Q, bits.BODY_QD)]
             inputs = [mask, model.body_world, *wanted, model.body_q, model.body_qd]
-            self._launch(worlds.reset_bodies, model.body_count, inputs, [state.body_q, state.body_qd])
+            self._launch(OF_BODIES.reset, model.body_count, inputs, [state.body_q, state.body_qd])
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
@@ -174,8 +176,7 @@ class Steps:
         bodies: list[wp.array] = []
         if model.body_count:
             bodies = [state_in.body_q, state_in.body_qd]
-            inputs = [*bodies, model.body_world, int(worlds.BAD_INPUT)]
-            self._launch(worlds.check_bodies, model.body_count, inputs, [self.report.trouble])
+            self._check_bodies(state_in, kernels.BAD_INPUT)
         if others.has_bodies:
             _copy(self._kept_bodies, [state_out.body_q, state_out.body_qd])
             if _overlap(bodies, [state_out.body_q, state_out.body_qd]):
@@ -203,11 +204,11 @@ class Steps:
         overwrites them."""
         model, tets = self.model, self.tetrahedra
         # If the state was finite before, the step made it infinite.
-        wrong = int(worlds.UNSTABLE if number else worlds.BAD_INPUT)
-        inputs = [now.particle_q, now.particle_qd, state_in.particle_f, model.particle_world, tets.rest, wrong]
+        wrong = int(kernels.UNSTABLE if number else kernels.BAD_INPUT)
+        inputs = [now.particle_q, now.particle_qd, state_in.particle_f, self.contacts.particles, tets.rest, wrong]
         copies = self._particles_before if copied else self._nothing
         memory = self.contacts.memory if number == 0 else [self._no_numbers, self._no_numbers]
-        outputs = [*memory, tets.x, tets.u, self._f, *copies, self.report.trouble]
+        outputs = [*memory, tets.u, self._f, *copies, self.report.trouble]
         self._launch(kernels.gather_particles, model.particle_count, inputs, outputs)
 
     def _bodies_after(self, done: float, substep: Step, given: newton.State) -> newton.State:
@@ -221,8 +222,8 @@ class Steps:
         if not (done and self.model.body_count):
             return given
         self._moved.body_qd = given.body_qd
-        inputs = [done, given.body_q, given.body_qd, self.model.body_com]
-        self._launch(move_bodies, self.model.body_count, inputs, [self._moved.body_q])
+        inputs = [done, self.contacts.bodies(given)]
+        self._launch(kernels.move_bodies, self.model.body_count, inputs, [self._moved.body_q])
         return self._moved
 
     def _launch_forces(self, substep: Step, given: newton.State, share: float, done: float) -> None:
@@ -234,41 +235,52 @@ class Steps:
             share: The substep's share of the step.
             done: Time of the step that has passed [s].
         """
-        model, others = self.model, self.others
         self.tetrahedra.add_forces(substep.state_in, self._activation, self._f)
         of_bodies = self._bodies_after(done, substep, given)
         self.contacts.add_forces(substep, of_bodies, self._f, self.report.trouble, share)
-        if others.has_bodies:
-            wp.copy(self._body_f, given.body_f)
-            self._add_wrenches(1.0, self._body_f)
-        elif model.body_count:
-            self._add_wrenches(share, given.body_f)
+        self._launch_reactions(given, share)
+
+    def _launch_reactions(self, given: newton.State, share: float) -> None:
+        """Launch the particles' forces on bodies."""
+        target = given.body_f
+        if self.others.has_bodies:
+            target, share = self._body_f, 1.0
+            wp.copy(target, given.body_f)
+        if self.model.body_count:
+            inputs = [share, self.contacts.reactions]
+            self._launch(kernels.add_wrenches, self.model.body_count, inputs, [target])
 
     def _launch_motion(self, substep: Step, fastest: float) -> None:
         model, others = self.model, self.others
         now, out, dt = substep.state_in, substep.state_out, substep.dt
-        particle_world = model.particle_world
         if others.has_particles:
             self._launch(kernels.unpad, model.particle_count, [self._f], [others.particle_forces])
         else:
-            inputs = [dt, self.damping, model.particle_max_velocity, fastest, model.gravity, model.particle_inv_mass]
-            inputs += [model.particle_flags, particle_world, self._f, now.particle_q, now.particle_qd]
+            inputs = [dt, self.damping, model.particle_max_velocity, fastest, self.contacts.particles, self._f]
+            inputs += [now.particle_q, now.particle_qd, *self._motions]
             outputs = [out.particle_q, out.particle_qd, self.report.trouble]
             self._launch(kernels.step_particles, model.particle_count, inputs, outputs)
-        if others.has_bodies or others.has_particles:
-            others.step(substep, self._body_f if others.has_bodies else now.body_f)
+        count = self._steps_of_others(dt)
+        part = substep._replace(dt=dt / count)
+        for _ in range(count if others.has_bodies or others.has_particles else 0):
+            others.step(part, self._body_f if others.has_bodies else now.body_f)
+            part = part._replace(state_in=out)
         if others.has_particles and self.damping > 0:
-            inputs = [dt, self.damping, model.particle_inv_mass, model.particle_flags]
+            inputs = [dt, self.damping, self.contacts.particles]
             self._launch(kernels.damp_particles, model.particle_count, inputs, [out.particle_q, out.particle_qd])
         if others.has_bodies:
-            self._check_bodies(out)
+            self._check_bodies(out, kernels.UNSTABLE)
         if others.has_particles:
-            inputs = [out.particle_q, out.particle_qd, fastest, particle_world]
-            self._launch(worlds.check_particles, model.particle_count, inputs, [self.report.trouble])
+            inputs = [out.particle_q, out.particle_qd, fastest, model.particle_world, int(kernels.UNSTABLE)]
+            self._launch(OF_PARTICLES.check, model.particle_count, inputs, [self.report.trouble])
 
-    def _check_bodies(self, out: newton.State) -> None:
-        inputs = [out.body_q, out.body_qd, self.model.body_world, int(worlds.UNSTABLE)]
-        self._launch(worlds.check_bodies, self.model.body_count, inputs, [self.report.trouble])
+    def _steps_of_others(self, dt: float) -> int:
+        """Number of steps in which everything else makes a substep."""
+        return 1
+
+    def _check_bodies(self, state: newton.State, wrong: int) -> None:
+        inputs = [state.body_q, state.body_qd, 0.0, self.model.body_world, int(wrong)]
+        self._launch(OF_BODIES.check, self.model.body_count, inputs, [self.report.trouble])
 
     def _launch_undoing(self, out: newton.State, particles: list[wp.array], bodies: list[wp.array]) -> None:
         """Restore the worlds with a failure."""
@@ -277,16 +289,102 @@ class Steps:
         model = self.model
         inputs = [model.particle_world, self.report.trouble, *particles, *self._kept_particles]
         outputs = [out.particle_q, out.particle_qd]
-        self._launch(worlds.put_back_particles, model.particle_count, inputs, outputs)
+        self._launch(OF_PARTICLES.put_back, model.particle_count, inputs, outputs)
         if self.others.has_bodies:
             inputs = [model.body_world, self.report.trouble, *bodies, *self._kept_bodies]
-            self._launch(worlds.put_back_bodies, model.body_count, inputs, [out.body_q, out.body_qd])
-
-    def _add_wrenches(self, share: float, target: wp.array) -> None:
-        self._launch(add_wrenches, self.model.body_count, [share, self.contacts.reactions], [target])
+            self._launch(OF_BODIES.put_back, model.body_count, inputs, [out.body_q, out.body_qd])
 
     def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+
+
+class Report:
+    """Failures of the worlds of a model.
+
+    Args:
+        model: The model.
+
+    Attributes:
+        trouble: The failure of each world in the present step, and of what is in no world, int32 [worlds + 1]; see
+            ``kernels.newton.particles``.
+    """
+
+    def __init__(self, model: newton.Model):
+        self._model, self._device = model, model.device
+        self.trouble = wp.zeros(max(int(model.world_count), 1) + 1, dtype=wp.int32, device=self._device)
+        self._found = wp.zeros(kernels.REPORTS, dtype=wp.int32, device=self._device)
+        #: Whether there is one, which the host can read without waiting.
+        self._seen = Mapped(1, self._device)
+
+    @property
+    def may_be_wrong(self) -> bool:
+        """Whether a world may have failed in the present step."""
+        # On the CPU a check costs less than a launch; a recorded step must handle all cases.
+        return self._device.is_cuda or self._device.is_capturing or bool(self.trouble.numpy().any())
+
+    @property
+    def is_unstable(self) -> bool:
+        """Whether a step's result was not finite; waits for the device."""
+        return bool(self._found.numpy()[kernels.UNSTABLE])
+
+    def forget_unstable(self) -> None:
+        """The step is made again."""
+        self._found[kernels.UNSTABLE : kernels.UNSTABLE + 1].zero_()
+
+    def launch(self) -> None:
+        """Launch the kernel that stores the failures of a step, at its end."""
+        if self.may_be_wrong:
+            outputs = [self._found, self._seen.array]
+            wp.launch(kernels.report_trouble, len(self.trouble), [self.trouble], outputs, device=self._device)
+
+    def check_earlier(self, following: Following | None) -> None:
+        """Report errors of steps that have finished. On CUDA, outside captures; does not wait.
+
+        If substeps follow the state, a world that failed continues with twice as many, and a warning says so.
+        """
+        if self._device.is_cpu or self._device.is_capturing or not self._seen.values[0]:
+            return
+        try:
+            self.check(None, following)
+        except UnstableError as error:
+            if following is None or following.share < 0.5**RETRIES:
+                raise
+            warnings.warn(str(error), UserWarning, stacklevel=3)
+
+    def check(self, stable_dt: float | None, following: Following | None) -> None:
+        """See ``SolverCorotated.check``."""
+        report = self._found.numpy().copy()
+        if not report.any():
+            return
+        self._found.zero_()
+        self._seen.values[0] = 0.0
+        worst = int(np.flatnonzero(report)[-1])
+        world = int(report[worst]) - 1
+        where = f" in world {world}" if self._model.world_count > 1 and world < self._model.world_count else ""
+        if worst == int(kernels.BAD_INPUT):
+            raise InputError(f"state_in is not finite{where}; state_out keeps its former values there")
+        if worst == int(kernels.TOO_MANY_PAIRS):
+            raise InputError(
+                "there are more pairs of soft bodies than Newton has room for: call pipeline.init_soft_self_contact "
+                f"with larger vertex_buffer_pre_alloc and edge_buffer_pre_alloc{where}; no step was made"
+            )
+        if worst == int(kernels.TOO_MANY_CONTACTS):
+            raise InputError(
+                "there are more soft contacts than contacts.soft_contact_max: make the CollisionPipeline with a "
+                "larger soft_contact_max; no step was made"
+            )
+        raise UnstableError(self._unstable(where, stable_dt, following))
+
+    def _unstable(self, where: str, stable_dt: float | None, following: Following | None) -> str:
+        """The message; from now on steps have more substeps if these follow the state and steps are not repeated."""
+        hint = "" if stable_dt is None else f"; the largest stable step at rest is about {stable_dt:.3g} s"
+        wrong = "not finite" if following is None else "not finite or beyond reason"
+        if following is not None and self._device.is_cpu and not following.was_recorded:
+            hint += f"; {2**RETRIES} times the substeps did not help"
+        elif following is not None:
+            following.share *= 0.5
+            hint += "; from now on steps have twice the substeps, recorded ones when they are recorded again"
+        return f"the step's result is {wrong}{where}; that state was not changed{hint}"
 
 
 def _copy(to: list[wp.array], given: list[wp.array]) -> None:

@@ -2,50 +2,169 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_corot.discretization.discretization import FixedMesh
+from warp_corot.elasticity import Corotated
+from warp_corot.elasticity.cpu import Lanes
+from warp_corot.elasticity.dilatation import ELEMENT
 from warp_corot.elasticity.model import Kept, isotropic_material
 from warp_corot.errors import InputError
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, linear_stress
 from warp_corot.kernels.elements.elements import GeneralElements
 from warp_corot.kernels.elements.forces import law_stress, repair_forces, scatter_forces
 from warp_corot.kernels.elements.general_cuda import BLOCK, PosedElements
-from warp_corot.kernels.elements.simd8 import LANES
 from warp_corot.kernels.math.rotation import quick_rotation
-from warp_corot.kernels.newton.attributes import split_materials, write_attributes
 from warp_corot.kernels.newton.elements import (
     EACH,
     posed_stress,
     scatter_damping_and_activation,
     scatter_posed,
     scatter_posed_lanes,
+    write_attributes,
 )
+from warp_corot.kernels.newton.particles import add_nodes, gather_nodes
+from warp_corot.mesh import TetForest
 
-from .forests import ForestGroup, forest_groups
+from .checks import LAME, warn_of_lost, why_none
 from .library import newton
-from .lost import warn_of_lost, why_none
-from .state import STATE, attribute_of
-
-#: Meanings of k_mu and k_lambda: mu = a k_mu, lambda = k_lambda + b k_mu, as (a, b).
-LAME = {"documented": (1.0, 0.0), "semi-implicit": (0.75, -0.625)}
+from .scene import STATE, attribute_of, mesh_fill, right_handed
 
 
-class Part:
-    """A part of a model's tetrahedra for a kernel: a range, or a list."""
+class ForestGroup:
+    """All copies of one forest in a model, as the worlds of one discretization.
 
-    def __init__(self, tets: npt.NDArray[np.integer], device: wp.Device):
-        self.first, self.count = int(tets[0]), len(tets)
-        listed = tets if (np.diff(tets) != 1).any() else tets[:0]
-        self.ids = wp.array(listed, dtype=wp.int32, device=device)
+    Args:
+        forest: The forest.
+        particles: First particle of each copy.
+        tets: First tetrahedron of each copy.
+
+    Attributes:
+        tets: Tetrahedra of all copies, indices into the model's, int [copies * T].
+        nodes: Particles of all copies, int [copies * N].
+        rest: Rest positions of these [m], float32 [copies * N, 4].
+        follow_one_another: Whether the particles are contiguous, so that forces need no arrays of the forest's own.
+    """
+
+    def __init__(
+        self,
+        model: newton.Model,
+        forest: TetForest,
+        particles: npt.NDArray[np.integer],
+        tets: npt.NDArray[np.integer],
+        rotation_level: int | None,
+    ):
+        self.forest, self.copies = forest, len(particles)
+        self.device = model.device
+        self.rotation_level = rotation_level
+        self.tets = (tets[:, None] + np.arange(len(forest.tets))).ravel()
+        self.nodes = (particles[:, None] + np.arange(len(forest.points))).ravel()
+        self.count = len(self.nodes)
+        self.follow_one_another = bool((np.diff(self.nodes) == 1).all())
+        # Displacements use the forest's own axes, so only a copy's position is subtracted, and no digits are lost.
+        rest = np.tile(forest.points, (self.copies, 1)).reshape(self.copies, -1, 3)
+        there = model.particle_q.numpy().astype(np.float64)[self.nodes].reshape(rest.shape)
+        rest = rest + (there - rest).mean(axis=1, keepdims=True)
+        self.rest = np.zeros((self.count, 4), np.float32)
+        self.rest[:, :3] = rest.reshape(-1, 3)
+        #: Its nodes in arrays over particles; cached, since these arrays are the same in every step.
+        self._parts: dict[int, wp.array] = {}
+        if not self.follow_one_another:
+            self._particles = wp.array(self.nodes, dtype=wp.int32, device=self.device)
+            self._u, self._f = (wp.zeros(self.count, dtype=wp.vec4, device=self.device) for _ in range(2))
+
+    def set_material(self, mu: npt.NDArray[np.float64], lam: npt.NDArray[np.float64]) -> None:
+        """Set Lamé's parameters from those of the model's tetrahedra [Pa], float64 [all T]."""
+        share = mesh_fill(self.forest)
+        own_mu, own_lam = (_squeezed(a[self.tets].reshape(self.copies, -1) / share) for a in (mu, lam))
+        made_of = FixedMesh.of_lame(self.forest, own_mu, own_lam, self.copies, self.device)
+        self._field = Corotated(rotation_level=self.rotation_level, dilatation=ELEMENT).bind(made_of)
+
+    def add_forces(self, u: wp.array, f: wp.array) -> None:
+        """Add the elastic forces of displaced particles to f, both vec4 [P]."""
+        if self.follow_one_another:
+            self._field.add_forces(self._part_of(u), self._part_of(f))
+            return
+        wp.launch(gather_nodes, dim=self.count, inputs=[self._particles, u], outputs=[self._u], device=self.device)
+        self._field.add_forces(self._u, self._f)
+        wp.launch(add_nodes, dim=self.count, inputs=[self._particles, self._f], outputs=[f], device=self.device)
+
+    def _part_of(self, nodal: wp.array) -> wp.array:
+        if nodal.ptr not in self._parts:
+            self._parts[nodal.ptr] = nodal[int(self.nodes[0]) : int(self.nodes[-1]) + 1]
+        return self._parts[nodal.ptr]
+
+
+def forest_groups(model: newton.Model, tets: npt.NDArray[np.integer], rotation_level: int | None) -> list[ForestGroup]:
+    """The forests in a model; tetrahedra that were changed after they were added are left to the general path."""
+    names = attribute_of(model, "forest") or []
+    rows = [attribute_of(model, f"forest_{name}") for name in ("particle", "tet")]
+    particles, first = (np.empty(0, int) if row is None else row.numpy() for row in rows)
+    forests = [getattr(name, "forest", None) for name in names]
+    keys = np.array([id(forest) for forest in forests], dtype=np.int64)
+    groups = []
+    for key in dict.fromkeys(keys.tolist()):
+        chosen = np.flatnonzero(keys == key)
+        forest, starts = forests[chosen[0]], (particles[chosen], first[chosen])
+        if not isinstance(forest, TetForest) or not _is_there(forest, model, tets, *starts):
+            warnings.warn(
+                "a forest of this model comes from a file, or was changed after it was added; its tetrahedra are "
+                "stepped one by one",
+                UserWarning,
+                stacklevel=5,
+            )
+            continue
+        groups.append(ForestGroup(model, forest, *starts, rotation_level))
+    return groups
+
+
+def _is_there(
+    forest: TetForest,
+    model: newton.Model,
+    tets: npt.NDArray[np.integer],
+    particles: npt.NDArray[np.integer],
+    first: npt.NDArray[np.integer],
+) -> bool:
+    """Whether a model's tetrahedra have the forest's nodes, which no others have, and its rest shapes, in any axes."""
+    own = right_handed(forest)
+    if not ((particles >= 0).all() and (particles + len(forest.points) <= model.particle_count).all()):
+        return False
+    corners = forest.points[own]
+    shapes = _shapes(np.linalg.inv(np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)))
+    size = np.abs(shapes).max(axis=(1, 2), keepdims=True)
+    poses = model.tet_poses.numpy().reshape(-1, 3, 3)
+    uses = np.bincount(tets.ravel(), minlength=model.particle_count)
+    own_uses = np.bincount(own.ravel(), minlength=len(forest.points))
+    for p, t in zip(particles, first, strict=True):
+        if not np.array_equal(uses[p : p + len(forest.points)], own_uses):
+            return False
+        if not np.array_equal(tets[t : t + len(own)], own + p):
+            return False
+        if not (np.abs(_shapes(poses[t : t + len(own)].astype(np.float64)) - shapes) < 1e-4 * size).all():
+            return False
+    return True
+
+
+def _shapes(poses: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """The part of inverse rest matrices B that does not depend on rotation, B B^T."""
+    return poses @ np.swapaxes(poses, 1, 2)
+
+
+def _squeezed(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64] | float:
+    """[copies, T], or one number if all are equal to float32 rounding, so that kernels read only one."""
+    one = float(values.flat[0])
+    return one if np.allclose(values, one, rtol=2e-7, atol=0.0) else values
 
 
 class Tetrahedra:
     """Forces, rotations and stresses of all tetrahedra of a model.
 
-    Forces use positions that have been gathered (see ``kernels.newton.particles``) into arrays that are empty if
-    no element needs them.
+    Forces use displacements that have been gathered; see ``kernels.newton.particles``. Tetrahedra outside forests have
+    no rest positions: only the rest matrix of each is known, and their particles' displacements are positions.
 
     Args:
         model: The model.
@@ -53,8 +172,8 @@ class Tetrahedra:
         rotation_level: Level of shared rotations in forests; see ``Corotated``.
 
     Attributes:
-        x: Positions of particles [m], vec4 [P]; for elements that are computed one by one.
-        rest, u: Rest positions and displacements of the particles of forests [m], vec4 [P].
+        rest: Rest positions of the particles of forests, zero for others [m], vec4 [P]; empty without forests.
+        u: Displacements of particles from there [m], vec4 [P].
 
     Raises:
         InputError: There are no tetrahedra, or a material is not positive definite.
@@ -67,19 +186,23 @@ class Tetrahedra:
         self.device = model.device
         self.tets = model.tet_indices.numpy().reshape(-1, 4)
         self.elements = self._elements(np.arange(model.tet_count))
-        #: mu, lambda, k_lambda [Pa] and k_damp [Pa s] of all tetrahedra.
+        #: mu, lambda, k_lambda [Pa] and k_damp [Pa s] of all tetrahedra; and the last two for the kernel beside elastic
+        #: ones.
         self._materials = self._room_for_materials(model.tet_count)
-        self.mu, self.lam = self._materials[:2]
+        self.mu, self.lam, _, self.k_damp = self._materials
+        self._beside = self._room_for_materials(model.tet_count)[:2]
         self.groups: list[ForestGroup] = forest_groups(model, self.tets, rotation_level)
         #: Whether the elastic kernel of single tetrahedra includes activation and damping.
         self._fused, self._may_be_active = self.device.is_cuda, True
-        single = np.ones(model.tet_count, bool)
+        self._is_single = np.ones(model.tet_count, bool)
         for group in self.groups:
-            single[group.tets] = False
-        self._take_single(np.flatnonzero(single))
-        everything = [Part(np.arange(model.tet_count), self.device)]
-        self._others = [Part(group.tets, self.device) for group in self.groups] if self._fused else everything
-        self._make_room_for_nodes()
+            self._is_single[group.tets] = False
+        self._take_single(np.flatnonzero(self._is_single))
+        rest = np.zeros((model.particle_count if self.groups else 0, 4), np.float32)
+        for group in self.groups:
+            rest[group.nodes] = group.rest
+        self.rest = wp.array(rest, dtype=wp.vec4, device=self.device)
+        self.u = wp.zeros(model.particle_count, dtype=wp.vec4, device=self.device)
         fill = attribute_of(model, "fill")
         self._fill = wp.ones(1, dtype=wp.float32, device=self.device) if fill is None else fill
         self._nothing = {name: wp.empty(0, dtype=dtype, device=self.device) for name, dtype in STATE.items()}
@@ -113,10 +236,12 @@ class Tetrahedra:
         bad = np.flatnonzero(~(materials[:, 2] >= 0))
         if len(bad):
             raise InputError(f"tetrahedron {bad[0]} has k_damp {materials[bad[0], 2]:g} Pa s; it must not be negative")
-        self._launch(split_materials, len(materials), [self.model.tet_materials, self._no_ids, a, b], self._materials)
-        if self._single_materials is not self._materials:
-            inputs = [self.model.tet_materials, self._single_ids, a, b]
-            self._launch(split_materials, self.single_count, inputs, self._single_materials)
+        columns = [mu, lam, materials[:, 1], materials[:, 2]]
+        for arrays, chosen in ((self._materials, slice(None)), (self._single_materials, self._is_single)):
+            for array, column in zip(arrays, columns, strict=True):
+                array.assign(column[chosen].astype(np.float32))
+        for array, column in zip(self._beside, columns[2:], strict=True):
+            array.assign(np.where(self._fused & self._is_single, 0.0, column).astype(np.float32))
         self.damped = bool((materials[:, 2] > 0).any())
         for group in self.groups:
             group.set_material(mu, lam)
@@ -130,24 +255,17 @@ class Tetrahedra:
         self._may_be_active = not looks or bool(activation.numpy().any())
 
     def add_forces(self, state: newton.State, activation: wp.array, f: wp.array) -> None:
-        """Add the forces [N] for a state, whose positions have been gathered, to f, vec4 [P]."""
+        """Add the forces [N] for a state, whose displacements have been gathered, to f, vec4 [P]."""
         q, v = state.particle_q, state.particle_qd
-        self._add_forces(self.x, self.u, activation, v, f)
-        if not (self.damped or self._may_be_active):
-            return
-        for part in self._others:
-            inputs = [self.elements, *self._materials[2:], part.ids, part.first, part.count, activation, q, v]
-            threads = -(-part.count // int(EACH))
-            self._launch(scatter_damping_and_activation(self.damped), threads, inputs, [f])
+        self._add_forces(self.u, activation, v, f)
+        count = self.model.tet_count
+        if (self.damped or self._may_be_active) and not (self._fused and self.single_count == count):
+            inputs = [self.elements, *self._beside, count, activation, q, v]
+            self._launch(scatter_damping_and_activation(self.damped), -(-count // int(EACH)), inputs, [f])
 
-    def add_elastic_forces(self, x: wp.array | None, u: wp.array | None, f: wp.array) -> None:
-        """Add the elastic forces [N] for given positions to f, vec4 [P].
-
-        Args:
-            x: Positions; None: elements that need them are left out.
-            u: Displacements; None: elements that need them are left out.
-        """
-        self._add_forces(x, u, self._no_activation, self._no_velocities, f)
+    def add_elastic_forces(self, u: wp.array, f: wp.array) -> None:
+        """Add the elastic forces of displacements [N] to f, both vec4 [P]."""
+        self._add_forces(u, self._no_activation, self._no_velocities, f)
 
     def add_linear_forces(self, u: wp.array, f: wp.array) -> None:
         """Add the elastic forces of small displacements from rest shapes [N] to f, vec4 [P]."""
@@ -155,31 +273,15 @@ class Tetrahedra:
         material = isotropic_material([self.mu, self.lam, 1])
         self._launch(kernel, self.model.tet_count, [self.elements, material, u], [f])
 
-    @property
-    def k_damp(self) -> wp.array:
-        """Viscosity of all tetrahedra [Pa s], float32 [T]."""
-        return self._materials[3]
-
-    @property
-    def nodes_by_positions(self) -> npt.NDArray[np.integer]:
-        """Particles of elements whose forces are found from positions."""
-        return self._nodes[0]
-
-    @property
-    def nodes_by_displacements(self) -> npt.NDArray[np.integer]:
-        """Particles of elements whose forces are found from displacements."""
-        return self._nodes[1]
-
     def write_attributes(self, state: newton.State) -> None:
         """Write rotations and stresses for a state's positions, if it has attributes for them."""
         there = {name: attribute_of(state, name) for name in STATE}
         if all(array is None for array in there.values()):
             return
-        kernel = write_attributes(*(array is not None for array in there.values()))
         fill = [self._fill, int(len(self._fill) == self.model.tet_count)]
         inputs = [self.elements, self.mu, self.lam, *fill, state.particle_q]
         outputs = [self._nothing[name] if array is None else array for name, array in there.items()]
-        self._launch(kernel, self.model.tet_count, inputs, outputs)
+        self._launch(write_attributes, self.model.tet_count, inputs, outputs)
 
     def posed(self, ids: npt.NDArray[np.integer]) -> PosedElements:
         """Chosen elements in the form for ``scatter_posed``."""
@@ -190,68 +292,35 @@ class Tetrahedra:
         posed.volume = wp.array(self.elements.volume.numpy()[ids], dtype=wp.float32, device=self.device)
         return posed
 
-    def _add_forces(
-        self,
-        x: wp.array | None,
-        u: wp.array | None,
-        activation: wp.array,
-        v: wp.array,
-        f: wp.array,
-    ) -> None:
+    def _add_forces(self, u: wp.array, activation: wp.array, v: wp.array, f: wp.array) -> None:
         """Add elastic forces, and others in the same kernel."""
-        if self.single_count and x is not None:
-            if self._fused:
-                inputs = [self._single, *self._single_materials, self._single_ids, activation, x, v]
-                self._launch(scatter_posed(quick_rotation, self.damped), self.single_count, inputs, [f], BLOCK)
-            else:
-                material = self._single_isotropic(*self._single_materials[:2])
-                inputs = [self._single, self.single_count, material, x]
-                self._launch(scatter_posed_lanes, -(-self.single_count // LANES), inputs, [f, self._left_out])
-                repair = repair_forces(GeneralElements, IsotropicMaterial, posed_stress)
-                self._launch(repair, 1, [self._single, material, x], [self._left_out, f])
+        if self._fused and self.single_count:
+            inputs = [self._single, *self._single_materials, self._single_ids, activation, u, v]
+            self._launch(scatter_posed(quick_rotation, self.damped), self.single_count, inputs, [f], BLOCK)
+        elif self.single_count:
+            self._lanes.scatter_forces(self._single_isotropic(*self._single_materials[:2]), u, f)
         for group in self.groups:
-            at = u if group.follow_one_another else x
-            if at is not None:
-                group.add_forces(at, at, f)
+            group.add_forces(u, f)
 
     def _take_single(self, ids: npt.NDArray[np.integer]) -> None:
         """Set the tetrahedra that are computed one by one."""
-        self.single_count, self._single_places = len(ids), ids
-        self._no_ids = wp.empty(0, dtype=wp.int32, device=self.device)
+        self.single_count = len(ids)
         # The kernel with damping and activation reads these, too.
         room = (self.model.tet_count, self.model.particle_count) if self._fused else (0, 0)
         self._no_activation = wp.zeros(room[0], dtype=wp.float32, device=self.device)
         self._no_velocities = wp.zeros(room[1], dtype=wp.vec3, device=self.device)
-        self._left_out = wp.zeros(len(ids) + 1, dtype=wp.int32, device=self.device)
         everything = len(ids) == self.model.tet_count
-        self._single: PosedElements | GeneralElements
         if self._fused:
             self._single = self.posed(ids)
         else:
-            self._single = self.elements if everything else self._elements(ids)
-        self._single_ids, self._single_materials = self._no_ids, self._materials
+            elements = self.elements if everything else self._elements(ids)
+            repair = repair_forces(GeneralElements, IsotropicMaterial, posed_stress)
+            self._lanes = Lanes(elements, elements, scatter=scatter_posed_lanes, repair=repair)
+        self._single_ids, self._single_materials = wp.empty(0, dtype=wp.int32, device=self.device), self._materials
         self._single_isotropic = Kept(lambda mu, lam: isotropic_material([mu, lam, 1]))
         if not everything:
             self._single_ids = wp.array(ids, dtype=wp.int32, device=self.device)
             self._single_materials = self._room_for_materials(len(ids))
-
-    def _make_room_for_nodes(self) -> None:
-        ranges = [group for group in self.groups if group.follow_one_another]
-        count = self.model.particle_count
-        one_by_one = bool(self.single_count) or len(ranges) < len(self.groups)
-        self.x = wp.zeros(count if one_by_one else 0, dtype=wp.vec4, device=self.device)
-        self.u = wp.zeros(count if ranges else 0, dtype=wp.vec4, device=self.device)
-        rest = np.zeros((len(self.u), 4), np.float32)
-        for group in ranges:
-            rest[group.nodes] = group.rest
-        of_positions = [group.nodes for group in self.groups if not group.follow_one_another]
-        if self.single_count:
-            of_positions.append(np.unique(self.tets[self._single_places]))
-        nobody = np.empty(0, int)
-        self._nodes = tuple(
-            np.concatenate([nobody, *nodes]) for nodes in (of_positions, [group.nodes for group in ranges])
-        )
-        self.rest = wp.array(rest, dtype=wp.vec4, device=self.device)
 
     def _room_for_materials(self, count: int) -> list[wp.array]:
         return [wp.empty(count, dtype=wp.float32, device=self.device) for _ in range(4)]

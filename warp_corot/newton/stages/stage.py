@@ -1,4 +1,5 @@
-"""USD stages as Newton's models: tetrahedra with the materials that Newton reads, rigid bodies, colliders, a ground.
+"""USD stages as Newton's models: tetrahedra with the materials that Newton reads, or defaults, rigid bodies, colliders
+and a ground; and what users should know of the initial state: overlaps, and bodies that contact cannot feel.
 
 A model is in its stage's own units: UsdPhysics gives all quantities in them, and Newton reads them unchanged. Only
 defaults, here or in Newton, are lengths or masses in SI and are converted.
@@ -9,24 +10,35 @@ from __future__ import annotations
 import math
 import re
 import warnings
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation
 
 from warp_corot.errors import InputError
 from warp_corot.inputs.selection import select_nodes
 from warp_corot.io.files.quiet import quietly
 from warp_corot.io.files.usd import first_message
-from warp_corot.io.read.usd.scene import Scene
+from warp_corot.io.read.usd.scene import Scene, TetPrim
 from warp_corot.io.write.usd.over import FollowingSurface
+from warp_corot.materials.isotropic import Isotropic
 from warp_corot.newton.library import newton
-from warp_corot.newton.state import register_custom_attributes
+from warp_corot.newton.scene import register_custom_attributes
 
-from .material import Body, StageOptions, contact_law, give_material
-from .start import check_colliders, check_ground, notes_of, staying, used_points
-
+#: Young's modulus over the weight of a column as high as the body, if a stage gives no material.
+STIFFNESS_PER_WEIGHT = 20.0
+#: Fraction of critical damping of a body's slowest vibration, if no viscosity is given.
+DAMPED_SHARE = 0.05
+#: Stiffness of contact over Young's modulus times edge of a tetrahedron: it limits how deep bodies sink into the
+#: ground.
+CONTACT_STIFFNESS = 3.0
+#: Defaults if a stage has no material and no option gives one; density in kg/m^3.
+POISSON, DENSITY = 0.45, 1000.0
+#: Newton's Young's modulus [Pa] and Poisson's ratio for a material without them.
+FALLBACK = (1e6, 0.3)
 GRAVITY = 9.81
 #: Distance at which soft bodies begin to push one another, over the mean edge of their tetrahedra.
 THICKNESS = 0.1
@@ -35,6 +47,77 @@ _SEEN_TO = re.compile(
     r"non-unit (linear|mass) units are not supported|static xforms or the world are not supported|"
     r"cannot disable deformable particle collision|add_usd\(\) still reads them"
 )
+#: Initial depth of a point in a collider, over the edge of its tetrahedra, that is reported.
+TOUCHING = 0.05
+#: Maximum of a collider's longest side over the cube root of its bounds' volume: Newton counts voxels one by one.
+LONGEST = 1e5
+#: Maximum number of names in a line.
+_NAMES = 4
+
+
+@dataclass(frozen=True)
+class StageOptions:
+    """Values for what the stage does not define, in SI units.
+
+    Attributes:
+        young: Young's modulus if the stage gives none [Pa]; None: from the weight for bodies without a material, 1 MPa
+            for materials without it.
+        poisson: The same for Poisson's ratio; None: 0.45 for bodies without a material, 0.3 for materials without it.
+        density: The same for density [kg/m^3]; None: 1000.
+        gravity: Acceleration [m/s^2], in place of the stage's own.
+        viscosity: Viscous stress over elastic shear stress of one strain [s]; None: the slowest vibration
+            of each body has a twentieth of critical damping.
+        ground: Height of a ground plane [m]; "auto": below everything, if nothing in the stage supports the bodies;
+            "none".
+        fix: Expression for the nodes that are held; see ``select_nodes``.
+        radius: Contact radius around each point of a soft body [m].
+        soft_contact: Whether soft bodies and cloth touch one another, and themselves.
+    """
+
+    young: float | None = None
+    poisson: float | None = None
+    density: float | None = None
+    gravity: tuple[float, float, float] | None = None
+    viscosity: float | None = None
+    ground: float | str = "auto"
+    fix: str | None = None
+    radius: float = 0.0
+    soft_contact: bool = True
+
+    def __post_init__(self) -> None:
+        young, poisson, density = self.young, self.poisson, self.density
+        # The constructor checks the values.
+        Isotropic(_first(young, 1.0), _first(poisson, POISSON), _first(density, DENSITY))
+        if self.viscosity is not None and not (math.isfinite(self.viscosity) and self.viscosity >= 0):
+            raise InputError(f"viscosity is {self.viscosity:g}; it must be zero or a positive time in seconds")
+        if self.gravity is not None and not (np.shape(self.gravity) == (3,) and np.isfinite(self.gravity).all()):
+            raise InputError(f"gravity is {self.gravity}; it must be three finite numbers [m/s^2]")
+        if not (math.isfinite(self.radius) and self.radius >= 0):
+            raise InputError(f"radius is {self.radius:g}; it must be zero or a positive length in metres")
+
+
+@dataclass(eq=False)
+class Body:
+    """A soft body of a stage.
+
+    Attributes:
+        prim: Its prim.
+        particles, tets: Its ranges in the model.
+        young: Young's modulus [Pa], of its first tetrahedron.
+        poisson: Poisson's ratio.
+        density: Mean density [kg/m^3].
+        edge: Mean edge of its tetrahedra [m].
+        given: Whether the stage gives the material.
+    """
+
+    prim: TetPrim
+    particles: slice
+    tets: slice
+    young: float = math.nan
+    poisson: float = math.nan
+    density: float = math.nan
+    edge: float = math.nan
+    given: bool = True
 
 
 @dataclass(eq=False)
@@ -299,4 +382,259 @@ def _find_surfaces(made: StageModel, found: dict[str, Any]) -> None:
     made.cables = list(found["path_cable_map"])
 
 
-__all__ = ["StageModel", "StageOptions", "stage_model"]
+# --- materials -------------------------------------------------------------------------------------------------------
+
+
+def give_material(
+    body: Body, builder: newton.ModelBuilder, scene: Scene, options: StageOptions, gravity: float
+) -> str | None:
+    """Give a body in a builder the material values that the stage lacks, and its viscosity.
+
+    Args:
+        body: The body; its values are set.
+        builder: The builder; values that the stage lacks are NaN.
+        scene: The stage.
+        options: The substitutes.
+        gravity: Acceleration [m/s^2].
+
+    Returns:
+        The chosen values in words, or None.
+
+    Raises:
+        InputError: A material that is not positive definite, or no mass.
+    """
+    units, path = scene.units, body.prim.path
+    x = np.array(builder.particle_q[body.particles], dtype=np.float64)
+    tets = np.array(builder.tet_indices[body.tets]).reshape(-1, 4) - body.particles.start
+    volumes = 1.0 / (6.0 * np.abs(np.linalg.det(np.array(builder.tet_poses[body.tets]).reshape(-1, 3, 3))))
+    body.edge = float((6.0 * math.sqrt(2.0) * volumes.mean()) ** (1 / 3)) * units.metres
+    said, chosen = scene.says(path), []
+    masses = np.array(builder.particle_mass[body.particles], dtype=np.float64)
+    if "density" not in said:
+        density = _first(options.density, DENSITY)
+        # A body's masses exist already, with a default; those of other tetrahedra do not.
+        masses = _lumped(tets, volumes, len(x)) if np.isnan(masses).any() else masses / (masses.sum() / volumes.sum())
+        masses *= density / units.density
+        builder.particle_mass[body.particles] = masses.tolist()
+        chosen.append(("density", f"density {density:g} kg/m^3"))
+    body.density = float(masses.sum() / volumes.sum()) * units.density
+    if not body.density > 0.0:
+        raise InputError(f"{scene.path}: {path}: has no mass; it must have a positive mass")
+    size = np.ptp(x, axis=0) * units.metres
+    lame = np.array(builder.tet_materials[body.tets], dtype=np.float64)
+    body.given = not np.isnan(lame[:, :2]).any()
+    if not {"young", "poisson"} <= said.keys():
+        height = float(size["XYZ".index(scene.up_axis)])
+        weight = float(f"{STIFFNESS_PER_WEIGHT * body.density * gravity * height:.1e}")
+        young, poisson = FALLBACK if body.given else (weight, POISSON)
+        young = said["young"] * units.pressure if "young" in said else _first(options.young, young)
+        poisson = said["poisson"] if "poisson" in said else _first(options.poisson, poisson)
+        lame[:, 0] = young / (2.0 * (1.0 + poisson)) / units.pressure
+        lame[:, 1] = 2.0 * lame[:, 0] * poisson / (1.0 - 2.0 * poisson)
+        taken = {"young": f"E = {young:g} Pa", "poisson": f"nu = {poisson:g}"}
+        chosen[:0] = [(name, text) for name, text in taken.items() if name not in said]
+    mu, lam = lame[:, 0] * units.pressure, lame[:, 1] * units.pressure
+    if not (np.isfinite(lame[:, :2]).all() and (mu > 0.0).all() and (3.0 * lam + 2.0 * mu > 0.0).all()):
+        raise InputError(
+            f"{scene.path}: {path}: its material is not positive definite, with Lame's parameters mu = "
+            f"{mu[0]:g} Pa and lambda = {lam[0]:g} Pa; Young's modulus must be positive, Poisson's ratio in (-1, 0.5)"
+        )
+    body.young = float(mu[0] * (3 * lam[0] + 2 * mu[0]) / (lam[0] + mu[0]))
+    body.poisson = float(lam[0] / (2 * (lam[0] + mu[0])))
+    relaxation = options.viscosity
+    if relaxation is None:
+        slowest = 0.5 * math.pi * math.sqrt(body.young / body.density) / float(size.max())
+        relaxation = 2.0 * DAMPED_SHARE / slowest
+    lame[:, 2] = 2.0 * lame[:, 0] * relaxation
+    builder.tet_materials[body.tets] = [tuple(row) for row in lame.tolist()]
+    if not chosen:
+        return None
+    missing = "no physics material for a volume" if not body.given else "a physics material with missing values"
+    return f"{path} has {missing}: {', '.join(text for _, text in chosen)} ({', '.join(f'--{n}' for n, _ in chosen)})"
+
+
+def _lumped(tets: npt.NDArray[np.integer], volumes: npt.NDArray[np.float64], count: int) -> npt.NDArray[np.float64]:
+    """A quarter of each tetrahedron's volume at each of its corners, float64 [count]."""
+    return np.bincount(tets.ravel(), np.repeat(volumes / 4.0, 4), minlength=count).astype(np.float64)
+
+
+def _first(given: float | None, default: float) -> float:
+    return default if given is None else given
+
+
+def contact_law(soft: Sequence[Body]) -> tuple[float, float]:
+    """Stiffness [N/m] of contact, and damping [N s/m] at half of critical, for the stiffest of the bodies."""
+    body = max(soft, key=lambda one: one.young * one.edge)
+    stiffness = CONTACT_STIFFNESS * body.young * body.edge
+    return stiffness, math.sqrt(stiffness * body.density * body.edge**3)
+
+
+# --- the initial state -----------------------------------------------------------------------------------------------
+
+
+def used_points(made: StageModel, builder: newton.ModelBuilder) -> npt.NDArray[np.bool_]:
+    """A builder's particles without those points of soft bodies that belong to no tetrahedron, bool [P]."""
+    used = np.ones(builder.particle_count, bool)
+    for body in made.soft:
+        used[body.particles] = False
+        used[np.unique(np.array(builder.tet_indices[body.tets]))] = True
+    return used
+
+
+def check_colliders(builder: newton.ModelBuilder, source: Any) -> None:
+    """Check that Newton can divide the size of every collider into voxels, in the stage's units.
+
+    Args:
+        builder: The builder with the colliders.
+        source: The stage's file, for the message.
+
+    Raises:
+        InputError: A size is not finite, or absurdly long and thin.
+    """
+    divided = [getattr(newton.GeoType, name) for name in ("MESH", "CONVEX_MESH", "BOX", "ELLIPSOID")]
+    shapes = zip(builder.shape_type, builder.shape_scale, builder.shape_source, builder.shape_label, strict=True)
+    for kind, scale, data, label in shapes:
+        points = getattr(data, "vertices", None)
+        if kind not in divided or (points is not None and not len(points)):
+            continue
+        own = np.full(3, 2.0) if points is None else np.ptp(np.asarray(points, dtype=np.float64), axis=0)
+        size = np.abs(own * np.asarray(scale, dtype=np.float64))
+        if not np.isfinite(size).all():
+            raise InputError(f"{source}: collider {label} must have a finite size")
+        sides = np.maximum(size, 1e-6)
+        if sides.max() > LONGEST * np.prod(sides) ** (1.0 / 3.0):
+            raise InputError(f"{source}: collider {label} is {sides.max():.3g} long and {sides.min():.3g} thin")
+
+
+def check_ground(made: StageModel, builder: newton.ModelBuilder, height: float, radius: float) -> None:
+    """Check that a requested ground plane is below everything that can move, in the stage's units.
+
+    Raises:
+        InputError: It cuts a soft body, or is above one.
+    """
+    axis, metres = "XYZ".index(made.scene.up_axis), made.scene.units.metres
+    x, masses = np.array(builder.particle_q, dtype=np.float64)[:, axis], np.array(builder.particle_mass)
+    found = []
+    for body in made.soft:
+        free = x[body.particles][masses[body.particles] > 0.0]
+        if len(free):
+            found.append((float(free.min()) - radius, body))
+    low, body = min(found, key=lambda one: one[0])
+    if low < height - TOUCHING * body.edge / metres:
+        raise InputError(
+            f"ground is {height * metres:g} m; {body.prim.path} reaches down to {'xyz'[axis]} = {_round(low * metres)} "
+            f"m, {(height - low) * metres:.3g} m below it, and would be thrown up; it must be at most "
+            f'{_round(low * metres)}, or "auto" (--ground)'
+        )
+    for path, bounds in _falling(made, builder):
+        if bounds[0, axis] < height - 0.01 * (bounds[1, axis] - bounds[0, axis]):
+            deep = (height - bounds[0, axis]) * metres
+            warnings.warn(f"{path} begins {deep:.3g} m deep in the ground (--ground)", UserWarning, stacklevel=4)
+
+
+def warn_of_overlaps(made: StageModel, contacts: newton.Contacts) -> None:
+    """Warn of soft bodies that begin in colliders, from which contact will push them.
+
+    Args:
+        made: The stage's model.
+        contacts: Contacts of its initial state.
+    """
+    model, metres = made.model, made.scene.units.metres
+    count = min(int(contacts.soft_contact_count.numpy()[0]), contacts.soft_contact_max)
+    fields = (contacts.soft_contact_particle, contacts.soft_contact_shape, contacts.soft_contact_body_pos)
+    particle, shape, point = (array.numpy()[:count] for array in fields)
+    normal = contacts.soft_contact_normal.numpy()[:count].astype(np.float64)
+    x = model.particle_q.numpy().astype(np.float64)[particle]
+    gap = np.einsum("ci,ci->c", normal, x - _in_world(model, shape, point)) - model.particle_radius.numpy()[particle]
+    gap[model.particle_inv_mass.numpy()[particle] == 0.0] = np.inf
+    for body in made.soft:
+        inside = (particle >= body.particles.start) & (particle < body.particles.stop)
+        inside &= gap < -TOUCHING * body.edge / metres
+        for one in np.unique(shape[inside]):
+            deep = -gap[inside & (shape == one)].min() * metres
+            warnings.warn(
+                f"{body.prim.path} begins {deep:.3g} m deep in {model.shape_label[one]}, and contact will throw it out",
+                UserWarning,
+                stacklevel=3,
+            )
+
+
+def notes_of(made: StageModel, builder: newton.ModelBuilder, options: StageOptions) -> Iterator[str]:
+    """Facts that a user may not expect, one line each."""
+    scene = made.scene
+    if not scene.says_metres:
+        yield "the stage has no metersPerUnit: by USD's default its unit is a centimetre"
+    if len(scene.physics_scenes) > 1:
+        yield f"gravity is from the first of {len(scene.physics_scenes)} physics scenes, {scene.physics_scenes[0]}"
+    if scene.skipped:
+        yield f"prototypes of point instancers are not simulated: {_names(scene.skipped)}"
+    if scene.stopped:
+        yield f"bodies and colliders do not follow the stage's animation, which is stopped: {_names(scene.stopped)}"
+    used = used_points(made, builder)
+    for body in made.soft:
+        if alone := np.count_nonzero(~used[body.particles]):
+            yield f"{body.prim.path}: points in no tetrahedron, which stay where they are: {alone}"
+        attribute = scene.stage.GetPrimAtPath(body.prim.path).GetAttribute("physics:collisionEnabled")
+        if attribute and attribute.Get() is False:
+            yield f"{body.prim.path} collides, though its collision is disabled: Newton has no such switch for points"
+    given = {"young": options.young, "poisson": options.poisson, "density": options.density}
+    for name, value in given.items():
+        if value is not None and all(name in scene.says(body.prim.path) for body in made.soft):
+            yield f"--{name} is not used: the stage gives it for all soft bodies"
+    if len(made.soft) > 1 and not options.soft_contact:
+        yield "soft bodies touch colliders and rigid bodies, not one another"
+    yield from _narrow(made, builder, options.radius)
+
+
+def _narrow(made: StageModel, builder: newton.ModelBuilder, radius: float) -> Iterator[str]:
+    """Rigid bodies that can slip in between the points of a soft body."""
+    for path, bounds in _falling(made, builder):
+        width = float(np.sort(bounds[1] - bounds[0])[1]) * made.scene.units.metres
+        body = max(made.soft, key=lambda one: one.edge)
+        if width < body.edge and body.edge > 2.0 * radius:
+            yield (
+                f"{path} is {width:.3g} m wide and can slip in between the points of {body.prim.path}, {body.edge:.3g} "
+                "m apart, because contact is only at points; a finer mesh or points with a radius help (--radius)"
+            )
+
+
+def staying(builder: newton.ModelBuilder) -> set[int]:
+    """Bodies that do not fall: -1 for the world, kinematic bodies, and those jointed to these."""
+    found = {-1} | {k for k, flags in enumerate(builder.body_flags) if flags & int(newton.BodyFlags.KINEMATIC)}
+    joints = [
+        (parent, child)
+        for parent, child, kind in zip(builder.joint_parent, builder.joint_child, builder.joint_type, strict=True)
+        if kind != newton.JointType.FREE
+    ]
+    before = 0
+    while len(found) > before:
+        before = len(found)
+        found |= {child for parent, child in joints if parent in found}
+    return found
+
+
+def _falling(made: StageModel, builder: newton.ModelBuilder) -> Iterator[tuple[str, npt.NDArray[np.float64]]]:
+    """Rigid bodies that can fall, with their bounds."""
+    held = staying(builder)
+    for path, index in made.rigid.items():
+        bounds = None if index in held else made.scene.bounds(path)
+        if bounds is not None:
+            yield path, bounds
+
+
+def _in_world(model: Any, shape: npt.NDArray[np.integer], point: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
+    """Points given in the frames of the shapes' bodies, in the world, float64 [C, 3]."""
+    found, body = point.astype(np.float64), model.shape_body.numpy()[shape]
+    if (moving := body >= 0).any():
+        pose = model.body_q.numpy().astype(np.float64)[body[moving]]
+        found[moving] = Rotation.from_quat(pose[:, 3:]).apply(found[moving]) + pose[:, :3]
+    return found
+
+
+def _names(paths: list[str]) -> str:
+    return ", ".join(paths[:_NAMES]) + (f" and {len(paths) - _NAMES} more" if len(paths) > _NAMES else "")
+
+
+def _round(value: float) -> str:
+    """A height with few digits, and never minus zero."""
+    return f"{round(value, 9) + 0.0:.6g}"

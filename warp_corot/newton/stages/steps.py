@@ -11,18 +11,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import warp as wp
+from scipy.spatial.transform import Rotation
 
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.device import checked_device
 from warp_corot.io.read.usd.scene import open_scene
 from warp_corot.io.write.animate import steps_per_frame
 from warp_corot.io.write.usd.over import SceneState, SceneWriter
-from warp_corot.newton.following import INTERVAL, RETRIES
 from warp_corot.newton.library import newton
 from warp_corot.newton.solver import SolverCorotated
+from warp_corot.newton.substeps import INTERVAL, RETRIES
 
-from .stage import StageOptions, stage_model
-from .start import warn_of_overlaps
+from .stage import StageOptions, stage_model, warn_of_overlaps
 
 #: Maximum number of steps that are recorded together, with one measurement; a frame is a whole number of chunks. On the
 #: CPU recording a step takes as long as ten steps.
@@ -204,18 +204,7 @@ class StageSimulation:
             return poses
         every = self.state.body_q.numpy().astype(np.float64)[list(self.parts.rigid.values())]
         poses[:, 3, :3], poses[:, 3, 3] = every[:, :3], 1.0
-        x, y, z, w = (every[:, 3:] / np.linalg.norm(every[:, 3:], axis=1, keepdims=True)).T
-        poses[:, :3, :3] = np.moveaxis(
-            np.array(
-                [
-                    [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
-                    [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
-                    [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
-                ]
-            ),
-            2,
-            0,
-        )
+        poses[:, :3, :3] = np.swapaxes(Rotation.from_quat(every[:, 3:]).as_matrix(), 1, 2)
         return poses
 
     # --- pieces ----------------------------------------------------------------------------------------------------

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from functools import partial
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 import warp as wp
 
 from warp_corot.kernels.stepping import gauge as kernels
@@ -20,12 +21,66 @@ if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
     from warp_corot.elasticity import ForceField
 
+#: Adds the forces of displacements, vec4, to the second array.
+AddForces = Callable[[wp.array, wp.array], None]
+
 #: Iterations to find the largest curvature at rest. They find it to 1 %; a value that is too small makes later steps
 #: shorter, not longer.
 REST_TURNS = 32
 
 
-class Gauge:
+class Curvature:
+    """Finds the largest curvature of forces, by launches that may be recorded.
+
+    Args:
+        places: Length of nodal arrays.
+        found: The result, float32 [2], zero before; see ``Gauge``.
+        ranks, number: The processes that have the other parts of the body, and its number there.
+
+    Attributes:
+        directions: The directions in which nodes are moved, vec4, which go on from one measurement to the next.
+        scale: The size of the probing motion, float32 [1].
+    """
+
+    def __init__(self, places: int, found: wp.array, ranks: Halo = ALONE, number: int = 0):
+        self.found, self._ranks, self._number = found, ranks, number
+        self.directions, self._probed, self._forces = (
+            wp.zeros(places, dtype=wp.vec4, device=found.device) for _ in range(3)
+        )
+        self.scale = wp.zeros(1, dtype=wp.float32, device=found.device)
+
+    def fit(self, inverse_mass: npt.NDArray[np.floating], smallest_volume: float) -> None:
+        """Scale the probing motion to a mesh: the lightest free node moves a share of the smallest element."""
+        lightest = self._ranks.max(float(inverse_mass.max(initial=0.0)))
+        size = smallest_volume ** (1.0 / 3.0)
+        self.scale.fill_(PROBE * size / np.sqrt(lightest) if lightest > 0 else 0.0)
+
+    def find(self, add_forces: AddForces, inverse_mass: wp.array, u: wp.array, f: wp.array, count: int) -> None:
+        """Measure at displacements u of ``count`` nodes, where the forces are f [N], both vec4."""
+        outputs = [self.directions, self._probed, self._forces]
+        wp.launch(kernels.probe_directions, count, [self.scale, inverse_mass, u], outputs, device=u.device)
+        self._ranks.exchange(self._number, self._probed)
+        add_forces(self._probed, self._forces)
+        inputs = [inverse_mass, u, self._probed, f, self._forces]
+        wp.launch(kernels.find_curvatures, count, inputs, [self.directions, self.found], device=u.device)
+
+    def at_rest(self, add_forces: AddForces, inverse_mass: wp.array, count: int) -> float:
+        """The largest curvature without displacements [1/s^2]; waits for the device."""
+        u, f = (wp.zeros_like(self.directions) for _ in range(2))
+        add_forces(u, f)
+
+        def find_afresh() -> None:
+            self.found.zero_()
+            self.find(add_forces, inverse_mass, u, f, count)
+
+        repeat(find_afresh, REST_TURNS, u.device, self._ranks)
+        self._ranks.max(self.found)
+        value = float(self.found.numpy()[0])
+        self.found.zero_()
+        return value
+
+
+class Gauge(Curvature):
     """Finds the largest curvature and the largest strain of a body, by launches that may be recorded.
 
     Args:
@@ -36,29 +91,20 @@ class Gauge:
     """
 
     def __init__(self, body: SoftBody, field: ForceField, found: wp.array, ranks: Halo = ALONE, number: int = 0):
-        self._ranks, self._number = ranks, number
-        self.body = body
-        self.field = field
-        self.found = found
-        places = body.state.displacements.shape
-        self.directions = wp.zeros(places, dtype=wp.vec4, device=body.device)
+        super().__init__(len(body.state.displacements), found, ranks, number)
+        self.body, self.field = body, field
         if (numbers := ranks.owned(body).numbers) is not None:
             drawn = normal_numbers(numbers, 20130705)
             self.directions.assign(padded(drawn / np.linalg.norm(drawn, axis=1, keepdims=True), len(self.directions)))
-        self._probed, self._forces = (wp.zeros(places, dtype=wp.vec4, device=body.device) for _ in range(2))
         self._rest_directions = self.directions
-        #: The size of the probing motion, float32 [1].
-        self.scale = wp.zeros(1, dtype=wp.float32, device=body.device)
         self.rescale()
         # Loading within a recording would end it on some drivers.
         wp.load_module(kernels.find_strains(body.discretization.element_kind).module, body.device)
 
     def rescale(self) -> None:
-        """Scale the probing motion to the mesh: the lightest free node moves a share of the smallest element."""
+        """Scale the probing motion to the present mesh."""
         inverse = self.body.conditions.inverse_mass[: self.body.node_count].numpy()
-        lightest = self._ranks.max(float(inverse.max(initial=0.0)))
-        size = self.body.discretization.smallest_volume ** (1.0 / 3.0)
-        self.scale.fill_(PROBE * size / np.sqrt(lightest) if lightest > 0 else 0.0)
+        self.fit(inverse, self.body.discretization.smallest_volume)
 
     def restart(self) -> None:
         """Continue from the directions that were found at rest."""
@@ -71,8 +117,8 @@ class Gauge:
             pace: The length of the steps to come.
             ahead: Number of steps before the next measurement.
         """
-        body = self.body
-        self._find_curvature(body.state.displacements, body.state.forces)
+        body, state = self.body, self.body.state
+        self.find(self.field.add_forces, *self._nodes(state.displacements, state.forces))
         # Each part of a body numbers its elements in its own way, so all of them are measured there.
         turns = int(kernels.TURNS) if self._ranks.is_alone else 1
         wp.launch(
@@ -80,8 +126,8 @@ class Gauge:
             dim=-(-body.sizes.launch_elements // turns),
             inputs=[
                 body.discretization.elements,
-                body.state.displacements,
-                self._ranks.exchange(self._number, body.state.velocities, copies=True),
+                state.displacements,
+                self._ranks.exchange(self._number, state.velocities, copies=True),
                 pace.arrays,
                 ahead,
                 turns,
@@ -93,29 +139,10 @@ class Gauge:
 
     def curvature_at_rest(self) -> float:
         """The largest curvature about the rest shape [1/s^2]; waits for the device."""
-        u, f = (wp.zeros_like(self.body.state.displacements) for _ in range(2))
         with self.field.state_kept():
-            self.field.add_forces(u, f)
-            repeat(partial(self._find_afresh, u, f), REST_TURNS, self.body.device, self._ranks)
-            self._ranks.max(self.found)
+            value = self.at_rest(self.field.add_forces, *self._nodes())
         self._rest_directions = wp.clone(self.directions)
-        value = float(self.found.numpy()[0])
-        self.found.zero_()
         return value
 
-    def _find_afresh(self, u: wp.array, f: wp.array) -> None:
-        self.found.zero_()
-        self._find_curvature(u, f)
-
-    def _find_curvature(self, u: wp.array, f: wp.array) -> None:
-        inverse_mass = self.body.conditions.inverse_mass
-        outputs = [self.directions, self._probed, self._forces]
-        self._launch(kernels.probe_directions, [self.scale, inverse_mass, u], outputs)
-        self._ranks.exchange(self._number, self._probed)
-        self.field.add_forces(self._probed, self._forces)
-        inputs = [inverse_mass, u, self._probed, f, self._forces]
-        self._launch(kernels.find_curvatures, inputs, [self.directions, self.found])
-
-    def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
-        body = self.body
-        wp.launch(kernel, dim=body.sizes.launch_nodes, inputs=inputs, outputs=outputs, device=body.device)
+    def _nodes(self, *vectors: wp.array) -> tuple:
+        return self.body.conditions.inverse_mass, *vectors, self.body.sizes.launch_nodes

@@ -1,20 +1,27 @@
-"""Checks of the arguments that users give to ``SolverCorotated``."""
+"""Checks of what users give to ``SolverCorotated``: arguments; models whose builder left tetrahedra out; and recordings
+that do not go on from one another."""
 
 from __future__ import annotations
 
 import math
+import warnings
 from numbers import Real
 from typing import Any, NamedTuple
 
+import numpy as np
+import numpy.typing as npt
 import warp as wp
 
-from warp_corot.errors import InputError
+from warp_corot.errors import InputError, depth_of_user
+from warp_corot.mesh.surfaces.boundary import boundary_faces
 
 from .library import ModelView, newton
-from .state import STATE, attribute_of
-from .tetrahedra import LAME
+from .scene import STATE, attribute_of
 
 INTEGRATORS = ("explicit", "implicit")
+#: Meanings of k_mu and k_lambda: mu = a k_mu, lambda = k_lambda + b k_mu, as (a, b).
+LAME = {"documented": (1.0, 0.0), "semi-implicit": (0.75, -0.625)}
+_REPAIR = "build with warp_corot.newton.add_mesh(builder, warp_corot.TetMesh(points, tets), ...), which repairs them"
 
 
 class Step(NamedTuple):
@@ -142,3 +149,87 @@ def _check_state(name: str, state: Any, model: newton.Model) -> None:
 
 def _named(value: Any) -> str:
     return "None" if value is None else f"a {type(value).__name__}"
+
+
+def why_none(model: newton.Model) -> str:
+    """In one line, why a model has no tetrahedra, and what to do."""
+    bodies = 0 if model.volume_particle_start is None else len(model.volume_particle_start)
+    if not bodies:
+        return "the model has no tetrahedra; add some with add_soft_mesh, add_soft_grid or add_forest"
+    labels = [str(label) for label in model.volume_label]
+    named = f"{bodies} soft bod{'y' if bodies == 1 else 'ies'} ({', '.join(labels[:3])}{', ...' * (bodies > 3)})"
+    return (
+        f"the model has no tetrahedra, though {named}: Newton's builder leaves out wrongly wound tetrahedra and their "
+        f"mass, and all of these are wrongly wound; {_REPAIR}"
+    )
+
+
+def warn_of_lost(model: newton.Model, tets: npt.NDArray[np.integer]) -> None:
+    """Warn if soft bodies of a model seem to lack tetrahedra.
+
+    Their surface triangles were found from all tetrahedra: if some were left out, the rest have more outer faces. Or
+    particles are in no tetrahedron, and the triangles do not show that they never were in one.
+    """
+    if model.volume_particle_start is None or not len(model.volume_particle_start):
+        return
+    in_body, of_body = np.zeros(model.particle_count, bool), np.zeros(len(tets), bool)
+    ranges = (model.volume_particle_start, model.volume_particle_end, model.volume_tet_start, model.volume_tet_end)
+    for first, last, first_tet, last_tet in zip(*(array.numpy() for array in ranges), strict=True):
+        in_body[first:last] = True
+        of_body[first_tet:last_tet] = True
+    single = in_body.copy()
+    single[tets] = False
+    surface = faces = 0
+    if model.tri_count:
+        triangles = model.tri_indices.numpy().reshape(-1, 3)
+        surface = int(np.count_nonzero(in_body[triangles].all(axis=1)))
+        faces = len(boundary_faces(tets[of_body])[0])
+    lost = []
+    if single.any() and not faces == surface > 0:
+        lost.append(f"{np.count_nonzero(single)} particles of soft bodies are in no tetrahedron")
+    if faces > surface > 0:
+        lost.append(f"soft bodies with {surface} surface triangles have {faces} outer faces")
+    if lost:
+        warnings.warn(
+            f"{' and '.join(lost)}: Newton's builder leaves out wrongly wound tetrahedra and their mass; {_REPAIR}",
+            UserWarning,
+            stacklevel=5,
+        )
+
+
+class Recordings:
+    """The states between which recordings lead.
+
+    A graph keeps the addresses of the states. If a frame swaps two states an odd number of times, its replay reads the
+    same old state again and again, unless the result is copied back.
+
+    Args:
+        device: The model's device.
+    """
+
+    def __init__(self, device: wp.Device):
+        self._device = device
+        self._ways: list[tuple[wp.array, wp.array]] = []
+        self._recording = self._told = False
+
+    def follow(self, state_in: newton.State, state_out: newton.State) -> None:
+        """Follow a step, if it is recorded; the steps of a recording come one after the other."""
+        goes_on, self._recording = self._recording, self._device.is_capturing
+        if self._recording and not self._told:
+            begin = self._ways.pop()[0] if goes_on else state_in.particle_q
+            self._ways = [way for way in self._ways if way[0] is not begin] + [(begin, state_out.particle_q)]
+
+    def check(self) -> None:
+        """Warn, once, of a recording whose result no recording reads; waits for the device."""
+        begins = {begin.ptr for begin, _ in self._ways}
+        lost = (way for way in self._ways if way[1].ptr not in begins)
+        if self._told or self._device.is_capturing or all(np.array_equal(a.numpy(), b.numpy()) for a, b in lost):
+            return
+        self._told = True
+        warnings.warn(
+            "recorded steps end in another state than that from which they begin, and nothing copies it back: each "
+            "replay begins where the first one did; record an even number of swaps, or end the recording with "
+            "state_in.assign(state_out)",
+            UserWarning,
+            stacklevel=depth_of_user(),
+        )

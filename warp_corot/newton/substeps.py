@@ -1,0 +1,273 @@
+"""Substeps: the largest stable time step of a model (see ``solvers.steps.stable_step``), and how many the current state
+needs (see ``kernels.stepping.gauge``)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.elasticity import Corotated
+from warp_corot.elasticity.model import isotropic_material
+from warp_corot.errors import InputError
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, linear_stress
+from warp_corot.kernels.elements.elements import GeneralElements
+from warp_corot.kernels.elements.forces import law_stress, scatter_forces
+from warp_corot.kernels.newton import elements as of_elements
+from warp_corot.kernels.stepping import gauge
+from warp_corot.kernels.stepping.lanczos import add_scaled, scale_by
+from warp_corot.mesh.growing.cut import linked, node_pairs
+from warp_corot.solvers.guarding.mapped import Mapped
+from warp_corot.solvers.steps.gauge import Curvature
+from warp_corot.solvers.steps.stable_step import largest_eigenvalue
+
+from .contact import Contacts
+from .library import newton
+from .others import Others
+from .tetrahedra import Tetrahedra
+
+#: Number of substeps between measurements. A measurement takes about as long as four substeps.
+INTERVAL = 64
+#: A recorded step has at least this many times the substeps that the model needs at rest, since it cannot change them.
+HEADROOM = 1.5
+#: Number of retries of a failed step, each with twice the substeps.
+RETRIES = 4
+#: Factor on the used fraction of the safe substep at each measurement after a retry.
+RECOVERY = 1.02
+#: Fraction of the largest stable step that errors suggest: elements stiffen when strained.
+SAFETY = 0.7
+#: Number of attempts to lengthen a step, and the largest eigenvalue, of 4, from which it is long enough.
+LENGTHENINGS = 6
+ENOUGH = 3.95
+
+
+class _SmallMotions:
+    """Forces -(a K + b C) u of small displacements from rest: of elements, of everything else, and of a spring and a
+    damper at every particle.
+
+    Elements turn with their rotations; if these are negligible, the model is linear elasticity, and viscosity adds to
+    its moduli.
+    """
+
+    def __init__(self, tets: Tetrahedra, others: Others, a: float, b: float, stiffness: float, damping: float):
+        self.elements, self.others, self._at_particles = tets.elements, others, a * stiffness + b * damping
+        mu, lam, viscosity = (array.numpy().astype(np.float64) for array in (tets.mu, tets.lam, tets.k_damp))
+        moduli = (a * mu + 0.5 * b * viscosity, a * lam + b * viscosity)
+        device = tets.device
+        self._material = isotropic_material([*(wp.array(m, dtype=wp.float32, device=device) for m in moduli), 1])
+        self._kernel = scatter_forces(GeneralElements, IsotropicMaterial, law_stress(linear_stress))
+        #: Scaled displacements, kept because launches may be recorded.
+        self._parts = [(f, k, wp.zeros_like(tets.u)) for k, f in enumerate((a, b)) if f and others.has_particles]
+
+    def add_forces(self, u: wp.array, f: wp.array) -> None:
+        count = len(self.elements.volume)
+        wp.launch(self._kernel, dim=count, inputs=[self.elements, self._material, u], outputs=[f], device=u.device)
+        for factor, damping, scaled in self._parts:
+            wp.copy(scaled, u)
+            wp.launch(scale_by, dim=len(u), inputs=[factor, scaled], device=u.device)
+            self.others.add_linear_forces(scaled, f, bool(damping))
+        wp.launch(add_scaled, dim=len(u), inputs=[-self._at_particles, u], outputs=[f], device=u.device)
+
+    @contextmanager
+    def state_kept(self) -> Iterator[None]:
+        yield
+
+
+def stable_step(
+    tets: Tetrahedra, others: Others, stiffness: float = 0.0, damping: float = 0.0, of_bodies: float = 0.0
+) -> float:
+    """The largest stable step of symplectic Euler about rest [s]; infinite if nothing can move.
+
+    It is stable while no eigenvalue of dt^2 M^-1 K + 2 dt M^-1 C is above 4. With w^2 the largest eigenvalue of M^-1 K
+    and c that of M^-1 C, which may belong to other motions, w^2 dt^2 + 2 c dt = 4 gives a step that is short enough;
+    then it is lengthened as far as possible. K and C are those of tetrahedra at rest and of springs, triangles and
+    bending edges about the model's initial positions, all together.
+
+    Args:
+        tets, others: The parts of the model.
+        stiffness: Stiffness of a spring at every particle [N/m], for contact.
+        damping: Damping of a damper at every particle [N s/m].
+        of_bodies: Stiffness over mass at the other end of this spring [1/s^2]; 0: that end does not move. Bodies that
+            are touched in several places need no shorter steps; see ``kernels.newton.explicit_rows``.
+    """
+    inverse = free_inverse_masses(tets.model)
+    inverse_mass = wp.array(inverse, dtype=wp.float32, device=tets.device)
+    smallest = float(tets.elements.volume.numpy().astype(np.float64).min())
+
+    def largest(a: float, b: float) -> float:
+        motions = _SmallMotions(tets, others, a, b, stiffness, damping)
+        return largest_eigenvalue(motions, inverse_mass, smallest, len(inverse)) + a * of_bodies
+
+    w2 = largest(1.0, 0.0)
+    if not (tets.damped or others.damped or damping > 0):
+        return 2.0 / math.sqrt(w2) if w2 > 0 else math.inf
+    c = largest(0.0, 1.0)
+    if w2 == 0.0 and c == 0.0:
+        return math.inf
+    dt = 4.0 / (c + math.sqrt(c * c + 4.0 * w2))
+    for _ in range(LENGTHENINGS if w2 > 0 and c > 0 else 0):
+        found = largest(dt * dt, 2.0 * dt)
+        if found >= ENOUGH:
+            break
+        # Eigenvalues grow no faster than dt^2.
+        dt *= math.sqrt(4.0 / found)
+    return dt
+
+
+def free_inverse_masses(model: newton.Model) -> npt.NDArray[np.floating]:
+    """Inverse masses of particles [1/kg], zero for those that do not move, float32 [P]."""
+    active = (model.particle_flags.numpy() & int(newton.ParticleFlags.ACTIVE)) != 0
+    return np.where(active, model.particle_inv_mass.numpy(), 0.0)
+
+
+def stable_steps(tets: Tetrahedra, others: Others, contacts: Contacts) -> tuple[float, float]:
+    """The largest stable step about rest [s], and the same with a contact or an attachment at every particle."""
+    alone = stable_step(tets, others)
+    stiffness, damping = others.contact
+    stiffness += contacts.stiffest
+    if not (stiffness > 0 or damping > 0):
+        return alone, alone
+    return alone, min(alone, stable_step(tets, others, stiffness, damping, contacts.stiffest * contacts.lightest))
+
+
+def check_substep(dt: float, count: int, stable_dt: float, contact_dt: float) -> None:
+    """Check a step of ``dt`` in ``count`` substeps against the result of ``stable_steps`` [s].
+
+    Raises:
+        InputError: The substeps are too long.
+    """
+    if dt / count > stable_dt:
+        each = f", {count} substeps of {dt / count:.3g} s" if count > 1 else ""
+        needed = math.ceil(dt / (SAFETY * contact_dt))
+        raise InputError(
+            f"dt is {dt:.3g} s{each}; the largest stable step is about {stable_dt:.3g} s: "
+            f"make shorter steps, or SolverCorotated(..., substeps={needed}), or substeps=None"
+        )
+
+
+class Following:
+    """The safe substep of a model, which follows the state by launches that may be recorded.
+
+    On the CPU the host gets the result of a measurement at once. On CUDA it does not wait: it uses the values that the
+    device has written to the host's memory so far.
+
+    Args:
+        model: The model.
+        tetrahedra: Its tetrahedra. Everything else in the model is assumed to be as stiff as at rest.
+
+    Attributes:
+        share: The fraction of the safe substep that is used; less than one after a failed step.
+        reach: The size of the largest body [m]: a larger motion in a substep is a failure.
+        made: Number of substeps of the last step.
+        was_recorded: Whether the last step was recorded.
+    """
+
+    def __init__(self, model: newton.Model, tetrahedra: Tetrahedra):
+        self.model, self.tetrahedra = model, tetrahedra
+        self.device = model.device
+        self._f = wp.zeros(model.particle_count, dtype=wp.vec4, device=self.device)
+        self._found = wp.zeros((1, 2), dtype=wp.float32, device=self.device)
+        self._curvature = Curvature(model.particle_count, self._found[0])
+        self._at_rest = wp.zeros((1, 4), dtype=wp.float64, device=self.device)
+        self._allowed = wp.zeros(1, dtype=wp.float64, device=self.device)
+        self._turn = wp.zeros(1, dtype=wp.int32, device=self.device)
+        self._excess = wp.zeros(1, dtype=wp.float32, device=self.device)
+        self._seen = Mapped(1, self.device)
+        self.share, self.made, self.was_recorded = 1.0, 1, False
+        self.reach = _size(model, tetrahedra.tets)
+        self._since, self._recording = INTERVAL, False
+        # Loading kernels within a recording would end it on some drivers.
+        wp.load_module(of_elements.find_posed_strains.module, self.device)
+
+    def find_rest(self, stable: float) -> None:
+        """Set the largest stable substep at rest [s], the reference of measurements."""
+        tets, inverse = self.tetrahedra, free_inverse_masses(self.model)
+        has_tets = np.zeros(len(inverse), bool)
+        has_tets[tets.tets] = True
+        inverse *= has_tets
+        self._inverse_mass = wp.array(inverse, dtype=wp.float32, device=self.device)
+        self._curvature.fit(inverse, float(tets.elements.volume.numpy().min()))
+        curvature = self._curvature.at_rest(tets.add_linear_forces, self._inverse_mass, len(inverse))
+        row = [stable, curvature, Corotated.step_safety, Corotated.strained_safety]
+        self._longest = stable * Corotated.step_safety
+        if not math.isfinite(stable):
+            row[0] = self._longest = 1e30
+        self._at_rest.assign(np.array([row]))
+        self._allowed.fill_(self._longest)
+        self._seen.values[0] = self._longest
+        self._since = INTERVAL
+
+    @property
+    def substep(self) -> float:
+        """The substep that the host would use now [s]; does not wait."""
+        return self.share * float(self._seen.values[0])
+
+    @property
+    def recorded_substep(self) -> float:
+        """The longest substep that would be recorded now [s]; does not wait."""
+        return min(self.substep, self._longest / HEADROOM)
+
+    def count_for(self, dt: float) -> int:
+        """Number of substeps in a time [s]."""
+        longest = self.recorded_substep if self.device.is_capturing else self.substep
+        # A quotient that exceeds one by rounding counts as one.
+        return max(1, math.ceil(dt / longest * (1.0 - 1e-6)))
+
+    def is_due(self) -> bool:
+        """Whether the next substep begins with a measurement; the first one of a recording does."""
+        begins, self._recording = self.device.is_capturing and not self._recording, self.device.is_capturing
+        self.was_recorded = self.device.is_capturing
+        due = begins or self._since >= INTERVAL
+        self._since = 1 if due else self._since + 1
+        return due
+
+    def measure(self, state: newton.State, dt: float, substep: float) -> None:
+        """Measure at a state whose displacements have been gathered.
+
+        Args:
+            state: The state.
+            dt: The remaining time of the step [s].
+            substep: The planned length of a substep [s].
+        """
+        tets, model = self.tetrahedra, self.model
+        self._f.zero_()
+        tets.add_elastic_forces(tets.u, self._f)
+        self._curvature.find(tets.add_elastic_forces, self._inverse_mass, tets.u, self._f, model.particle_count)
+        ahead = max(dt, INTERVAL * substep)
+        inputs = [tets.elements, state.particle_q, state.particle_qd, ahead, model.tet_count, self._turn]
+        looked_at = -(-model.tet_count // int(gauge.TURNS))
+        self._launch(of_elements.find_posed_strains, inputs, [self._found], looked_at)
+        recorded = substep if self.device.is_capturing else 0.0
+        inputs = [self._at_rest, wp.float64(recorded)]
+        outputs = [self._found, self._allowed, self._turn, self._excess, self._seen.array]
+        self._launch(of_elements.take_safe_substep, inputs, outputs, 1)
+        self.recover()
+
+    def recover(self) -> None:
+        """Increase the used fraction of the safe substep a little after a failed step."""
+        self.share = min(1.0, RECOVERY * self.share)
+
+    def take_excess(self) -> float:
+        """The largest factor by which recorded substeps were too long since the last call; waits for the device."""
+        excess = float(self._excess.numpy()[0])
+        if excess > 0.0:
+            self._excess.zero_()
+        return excess
+
+    def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list, dim: int) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+
+
+def _size(model: newton.Model, tets: npt.NDArray[np.integer]) -> float:
+    """The diagonal of the bounding box of the largest connected body of tetrahedra [m]."""
+    count = model.particle_count
+    body = linked(node_pairs(tets), count)
+    number, x = int(body.max()) + 1, model.particle_q.numpy()
+    low, high = (np.full((number, 3), value) for value in (np.inf, -np.inf))
+    np.minimum.at(low, body, x)
+    np.maximum.at(high, body, x)
+    return float(np.linalg.norm(high - low, axis=1).max())
