@@ -7,7 +7,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import warp as wp
 
 from warp_corot.elasticity.model import isotropic_material
@@ -68,45 +67,30 @@ class Unknowns:
     """
 
     def __init__(self, model: newton.Model):
-        particles, bodies = _worlds_of(model)
-        size = np.bincount(particles, minlength=1)
-        size = size + np.pad(2 * np.bincount(bodies, minlength=0), (0, len(size)))[: len(size)]
+        particles, bodies = model.particle_count, model.body_count
+        worlds = model.particle_world.numpy()
+        if bodies:
+            worlds = np.concatenate([worlds, np.repeat(model.body_world.numpy(), 2)])
+        if worlds.min() < 0:
+            worlds = np.zeros_like(worlds)
+        worlds, size = np.unique(worlds, return_inverse=True, return_counts=True)[1:]
         if len(size) * size.max() > PADDING * size.sum():
-            particles, bodies = np.zeros_like(particles), np.zeros_like(bodies)
-            size = np.array([len(particles) + 2 * len(bodies)])
+            worlds, size = np.zeros_like(worlds), np.array([len(worlds)])
         self.worlds, self.count = len(size), int(size.max())
-        of_particles = particles * self.count + _places(particles)
-        first = np.bincount(particles, minlength=self.worlds)
-        of_bodies = bodies * self.count + first[bodies] + 2 * _places(bodies)
+        entry = np.empty(len(worlds), np.int32)
+        in_order = np.argsort(worlds, kind="stable")
+        entry[in_order] = np.arange(len(worlds)) + np.repeat(
+            self.count * np.arange(len(size)) - np.cumsum(size) + size, size
+        )
         owner = np.full(self.worlds * self.count, -1, np.int32)
-        owner[of_bodies] = np.arange(len(bodies))
+        owner[entry[particles::2]] = np.arange(bodies)
         self.particle, self.body, self.owner = (
-            wp.array(values, dtype=wp.int32, device=model.device) for values in (of_particles, of_bodies, owner)
+            wp.array(values, dtype=wp.int32, device=model.device)
+            for values in (entry[:particles], np.ascontiguousarray(entry[particles::2]), owner)
         )
 
     def __len__(self) -> int:
         return self.worlds * self.count
-
-
-def _worlds_of(model: newton.Model) -> tuple[npt.NDArray[np.integer], npt.NDArray[np.integer]]:
-    """Worlds of particles and bodies, all zero if something that moves is in no world."""
-    particles = model.particle_world.numpy()
-    bodies = model.body_world.numpy() if model.body_count else np.zeros(0, np.int32)
-    if min(particles.min(initial=0), bodies.min(initial=0)) < 0:
-        return np.zeros_like(particles), np.zeros_like(bodies)
-    numbers, places = np.unique(np.concatenate([particles, bodies]), return_inverse=True)
-    if not len(numbers):
-        return particles, bodies
-    return places[: len(particles)], places[len(particles) :]
-
-
-def _places(worlds: npt.NDArray[np.integer]) -> npt.NDArray[np.integer]:
-    """The number of each entry among those of its world."""
-    order = np.argsort(worlds, kind="stable")
-    starts = np.searchsorted(worlds[order], worlds[order], "left")
-    places = np.empty_like(order)
-    places[order] = np.arange(len(worlds)) - starts
-    return places
 
 
 class TurnedPieces:

@@ -29,6 +29,13 @@ FEW = 32
 #: Kernels over the states of particles and of bodies.
 OF_PARTICLES = kernels.state_kernels(wp.vec3, wp.vec3)
 OF_BODIES = kernels.state_kernels(wp.transform, wp.spatial_vector)
+#: What there is no room for, and what to do.
+_NO_ROOM = {
+    int(kernels.TOO_MANY_PAIRS): "pairs of soft bodies than Newton has room for: call pipeline.init_soft_self_contact "
+    "with larger vertex_buffer_pre_alloc and edge_buffer_pre_alloc",
+    int(kernels.TOO_MANY_CONTACTS): "soft contacts than contacts.soft_contact_max: make the CollisionPipeline with a "
+    "larger soft_contact_max",
+}
 
 
 class Steps:
@@ -363,16 +370,8 @@ class Report:
         where = f" in world {world}" if self._model.world_count > 1 and world < self._model.world_count else ""
         if worst == int(kernels.BAD_INPUT):
             raise InputError(f"state_in is not finite{where}; state_out keeps its former values there")
-        if worst == int(kernels.TOO_MANY_PAIRS):
-            raise InputError(
-                "there are more pairs of soft bodies than Newton has room for: call pipeline.init_soft_self_contact "
-                f"with larger vertex_buffer_pre_alloc and edge_buffer_pre_alloc{where}; no step was made"
-            )
-        if worst == int(kernels.TOO_MANY_CONTACTS):
-            raise InputError(
-                "there are more soft contacts than contacts.soft_contact_max: make the CollisionPipeline with a "
-                "larger soft_contact_max; no step was made"
-            )
+        if worst in _NO_ROOM:
+            raise InputError(f"there are more {_NO_ROOM[worst]}{where}; no step was made")
         raise UnstableError(self._unstable(where, stable_dt, following))
 
     def _unstable(self, where: str, stable_dt: float | None, following: Following | None) -> str:
