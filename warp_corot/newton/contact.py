@@ -106,41 +106,29 @@ class Contacts:
         Raises:
             InputError: An attachment is rigid.
         """
-        if self.model.attachment_particle_body_count:
-            stiffness = self.model.attachment_particle_body_stiffness.numpy()
-            bad = np.flatnonzero(~np.isfinite(stiffness))
-            if len(bad):
-                raise InputError(f"attachment {bad[0]} has stiffness {stiffness[bad[0]]}; it must be finite [N/m]")
-        #: Largest possible stiffness of a contact or an attachment [N/m].
-        self.stiffest = self._find_stiffest()
-        #: Inverse mass of the lightest moving body that particles can touch or are attached to [1/kg]; 0: there is
-        #: none.
-        self.lightest = self._find_lightest()
-
-    def _find_stiffest(self) -> float:
-        found = [0.0]
-        if self.model.shape_count:
-            one = 0.5 * (self.model.soft_contact_ke + float(self.model.shape_material_ke.numpy().max()))
-            found.append(one * (CROWD if self.crowded else 1.0))
-        if self.pairs is not None:
-            found.append(CROWD * self.model.soft_contact_ke)
-        if self.model.attachment_particle_body_count:
-            found.append(float(self.model.attachment_particle_body_stiffness.numpy().max()))
-        return max(found)
-
-    def _find_lightest(self) -> float:
         model = self.model
-        if not model.body_count:
-            return 0.0
-        touched = np.zeros(model.body_count, bool)
+        found, touched = [0.0], np.zeros(model.body_count, bool)
         if model.shape_count:
+            one = 0.5 * (model.soft_contact_ke + float(model.shape_material_ke.numpy().max()))
+            found.append(one * (CROWD if self.crowded else 1.0))
             collide = (model.shape_flags.numpy() & int(newton.ShapeFlags.COLLIDE_PARTICLES)) != 0
             bodies = model.shape_body.numpy()
             touched[bodies[collide & (bodies >= 0)]] = True
+        if self.pairs is not None:
+            found.append(CROWD * model.soft_contact_ke)
         if model.attachment_particle_body_count:
+            stiffness = model.attachment_particle_body_stiffness.numpy()
+            bad = np.flatnonzero(~np.isfinite(stiffness))
+            if len(bad):
+                raise InputError(f"attachment {bad[0]} has stiffness {stiffness[bad[0]]}; it must be finite [N/m]")
+            found.append(float(stiffness.max()))
             touched[model.attachment_particle_body_body.numpy()] = True
-        touched &= (model.body_flags.numpy() & int(newton.BodyFlags.KINEMATIC)) == 0
-        return float(model.body_inv_mass.numpy()[touched].max(initial=0.0))
+        #: Largest possible stiffness of a contact or an attachment [N/m]; and inverse mass of the lightest moving body
+        #: that particles can touch or are attached to [1/kg], 0: there is none.
+        self.stiffest, self.lightest = max(found), 0.0
+        if model.body_count:
+            touched &= (model.body_flags.numpy() & KINEMATIC) == 0
+            self.lightest = float(model.body_inv_mass.numpy()[touched].max(initial=0.0))
 
     # --- launches ----------------------------------------------------------------------------------------------------
 
