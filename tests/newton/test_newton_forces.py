@@ -103,6 +103,27 @@ def test_forests_against_the_oracle(device, rng, copies):
     assert_near(impulse(solver, model, x), oracle_forces(model, rest, x, mu, lam), 1e-3)
 
 
+def test_a_tetrahedron_on_a_forest(device, rng):
+    """Its particles are displaced from the forest's rest positions for one and from the origin for the other, so the
+    forest is not stepped by its subtrees."""
+    material = wc.Isotropic(young=1e4, poisson=0.35, density=1000.0)
+    made = builder()
+    wn.add_forest(made, adaptive_forest(3), material, pos=(1.0, 2.0, 3.0))
+    corners = np.array(made.particle_q)[list(made.tri_indices[0])]
+    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+    top = corners.mean(axis=0) + 0.1 * normal / np.linalg.norm(normal)
+    made.add_particle(wp.vec3(*top.tolist()), wp.vec3(), 1.0)
+    made.add_tetrahedron(*made.tri_indices[0], made.particle_count - 1, MU, LAM, 0.0)
+    model = made.finalize(device=device)
+    assert model.tet_count == len(adaptive_forest(3).tets) + 1
+    with pytest.warns(UserWarning, match="has particles in other tetrahedra"):
+        solver = wn.SolverCorotated(model)
+    rest = model.particle_q.numpy().astype(float)
+    x = rest + 0.01 * rng.standard_normal(rest.shape)
+    mu, lam, _ = model.tet_materials.numpy().reshape(-1, 3).astype(float).T
+    assert_near(impulse(solver, model, x), oracle_forces(model, rest, x, mu, lam), 1e-3)
+
+
 def test_rotations_of_ancestors(device, rng):
     """With rotation_level: the same as the forest in this package."""
     forest = wc.TetForest.box((1, 1, 1), 0.3, 6)

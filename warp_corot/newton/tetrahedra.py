@@ -112,8 +112,8 @@ def forest_groups(model: newton.Model, tets: npt.NDArray[np.integer], rotation_l
         forest, starts = forests[chosen[0]], (particles[chosen], first[chosen])
         if not isinstance(forest, TetForest) or not _is_there(forest, model, tets, *starts):
             warnings.warn(
-                "a forest of this model comes from a file, or was changed after it was added; its tetrahedra are "
-                "stepped one by one",
+                "a forest of this model comes from a file, was changed after it was added, or has particles in other "
+                "tetrahedra; its tetrahedra are stepped one by one",
                 UserWarning,
                 stacklevel=5,
             )
