@@ -17,7 +17,7 @@ from warp_corot.kernels.elements.constitutive import (
     rotated_stress,
     symmetric,
 )
-from warp_corot.kernels.elements.elements import GeneralElements, load_node, scatter_stress
+from warp_corot.kernels.elements.elements import GeneralElements, scatter_stress
 from warp_corot.kernels.elements.forces import von_mises
 from warp_corot.kernels.elements.general_cuda import (
     PosedElements,
@@ -37,14 +37,6 @@ wp.set_module_options({"enable_backward": False})
 
 #: Number of tetrahedra that a thread checks for activation.
 EACH = wp.constant(4)
-
-
-@wp.func
-def deformation_gradient(elements: GeneralElements, t: int, x: wp.array[wp.vec4]):
-    nodes = elements.nodes[t]
-    x0 = load_node(x, nodes[0])
-    edges = wp.matrix_from_cols(load_node(x, nodes[1]) - x0, load_node(x, nodes[2]) - x0, load_node(x, nodes[3]) - x0)
-    return edges * elements.rest_inverse[t]
 
 
 @wp.func
@@ -142,7 +134,7 @@ scatter_posed_lanes = scatter_simd8(
 @wp.func
 def posed_stress(elements: GeneralElements, t: int, material: IsotropicMaterial, x: wp.array[wp.vec4]):
     """The stress of element t at positions x, right for every F, for ``elements.forces.repair_forces``."""
-    f = deformation_gradient(elements, t, x)
+    f = edge_differences(elements.nodes[t], x) * elements.rest_inverse[t]
     return corotated_stress(f, byers_xu(f), material.mu[t], material.lam[t])
 
 

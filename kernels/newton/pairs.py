@@ -46,8 +46,7 @@ class Surfaces:
     edges: wp.array2d[wp.int32]  # opposite vertices, then the edge's
     facing: wp.array[wp.float32]  # of each triangle: 1 if its normal points out of tetrahedra, -1 into them, 0 of cloth
     outward: wp.array[wp.vec2i]  # of each edge: its triangles on tetrahedra, or -1
-    part: wp.array[wp.int32]  # of each particle: its connected body
-    exposed: wp.array[wp.int32]  # of each particle: whether it is on a triangle
+    part: wp.array[wp.int32]  # of each particle: its connected body, or -1 if it is on no triangle
     rest: wp.array[wp.vec3]  # positions at first [m]
 
 
@@ -89,7 +88,7 @@ def vertex_row(surfaces: Surfaces, v: int, t: int, margin: float, q: wp.array[wp
     i = surfaces.triangles[t, 0]
     j = surfaces.triangles[t, 1]
     k = surfaces.triangles[t, 2]
-    if surfaces.exposed[v] == 0:
+    if surfaces.part[v] < 0:
         return row
     w = on_triangle(q[v], q[i], q[j], q[k])
     apart = q[v] - (w[0] * q[i] + w[1] * q[j] + w[2] * q[k])

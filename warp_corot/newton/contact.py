@@ -319,16 +319,12 @@ class SoftPairs:
         self.model, self.margin, self.device = model, margin, model.device
         triangles = model.tri_indices.numpy().reshape(-1, 3)
         edges = model.edge_indices.numpy().reshape(-1, 4)
-        count = model.particle_count
-        exposed = np.zeros(count, np.int32)
-        exposed[triangles] = 1
         facing = _facing(model, triangles)
         self._surfaces = surfaces = Surfaces()
         surfaces.triangles, surfaces.edges = model.tri_indices, model.edge_indices
         surfaces.facing = self._on_device(facing, wp.float32)
         surfaces.outward = self._on_device(_triangles_of_edges(triangles, edges, facing), wp.vec2i)
         surfaces.part = self._on_device(_parts(model, triangles), wp.int32)
-        surfaces.exposed = self._on_device(exposed, wp.int32)
         surfaces.rest = wp.clone(model.particle_q)
 
     def lists_of(self, contacts: newton.Contacts) -> PairLists:
@@ -406,7 +402,9 @@ def _places(wanted: npt.NDArray[np.integer], among: npt.NDArray[np.integer]) -> 
 
 
 def _parts(model: newton.Model, triangles: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
-    """Number of the connected body of each particle, int32 [P]."""
+    """Number of the connected body of each particle, -1 if it is on no triangle, int32 [P]."""
     tets = model.tet_indices.numpy().reshape(-1, 4)
     pairs = np.concatenate([node_pairs(tets)] + [triangles[:, [0, k]] for k in (1, 2)])
-    return linked(pairs, model.particle_count).astype(np.int32)
+    parts = np.full(model.particle_count, -1, np.int32)
+    parts[triangles] = linked(pairs, model.particle_count)[triangles]
+    return parts

@@ -39,6 +39,7 @@ class Others:
         damped: Whether springs, triangles or bending edges have dampers.
         is_own: Whether the bodies' solver is the one that is made here.
         contact: Stiffness [N/m] and damping [N s/m] of each contact between particles.
+        particle_forces: The forces on particles in the step [N], vec3 [P].
     """
 
     def __init__(self, model: newton.Model, rigid_solver: SolverBase | str | None, particle_contact: bool):
@@ -76,7 +77,7 @@ class Others:
                 raise InputError(f"{error} Give another rigid_solver, or None.") from None
         #: Copies of contacts without those of particles, by the original contacts.
         self._rigid_contacts: tuple[newton.Contacts, newton.Contacts] | None = None
-        self._particle_f = wp.empty(model.particle_count, dtype=wp.vec3, device=model.device)
+        self.particle_forces = wp.empty(model.particle_count, dtype=wp.vec3, device=model.device)
         #: Stiffness and damping at the last ``refresh``.
         self._seen: list[np.ndarray] = []
         self.refresh()
@@ -124,16 +125,11 @@ class Others:
             inputs = [x, model.edge_indices, model.edge_bending_properties, int(damping), u]
             wp.launch(scatter_bending, dim=model.edge_count, inputs=inputs, outputs=[f], device=model.device)
 
-    @property
-    def particle_forces(self) -> wp.array:
-        """The array for the forces on particles in the step [N], vec3 [P]."""
-        return self._particle_f
-
     def step(self, substep: Step, body_f: wp.array | None) -> None:
         """Make a step with the given wrenches on bodies and forces on particles."""
         now, out, control, contacts, dt, _ = substep
         rigid = self._without_soft(contacts)
-        with _forces(now, self._particle_f if self.has_particles else now.particle_f, body_f):
+        with _forces(now, self.particle_forces if self.has_particles else now.particle_f, body_f):
             if self._solver is not None:
                 self._solver.step(now, out, control, rigid, dt)
             if self._rigid is not None and self.has_bodies:
