@@ -11,8 +11,8 @@ import warp as wp
 from ranked import graded, jittered
 
 import warp_corot as wc
-from warp_corot.discretization.awaited import Awaited
 from warp_corot.discretization.groups import group_numbers
+from warp_corot.discretization.plan import Awaited
 from warp_corot.discretization.planning.fixed import ForcePlan
 from warp_corot.distributed.partition import Partition
 from warp_corot.distributed.parts import Part, numbered_part

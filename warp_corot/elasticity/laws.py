@@ -41,7 +41,7 @@ from warp_corot.kernels.subtrees.memory import BLOCK
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretized
-    from warp_corot.discretization.subtrees import Batch
+    from warp_corot.discretization.plan import Batch
     from warp_corot.elasticity.clusters import ClusterScatter
 
 

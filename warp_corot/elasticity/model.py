@@ -13,9 +13,8 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.discretization.discretization import Discretization, Discretized, discretization_of
-from warp_corot.discretization.members import Members
-from warp_corot.discretization.plan import FlatLeaves, Plan
-from warp_corot.discretization.subtrees import Batch, chosen
+from warp_corot.discretization.groups import Members
+from warp_corot.discretization.plan import Batch, FlatLeaves, Plan, chosen
 from warp_corot.elasticity.divided import DividedForces, Piece
 from warp_corot.errors import InputError
 from warp_corot.inputs.cpu_threads import Regions, Team, launch

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, ClassVar, TypeAlias
 import warp as wp
 
 from warp_corot.discretization.discretization import Discretization
-from warp_corot.discretization.plan import Plan, Units
-from warp_corot.discretization.subtrees import Batch, Sharing
+from warp_corot.discretization.plan import Batch, Plan, Sharing, Units
 from warp_corot.elasticity.clusters import ClusterScatter, clustered
 from warp_corot.elasticity.corotated.launches import DegenerateLeaves, OwnLaunches
 from warp_corot.elasticity.corotated.tangents import (
