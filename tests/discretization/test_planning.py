@@ -7,8 +7,8 @@ from plan_oracle import OraclePlan, OracleUnits
 
 import warp_corot as wc
 from warp_corot.discretization.frames import all_frames
+from warp_corot.discretization.plan import GROUPED_LEAVES, Sharing
 from warp_corot.discretization.planning.fixed import ForcePlan, pays_in_groups
-from warp_corot.discretization.subtrees import GROUPED_LEAVES, Sharing
 from warp_corot.kernels.tables.shapes import FRAME_SHIFT
 
 MATERIAL = wc.Isotropic(young=1e4, poisson=0.4, density=1000.0)
@@ -122,7 +122,7 @@ def test_slots_are_the_oracles(mesh, level, rotation_level, grouped, device):
 
 @pytest.mark.parametrize("threads", [2, 7, 5000])
 def test_any_number_of_threads_makes_the_same_plan(threads, device, monkeypatch):
-    for module in ("fixed", "targets"):
+    for module in ("fixed", "planner"):
         monkeypatch.setattr(f"warp_corot.discretization.planning.{module}.threads_on", lambda device: threads)
     forest, device = mixed(7), wp.get_device(device)
     options = {"worlds": 2, "grouped": True, "deterministic": True}

@@ -14,9 +14,10 @@ from tangents import diagonal
 import warp_corot as wc
 from warp_corot.discretization.deviatoric import deviatoric
 from warp_corot.discretization.discretization import FixedMesh
-from warp_corot.elasticity.corotated.fields import Simd8Field, SubtreeField
+from warp_corot.elasticity import ForceField
+from warp_corot.elasticity.corotated.fields import SubtreeField
 from warp_corot.elasticity.dilatation import DilatationField
-from warp_corot.elasticity.laws import LawCudaField, LawSimd8Field
+from warp_corot.elasticity.laws import LawCudaField
 
 YOUNG, POISSON = 1e4, 0.4
 MODELS = {
@@ -200,8 +201,7 @@ def test_one_launch_gives_the_forces_of_several_passes(law, device, rng, monkeyp
     body = wc.SoftBody(mesh, material, device=device)
     u = vec4(rng.uniform(-0.02, 0.02, mesh.points.shape), device)
     together = nodal(MODELS[law](dilatation="shared").bind(body).elastic_forces(u))
-    for kind in (SubtreeField, Simd8Field, LawSimd8Field):
-        monkeypatch.setattr(kind, "share_dilatation", lambda *_: False)
+    monkeypatch.setattr(ForceField, "share_dilatation", lambda *_: False)
     for kind in (SubtreeField, LawCudaField):
         monkeypatch.setattr(kind, "in_clusters", None)
     apart = nodal(MODELS[law](dilatation="shared").bind(body).elastic_forces(u))

@@ -5,9 +5,9 @@ import pytest
 from remesh_cases import CUBE, DENSITY, assert_sound, leaf_list, moving, random_marks, set_nodes
 
 import warp_corot as wc
-from warp_corot.discretization.changing.fields import CARRIED_BY_NODES, CARRIED_BY_TETRAHEDRA, OF_NODES, OF_TETRAHEDRA
 from warp_corot.discretization.changing.passes import RemeshPass
 from warp_corot.discretization.changing.pools import DeviceForest
+from warp_corot.discretization.changing.snapshot import CARRIED_BY_NODES, CARRIED_BY_TETRAHEDRA, OF_NODES, OF_TETRAHEDRA
 
 
 def points_of(device):

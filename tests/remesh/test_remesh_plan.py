@@ -8,12 +8,11 @@ from shortened import crossed
 
 import warp_corot as wc
 from warp_corot.discretization.changing.passes import RemeshPass
-from warp_corot.discretization.changing.plan import DevicePlan
+from warp_corot.discretization.changing.plan import DevicePlan, launch_size
 from warp_corot.discretization.changing.pools import DeviceForest
-from warp_corot.discretization.changing.sizes import launch_size
 from warp_corot.discretization.elements import device_elements
+from warp_corot.discretization.plan import Sharing
 from warp_corot.discretization.planning.fixed import ForcePlan, units_of
-from warp_corot.discretization.subtrees import Sharing
 from warp_corot.kernels.remesh.pools import SINKS
 from warp_corot.kernels.tables.shapes import FRAME_SHIFT
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from warp_corot.discretization.elements import in_worlds
 from warp_corot.discretization.frames import frame_keys, frame_table
-from warp_corot.discretization.planning.tree import subtree_nodes
-from warp_corot.discretization.subtrees import Sharing
+from warp_corot.discretization.plan import Sharing
+from warp_corot.discretization.planning.planner import subtree_nodes
 from warp_corot.kernels.tables.subtree import GROUP_NODES, LEAVES, group_leaves, group_nodes
 
 SUBTREE_LEVELS = 3

@@ -5,7 +5,7 @@ import oracle
 from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import spsolve
 
-from warp_corot.discretization.matching import neighbour_groups
+from warp_corot.discretization.groups import neighbour_groups
 
 
 def of_eights(mesh):

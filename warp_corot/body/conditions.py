@@ -8,9 +8,8 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.discretization.clock import Clock
 from warp_corot.discretization.discretization import Discretization
-from warp_corot.discretization.nodal import same_array
+from warp_corot.discretization.sizes import Clock, same_array
 from warp_corot.kernels.stepping.conditions import LOAD_NODES, follow_activation, free_nodes, hold_nodes, release_nodes
 from warp_corot.kernels.stepping.integrate import follow_trajectory
 

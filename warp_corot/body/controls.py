@@ -9,8 +9,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.discretization.elements import Mesh
-from warp_corot.discretization.nodal import vec3_view
-from warp_corot.discretization.sizes import Sizes
+from warp_corot.discretization.sizes import Sizes, vec3_view
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_indices
 from warp_corot.inputs.simulation_lock import under_lock

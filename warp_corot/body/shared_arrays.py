@@ -7,8 +7,7 @@ from typing import Any
 import warp as wp
 
 from warp_corot.discretization.discretization import MeshChanges
-from warp_corot.discretization.nodal import vec3_view
-from warp_corot.discretization.sizes import Sizes
+from warp_corot.discretization.sizes import Sizes, vec3_view
 from warp_corot.errors import InputError
 
 from .conditions import Conditions

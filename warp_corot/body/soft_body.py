@@ -9,10 +9,9 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.discretization.clock import Clock
 from warp_corot.discretization.discretization import Discretization, FixedMesh, MeshChanges
 from warp_corot.discretization.elements import Mesh, repeated
-from warp_corot.discretization.nodal import vec3_view
+from warp_corot.discretization.sizes import Clock, vec3_view
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_count, checked_numbers, shown
 from warp_corot.inputs.cpu_threads import team_for

@@ -9,8 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.discretization.nodal import padded, same_array
-from warp_corot.discretization.sizes import Sizes
+from warp_corot.discretization.sizes import Sizes, padded, same_array
 from warp_corot.kernels.stepping.integrate import ADOPT_POSITIONS, PUBLISH_POSITIONS
 
 if TYPE_CHECKING:

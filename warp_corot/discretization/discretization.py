@@ -19,14 +19,12 @@ from warp_corot.materials.directional import Directional
 from warp_corot.materials.isotropic import Material
 from warp_corot.mesh import TetForest
 
-from .awaited import Awaited
-from .clock import Clock
 from .elements import ElementKind, Elements, Mesh, device_elements, element_kind, with_targets
 from .frames import parts
 from .levels import Levels, TreeNodes
-from .plan import FlatLeaves, Plan
+from .plan import Awaited, FlatLeaves, Plan
 from .planning.fixed import ForcePlan, pays_in_groups, units_of
-from .sizes import Sizes
+from .sizes import Clock, Sizes
 from .slots import Slots
 
 if TYPE_CHECKING:

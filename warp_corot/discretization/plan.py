@@ -1,22 +1,89 @@
-"""The force plan: complete subtrees in batches of one type, and the remaining leaves.
+"""The force plan: complete subtrees in batches of one type, the units of work of the fast force path, and the remaining
+leaves.
 
-Meshing edits the tree. The plan is derived from the tree on the device, and steps read only the plan. It is derived
-once if the mesh never changes (``planning.fixed``), otherwise after each pass (``changing.plan``).
+In an adaptive forest, every stretch of equal levels benefits: eight leaves under one ancestor three levels up form a
+subtree, and eight of these subtrees under one ancestor form a group (CUDA). Other leaves are computed one by one.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+from enum import Enum
 from typing import Protocol
 
 import numpy as np
+import numpy.typing as npt
 import warp as wp
 
-from warp_corot.kernels.elements.elements import GeneralElements
+from warp_corot.discretization.elements import Elements
+from warp_corot.discretization.slots import Slots
+from warp_corot.inputs.cpu_threads import part_of
+from warp_corot.kernels.elements.elements import ForestElements, GeneralElements, Subtrees
 
-from .elements import Elements
-from .slots import Slots
-from .subtrees import Batch, Sharing
+#: With at least this many leaves in groups, a launch for groups saves more time than it costs.
+GROUPED_LEAVES = 1 << 16
+
+
+class Sharing(Enum):
+    """The owner of the rotation that the leaves of a subtree use."""
+
+    OWN = "own"
+    ROOT = "the subtree root's"
+    ABOVE = "an ancestor's above the root"
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Subtrees of one type in one launch, world after world.
+
+    Attributes:
+        shape: Their type, 0, 1 or 2.
+        grouped: Whether they come in groups of eight (CUDA).
+        count: Number of subtrees.
+        sharing: The owner of the rotation that their leaves use.
+        subtrees: ``kernels.elements.elements.Subtrees``.
+        roots: Their roots as forest elements if leaves share the root's rotation, else None.
+        unit: The one of ``Units`` that each uses if leaves share a rotation from further up, int32 [count], else None.
+        flagged: Set by the kernel: bit k of a subtree's byte if its leaf k, in tree order, was left out; uint8
+            [count, rounded up to eights].
+        live: The number of subtrees, if launches cover more, int32 [1] on the device, else None.
+    """
+
+    shape: int
+    grouped: bool
+    count: int
+    sharing: Sharing
+    subtrees: Subtrees
+    roots: ForestElements | None
+    unit: wp.array | None
+    flagged: wp.array
+    live: wp.array | None = None
+
+    def part(self, begin: int, end: int) -> Batch:
+        """Some of the subtrees, on the CPU; their leaves have own rotations."""
+        flags = wp.zeros(-(-(end - begin) // 8) * 8, dtype=wp.uint8, device="cpu")
+        return replace(self, count=end - begin, subtrees=part_of(self.subtrees, begin, end), flagged=flags)
+
+    @property
+    def flags_by_eights(self) -> wp.array:
+        """``flagged`` as uint64, eight subtrees each."""
+        return wp.array(ptr=self.flagged.ptr, dtype=wp.uint64, shape=len(self.flagged) // 8, device=self.flagged.device)
+
+
+def chosen(values: wp.array, places: wp.array) -> wp.array:
+    """The values of an array at chosen places."""
+    return wp.array(values.numpy()[places.numpy()], dtype=values.dtype, device=values.device)
+
+
+# --- the plan --------------------------------------------------------------------------------------------------------
+#
+# The force plan: complete subtrees in batches of one type, and the remaining leaves.
+#
+# Meshing edits the tree. The plan is derived from the tree on the device, and steps read only the plan. It is derived
+# once if the mesh never changes (``planning.fixed``), otherwise after each pass (``changing.plan``).
+
 
 __all__ = ["Batch", "FlatLeaves", "LeafCounts", "Plan", "Sharing", "Units"]
 
@@ -124,3 +191,39 @@ class Plan(Protocol):
 
     @property
     def counts(self) -> LeafCounts | None: ...
+
+
+# --- nodes whose displacements arrive during a step ------------------------------------------------------------------
+
+
+@dataclass(eq=False)
+class Awaited:
+    """Nodes that other processes move.
+
+    Attributes:
+        nodes: Mask of these nodes among those of all worlds, bool [worlds * N].
+        later: Launches within this context see their displacements, and run beside launches outside of it.
+        is_used: Whether forces have separate launches, so that some are computed before the nodes arrive.
+    """
+
+    nodes: npt.NDArray[np.bool_]
+    later: Callable[[], AbstractContextManager[None]]
+    is_used: bool = False
+
+    def divided(self, batch: Batch) -> tuple[Batch, Batch]:
+        """Divide groups of eight subtrees into those that need none of the nodes, and the others."""
+        nodes = batch.subtrees.nodes.numpy()
+        late = (self.nodes[np.maximum(nodes, 0)] & (nodes >= 0)).any(axis=1)
+        first, second = (_those(batch, nodes, np.flatnonzero(late == wanted)) for wanted in (False, True))
+        return first, second
+
+
+def _those(batch: Batch, nodes: npt.NDArray[np.int32], groups: npt.NDArray[np.intp]) -> Batch:
+    """Some groups of a batch."""
+    given, subtrees, device = batch.subtrees, Subtrees(), batch.flagged.device
+    members = wp.array((8 * groups[:, None] + np.arange(8)).ravel(), dtype=wp.int32, device="cpu")
+    subtrees.nodes = subtrees.targets = wp.array(nodes[groups], dtype=wp.int32, device=device, ndim=2)
+    subtrees.code, subtrees.first = chosen(given.code, members), chosen(given.first, members)
+    subtrees.frames, subtrees.size = given.frames, given.size
+    flagged = wp.zeros(len(members), dtype=wp.uint8, device=device)
+    return replace(batch, count=len(members), subtrees=subtrees, flagged=flagged)

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
-from warp_corot.discretization.awaited import Awaited
+from warp_corot.discretization.plan import Awaited
 from warp_corot.kernels.distributed import exchange as kernels
 from warp_corot.solvers.halo import Floats, Halo, Owned, V
 

@@ -16,7 +16,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
-from warp_corot.discretization.members import Members
+from warp_corot.discretization.groups import Members
 from warp_corot.kernels.distributed.multigrid import add_correction
 from warp_corot.kernels.implicit.multigrid import values
 from warp_corot.mesh import TetForest

@@ -10,8 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_corot.discretization.elements import Mesh
-from warp_corot.discretization.groups import group_numbers
-from warp_corot.discretization.matching import neighbour_groups
+from warp_corot.discretization.groups import group_numbers, neighbour_groups
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_numbers, shown
 from warp_corot.mesh import TetForest, TetMesh

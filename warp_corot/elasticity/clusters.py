@@ -12,8 +12,7 @@ import warp as wp
 
 from warp_corot.discretization.clusters import order_in_clusters, pairs_in_clusters
 from warp_corot.discretization.elements import Elements, in_worlds
-from warp_corot.discretization.plan import Plan
-from warp_corot.discretization.subtrees import GROUPED_LEAVES, Batch
+from warp_corot.discretization.plan import GROUPED_LEAVES, Batch, Plan
 from warp_corot.elasticity.cpu import as_general
 from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.clusters.laws import ActiveMaterial

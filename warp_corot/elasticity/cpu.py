@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import warp as wp
 
 from warp_corot.discretization.elements import Elements, copied
-from warp_corot.discretization.plan import Plan
+from warp_corot.discretization.plan import Plan, Sharing
 from warp_corot.elasticity.divided import Piece
-from warp_corot.elasticity.model import ForceField, Kept, isotropic_material
+from warp_corot.elasticity.model import Kept, isotropic_material, rotated_material
 from warp_corot.inputs.cpu_threads import Team, launch, part_of
 from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.corotated.anisotropic import FibreMaterial
@@ -31,11 +31,20 @@ from warp_corot.kernels.elements.elements import GeneralElements
 from warp_corot.kernels.elements.forces import repair_forces, scatter_forces
 from warp_corot.kernels.elements.native_laws import IsotropicLaw, NativeLaw
 from warp_corot.kernels.elements.simd8 import LANES
-from warp_corot.kernels.subtrees.cpu import DilatingMaterial, scatter_subtrees
+from warp_corot.kernels.subtrees.cpu import (
+    DilatingMaterial,
+    ToleranceMaterial,
+    scatter_law_subtrees,
+    scatter_subtrees,
+    scatter_subtrees_shared,
+    scatter_subtrees_tolerance,
+)
+from warp_corot.kernels.subtrees.degenerate import repair_own, repair_shared
 from warp_corot.mesh import TetForest
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretization
+    from warp_corot.elasticity.model import ForceField
 
 
 class Lanes:
@@ -203,62 +212,103 @@ def _material(isotropic: IsotropicMaterial, lam: wp.array, tolerance: float | No
 # --- isotropic laws: complete subtrees, and other elements -----------------------------------------------------------
 
 
-class InLanes(ForceField):
-    """The part of a field of an isotropic law for the CPU, where threads can divide it.
+class SimdForces:
+    """The forces of an isotropic law on the CPU: of complete subtrees, whose leaves have own rotations or their root's,
+    and of other elements.
 
-    With a shared dilatation the elements outside subtrees are in groups, and the field's own launches add its forces.
+    With a shared dilatation the elements outside subtrees are in groups, and these launches add its forces, too.
+
+    Args:
+        field: The field whose forces these are.
+        law: A law of ``kernels.elements.native_laws``.
+        repair: The kernel for the elements that it leaves out; None: it leaves none out.
+        tolerance: The largest angle at which the root's rotation is used [rad]; None: never.
     """
 
-    plan: Any
-    #: A law of ``kernels.elements.native_laws``, and the kernel for the elements that it leaves out.
-    lanes_law: IsotropicLaw = "corotated"
-    repair: wp.Kernel | None = None
-    _lanes: Lanes | None = None
+    def __init__(
+        self, field: ForceField, law: IsotropicLaw, repair: wp.Kernel | None = None, tolerance: float | None = None
+    ):
+        self._field, self._law, self._repair, self._tolerance = field, law, repair, tolerance
+        self.plan: Any = field.plan
+        self._dilating: Dilating | None = None
+        self._near, self._rotated = Kept(_near_material), Kept(rotated_material)
+        self._no_rotations, self._no_unit = (wp.empty(0, dtype=kind, device="cpu") for kind in (wp.mat33, wp.int32))
+        self.follow()
 
-    def share_dilatation(self, dilating: Dilating) -> bool:
+    def share_dilatation(self, dilating: Dilating) -> None:
+        """Add the forces of a shared dilatation, too, from now on."""
         self._dilating = dilating
         self.derive()
         self.follow()
-        return True
 
     def derive(self) -> None:
+        """See ``ForceField``."""
         if self._dilating is not None:
-            self._dilating.derive(self.isotropic)
+            self._dilating.derive(self._field.isotropic)
 
     def follow(self) -> None:
-        super().follow()
-        flat, of_law = self.plan.flat, {"scatter": scatter_law_elements(self.lanes_law), "repair": self.repair}
-        self._lanes, self._flat_material = None, self.isotropic
+        """See ``ForceField``."""
+        field, flat = self._field, self.plan.flat
+        of_law = {"scatter": scatter_law_elements(self._law), "repair": self._repair}
+        self._lanes: Lanes | None = None
+        self._flat_material = field.isotropic
         if self._dilating is not None:
             return
-        if not isinstance(self.discretization.mesh, TetForest):
-            self._lanes = Lanes(self.elements, self.elements, **of_law)
+        if not isinstance(field.discretization.mesh, TetForest):
+            self._lanes = Lanes(field.elements, field.elements, **of_law)
         elif len(flat):
-            self._flat_material = self.isotropic_of(flat)
-            if self.device.is_cpu and flat.unit is None:
-                general = flat.general or as_general(flat.elements, rest_matrices, [flat.elements])
-                self._lanes = Lanes(general, general, **of_law)
+            self._flat_material = field.isotropic_of(flat)
+            general = flat.general or as_general(flat.elements, rest_matrices, [flat.elements])
+            self._lanes = Lanes(general, general, **of_law)
 
     @property
-    def other_kernels(self) -> list[LoadedKernel]:
-        """The kernels for elements outside subtrees."""
-        law, dilating = self.lanes_law, self._dilating
-        scatter = scatter_law_elements(law) if dilating is None else dilating.kernel(law)
-        return [scatter] if self.repair is None else [scatter, self.repair]
+    def kernels(self) -> list[LoadedKernel]:
+        """The kernels that launches take, or may take later if the mesh changes."""
+        found: list[LoadedKernel] = [self._kernel(shape, sharing) for shape, _, sharing in self.plan.kinds]
+        dilating = self._dilating
+        if dilating is None and self._lanes is None and self.plan.counts is None:
+            return found
+        found.append(scatter_law_elements(self._law) if dilating is None else dilating.kernel(self._law))
+        return found if self._repair is None else [*found, self._repair]
 
-    def scatter_others(self, u: wp.array, f: wp.array) -> None:
-        """Add the forces of elements outside subtrees."""
+    def _kernel(self, shape: int, sharing: Sharing) -> wp.Kernel:
+        if sharing is not Sharing.OWN:
+            return scatter_subtrees_shared(shape, False)
+        shared = None if self._dilating is None else self._dilating.of
+        if self._tolerance is not None:
+            return scatter_subtrees_tolerance(shape, shared)
+        return scatter_law_subtrees(shape, self._law, shared)
+
+    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
+        """Add the forces [N] of displacements u to f; both vec4 [N]."""
+        isotropic = self._field.isotropic
+        material: Any = isotropic
         if self._dilating is not None:
-            self._dilating.scatter_groups(self.lanes_law, u, f, self.repair)
+            material = self._dilating.material(isotropic, self._tolerance)
+        elif self._tolerance is not None:
+            material = self._near(isotropic, self._tolerance)
+        for batch in self.plan.batches:
+            if not batch.count:
+                continue
+            own, first, threads = batch.sharing is Sharing.OWN, batch.subtrees.first, -(-batch.count // LANES)
+            of_batch = material if own else self._rotated(isotropic, self._no_rotations, self._no_unit)
+            inputs, kernel = [batch.subtrees, batch.count, of_batch, u], self._kernel(batch.shape, batch.sharing)
+            launch(kernel, threads, inputs, [f, batch.flagged], device="cpu")
+            if self._repair is not None:
+                flags, inputs = batch.flags_by_eights, [self._field.elements, isotropic, u]
+                repair, where = (repair_own, [1, flags, first]) if own else (repair_shared, [flags, first, batch.roots])
+                launch(repair, len(flags), [*where, *inputs], [f], device="cpu")
+        if self._dilating is not None:
+            self._dilating.scatter_groups(self._law, u, f, self._repair)
         elif self._lanes is not None:
             self._lanes.scatter_forces(self._flat_material, u, f)
 
     def pieces(self, team: Team) -> list[Piece]:
-        """See ``ForceField``: copies of the field, each with some of the subtrees and of the other elements."""
-        if self.plan.counts is not None or self.plan.units is not None:
+        """See ``ForceField``: copies, each with some of the subtrees and of the other elements."""
+        if self.plan.counts is not None:
             return []
 
-        worlds = self.discretization.worlds
+        worlds = self._field.discretization.worlds
 
         def parts_of(whole: Any) -> list[Any]:
             return [whole.part(*bounds) for bounds in team.bounds(whole.count, LANES, worlds)]
@@ -278,6 +328,12 @@ class InLanes(ForceField):
         if self._dilating is not None:
             return [*nodes, self._dilating.nodes] if self._dilating.count else nodes
         return nodes if self._lanes is None else [*nodes, self._lanes.elements.nodes]
+
+
+def _near_material(isotropic: IsotropicMaterial, tolerance: float) -> ToleranceMaterial:
+    material = ToleranceMaterial()
+    material.isotropic, material.tolerance = isotropic, tolerance
+    return material
 
 
 # --- all elements under any law, one by one or eight at a time -------------------------------------------------------

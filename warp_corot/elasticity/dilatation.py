@@ -12,9 +12,8 @@ import warp as wp
 
 from warp_corot.discretization.deviatoric import deviatoric
 from warp_corot.discretization.discretization import Discretization, discretization_of
-from warp_corot.discretization.members import Members
-from warp_corot.discretization.plan import Plan
-from warp_corot.discretization.subtrees import Batch
+from warp_corot.discretization.groups import Members
+from warp_corot.discretization.plan import Batch, Plan
 from warp_corot.elasticity.cpu import Dilating
 from warp_corot.elasticity.groups import ClusteredGroups, ElementGroups, elements_of, group_numbers
 from warp_corot.elasticity.model import ElementTangent, ForceField, SmallForces, Tangent

@@ -8,13 +8,11 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.discretization.changing.groups import ChangingGroups
-from warp_corot.discretization.changing.plan import DevicePlan
+from warp_corot.discretization.changing.plan import ChangingGroups, DevicePlan
 from warp_corot.discretization.discretization import Discretization
+from warp_corot.discretization.groups import Batch as GroupBatch
 from warp_corot.discretization.groups import Groups
-from warp_corot.discretization.members import Batch as GroupBatch
-from warp_corot.discretization.plan import Plan
-from warp_corot.discretization.subtrees import Batch
+from warp_corot.discretization.plan import Batch, Plan
 from warp_corot.elasticity.clusters import ClusterScatter
 from warp_corot.elasticity.model import Kept
 from warp_corot.errors import InputError

@@ -13,7 +13,7 @@ import warp as wp
 from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.plan import Plan
 from warp_corot.elasticity.clusters import divided
-from warp_corot.elasticity.cpu import InLanes
+from warp_corot.elasticity.cpu import SimdForces
 from warp_corot.elasticity.dilatation import AUTO, bind_law, check_dilatation
 from warp_corot.elasticity.model import ForceField, Law, LawField, Model
 from warp_corot.errors import InputError
@@ -33,15 +33,13 @@ from warp_corot.kernels.elements.constitutive import (
     stvk_stress,
 )
 from warp_corot.kernels.elements.dilatation import GREEN, LOG_VOLUME, SMALL, Dilatation
-from warp_corot.kernels.elements.simd8 import LANES
-from warp_corot.kernels.subtrees import cpu as subtree_cpu
 from warp_corot.kernels.subtrees import cuda as subtree_cuda
 from warp_corot.kernels.subtrees.degenerate import NO_LIST
 from warp_corot.kernels.subtrees.memory import BLOCK
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretized
-    from warp_corot.discretization.subtrees import Batch
+    from warp_corot.discretization.plan import Batch
     from warp_corot.elasticity.clusters import ClusterScatter
 
 
@@ -98,7 +96,7 @@ class LawCudaField(LawField):
             super().scatter_forces(u, f)
 
 
-class LawSimd8Field(InLanes, LawField):
+class LawSimdField(LawField):
     """Complete subtrees of a forest as units of work, other elements one by one, eight of each in the lanes.
 
     Args:
@@ -110,32 +108,10 @@ class LawSimd8Field(InLanes, LawField):
     def __init__(self, discretization: Discretization, law: Law, *, deterministic: bool = False):
         super().__init__(discretization, law, deterministic=deterministic)
         assert law.lanes is not None
-        self.lanes_law = law.lanes
-        self.follow()
+        self._simd = SimdForces(self, law.lanes)
 
     def plan_of(self, discretization: Discretization) -> Plan:
         return discretization.plan()
-
-    @property
-    def _force_kernels(self) -> list[LoadedKernel]:
-        return [*(self._kernel(shape) for shape, _grouped, _sharing in self.plan.kinds), *self.other_kernels]
-
-    def load_kernels(self) -> None:
-        load((), self.device, self._force_kernels)
-
-    def _kernel(self, shape: int) -> wp.Kernel:
-        return subtree_cpu.scatter_law_subtrees(
-            shape, self.lanes_law, None if self._dilating is None else self._dilating.of
-        )
-
-    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        material: Any = self.isotropic
-        if self._dilating is not None:
-            material = self._dilating.material(material)
-        for batch in self.plan.batches:
-            inputs, threads = [batch.subtrees, batch.count, material, u], -(-batch.count // LANES)
-            self.launch(self._kernel(batch.shape), threads, inputs, [f, batch.flagged])
-        self.scatter_others(u, f)
 
 
 # --- the choice of kernels -------------------------------------------------------------------------------------------
@@ -149,7 +125,7 @@ def law_field(law: Law, discretization: Discretization, deterministic: bool = Fa
         discretization: The mesh and the material.
         deterministic: As for every field.
     """
-    kind = LawSimd8Field if discretization.device.is_cpu else LawCudaField
+    kind = LawSimdField if discretization.device.is_cpu else LawCudaField
     return kind(discretization, law, deterministic=deterministic)
 
 

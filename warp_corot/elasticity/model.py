@@ -13,13 +13,12 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.discretization.discretization import Discretization, Discretized, discretization_of
-from warp_corot.discretization.members import Members
-from warp_corot.discretization.plan import FlatLeaves, Plan
-from warp_corot.discretization.subtrees import Batch, chosen
+from warp_corot.discretization.groups import Members
+from warp_corot.discretization.plan import Batch, FlatLeaves, Plan, chosen
 from warp_corot.elasticity.divided import DividedForces, Piece
 from warp_corot.errors import InputError
 from warp_corot.inputs.cpu_threads import Regions, Team, launch
-from warp_corot.inputs.loading import LoadedKernel
+from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.corotated.anisotropic import FibreMaterial
 from warp_corot.kernels.corotated.tangent import KeptStrains
 from warp_corot.kernels.elements.added import Prestress, PronyMaterial
@@ -43,7 +42,7 @@ from warp_corot.kernels.elements.stiffness_products import (
 
 if TYPE_CHECKING:
     from warp_corot.elasticity.clusters import ClusterScatter
-    from warp_corot.elasticity.cpu import Dilating
+    from warp_corot.elasticity.cpu import Dilating, SimdForces
     from warp_corot.kernels.stepping.pace import Pace
 
 
@@ -66,6 +65,13 @@ class Kept(Generic[S]):
         if self._struct is None or any(a is not b for a, b in zip(values, self._values, strict=True)):
             self._values, self._struct = values, self._make(*values)
         return self._struct
+
+
+def rotated_material(isotropic: IsotropicMaterial, rotations: wp.array, unit: wp.array) -> RotatedMaterial:
+    """Lamé's parameters with given rotations."""
+    material = RotatedMaterial()
+    material.isotropic, material.rotations, material.unit = isotropic, rotations, unit
+    return material
 
 
 def isotropic_material(given: list) -> IsotropicMaterial:
@@ -143,7 +149,8 @@ class ForceField(ABC):
     takes_anisotropic: ClassVar[bool] = False
     is_linear: bool = False
     shares_dilatation: ClassVar[bool] = False
-    _dilating: Dilating | None = None
+    #: The launches on the CPU of a field of an isotropic law, which threads can divide.
+    _simd: SimdForces | None = None
     _divided: DividedForces | None = None
 
     def __init__(self, body: Discretized | Discretization, deterministic: bool = False):
@@ -180,7 +187,7 @@ class ForceField(ABC):
 
     def pieces(self, team: Team) -> Sequence[Piece]:
         """Parts of the field whose forces add up to this one's; none if it cannot be divided."""
-        return []
+        return [] if self._simd is None else self._simd.pieces(team)
 
     def add_forces(self, u: wp.array, f: wp.array) -> None:
         """Add the elastic nodal forces [N] of displacements u to f; both vec4 [worlds * N]."""
@@ -229,20 +236,24 @@ class ForceField(ABC):
         """Kernels of factories that steps on the CPU launch; each that is named is loaded beside others."""
         return []
 
-    def load_kernels(self) -> None:  # noqa: B027 (most have none)
+    def load_kernels(self) -> None:
         """Load every kernel that a later plan may need, so that none is compiled during steps.
 
         Called before the first step if plans change.
         """
+        if self._simd is not None:
+            load((), self.device, self._simd.kernels)
 
     def note(self) -> None:  # noqa: B027 (most keep nothing)
         """Launch the update of the data that elements carry; called before a pass changes the mesh."""
 
-    def derive(self) -> None:  # noqa: B027 (most need nothing)
+    def derive(self) -> None:
         """Launch the update of the field's data of elements, if the plan has changed; may be recorded.
 
         Called if plans change, each time after one is derived.
         """
+        if self._simd is not None:
+            self._simd.derive()
 
     def take_material(self) -> None:
         """Copy Lamé's parameters again, because their values have changed in the arrays."""
@@ -250,20 +261,24 @@ class ForceField(ABC):
             leaves, own = self._flat_lame
             for copy, values in zip(own, self._lame, strict=True):
                 copy.assign(chosen(values, leaves))
-        if self._dilating is not None:
-            self._dilating.derive(self.isotropic)
+        if self._simd is not None:
+            self._simd.derive()
 
-    def follow(self) -> None:  # noqa: B027 (most need nothing)
+    def follow(self) -> None:
         """Adapt launches to the present sizes of the plan.
 
         Called if plans change, before steps are recorded, whenever a size has changed.
         """
+        if self._simd is not None:
+            self._simd.follow()
 
     def share_dilatation(self, dilating: Dilating) -> bool:
         """Add the forces of a dilatation that subtrees and groups share, too, from now on (CPU); return whether the
         field can.
         """
-        return False
+        if self._simd is not None:
+            self._simd.share_dilatation(dilating)
+        return self._simd is not None
 
     @property
     def stiffest(self) -> SmallForces:
@@ -496,7 +511,7 @@ class ElementField(ForceField):
 
     @property
     def _force_kernels(self) -> list[LoadedKernel]:
-        return [self._forces]
+        return [self._forces] if self._simd is None else self._simd.kernels
 
     @property
     def _forces(self) -> wp.Kernel:
@@ -507,7 +522,10 @@ class ElementField(ForceField):
         return StressLaw(*self._functions, self.material, self._Material)
 
     def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        self.launch(self._forces, self.element_count, [self.elements, self.material, u], [f])
+        if self._simd is not None:
+            self._simd.scatter_forces(u, f)
+        else:
+            self.launch(self._forces, self.element_count, [self.elements, self.material, u], [f])
 
     def write_energies(self, u: wp.array, energies: wp.array) -> None:
         self._launch_over_elements(self._energies, self.material, u, energies)

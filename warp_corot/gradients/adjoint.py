@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.discretization.nodal import padded
+from warp_corot.discretization.sizes import padded
 from warp_corot.elasticity import ForceField
 from warp_corot.errors import ConvergenceError
 from warp_corot.solvers.implicit.conjugate_gradients import ConjugateGradients

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.discretization.nodal import padded
+from warp_corot.discretization.sizes import padded
 from warp_corot.kernels.implicit import steps as rows
 from warp_corot.solvers.implicit.schemes import ImplicitIntegrator
 

@@ -14,7 +14,7 @@ import warp as wp
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.options import Contact
 from warp_corot.contact.shapes import Shape
-from warp_corot.discretization.nodal import padded
+from warp_corot.discretization.sizes import padded
 from warp_corot.elasticity import Corotated, Model
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.checks import checked_count, refuse_tape, shown

@@ -12,12 +12,11 @@ import warp as wp
 
 from warp_corot.discretization.changing.cutting import CutPass
 from warp_corot.discretization.changing.passes import RemeshPass
-from warp_corot.discretization.changing.plan import DevicePlan
+from warp_corot.discretization.changing.plan import DevicePlan, launch_size
 from warp_corot.discretization.changing.pools import DeviceForest, PassCounts
-from warp_corot.discretization.changing.sizes import launch_size
 from warp_corot.discretization.changing.survey import Survey
 from warp_corot.discretization.changing.transfer import Column
-from warp_corot.discretization.clock import Clock
+from warp_corot.discretization.sizes import Clock
 from warp_corot.errors import InputError
 from warp_corot.kernels.remesh.criteria import nearness
 from warp_corot.kernels.remesh.cut_surface import Surface

@@ -20,7 +20,7 @@ from warp_corot.contact.reading import ContactPoint, contact_points
 from warp_corot.contact.tool import Obstacle
 from warp_corot.cutting.blade import Blade, checked_blades
 from warp_corot.cutting.blades import Blades
-from warp_corot.discretization.nodal import vec3_view
+from warp_corot.discretization.sizes import vec3_view
 from warp_corot.elasticity import Corotated, Model
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_count, checked_flag, checked_number, refuse_tape

@@ -10,7 +10,7 @@ import warp as wp
 
 from warp_corot.kernels.remesh import pools as kernels
 
-from .fields import CARRIED_BY_NODES, CARRIED_BY_TETRAHEDRA, OF_NODES, OF_TETRAHEDRA
+from .snapshot import CARRIED_BY_NODES, CARRIED_BY_TETRAHEDRA, OF_NODES, OF_TETRAHEDRA
 
 if TYPE_CHECKING:
     from .pools import DeviceForest

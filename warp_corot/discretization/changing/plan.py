@@ -3,28 +3,57 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_corot.discretization.changing.pools import DeviceForest
 from warp_corot.discretization.elements import edge_lengths
 from warp_corot.discretization.frames import device_frames
-from warp_corot.discretization.plan import LeafCounts, Units
-from warp_corot.discretization.planning.arrays import GRANULE, PlanArrays, Room
-from warp_corot.discretization.planning.planner import Planner
-from warp_corot.discretization.subtrees import Sharing
+from warp_corot.discretization.groups import cubes_of
+from warp_corot.discretization.plan import LeafCounts, Sharing, Units
+from warp_corot.discretization.planning.planner import GRANULE, PlanArrays, Planner, Room
 from warp_corot.kernels.elements.cpu import rest_matrices
 from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.plan import changing as kernels
+from warp_corot.kernels.plan import groups as group_kernels
 from warp_corot.kernels.plan.plan import Plan
 from warp_corot.kernels.plan.tree import Tree
 from warp_corot.kernels.remesh.pools import LEAF_PADDING, LEAVES, NODE_TOP
 from warp_corot.kernels.tables.shapes import MIRROR_BIT
 from warp_corot.mesh.lattice import MAX_LEVEL
 
-from .pools import DeviceForest
-from .sizes import launch_size
+#: A launch keeps its size until it needs less than this fraction of it.
+SLACK = 0.8
+
+
+def launch_size(count: int, present: int, granule: int = 1, limit: int | None = None) -> int:
+    """A size for launches over ``count`` items and some padding, rarely different from the present one.
+
+    A new size is too large by at most a sixteenth or one granule.
+
+    Args:
+        count: Number of items.
+        present: The present size, or 0.
+        granule: A power of two; the size is a multiple of it.
+        limit: Number of places; a multiple of the granule if that matters.
+
+    Returns:
+        At least ``count``; 0 if that is 0.
+    """
+    if SLACK * present <= count <= present:
+        return present
+    if count == 0:
+        return 0
+    step = max(granule, 1 << max(count.bit_length() - 5, 0))
+    size = -(-count // step) * step
+    return size if limit is None else min(size, limit)
+
+
+# --- the plan --------------------------------------------------------------------------------------------------------
+
 
 #: Launches over leaves outside subtrees grow by at least about this part of all leaves.
 LEAST_FLAT = 128
@@ -234,3 +263,58 @@ def tree_of(forest: DeviceForest) -> Tree:
     # The frame of a root is along the axes: deformation gradients of padding are exact, energies zero.
     tree.sink, tree.padding_code = pools.sink, int(pools.code[:1].numpy()[0])
     return tree
+
+
+# --- groups of the leaves outside subtrees ---------------------------------------------------------------------------
+
+
+class ChangingGroups:
+    """Groups of a plan's leaves outside subtrees.
+
+    Args:
+        plan: The plan; launch ``launch`` after it.
+
+    Attributes:
+        starts, members: As in ``groups.Groups``, with room for the largest possible number.
+        live: Number of groups, int32 [1] on the device.
+    """
+
+    def __init__(self, plan: DevicePlan):
+        self._forest, self._plan, self.device = plan.forest, plan.arrays, plan.device
+        source, most = plan.forest.source, len(plan.arrays.flat)
+        _, cube_of_root = np.unique(
+            cubes_of(source, source.tree.tets[: self._pools.roots]), axis=0, return_inverse=True
+        )
+        groups = self._groups = group_kernels.Groups()
+        groups.count = self._zeros(1)
+        groups.starts, groups.size = self._zeros(most + 1), self._zeros(most + 1)
+        groups.members, groups.filled = self._zeros(most), self._zeros(most)
+        tetrahedra = len(self._pools.level)
+        groups.tally, groups.makes, groups.is_flat = (self._zeros(tetrahedra) for _ in range(3))
+        count = int(cube_of_root.max()) + 1
+        groups.cube_tally, groups.cube_makes = self._zeros(count), self._zeros(count)
+        groups.cube_of_root = wp.array(cube_of_root.ravel(), dtype=wp.int32, device=self.device)
+        self.starts, self.members, self.live = groups.starts, groups.members, groups.count
+
+    def launch(self) -> None:
+        """Launch the search for groups if the plan has just been derived; may be recorded."""
+        pools, plan, groups = self._pools, self._plan, self._groups
+        most, tetrahedra, cubes = len(groups.filled), len(groups.tally), len(groups.cube_tally)
+        self._launch(group_kernels.begin_groups, max(most, tetrahedra, cubes), pools, plan)
+        self._launch(group_kernels.mark_flat, most, pools, plan)
+        self._launch(group_kernels.climb, tetrahedra, pools, plan)
+        self._launch(group_kernels.number_cubes, cubes, plan)
+        self._launch(group_kernels.count_members, most, pools, plan)
+        wp.utils.array_scan(groups.size, groups.starts, inclusive=True)
+        self._launch(group_kernels.place_members, most, pools, plan)
+        self._launch(group_kernels.order_members, most, plan)
+
+    @property
+    def _pools(self) -> Any:
+        return self._forest.pools
+
+    def _zeros(self, count: int) -> wp.array:
+        return wp.zeros(count, dtype=wp.int32, device=self.device)
+
+    def _launch(self, kernel: wp.Kernel, dim: int, *arguments: Any) -> None:
+        wp.launch(kernel, dim=dim, inputs=[*arguments, self._groups], device=self.device)

@@ -18,8 +18,7 @@ from warp_corot.kernels.remesh import pools as kernels
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.tree import LIVE, VOID, Tree
 
-from .fields import padding
-from .snapshot import Snapshot
+from .snapshot import Snapshot, padding
 from .transfer import Carriage, Column, Numbers
 
 
@@ -184,7 +183,7 @@ class DeviceForest:
         All nodes that leaves name keep their numbers. In a domain's mesh, the function's values at new nodes are means,
         as in ``TetForest.refine``; ``fill`` and ``labels`` are those that the leaves carry.
         """
-        from .export import exported
+        from .snapshot import exported
 
         return exported(self)
 

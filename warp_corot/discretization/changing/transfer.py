@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.discretization.nodal import padded
+from warp_corot.discretization.sizes import padded
 from warp_corot.errors import InputError
 from warp_corot.kernels.remesh.pools import SINKS
 from warp_corot.kernels.remesh.state import MEAN, NO_ROW, Carried

@@ -10,15 +10,11 @@ from typing import TYPE_CHECKING, cast
 import warp as wp
 
 from warp_corot.discretization.elements import Elements, device_elements, with_targets
-from warp_corot.discretization.plan import FlatLeaves, Units
+from warp_corot.discretization.plan import GROUPED_LEAVES, Batch, FlatLeaves, Sharing, Units
 from warp_corot.discretization.slots import Slots
-from warp_corot.discretization.subtrees import GROUPED_LEAVES, Batch, Sharing
 from warp_corot.mesh import TetForest
 
-from .arrays import PlanArrays, Room
-from .planner import Planner, threads_on
-from .targets import SubtreeTargets
-from .tree import tree_of
+from .planner import PlanArrays, Planner, Room, SubtreeTargets, threads_on, tree_of
 
 if TYPE_CHECKING:
     from warp_corot.kernels.elements.elements import ForestElements

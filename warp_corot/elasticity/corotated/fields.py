@@ -3,15 +3,14 @@ work."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, TypeAlias
+from typing import TYPE_CHECKING, ClassVar
 
 import warp as wp
 
 from warp_corot.discretization.discretization import Discretization
-from warp_corot.discretization.plan import Plan, Units
-from warp_corot.discretization.subtrees import Batch, Sharing
+from warp_corot.discretization.plan import Batch, Plan, Sharing, Units
 from warp_corot.elasticity.clusters import ClusterScatter, clustered
 from warp_corot.elasticity.corotated.launches import DegenerateLeaves, OwnLaunches
 from warp_corot.elasticity.corotated.tangents import (
@@ -22,8 +21,8 @@ from warp_corot.elasticity.corotated.tangents import (
     SubtreeTangent,
     subtrees_of,
 )
-from warp_corot.elasticity.cpu import Dilating, InLanes
-from warp_corot.elasticity.model import ForceField, Kept, StressLaw, Tangent
+from warp_corot.elasticity.cpu import Dilating, SimdForces
+from warp_corot.elasticity.model import ForceField, Kept, StressLaw, Tangent, rotated_material
 from warp_corot.inputs.cpu_threads import launch
 from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.clusters.laws import isotropic_law
@@ -60,13 +59,6 @@ class Rotations:
     @classmethod
     def of(cls, units: Units) -> Rotations:
         return cls(units, wp.empty(units.count, dtype=wp.mat33, device=units.unit.device))
-
-
-def rotated_material(isotropic: IsotropicMaterial, rotations: wp.array, unit: wp.array) -> RotatedMaterial:
-    """Lamé's parameters with given rotations."""
-    material = RotatedMaterial()
-    material.isotropic, material.rotations, material.unit = isotropic, rotations, unit
-    return material
 
 
 class CorotatedField(ForceField):
@@ -113,6 +105,7 @@ class CorotatedField(ForceField):
         return discretization.plan(self.rotation_level, subtrees=self.takes_subtrees, deterministic=self.deterministic)
 
     def follow(self) -> None:
+        super().follow()
         self._shared = None
 
     @property
@@ -217,23 +210,6 @@ class LeafField(CorotatedField):
             self._sharing()
 
 
-class Simd8Field(InLanes, CorotatedField):
-    """General elements on the CPU."""
-
-    repair = repair_elements
-
-    def __init__(self, discretization: Discretization, model: CorotatedOptions, deterministic: bool):
-        super().__init__(discretization, model, deterministic)
-        self.follow()
-
-    @property
-    def _force_kernels(self) -> list[LoadedKernel]:
-        return self.other_kernels
-
-    def scatter_forces(self, u: wp.array, f: wp.array) -> None:
-        self.scatter_others(u, f)
-
-
 # --- elements in clusters on CUDA ------------------------------------------------------------------------------------
 
 
@@ -265,51 +241,43 @@ class CorotatedGeneralField(LeafField):
 # left out.
 
 
-#: The structs that kernels of lanes read.
-LanesMaterial: TypeAlias = (
-    "IsotropicMaterial | RotatedMaterial | subtree_cpu.ToleranceMaterial | subtree_cpu.DilatingMaterial"
-)
-
-
-class SubtreeField(InLanes, CorotatedField):
-    """The fast path: complete subtrees in batches, leaf by leaf only what is left over."""
+class SubtreeField(CorotatedField):
+    """The fast path: complete subtrees in batches, leaf by leaf only what is left over; general meshes on the CPU."""
 
     takes_subtrees = True
-    repair = repair_elements
 
     def __init__(self, discretization: Discretization, model: CorotatedOptions, deterministic: bool):
         super().__init__(discretization, model, deterministic)
         self._uniform = discretization.material_stride == 0
+        if self.device.is_cpu and self.plan.units is None:
+            self._simd = SimdForces(self, "corotated", repair_elements, model.tolerance)
         self.follow()
-        self.derive()
 
     @property
     def _force_kernels(self) -> list[LoadedKernel]:
         if self._own_launches is not None:
             return [*self._own_launches.kernels, DegenerateLeaves.kernel]
+        if self._simd is not None:
+            return self._simd.kernels
         of_subtrees: list[LoadedKernel] = [(self._kernel(*kind), self._block) for kind in self.plan.kinds]
-        if self._dilating is not None or self._lanes is not None:
-            return [*of_subtrees, *self.other_kernels]
         of_leaves = [self._own if self.plan.flat.unit is None else self._forces] if len(self.plan.flat) else []
         return [*of_subtrees, *of_leaves]
 
     def load_kernels(self) -> None:
         one_launch = self._listed and self.rotation_level is None
-        kinds = () if one_launch else self.plan.kinds
+        kinds = () if one_launch or self._simd is not None else self.plan.kinds
         found: list[LoadedKernel] = [(self._kernel(*kind), self._block) for kind in kinds]
         found += [self._forces, self._own, self._extract, repair_own]
-        found += self.other_kernels if self.device.is_cpu else []
+        found += [] if self._simd is None else self._simd.kernels
         found += [DegenerateLeaves.kernel] if self._listed else []
         load((), self.device, [*found, *([OwnLaunches.later_kernel(self._uniform)] if one_launch else [])])
 
     def share_dilatation(self, dilating: Dilating) -> bool:
-        if any(sharing is not Sharing.OWN for _shape, _grouped, sharing in self.plan.kinds):
-            return False
-        return super().share_dilatation(dilating)
+        own = all(sharing is Sharing.OWN for _shape, _grouped, sharing in self.plan.kinds)
+        return own and super().share_dilatation(dilating)
 
     def tangent(self, *, exact: bool = False) -> Tangent:
-        own = self.model.level is None and self._tolerance is None
-        if not exact and own and self._listed and self.element_count >= FEWEST:
+        if not exact and self.model.level is None and self._listed and self.element_count >= FEWEST:
             batches = subtrees_of(self.plan)
             if batches is not None:
                 return SubtreeTangent(self, batches)
@@ -342,13 +310,8 @@ class SubtreeField(InLanes, CorotatedField):
                 return
             self._degenerate = DegenerateLeaves.of(plan, self.device)
         self._kernels = [self._kernel(batch.shape, batch.grouped, batch.sharing) for batch in plan.batches]
-        self._materials = [self._material(batch) for batch in plan.batches]
-        self._flat_rotated = Kept(rotated_material)
-
-    @property
-    def _tolerance(self) -> float | None:
-        """The model's tolerance on the CPU; on CUDA sharing within one gained 7 % at most, so there is none."""
-        return self.model.tolerance if self.device.is_cpu else None
+        self._batch_materials = [Kept(rotated_material) for _ in plan.batches]
+        self._flat_material, self._flat_rotated = self.isotropic_of(plan.flat), Kept(rotated_material)
 
     @property
     def _listed(self) -> bool:
@@ -361,14 +324,15 @@ class SubtreeField(InLanes, CorotatedField):
             self._own_launches.scatter_forces(u, f, self._degenerate.own)
             self._degenerate.repair(self.elements, self.isotropic, u, f)
             return
+        if self._simd is not None:
+            self._simd.scatter_forces(u, f)
+            return
         if self.plan.units is not None:
             self.extract_rotations(u)
-        for batch, kernel, material in zip(self.plan.batches, self._kernels, self._materials, strict=True):
-            self._launch_batch(batch, kernel, material, u, f)
+        for batch, kernel, kept in zip(self.plan.batches, self._kernels, self._batch_materials, strict=True):
+            self._launch_batch(batch, kernel, kept, u, f)
         flat = self.plan.flat
-        if self._dilating is not None or self._lanes is not None:
-            self.scatter_others(u, f)
-        elif len(flat) and flat.unit is not None:
+        if len(flat) and flat.unit is not None:
             rotated = self._flat_rotated(self._flat_material, self._rotations, flat.unit)
             self.launch(self._forces, len(flat), [flat.elements, rotated, u], [f])
         elif len(flat):
@@ -378,46 +342,27 @@ class SubtreeField(InLanes, CorotatedField):
 
     def _kernel(self, shape: int, grouped: bool, sharing: Sharing) -> wp.Kernel:
         given = sharing is Sharing.ABOVE
-        if self.device.is_cuda:
-            if sharing is Sharing.OWN:
-                return subtree_cuda.scatter_subtrees_own(shape, grouped, self._uniform, self._listed)
-            return subtree_cuda.scatter_subtrees_shared(shape, grouped, self._uniform, given, self._listed)
         if sharing is Sharing.OWN:
-            dilatation = None if self._dilating is None else self._dilating.of
-            if self._tolerance is not None:
-                return subtree_cpu.scatter_subtrees_tolerance(shape, dilatation)
-            return subtree_cpu.scatter_law_subtrees(shape, shared=dilatation)
-        return subtree_cpu.scatter_subtrees_shared(shape, given)
-
-    def _material(self, batch: Batch) -> Callable[[], LanesMaterial]:
-        """The function that makes the struct that a kernel of lanes reads."""
-        if batch.sharing is not Sharing.OWN:
-            rotated, unit = Kept(rotated_material), self._no_unit if batch.unit is None else batch.unit
-            return lambda: rotated(self.isotropic, self._rotations, unit)
-        if self._dilating is not None:
-            dilating = self._dilating
-            return lambda: dilating.material(self.isotropic, self._tolerance)
-        if self._tolerance is not None:
-            near, tolerance = Kept(near_material), self._tolerance
-            return lambda: near(self.isotropic, tolerance)
-        return lambda: self.isotropic
+            if self.device.is_cpu:
+                return subtree_cpu.scatter_law_subtrees(shape)
+            return subtree_cuda.scatter_subtrees_own(shape, grouped, self._uniform, self._listed)
+        if self.device.is_cpu:
+            return subtree_cpu.scatter_subtrees_shared(shape, given)
+        return subtree_cuda.scatter_subtrees_shared(shape, grouped, self._uniform, given, self._listed)
 
     def _launch_batch(
-        self, batch: Batch, kernel: wp.Kernel, material: Callable[[], LanesMaterial], u: wp.array, f: wp.array
+        self, batch: Batch, kernel: wp.Kernel, kept: Kept[RotatedMaterial], u: wp.array, f: wp.array
     ) -> None:
         own = batch.sharing is Sharing.OWN
-        outputs = [f, batch.flagged]
+        unit = self._no_unit if batch.unit is None else batch.unit
         if self.device.is_cuda:
-            threads = batch.count
-            if own:
-                inputs = [batch.subtrees, self.isotropic, u]
-            else:
-                unit = self._no_unit if batch.unit is None else batch.unit
-                inputs = [batch.subtrees, self.isotropic, u, self._rotations, unit]
-            outputs.append(NO_LIST if self._degenerate is None else self._degenerate.list_of(batch))
+            threads, rotations = batch.count, [] if own else [self._rotations, unit]
+            inputs = [batch.subtrees, self.isotropic, u, *rotations]
+            outputs = [f, batch.flagged, NO_LIST if self._degenerate is None else self._degenerate.list_of(batch)]
         else:
-            threads = -(-batch.count // LANES)
-            inputs = [batch.subtrees, batch.count, material(), u]
+            material = self.isotropic if own else kept(self.isotropic, self._rotations, unit)
+            threads, inputs = -(-batch.count // LANES), [batch.subtrees, batch.count, material, u]
+            outputs = [f, batch.flagged]
         launch(kernel, threads, inputs, outputs, device=self.device, block_dim=self._block)
         if self._degenerate is not None or not batch.count:
             return
@@ -427,9 +372,3 @@ class SubtreeField(InLanes, CorotatedField):
             self.launch(repair_own, len(flags), [1, flags, batch.subtrees.first, *inputs], [f])
         elif batch.sharing is Sharing.ROOT:
             self.launch(repair_shared, len(flags), [flags, batch.subtrees.first, batch.roots, *inputs], [f])
-
-
-def near_material(isotropic: IsotropicMaterial, tolerance: float) -> subtree_cpu.ToleranceMaterial:
-    material = subtree_cpu.ToleranceMaterial()
-    material.isotropic, material.tolerance = isotropic, tolerance
-    return material

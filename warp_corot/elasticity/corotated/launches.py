@@ -6,10 +6,8 @@ from contextlib import nullcontext
 
 import warp as wp
 
-from warp_corot.discretization.awaited import Awaited
 from warp_corot.discretization.elements import Elements
-from warp_corot.discretization.plan import FlatLeaves, Plan
-from warp_corot.discretization.subtrees import GROUPED_LEAVES, Batch, Sharing
+from warp_corot.discretization.plan import GROUPED_LEAVES, Awaited, Batch, FlatLeaves, Plan, Sharing
 from warp_corot.elasticity.clusters import ClusterScatter, grouped_and_others
 from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.clusters.laws import isotropic_law

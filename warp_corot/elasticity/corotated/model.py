@@ -13,7 +13,6 @@ from warp_corot.elasticity.corotated.fields import (
     CorotatedField,
     CorotatedGeneralField,
     LeafField,
-    Simd8Field,
     SubtreeField,
 )
 from warp_corot.elasticity.dilatation import AUTO, bind_law, check_dilatation
@@ -147,7 +146,7 @@ class Corotated(CorotatedOptions):
         elif self.stiffness != "factored":
             raise InputError(f"stiffness {self.stiffness!r} needs a forest; general elements have no three shapes")
         elif fast and discretization.device.is_cpu:
-            return Simd8Field(discretization, self, deterministic)
+            return SubtreeField(discretization, self, deterministic)
         elif fast and not deterministic:
             return CorotatedGeneralField(discretization, self)
         return LeafField(discretization, self, deterministic)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 import warp as wp
 
-from warp_corot.discretization.subtrees import Batch, Sharing
+from warp_corot.discretization.plan import Batch, Sharing
 from warp_corot.elasticity.cpu import as_general
 from warp_corot.elasticity.model import ElementTangent, Kept, Tangent
 from warp_corot.kernels.corotated import turned_subtrees as kernels

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from warp_corot.discretization.discretization import Discretization
-from warp_corot.discretization.members import Members
+from warp_corot.discretization.groups import Members
 from warp_corot.inputs.cpu_threads import Regions, launch
 from warp_corot.kernels.elements.dilatation import not_held
 from warp_corot.kernels.elements.elements import ForestElements

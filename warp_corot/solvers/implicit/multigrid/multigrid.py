@@ -10,9 +10,9 @@ import numpy as np
 import warp as wp
 
 from warp_corot.discretization.discretization import Discretization, Discretized, discretization_of
+from warp_corot.discretization.groups import Members
 from warp_corot.discretization.levels import Levels
-from warp_corot.discretization.members import Members
-from warp_corot.discretization.subtrees import Batch
+from warp_corot.discretization.plan import Batch
 from warp_corot.errors import InputError
 from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.implicit.multigrid import pattern, values

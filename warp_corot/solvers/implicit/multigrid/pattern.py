@@ -8,8 +8,8 @@ from typing import Any
 
 import warp as wp
 
-from warp_corot.discretization.members import Members
-from warp_corot.discretization.subtrees import Batch
+from warp_corot.discretization.groups import Members
+from warp_corot.discretization.plan import Batch
 from warp_corot.kernels.implicit.multigrid import pattern as kernels
 from warp_corot.kernels.implicit.multigrid import roots as roots_kernels
 from warp_corot.kernels.implicit.multigrid import shared

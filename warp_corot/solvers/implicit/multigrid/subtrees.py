@@ -13,8 +13,8 @@ import numpy as np
 import warp as wp
 
 from warp_corot.discretization.discretization import Discretization, FixedMesh
-from warp_corot.discretization.members import Members
-from warp_corot.discretization.subtrees import Batch
+from warp_corot.discretization.groups import Members
+from warp_corot.discretization.plan import Batch
 from warp_corot.inputs.loading import load
 from warp_corot.kernels.corotated import turned_subtrees
 from warp_corot.kernels.elements.elements import ForestElements, Subtrees
