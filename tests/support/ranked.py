@@ -315,20 +315,9 @@ def forest_divided(kept: Path) -> np.ndarray | None:
     return wd.gather(body.positions)
 
 
-def general_divided(kept: Path) -> np.ndarray | None:
-    """The run "newmark" of a general mesh that rank 0 makes and divides, saved; the positions of all nodes on rank
-    0."""
-    import warp_corot.distributed as wd
-
-    body = body_of(wd.divided(jittered), 0.3)
-    sim = wd.Simulation(body, deterministic=True, **options_of("newmark"))
-    moved(sim, body)
-    sim.save(kept)
-    return wd.gather(body.positions)
-
-
 def general_loaded(file: Path) -> np.ndarray | None:
-    """The run "newmark" of a mesh that rank 0 reads from a file; the positions of all nodes on rank 0."""
+    """The run "newmark" of a mesh that rank 0 reads from a file and divides, saved beside it; the positions of all
+    nodes on rank 0."""
     import meshio
 
     import warp_corot.distributed as wd
@@ -346,6 +335,7 @@ def general_loaded(file: Path) -> np.ndarray | None:
     body = body_of(part, 0.3)
     sim = wd.Simulation(body, deterministic=True, **options_of("newmark"))
     moved(sim, body)
+    sim.save(file.with_suffix(".3.npz"))
     said = ""
     try:
         wd.load(file.with_name("no.vtu"))
@@ -447,9 +437,8 @@ def make_all(folder: Path, size: int, names: list[str]) -> None:
             found["divided.x"] = forest_divided(folder / "divided.3.npz")
             found |= resumed(folder / "divided.3.npz")
         if "newmark" in names:
-            found["divided.newmark.x"] = general_divided(folder / "general.3.npz")
-            found |= resumed(folder / "general.3.npz")
             found["loaded.newmark.x"] = general_loaded(folder / "general.vtu")
+            found |= resumed(folder / "general.3.npz")
         if "worlds" in names:
             active_in_parts(folder / "active.3.npz")
             found |= worlds_in_parts(folder / f"{size}.usda")
