@@ -26,9 +26,9 @@ Floats = npt.NDArray[np.float64]
 #: A buffer for each neighbour.
 Room = dict[int, npt.NDArray[Any]]
 
-#: Bits of the whole numbers into which addends are split, so that sums of 2**32 of them fit into int64; and the number
-#: of splits.
-BITS, ROUNDS = 30, 3
+#: Bits of the whole numbers into which addends are split, so that sums of 2**32 of them fit into int64; and the binary
+#: logarithm of the smallest unit.
+BITS, LEAST_POWER = 30, -1020
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,29 +273,28 @@ def reproducible_sums(addends: Floats, comm: Any) -> Floats:
     """The sums of all ranks' addends, [n, columns] -> [columns], the same in any order; NaN where any addend is not
     finite.
 
-    Each addend is split into whole numbers of smaller and smaller units, powers of two below the largest addend of all
-    ranks. Sums of whole numbers are exact.
+    Each addend is split into whole numbers of smaller and smaller units, the same powers of two on all ranks. Sums of
+    whole numbers are exact.
     """
     columns = addends.shape[1]
-    sizes = np.abs(addends).max(axis=0, initial=0.0)
-    bad = ~np.isfinite(sizes)
-    most = np.where(bad, 0.0, sizes)
-    everywhere = np.array(comm.allgather(np.stack([most, bad])))
-    most, bad = everywhere[:, 0].max(axis=0), everywhere[:, 1].max(axis=0) > 0
+    bad = ~np.isfinite(addends).all(axis=0)
     left = np.where(bad, 0.0, addends)
-    unit = np.ldexp(1.0, np.frexp(most)[1])
-    total = np.zeros(columns)
-    parts = np.zeros((ROUNDS, columns), np.int64)
-    units = np.zeros((ROUNDS, columns))
-    for number in range(ROUNDS):
-        unit = np.ldexp(unit, -BITS)
-        units[number] = unit
-        known = unit > 0.0
-        whole = np.where(known, np.rint(left / np.where(known, unit, 1.0)), 0.0)
+    first = power = BITS * (1 + int(np.frexp(np.abs(left).max(initial=0.0))[1]) // BITS)
+    parts, is_left = [], left.any(axis=1)
+    while is_left.any() and power > LEAST_POWER:
+        if 4 * np.count_nonzero(is_left) < len(left):
+            left = left[is_left]
+        power -= BITS
+        unit = np.ldexp(1.0, power)
+        whole = np.rint(left * (1.0 / unit))
         left = left - whole * unit
-        parts[number] = whole.astype(np.int64).sum(axis=0)
-    together = np.array(comm.allgather(parts)).sum(axis=0)
+        parts.append(whole.astype(np.int64).sum(axis=0))
+        is_left = left.any(axis=1)
+    sums: dict[int, Any] = {}
+    everywhere = comm.allgather((bad, first, parts))
+    for _, highest, of_rank in everywhere:
+        for number, part in enumerate(of_rank, start=1):
+            sums[highest - BITS * number] = sums.get(highest - BITS * number, 0) + part
     # Add the smallest units first.
-    for number in reversed(range(ROUNDS)):
-        total += together[number] * units[number]
-    return np.where(bad, np.nan, total)
+    total = sum((np.ldexp(sums[power].astype(np.float64), power) for power in sorted(sums)), np.zeros(columns))
+    return np.where(np.any([bad for bad, *_ in everywhere], axis=0), np.nan, total)
