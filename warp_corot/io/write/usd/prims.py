@@ -246,6 +246,13 @@ def triangle_samples(path: str, triangles: NDArray[np.int32]) -> Samples:
     }
 
 
+def declare_tet_stress(tets: Any) -> None:
+    """Declare the stress of each tetrahedron of a TetMesh."""
+    kind = Sdf.ValueTypeNames.FloatArray
+    stress = UsdGeom.PrimvarsAPI(tets).CreatePrimvar("vonMises", kind, UsdGeom.Tokens.uniform)
+    stress.GetAttr().SetDocumentation("Von Mises stress of each tetrahedron [Pa]")
+
+
 def declare_moving(body: Any, with_stress: bool, colored: bool = True) -> None:
     """Declare points, extent and, if it has any, colours: of the stress, or else of tissue."""
     body.CreatePointsAttr()
@@ -426,8 +433,7 @@ class TetPrims:
         types, tokens = Sdf.ValueTypeNames, UsdGeom.Tokens
         primvars.CreatePrimvar("rest", types.Point3fArray, tokens.vertex)
         if statics.stress:
-            stress = primvars.CreatePrimvar("vonMises", types.FloatArray, tokens.uniform)
-            stress.GetAttr().SetDocumentation("Von Mises stress of each tetrahedron [Pa]")
+            declare_tet_stress(primvars)
         if self._present.fixed is not None:
             fixed = primvars.CreatePrimvar("fixed", types.IntArray, tokens.vertex)
             fixed.GetAttr().SetDocumentation("1 where the node is held")
