@@ -9,8 +9,8 @@ import trimesh
 import warp_corot as wc
 from warp_corot.domain.fidelity import fidelity
 from warp_corot.domain.winding import net_edges
-from warp_corot.io.checkpoint.mesh import pack_mesh, unpack_mesh
-from warp_corot.io.checkpoint.tree import joined, split
+from warp_corot.io.checkpoint.archive import joined, split
+from warp_corot.io.checkpoint.contents import pack_mesh, unpack_mesh
 from warp_corot.mesh.surfaces import creases
 
 TURN = trimesh.transformations.euler_matrix(np.radians(20.0), np.radians(30.0), 0.0)

@@ -126,16 +126,15 @@ def place_ground(touched: RunContact, args: argparse.Namespace, bodies: Sequence
     up = up_of(bodies[0].subject, gravity)
     height = args.ground
     if height in (None, AUTO):
-        height = min(float((_touched_points(body, args) @ up).min()) for body in bodies)
-        height -= args.drop or 0.0
+        # The lowest point on which contact will act.
+        whole = are_several() and INTEGRATORS[integrator_name(args)].is_implicit
+        owns = [None if whole else own_surface(body.subject.mesh) for body in bodies]
+        points = [
+            body.subject.mesh.points[body.subject.used] if own is None else own.points
+            for body, own in zip(bodies, owns, strict=True)
+        ]
+        height = min(float((each @ up).min()) for each in points) - (args.drop or 0.0)
     touched.obstacles = {"ground": Ground(up, height), **touched.obstacles}
-
-
-def _touched_points(body: RunBody, args: argparse.Namespace) -> Floats:
-    """The points of a body on which contact will act [m], [n, 3]."""
-    is_implicit = INTEGRATORS[integrator_name(args)].is_implicit
-    own = None if are_several() and is_implicit else own_surface(body.subject.mesh)
-    return body.subject.mesh.points[body.subject.used] if own is None else own.points
 
 
 def say_reach(bodies: Sequence[RunBody], sim: Simulation) -> None:

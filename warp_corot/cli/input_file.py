@@ -321,12 +321,6 @@ def merged_nodes(
     points: npt.NDArray[np.float64], tets: npt.NDArray[np.int32]
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int32], npt.NDArray[np.int64]]:
     """Tetrahedra with coincident nodes merged, and the new node of each point."""
-    kept, place = _welded(points)
-    return points[kept], place[tets].astype(np.int32), place
-
-
-def _welded(points: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """The first point at each position, and the position of each point among them."""
     step = SAME * longest_side(points) or 1.0
     _, kept, place = np.unique(np.round(points / step), axis=0, return_index=True, return_inverse=True)
-    return kept, place.reshape(-1)
+    return points[kept], place.reshape(-1)[tets].astype(np.int32), place.reshape(-1)

@@ -128,7 +128,8 @@ def find_subject(opened: InputFile, args: argparse.Namespace) -> InputMesh:
     """
     if opened.kind == "box":
         level = BOX_LEVEL if args.level is None else args.level
-        return _box(1.0 if args.scale is None else args.scale, level, offset_of(args))
+        x, y, z = offset_of(args).tolist()
+        return box_subject(TetForest.box(CELLS, CELL_SIZE * (args.scale or 1.0), level, origin=(x, y, z)))
     loaded: LoadedMesh = placed(opened, args)
     points, tets = loaded.points, loaded.tets
     sets = {name: np.isin(np.arange(len(points)), nodes) for name, nodes in loaded.node_sets.items()}
@@ -177,11 +178,6 @@ def _joined(
 
 def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
-
-
-def _box(scale: float, level: int, offset: np.ndarray) -> InputMesh:
-    x, y, z = offset.tolist()
-    return box_subject(TetForest.box(CELLS, CELL_SIZE * scale, level, origin=(x, y, z)))
 
 
 def box_subject(mesh: TetForest) -> InputMesh:
@@ -260,7 +256,11 @@ def find_organ(opened: InputFile, args: argparse.Namespace) -> InputMesh:
 
 def domain_of(opened: InputFile, args: argparse.Namespace, entries: list[LabelMaterial]) -> Domain:
     """The domain of a surface or a scan; ``entries`` are filled with the materials of its labels."""
-    return _scan(opened, args, entries) if opened.kind == "scan" else _surface(opened, args)
+    from warp_corot.domain import Domain
+
+    if opened.kind == "scan":
+        return _scan(opened, args, entries)
+    return Domain.from_surface(placed(opened, args), unit=opened.unit, device=args.device)
 
 
 def fineness_of(args: argparse.Namespace, domain: Domain) -> dict[str, Any]:
@@ -272,19 +272,14 @@ def fineness_of(args: argparse.Namespace, domain: Domain) -> dict[str, Any]:
     return {"cell_size": size, "max_level": args.level, "surface_error": args.surface_error, "device": args.device}
 
 
-def _surface(opened: InputFile, args: argparse.Namespace) -> Domain:
-    from warp_corot.domain import Domain
-
-    return Domain.from_surface(placed(opened, args), unit=opened.unit, device=args.device)
-
-
 def _scan(opened: InputFile, args: argparse.Namespace, entries: list[LabelMaterial]) -> Domain:
     """The domain of a scan; ``entries`` are filled with the materials of its labels."""
     from warp_corot.domain import Domain
 
     volume, unit = placed(opened, args), opened.unit
-    if args.threshold is None:
-        volume = _without_nan(volume, opened.notes)
+    if args.threshold is None and volume.values.dtype.kind == "f" and (missing := np.isnan(volume.values)).any():
+        opened.notes.append(f"{np.count_nonzero(missing)} voxels are not a number and count as outside")
+        volume = replace(volume, values=np.where(missing, 0.0, volume.values))
     option, text = ("--labels", args.labels) if args.labels is not None else ("--materials", args.materials)
     numbers: dict[str, Any] | None = None
     if text is not None:
@@ -303,14 +298,6 @@ def _scan(opened: InputFile, args: argparse.Namespace, entries: list[LabelMateri
     smoothing = args.smoothing or 0.0
     up = args.up or "Z"
     return Domain.from_labels(volume, labels=numbers, unit=unit, smoothing=smoothing, up_axis=up, device=args.device)
-
-
-def _without_nan(volume: LoadedVolume, notes: list[str]) -> LoadedVolume:
-    """The volume with 0, which is outside, in place of values that are not numbers."""
-    if volume.values.dtype.kind != "f" or not (missing := np.isnan(volume.values)).any():
-        return volume
-    notes.append(f"{np.count_nonzero(missing)} voxels are not a number and count as outside")
-    return replace(volume, values=np.where(missing, 0.0, volume.values))
 
 
 def _see_labels(volume: LoadedVolume) -> None:

@@ -9,17 +9,19 @@ import itertools
 import pickle
 import tempfile
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+import warp as wp
 
 from warp_corot.contact.shapes import Ground
 from warp_corot.contact.tool import Obstacle, Tool
 from warp_corot.errors import InputError
+from warp_corot.inputs.loading import begin_loading
 from warp_corot.io.files.whole import check_output, writing
 from warp_corot.io.pictures.film import FILMS, check_film, frames_shown, write_film
 from warp_corot.simulation.progress import bar_of
@@ -172,20 +174,6 @@ def _felt(obstacle: Obstacle) -> dict[str, float]:
 # --- what pictures show at one time ----------------------------------------------------------------------------------
 
 
-@dataclass
-class PreviewFrame:
-    """A frame: moved points, triangles, values at the points (NaN on obstacles), rest positions, held nodes, corners of
-    the ground [4, 3] or [0, 3], and the time [s]."""
-
-    positions: np.ndarray
-    triangles: np.ndarray
-    values: np.ndarray
-    rest: np.ndarray
-    held: np.ndarray
-    ground: np.ndarray
-    time: float
-
-
 class DrawnBodies:
     """What is drawn of bodies: their skins and their stresses, bound again when a mesh has changed."""
 
@@ -201,8 +189,9 @@ class DrawnBodies:
         self._skins = BoundSkins([soft.mesh for soft in self._soft], drawn, changing=changing, are_cut=are_cut)
         self._averages: dict[int, tuple[Any, VertexAverage]] = {}
 
-    def frame(self, sim: Simulation) -> PreviewFrame:
-        """The current state."""
+    def frame(self, sim: Simulation) -> Picture:
+        """The current state; values are NaN on obstacles."""
+        from warp_corot.io.pictures.preview import Picture
         from warp_corot.io.write.solids import ground_corners, poses_of, shape_of, solid_of
 
         u = np.concatenate([soft.displacements.numpy() for soft in self._soft])
@@ -223,14 +212,13 @@ class DrawnBodies:
                 parts.append((points, solid.triangles, np.full(len(points), np.nan), points, np.zeros(len(points))))
         firsts = np.cumsum([0, *(len(part[0]) for part in parts)])
         moved, faces, values, rest, fixed = zip(*parts, strict=True)
-        return PreviewFrame(
+        marks = {"held": np.concatenate(fixed) > 0.5} | ({"square": ground} if len(ground) else {})
+        return Picture(
             np.concatenate(moved).astype(np.float32),
             np.concatenate([triangles + first for triangles, first in zip(faces, firsts, strict=False)]),
             np.concatenate(values).astype(np.float32),
             np.concatenate(rest),
-            np.concatenate(fixed) > 0.5,
-            ground,
-            sim.time,
+            options=marks,
         )
 
     def _stress(self, k: int, sim: Simulation) -> np.ndarray:
@@ -278,6 +266,7 @@ class Previews:
         elif len(self.frames) * len(self.views) > MOST_PANELS:
             panels = f"{len(self.frames)} frames from {len(self.views)} sides"
             raise InputError(f"--preview would have {panels}; a picture has at most {MOST_PANELS} panels")
+        begin_loading(["viewing.pictures"], wp.get_device("cpu"))
         self._file: IO[bytes] | None = None
         # Of all stored frames: points that lie farthest out [m], and the end of the colour map.
         self._outermost: list[np.ndarray] = []
@@ -293,11 +282,11 @@ class Previews:
             self._file = tempfile.TemporaryFile()  # noqa: SIM115 (closed with this object)
             self._bodies = DrawnBodies(bodies)
         shown = self._bodies.frame(sim)
-        pickle.dump(shown, self._file, pickle.HIGHEST_PROTOCOL)
-        used = np.unique(shown.triangles)
-        seen = np.concatenate([shown.positions[used], shown.rest[used]])
+        pickle.dump((sim.time, shown), self._file, pickle.HIGHEST_PROTOCOL)
+        used = np.unique(shown.faces)
+        seen = np.concatenate([np.asarray(each)[used] for each in (shown.positions, shown.rest)])
         self._outermost.append(seen[np.argmax(seen @ OUTWARDS, axis=0)])
-        self._highest = max(self._highest, value_limits(shown.values)[1])
+        self._highest = max(self._highest, value_limits(shown.scalars)[1])
 
     def draw(self, bodies: Sequence[RunBody], name: str) -> None:
         """Draw the stored frames.
@@ -313,68 +302,49 @@ class Previews:
             return
         from warp_corot.io.pictures.preview import save_picture
 
-        with (
-            bar_of(len(self._outermost), "frames", "drawing") as drawn,
-            contextlib.closing(self._images(name, bodies[0].soft.mesh.up_axis, drawn)) as images,
-        ):
+        shots = self._shots(name, bodies[0].soft.mesh.up_axis)
+        with bar_of(len(self._outermost), "frames", "drawing") as drawn, contextlib.closing(shots) as images:
             if is_film(self.args.preview):
-                write_film(self.args.preview, images, self.fps)
+                write_film(self.args.preview, _counted(images, drawn), self.fps)
             else:
                 save_picture(next(images), self.args.preview)
 
-    def _images(self, name: str, up_axis: str, drawn: Callable[[float], None]) -> Generator[Image, None, None]:
+    def _shots(self, name: str, up_axis: str) -> Generator[Image, None, None]:
         """The frames of a film, or the only picture."""
         from warp_corot.io.pictures.preview import Strip
 
-        film, sides = is_film(self.args.preview), len(self.views)
-        strip = None
-        for pictures, title in self._sheets(name, film, drawn):
-            if strip is None:
-                one = len(pictures) == 1
-                strip = Strip(
-                    pictures,
-                    np.concatenate(self._outermost),
-                    up_axis,
-                    titled=True,
-                    value_range=(0.0, self._highest),
-                    size=(FILM_SIZE[0] * sides, FILM_SIZE[1]) if film else (1200, 900) if one else None,
-                    columns=sides if film or 1 < sides < len(pictures) else min(len(pictures), MOST_COLUMNS),
-                )
-            yield strip.draw(pictures, title)
-
-    def _sheets(self, name: str, film: bool, drawn: Callable[[float], None]) -> Iterator[tuple[list[Picture], str]]:
-        """Pictures that are drawn side by side, and their title."""
-        static, several = is_static(self.args), len(self.frames) > 1
-        panels = []
-        for number, (frame, shown) in enumerate(zip(self.frames, self._kept(), strict=False), start=1):
-            if film:
-                yield self._pictures(shown, ""), name if static else f"{name}; {shown.time:.2f} s"
-            else:
-                when = f"frame {frame}" if static else f"{shown.time:.3g} s"
-                panels += self._pictures(shown, when if several else "")
-            drawn(number)
-        if not film:
-            yield panels, name if several or static else f"{name}; {shown.time:.3g} s"
-
-    def _pictures(self, shown: PreviewFrame, frame_title: str) -> list[Picture]:
-        """A frame from all sides."""
-        from warp_corot.io.pictures.preview import Picture
-
-        named = (self.args.preview_views or "").split(",") if len(self.views) > 1 else [""]
-        titles = [", ".join(filter(None, (name, frame_title))) for name in named]
-        options: dict[str, Any] = {"held": shown.held} if shown.held.any() else {}
-        if len(shown.ground):
-            options["square"] = shown.ground
-        return [
-            Picture(shown.positions, shown.triangles, shown.values, shown.rest, words, options, view)
-            for view, words in zip(self.views, titles, strict=True)
-        ]
-
-    def _kept(self) -> Iterator[PreviewFrame]:
         assert self._file is not None
         self._file.seek(0)
-        for _ in self._outermost:
-            yield pickle.load(self._file)
+        film, sides, static = is_film(self.args.preview), len(self.views), is_static(self.args)
+        several = len(self.frames) > 1 and not film
+        strip, sheet = None, []
+        for number, frame in enumerate(self.frames[: len(self._outermost)], start=1):
+            time, shown = pickle.load(self._file)
+            when = f"frame {frame}" if static else f"{time:.3g} s"
+            named = self.args.preview_views.split(",") if sides > 1 else [""]
+            titles = [", ".join(filter(None, (side, when if several else ""))) for side in named]
+            sheet += [replace(shown, view=view, title=title) for view, title in zip(self.views, titles, strict=True)]
+            if not film and number < len(self._outermost):
+                continue
+            strip = strip or Strip(
+                sheet,
+                np.concatenate(self._outermost),
+                up_axis,
+                titled=True,
+                value_range=(0.0, self._highest),
+                size=(FILM_SIZE[0] * sides, FILM_SIZE[1]) if film else (1200, 900) if len(sheet) == 1 else None,
+                columns=sides if film or 1 < sides < len(sheet) else min(len(sheet), MOST_COLUMNS),
+            )
+            yield strip.draw(
+                sheet, name if static or several else f"{name}; {f'{time:.2f}' if film else f'{time:.3g}'} s"
+            )
+            sheet = []
+
+
+def _counted(images: Iterator[Image], drawn: Callable[[float], None]) -> Iterator[Image]:
+    for number, image in enumerate(images, start=1):
+        drawn(number)
+        yield image
 
 
 def is_film(path: Path) -> bool:

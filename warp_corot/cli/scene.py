@@ -31,6 +31,7 @@ def run(args: argparse.Namespace) -> int:
     """
     from warp_corot.io.write.animate import (
         Recording,
+        closed_whole,
         frame_count,
         progress_bar,
         rounding,
@@ -75,17 +76,17 @@ def run(args: argparse.Namespace) -> int:
         complain(note, kind="note")
     done = Recording(writer.path)
     try:
-        with progress_bar(count) as progress:
+        with closed_whole(writer, done), progress_bar(count) as progress:
             for frame in range(count + 1):
                 if frame:
                     with WATCH.part("stepping", into=done):
                         sim.advance()
                 with WATCH.part("writing", into=done), signals_held_back():
-                    _write(writer, sim, done)
+                    writer.write(sim.show())
+                    done.frames, done.simulated, done.steps = writer.frames, sim.time, sim.frames * sim.steps
                 progress(frame, count)
-        _close(writer, done)
     except (KeyboardInterrupt, UnstableError, OSError) as error:
-        return _end(error, writer, done)
+        return early_end(error, done)
     print(_summary(args.input, sim, writer, done))
     return 0
 
@@ -102,32 +103,17 @@ def _ground(text: str) -> float | str:
     return height
 
 
-def _write(writer: SceneWriter, sim: StageSimulation, done: Recording) -> None:
-    writer.write(sim.show())
-    done.frames = writer.frames
-    done.simulated = sim.time
-    done.steps = sim.frames * sim.steps
-
-
-def _close(writer: SceneWriter, done: Recording) -> None:
-    from warp_corot.io.write.animate import signals_held_back
-
-    with WATCH.part("writing", into=done), signals_held_back():
-        writer.close()
-
-
-def _end(error: BaseException, writer: SceneWriter, done: Recording) -> int:
-    """Close the stage after an early end, and report its state; returns the exit status."""
-    try:
-        _close(writer, done)
-    except OSError as other:
-        complain(str(other))
-    return early_end(error, done)
-
-
 def _summary(source: Path, sim: StageSimulation, writer: SceneWriter, done: Recording) -> str:
     parts, units = sim.parts, sim.scene.units
     gravity = sim.parts.model.gravity.numpy()[-1] * units.metres
+    moved = sim.state.particle_q.numpy().astype(np.float64) - parts.model.particle_q.numpy()
+    moved = float(np.linalg.norm(moved, axis=1).max()) * units.metres
+    solves, steps = sim.solver.solves, f"{milliseconds(sim.dt)}, largest stable one about "
+    if solves.steps:
+        steps = f"{milliseconds(sim.dt)}, implicit, {solves.linear_iterations / solves.steps:.0f} iterations each"
+        steps += unfinished(solves, "steps", "shorten the steps (--dt)")
+    else:
+        steps += milliseconds(sim.solver.stable_dt)
     rows = [("stage", f"{units.metres:g} m per unit, {sim.scene.up_axis} up")]
     for body in parts.soft:
         size = f"{len(body.prim.points)} points, {len(body.prim.tets)} tetrahedra"
@@ -140,25 +126,12 @@ def _summary(source: Path, sim: StageSimulation, writer: SceneWriter, done: Reco
     rows += [
         ("colliders", f"{parts.model.shape_count}" + (", with a ground" if parts.ground is not None else "")),
         ("gravity", f"{' '.join(f'{g:.4g}' for g in gravity)} m/s^2"),
-        ("time step", _steps(sim)),
+        ("time step", steps),
         ("speed", speed(done)),
         ("wall time", wall_time()),
-        ("displacement", f"{length(_displacement(sim))} largest at the end"),
+        ("displacement", f"{length(moved)} largest at the end"),
         ("stress", f"colours up to {pressure(writer.stress_range[1])} (von Mises)"),
         ("device", f"{parts.model.device} ({parts.model.device.name})"),
         ("written", f"{done.path}, {done.frames} frames, {done.simulated:.4g} s"),
     ]
     return "\n".join([str(source), *aligned(rows)])
-
-
-def _steps(sim: StageSimulation) -> str:
-    solves = sim.solver.solves
-    if not solves.steps:
-        return f"{milliseconds(sim.dt)}, largest stable one about {milliseconds(sim.solver.stable_dt)}"
-    text = f"{milliseconds(sim.dt)}, implicit, {solves.linear_iterations / solves.steps:.0f} iterations each"
-    return text + unfinished(solves, "steps", "shorten the steps (--dt)")
-
-
-def _displacement(sim: StageSimulation) -> float:
-    moved = sim.state.particle_q.numpy().astype(np.float64) - sim.parts.model.particle_q.numpy()
-    return float(np.linalg.norm(moved, axis=1).max()) * sim.scene.units.metres

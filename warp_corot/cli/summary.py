@@ -151,7 +151,12 @@ def aligned(rows: Sequence[tuple[str, str]]) -> list[str]:
 def _body(subject: InputMesh) -> list[tuple[str, str]]:
     """For a body from a surface or a scan, the reports of its domain and its mesh, and their time."""
     if subject.domain is None:
-        return [("mesh", _mesh(subject))]
+        nodes, repaired = len(subject.mesh.points), getattr(subject.mesh, "repaired", 0)
+        unused = nodes - len(subject.used)
+        remarks = [f"{repaired} wound wrongly and repaired"] if repaired else []
+        remarks += [f"{unused} nodes in no tetrahedron"] if unused else []
+        said = f" ({', '.join(remarks)})" if remarks else ""
+        return [("mesh", f"{nodes} nodes, {len(subject.mesh.tets)} tetrahedra{said}")]
     assert isinstance(subject.mesh, TetForest)
     took = ", ".join(f"{stage} {seconds:.2f} s" for stage, seconds in subject.times.items())
     rows = [*_block("domain", subject.domain.report()), *_block("mesh", subject.mesh.summary())]
@@ -238,14 +243,6 @@ def pressure(pascals: float) -> str:
         if pascals >= factor:
             return f"{pascals / factor:g} {unit}"
     return f"{pascals:g} Pa"
-
-
-def _mesh(subject: InputMesh) -> str:
-    nodes, repaired = len(subject.mesh.points), getattr(subject.mesh, "repaired", 0)
-    unused = nodes - len(subject.used)
-    remarks = [f"{repaired} wound wrongly and repaired"] if repaired else []
-    remarks += [f"{unused} nodes in no tetrahedron"] if unused else []
-    return f"{nodes} nodes, {len(subject.mesh.tets)} tetrahedra" + (f" ({', '.join(remarks)})" if remarks else "")
 
 
 def remesh_rows(sim: Simulation, done: Recording) -> list[tuple[str, str]]:

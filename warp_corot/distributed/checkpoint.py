@@ -25,8 +25,7 @@ from warp_corot.contact.contacts import Contacts
 from warp_corot.contact.keeping import keep_again, kept_arrays
 from warp_corot.elasticity import Corotated
 from warp_corot.inputs.checks import checked_path
-from warp_corot.io.checkpoint.archive import load_checkpoint, pack_body, rebuilt_body, save_checkpoint
-from warp_corot.io.checkpoint.tree import joined, split
+from warp_corot.io.checkpoint.archive import joined, load_checkpoint, pack_body, rebuilt_body, save_checkpoint, split
 from warp_corot.remesh.online import OnlineRemesh
 from warp_corot.simulation.simulation import Simulation as OnOne
 from warp_corot.solvers.system import System

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from warp_corot.discretization.elements import Mesh
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import shown
-from warp_corot.io.checkpoint.mesh import box_level
+from warp_corot.io.checkpoint.contents import box_level
 from warp_corot.mesh import TetForest, TetMesh
 from warp_corot.mesh.around import subtrees_around
 from warp_corot.mesh.lattice import LATTICE_BITS, checked_box

@@ -52,11 +52,6 @@ def is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
-def new_token() -> str:
-    """A token that cannot be guessed."""
-    return secrets.token_urlsafe(16)
-
-
 class AccessControl:
     """Lets requests pass or refuses them.
 

@@ -54,7 +54,7 @@ def present(sim: Simulation) -> dict[str, Any]:
     mean = material.isotropic
     return {
         "law": next(name for name, kind in MODELS.items() if type(model) is kind),
-        "rotations": _level_of(model),
+        "rotations": OWN if (level := getattr(model, "rotation_level", None)) is None else str(level),
         "young": float(np.mean(mean.young)),
         "poisson": float(np.mean(mean.poisson)),
         "density": float(np.mean(material.density)),
@@ -134,11 +134,6 @@ def changed(material: Any, stiffer: float, poisson: float | None, heavier: float
     if poisson is not None and type(material) is Isotropic:
         values["poisson"] = poisson
     return replace(material, **values)
-
-
-def _level_of(model: Model) -> str:
-    level = getattr(model, "rotation_level", None)
-    return OWN if level is None else str(level)
 
 
 def _number(text: str) -> int | float | str:

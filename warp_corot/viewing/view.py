@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 import sys
 import threading
 import time
@@ -17,7 +18,7 @@ from warp_corot.simulation.simulation import Simulation
 from .commands import Commands
 from .messages import frame_told, page_told, topology
 from .saving import Saving
-from .server import AccessControl, Server, Visitor, is_loopback, new_token
+from .server import AccessControl, Server, Visitor, is_loopback
 from .session import PageFrame, Session
 
 #: The default port of the page.
@@ -63,7 +64,7 @@ class View:
     ):
         if not isinstance(sim, Simulation) or not sim.ranks.is_alone:
             raise InputError(f"sim is {as_shown(sim)}; it must be a Simulation on one process: Simulation(body)")
-        gate = AccessControl(host, token if token is not None or is_loopback(host) else new_token())
+        gate = AccessControl(host, token if token is not None or is_loopback(host) else secrets.token_urlsafe(16))
         self._lock, self._over, self._title = threading.RLock(), threading.Event(), title
         self._thread: threading.Thread | None = None
         self._is_closed = False
@@ -197,7 +198,8 @@ def view(
         raise InputError(f"surface names {len(own)} surfaces; there must be one for each body")
     page = View(sim, host=host, port=port, token=token, own=own)
     print(f"the page is at {page.address}", flush=True)
-    if wait or (wait is None and not _is_interactive()):
+    is_interactive = hasattr(sys, "ps1") or bool(sys.flags.interactive) or "ipykernel" in sys.modules
+    if wait or (wait is None and not is_interactive):
         try:
             page.run()
         except KeyboardInterrupt:
@@ -207,8 +209,3 @@ def view(
     else:
         page.start()
     return page
-
-
-def _is_interactive() -> bool:
-    """Whether Python is interactive, as in a notebook."""
-    return hasattr(sys, "ps1") or bool(sys.flags.interactive) or "ipykernel" in sys.modules

@@ -50,7 +50,11 @@ class Camera:
 
         Azimuth 0 looks along −Z where Y is up, along +Y where Z is up, along −Y where X is up.
         """
-        right, up, front = _world_axes(up_axis)
+        if up_axis not in ("X", "Y", "Z"):
+            raise InputError(f"up_axis is {up_axis!r}; it must be X, Y or Z")
+        i, j, k = np.eye(3)
+        # To the right, up and towards a viewer at azimuth 0: a right-handed triple.
+        right, up, front = {"Y": (i, j, k), "Z": (i, k, -j), "X": (k, i, j)}[up_axis]
         a, e = math.radians(azimuth), math.radians(elevation)
         towards = math.cos(e) * (math.cos(a) * front + math.sin(a) * right) + math.sin(e) * up
         across = math.cos(a) * right - math.sin(a) * front
@@ -71,14 +75,6 @@ class Camera:
         u, v = self.project(points)[0].T
         a, b, c = faces.T
         return (u[b] - u[a]) * (v[c] - v[a]) > (v[b] - v[a]) * (u[c] - u[a])
-
-
-def _world_axes(up_axis: str) -> tuple[Array, Array, Array]:
-    """Right, up and front (towards a viewer at azimuth 0), a right-handed triple."""
-    if up_axis not in ("X", "Y", "Z"):
-        raise InputError(f"up_axis is {up_axis!r}; it must be X, Y or Z")
-    x, y, z = np.eye(3)
-    return {"Y": (x, y, z), "Z": (x, z, -y), "X": (z, x, y)}[up_axis]
 
 
 def dropped_shadow(points: Array, camera: Camera, height: float) -> Array:

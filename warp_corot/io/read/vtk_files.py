@@ -144,9 +144,12 @@ def _joined(leaves: list[tuple[str, Any]]) -> FileMesh:
     sets: dict[str, list[NDArray[np.int64]]] = {}
     offset = 0
     for number, (_, data) in enumerate(leaves, start=1):
-        own = _points(data)
-        for name, nodes in _node_sets(data).items():
-            sets.setdefault(name, []).append(nodes + offset)
+        own = np.empty((0, 3))
+        if data.GetPoints() is not None:
+            own = np.array(vtk_to_numpy(data.GetPoints().GetData()), dtype=np.float64)
+        for array, numbers in _whole_arrays(data.GetPointData(), data.GetNumberOfPoints()).items():
+            for name, nodes in sets_of_numbers(array, numbers).items():
+                sets.setdefault(name, []).append(nodes + offset)
         extra = {"block": number} if len(leaves) > 1 else {}
         for block in _cells(data, ignored, notes):
             values = {**block.data, **{name: np.full(len(block.nodes), k) for name, k in extra.items()}}
@@ -156,12 +159,6 @@ def _joined(leaves: list[tuple[str, Any]]) -> FileMesh:
     names = {"block": {k: name for k, (name, _) in enumerate(leaves, start=1)}} if len(leaves) > 1 else {}
     joined = {name: np.concatenate(parts) for name, parts in sets.items()}
     return FileMesh(np.concatenate(points), blocks, names, ignored, list(dict.fromkeys(notes)), joined)
-
-
-def _points(data: Any) -> NDArray[np.float64]:
-    if data.GetPoints() is None:
-        return np.empty((0, 3))
-    return np.array(vtk_to_numpy(data.GetPoints().GetData()), dtype=np.float64)
 
 
 def _cells(data: Any, ignored: dict[str, int], notes: list[str]) -> Iterator[Block]:
@@ -176,7 +173,10 @@ def _cells(data: Any, ignored: dict[str, int], notes: list[str]) -> Iterator[Blo
         triangles = _ints(data.GetPolys().GetConnectivityArray()).reshape(-1, 3)
         yield Block("triangle", triangles, _data(data, np.arange(len(triangles))))
         return
-    types = _types(data)
+    array = data.GetCellTypes() if hasattr(data, "GetCellTypes") else None
+    if array is None or not hasattr(array, "GetNumberOfTuples"):
+        array = data.GetCellTypesArray()
+    types = _ints(array)
     array = data.GetCells()
     offsets, nodes = _ints(array.GetOffsetsArray()), _ints(array.GetConnectivityArray())
     if len(offsets) != len(types) + 1 or (np.diff(offsets) < 0).any() or offsets[-1] > len(nodes):
@@ -243,14 +243,6 @@ def _data(data: Any, cells: NDArray) -> dict[str, NDArray[np.int64]]:
     return {name: values[cells] for name, values in numbers.items()}
 
 
-def _node_sets(data: Any) -> dict[str, NDArray[np.int64]]:
-    """The node sets that point data define."""
-    found: dict[str, NDArray[np.int64]] = {}
-    for name, values in _whole_arrays(data.GetPointData(), data.GetNumberOfPoints()).items():
-        found |= sets_of_numbers(name, values)
-    return found
-
-
 def _whole_arrays(arrays: Any, count: int) -> dict[str, NDArray[np.int64]]:
     found = {}
     for k in range(arrays.GetNumberOfArrays()):
@@ -263,13 +255,6 @@ def _whole_arrays(arrays: Any, count: int) -> dict[str, NDArray[np.int64]]:
         if values is not None and len(values) == count:
             found[name] = values
     return found
-
-
-def _types(data: Any) -> NDArray[np.int64]:
-    array = data.GetCellTypes() if hasattr(data, "GetCellTypes") else None
-    if array is None or not hasattr(array, "GetNumberOfTuples"):
-        array = data.GetCellTypesArray()
-    return _ints(array)
 
 
 def _ints(array: Any) -> NDArray[np.int64]:

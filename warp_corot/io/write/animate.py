@@ -29,6 +29,7 @@ from warp_corot.simulation.simulation import Simulation
 from .skins import BoundSkins, has_domain
 
 if TYPE_CHECKING:
+    from warp_corot.io.write.usd.pieces import ColoredStage
     from warp_corot.io.write.usd.prims import Touched
     from warp_corot.io.write.usd.writer import UsdWriter
 
@@ -276,7 +277,7 @@ def record(
             for other in others:
                 other.write(fields)
 
-    with _closed_whole(writer, done, others), progress_bar(count, wanted=progress is None) as bar:
+    with closed_whole(writer, done, others), progress_bar(count, wanted=progress is None) as bar:
         make_frames(sim, fps, count, done, write, progress or bar)
     return done
 
@@ -349,7 +350,7 @@ def _touched(sim: Simulation, joined: _Joined) -> Touched | None:
 
 
 @contextmanager
-def _closed_whole(writer: UsdWriter, done: Recording, others: Sequence[Writer] = ()) -> Iterator[None]:
+def closed_whole(writer: ColoredStage, done: Recording, others: Sequence[Writer] = ()) -> Iterator[None]:
     """Close the writers at the end in any case, with signals delayed and the time measured."""
     try:
         yield

@@ -164,7 +164,9 @@ class BoundSkins:
             if mesh is not self._meshes[index]:
                 self._skins[index] = [_bound_anew(skin, mesh) for skin in self._skins[index]]
                 self._meshes[index] = mesh
-            found += [_shifted(skin, offset) for skin in self._skins[index]]
+            for skin in self._skins[index]:
+                nodes = (skin.surface.nodes + offset).astype(np.int32)
+                found.append(replace(skin, surface=replace(skin.surface, nodes=nodes)))
             offset += len(mesh.points)
         return _joined(found)
 
@@ -196,7 +198,9 @@ def _skins_of_one(mesh: Any, surface: Any, labels: bool) -> list[Skin]:
     if isinstance(surface, OwnSurface):
         return _bound_looks(mesh, surface.looks)
     if isinstance(surface, str | PathLike):
-        return _bound_prims(mesh, surface)
+        from warp_corot.io.read.usd.look import read_looks
+
+        return _bound_looks(mesh, _outwards(read_looks(surface)))
     if surface is not None:
         raise InputError(f"surface is a {type(surface).__name__}; it must be a SurfaceMesh or a surface file")
     if labels and has_labels(mesh) and not has_domain(mesh):
@@ -230,12 +234,6 @@ def _check_nodes(surface: SurfaceMesh, count: int) -> None:
         )
 
 
-def _bound_prims(mesh: Any, path: str | PathLike[str]) -> list[Skin]:
-    from warp_corot.io.read.usd.look import read_looks
-
-    return _bound_looks(mesh, _outwards(read_looks(path)))
-
-
 def _outwards(looks: Sequence[Look]) -> list[Look]:
     """The parts of a surface wound as the body that they enclose together."""
     firsts = np.cumsum([0, *(len(look.points) for look in looks)])
@@ -263,11 +261,6 @@ def _check_size(look: Look, nodes: np.ndarray) -> None:
             f"{look.source}: {look.path} is {size:.3g} m long and {'apart from' if apart else 'bound to'} the body, "
             f"which is {body:.3g} m long; is its metersPerUnit right?"
         )
-
-
-def _shifted(skin: Skin, offset: int) -> Skin:
-    nodes = (skin.surface.nodes + offset).astype(np.int32)
-    return replace(skin, surface=replace(skin.surface, nodes=nodes)) if offset else skin
 
 
 def _joined(skins: Sequence[Skin]) -> list[Skin]:

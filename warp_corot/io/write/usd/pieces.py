@@ -15,13 +15,14 @@ before the change.
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import re
 import time
 import uuid
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -388,6 +389,17 @@ class ColoredStage(PieceStore):
         if not self._closed:
             self._closed = True
             self.finish()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        try:
+            self.close()
+        except OSError as error:
+            if kind is None:
+                raise
+            logging.getLogger(__name__).warning("%s", error)  # the first error is the one to raise
 
     def last_look(self, samples: Samples) -> Samples:
         return self._colors(samples) if self._ranges_used - {self.stress_range} else {}

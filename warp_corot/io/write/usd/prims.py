@@ -14,7 +14,7 @@ from warp_corot.errors import InputError
 from warp_corot.io.files.usd import free_name
 from warp_corot.io.pictures.colors import TISSUE, VertexAverage, color_index, srgb_to_linear, stress_colors
 from warp_corot.io.write.skins import Skin
-from warp_corot.mesh.surfaces.bound import SurfaceMesh, vertex_normals
+from warp_corot.mesh.surfaces.bound import vertex_normals
 from warp_corot.mesh.surfaces.boundary import boundary_faces, signed_volumes
 
 from .pieces import Samples
@@ -171,7 +171,9 @@ class SkinPrim:
             of_points = np.einsum("vn,vnc->vc", surface.weights, frame.velocities[surface.nodes])
             samples[f"{self._path}.velocities"] = Vt.Vec3fArray.FromNumpy(of_points.astype(np.float32))
         if self._changing:
-            if self._said is None or not _is_same_skin(self._said.surface, surface):
+            said = None if self._said is None else self._said.surface
+            names = ("triangles", "points", "of_cut")
+            if said is None or not all(np.array_equal(getattr(said, name), getattr(surface, name)) for name in names):
                 samples |= triangle_samples(self._path, surface.triangles)
                 if self._skin.is_cut:
                     inside = np.flatnonzero(surface.of_cut).astype(np.int32)
@@ -186,11 +188,6 @@ class SkinPrim:
             return {}
         indices = Vt.IntArray.FromNumpy(color_index(np.asarray(stress), *limits))
         return {f"{self._path}.primvars:displayColor:indices": indices}
-
-
-def _is_same_skin(one: SurfaceMesh, other: SurfaceMesh) -> bool:
-    pairs = ((one.triangles, other.triangles), (one.points, other.points), (one.of_cut, other.of_cut))
-    return all(np.array_equal(a, b) for a, b in pairs)
 
 
 def skin_paths(skins: Sequence[Skin]) -> list[str]:
@@ -244,6 +241,13 @@ def triangle_samples(path: str, triangles: NDArray[np.int32]) -> Samples:
         f"{path}.faceVertexCounts": Vt.IntArray(len(triangles), 3),
         f"{path}.faceVertexIndices": Vt.IntArray.FromNumpy(np.ascontiguousarray(triangles).reshape(-1)),
     }
+
+
+def declare_tet_stress(tets: Any) -> None:
+    """Declare the stress of each tetrahedron of a TetMesh."""
+    kind = Sdf.ValueTypeNames.FloatArray
+    stress = UsdGeom.PrimvarsAPI(tets).CreatePrimvar("vonMises", kind, UsdGeom.Tokens.uniform)
+    stress.GetAttr().SetDocumentation("Von Mises stress of each tetrahedron [Pa]")
 
 
 def declare_moving(body: Any, with_stress: bool, colored: bool = True) -> None:
@@ -389,7 +393,10 @@ class TetPrims:
         if before is not None and before[0] is self._present:
             return {}
         samples: Samples = {}
-        if before is None or not _are_same(before[0], self._present):
+        if before is None or not (
+            np.array_equal(before[0].tets, self._present.tets)
+            and np.array_equal(before[0].points, self._present.points)
+        ):
             samples |= self._topology()
         if before is None or not self._is_same_surface(*before):
             samples |= self._surface_topology()
@@ -426,8 +433,7 @@ class TetPrims:
         types, tokens = Sdf.ValueTypeNames, UsdGeom.Tokens
         primvars.CreatePrimvar("rest", types.Point3fArray, tokens.vertex)
         if statics.stress:
-            stress = primvars.CreatePrimvar("vonMises", types.FloatArray, tokens.uniform)
-            stress.GetAttr().SetDocumentation("Von Mises stress of each tetrahedron [Pa]")
+            declare_tet_stress(primvars)
         if self._present.fixed is not None:
             fixed = primvars.CreatePrimvar("fixed", types.IntArray, tokens.vertex)
             fixed.GetAttr().SetDocumentation("1 where the node is held")
@@ -450,7 +456,3 @@ class SurfaceTriangles:
         self.faces = faces
         self.nodes, compact = np.unique(faces, return_inverse=True)
         self.triangles = compact.reshape(-1, 3).astype(np.int32)
-
-
-def _are_same(one: Present, other: Present) -> bool:
-    return np.array_equal(one.tets, other.tets) and np.array_equal(one.points, other.points)

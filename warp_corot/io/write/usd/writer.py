@@ -1,6 +1,5 @@
 """Simulated frames as a USD stage: the tetrahedra and their boundary, or smooth surfaces in place of it."""
 
-import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol
@@ -186,17 +185,6 @@ class UsdWriter(ColoredStage):
         for prim in self._prims:
             samples |= prim.samples(frame)
         self._add(samples, stress, nodal)
-
-    def __enter__(self) -> "UsdWriter":
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        try:
-            self.close()
-        except OSError as error:
-            if kind is None:
-                raise
-            logging.getLogger(__name__).warning("%s", error)  # the first error is the one to raise
 
     def _colors(self, samples: Samples, nodal: NDArray[np.float64] | None = None) -> Samples:
         colors: Samples = {}
