@@ -88,7 +88,7 @@ def search_near(
     watch: Watch,
     near: Near,
     touches: Touches,
-    arrived: wp.array[wp.uint64],
+    arrived: wp.array[wp.uint32],
 ):
     """Make some phases of a search, if one is due. Those for soft surfaces come before ``BESIDE``.
 

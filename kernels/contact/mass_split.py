@@ -54,8 +54,7 @@ class Sums:
     live: wp.array[wp.int32]  # contacts that may act in this step, by their numbers
     live_count: wp.array[wp.int32]  # [2] how many in this step while forces are found, and in the last one
     is_shared: int  # whether several threads of the CPU add at the same time
-    # [2] blocks at the barrier for all of them, ever; and in this step at that for blocks with contacts that may act
-    arrived: wp.array[wp.uint64]
+    arrived: wp.array[wp.uint32]  # [2 LINE] the barriers of all blocks, and of those with contacts that may act
 
 
 @wp.struct
@@ -370,8 +369,11 @@ def phases(has_triangles: bool, has_pairs: bool) -> SimpleNamespace:
         pushes = wp.dot(contact.force, contact.force) > 0.0
         if pushes or contact.least > wp.dot(contact.opens, contact.normal):
             contact.acts = ACTS
-            for buffer in range(2):
+            # A loop that is not unrolled: less code to fetch.
+            buffer = int(0)
+            while buffer < 2:
                 add(contact, 1, contact.force, buffer, law.grain, surface, sums)
+                buffer += 1
             keep(number, contact, all)
         return 1
 
@@ -474,7 +476,6 @@ def end_place(s: int, buffer: int, near: Near, all: Contacts, sums: Sums):
 
 @wp.func
 def clear_lists(sums: Sums):
-    sums.arrived[1] = wp.uint64(0)
     sums.live_count[1] = sums.live_count[0]
     sums.live_count[0] = 0
 

@@ -35,30 +35,35 @@ def block_count() -> int:
     ...
 
 
+#: Numbers from one counter of a barrier to the next: each has a line of the cache of its own, for blocks that wait read
+#: it all the time.
+LINE = wp.constant(32)
+
+
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
     __syncthreads();
     if (blocks == 1) return;
     if (threadIdx.x == 0) {
-        unsigned long long* count = reinterpret_cast<unsigned long long*>(&wp::index(arrived, which));
-        __threadfence();
-        const unsigned long long goal = (atomicAdd(count, 1ull) / blocks + 1ull) * blocks;
-        while (*reinterpret_cast<volatile unsigned long long*>(count) < goal) {}
-        __threadfence();
+        unsigned* count = &wp::index(arrived, which * 32);
+        const unsigned own = blockIdx.x == 0 ? 0x80000000u - (blocks - 1u) : 1u;
+        unsigned before, now;
+        asm volatile("atom.add.release.gpu.global.u32 %0, [%1], %2;" : "=r"(before) : "l"(count), "r"(own) : "memory");
+        do asm volatile("ld.acquire.gpu.global.u32 %0, [%1];" : "=r"(now) : "l"(count) : "memory");
+        while (((before ^ now) & 0x80000000u) == 0u);
     }
     __syncthreads();
 #endif
 """)
-def synchronize_blocks(arrived: wp.array[wp.uint64], which: int, blocks: int):
-    """Wait for all threads of so many blocks, which must all be resident. ``arrived[which]`` counts blocks that have
-    waited together since it was zero."""
+def synchronize_blocks(arrived: wp.array[wp.uint32], which: int, blocks: int):
+    """Wait for all threads of the first so many blocks, which must all be resident. Together they change the first bit
+    of ``arrived[LINE * which]``."""
     ...
 
 
 @wp.func
-def synchronize_grid(arrived: wp.array[wp.uint64]):
-    """Wait for all threads of the launch, whose blocks must all be resident. ``arrived[0]`` counts blocks, ever; a
-    launch with another number of blocks has another one."""
+def synchronize_grid(arrived: wp.array[wp.uint32]):
+    """Wait for all threads of the launch, whose blocks must all be resident, by the first counter."""
     synchronize_blocks(arrived, 0, block_count())
 
 

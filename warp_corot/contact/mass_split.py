@@ -17,6 +17,7 @@ from warp_corot.kernels.contact.sweep import sweeper
 from warp_corot.kernels.contact.touches import Touches
 from warp_corot.kernels.contact.vertices import Rigid
 from warp_corot.kernels.stepping.pace import Pace
+from warp_corot.kernels.stepping.threads import LINE
 
 from .obstacles import have_edges
 from .options import Contact
@@ -104,7 +105,7 @@ class MassSplit:
         contacts = self._at_places + self._at_triangles + room
         self.sums.live = wp.zeros(contacts, dtype=wp.int32, device=device)
         self.sums.live_count = wp.zeros(2, dtype=wp.int32, device=device)
-        self.sums.arrived = wp.zeros(2, dtype=wp.uint64, device=device)
+        self.sums.arrived = wp.zeros(2 * int(LINE), dtype=wp.uint32, device=device)
         self._records = wp.zeros(min(contacts, RECORDS) if device.is_cpu else 0, dtype=kernels.Contact, device=device)
         #: Whether one launch makes all phases, and its threads, or those of a launch for each phase.
         self._is_one, self._threads = self._are_separate or self._regions.team.parts == 1, self._regions.team.parts

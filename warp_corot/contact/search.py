@@ -67,7 +67,7 @@ class Search:
         watch.fastest = wp.zeros(1, dtype=wp.float32, device=device)
         watch.size, watch.most_alone, watch.hit = size, float(kernels.ALONE), float(kernels.HIT_BESIDE)
         watch.due, watch.missed, watch.searches = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(3))
-        self._arrived = wp.zeros(1, dtype=wp.uint64, device=device)
+        self._arrived = wp.zeros(1, dtype=wp.uint32, device=device)
         watch.awake = wp.ones(1, dtype=wp.int32, device=device)
         watch.room, watch.free = (wp.zeros(n, dtype=wp.float32, device=device) for n in (1, 2))
         watch.calm = wp.zeros(3, dtype=wp.float32, device=device)
