@@ -16,7 +16,7 @@ from .law import Law
 from .motion import Surface, foreseen
 from .near import Near
 from .rows import Meeting, Rows, row_count
-from .vertices import WAITS
+from .vertices import FORESEEN, WAITS
 from .visits import Part, Visits, append, choose
 from .watch import FARTHEST, Watch
 
@@ -26,8 +26,10 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINED})
 #: been missed, or after it.
 BEFORE_STEP, BEFORE_SEARCH, AFTER_SEARCH = (wp.constant(k) for k in range(3))
 #: Motion is reserved for so many steps like that of the search, and the fastest one once more for anything, which may
-#: be hit. A search is due if so many more steps would use that up.
-STEPS, AHEAD = wp.constant(14.0), wp.constant(2.0)
+#: be hit.
+STEPS = wp.constant(16.0)
+#: Motion is rounded by less than this.
+ROUNDED = wp.constant(1.0001)
 
 
 @wp.kernel(enable_backward=False)
@@ -75,8 +77,8 @@ def ask_for_search(
     watch: Watch,
     visits: Visits,
 ):
-    """Ask for a search if anything may touch in this step that the last one has not found. Only motion relative to the
-    mean of a world counts."""
+    """Ask for a search if ``FORESEEN`` more steps may bring anything together that the last one has not found, and count
+    what may have been missed. Only motion relative to the mean of a world counts."""
     places = surface.node.shape[0]
     for w in range(visits.mean_gone.shape[0]):
         visits.mean_gone[w] = wp.vec4()
@@ -97,17 +99,18 @@ def ask_for_search(
             visits.gone[s] = wp.vec4()
         watch.due[0] = 0
         watch.searches[0] = watch.searches[0] + 1
-        return
     for s in range(places):
         if surface.node[s] >= 0:
             w = surface.world[s]
-            far = length_of(visits.gone[s] - visits.mean_gone[w])
-            if when == BEFORE_SEARCH:
-                if not (far <= watch.reach[s]) and visits.may_miss[0] != 0:
+            far = FORESEEN * length_of(visits.goes[s] - visits.mean_goes[w])
+            if when != AFTER_SEARCH:
+                gone = length_of(visits.gone[s] - visits.mean_gone[w])
+                far = wp.where(when == BEFORE_SEARCH, gone - 0.5 * law.closing, gone + far)
+            if not (far <= watch.reach[s] - 0.5 * law.closing):
+                if when == BEFORE_STEP:
+                    watch.due[0] = 1
+                elif when == AFTER_SEARCH or visits.may_miss[0] != 0:
                     watch.missed[0] = watch.missed[0] + 1
-                    return
-            elif not (far + AHEAD * length_of(visits.goes[s] - visits.mean_goes[w]) <= watch.reach[s] - 0.5 * law.closing):
-                watch.due[0] = 1
                 return
 
 
@@ -138,26 +141,21 @@ def reserve_motion(
 @wp.func_native(
     on_cpu(
         """
-    four low[2], high[2];
-    for (int k = 0; k < 4; ++k) {
-        const int side = k >= first;
-        const four a = *reinterpret_cast<const four*>(&wp::index(gone, places[k]));
-        const four b = a + ahead * *reinterpret_cast<const four*>(&wp::index(goes, places[k]));
-        const four least = a < b ? a : b, most = a < b ? b : a;
-        const bool begins = k == 0 || k == first;
-        low[side] = begins ? least : (least < low[side] ? least : low[side]);
-        high[side] = begins ? most : (most > high[side] ? most : high[side]);
-    }
-    const four up = high[0] - low[1], down = high[1] - low[0], far = up > down ? up : down;
-    return far[0] * far[0] + far[1] * far[1] + far[2] * far[2];
+    const auto at = [&](const auto& a, int k) { return *reinterpret_cast<const four*>(&wp::index(a, places[k])); };
+    const auto length = [](four a) { return __builtin_sqrtf(a[0] * a[0] + a[1] * a[1] + a[2] * a[2]); };
+    float most = 0.0f;
+    for (int k = 0; k < first; ++k)
+        for (int m = first; m < 4; ++m) {
+            const float far = length(at(gone, k) - at(gone, m)) + ahead * length(at(goes, k) - at(goes, m));
+            most = far <= most ? most : far;
+        }
+    return most;
 """,
         otherwise="return 0.0f;\n",
     )
 )
-def nearing_squared(
-    places: wp.vec4i, first: int, ahead: float, gone: wp.array[wp.vec4], goes: wp.array[wp.vec4]
-) -> float:
-    """The square of how far two sides have come nearer since the last search and may in so many steps, at most [m^2].
+def nearing(places: wp.vec4i, first: int, ahead: float, gone: wp.array[wp.vec4], goes: wp.array[wp.vec4]) -> float:
+    """How far two sides have come nearer since the last search and may in so many steps, at most [m].
 
     Args:
         places: Those of both sides.
@@ -170,7 +168,6 @@ def nearing_squared(
 def list_rows(
     # In
     first: int,
-    ahead: float,
     closing: float,
     nodes: int,
     rows: Rows,
@@ -183,17 +180,15 @@ def list_rows(
 
     Args:
         first: The number of the first pair among contacts.
-        ahead: In so many steps.
         closing: As in ``Law`` [m].
         nodes: Number of places; owners from there on are edges.
     """
     for row in range(row_count(rows)):
         owner = rows.owner[row]
         if owner >= 0:
-            left = wp.max(rows.away[row] - closing, 0.0)
             places = rows.places[row]
-            far = nearing_squared(places, wp.where(owner < nodes, 1, 2), ahead, visits.gone, visits.goes)
-            if not (far < left * left) or rows.acts[row] > WAITS:
+            far = nearing(places, wp.where(owner < nodes, 1, 2), FORESEEN, visits.gone, visits.goes)
+            if not (ROUNDED * far + closing < rows.away[row]) or rows.acts[row] > WAITS:
                 append(visits.contacts, 0, visits.contact_count, 0, first + row, 0)
                 for k in range(4):
                     choose(places[k], here, visits)

@@ -420,7 +420,9 @@ def distance_in(owner: int, other: int, surface: Surface, meeting: Meeting):
         b = surface.x[c[1]]
         e = surface.x[c[2]]
         way = surface.x[owner] - point_of(on_triangle(surface.x[owner], a, b, e), a, b, e)
-        return wp.where(wp.dot(way, meeting.normals[other]) < 0.0, 0.0, wp.length(way))
+        # A gap may be less than the distance where a node is beside a triangle; see ``locate_node``.
+        far = wp.length(way) - BORDER * triangle_size(surface, c)
+        return wp.where(wp.dot(way, meeting.normals[other]) < 0.0, 0.0, wp.max(far, 0.0))
     f = meeting.edges[owner - nodes]
     g = meeting.edges[other]
     p = surface.x[f[0]]

@@ -13,7 +13,7 @@ from warp_corot.kernels.contact import nearing
 from warp_corot.kernels.contact.law import Law
 from warp_corot.kernels.contact.near import Near
 from warp_corot.kernels.contact.touches import Touches
-from warp_corot.kernels.contact.vertices import FORESEEN, Rigid
+from warp_corot.kernels.contact.vertices import Rigid
 from warp_corot.kernels.contact.visits import Part, Visits
 from warp_corot.solvers.system import System
 
@@ -124,7 +124,7 @@ class Approach:
             self._over_parts(nearing.foresee_carriers, offset, damping, [visits])
             self._follow(nearing.BEFORE_STEP, offset)
             wp.capture_if(watch.due, partial(self._find_pairs, offset, damping))
-            inputs = [self._split.first_pair, float(FORESEEN), self._law.closing, self._surface.count]
+            inputs = [self._split.first_pair, self._law.closing, self._surface.count]
             outputs = [self._pairs.rows, watch, self.here, visits]
             wp.launch(nearing.list_rows, 1, inputs, outputs, device=self._device)
         wp.capture_if(watch.awake, partial(self._act, offset, damping, accounts))
@@ -183,6 +183,7 @@ class Approach:
     def _find_pairs(self, offset: int, damping: float) -> None:
         """Launch a search for pairs."""
         inputs, watch = [self._surface.arrays, self._law], self._search.watch
+        watch.awake.fill_(1)
         for when in (nearing.BEFORE_SEARCH, nearing.AFTER_SEARCH):
             if when == nearing.AFTER_SEARCH:
                 self._place(offset, damping)
