@@ -272,9 +272,7 @@ def carry(s: int, part: Part, pace: Pace, offset: int, surface: Surface, visits:
 
 
 @wp.func
-def room_beside(
-    s: int, has_edges: int, part: Part, rigid: Rigid, watch: Watch, visits: Visits, here: Near
-):
+def room_beside(s: int, has_edges: int, part: Part, rigid: Rigid, watch: Watch, visits: Visits, here: Near):
     """How far a place may go before it or a triangle around it may touch an obstacle [m]; those that may are listed."""
     surface = rigid.surface
     x = surface.x[s]
@@ -399,7 +397,9 @@ def visit(
             most = float(FAR)
             for e in range(surface.bearing.starts[n], surface.bearing.starts[n + 1]):
                 most = wp.min(most, visits.until[e])
-            lower_budget(visits.budgets, n + part.shift, wp.max(most - visits.ways[n + part.shift], 0.0), visits.is_shared)
+            lower_budget(
+                visits.budgets, n + part.shift, wp.max(most - visits.ways[n + part.shift], 0.0), visits.is_shared
+            )
 
 
 @wp.kernel(enable_backward=False)

@@ -33,9 +33,7 @@ def push(
         if counts != 0:
             w = body.inverse_mass[i]
             v = load_node(body.v, i)
-            count_constraint(
-                i, force, force_at(i, body), v, body.damping, body.gravity, w, pace, offset, account
-            )
+            count_constraint(i, force, force_at(i, body), v, body.damping, body.gravity, w, pace, offset, account)
 
 
 @wp.kernel(enable_backward=False)

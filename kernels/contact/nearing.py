@@ -6,7 +6,6 @@ between them then. So a step looks at how far places have moved, and only at tho
 
 import warp as wp
 
-from warp_corot.kernels.elements.elements import load_node
 from warp_corot.kernels.elements.simd8 import on_cpu
 from warp_corot.kernels.modules import INLINED
 from warp_corot.kernels.stepping.pace import Pace
@@ -15,7 +14,7 @@ from .bearing import is_borne
 from .law import Law
 from .motion import Surface, foreseen
 from .near import Near
-from .rows import Meeting, Rows, row_count
+from .rows import Rows, row_count
 from .vertices import FORESEEN, WAITS
 from .visits import Part, Visits, append, choose
 from .watch import FARTHEST, Watch
@@ -77,7 +76,7 @@ def ask_for_search(
     watch: Watch,
     visits: Visits,
 ):
-    """Ask for a search if ``FORESEEN`` more steps may bring anything together that the last one has not found, and count
+    """Ask for a search if ``FORESEEN`` more steps may bring things together that the last one has not found, and count
     what may have been missed. Only motion relative to the mean of a world counts."""
     places = surface.node.shape[0]
     for w in range(visits.mean_gone.shape[0]):

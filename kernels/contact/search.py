@@ -148,10 +148,10 @@ def node_is_near(s: int, t: int, out: wp.vec3, surface: Surface, meeting: Meetin
     flags = near.flags[s] | near.flags[c[0]] | near.flags[c[1]] | near.flags[c[2]]
     if (flags & CRUSHED) != 0:
         return False
+    are_apart = bool(True)
     for k in range(3):
-        if share_bearers(s, c[k], surface):
-            return False
-    return True
+        are_apart = are_apart and not share_bearers(s, c[k], surface)
+    return are_apart
 
 
 @wp.func

@@ -27,7 +27,7 @@ class Part:
 
 @wp.struct
 class Visits:
-    """What steps visit. Carriers are all places, [S], and after these all nodes that bear places, [B]: [N] = [S + B]."""
+    """What steps visit. Carriers are all places, [S], and then all nodes that bear places, [B]: [N] = [S + B]."""
 
     # [N] a displacement, and how far the carrier may go from there before it is due, plus ``came`` then [m]
     budgets: wp.array[wp.vec4]

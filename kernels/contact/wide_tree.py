@@ -35,8 +35,8 @@ BLUNT = wp.constant(1.25)
 class WideTree:
     """Nodes, each with the boxes of eight others; empty on CUDA.
 
-    A body in a world has roots of its own; each stands for 64 leaves. Leaf z is a lane of node z / 8 of ``lower_nodes``,
-    which is a lane of node z / 64 of ``upper_nodes``, which is a lane of node z / 512 of ``roots``.
+    A body in a world has roots of its own, lanes that stand for 64 leaves. Leaf z is a lane of node z / 8 of
+    ``lower_nodes``, which is a lane of node z / 64 of ``upper_nodes``, which is a lane of node z / 512 of ``roots``.
     """
 
     roots: wp.array[wp.float32]

@@ -157,7 +157,10 @@ class Approach:
         """Launch a kernel over the carriers of each body, in parts."""
         for k in range(len(self._system.bodies)):
             start, count, _nodes = self._surface.nodes_of(k)
-            bounds, inputs = self._regions.team.bounds(count), [self._part(k, damping), self._system.pace.arrays, offset]
+            bounds, inputs = (
+                self._regions.team.bounds(count),
+                [self._part(k, damping), self._system.pace.arrays, offset],
+            )
 
             def over(part: int, start: int = start, bounds: list = bounds, inputs: list = inputs) -> None:
                 begin, end = bounds[part]
@@ -182,6 +185,7 @@ class Approach:
 
     def _find_pairs(self, offset: int, damping: float) -> None:
         """Launch a search for pairs."""
+        assert self._pairs is not None
         inputs, watch = [self._surface.arrays, self._law], self._search.watch
         watch.awake.fill_(1)
         for when in (nearing.BEFORE_SEARCH, nearing.AFTER_SEARCH):

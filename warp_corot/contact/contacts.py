@@ -116,7 +116,7 @@ class Contacts:
         if self.device.is_cpu and (self.rigid is not None or self.pairs is not None) and system.ranks.is_alone:
             things = (system, made, self.search, self.obstacles, self.law, self.rigid, self.pairs, self.split)
             self.approach = Approach(*things, self._predict, self._regions)
-        #: Steps while nothing is near; None on the CPU, where the device cannot leave anything out, or without searches.
+        #: Steps while nothing is near; None on the CPU, where nothing can be left out, and without searches.
         self.sleep = Sleep(system, made, self.obstacles, self.search) if self.search.can_sleep else None
         self._revision = 0
         self._is_looked_at = self._has_crushed = False

@@ -6,9 +6,8 @@ import numpy as np
 import warp as wp
 
 from warp_corot.errors import UnstableError
-from warp_corot.kernels.contact import boxes
+from warp_corot.kernels.contact import boxes, wide_tree
 from warp_corot.kernels.contact import search as search_kernels
-from warp_corot.kernels.contact import wide_tree
 from warp_corot.kernels.contact.crushed import mark_crushed
 from warp_corot.kernels.contact.rows import Meeting, Rows
 from warp_corot.kernels.contact.watch import HIT

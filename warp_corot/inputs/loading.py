@@ -42,7 +42,7 @@ IMPLICIT_ON_FORESTS = (
 )
 #: Modules for explicit contact with obstacles.
 CONTACT = (
-    *("contact.mass_split", "contact.begin", "contact.sums", "contact.beside", "contact.sleep", "contact.overlaps"),
+    *("contact.mass_split", "contact.begin", "contact.sums", "contact.beside", "contact.sleep"),
     *("contact.watch", "contact.near", "contact.end", "contact.bearing"),
 )
 
