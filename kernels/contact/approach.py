@@ -5,34 +5,28 @@ next visit, less what obstacles have come nearer, so that a step looks at nothin
 gone. After Mirtich, Impulse-based dynamic simulation of rigid body systems (1996), section 2.3.
 """
 
-from typing import Any
-
 import warp as wp
 
-from warp_corot.kernels.elements.elements import load_node, store_node
+from warp_corot.kernels.elements.elements import load_node
 from warp_corot.kernels.elements.simd8 import on_cpu
 from warp_corot.kernels.modules import INLINED
-from warp_corot.kernels.stepping.integrate import by_vectors
 from warp_corot.kernels.stepping.pace import DONE, DT, Pace, length_before
-from warp_corot.kernels.stepping.work import count_constraint
 
 from .bearing import find_borne, is_borne
-from .begin import foreseen
+from .end import push
 from .mass_split import Sums, take_force
-from .motion import Bearing, Foreseen, Motions, Surface, distance_between
-from .near import BESIDE, FAR, Near
+from .motion import Bearing, Foreseen, Motions, Surface, distance_between, foreseen, kick_of
+from .near import FAR, Near
 from .shapes import GROUND, distance_to, sure_distance
 from .touches import Touches
 from .vertices import FORESEEN, OUT, Rigid
-from .visits import Visits, append, claim, lower_budget
+from .visits import LATE, LISTED, Part, Visits, append, choose, claim, lower_budget
 from .watch import FARTHEST, STABLE, Watch, begin_obstacle, pair_of
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINED})
 
 #: The phases of a visit.
 CHOOSE, CARRY, PLACE, CORNERS, LIMIT = (wp.constant(k) for k in range(5))
-#: Flags for places that were not visited in the step before, and for those that may touch something in this one.
-LATE, LISTED = wp.constant(16), wp.constant(32)
 #: A triangle is visited within this many of its longest edges of an obstacle; all of it is within 0.58 of one of a
 #: corner. Nearer to an obstacle than LONG edges at rest the edges are measured, and nodes may go by GROWN of the
 #: longest one until they are again.
@@ -88,10 +82,11 @@ def begin_visits(
             visits.touches[pair] = 0
     here.count[0] = 0
     here.touch_count[0] = kept
-    visits.chosen_count[0] = 0
     visits.contact_count[0] = 0
-    visits.due_count[0] = 0
-    visits.carrying_count[0] = 0
+    for body in range(visits.chosen_count.shape[0]):
+        visits.chosen_count[body] = 0
+        visits.due_count[body] = 0
+        visits.carrying_count[body] = 0
     number = pace.counts[DONE] + wp.int64(offset)
     visits.is_first[0] = wp.where(visits.step[0] + wp.int64(1) == number, 0, 1)
     visits.step[0] = number
@@ -114,7 +109,7 @@ def begin_visits(
     const int* nodes = &wp::index(node, 0);
     const float* w = &wp::index(inverse_mass, 0);
     const auto first = [](const auto& a) { return reinterpret_cast<const four*>(&wp::index(a, 0)); };
-    const four *from = first(budgets), *forces = first(f), *at = first(u), *speeds = first(v);
+    const four *from = first(budgets) + shift, *forces = first(f), *at = first(u), *speeds = first(v);
     const four g = {gravity[0], gravity[1], gravity[2], 0.0f};
     for (; n < end; ++n) {
         const int i = nodes[n];
@@ -133,6 +128,7 @@ def begin_visits(
 def next_due(
     n: int,
     end: int,
+    shift: int,
     used: float,
     kick: float,
     damped: float,
@@ -148,8 +144,9 @@ def next_due(
     """The next carrier from n on that may be due without loads; most are not, and need no roots.
 
     Args:
+        shift: How much larger their numbers are in ``budgets``.
         used: How much of the budgets is used by other motion [m].
-        kick, damped: As in ``foreseen``.
+        kick, damped: As in ``motion.foreseen``.
         ahead: How long nodes go on as in this step [s].
     """
     ...
@@ -161,13 +158,14 @@ def start_at(u: wp.vec3, left: float):
 
 
 @wp.func
-def know(n: int, own: Foreseen, nodes: Surface, visits: Visits):
+def know(n: int, own: Foreseen, part: Part, visits: Visits):
     """Store the motion of a carrier without contact."""
-    append(visits.carrying, visits.carrying_count, n, visits.is_shared)
-    nodes.rest[n] = own.rest
-    nodes.x[n] = own.x
-    nodes.d[n] = own.d
-    nodes.yielding[n] = own.yielding
+    first = part.start + part.shift
+    append(visits.carrying, first, visits.carrying_count, part.number, n, visits.is_shared)
+    part.nodes.rest[n] = own.rest
+    part.nodes.x[n] = own.x
+    part.nodes.d[n] = own.d
+    part.nodes.yielding[n] = own.yielding
 
 
 @wp.kernel(enable_backward=False)
@@ -175,52 +173,43 @@ def find_due(
     # In
     begin: int,
     end: int,
-    damping: float,
-    gravity: wp.vec3,
-    inverse_mass: wp.array[wp.float32],
-    has_load: int,
-    load: wp.array[Any],
+    part: Part,
     pace: Pace,
     offset: int,
-    rest: wp.array[wp.vec4],
-    f: wp.array[wp.vec4],
-    u: wp.array[wp.vec4],
-    v: wp.array[wp.vec4],
     # In and out
-    nodes: Surface,
     watch: Watch,
     visits: Visits,
 ):
-    """List the carriers from ``begin`` to ``end`` whose budgets this step may use up."""
+    """List the carriers from ``begin`` to ``end`` of a body whose budgets this step may use up."""
+    body = part.dynamics
     dt = float(pace.seconds[DT])
-    kick = dt
-    if offset == 0:
-        kick = 0.5 * (float(length_before(pace)) + dt)
-    damped = 1.0 / (1.0 + dt * damping)
+    damped = 1.0 / (1.0 + dt * body.damping)
     used = visits.came[0] + AHEAD * visits.came[1] + watch.least[0]
     is_first = visits.is_first[0] != 0
     n = int(begin)
     while n < end:
-        if not is_first and has_load == 0:
+        if not is_first and body.load_stride == 0:
             n = next_due(
-                n, end, used, kick, damped, AHEAD * dt, gravity, nodes.node, visits.budgets, inverse_mass, f, u, v
-            )
-        if n < end and nodes.node[n] >= 0:
-            i = nodes.node[n]
-            budget = visits.budgets[n]
-            own = foreseen(i, damping, gravity, inverse_mass, has_load, load, pace, offset, rest, f, u, v)
-            gone = wp.length(load_node(u, i) - wp.vec3(budget[0], budget[1], budget[2]))
+                n, end, part.shift, used, kick_of(pace, offset), damped, AHEAD * dt, body.gravity, part.nodes.node,
+                visits.budgets, body.inverse_mass, body.f, body.u, body.v,
+            )  # fmt: skip
+        if n < end and part.nodes.node[n] >= 0:
+            i = part.nodes.node[n]
+            c = n + part.shift
+            budget = visits.budgets[c]
+            own = foreseen(i, body, pace, offset)
+            gone = wp.length(load_node(body.u, i) - wp.vec3(budget[0], budget[1], budget[2]))
             goes = AHEAD * wp.length(own.d)
             if is_first or not (gone + goes <= budget[3] - used):
-                visits.carriers[n] = visits.count[0]
-                know(n, own, nodes, visits)
-                visits.needs[n] = goes + used
-                way = wp.where(is_first, 0.0, visits.ways[n] + gone)
-                visits.ways[n] = way
-                visits.budgets[n] = start_at(load_node(u, i), FAR)
+                visits.carriers[c] = visits.count[0]
+                know(n, own, part, visits)
+                visits.needs[c] = goes + used
+                way = wp.where(is_first, 0.0, visits.ways[c] + gone)
+                visits.ways[c] = way
+                visits.budgets[c] = start_at(load_node(body.u, i), FAR)
                 if way > FARTHEST_WAY * watch.size:
                     visits.step[0] = wp.int64(-2)  # all places are visited in the next step
-                append(visits.due, visits.due_count, n, visits.is_shared)
+                append(visits.due, part.start + part.shift, visits.due_count, part.number, n, visits.is_shared)
                 watch.awake[0] = 1
         n += 1
 
@@ -235,17 +224,6 @@ def end_run(pace: Pace, watch: Watch):
 
 
 @wp.func
-def choose(s: int, here: Near, visits: Visits):
-    """Visit a place in this step, once. Returns whether it was not chosen before."""
-    was = visits.places[s]
-    if not claim(visits.places, s, visits.count[0], visits.is_shared):
-        return False
-    append(visits.chosen, visits.chosen_count, s, visits.is_shared)
-    here.flags[s] = BESIDE | wp.where(was + 1 < visits.count[0], LATE, 0)
-    return True
-
-
-@wp.func
 def carriers_of(s: int, surface: Surface):
     """The numbers of the nodes that carry a place, and its weights."""
     if is_borne(s, surface):
@@ -254,88 +232,47 @@ def carriers_of(s: int, surface: Surface):
 
 
 @wp.func
-def position_of(s: int, nodes: Surface, surface: Surface, u: wp.array[wp.vec4], share: float):
+def position_of(s: int, part: Part, surface: Surface, share: float):
     """Where a place is that this step need not visit, with this share of its displacement: zero is at rest."""
     n, w = carriers_of(s, surface)
     x = wp.vec3()
     for m in range(4):
         if w[m] != 0.0:
-            x += w[m] * (nodes.rest[n[m]] + share * load_node(u, nodes.node[n[m]]))
+            i = part.nodes.node[n[m]]
+            x += w[m] * (part.nodes.rest[n[m]] + share * load_node(part.dynamics.u, i))
     return x
 
 
 @wp.func
-def longest_edge(
-    s: int,
-    x: wp.vec3,
-    share: float,
-    triangles: wp.array[wp.vec3i],
-    corner_starts: wp.array[wp.int32],
-    corners: wp.array[wp.int32],
-    nodes: Surface,
-    surface: Surface,
-    u: wp.array[wp.vec4],
-):
+def longest_edge(s: int, x: wp.vec3, share: float, part: Part, surface: Surface, visits: Visits):
     """The longest edge from a place at x [m]; ``share`` as for ``position_of``."""
     longest = float(0.0)
-    for c in range(corner_starts[s], corner_starts[s + 1]):
+    for c in range(visits.corner_starts[s], visits.corner_starts[s + 1]):
         # Each edge belongs to two triangles, in one of which its end comes next.
-        r = triangles[corners[c] / 3][(corners[c] + 1) % 3]
-        longest = wp.max(longest, wp.length(position_of(r, nodes, surface, u, share) - x))
+        r = visits.triangles[visits.corners[c] / 3][(visits.corners[c] + 1) % 3]
+        longest = wp.max(longest, wp.length(position_of(r, part, surface, share) - x))
     return longest
 
 
 @wp.func
-def carry(
-    s: int,
-    damping: float,
-    gravity: wp.vec3,
-    inverse_mass: wp.array[wp.float32],
-    has_load: int,
-    load: wp.array[Any],
-    pace: Pace,
-    offset: int,
-    rest: wp.array[wp.vec4],
-    f: wp.array[wp.vec4],
-    u: wp.array[wp.vec4],
-    v: wp.array[wp.vec4],
-    nodes: Surface,
-    surface: Surface,
-    visits: Visits,
-):
+def carry(s: int, part: Part, pace: Pace, offset: int, surface: Surface, visits: Visits):
     """Find the motion of the carriers of a place in this step without contact, and begin to measure their way here."""
     b, _w = carriers_of(s, surface)
     for m in range(4):
         n = b[m]
-        if claim(visits.carriers, n, visits.count[0], visits.is_shared):
-            i = nodes.node[n]
-            know(
-                n,
-                foreseen(i, damping, gravity, inverse_mass, has_load, load, pace, offset, rest, f, u, v),
-                nodes,
-                visits,
-            )
-            now = load_node(u, i)
-            budget = visits.budgets[n]
+        c = n + part.shift
+        if claim(visits.carriers, c, visits.count[0], visits.is_shared):
+            i = part.nodes.node[n]
+            know(n, foreseen(i, part.dynamics, pace, offset), part, visits)
+            now = load_node(part.dynamics.u, i)
+            budget = visits.budgets[c]
             gone = wp.length(now - wp.vec3(budget[0], budget[1], budget[2]))
-            visits.ways[n] = visits.ways[n] + gone
-            visits.budgets[n] = start_at(now, wp.max(budget[3] - gone, 0.0))
+            visits.ways[c] = visits.ways[c] + gone
+            visits.budgets[c] = start_at(now, wp.max(budget[3] - gone, 0.0))
 
 
 @wp.func
-def room_beside(
-    s: int,
-    has_edges: int,
-    triangles: wp.array[wp.vec3i],
-    corner_starts: wp.array[wp.int32],
-    corners: wp.array[wp.int32],
-    u: wp.array[wp.vec4],
-    nodes: Surface,
-    rigid: Rigid,
-    watch: Watch,
-    visits: Visits,
-    here: Near,
-):
+def room_beside(s: int, has_edges: int, part: Part, rigid: Rigid, watch: Watch, visits: Visits, here: Near):
     """How far a place may go before it or a triangle around it may touch an obstacle [m]; those that may are listed."""
     surface = rigid.surface
     x = surface.x[s]
@@ -354,7 +291,7 @@ def room_beside(
         holds = rigid.allowance[o, s] != 0.0 or wp.length_sq(rigid.forces[o, s]) > 0.0
         if gap <= close or rigid.acts[o, s] != OUT or holds:
             may_touch = True
-            append(visits.contacts, visits.contact_count, o * surface.node.shape[0] + s, visits.is_shared)
+            append(visits.contacts, 0, visits.contact_count, 0, o * surface.node.shape[0] + s, visits.is_shared)
         if holds:
             gap = wp.min(gap, 0.0)
         elif gap < -watch.least[0] and (here.flags[s] & LATE) != 0 and visits.may_miss[0] != 0:
@@ -362,18 +299,18 @@ def room_beside(
         if span == 0.0 or gap > span:
             room = wp.min(room, gap - span)
         else:
-            longest = longest_edge(s, x, 1.0, triangles, corner_starts, corners, nodes, surface, u)
+            longest = longest_edge(s, x, 1.0, part, surface, visits)
             room = wp.min(room, wp.min(gap - longest, GROWN * longest))
             if gap <= COVERED * longest + close + watch.least[0]:
-                for c in range(corner_starts[s], corner_starts[s + 1]):
-                    pair = o * triangles.shape[0] + corners[c] / 3
+                for c in range(visits.corner_starts[s], visits.corner_starts[s + 1]):
+                    pair = o * visits.triangles.shape[0] + visits.corners[c] / 3
                     if claim(visits.touches, pair, 1, visits.is_shared):
-                        append(here.touches, here.touch_count, pair, visits.is_shared)
+                        append(here.touches, 0, here.touch_count, 0, pair, visits.is_shared)
     if may_touch:
         if not (wp.length(surface.d[s]) <= STABLE * watch.size):
             wp.atomic_add(watch.missed, 0, 1)
         here.flags[s] = here.flags[s] | LISTED
-        append(here.nodes, here.count, s, visits.is_shared)
+        append(here.nodes, 0, here.count, 0, s, visits.is_shared)
     return wp.max(room, 0.0)
 
 
@@ -384,47 +321,35 @@ def visit(
     thread: int,
     first: int,
     last: int,
-    damping: float,
-    gravity: wp.vec3,
-    inverse_mass: wp.array[wp.float32],
-    has_load: int,
-    load: wp.array[Any],
+    part: Part,
     pace: Pace,
     offset: int,
-    rest: wp.array[wp.vec4],
-    f: wp.array[wp.vec4],
-    u: wp.array[wp.vec4],
-    v: wp.array[wp.vec4],
     has_edges: int,
-    triangles: wp.array[wp.vec3i],
-    corner_starts: wp.array[wp.int32],
-    corners: wp.array[wp.int32],
     watch: Watch,
     # In and out
-    nodes: Surface,
     rigid: Rigid,
     visits: Visits,
     # Out
     here: Near,
 ):
-    """Find the motion of what is due without contact, and how far it is from obstacles.
+    """Find the motion of what is due in a body without contact, and how far it is from obstacles.
 
     Args:
         threads, thread: Number of threads, and this one.
         first, last: The phases.
         has_edges: Whether an obstacle can pass between nodes.
-        nodes: The carriers.
         here: What may touch in this step.
     """
     surface = rigid.surface
-    are_borne = surface.bearing.bearers.shape[0] > 0
+    are_borne = part.shift > 0
+    own = part.start + part.shift
     if first == CHOOSE:
         k = int(thread)
-        while k < visits.due_count[0]:
-            n = visits.due[k]
+        while k < visits.due_count[part.number]:
+            n = visits.due[own + k]
             k += threads
             if are_borne:
-                need = visits.ways[n] + visits.needs[n]
+                need = visits.ways[n + part.shift] + visits.needs[n + part.shift]
                 for e in range(surface.bearing.starts[n], surface.bearing.starts[n + 1]):
                     if visits.is_first[0] != 0 or not (visits.until[e] >= need):
                         choose(surface.bearing.places[e], here, visits)
@@ -432,53 +357,49 @@ def visit(
                 choose(n, here, visits)
     if first <= CARRY and last >= CARRY:
         k = int(thread)
-        while k < visits.chosen_count[0]:
-            s = visits.chosen[k]
+        while k < visits.chosen_count[part.number]:
+            s = visits.chosen[part.place + k]
             k += threads
-            carry(
-                s, damping, gravity, inverse_mass, has_load, load, pace, offset, rest, f, u, v, nodes, surface, visits
-            )
+            carry(s, part, pace, offset, surface, visits)
     if first <= PLACE and last >= PLACE:
         k = int(thread)
-        while k < visits.chosen_count[0]:
-            s = visits.chosen[k]
+        while k < visits.chosen_count[part.number]:
+            s = visits.chosen[part.place + k]
             k += threads
             if are_borne:
-                find_borne(s, nodes, surface)
+                find_borne(s, part.nodes, surface)
             if visits.is_first[0] != 0 and has_edges != 0:
-                at_rest = position_of(s, nodes, surface, u, 0.0)
-                visits.spans[s] = longest_edge(s, at_rest, 0.0, triangles, corner_starts, corners, nodes, surface, u)
-            room = room_beside(s, has_edges, triangles, corner_starts, corners, u, nodes, rigid, watch, visits, here)
+                visits.spans[s] = longest_edge(s, position_of(s, part, surface, 0.0), 0.0, part, surface, visits)
+            room = room_beside(s, has_edges, part, rigid, watch, visits, here)
             b, w = carriers_of(s, surface)
             left = visits.came[0] + room / (wp.abs(w[0]) + wp.abs(w[1]) + wp.abs(w[2]) + wp.abs(w[3]))
             for m in range(4):
                 if w[m] != 0.0:
-                    lower_budget(visits.budgets, b[m], left, visits.is_shared)
+                    lower_budget(visits.budgets, b[m] + part.shift, left, visits.is_shared)
                     if are_borne:
-                        visits.until[visits.entries[s][m]] = visits.ways[b[m]] + left
+                        visits.until[visits.entries[s][m]] = visits.ways[b[m] + part.shift] + left
     if first <= CORNERS and last >= CORNERS and thread == 0:
         for k in range(here.touch_count[0]):
             for m in range(3):
-                s = triangles[here.touches[k] % triangles.shape[0]][m]
-                if choose(s, here, visits):
-                    carry(
-                        s, damping, gravity, inverse_mass, has_load, load, pace, offset, rest, f, u, v, nodes, surface,
-                        visits,
-                    )  # fmt: skip
+                s = visits.triangles[here.touches[k] % visits.triangles.shape[0]][m]
+                if visits.body[s] == part.number and choose(s, here, visits):
+                    carry(s, part, pace, offset, surface, visits)
                     if are_borne:
-                        find_borne(s, nodes, surface)
-                if (here.flags[s] & LISTED) == 0:
+                        find_borne(s, part.nodes, surface)
+                if visits.body[s] == part.number and (here.flags[s] & LISTED) == 0:
                     here.flags[s] = here.flags[s] | LISTED
-                    append(here.nodes, here.count, s, visits.is_shared)
+                    append(here.nodes, 0, here.count, 0, s, visits.is_shared)
     if last == LIMIT and are_borne:
         k = int(thread)
-        while k < visits.due_count[0]:
-            n = visits.due[k]
+        while k < visits.due_count[part.number]:
+            n = visits.due[own + k]
             k += threads
             most = float(FAR)
             for e in range(surface.bearing.starts[n], surface.bearing.starts[n + 1]):
                 most = wp.min(most, visits.until[e])
-            lower_budget(visits.budgets, n, wp.max(most - visits.ways[n], 0.0), visits.is_shared)
+            lower_budget(
+                visits.budgets, n + part.shift, wp.max(most - visits.ways[n + part.shift], 0.0), visits.is_shared
+            )
 
 
 @wp.kernel(enable_backward=False)
@@ -486,24 +407,14 @@ def end_visits(
     # In
     threads: int,
     thread: int,
-    shift: int,
     buffer: int,
     grain: float,
-    nodes: Surface,
     visits: Visits,
     counts: int,
-    damping: float,
-    gravity: wp.vec3,
-    inverse_mass: wp.array[wp.float32],
-    has_load: int,
-    load: wp.array[Any],
     pace: Pace,
     offset: int,
-    rest: wp.array[wp.vec4],
-    f: wp.array[wp.vec4],
-    u: wp.array[wp.vec4],
-    v: wp.array[wp.vec4],
     # In and out
+    part: Part,
     sums: Sums,
     account: wp.array2d[wp.float64],
     # Out
@@ -511,50 +422,33 @@ def end_visits(
 ):
     """Add the contact forces at the carriers of what was visited to a body's forces; see ``end_contact``."""
     k = int(thread)
-    while k < visits.carrying_count[0]:
-        n = visits.carrying[k]
+    while k < visits.carrying_count[part.number]:
+        n = visits.carrying[part.start + part.shift + k]
         k += threads
-        if sums.touched[n + shift] != 0:
-            i = nodes.node[n]
-            force = take_force(n + shift, buffer, grain, sums)
-            store_node(contact_forces, i, force)
-            if wp.dot(force, force) > 0.0:
-                total = load_node(f, i) + force
-                store_node(f, i, total)
-                if counts != 0:
-                    count_constraint(
-                        i, force, total, damping, gravity, inverse_mass, has_load, load, pace, offset, v, account
-                    )
+        if sums.touched[n + part.shift] != 0:
+            force = take_force(n + part.shift, buffer, grain, sums)
+            push(part.nodes.node[n], force, counts, pace, offset, part.dynamics, account, contact_forces)
 
 
 @wp.kernel(enable_backward=False)
 def complete_triangles(
     # In
     pace: Pace,
-    u: wp.array[wp.vec4],
-    v: wp.array[wp.vec4],
-    nodes: Surface,
-    triangles: wp.array[wp.vec3i],
-    corner_starts: wp.array[wp.int32],
-    corners: wp.array[wp.int32],
-    here: Near,
+    part: Part,
     visits: Visits,
     # Out
     surface: Surface,
 ):
     """Find where the other corners of triangles around places with a force were at the beginning of the last step."""
     before = float(length_before(pace))
-    for k in range(here.count[0]):
-        s = here.nodes[k]
+    for k in range(visits.chosen_count[part.number]):
+        s = visits.chosen[part.place + k]
         if wp.length_sq(surface.f[s]) > 0.0:
-            for c in range(corner_starts[s], corner_starts[s + 1]):
-                r = triangles[corners[c] / 3][(corners[c] + 1) % 3]
+            for c in range(visits.corner_starts[s], visits.corner_starts[s + 1]):
+                r = visits.triangles[visits.corners[c] / 3][(visits.corners[c] + 1) % 3]
                 if visits.places[r] != visits.count[0]:
                     b, w = carriers_of(r, surface)
-                    x = position_of(r, nodes, surface, u, 1.0)
+                    x = position_of(r, part, surface, 1.0)
                     for m in range(4):
-                        x -= (w[m] * before) * load_node(v, nodes.node[b[m]])
+                        x -= (w[m] * before) * load_node(part.dynamics.v, part.nodes.node[b[m]])
                     surface.x[r] = x
-
-
-FIND_DUE, VISIT, END_VISITS = (by_vectors(kernel, "load") for kernel in (find_due, visit, end_visits))

@@ -27,20 +27,35 @@ def loose_share(s: int, surface: Surface):
     return wp.where(surface.yielding[s] > 0.0, 1.0, 0.0)
 
 
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    for (int k = 0; k < 4; ++k)
+        for (int m = 0; m < 4; ++m)
+            if (b[k] == c[m] && v[k] != 0.0f && w[m] != 0.0f) return true;
+    return false;
+#else
+    typedef int four __attribute__((vector_size(16)));
+    four first, other;
+    for (int k = 0; k < 4; ++k) first[k] = v[k] != 0.0f ? b[k] : -1, other[k] = w[k] != 0.0f ? c[k] : -2;
+    four same = first == other;
+    same |= first == __builtin_shufflevector(other, other, 1, 2, 3, 0);
+    same |= first == __builtin_shufflevector(other, other, 2, 3, 0, 1);
+    same |= first == __builtin_shufflevector(other, other, 3, 0, 1, 2);
+    return __builtin_reduce_or(same) != 0;
+#endif
+""")
+def have_common(b: wp.vec4i, v: wp.vec4, c: wp.vec4i, w: wp.vec4) -> bool:
+    """Whether two sets of numbers b and c with weights v and w have a common one whose weights are not zero."""
+    ...
+
+
 @wp.func
 def share_bearers(s: int, r: int, surface: Surface):
     """Whether a node bears both of two places, which are then as near each other as two nodes of an element."""
     if not is_borne(s, surface) or not is_borne(r, surface):
         return False
-    b = surface.bearing.bearers[s]
-    c = surface.bearing.bearers[r]
-    v = surface.bearing.weights[s]
-    w = surface.bearing.weights[r]
-    for k in range(4):
-        for m in range(4):
-            if b[k] == c[m] and v[k] != 0.0 and w[m] != 0.0:
-                return True
-    return False
+    of = surface.bearing
+    return have_common(of.bearers[s], of.weights[s], of.bearers[r], of.weights[r])
 
 
 @wp.func

@@ -1,57 +1,18 @@
 """The beginning of a step with contact: the motion of surfaces without contact, and the motion of obstacles."""
 
-from typing import Any
-
 import warp as wp
 
-from warp_corot.kernels.elements.elements import load_node
-from warp_corot.kernels.stepping.integrate import by_vectors, symplectic_euler_velocity, vector_at
-from warp_corot.kernels.stepping.pace import DT, Pace, length_before
+from warp_corot.kernels.modules import INLINED
+from warp_corot.kernels.stepping.pace import Pace
 
 from .bearing import place_among
-from .motion import Foreseen, Motions, Surface
+from .motion import Dynamics, Foreseen, Motions, Surface, foreseen
 from .watch import Watch, begin_obstacle, pair_of
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINED})
 
 #: Number of threads of a block on CUDA: few, so that the places of a small surface are on many multiprocessors.
 BLOCK = 64
-
-
-@wp.func
-def foreseen(
-    i: int,
-    damping: float,
-    gravity: wp.vec3,
-    inverse_mass: wp.array[wp.float32],
-    has_load: int,
-    load: wp.array[Any],
-    pace: Pace,
-    offset: int,
-    rest: wp.array[wp.vec4],
-    f: wp.array[wp.vec4],
-    u: wp.array[wp.vec4],
-    v: wp.array[wp.vec4],
-):
-    """The position of a node and its motion in this step without contact, as the step computes it."""
-    dt = float(pace.seconds[DT])
-    kick = dt
-    if offset == 0:
-        kick = 0.5 * (float(length_before(pace)) + dt)
-    damped = 1.0 / (1.0 + dt * damping)
-    force = load_node(f, i)
-    if has_load != 0:
-        force += vector_at(load, i)
-    w = inverse_mass[i]
-    velocity = load_node(v, i)
-    if w > 0.0:
-        velocity = symplectic_euler_velocity(velocity, force, w, gravity, kick, damped)
-    found = Foreseen()
-    found.rest = load_node(rest, i)
-    found.x = found.rest + load_node(u, i)
-    found.d = dt * velocity
-    found.yielding = dt * kick * w * damped
-    return found
 
 
 @wp.kernel(enable_backward=False)
@@ -63,17 +24,9 @@ def begin_step(
     borne: int,
     frames: int,
     obstacles: int,
-    damping: float,
-    gravity: wp.vec3,
-    inverse_mass: wp.array[wp.float32],
-    has_load: int,
-    load: wp.array[Any],
+    body: Dynamics,
     pace: Pace,
     offset: int,
-    rest: wp.array[wp.vec4],
-    f: wp.array[wp.vec4],
-    u: wp.array[wp.vec4],
-    v: wp.array[wp.vec4],
     bearers: Surface,
     motions: Motions,
     world_starts: wp.array[wp.float64],
@@ -108,7 +61,7 @@ def begin_step(
         nodes.f[s] = wp.vec3()
         nodes.yielding[s] = 0.0
         if i >= 0:
-            own = foreseen(i, damping, gravity, inverse_mass, has_load, load, pace, offset, rest, f, u, v)
+            own = foreseen(i, body, pace, offset)
             nodes.rest[s] = own.rest
             nodes.x[s] = own.x
             nodes.d[s] = own.d
@@ -124,7 +77,7 @@ def begin_step(
             # Without branches, so that CUDA loads all at once.
             for m in range(4):
                 i = bearers.node[b[m]]
-                own = foreseen(i, damping, gravity, inverse_mass, has_load, load, pace, offset, rest, f, u, v)
+                own = foreseen(i, body, pace, offset)
                 place = place_among(place, w[m], own)
             surface.rest[s] = place.rest
             surface.x[s] = place.x
@@ -132,6 +85,3 @@ def begin_step(
             surface.yielding[s] = place.yielding
             surface.bearing.loose[s] = wp.clamp(place.loose, 0.0, 1.0)
             surface.bearing.held[s] = place.held
-
-
-BEGIN_STEP = by_vectors(begin_step, "load")

@@ -4,7 +4,7 @@ import warp as wp
 
 from warp_corot.kernels.stepping.threads import spread_thread, synchronize_grid
 
-from .extremes import raise_by_warp
+from .boxes import raise_by_warp
 from .near import AROUND, BESIDE, Near, add_motion, begin_search, leave_room, mark
 from .shapes import GROUND, distance_to, sure_distance
 from .sleep import end_search

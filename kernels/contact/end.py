@@ -1,20 +1,39 @@
 """The end of the contact of a step: forces and their work at nodes, and the watch for the next search."""
 
-from typing import Any
-
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
-from warp_corot.kernels.stepping.integrate import by_vectors
+from warp_corot.kernels.modules import INLINED
 from warp_corot.kernels.stepping.pace import Pace
 from warp_corot.kernels.stepping.work import count_constraint
 
 from .begin import BLOCK as BLOCK
 from .mass_split import Sums, take_force
-from .motion import Surface
+from .motion import Dynamics, Surface, force_at
 from .watch import Watch, follow_node
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINED})
+
+
+@wp.func
+def push(
+    i: int,
+    force: wp.vec3,
+    counts: int,
+    pace: Pace,
+    offset: int,
+    body: Dynamics,
+    account: wp.array2d[wp.float64],
+    contact_forces: wp.array[wp.vec4],
+):
+    """Add the contact force of a node to its forces, and count its work if ``counts`` says so."""
+    store_node(contact_forces, i, force)
+    if wp.dot(force, force) > 0.0:
+        store_node(body.f, i, load_node(body.f, i) + force)
+        if counts != 0:
+            w = body.inverse_mass[i]
+            v = load_node(body.v, i)
+            count_constraint(i, force, force_at(i, body), v, body.damping, body.gravity, w, pace, offset, account)
 
 
 @wp.kernel(enable_backward=False)
@@ -30,18 +49,12 @@ def end_contact(
     nodes: Surface,
     surface: Surface,
     counts: int,
-    damping: float,
-    gravity: wp.vec3,
-    inverse_mass: wp.array[wp.float32],
-    has_load: int,
-    load: wp.array[Any],
     pace: Pace,
     offset: int,
-    v: wp.array[wp.vec4],
     # In and out
     sums: Sums,
     watch: Watch,
-    f: wp.array[wp.vec4],
+    body: Dynamics,
     account: wp.array2d[wp.float64],
     # Out
     contact_forces: wp.array[wp.vec4],
@@ -63,16 +76,6 @@ def end_contact(
             n = s + shift
             if watch.awake[0] != 0 and sums.touched[n] != 0:
                 force = take_force(n, buffer, grain, sums)
-            store_node(contact_forces, i, force)
-            if wp.dot(force, force) > 0.0:
-                total = load_node(f, i) + force
-                store_node(f, i, total)
-                if counts != 0:
-                    count_constraint(
-                        i, force, total, damping, gravity, inverse_mass, has_load, load, pace, offset, v, account
-                    )
+            push(i, force, counts, pace, offset, body, account, contact_forces)
     if watch.awake[0] != 0 and k < places and surface.node[place_start + k] >= 0:
         follow_node(place_start + k, surface, watch)
-
-
-END_CONTACT = by_vectors(end_contact, "load")

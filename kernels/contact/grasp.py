@@ -4,20 +4,17 @@ In implicit steps both are springs to the tool's pose at the end of the step. Th
 has the force of the last step as a multiplier, so a node at rest has no offset.
 """
 
-from typing import Any
-
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
-from warp_corot.kernels.stepping.integrate import by_vectors
+from warp_corot.kernels.modules import INLINED
 from warp_corot.kernels.stepping.pace import Pace
 
-from .begin import foreseen
 from .law import SETTLING
-from .motion import Motions
+from .motion import Dynamics, Motions, foreseen
 from .shapes import carried
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINED})
 
 #: Whether a node is held: not while the grasp is open, yes, or not because it was out of reach when the grasp closed.
 OPEN, HELD, MISSED = (wp.constant(k) for k in range(3))
@@ -72,18 +69,10 @@ def hold_in_tool(
     places: wp.array[wp.vec3],
     held: wp.array[wp.int32],
     stiffness: float,
-    damping: float,
-    gravity: wp.vec3,
-    inverse_mass: wp.array[wp.float32],
-    has_load: int,
-    load: wp.array[Any],
     pace: Pace,
     offset: int,
-    rest: wp.array[wp.vec4],
-    u: wp.array[wp.vec4],
-    v: wp.array[wp.vec4],
     # In and out
-    f: wp.array[wp.vec4],
+    body: Dynamics,
     contact_forces: wp.array[wp.vec4],
     # Out
     forces: wp.array[wp.vec3],
@@ -94,10 +83,10 @@ def hold_in_tool(
     k = wp.tid()
     i = nodes[k]
     forces[k] = wp.vec3()
-    if inverse_mass[i] == 0.0 or held[k] != HELD:
+    if body.inverse_mass[i] == 0.0 or held[k] != HELD:
         return
     world = k / per_world
-    own = foreseen(i, damping, gravity, inverse_mass, has_load, load, pace, offset, rest, f, u, v)
+    own = foreseen(i, body, pace, offset)
     now = motions.now[world, o]
     way = carried(now, motions.later[world, o], own.x) - own.d
     off = wp.transform_point(now, places[k]) - own.x
@@ -105,7 +94,7 @@ def hold_in_tool(
     if stiffness > 0.0:
         force = (stiffness / (1.0 + stiffness * own.yielding)) * (way + off)
     forces[k] = force
-    store_node(f, i, load_node(f, i) + force)
+    store_node(body.f, i, load_node(body.f, i) + force)
     store_node(contact_forces, i, load_node(contact_forces, i) + force)
 
 
@@ -182,6 +171,3 @@ def sum_held(
         force -= wp.vec3d(forces[k])
         torque -= wp.vec3d(wp.cross(wp.quat_rotate(turn, places[k]), forces[k]))
     wrenches[world] = wp.spatial_vector(wp.vec3(force), wp.vec3(torque))
-
-
-HOLD_IN_TOOL = by_vectors(hold_in_tool, "load")

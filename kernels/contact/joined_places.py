@@ -5,9 +5,9 @@ import warp as wp
 from warp_corot.kernels.stepping.pace import DT, Pace
 
 from .carriers import Carriers, crowd_at, ease_at, gone_at, is_held_at, motion_at
-from .facing import locate_facing
 from .joined import NEAR, OFTEN, STIFF, Joined, opened_by
 from .law import Law, held_back
+from .locate import locate_facing
 from .motion import Surface
 from .rows import Meeting, Rows, row_count
 from .springs import kept_gap, least_gap

@@ -3,7 +3,8 @@
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node
-from warp_corot.kernels.stepping.pace import DT, Pace, time_after
+from warp_corot.kernels.stepping.integrate import symplectic_euler_velocity
+from warp_corot.kernels.stepping.pace import DT, Pace, length_before, time_after
 
 wp.set_module_options({"enable_backward": False})
 
@@ -66,6 +67,58 @@ class Foreseen:
     yielding: float
     loose: float  # share of the weights that free nodes have
     held: wp.vec3  # part of the displacement that comes from held nodes [m]
+
+
+@wp.struct
+class Dynamics:
+    """What moves the nodes of a body in an explicit step."""
+
+    damping: float  # [1/s]
+    gravity: wp.vec3  # [m/s^2]
+    inverse_mass: wp.array[wp.float32]  # [1/kg]; zero for held nodes
+    load: wp.array[wp.float32]  # external forces [N], so many numbers for each node; zero: there are none
+    load_stride: int
+    rest: wp.array[wp.vec4]  # [m]
+    f: wp.array[wp.vec4]  # all forces but loads and gravity [N]
+    u: wp.array[wp.vec4]  # [m]
+    v: wp.array[wp.vec4]  # [m/s]
+
+
+@wp.func
+def force_at(i: int, body: Dynamics):
+    """The force on a node besides gravity [N]."""
+    force = load_node(body.f, i)
+    if body.load_stride > 0:
+        k = body.load_stride * i
+        force += wp.vec3(body.load[k], body.load[k + 1], body.load[k + 2])
+    return force
+
+
+@wp.func
+def kick_of(pace: Pace, offset: int):
+    """How long forces act until the velocity of this step: half of the last step and half of this one [s]."""
+    dt = float(pace.seconds[DT])
+    if offset == 0:
+        return 0.5 * (float(length_before(pace)) + dt)
+    return dt
+
+
+@wp.func
+def foreseen(i: int, body: Dynamics, pace: Pace, offset: int):
+    """The position of a node and its motion in this step without contact, as the step computes it."""
+    dt = float(pace.seconds[DT])
+    kick = kick_of(pace, offset)
+    damped = 1.0 / (1.0 + dt * body.damping)
+    w = body.inverse_mass[i]
+    velocity = load_node(body.v, i)
+    if w > 0.0:
+        velocity = symplectic_euler_velocity(velocity, force_at(i, body), w, body.gravity, kick, damped)
+    found = Foreseen()
+    found.rest = load_node(body.rest, i)
+    found.x = found.rest + load_node(body.u, i)
+    found.d = dt * velocity
+    found.yielding = dt * kick * w * damped
+    return found
 
 
 @wp.func

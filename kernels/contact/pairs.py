@@ -44,7 +44,9 @@ def may_push(row: int, law: Law, surface: Surface, rows: Rows):
     p = rows.places[row]
     most = float(0.0)
     for k in range(4):
-        most += wp.abs(w[k]) * wp.length(surface.d[p[k]])
+        for m in range(4):
+            if w[k] > 0.0 and w[m] < 0.0:
+                most = wp.max(most, wp.length(surface.d[p[k]] - surface.d[p[m]]))
     return gap <= FORESEEN * most + law.closing
 
 

@@ -53,6 +53,7 @@ class Rows:
     shares: wp.array[wp.vec4]
     normal: wp.array[wp.vec3]  # from the second to the first
     gap: wp.array[wp.float32]
+    away: wp.array[wp.float32]  # how far the two were apart at the last search, at least [m]; empty on CUDA
     acts: wp.array[wp.int32]  # see ``mass_split``
     force: wp.array[wp.vec3]  # on the first [N]
     more: wp.array[wp.vec3]  # its change in the last iteration

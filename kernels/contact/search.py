@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from warp_corot.kernels.modules import INLINED
+
 from .bearing import share_bearers
 from .boxes import edge_reach, lower_end, root_of, triangle_reach, triangle_size, upper_end
 from .closest import on_segments, on_triangle, point_of
@@ -10,8 +12,9 @@ from .motion import Surface
 from .near import CRUSHED, PAIRED, Near, mark
 from .rows import BAND, BAND_AT_REST, Meeting, Rows, row_count
 from .watch import Watch, ahead_at
+from .wide_tree import BLUNT, MAY_FACE, NEARLY, Space, has_wide, query_wide
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINED})
 
 #: Number of neighbours that a thread keeps; with more, it finds them a second time.
 KEPT = wp.constant(32)
@@ -19,13 +22,8 @@ Kept = wp.types.vector(length=32, dtype=wp.int32)
 
 #: Edges with a larger sine of the bend are sharp.
 SHARP = wp.constant(0.15)
-#: The largest cosine between the normals of a node and a triangle of one body that may face each other before the next
-#: search.
-MAY_FACE = wp.constant(0.5)
 #: The largest cosine between the normals of a node and a triangle of two bodies that may touch before the next search.
 MAY_TOUCH = wp.constant(-0.3)
-#: Edges that bend by up to about 100 degrees, whose normals add up to at least this, touch only what they face.
-BLUNT = wp.constant(1.25)
 
 
 @wp.struct
@@ -117,16 +115,9 @@ def node_is_near(s: int, t: int, out: wp.vec3, surface: Surface, meeting: Meetin
     if c[0] == s or c[1] == s or c[2] == s or meeting.opposite[t] == s:
         return False
     normal = meeting.normals[t]
-    if meeting.body[s] == meeting.body[c[0]]:
-        if wp.dot(out, normal) > MAY_FACE:
-            return False
-        # Inverted elements have passed through their own body and have to get back.
-        flags = near.flags[s] | near.flags[c[0]] | near.flags[c[1]] | near.flags[c[2]]
-        if (flags & CRUSHED) != 0:
-            return False
-        for k in range(3):
-            if share_bearers(s, c[k], surface):
-                return False
+    is_own = meeting.body[s] == meeting.body[c[0]]
+    if is_own and wp.dot(out, normal) > MAY_FACE:
+        return False
     a = surface.x[c[0]]
     b = surface.x[c[1]]
     e = surface.x[c[2]]
@@ -144,14 +135,23 @@ def node_is_near(s: int, t: int, out: wp.vec3, surface: Surface, meeting: Meetin
             return False
         if is_beside(way, normal, far, size, wp.max(wp.length(b - a), wp.max(wp.length(e - b), wp.length(a - e)))):
             return False
-        if meeting.body[s] == meeting.body[c[0]]:
+        if is_own:
             # Deeper nodes of the same body do not count as touching; see ``locate.deepest``.
             apart = surface.rest[s] - surface.rest[c[0]]
             most = wp.max(wp.length(apart), wp.length(surface.rest[s] - surface.rest[c[1]]))
             most = wp.max(most, wp.length(surface.rest[s] - surface.rest[c[2]]))
-            if distance > far + BAND_AT_REST * most:
-                return node_faces_at_rest(s, c, apart, surface, meeting)
-    return meeting.body[s] == meeting.body[c[0]] or may_face(s, out, normal, meeting)
+            if distance > far + BAND_AT_REST * most and not node_faces_at_rest(s, c, apart, surface, meeting):
+                return False
+    if not is_own:
+        return may_face(s, out, normal, meeting)
+    # Inverted elements have passed through their own body and have to get back.
+    flags = near.flags[s] | near.flags[c[0]] | near.flags[c[1]] | near.flags[c[2]]
+    if (flags & CRUSHED) != 0:
+        return False
+    are_apart = bool(True)
+    for k in range(3):
+        are_apart = are_apart and not share_bearers(s, c[k], surface)
+    return are_apart
 
 
 @wp.func
@@ -207,16 +207,8 @@ def edge_is_near(k: int, m: int, is_sharp: bool, out: wp.vec3, surface: Surface,
         return False
     if e[0] == f[0] or e[0] == f[1] or e[1] == f[0] or e[1] == f[1]:
         return False
-    if meeting.body[e[0]] == meeting.body[f[0]]:
-        if face_away(out, meeting.outs[m]):
-            return False
-        flags = near.flags[e[0]] | near.flags[e[1]] | near.flags[f[0]] | near.flags[f[1]]
-        if (flags & CRUSHED) != 0:
-            return False
-        for n in range(2):
-            if share_bearers(e[n], f[0], surface) or share_bearers(e[n], f[1], surface):
-                return False
-    if is_opposite(e, m, meeting):
+    is_own = meeting.body[e[0]] == meeting.body[f[0]]
+    if is_own and face_away(out, meeting.outs[m]):
         return False
     p = surface.x[e[0]]
     q = surface.x[e[1]]
@@ -230,8 +222,15 @@ def edge_is_near(k: int, m: int, is_sharp: bool, out: wp.vec3, surface: Surface,
         wp.max(approach(e[0], f[0], meeting), approach(e[0], f[1], meeting)),
         wp.max(approach(e[1], f[0], meeting), approach(e[1], f[1], meeting)),
     )
-    if not (wp.length(way) <= far + band):
+    if not (wp.length(way) <= far + band) or is_opposite(e, m, meeting):
         return False
+    if is_own:
+        flags = near.flags[e[0]] | near.flags[e[1]] | near.flags[f[0]] | near.flags[f[1]]
+        if (flags & CRUSHED) != 0:
+            return False
+        for n in range(2):
+            if share_bearers(e[n], f[0], surface) or share_bearers(e[n], f[1], surface):
+                return False
     other = bend(surface, meeting, m)
     # Sharp edges find flat ones; the first of two sharp or flat edges finds the pair.
     if other < -SHARP:
@@ -265,9 +264,17 @@ def in_order(kept: Kept, count: int):
 
 
 @wp.func
-def near_node(
-    i: int, start: int, of_triangles: wp.uint64, surface: Surface, meeting: Meeting, near: Near, rows: Rows, kept: Kept
-):
+def add_found(other: int, start: int, count: int, rows: Rows, kept: Kept):
+    """Keep one more neighbour, or write it if a start is given."""
+    if start >= 0:
+        add_other(start, count, other, rows)
+    elif count < KEPT:
+        kept[count] = other
+    return kept
+
+
+@wp.func
+def near_node(i: int, start: int, space: Space, surface: Surface, meeting: Meeting, near: Near, rows: Rows, kept: Kept):
     """Count the triangles near a node and keep the first ones, or write all if a start is given."""
     count = int(0)
     reach = meeting.reach[i]
@@ -276,28 +283,35 @@ def near_node(
     high = upper_end(i, surface, meeting) + beyond
     out = wp.vec3()
     knows = bool(False)
+    if has_wide(space.wide):
+        out = node_normal(i, meeting)
+        is_own = meeting.meets_itself
+        far = wp.where(meeting.ahead.shape[0] > 0, -1.0, NEARLY * reach)
+        x = surface.x[i]
+        found = query_wide(space.wide, 0, surface.world[i], meeting.body[i], is_own, low, high, out, far, x, x)
+        for k in range(found):
+            t = space.wide.found[k]
+            if node_is_near(i, t, out, surface, meeting, near):
+                kept = add_found(t, start, count, rows, kept)
+                count += 1
+        return count, kept
     for g in range(meeting.groups):
         root = root_of(0, g, i, low, high, surface, meeting)
         if root >= 0:
             if not knows:
                 out = node_normal(i, meeting)
                 knows = True
-            query = wp.bvh_query_aabb(of_triangles, low, high, root)
+            query = wp.bvh_query_aabb(space.of_triangles, low, high, root)
             t = int(0)
             while wp.bvh_query_next(query, t):
                 if node_is_near(i, t, out, surface, meeting, near):
-                    if start >= 0:
-                        add_other(start, count, t, rows)
-                    elif count < KEPT:
-                        kept[count] = t
+                    kept = add_found(t, start, count, rows, kept)
                     count += 1
     return count, kept
 
 
 @wp.func
-def near_edge(
-    k: int, start: int, of_edges: wp.uint64, surface: Surface, meeting: Meeting, near: Near, rows: Rows, kept: Kept
-):
+def near_edge(k: int, start: int, space: Space, surface: Surface, meeting: Meeting, near: Near, rows: Rows, kept: Kept):
     """Count the edges near one that is sharp, or flat, and keep the first ones, or write all if a start is given."""
     count = int(0)
     e = meeting.edges[k]
@@ -308,6 +322,25 @@ def near_edge(
     own = float(0.0)
     out = wp.vec3()
     knows = bool(False)
+    if has_wide(space.wide):
+        own = bend(surface, meeting, k)
+        if own <= SHARP and (own < -SHARP or meeting.flat_edges == 0):
+            return 0, kept
+        out = meeting.outs[k]
+        length = wp.length(out)
+        way = wp.where(length < BLUNT, wp.vec3(), out / length)
+        is_own = meeting.meets_itself
+        far = wp.where(meeting.ahead.shape[0] > 0, -1.0, NEARLY * reach)
+        x = surface.x[e[0]]
+        along = surface.x[e[1]] - x
+        world = surface.world[e[0]]
+        found = query_wide(space.wide, 1, world, meeting.body[e[0]], is_own, low, high, way, far, x, along)
+        for n in range(found):
+            m = space.wide.found[n]
+            if edge_is_near(k, m, own > SHARP, out, surface, meeting, near):
+                kept = add_found(m, start, count, rows, kept)
+                count += 1
+        return count, kept
     for g in range(meeting.groups):
         root = root_of(1, g, e[0], low, high, surface, meeting)
         if root >= 0:
@@ -317,14 +350,11 @@ def near_edge(
                 knows = True
             if own <= SHARP and (own < -SHARP or meeting.flat_edges == 0):
                 return 0, kept
-            query = wp.bvh_query_aabb(of_edges, low, high, root)
+            query = wp.bvh_query_aabb(space.of_edges, low, high, root)
             m = int(0)
             while wp.bvh_query_next(query, m):
                 if edge_is_near(k, m, own > SHARP, out, surface, meeting, near):
-                    if start >= 0:
-                        add_other(start, count, m, rows)
-                    elif count < KEPT:
-                        kept[count] = m
+                    kept = add_found(m, start, count, rows, kept)
                     count += 1
     return count, kept
 
@@ -333,8 +363,7 @@ def near_edge(
 def near_owner(
     i: int,
     start: int,
-    of_triangles: wp.uint64,
-    of_edges: wp.uint64,
+    space: Space,
     surface: Surface,
     meeting: Meeting,
     near: Near,
@@ -346,9 +375,9 @@ def near_owner(
     found = kept
     if i < nodes:
         if surface.node[i] >= 0:
-            count, found = near_node(i, start, of_triangles, surface, meeting, near, rows, kept)
+            count, found = near_node(i, start, space, surface, meeting, near, rows, kept)
     elif meeting.edges[i - nodes][0] >= 0:
-        count, found = near_edge(i - nodes, start, of_edges, surface, meeting, near, rows, kept)
+        count, found = near_edge(i - nodes, start, space, surface, meeting, near, rows, kept)
     return count, found
 
 
@@ -369,12 +398,47 @@ def mark_row(owner: int, other: int, meeting: Meeting, near: Near):
             mark(near, f[k], PAIRED)
 
 
+@wp.func
+def places_in(owner: int, other: int, meeting: Meeting):
+    """The places of a pair."""
+    nodes = meeting.body.shape[0]
+    if owner < nodes:
+        c = meeting.triangles[other]
+        return wp.vec4i(owner, c[0], c[1], c[2])
+    e = meeting.edges[owner - nodes]
+    f = meeting.edges[other]
+    return wp.vec4i(e[0], e[1], f[0], f[1])
+
+
+@wp.func
+def distance_in(owner: int, other: int, surface: Surface, meeting: Meeting):
+    """How far the two of a pair are apart at least; zero if they overlap [m]."""
+    nodes = meeting.body.shape[0]
+    if owner < nodes:
+        c = meeting.triangles[other]
+        a = surface.x[c[0]]
+        b = surface.x[c[1]]
+        e = surface.x[c[2]]
+        way = surface.x[owner] - point_of(on_triangle(surface.x[owner], a, b, e), a, b, e)
+        # A gap may be less than the distance where a node is beside a triangle; see ``locate_node``.
+        far = wp.length(way) - BORDER * triangle_size(surface, c)
+        return wp.where(wp.dot(way, meeting.normals[other]) < 0.0, 0.0, wp.max(far, 0.0))
+    f = meeting.edges[owner - nodes]
+    g = meeting.edges[other]
+    p = surface.x[f[0]]
+    q = surface.x[f[1]]
+    r = surface.x[g[0]]
+    u = surface.x[g[1]]
+    s, t = on_segments(p, q, r, u)
+    band = BAND * wp.min(wp.length(q - p), wp.length(u - r))
+    return wp.max(wp.length(p + s * (q - p) - r - t * (u - r)) - band, 0.0)
+
+
 @wp.kernel(enable_backward=False)
 def find_pairs(
     # In
     watch: Watch,
-    of_triangles: wp.uint64,
-    of_edges: wp.uint64,
+    space: Space,
     surface: Surface,
     meeting: Meeting,
     old: OldRows,
@@ -387,7 +451,7 @@ def find_pairs(
     if watch.due[0] == 0:
         return
     room = rows.owner.shape[0]
-    count, kept = near_owner(i, -1, of_triangles, of_edges, surface, meeting, near, rows, Kept())
+    count, kept = near_owner(i, -1, space, surface, meeting, near, rows, Kept())
     start = int(0)
     rows.counts[i] = 0
     if count > 0:
@@ -405,7 +469,7 @@ def find_pairs(
         for k in range(count):
             rows.other[start + k] = kept[k]
     else:
-        near_owner(i, start, of_triangles, of_edges, surface, meeting, near, rows, kept)
+        near_owner(i, start, space, surface, meeting, near, rows, kept)
     rows.counts[i] = count
     before = old.starts[i]
     last = before + old.counts[i]
@@ -421,6 +485,9 @@ def find_pairs(
         rows.owner[row] = i
         rows.acts[row] = acts
         rows.force[row] = force
+        if rows.away.shape[0] > 0:
+            rows.places[row] = places_in(i, other, meeting)
+            rows.away[row] = distance_in(i, other, surface, meeting)
         mark_row(i, other, meeting, near)
 
 

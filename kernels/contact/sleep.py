@@ -91,13 +91,6 @@ def rouse(
 
 
 @wp.kernel(enable_backward=False)
-def move_frames(watch: Watch):
-    """Move the frames of the watch along in a step in which contact sleeps."""
-    world = wp.tid()
-    watch.drift[world] = watch.drift[world] + watch.common[world]
-
-
-@wp.kernel(enable_backward=False)
 def check_sleep(
     # In
     start: int,

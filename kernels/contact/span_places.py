@@ -8,8 +8,7 @@ from .active import NEAR_END
 from .carriers import Carriers, crowd_at, ease_at, is_held_at, motion_at
 from .law import Law, held_back
 from .motion import Motions, Surface
-from .nearest_span import Found, find_span
-from .rolling import tilted
+from .nearest_span import Found, find_span, tilted
 from .shapes import GROUND, Shapes, carried, distance_to
 from .spans import Spans, list_span, span_at
 from .springs import QUARTERED, kept_gap

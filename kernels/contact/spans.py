@@ -13,7 +13,7 @@ from warp_corot.kernels.implicit.line_search import TRIED
 
 from .carriers import Carriers, couple_at, motion_at, push_at
 from .motion import Surface
-from .rolling import Rolling, share_of_moment, tilted
+from .nearest_span import Rolling, share_of_moment, tilted
 from .springs import bound_of, spring_state
 from .touches import Touches
 

@@ -219,3 +219,22 @@ def place_forces(grain: float, totals: wp.array2d[wp.vec3], forces: wp.array[wp.
     for o in range(totals.shape[0]):
         force += totals[o, s]
     surface.f[s] = force
+
+
+@wp.kernel(enable_backward=False)
+def find_gaps(
+    # In
+    shapes: Shapes,
+    motions: Motions,
+    world: int,
+    points: wp.array[wp.vec3],
+    most: float,
+    # Out
+    gaps: wp.array2d[wp.float32],
+):
+    """Find distances [O, n] of points from the obstacles of a world [m], negative inside. Distances beyond
+    ``most`` are only known to be larger than it.
+    """
+    o, i = wp.tid()
+    gap, _normal = distance_to(shapes, o, motions.later[world, o], points[i], most)
+    gaps[o, i] = gap

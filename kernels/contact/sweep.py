@@ -84,18 +84,16 @@ def sweeper(has_triangles: bool, has_pairs: bool) -> wp.Kernel:
 
         Args:
             threads, thread: The number of threads, each of which has a launch of its own, and this one.
-            listed, listed_count: The contacts of obstacles at places that may act, and how many there are; empty: any.
+            listed, listed_count: The contacts of places and of pairs that may act, and how many there are; empty: any.
             records: Memory for as many contacts as there usually are.
         """
         if awake[0] == 0:
             return
         dt = float(pace.seconds[DT])
         if first == LOCATE:
-            # Instead of all obstacles at all places that are near.
-            beside = near.count[0] * all.rigid.forces.shape[0]
             count = contact_count(near, all)
             if listed.shape[0] > 0:
-                count += listed_count[0] - beside
+                count = listed_count[0] + near.touch_count[0]
             k = int(thread)
             while k < count:
                 number = int(-1)
@@ -104,7 +102,7 @@ def sweeper(has_triangles: bool, has_pairs: bool) -> wp.Kernel:
                 elif k < listed_count[0]:
                     number = listed[k]
                 else:
-                    number = number_of(k - listed_count[0] + beside, near, all)
+                    number = all.first_triangle + near.touches[k - listed_count[0]]
                 may_act = int(0)
                 if number >= 0:
                     may_act = locate(number, dt, all, sums)

@@ -4,12 +4,30 @@ import warp as wp
 
 from warp_corot.kernels.elements.simd8 import on_cpu
 
+from .motion import Dynamics, Surface
+from .near import BESIDE, Near
+
 wp.set_module_options({"enable_backward": False})
+
+#: Flags for places that were not visited in the step before, and for those that may touch something in this one.
+LATE, LISTED = wp.constant(16), wp.constant(32)
+
+
+@wp.struct
+class Part:
+    """The surface of a body. Its carriers are places, or the nodes that bear them; see ``Visits``."""
+
+    number: int
+    place: int  # its first place
+    start: int  # its first carrier among ``nodes``
+    shift: int  # how much larger the numbers of these are among all carriers
+    nodes: Surface
+    dynamics: Dynamics
 
 
 @wp.struct
 class Visits:
-    """What steps visit. Carriers are the places, [N] = [S], or the nodes that bear them, [N] = [B]."""
+    """What steps visit. Carriers are all places, [S], and then all nodes that bear places, [B]: [N] = [S + B]."""
 
     # [N] a displacement, and how far the carrier may go from there before it is due, plus ``came`` then [m]
     budgets: wp.array[wp.vec4]
@@ -26,17 +44,31 @@ class Visits:
     is_first: wp.array[wp.int32]  # [1] whether this step visits everything
     may_miss: wp.array[wp.int32]  # [1] whether places may not have moved into obstacles unseen
     count: wp.array[wp.int32]  # [1] the number of steps, ever
+    body: wp.array[wp.int32]  # [S] the body of a place
+    first_place: wp.array[wp.int32]  # [bodies]
     places: wp.array[wp.int32]  # [S] that number at the last visit to a place
     touches: wp.array[wp.int32]  # [O T] the same for an obstacle and a triangle
-    chosen: wp.array[wp.int32]  # [S] the places that are visited in this step
-    chosen_count: wp.array[wp.int32]  # [1]
-    contacts: wp.array[wp.int32]  # [O S] contacts at places that may act, by their numbers in ``mass_split``
+    contacts: wp.array[wp.int32]  # contacts of places and of pairs that may act, by their numbers in ``mass_split``
     contact_count: wp.array[wp.int32]  # [1]
     carriers: wp.array[wp.int32]  # [N] that number when the motion of a carrier was found last
-    due: wp.array[wp.int32]  # [N] those that are due
-    due_count: wp.array[wp.int32]  # [1]
+    # Lists for each body, from its first place or carrier on, and how many there are in each, [bodies]:
+    chosen: wp.array[wp.int32]  # [S] the places that are visited in this step
+    chosen_count: wp.array[wp.int32]
+    due: wp.array[wp.int32]  # [N] those that are due, by their numbers among ``nodes`` of a ``Part``
+    due_count: wp.array[wp.int32]
     carrying: wp.array[wp.int32]  # [N] those whose motion is known
-    carrying_count: wp.array[wp.int32]  # [1]
+    carrying_count: wp.array[wp.int32]
+    triangles: wp.array[wp.vec3i]  # [T]
+    corner_starts: wp.array[wp.int32]  # [S + 1] the triangles around each place, see ``Skin``
+    corners: wp.array[wp.int32]
+    # [S] displacements of places at the last search for pairs; how far they have come from there, and go in this step
+    # without contact, as carriers [N] do; and the means of these in each world, [W] [m]
+    searched: wp.array[wp.vec4]
+    gone: wp.array[wp.vec4]
+    goes: wp.array[wp.vec4]
+    carried: wp.array[wp.vec4]
+    mean_gone: wp.array[wp.vec4]
+    mean_goes: wp.array[wp.vec4]
     is_shared: int  # whether several threads visit at the same time
 
 
@@ -60,13 +92,25 @@ def claim(a: wp.array[wp.int32], i: int, value: int, is_shared: int) -> bool:
 
 @wp.func_native(
     on_cpu("""
-    int& end = wp::index(count, 0);
-    wp::index(list, is_shared ? __atomic_fetch_add(&end, 1, __ATOMIC_RELAXED) : end++) = item;
+    int& end = wp::index(counts, k);
+    wp::index(list, first + (is_shared ? __atomic_fetch_add(&end, 1, __ATOMIC_RELAXED) : end++)) = item;
 """)
 )
-def append(list: wp.array[wp.int32], count: wp.array[wp.int32], item: int, is_shared: int):
-    """Add an item to the end of a list."""
+def append(list: wp.array[wp.int32], first: int, counts: wp.array[wp.int32], k: int, item: int, is_shared: int):
+    """Add an item to the end of the k-th list, which begins at ``first``."""
     ...
+
+
+@wp.func
+def choose(s: int, here: Near, visits: Visits):
+    """Visit a place in this step, once. Returns whether it was not chosen before."""
+    was = visits.places[s]
+    if not claim(visits.places, s, visits.count[0], visits.is_shared):
+        return False
+    k = visits.body[s]
+    append(visits.chosen, visits.first_place[k], visits.chosen_count, k, s, visits.is_shared)
+    here.flags[s] = BESIDE | wp.where(was + 1 < visits.count[0], LATE, 0)
+    return True
 
 
 @wp.func_native(

@@ -75,18 +75,16 @@ def count_work(
 def count_constraint(
     i: int,
     force: wp.vec3,
-    total: wp.vec3,
+    all_forces: wp.vec3,
+    velocity: wp.vec3,
     damping: float,
     gravity: wp.vec3,
-    inverse_mass: wp.array[wp.float32],
-    has_load: int,
-    load: wp.array[Any],
+    w: float,
     pace: Pace,
     offset: int,
-    v: wp.array[wp.vec4],
     account: wp.array2d[wp.float64],
 ):
-    """Count the work of the force C of constraints on a node, which is part of its ``total`` force.
+    """Count the work of the force C of constraints on a node, which is part of all its forces but gravity.
 
     Let b and d be the lengths of the last step and of this one, and v and w the velocities before and after the kick.
     Let F be all other forces: elastic ones, gravity and loads. All forces act for (b + d) / 2, so they add the kinetic
@@ -99,14 +97,9 @@ def count_constraint(
     if offset == 0:
         before = float(length_before(pace))
     kick = 0.5 * (before + dt)
-    velocity = load_node(v, i)
-    w = inverse_mass[i]
     if w == 0.0:
         add_work(account, i, kick * wp.dot(force, velocity))
         return
-    all_forces = total
-    if has_load != 0:
-        all_forces += vector_at(load, i)
     later = symplectic_euler_velocity(velocity, all_forces, w, gravity, kick, 1.0 / (1.0 + dt * damping))
     others = all_forces - force + gravity / w
     work = 0.5 * kick * wp.dot(force, velocity + later)
@@ -135,7 +128,9 @@ def count_constraints(
     if wp.dot(force, force) == 0.0:
         return
     total = load_node(f, i)
-    count_constraint(i, force, total, damping, gravity, inverse_mass, has_load, load, pace, offset, v, account)
+    if has_load != 0:
+        total += vector_at(load, i)
+    count_constraint(i, force, total, load_node(v, i), damping, gravity, inverse_mass[i], pace, offset, account)
 
 
 COUNT_WORK = by_vectors(count_work, "load")

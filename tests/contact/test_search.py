@@ -133,6 +133,8 @@ def thrown(device, least, **sizes):
     low.fix("z == zmin")
     high.velocities = np.tile((0.2, 0.1, -0.5), (high.node_count, 1))
     search = sim.contact.search
+    # Steps look at all pairs within this distance.
+    sim.contact.law.closing = sizes.get("closing", sim.contact.law.closing)
     search.watch.least.fill_(least)
     search.watch.size = sizes.get("size", search.watch.size)
     search.farthest = sizes.get("most", search.farthest)
@@ -152,8 +154,8 @@ def test_the_times_of_searches_do_not_matter():
 def test_motion_beyond_the_margin_repeats_the_run():
     """If too little room was reserved, the run is repeated with more, with the same result as if there had been
     enough."""
-    enough, _ = thrown("cpu", 2e-4)
-    again, search = thrown("cpu", 1e-6, size=1e-9)
+    enough, _ = thrown("cpu", 2e-4, closing=1e-9)
+    again, search = thrown("cpu", 1e-6, size=1e-9, closing=1e-9)
     assert float(search.watch.least.numpy()[0]) > 1e-5
     assert not search.has_missed
     np.testing.assert_array_equal(again, enough)
@@ -161,7 +163,7 @@ def test_motion_beyond_the_margin_repeats_the_run():
 
 def test_the_search_reaches_no_farther_than_steps_can_go(device):
     with pytest.raises(wc.UnstableError, match="in one step"):
-        thrown(device, 1e-6, size=1e-9, most=1e-7)
+        thrown(device, 1e-6, size=1e-9, most=1e-7, closing=1e-9)
 
 
 def marked(contacts):

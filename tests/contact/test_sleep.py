@@ -138,8 +138,8 @@ def test_soft_bodies_that_are_apart_sleep_until_they_meet(device, itself):
         bodies[0].fix("z < 1e-6")
         sim = simulation(bodies, awake=awake, contact=wc.Contact(self_contact=itself))
         sim.advance_steps(30)
-        # So few elements are all near one another.
-        assert sleeps(sim) == (not awake and not itself)
+        # So few elements are all near one another where searches are for all of them.
+        assert sleeps(sim) == (not awake and (not itself or sim.contact.approach is not None))
         sim.advance_steps(220)
         met.append(moved(sim))
     assert np.abs(met[0][: len(met[0]) // 2]).max() > 1e-3, "the upper one hits the lower one"

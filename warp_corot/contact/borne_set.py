@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from warp_corot.kernels.contact import borne_meetings as meetings
+from warp_corot.kernels.contact import meetings
 from warp_corot.kernels.contact import span_places as kernels
 from warp_corot.kernels.contact.law import Law
 from warp_corot.kernels.implicit.assembled import Couplings

@@ -11,8 +11,8 @@ import warp as wp
 
 from warp_corot.inputs.cpu_threads import Regions, launch, team_of
 from warp_corot.kernels.contact import bearing, motion, sums
-from warp_corot.kernels.contact.begin import BEGIN_STEP, BLOCK
-from warp_corot.kernels.contact.end import END_CONTACT
+from warp_corot.kernels.contact.begin import BLOCK, begin_step
+from warp_corot.kernels.contact.end import end_contact
 from warp_corot.kernels.contact.law import SETTLING, Law
 from warp_corot.solvers.halo import ALONE
 from warp_corot.solvers.system import System
@@ -111,13 +111,13 @@ class Contacts:
         #: The forces of explicit steps.
         self.split = MassSplit(*given)
         self._is_explicit = False
-        #: Steps that visit only what may touch an obstacle; None on CUDA, between soft surfaces and over ranks.
+        #: Steps that visit only what may touch; None on CUDA and over ranks.
         self.approach: Approach | None = None
-        if self.device.is_cpu and self.rigid is not None and self.pairs is None and system.ranks.is_alone:
-            self.approach = Approach(system, made, self.search, self.rigid, self.split, self._regions)
-        #: Steps while nothing is near; None where the device cannot leave anything out, or nothing is searched for.
-        can_sleep = self.approach is None and self.search.can_sleep
-        self.sleep = Sleep(system, made, self.obstacles, self.search) if can_sleep else None
+        if self.device.is_cpu and (self.rigid is not None or self.pairs is not None) and system.ranks.is_alone:
+            things = (system, made, self.search, self.obstacles, self.law, self.rigid, self.pairs, self.split)
+            self.approach = Approach(*things, self._predict, self._regions)
+        #: Steps while nothing is near; None on the CPU, where nothing can be left out, and without searches.
+        self.sleep = Sleep(system, made, self.obstacles, self.search) if self.search.can_sleep else None
         self._revision = 0
         self._is_looked_at = self._has_crushed = False
         self._make_arrays()
@@ -147,6 +147,8 @@ class Contacts:
                 self._predict(0, 0.0)
             self.pairs.prepare()
         self.split.follow()
+        if self.approach is not None and self.approach.is_outdated:
+            self.approach.follow()
 
     @property
     def is_full(self) -> bool:
@@ -195,8 +197,8 @@ class Contacts:
         self._is_explicit = True
         if self.approach is not None:
             self.obstacles.launch_targets()
-            accounts = self.system.constraint_accounts(0) if self.counts_work else []
-            self.approach.launch(offset, damping, accounts[0] if accounts else None)
+            accounts = [each for k in range(len(self.system.bodies)) for each in self.system.constraint_accounts(k)]
+            self.approach.launch(offset, damping, accounts if accounts and self.counts_work else None)
         elif self.sleep is not None:
             self.sleep.launch(offset, partial(self._act, offset, damping))
         else:
@@ -211,24 +213,18 @@ class Contacts:
         self.split.launch()
         follows = self.search.is_needed and not surface.is_whole
         for k, (body, part) in enumerate(zip(system.bodies, surface.parts, strict=True)):
-            state, conditions, accounts = body.state, body.conditions, system.constraint_accounts(k)
+            state, accounts = body.state, system.constraint_accounts(k)
             counts = bool(accounts) and self.counts_work
             if part.bearers and len(system.constraints) > 1:
                 # Grasps add to the forces of nodes that bear nothing, too.
                 state.contact_forces.zero_()
             start, count, arrays = self.surface.nodes_of(k)
             inputs: list = [self.split.first(k) - start, self.split.buffer, self.law.grain, arrays, surface.arrays]
-            inputs += [int(counts), damping, system.gravity, conditions.inverse_mass, int(conditions.has_loads)]
-            inputs += [conditions.loads, system.pace.arrays, offset, state.velocities]
-            outputs = [
-                self.split.sums,
-                self.search.watch,
-                state.forces,
-                accounts[0] if counts else None,
-                state.contact_forces,
-            ]
+            inputs += [int(counts), system.pace.arrays, offset]
+            outputs = [self.split.sums, self.search.watch, system.dynamics(body, damping)]
+            outputs += [accounts[0] if counts else None, state.contact_forces]
             ranges = (start, count), (part.start, self._count(k) if follows else 0)
-            self._launch_ranges(END_CONTACT[conditions.loads.dtype], ranges, inputs, outputs, (k, offset))
+            self._launch_ranges(end_contact, ranges, inputs, outputs, (k, offset))
         if surface.is_whole:
             self.split.launch_clear()
             self.search.launch_after()
@@ -380,18 +376,16 @@ class Contacts:
         # On CUDA a launch takes longer than the work: places find the nodes that bear them by themselves.
         finds_borne = self.device.is_cuda and not surface.is_whole
         for k, body in enumerate(system.bodies):
-            state, conditions, part = body.state, body.conditions, surface.parts[k]
+            part = surface.parts[k]
             start, count, arrays = self.surface.nodes_of(k)
             borne = self._count(k) if part.bearers and finds_borne else 0
             moved = system.worlds * obstacles.count if moves and k == 0 else 0
-            inputs = [damping, system.gravity, conditions.inverse_mass]
-            inputs += [int(conditions.has_loads), conditions.loads, system.pace.arrays, offset]
-            inputs += [state.rest, state.forces, state.displacements, state.velocities, surface.bearers]
+            inputs = [system.dynamics(body, damping), system.pace.arrays, offset, surface.bearers]
             frames = system.worlds if begins and k == 0 else 0
             inputs += [obstacles.motions, world_starts, int(moves)]
             outputs, ranges = [self.search.watch, arrays, surface.arrays], ((start, count), (part.start, borne))
-            kernel, key = BEGIN_STEP[conditions.loads.dtype], (k, offset, begins, moves)
-            self._launch_ranges(kernel, ranges, inputs, outputs, key, once=(frames, moved))
+            key = (k, offset, begins, moves)
+            self._launch_ranges(begin_step, ranges, inputs, outputs, key, once=(frames, moved))
         if isinstance(surface, WholeSurface):
             surface.complete()
         elif self.rigid is not None and self.rigid.have_edges:

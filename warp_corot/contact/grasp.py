@@ -166,20 +166,10 @@ class Grasp:
             return
         if self.closed is not None:
             self._take_hold(self._obstacles.motions.now)
-        system, state, conditions = self._system, self.body.state, self.body.conditions
         inputs = [self._nodes, self._per_world, self._number, self._obstacles.motions, self._places, self._held]
-        inputs += [
-            self._stiffness,
-            damping,
-            system.gravity,
-            conditions.inverse_mass,
-            int(conditions.has_loads),
-            conditions.loads,
-        ]
-        inputs += [system.pace.arrays, offset, state.rest, state.displacements, state.velocities]
-        outputs = [state.forces, state.contact_forces, self._forces]
-        kernel = kernels.HOLD_IN_TOOL[conditions.loads.dtype]
-        wp.launch(kernel, len(self._nodes), inputs, outputs, device=self.device)
+        inputs += [self._stiffness, self._system.pace.arrays, offset]
+        outputs = [self._system.dynamics(self.body, damping), self.body.state.contact_forces, self._forces]
+        self._launch(kernels.hold_in_tool, inputs, outputs)
 
     def launch_begin(self) -> None:
         """Launch the beginning of an implicit step."""

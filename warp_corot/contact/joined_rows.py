@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_corot.kernels.contact import joined as kernels
 from warp_corot.kernels.contact import joined_places as finding
-from warp_corot.kernels.contact import row_meetings
+from warp_corot.kernels.contact import meetings
 from warp_corot.kernels.contact.law import Law
 from warp_corot.kernels.contact.motion import Surface
 from warp_corot.kernels.implicit.assembled import Couplings
@@ -111,20 +111,20 @@ class JoinedRows:
         for k, body in enumerate(self._system.bodies):
             state = body.state
             inputs = [state.rest, state.displacements, state.velocities, pace, touched[k]]
-            self._on_carriers(k, row_meetings.foresee_places, inputs, [begins])
+            self._on_carriers(k, meetings.foresee_places, inputs, [begins])
             self._carriers.launch_places(k)
         self.launch_search(offset)
         inputs = [self._law, surface, self._pairs.meeting, self._pairs.rows, begins]
-        self._on_rows(row_meetings.find_row_meetings, inputs)
+        self._on_rows(meetings.find_row_meetings, inputs)
 
     def launch_touched(self, touched: Sequence[wp.array]) -> None:
         """Launch the record, after a step, of what the nodes of each body have touched."""
         surface = self._pairs.surface.arrays
-        self._on_rows(row_meetings.mark_acting, [surface, self._pairs.rows, self._marked])
+        self._on_rows(meetings.mark_acting, [surface, self._pairs.rows, self._marked])
         for k, array in enumerate(touched):
             start, offset, count, own = self._carriers.nodes_of(k)
             inputs = [start, offset, own, self._marked, array]
-            wp.launch(row_meetings.note_touched, count, inputs, device=self.device)
+            wp.launch(meetings.note_touched, count, inputs, device=self.device)
 
     def launch_begin(self, k: int, first: int, blocks: wp.array, increment: wp.array, guess: wp.array) -> None:
         """Launch the state of the k-th body at the beginning of a step.

@@ -129,6 +129,11 @@ class MassSplit:
         """The buffer of the sums that has the forces at the end of a step."""
         return self.iterations % 2
 
+    @property
+    def first_pair(self) -> int:
+        """The number of the first pair among contacts."""
+        return self._at_places + self._at_triangles
+
     def first(self, k: int) -> int:
         """The number in the sums of the first node that carries a body's surface."""
         part = self.surface.parts[k]
@@ -138,7 +143,7 @@ class MassSplit:
         """Launch all phases of a step for what is near; None: what the last search has found.
 
         Args:
-            listed: The contacts of obstacles at places that may act, and how many there are; None: any.
+            listed: The contacts of places and of pairs that may act, and how many there are; None: any.
         """
         near, self._listed = near or self._search.near, listed or (self._none, self._none)
         last = self.iterations + 1
@@ -175,7 +180,7 @@ class MassSplit:
 
     def _launch(self, near: Near, first: int, last: int, part: int) -> None:
         contacts = kernels.Contacts()
-        contacts.first_triangle, contacts.first_pair = self._at_places, self._at_places + self._at_triangles
+        contacts.first_triangle, contacts.first_pair = self._at_places, self.first_pair
         contacts.triangles, contacts.touches = self.surface.triangles, Touches()
         if self._rigid is not None:
             contacts.rigid, contacts.touches = self._rigid.arrays, self._rigid.touches

@@ -10,8 +10,8 @@ import warp as wp
 
 from warp_corot.errors import InputError
 from warp_corot.kernels.contact import motion as kernels
-from warp_corot.kernels.contact.overlaps import find_gaps
 from warp_corot.kernels.contact.shapes import Shapes
+from warp_corot.kernels.contact.sums import find_gaps
 from warp_corot.kernels.contact.watch import Watch, move_obstacles
 from warp_corot.solvers.system import System
 

@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from warp_corot.errors import UnstableError
-from warp_corot.kernels.contact import boxes
+from warp_corot.kernels.contact import boxes, wide_tree
 from warp_corot.kernels.contact import search as search_kernels
 from warp_corot.kernels.contact.crushed import mark_crushed
 from warp_corot.kernels.contact.rows import Meeting, Rows
@@ -16,6 +16,7 @@ from warp_corot.solvers.halo import ALONE, Halo
 from .options import Contact
 from .search import Search
 from .surface import ContactSurface
+from .wide_tree import planted
 
 #: Initial room for pairs, over the number of nodes and edges; and its growth if it is too small.
 PAIRS_EACH = 2
@@ -43,6 +44,7 @@ class Pairs:
     Attributes:
         rows: The pairs, as a struct for kernels.
         meeting: The things that may meet, as a struct for kernels.
+        space: What finds their neighbours, as a struct for kernels.
         revision: Changes whenever launches do.
     """
 
@@ -60,7 +62,7 @@ class Pairs:
         search.watch.most_calm, search.watch.hit = CALM_ITSELF if self.meets_itself else CALM, float(HIT)
         if self.meets_itself:
             search.watch.most_alone = 1.0
-        search.find_pairs = self._find
+        search.find_pairs = self.find
         self.follow()
 
     # --- places and room -------------------------------------------------------------------------------------------
@@ -69,6 +71,8 @@ class Pairs:
         """Update to the present surfaces."""
         surface, device = self.surface, self.device
         if surface.revision == self._taken:
+            if device.is_cpu:
+                self._is_planted = False  # leaves are of the triangles that there were
             self.forget()
             return
         self._taken = surface.revision
@@ -89,6 +93,7 @@ class Pairs:
         roots = (2, surface.worlds * meeting.groups)
         meeting.roots = wp.zeros(roots, dtype=wp.int32, device=device)
         self.meeting = meeting
+        self.space, self._is_planted = wide_tree.Space(), False
         self._boxes = [
             tuple(wp.zeros(max(number, 1), dtype=wp.vec3, device=device) for _ in range(2))
             for number in (surface.triangle_count, edges)
@@ -126,6 +131,7 @@ class Pairs:
         rows.places = wp.zeros(room, dtype=wp.vec4i, device=device)
         rows.shares = wp.zeros(room, dtype=wp.vec4, device=device)
         rows.gap = wp.zeros(room, dtype=wp.float32, device=device)
+        rows.away = wp.zeros(room if device.is_cpu else 0, dtype=wp.float32, device=device)
         return rows, old
 
     @property
@@ -153,19 +159,24 @@ class Pairs:
     @property
     def is_planted(self) -> bool:
         """Whether there are trees of boxes of the present surfaces."""
-        return bool(self._trees)
+        return self._is_planted
 
     def prepare(self) -> None:
         """Make everything that launches need."""
-        if not self._trees:
+        if not self._is_planted:
+            self._is_planted = True
+            self.revision += 1
+            if self.device.is_cpu:
+                self.space.wide = planted(self.surface)
+                return
             self._box()
             self._trees = [
                 wp.Bvh(lower, upper, groups=groups)
                 for (lower, upper), groups in zip(self._boxes, self._groups(), strict=True)
             ]
+            self.space.of_triangles, self.space.of_edges = (tree.id for tree in self._trees)
             self._find_roots()
-            self.revision += 1
-        elif self.search.count >= self._built + REBUILT:
+        elif self._trees and self.search.count >= self._built + REBUILT:
             # Pairs are the same, and in the same order.
             for tree in self._trees:
                 tree.rebuild()
@@ -190,22 +201,35 @@ class Pairs:
         for kernel, (lower, upper) in zip(boxed, self._boxes, strict=True):
             wp.launch(kernel, len(lower), inputs, [lower, upper], device=self.device)
 
-    def _find(self) -> None:
+    def find(self) -> None:
         """Launch the search for pairs."""
         watch, rows, old, device = self.search.watch, self.rows, self._old, self.device
         if self.meets_itself:
             self._mark_crushed()
         self._box()
-        if not self.meets_itself or self.meeting.groups > 1:
-            self._bound()
-        for tree in self._trees:
-            tree.refit()
+        if device.is_cpu:
+            self._fill()
+        else:
+            if not self.meets_itself or self.meeting.groups > 1:
+                self._bound()
+            for tree in self._trees:
+                tree.refit()
         owners = len(rows.starts)
         wp.launch(search_kernels.keep_rows, owners, [watch, rows, old], device=device)
         wp.launch(search_kernels.begin_rows, 1, [watch, rows], device=device)
-        inputs = [watch, *(tree.id for tree in self._trees), self.surface.arrays, self.meeting, old]
+        inputs = [watch, self.space, self.surface.arrays, self.meeting, old]
         wp.launch(search_kernels.find_pairs, owners, inputs, [rows, self.search.near], device=device)
         wp.launch(search_kernels.end_rows, 1, [watch, rows], [self.search.most], device=device)
+
+    def _fill(self) -> None:
+        """Launch the boxes of the wide tree."""
+        tree, watch, leaves = self.space.wide, self.search.watch, len(self.space.wide.triangle_starts) - 1
+        inputs = [watch, self.surface.arrays, self.meeting, *self._boxes[0], *self._boxes[1]]
+        wp.launch(wide_tree.fill_leaves, leaves, inputs, [tree], device=self.device)
+        lanes = int(wide_tree.LANES)
+        levels = ((tree.lower_nodes, tree.upper_nodes), (tree.upper_nodes, tree.roots))
+        for k, (children, nodes) in enumerate(levels):
+            wp.launch(wide_tree.fill_nodes, leaves // lanes ** (k + 1), [watch, children], [nodes], device=self.device)
 
     def _groups(self) -> list[wp.array]:
         """The group of each triangle and of each edge: its body in its world, or its world; see ``Meeting``."""

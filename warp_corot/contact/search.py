@@ -172,7 +172,7 @@ class Search:
     @property
     def can_sleep(self) -> bool:
         """Whether the device can leave out contact while nothing is near."""
-        return self._branches and self.is_needed
+        return self.device.is_cuda and self._branches and self.is_needed
 
     def launch(self, offset: int, *, follows: bool = False, sleeps: bool = False) -> None:
         """Launch a search, if it is due in this step.

@@ -1,4 +1,4 @@
-"""Steps in which contact sleeps, because nothing is near; see ``kernels.contact.sleep``."""
+"""Steps on CUDA in which contact sleeps, because nothing is near; see ``kernels.contact.sleep``."""
 
 from __future__ import annotations
 
@@ -49,24 +49,13 @@ class Sleep:
         for k, body in enumerate(self._system.bodies):
             start, count, nodes = self._surface.nodes_of(k)
             moved = self._system.worlds * obstacles.count if k == 0 else 0
-            threads = 1 if self._device.is_cpu else max(count, moved)
-            inputs = [
-                threads,
-                start,
-                count,
-                nodes,
-                int(self.is_framed),
-                moved,
-                obstacles.motions,
-                body.conditions.world_starts,
-            ]
-            inputs += [self._system.pace.arrays, offset, *self._places(k), body.state.velocities]
+            threads = max(count, moved)
+            inputs = [threads, start, count, nodes, int(self.is_framed), moved, obstacles.motions]
+            inputs += [body.conditions.world_starts, self._system.pace.arrays, offset]
+            inputs += [*self._places(k), body.state.velocities]
             wp.launch(kernels.rouse, threads, inputs, [self._watch], device=self._device)
-        # A branch takes longer on CUDA than launches that end at once.
-        if self._device.is_cuda:
-            act()
-        else:
-            wp.capture_if(self._watch.awake, act, self._sleep if self._launches_asleep else None)
+        # A branch takes longer than launches that end at once.
+        act()
 
     def launch_check(self) -> None:
         """Launch the test after a run whether anything moved too far in its last step."""
@@ -74,24 +63,6 @@ class Sleep:
             start, count, nodes = self._surface.nodes_of(k)
             inputs = [start, nodes, int(self.is_framed), self._system.pace.arrays, *self._places(k)]
             wp.launch(kernels.check_sleep, count, inputs, [self._watch], device=self._device)
-
-    @property
-    def _launches_asleep(self) -> bool:
-        """Whether a step in which nothing is near launches anything else."""
-        return self.is_framed or self._clears
-
-    @property
-    def _clears(self) -> bool:
-        """Whether other constraints add to the forces of contact."""
-        return len(self._system.constraints) > 1
-
-    def _sleep(self) -> None:
-        """Launch a step in which nothing is near."""
-        if self.is_framed:
-            wp.launch(kernels.move_frames, self._system.worlds, [self._watch], device=self._device)
-        if self._clears:
-            for body in self._system.bodies:
-                body.state.contact_forces.zero_()
 
     def _places(self, k: int) -> list[wp.array]:
         """Rest positions and displacements of a body."""

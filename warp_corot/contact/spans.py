@@ -10,7 +10,7 @@ import warp as wp
 from warp_corot.kernels.contact import span_places as finding
 from warp_corot.kernels.contact import spans as kernels
 from warp_corot.kernels.contact.law import Law
-from warp_corot.kernels.contact.rolling import Rolling
+from warp_corot.kernels.contact.nearest_span import Rolling
 from warp_corot.kernels.contact.touches import Touches
 from warp_corot.kernels.implicit.assembled import Couplings
 from warp_corot.kernels.stepping.pace import Pace

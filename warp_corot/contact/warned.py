@@ -15,7 +15,7 @@ from warp_corot.kernels.contact import shapes as kinds
 from warp_corot.kernels.contact import sums
 from warp_corot.kernels.contact.crushed import count_crushed
 from warp_corot.kernels.contact.motion import Motions
-from warp_corot.kernels.contact.overlaps import find_gaps
+from warp_corot.kernels.contact.sums import find_gaps
 from warp_corot.solvers.halo import ALONE
 
 from .sampled import SignedDistance, TriangleMesh

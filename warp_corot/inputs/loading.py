@@ -42,8 +42,8 @@ IMPLICIT_ON_FORESTS = (
 )
 #: Modules for explicit contact with obstacles.
 CONTACT = (
-    *("contact.begin", "contact.sums", "contact.beside", "contact.sleep", "contact.overlaps", "contact.watch"),
-    *("contact.near", "contact.end", "contact.bearing"),
+    *("contact.begin", "contact.sums", "contact.beside", "contact.sleep", "contact.watch", "contact.near"),
+    *("contact.end", "contact.bearing"),
 )
 
 #: A kernel, or one with the number of threads of its blocks on CUDA, if that is not Warp's default.

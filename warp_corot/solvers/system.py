@@ -10,6 +10,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.elasticity import ForceField
+from warp_corot.kernels.contact.motion import Dynamics
 from warp_corot.solvers.steps.pace import Pace
 
 from .forces_work import ForcesWork
@@ -219,6 +220,18 @@ class System:
             self._work.launch_count(offset, damping)
         if not any(getattr(each, "counts_work", False) for each in self.constraints):
             self._work.launch_constraints(offset, damping)
+
+    def dynamics(self, body: SoftBody, damping: float) -> Dynamics:
+        """What moves the nodes of a body in an explicit step with this damping [1/s], as a struct for kernels."""
+        conditions, state, found = body.conditions, body.state, Dynamics()
+        found.damping, found.gravity, found.inverse_mass = damping, self.gravity, conditions.inverse_mass
+        found.rest, found.f, found.u, found.v = state.rest, state.forces, state.displacements, state.velocities
+        if conditions.has_loads:
+            loads = conditions.loads
+            found.load_stride = loads.strides[0] // 4
+            size = found.load_stride * len(loads)
+            found.load = wp.array(ptr=loads.ptr, dtype=wp.float32, shape=size, device=self.device, copy=False)
+        return found
 
     def support_work_of(self, body: SoftBody) -> wp.array:
         """Where steps add up the work of a body's supports: ``support_work``, or two places for each node, which add up
