@@ -66,8 +66,9 @@ def begin_step(
             nodes.x[s] = own.x
             nodes.d[s] = own.d
             nodes.yielding[s] = own.yielding
-    if k < borne:
-        s = borne_start + k
+    elif k < count + borne:
+        # Other threads than those of nodes, so that neither wait for the other.
+        s = borne_start + k - count
         surface.f[s] = wp.vec3()
         surface.yielding[s] = 0.0
         if surface.node[s] >= 0:

@@ -77,5 +77,8 @@ def end_contact(
             if watch.awake[0] != 0 and sums.touched[n] != 0:
                 force = take_force(n, buffer, grain, sums)
             push(i, force, counts, pace, offset, body, account, contact_forces)
-    if watch.awake[0] != 0 and k < places and surface.node[place_start + k] >= 0:
-        follow_node(place_start + k, surface, watch)
+    elif k < count + places and watch.awake[0] != 0:
+        # Other threads than those of nodes, so that neither wait for the other.
+        s = place_start + k - count
+        if surface.node[s] >= 0:
+            follow_node(s, surface, watch)

@@ -18,6 +18,7 @@ from warp_corot.inputs.device import checked_device
 from warp_corot.inputs.loading import (
     BODY,
     CONTACT,
+    CONTACT_ON_CPU,
     EXPLICIT,
     IMPLICIT,
     IMPLICIT_ON_FORESTS,
@@ -134,7 +135,8 @@ def _modules(bodies: Sequence[RunBody], touches: bool, chooses: bool, device: wp
     meshed = any(body.opened.kind in ("surface", "scan") for body in bodies)
     names = [*SURFACES, *MESHING] if meshed else []
     explicit = not INTEGRATORS[integrator_name(bodies[0].args)].is_implicit
-    names += [*BODY, *(CONTACT if touches and explicit else ()), *(STEPS_ON_CPU if device.is_cpu else STEPS)]
+    contact, steps = (CONTACT_ON_CPU, STEPS_ON_CPU) if device.is_cpu else (CONTACT, STEPS)
+    names += [*BODY, *(contact if touches and explicit else ()), *steps]
     if meshed and not touches and chooses and may_choose(bodies):
         return [*names, *IMPLICIT, *IMPLICIT_ON_FORESTS]
     return [*names, *(EXPLICIT if explicit else ())]

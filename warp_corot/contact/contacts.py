@@ -433,8 +433,8 @@ class Contacts:
         key: tuple,
         once: Sequence[int] = (),
     ) -> None:
-        """Launch a kernel in parts. Its first arguments are the beginning and the length of each range, and then
-        numbers of things that the first part does ``once``."""
+        """Launch a kernel in parts, with a thread for each item of all ranges. Its first arguments are the beginning
+        and the length of each range, and then numbers of things that the first part does ``once``."""
         bounds = [self._regions.team.bounds(count) for _, count in ranges]
 
         def phase(part: int) -> None:
@@ -442,7 +442,7 @@ class Contacts:
                 (start + of[part][0], of[part][1] - of[part][0]) for (start, _), of in zip(ranges, bounds, strict=True)
             ]
             first = [number if part == 0 else 0 for number in once]
-            dim = max(*(count for _, count in own), *first)
+            dim = max(sum(count for _, count in own), 0, *first)
             launch(kernel, dim, [*chain(*own), *first, *inputs], outputs, device=self.device, block_dim=BLOCK)
 
         self._regions.launch((kernel, *key), phase)

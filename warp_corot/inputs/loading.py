@@ -40,11 +40,13 @@ IMPLICIT_ON_FORESTS = (
     *("implicit.assembled", "implicit.multigrid.sweeps", "implicit.multigrid.cycle", "implicit.lagged"),
     "implicit.chosen",
 )
-#: Modules for explicit contact with obstacles.
+#: Modules for explicit contact, besides its solver; and those for soft surfaces on the CPU.
 CONTACT = (
     *("contact.begin", "contact.sums", "contact.beside", "contact.sleep", "contact.watch", "contact.near"),
     *("contact.end", "contact.bearing"),
 )
+CONTACT_ON_CPU = ("contact.approach", "contact.begin", "contact.sums", "contact.near", "contact.bearing")
+PAIRS_ON_CPU = ("contact.search", "contact.wide_tree", "contact.boxes", "contact.nearing", "contact.motion")
 
 #: A kernel, or one with the number of threads of its blocks on CUDA, if that is not Warp's default.
 LoadedKernel: TypeAlias = wp.Kernel | tuple[wp.Kernel, int]

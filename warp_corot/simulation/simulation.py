@@ -26,9 +26,11 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_count, checked_flag, checked_number, refuse_tape
 from warp_corot.inputs.loading import (
     CONTACT,
+    CONTACT_ON_CPU,
     EXPLICIT,
     IMPLICIT,
     IMPLICIT_ON_FORESTS,
+    PAIRS_ON_CPU,
     STEPS,
     STEPS_ON_CPU,
     LoadedKernel,
@@ -206,7 +208,8 @@ class Simulation(Cutting):
         explicit, chosen, on_cpu = not self.integrator.is_implicit, self.integrator.dt is None, self.device.is_cpu
         names = [*(STEPS_ON_CPU if on_cpu else STEPS), *(EXPLICIT if chosen else ()), *(() if explicit else IMPLICIT)]
         if touching and explicit:
-            names = [*CONTACT, *names]
+            meet = on_cpu and (len(self.parts) > 1 or touching[1].self_contact)
+            names = [*(CONTACT_ON_CPU if on_cpu else CONTACT), *(PAIRS_ON_CPU if meet else ()), *names]
         if not explicit and any(body.discretization.element_kind is ForestElements for body in self.parts):
             names += IMPLICIT_ON_FORESTS
         kernels: list[LoadedKernel] = [STEP_SYMPLECTIC_EULER[wp.vec4]] if explicit else []

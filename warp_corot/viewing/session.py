@@ -17,7 +17,7 @@ import numpy.typing as npt
 from warp_corot.contact.tool import Obstacle, Tool
 from warp_corot.cutting.blade import Blade
 from warp_corot.errors import InputError, UnstableError
-from warp_corot.inputs.loading import CONTACT, load
+from warp_corot.inputs.loading import CONTACT_ON_CPU, load
 from warp_corot.io.pictures.colors import color_index
 from warp_corot.mesh.surfaces.bound import SurfaceMesh
 from warp_corot.simulation.remade import remade, tools_lent
@@ -353,7 +353,7 @@ class Session:
     def prepare(self) -> None:
         """Compile what frames, hands and the page's tools launch, several modules at a time."""
         explicit = not self.sim.system.is_implicit
-        contact = CONTACT if explicit and not self.sim.device.is_cuda else ()
+        contact = CONTACT_ON_CPU if explicit and not self.sim.device.is_cuda else ()
         load(["viewing.values", "viewing.hands", *contact], self.sim.device)
         self.sim.advance_steps(1)
         self.frame()
