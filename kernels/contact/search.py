@@ -1,18 +1,19 @@
-"""The search for nodes and triangles, and for edges, that may come near each other before the next search."""
+"""The search for nodes and triangles, and for edges, that may come near each other before the next search; see
+``search_by_warp`` for CUDA."""
 
 import warp as wp
 
 from warp_corot.kernels.modules import INLINED
 
 from .bearing import share_bearers
-from .boxes import edge_reach, lower_end, root_of, triangle_reach, triangle_size, upper_end
+from .boxes import edge_reach, lower_end, triangle_reach, triangle_size, upper_end
 from .closest import on_segments, on_triangle, point_of
 from .locate import BORDER, ENDS, FACING, edge_normal, node_faces_at_rest
 from .motion import Surface
 from .near import CRUSHED, PAIRED, Near, mark
 from .rows import BAND, BAND_AT_REST, Meeting, Rows, row_count
 from .watch import Watch, ahead_at
-from .wide_tree import BLUNT, MAY_FACE, NEARLY, Space, has_wide, query_wide
+from .wide_tree import BLUNT, MAY_FACE, NEARLY, WideTree, query_wide
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINED})
 
@@ -274,88 +275,61 @@ def add_found(other: int, start: int, count: int, rows: Rows, kept: Kept):
 
 
 @wp.func
-def near_node(i: int, start: int, space: Space, surface: Surface, meeting: Meeting, near: Near, rows: Rows, kept: Kept):
+def near_node(
+    i: int, start: int, tree: WideTree, surface: Surface, meeting: Meeting, near: Near, rows: Rows, kept: Kept
+):
     """Count the triangles near a node and keep the first ones, or write all if a start is given."""
     count = int(0)
     reach = meeting.reach[i]
     beyond = wp.vec3(reach, reach, reach)
     low = lower_end(i, surface, meeting) - beyond
     high = upper_end(i, surface, meeting) + beyond
-    out = wp.vec3()
-    knows = bool(False)
-    if has_wide(space.wide):
-        out = node_normal(i, meeting)
-        is_own = meeting.meets_itself
-        far = wp.where(meeting.ahead.shape[0] > 0, -1.0, NEARLY * reach)
-        x = surface.x[i]
-        found = query_wide(space.wide, 0, surface.world[i], meeting.body[i], is_own, low, high, out, far, x, x)
-        for k in range(found):
-            t = space.wide.found[k]
-            if node_is_near(i, t, out, surface, meeting, near):
-                kept = add_found(t, start, count, rows, kept)
-                count += 1
-        return count, kept
-    for g in range(meeting.groups):
-        root = root_of(0, g, i, low, high, surface, meeting)
-        if root >= 0:
-            if not knows:
-                out = node_normal(i, meeting)
-                knows = True
-            query = wp.bvh_query_aabb(space.of_triangles, low, high, root)
-            t = int(0)
-            while wp.bvh_query_next(query, t):
-                if node_is_near(i, t, out, surface, meeting, near):
-                    kept = add_found(t, start, count, rows, kept)
-                    count += 1
+    out = node_normal(i, meeting)
+    is_own = meeting.meets_itself
+    far = wp.where(meeting.ahead.shape[0] > 0, -1.0, NEARLY * reach)
+    x = surface.x[i]
+    found = query_wide(tree, 0, surface.world[i], meeting.body[i], is_own, low, high, out, far, x, x)
+    for k in range(found):
+        t = tree.found[k]
+        if node_is_near(i, t, out, surface, meeting, near):
+            kept = add_found(t, start, count, rows, kept)
+            count += 1
     return count, kept
 
 
 @wp.func
-def near_edge(k: int, start: int, space: Space, surface: Surface, meeting: Meeting, near: Near, rows: Rows, kept: Kept):
+def finds_pairs(bend: float, meeting: Meeting):
+    """Whether an edge with this bend looks for others: a sharp one, or a flat one if they touch."""
+    return bend > SHARP or (bend >= -SHARP and meeting.flat_edges != 0)
+
+
+@wp.func
+def near_edge(
+    k: int, start: int, tree: WideTree, surface: Surface, meeting: Meeting, near: Near, rows: Rows, kept: Kept
+):
     """Count the edges near one that is sharp, or flat, and keep the first ones, or write all if a start is given."""
     count = int(0)
+    own = bend(surface, meeting, k)
+    if not finds_pairs(own, meeting):
+        return 0, kept
     e = meeting.edges[k]
     reach = edge_reach(meeting, e)
     beyond = wp.vec3(reach, reach, reach)
     low = wp.min(lower_end(e[0], surface, meeting), lower_end(e[1], surface, meeting)) - beyond
     high = wp.max(upper_end(e[0], surface, meeting), upper_end(e[1], surface, meeting)) + beyond
-    own = float(0.0)
-    out = wp.vec3()
-    knows = bool(False)
-    if has_wide(space.wide):
-        own = bend(surface, meeting, k)
-        if own <= SHARP and (own < -SHARP or meeting.flat_edges == 0):
-            return 0, kept
-        out = meeting.outs[k]
-        length = wp.length(out)
-        way = wp.where(length < BLUNT, wp.vec3(), out / length)
-        is_own = meeting.meets_itself
-        far = wp.where(meeting.ahead.shape[0] > 0, -1.0, NEARLY * reach)
-        x = surface.x[e[0]]
-        along = surface.x[e[1]] - x
-        world = surface.world[e[0]]
-        found = query_wide(space.wide, 1, world, meeting.body[e[0]], is_own, low, high, way, far, x, along)
-        for n in range(found):
-            m = space.wide.found[n]
-            if edge_is_near(k, m, own > SHARP, out, surface, meeting, near):
-                kept = add_found(m, start, count, rows, kept)
-                count += 1
-        return count, kept
-    for g in range(meeting.groups):
-        root = root_of(1, g, e[0], low, high, surface, meeting)
-        if root >= 0:
-            if not knows:
-                own = bend(surface, meeting, k)
-                out = meeting.outs[k]
-                knows = True
-            if own <= SHARP and (own < -SHARP or meeting.flat_edges == 0):
-                return 0, kept
-            query = wp.bvh_query_aabb(space.of_edges, low, high, root)
-            m = int(0)
-            while wp.bvh_query_next(query, m):
-                if edge_is_near(k, m, own > SHARP, out, surface, meeting, near):
-                    kept = add_found(m, start, count, rows, kept)
-                    count += 1
+    out = meeting.outs[k]
+    length = wp.length(out)
+    way = wp.where(length < BLUNT, wp.vec3(), out / length)
+    is_own = meeting.meets_itself
+    far = wp.where(meeting.ahead.shape[0] > 0, -1.0, NEARLY * reach)
+    x = surface.x[e[0]]
+    along = surface.x[e[1]] - x
+    found = query_wide(tree, 1, surface.world[e[0]], meeting.body[e[0]], is_own, low, high, way, far, x, along)
+    for n in range(found):
+        m = tree.found[n]
+        if edge_is_near(k, m, own > SHARP, out, surface, meeting, near):
+            kept = add_found(m, start, count, rows, kept)
+            count += 1
     return count, kept
 
 
@@ -363,7 +337,7 @@ def near_edge(k: int, start: int, space: Space, surface: Surface, meeting: Meeti
 def near_owner(
     i: int,
     start: int,
-    space: Space,
+    tree: WideTree,
     surface: Surface,
     meeting: Meeting,
     near: Near,
@@ -375,9 +349,9 @@ def near_owner(
     found = kept
     if i < nodes:
         if surface.node[i] >= 0:
-            count, found = near_node(i, start, space, surface, meeting, near, rows, kept)
+            count, found = near_node(i, start, tree, surface, meeting, near, rows, kept)
     elif meeting.edges[i - nodes][0] >= 0:
-        count, found = near_edge(i - nodes, start, space, surface, meeting, near, rows, kept)
+        count, found = near_edge(i - nodes, start, tree, surface, meeting, near, rows, kept)
     return count, found
 
 
@@ -438,7 +412,7 @@ def distance_in(owner: int, other: int, surface: Surface, meeting: Meeting):
 def find_pairs(
     # In
     watch: Watch,
-    space: Space,
+    tree: WideTree,
     surface: Surface,
     meeting: Meeting,
     old: OldRows,
@@ -446,12 +420,12 @@ def find_pairs(
     rows: Rows,
     near: Near,
 ):
-    """Find the pairs of each node and edge, with their former forces."""
+    """Find the pairs of each node and edge, with their former forces, on the CPU."""
     i = wp.tid()
     if watch.due[0] == 0:
         return
     room = rows.owner.shape[0]
-    count, kept = near_owner(i, -1, space, surface, meeting, near, rows, Kept())
+    count, kept = near_owner(i, -1, tree, surface, meeting, near, rows, Kept())
     start = int(0)
     rows.counts[i] = 0
     if count > 0:
@@ -469,7 +443,7 @@ def find_pairs(
         for k in range(count):
             rows.other[start + k] = kept[k]
     else:
-        near_owner(i, start, space, surface, meeting, near, rows, kept)
+        near_owner(i, start, tree, surface, meeting, near, rows, kept)
     rows.counts[i] = count
     before = old.starts[i]
     last = before + old.counts[i]
@@ -485,9 +459,8 @@ def find_pairs(
         rows.owner[row] = i
         rows.acts[row] = acts
         rows.force[row] = force
-        if rows.away.shape[0] > 0:
-            rows.places[row] = places_in(i, other, meeting)
-            rows.away[row] = distance_in(i, other, surface, meeting)
+        rows.places[row] = places_in(i, other, meeting)
+        rows.away[row] = distance_in(i, other, surface, meeting)
         mark_row(i, other, meeting, near)
 
 

@@ -54,21 +54,6 @@ class WideTree:
     found: wp.array[wp.int32]  # what a query has found
 
 
-@wp.struct
-class Space:
-    """What finds the neighbours of a box: trees of the boxes of triangles and of edges on CUDA, another on the CPU."""
-
-    of_triangles: wp.uint64
-    of_edges: wp.uint64
-    wide: WideTree
-
-
-@wp.func_native(on_cpu("return tree.roots.shape[0] > 0;\n", otherwise="return false;\n"))
-def has_wide(tree: WideTree) -> bool:
-    """Whether there is a wide tree."""
-    ...
-
-
 @wp.func_native(
     on_cpu(
         """

@@ -96,6 +96,58 @@ def lowest_bit(bits: int) -> int: ...
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
+    return __popc(__ballot_sync(0xffffffffu, flag != 0));
+#else
+    return flag != 0;
+#endif
+""")
+def lanes_with(flag: int) -> int:
+    """How many threads of the warp have a flag; all of them must ask."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    return __shfl_sync(0xffffffffu, value, 0);
+#else
+    return value;
+#endif
+""")
+def of_first_lane(value: int) -> int:
+    """The value of the first thread of the warp; all of them must ask."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    int sum = value;
+    const int lane = threadIdx.x & 31;
+    for (int far = 1; far < 32; far *= 2) {
+        const int other = __shfl_up_sync(0xffffffffu, sum, far);
+        if (lane >= far) sum += other;
+    }
+    return sum - value;
+#else
+    return 0;
+#endif
+""")
+def sum_before(value: int) -> int:
+    """The sum of the values of the warp's threads before this one; all of them must ask."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    __syncwarp();
+#endif
+""")
+def synchronize_warp():
+    """Wait for the threads of the warp, and see what they have written."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
     return wp::vec_t<3, wp::float32>(
         __shfl_down_sync(0xffffffff, value[0], distance),
         __shfl_down_sync(0xffffffff, value[1], distance),

@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from warp_corot.errors import UnstableError
-from warp_corot.kernels.contact import boxes, wide_tree
+from warp_corot.kernels.contact import boxes, search_by_warp, wide_tree
 from warp_corot.kernels.contact import search as search_kernels
 from warp_corot.kernels.contact.crushed import mark_crushed
 from warp_corot.kernels.contact.rows import Meeting, Rows
@@ -44,7 +44,7 @@ class Pairs:
     Attributes:
         rows: The pairs, as a struct for kernels.
         meeting: The things that may meet, as a struct for kernels.
-        space: What finds their neighbours, as a struct for kernels.
+        tree: What finds their neighbours on the CPU, as a struct for kernels.
         revision: Changes whenever launches do.
     """
 
@@ -93,7 +93,7 @@ class Pairs:
         roots = (2, surface.worlds * meeting.groups)
         meeting.roots = wp.zeros(roots, dtype=wp.int32, device=device)
         self.meeting = meeting
-        self.space, self._is_planted = wide_tree.Space(), False
+        self.tree, self._is_planted = wide_tree.WideTree(), False
         self._boxes = [
             tuple(wp.zeros(max(number, 1), dtype=wp.vec3, device=device) for _ in range(2))
             for number in (surface.triangle_count, edges)
@@ -167,14 +167,13 @@ class Pairs:
             self._is_planted = True
             self.revision += 1
             if self.device.is_cpu:
-                self.space.wide = planted(self.surface)
+                self.tree = planted(self.surface)
                 return
             self._box()
             self._trees = [
                 wp.Bvh(lower, upper, groups=groups)
                 for (lower, upper), groups in zip(self._boxes, self._groups(), strict=True)
             ]
-            self.space.of_triangles, self.space.of_edges = (tree.id for tree in self._trees)
             self._find_roots()
         elif self._trees and self.search.count >= self._built + REBUILT:
             # Pairs are the same, and in the same order.
@@ -217,13 +216,17 @@ class Pairs:
         owners = len(rows.starts)
         wp.launch(search_kernels.keep_rows, owners, [watch, rows, old], device=device)
         wp.launch(search_kernels.begin_rows, 1, [watch, rows], device=device)
-        inputs = [watch, self.space, self.surface.arrays, self.meeting, old]
-        wp.launch(search_kernels.find_pairs, owners, inputs, [rows, self.search.near], device=device)
+        given, outputs = [self.surface.arrays, self.meeting, old], [rows, self.search.near]
+        if device.is_cpu:
+            wp.launch(search_kernels.find_pairs, owners, [watch, self.tree, *given], outputs, device=device)
+        else:
+            trees, threads = [tree.id for tree in self._trees], owners * int(search_by_warp.LANES)
+            wp.launch(search_by_warp.find_pairs_by_warp, threads, [watch, *trees, *given], outputs, device=device)
         wp.launch(search_kernels.end_rows, 1, [watch, rows], [self.search.most], device=device)
 
     def _fill(self) -> None:
         """Launch the boxes of the wide tree."""
-        tree, watch, leaves = self.space.wide, self.search.watch, len(self.space.wide.triangle_starts) - 1
+        tree, watch, leaves = self.tree, self.search.watch, len(self.tree.triangle_starts) - 1
         inputs = [watch, self.surface.arrays, self.meeting, *self._boxes[0], *self._boxes[1]]
         wp.launch(wide_tree.fill_leaves, leaves, inputs, [tree], device=self.device)
         lanes = int(wide_tree.LANES)
