@@ -7,6 +7,7 @@ negative on the second, so that the sum of weights times positions is the vector
 import warp as wp
 
 from .motion import Surface
+from .watch import Watch
 
 wp.set_module_options({"enable_backward": False})
 
@@ -59,6 +60,17 @@ class Rows:
     more: wp.array[wp.vec3]  # its change in the last iteration
 
 
+@wp.struct
+class OldRows:
+    """The former rows' data that a search keeps; see ``Rows``."""
+
+    starts: wp.array[wp.int32]  # [S + E]
+    counts: wp.array[wp.int32]  # [S + E]
+    other: wp.array[wp.int32]
+    acts: wp.array[wp.int32]
+    force: wp.array[wp.vec3]
+
+
 @wp.func
 def row_count(rows: Rows):
     if rows.owner.shape[0] == 0:
@@ -70,3 +82,34 @@ def row_count(rows: Rows):
 def triangle_normal(surface: Surface, c: wp.vec3i):
     a = surface.x[c[0]]
     return wp.normalize(wp.cross(surface.x[c[1]] - a, surface.x[c[2]] - a))
+
+
+@wp.kernel(enable_backward=False)
+def keep_rows(watch: Watch, rows: Rows, old: OldRows):
+    """Copy the present rows, because the search overwrites them; a thread for each node and edge."""
+    i = wp.tid()
+    if watch.due[0] == 0:
+        return
+    owners = rows.starts.shape[0]
+    old.starts[i] = rows.starts[i]
+    old.counts[i] = rows.counts[i]
+    row = int(i)
+    while row < row_count(rows):
+        old.other[row] = rows.other[row]
+        old.acts[row] = rows.acts[row]
+        old.force[row] = rows.force[row]
+        row += owners
+
+
+@wp.kernel(enable_backward=False)
+def begin_rows(watch: Watch, rows: Rows):
+    """There are none."""
+    if watch.due[0] != 0:
+        rows.total[0] = 0
+
+
+@wp.kernel(enable_backward=False)
+def end_rows(watch: Watch, rows: Rows, most: wp.array[wp.int32]):
+    """How many there are, or would be if there were room."""
+    if watch.due[0] != 0:
+        most[0] = wp.max(most[0], rows.total[0])

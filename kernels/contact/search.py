@@ -3,7 +3,7 @@
 
 import warp as wp
 
-from warp_corot.kernels.modules import INLINED
+from warp_corot.kernels.modules import INLINED, unique_kernel
 
 from .bearing import share_bearers
 from .boxes import edge_reach, lower_end, triangle_reach, triangle_size, upper_end
@@ -11,11 +11,11 @@ from .closest import on_segments, on_triangle, point_of
 from .locate import BORDER, ENDS, FACING, edge_normal, node_faces_at_rest
 from .motion import Surface
 from .near import CRUSHED, PAIRED, Near, mark
-from .rows import BAND, BAND_AT_REST, Meeting, Rows, row_count
+from .rows import BAND, BAND_AT_REST, Meeting, OldRows, Rows
 from .watch import Watch, ahead_at
 from .wide_tree import BLUNT, MAY_FACE, NEARLY, WideTree, query_wide
 
-wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINED})
+wp.set_module_options({"enable_backward": False})
 
 #: Number of neighbours that a thread keeps; with more, it finds them a second time.
 KEPT = wp.constant(32)
@@ -25,17 +25,6 @@ Kept = wp.types.vector(length=32, dtype=wp.int32)
 SHARP = wp.constant(0.15)
 #: The largest cosine between the normals of a node and a triangle of two bodies that may touch before the next search.
 MAY_TOUCH = wp.constant(-0.3)
-
-
-@wp.struct
-class OldRows:
-    """The former rows' data that a search keeps; see ``Rows``."""
-
-    starts: wp.array[wp.int32]  # [S + E]
-    counts: wp.array[wp.int32]  # [S + E]
-    other: wp.array[wp.int32]
-    acts: wp.array[wp.int32]
-    force: wp.array[wp.vec3]
 
 
 @wp.func
@@ -408,7 +397,7 @@ def distance_in(owner: int, other: int, surface: Surface, meeting: Meeting):
     return wp.max(wp.length(p + s * (q - p) - r - t * (u - r)) - band, 0.0)
 
 
-@wp.kernel(enable_backward=False)
+@unique_kernel(cpu_compiler_flags=INLINED)
 def find_pairs(
     # In
     watch: Watch,
@@ -462,34 +451,3 @@ def find_pairs(
         rows.places[row] = places_in(i, other, meeting)
         rows.away[row] = distance_in(i, other, surface, meeting)
         mark_row(i, other, meeting, near)
-
-
-@wp.kernel(enable_backward=False)
-def keep_rows(watch: Watch, rows: Rows, old: OldRows):
-    """Copy the present rows, because the search overwrites them; a thread for each node and edge."""
-    i = wp.tid()
-    if watch.due[0] == 0:
-        return
-    owners = rows.starts.shape[0]
-    old.starts[i] = rows.starts[i]
-    old.counts[i] = rows.counts[i]
-    row = int(i)
-    while row < row_count(rows):
-        old.other[row] = rows.other[row]
-        old.acts[row] = rows.acts[row]
-        old.force[row] = rows.force[row]
-        row += owners
-
-
-@wp.kernel(enable_backward=False)
-def begin_rows(watch: Watch, rows: Rows):
-    """There are none."""
-    if watch.due[0] != 0:
-        rows.total[0] = 0
-
-
-@wp.kernel(enable_backward=False)
-def end_rows(watch: Watch, rows: Rows, most: wp.array[wp.int32]):
-    """How many there are, or would be if there were room."""
-    if watch.due[0] != 0:
-        most[0] = wp.max(most[0], rows.total[0])

@@ -7,9 +7,9 @@ import warp as wp
 
 from warp_corot.errors import UnstableError
 from warp_corot.kernels.contact import boxes, search_by_warp, wide_tree
-from warp_corot.kernels.contact import search as search_kernels
 from warp_corot.kernels.contact.crushed import mark_crushed
-from warp_corot.kernels.contact.rows import Meeting, Rows
+from warp_corot.kernels.contact.rows import Meeting, OldRows, Rows, begin_rows, end_rows, keep_rows
+from warp_corot.kernels.contact.search import find_pairs
 from warp_corot.kernels.contact.watch import HIT
 from warp_corot.solvers.halo import ALONE, Halo
 
@@ -118,9 +118,9 @@ class Pairs:
         self.search.forget()
         self.revision += 1
 
-    def _rows_for(self, room: int) -> tuple[Rows, search_kernels.OldRows]:
+    def _rows_for(self, room: int) -> tuple[Rows, OldRows]:
         device, owners = self.device, self.surface.count + self.surface.edge_count
-        rows, old = Rows(), search_kernels.OldRows()
+        rows, old = Rows(), OldRows()
         rows.total = wp.zeros(1, dtype=wp.int32, device=device)
         for kept in (rows, old):
             kept.starts, kept.counts = (wp.zeros(owners, dtype=wp.int32, device=device) for _ in range(2))
@@ -214,15 +214,15 @@ class Pairs:
             for tree in self._trees:
                 tree.refit()
         owners = len(rows.starts)
-        wp.launch(search_kernels.keep_rows, owners, [watch, rows, old], device=device)
-        wp.launch(search_kernels.begin_rows, 1, [watch, rows], device=device)
+        wp.launch(keep_rows, owners, [watch, rows, old], device=device)
+        wp.launch(begin_rows, 1, [watch, rows], device=device)
         given, outputs = [self.surface.arrays, self.meeting, old], [rows, self.search.near]
         if device.is_cpu:
-            wp.launch(search_kernels.find_pairs, owners, [watch, self.tree, *given], outputs, device=device)
+            wp.launch(find_pairs, owners, [watch, self.tree, *given], outputs, device=device)
         else:
             trees, threads = [tree.id for tree in self._trees], owners * int(search_by_warp.LANES)
             wp.launch(search_by_warp.find_pairs_by_warp, threads, [watch, *trees, *given], outputs, device=device)
-        wp.launch(search_kernels.end_rows, 1, [watch, rows], [self.search.most], device=device)
+        wp.launch(end_rows, 1, [watch, rows], [self.search.most], device=device)
 
     def _fill(self) -> None:
         """Launch the boxes of the wide tree."""

@@ -46,7 +46,7 @@ CONTACT = (
     *("contact.end", "contact.bearing"),
 )
 CONTACT_ON_CPU = ("contact.approach", "contact.begin", "contact.sums", "contact.near", "contact.bearing")
-PAIRS_ON_CPU = ("contact.search", "contact.wide_tree", "contact.boxes", "contact.nearing", "contact.motion")
+PAIRS_ON_CPU = ("contact.rows", "contact.wide_tree", "contact.boxes", "contact.nearing", "contact.motion")
 
 #: A kernel, or one with the number of threads of its blocks on CUDA, if that is not Warp's default.
 LoadedKernel: TypeAlias = wp.Kernel | tuple[wp.Kernel, int]

@@ -40,6 +40,7 @@ from warp_corot.inputs.loading import (
 )
 from warp_corot.inputs.simulation_lock import SIMULATION_LOCK, under_lock
 from warp_corot.kernels.contact.crushed import count_crushed
+from warp_corot.kernels.contact.search import find_pairs
 from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.stepping.gauge import find_strains
 from warp_corot.kernels.stepping.integrate import STEP_SYMPLECTIC_EULER
@@ -207,6 +208,7 @@ class Simulation(Cutting):
         """Load the kernels that steps are known to launch, several modules at a time; returns those to wait for."""
         explicit, chosen, on_cpu = not self.integrator.is_implicit, self.integrator.dt is None, self.device.is_cpu
         names = [*(STEPS_ON_CPU if on_cpu else STEPS), *(EXPLICIT if chosen else ()), *(() if explicit else IMPLICIT)]
+        meet = False
         if touching and explicit:
             meet = on_cpu and (len(self.parts) > 1 or touching[1].self_contact)
             names = [*(CONTACT_ON_CPU if on_cpu else CONTACT), *(PAIRS_ON_CPU if meet else ()), *names]
@@ -215,6 +217,8 @@ class Simulation(Cutting):
         kernels: list[LoadedKernel] = [STEP_SYMPLECTIC_EULER[wp.vec4]] if explicit else []
         kernels += [find_strains(body.discretization.element_kind) for body in self.parts if chosen]
         kernels += [count_crushed(body.discretization.element_kind) for body in self.parts if touching]
+        if meet:
+            kernels.append(find_pairs)
         if touching and explicit:
             kernels.append(solver_of(self.device, *touching, len(self.parts)))
         kernels += [kernel for field in self.fields for kernel in field.kernels]
