@@ -12,7 +12,6 @@ from typing import NamedTuple
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
-from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.stepping.integrate import is_finite
 
 wp.set_module_options({"enable_backward": False})
@@ -349,9 +348,14 @@ class StateKernels(NamedTuple):
 
 @functools.cache
 def state_kernels(Place: type, Velocity: type) -> StateKernels:
-    """The kernels for states with these types: of particles vec3 both, of bodies transforms and spatial vectors."""
+    """The kernels for states with these types: of particles vec3 both, of bodies transforms and spatial vectors.
 
-    @unique_kernel()
+    They are one module, so that those of resets are loaded with those of steps and may be recorded.
+    """
+    module = wp.get_module(f"newton_states_{Place.__name__}")
+    module.options["enable_backward"] = False
+
+    @wp.kernel(module=module, enable_backward=False)
     def check(
         # In
         q: wp.array[Place],
@@ -367,7 +371,7 @@ def state_kernels(Place: type, Velocity: type) -> StateKernels:
         if not is_sound(q[i], qd[i], fastest):
             wp.atomic_max(trouble, place_of(world[i], trouble.shape[0]), wrong)
 
-    @unique_kernel()
+    @wp.kernel(module=module, enable_backward=False)
     def put_back(
         # In
         world: wp.array[wp.int32],
@@ -397,7 +401,7 @@ def state_kernels(Place: type, Velocity: type) -> StateKernels:
             q[i] = before_q[i]
             qd[i] = before_qd[i]
 
-    @unique_kernel()
+    @wp.kernel(module=module, enable_backward=False)
     def reset(
         # In
         chosen: wp.array[wp.bool],

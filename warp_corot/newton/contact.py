@@ -197,7 +197,8 @@ class Contacts:
             outputs = [f, self.reactions, self._no_wrenches if reported is None else reported]
             self._launch(explicit_rows.scatter_rows, self.count, inputs, outputs)
         if self._lists is not None and self.pairs is not None:
-            self.pairs.add_forces(self._lists, self.law, dt, load, [particles, *motion], f, trouble)
+            inputs = [self.pairs.surfaces, self._lists, self.law, dt, load, particles, *motion]
+            self._launch(scatter_pairs, self.pairs.size, inputs, [f, trouble])
 
     def count_loads(self, state: newton.State, of_bodies: newton.State) -> wp.array:
         """Launch the count of how many contacts share each particle, if several may: float32 [P], or empty."""
@@ -210,7 +211,8 @@ class Contacts:
             inputs = [self.law.adhesion, self.rows, self.bodies(of_bodies), state.particle_q]
             self._launch(rows.count_loads, self.contact_count, inputs, [self._load])
         if self._lists is not None and self.pairs is not None:
-            self.pairs.count_loads(self._lists, self.law, state.particle_q, self._load)
+            inputs = [self.pairs.surfaces, self._lists, self.law, state.particle_q]
+            self._launch(count_pair_loads, self.pairs.size, inputs, [self._load])
         return self._load
 
     def bodies(self, of_bodies: newton.State) -> Bodies:
@@ -308,6 +310,10 @@ class SoftPairs:
     Args:
         model: A model with triangles.
         margin: Distance at which surfaces begin to push one another [m].
+
+    Attributes:
+        surfaces: Triangles and edges of the model.
+        size: Number of threads that go through the lists.
     """
 
     def __init__(self, model: newton.Model, margin: float):
@@ -316,11 +322,12 @@ class SoftPairs:
                 "self_contact_margin is given, but the model has no triangles with edges that could touch: give "
                 "add_forest and add_mesh surface=True"
             )
-        self.model, self.margin, self.device = model, margin, model.device
+        self.margin, self.device = margin, model.device
+        self.size = max(model.particle_count, model.edge_count)
         triangles = model.tri_indices.numpy().reshape(-1, 3)
         edges = model.edge_indices.numpy().reshape(-1, 4)
         facing = _facing(model, triangles)
-        self._surfaces = surfaces = Surfaces()
+        self.surfaces = surfaces = Surfaces()
         surfaces.triangles, surfaces.edges = model.tri_indices, model.edge_indices
         surfaces.facing = self._on_device(facing, wp.float32)
         surfaces.outward = self._on_device(_triangles_of_edges(triangles, edges, facing), wp.vec2i)
@@ -349,27 +356,6 @@ class SoftPairs:
         lists.edge_counts = data.edge_colliding_edges_count
         lists.edges = data.edge_colliding_edges
         return lists
-
-    def count_loads(self, lists: PairLists, law: rows.ContactLaw, q: wp.array, load: wp.array) -> None:
-        """Add to the loads of particles, float32 [P]."""
-        self._launch(count_pair_loads, [self._surfaces, lists, law, q], [load])
-
-    def add_forces(
-        self,
-        lists: PairLists,
-        law: rows.ContactLaw,
-        dt: float,
-        load: wp.array,
-        motion: list,
-        f: wp.array,
-        trouble: wp.array,
-    ) -> None:
-        """Add forces [N] to f, vec4 [P]; ``motion``: particles, positions, velocities, and forces before contacts'."""
-        self._launch(scatter_pairs, [self._surfaces, lists, law, dt, load, *motion], [f, trouble])
-
-    def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
-        dim = max(self.model.particle_count, self.model.edge_count)
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
     def _on_device(self, values: npt.NDArray[Any], dtype: type) -> wp.array:
         return wp.array(values, dtype=dtype, device=self.device)

@@ -33,7 +33,6 @@ from .checks import Step
 from .contact import Contacts
 from .library import newton
 from .others import Others
-from .scene import NAMESPACE
 from .steps import Steps
 from .tetrahedra import Tetrahedra
 
@@ -373,17 +372,15 @@ class ImplicitSteps(Steps):
         )
         self._first = wp.zeros(unknowns.worlds, dtype=wp.int32, device=self.device)
         self._search = LineSearch(unknowns.worlds, unknowns.count, self._rows, self.device)
-        self._still = wp.zeros(model.particle_count, dtype=wp.vec3, device=self.device)
+        # Viscous forces are those of the velocities after the step, which the solve finds.
+        still = wp.zeros(model.particle_count, dtype=wp.vec3, device=self.device)
+        self._turned_state: Any = SimpleNamespace(particle_q=self._turned.positions, particle_qd=still)
         self._replays = Replays(self.device, loops=True)
         self._can_replay = False
 
     def _launch_forces(self, substep: Step, given: newton.State, share: float, done: float) -> None:
-        now: Any = substep.state_in
-        self._turned.launch(now, self.contacts.particles, substep.dt)
-        # Viscous forces are those of the velocities after the step, which the solve finds.
-        at_rest: Any = SimpleNamespace(particle_q=self._turned.positions, particle_qd=self._still)
-        setattr(at_rest, NAMESPACE, getattr(now, NAMESPACE, None))
-        self.tetrahedra.add_forces(at_rest, self._activation, self._f)
+        self._turned.launch(substep.state_in, self.contacts.particles, substep.dt)
+        self.tetrahedra.add_forces(self._turned_state, self._activation, self._f)
         of_bodies = self._bodies_after(done, substep, given)
         if self._rows.begin(substep, of_bodies):
             self._replays.forget()
