@@ -5,8 +5,10 @@ from typing import Any
 
 import warp as wp
 
-from warp_corot.kernels.clusters.pair_elements import (
+from warp_corot.kernels.clusters.pairs import (
+    PairClusters,
     add_sum,
+    fetch_records,
     first_matrix,
     first_scale,
     half_word,
@@ -18,7 +20,6 @@ from warp_corot.kernels.clusters.pair_elements import (
     shared_quads,
     vector_of,
 )
-from warp_corot.kernels.clusters.pairs import PairClusters, fetch_records
 from warp_corot.kernels.corotated.anisotropic import (
     OrthotropicMaterial,
     axes_of,

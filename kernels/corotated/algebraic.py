@@ -6,7 +6,7 @@ With E = F^T F - I, its invariants a = tr E, b = tr adj E, c = det E, and j = J 
     I - S^-1 = (n0 I + (8 + y) E - (6 + y) adj E) / q,  y = (2t - 6j) / J,
     n0 = t (18 + t (8 + t)) - a (10 + t) - 2j - y (1 + a),  and  P = F (2 mu (I - S^-1) + lambda t S^-1),
 with the digits of E however small it is, for J > 0. Flat and turned over elements have their rotations from
-``robust_rotation``. ``elements.native_laws`` does the same for eight elements at once.
+``robust_rotation``. ``elements.simd8`` does the same for eight elements at once.
 """
 
 from typing import Any

@@ -1,4 +1,4 @@
-"""Differentials of the isotropic corotated law P = R sigma(e), e = sym(R^T F) - I, for ``elements.stiffness_products``.
+"""Differentials of the isotropic corotated law P = R sigma(e), e = sym(R^T F) - I, for ``elements.forces``.
 
 With the rotation held fixed dP = R sigma(sym(R^T dF)): the paper's R K R^T, which is positive semidefinite. The exact
 differential includes the change of R, dR = R [w]x with (tr(S) I - S) w = axial(R^T dF), which needs the rotation to be

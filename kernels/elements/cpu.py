@@ -12,8 +12,7 @@ import warp as wp
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import MOST, Dilatation
 from warp_corot.kernels.elements.elements import ForestElements, GeneralElements, frame, gradient_of, rest_volume
-from warp_corot.kernels.elements.native_laws import IsotropicLaw, NativeLaw, elastic
-from warp_corot.kernels.elements.simd8 import headers, on_cpu, scatter_simd8
+from warp_corot.kernels.elements.simd8 import IsotropicLaw, NativeLaw, elastic, headers, on_cpu, scatter_simd8
 from warp_corot.kernels.modules import unique_kernel
 
 wp.set_module_options({"enable_backward": False})
@@ -113,7 +112,7 @@ class GroupedMaterial:
 
 @functools.cache
 def scatter_grouped_elements(law: IsotropicLaw, of: Dilatation) -> wp.Kernel:
-    """Forces of a law of ``native_laws`` with a shared dilatation; a thread is ``GROUPS`` groups.
+    """Forces of a law of ``simd8`` with a shared dilatation; a thread is ``GROUPS`` groups.
 
     The corotated law lists what it leaves out.
     """

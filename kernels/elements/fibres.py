@@ -122,7 +122,7 @@ def active_stress(material: ReinforcedMaterial, t: int, f: wp.mat33):
     return wp.outer(s * column(f, 0), wp.vec3(1.0, 0.0, 0.0))
 
 
-# --- the law, for the kernels of ``forces`` and ``stiffness_products`` ------------------------------------------------
+# --- the law, for the kernels of ``forces`` and ``forces`` ------------------------------------------------
 
 
 @wp.func

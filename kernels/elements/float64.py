@@ -8,8 +8,7 @@ import warp as wp
 from warp_corot.kernels.modules import unique_kernel
 
 from .dilatation import Dilatation
-from .native_laws import IsotropicLaw, bare
-from .simd8 import headers, on_cpu
+from .simd8 import IsotropicLaw, bare, headers, on_cpu
 
 wp.set_module_options({"enable_backward": False})
 

@@ -2,7 +2,7 @@
 
 A group adds c g g^T to K, with g the derivative of the sum of lambda_e V_e theta_e with respect to its nodes'
 displacements and c = w'' / sum of lambda_e V_e. The rows g are found once for each linearisation, so that a product
-reads ten nodes for eight elements and no element. What elements add besides is left to ``mean_dilatation`` and, where
+reads ten nodes for eight elements and no element. What elements add besides is left to ``dilatation`` and, where
 some of them are held from turning over, to ``add_held``.
 """
 
@@ -11,10 +11,9 @@ import warp as wp
 from warp_corot.kernels.modules import Family
 
 from .constitutive import IsotropicMaterial
-from .dilatation import Dilatation, mean_of
+from .dilatation import Dilatation, is_live, mean_of, place_of, range_of, scatter
 from .elements import nodal_forces, rest_volume
 from .forces import in_local_frame, own_gradient
-from .mean_dilatation import is_live, place_of, range_of, scatter
 
 wp.set_module_options({"enable_backward": False})
 
@@ -62,7 +61,7 @@ def list_members(
     ranges: wp.array[wp.vec2i],
     members: wp.array[wp.int32],
 ):
-    """Write the range and the members of each group, a thread for each; see ``mean_dilatation.range_of``. Groups of
+    """Write the range and the members of each group, a thread for each; see ``dilatation.range_of``. Groups of
     elements from ``below`` on are left empty."""
     g = wp.tid()
     ranges[first_group + g] = wp.vec2i(0, 0)
@@ -148,7 +147,7 @@ def add_row(rows: wp.array[wp.vec4], place: int, row: wp.vec3):
 @OF_GROUPS.member
 def write_rows(Elements: type, of: Dilatation) -> wp.Kernel:
     """A thread a group, which also leaves (lambda_e h'', w', 0, 0) to its elements: the first for
-    ``add_held``, the second for ``mean_dilatation.own_differential``."""
+    ``add_held``, the second for ``dilatation.own_differential``."""
     measure, slope_of, curvature_of, holding = of.measure, of.slope, of.curvature, of.holding
 
     @OF_GROUPS.kernel()

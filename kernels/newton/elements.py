@@ -26,8 +26,7 @@ from warp_corot.kernels.elements.general_cuda import (
     load_four,
     rest_inverse_of,
 )
-from warp_corot.kernels.elements.native_laws import elastic
-from warp_corot.kernels.elements.simd8 import headers, scatter_simd8
+from warp_corot.kernels.elements.simd8 import elastic, headers, scatter_simd8
 from warp_corot.kernels.math.rotation import byers_xu, cofactor, identity3
 from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.stepping.gauge import TURNS, keep_largest

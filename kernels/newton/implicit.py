@@ -77,7 +77,7 @@ def linearise(
 
 @functools.cache
 def linearised(is_viscous: bool) -> wp.Function:
-    """The differential for ``elements.stiffness_products``."""
+    """The differential for ``elements.forces``."""
 
     @wp.func
     def linearised(elements: Any, t: int, made: Linearised, u: wp.array[wp.vec4], dg: wp.mat33):

@@ -3,7 +3,7 @@
 The law is that of ``corotated.anisotropic``. Each leaf is computed in its own frame, in which the columns of F - I are
 differences of displacements, and four unscaled iterations find its rotation. A leaf for which these find no rotation
 adds nothing; a bit flags it, and ``repair_leaves`` computes it. Leaves whose rotation is nearly indefinite are flagged,
-too: see ``corotated.anisotropic_simd8``.
+too: see ``corotated.anisotropic``.
 """
 
 import functools

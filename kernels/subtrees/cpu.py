@@ -2,7 +2,7 @@
 
 A CPU core is fast only with vector instructions. So the ten nodes of eight subtrees of one type are gathered into
 arrays of lanes, a loop computes the eight leaves, and forces are scattered once at the end (``native/subtrees8.h``).
-The laws are those of ``elements.native_laws``. A bit flags each leaf or subtree that the corotated law leaves out.
+The laws are those of ``elements.simd8``. A bit flags each leaf or subtree that the corotated law leaves out.
 """
 
 import functools
@@ -14,9 +14,8 @@ from warp_corot.kernels.corotated.tangent import RotatedMaterial
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.kernels.elements.elements import Subtrees
-from warp_corot.kernels.elements.native_laws import STRESSLESS, IsotropicLaw, NativeLaw, elastic
 from warp_corot.kernels.elements.shapes import Coefficients
-from warp_corot.kernels.elements.simd8 import headers, scatter_simd8
+from warp_corot.kernels.elements.simd8 import STRESSLESS, IsotropicLaw, NativeLaw, elastic, headers, scatter_simd8
 from warp_corot.kernels.tables.subtree import FRAMES, HANDEDNESS, LEAVES, POSITIONS, stiffness
 
 # --- the tables of a type in C++, generated from those of ``tables.subtree`` ------------------------------------------

@@ -258,7 +258,7 @@ def shared_forces(shape: int, uniform: bool, given: bool) -> wp.Function:
 # The dilatation that the eight leaves of a complete subtree share; see ``elements.dilatation``.
 #
 # This is the fast kernel for its forces on CUDA, where a thread takes a subtree, with ten displacements in and ten
-# forces out; ``cpu`` has that for the CPU. ``elements.mean_dilatation`` computes everything else leaf by leaf.
+# forces out; ``cpu`` has that for the CPU. ``elements.dilatation`` computes everything else leaf by leaf.
 
 
 @functools.cache

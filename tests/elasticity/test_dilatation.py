@@ -12,8 +12,7 @@ from shortened import crossed
 from tangents import diagonal
 
 import warp_corot as wc
-from warp_corot.discretization.deviatoric import deviatoric
-from warp_corot.discretization.discretization import FixedMesh
+from warp_corot.discretization.discretization import FixedMesh, deviatoric
 from warp_corot.elasticity import ForceField
 from warp_corot.elasticity.corotated.fields import SubtreeField
 from warp_corot.elasticity.dilatation import DilatationField

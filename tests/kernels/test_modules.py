@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from warp_corot.kernels.elements import mean_dilatation as kernels
+from warp_corot.kernels.elements import dilatation as kernels
 from warp_corot.kernels.elements.dilatation import SMALL, VOLUME
 from warp_corot.kernels.elements.elements import ForestElements, GeneralElements
 

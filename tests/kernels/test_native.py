@@ -12,8 +12,7 @@ import warp as wp
 from warp_corot.elasticity import float64
 from warp_corot.kernels.elements import dilatation
 from warp_corot.kernels.elements.constitutive import CONTINUED_BELOW
-from warp_corot.kernels.elements.native_laws import LAWS, elastic
-from warp_corot.kernels.elements.simd8 import NATIVE, headers
+from warp_corot.kernels.elements.simd8 import LAWS, NATIVE, elastic, headers
 from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.tables.shapes import FRAME_SHIFT, LEVEL_BITS, MIRROR_BIT
 

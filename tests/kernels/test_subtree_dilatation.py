@@ -8,7 +8,7 @@ import warp as wp
 from cases import CUBE
 
 import warp_corot as wc
-from warp_corot.discretization.deviatoric import deviatoric
+from warp_corot.discretization.discretization import deviatoric
 from warp_corot.discretization.planning.fixed import ForcePlan
 from warp_corot.elasticity.model import isotropic_material
 from warp_corot.kernels.elements.dilatation import VOLUME

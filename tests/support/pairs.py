@@ -6,8 +6,7 @@ import numpy as np
 import warp as wp
 
 from warp_corot.kernels.clusters.laws import add_pair, measure_pairs, pair_dilatations
-from warp_corot.kernels.clusters.pair_elements import half_word, pair_forces, record_of
-from warp_corot.kernels.clusters.pairs import PairClusters
+from warp_corot.kernels.clusters.pairs import PairClusters, half_word, pair_forces, record_of
 from warp_corot.kernels.elements.dilatation import VOLUME
 from warp_corot.kernels.elements.elements import load_node
 from warp_corot.kernels.tables.cluster_layout import QUAD_BYTES

@@ -35,7 +35,7 @@ from .views import Views
 from .worlds import World
 
 if TYPE_CHECKING:
-    from warp_corot.discretization.changing.following import FollowingBinding
+    from warp_corot.discretization.changing.transfer import FollowingBinding
     from warp_corot.mesh.surfaces.bound import DeviceBinding, SurfaceMesh
 
 
@@ -304,7 +304,7 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
             InputError: The mesh is not a forest, the body has several worlds, there are triangles and the body can be
                 cut, or as in ``TetForest.bind``.
         """
-        from warp_corot.discretization.changing.following import FollowingBinding
+        from warp_corot.discretization.changing.transfer import FollowingBinding
 
         if not isinstance(self.mesh, TetForest):
             raise InputError(f"only a TetForest can have points bound to it, not a {type(self.mesh).__name__}")

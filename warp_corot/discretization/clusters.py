@@ -8,17 +8,19 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.kernels.clusters.pair_elements import (
+from warp_corot.kernels.clusters.pair_tables import cut_clusters, pack_slots
+from warp_corot.kernels.clusters.pairs import (
     FIRST_MATRIX,
     GENERAL_VOLUMES,
     GENERAL_WORDS,
     LATTICE_WORDS,
+    PAIR_TASK_SLOTS,
+    TASK_WORDS,
     GeneralPairs,
     LatticePairs,
+    PairClusters,
     vec4u,
 )
-from warp_corot.kernels.clusters.pair_tables import cut_clusters, pack_slots
-from warp_corot.kernels.clusters.pairs import PAIR_TASK_SLOTS, TASK_WORDS, PairClusters
 from warp_corot.kernels.elements.elements import GeneralElements
 from warp_corot.kernels.tables.cluster_layout import BANK_GROUPS, QUAD_BYTES, PairLayout
 
@@ -208,7 +210,7 @@ def pairs_in_clusters(
 
     Returns:
         ``PairClusters`` of ``kernels.clusters.pairs``; ``LatticePairs`` or ``GeneralPairs`` of
-        ``kernels.clusters.pair_elements``; and the number of clusters.
+        ``kernels.clusters.pairs``; and the number of clusters.
     """
     device, tets = general.nodes.device, nodes[chosen]
     pairs = paired(tets)

@@ -10,6 +10,13 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_corot.discretization.elements import ElementKind, Elements, Mesh, device_elements, element_kind, with_targets
+from warp_corot.discretization.frames import parts
+from warp_corot.discretization.levels import Levels, TreeNodes
+from warp_corot.discretization.plan import Awaited, FlatLeaves, Plan
+from warp_corot.discretization.planning.fixed import ForcePlan, pays_in_groups, units_of
+from warp_corot.discretization.sizes import Clock, Sizes
+from warp_corot.discretization.slots import Slots
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import check_float32
 from warp_corot.inputs.cpu_threads import Team, team_of
@@ -19,16 +26,9 @@ from warp_corot.materials.directional import Directional
 from warp_corot.materials.isotropic import Material
 from warp_corot.mesh import TetForest
 
-from .elements import ElementKind, Elements, Mesh, device_elements, element_kind, with_targets
-from .frames import parts
-from .levels import Levels, TreeNodes
-from .plan import Awaited, FlatLeaves, Plan
-from .planning.fixed import ForcePlan, pays_in_groups, units_of
-from .sizes import Clock, Sizes
-from .slots import Slots
-
 if TYPE_CHECKING:
-    from .changing.pools import DeviceForest
+    from warp_corot.discretization.changing.pools import DeviceForest
+
 
 #: Elements, and with them nodes, are numbered in 32 bits.
 MOST_ELEMENTS = 2**31 - 1
@@ -337,3 +337,39 @@ def lumped_masses(mesh: Mesh, material: Material, worlds: int = 1) -> npt.NDArra
                 quarter = quarter * fill[part]
             np.add.at(of_world, mesh.tets[part].ravel(), np.repeat(quarter, 4))
     return np.broadcast_to(masses, (worlds, len(mesh.points))).ravel()
+
+
+# --- without resistance to changes of volume -------------------------------------------------------------------------
+#
+# A discretization whose elements do not resist changes of volume: a law's forces without the terms in lambda.
+
+
+def deviatoric(whole: Discretization) -> Discretization:
+    """A discretization with zero in place of lambda; all other data are those of ``whole`` and follow its changes."""
+    return cast("Discretization", _Deviatoric(whole))
+
+
+class _Deviatoric:
+    def __init__(self, whole: Discretization):
+        self._whole, self._zeros = whole, dict[str, tuple[wp.array, wp.array]]()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.__dict__["_whole"], name)
+
+    @property
+    def discretization(self) -> _Deviatoric:
+        return self
+
+    @property
+    def lam(self) -> wp.array:
+        return self._none_of("all", self._whole.lam)
+
+    def lame_of_flat(self, flat: FlatLeaves) -> tuple[wp.array, wp.array] | None:
+        given = self._whole.lame_of_flat(flat)
+        return None if given is None else (given[0], self._none_of("flat", given[1]))
+
+    def _none_of(self, which: str, lam: wp.array) -> wp.array:
+        known = self._zeros.get(which)
+        if known is None or known[0] is not lam:
+            known = self._zeros[which] = (lam, wp.zeros_like(lam))
+        return known[1]

@@ -14,7 +14,7 @@ from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.kernels.plan.tree import TORN
 from warp_corot.mesh import TetForest, TetMesh
 
-#: Groups in the form of ``kernels.elements.mean_dilatation.share_in_groups``: starts, members, the number of groups
+#: Groups in the form of ``kernels.elements.dilatation.share_in_groups``: starts, members, the number of groups
 #: if launches cover more, and the number in launches.
 Batch = tuple[wp.array, wp.array, wp.array, int]
 

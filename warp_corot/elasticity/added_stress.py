@@ -23,8 +23,7 @@ from warp_corot.inputs.forwarding import forwards
 from warp_corot.kernels.elements import added as kernels
 from warp_corot.kernels.elements.added import ViscousMaterial, relax_simd8, viscosity_stress
 from warp_corot.kernels.elements.forces import element_energies
-from warp_corot.kernels.elements.native_laws import PRESTRESS, PRONY, VISCOUS, NativeLaw
-from warp_corot.kernels.elements.simd8 import LANES
+from warp_corot.kernels.elements.simd8 import LANES, PRESTRESS, PRONY, VISCOUS, NativeLaw
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
@@ -43,7 +42,7 @@ class AddedStressField(ForceField):
         law: The elastic law's field.
         Material: The struct that the other stress reads.
         stress, differential, density: The other stress, its differential, and its energy density, as
-            ``kernels.elements.forces`` and ``kernels.elements.stiffness_products`` take them.
+            ``kernels.elements.forces`` and ``kernels.elements.forces`` take them.
         lanes: The other stress in C++, for the CPU, if it is there.
 
     Attributes:

@@ -26,8 +26,10 @@ from warp_corot.kernels.corotated.anisotropic import (
     fibre_cauchy,
     fibre_density,
     fibre_stress,
+    scatter_anisotropic_simd8,
+    turn_changed,
+    turn_elements,
 )
-from warp_corot.kernels.corotated.anisotropic_simd8 import scatter_anisotropic_simd8, turn_changed, turn_elements
 from warp_corot.kernels.corotated.well_conditioned import quaternions_of
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import LOG_VOLUME
@@ -39,7 +41,7 @@ from warp_corot.kernels.elements.fibres import (
     reinforced_stress,
 )
 from warp_corot.kernels.elements.forces import element_energies, repair_forces
-from warp_corot.kernels.elements.native_laws import FIBRES
+from warp_corot.kernels.elements.simd8 import FIBRES
 from warp_corot.kernels.math.rotation import byers_xu, quick_rotation
 from warp_corot.kernels.subtrees.anisotropic import repair_leaves, scatter_anisotropic_subtrees, scatter_flat
 from warp_corot.kernels.subtrees.degenerate import NO_LIST

@@ -16,8 +16,7 @@ from warp_corot.discretization.plan import GROUPED_LEAVES, Batch, Plan
 from warp_corot.elasticity.cpu import as_general
 from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.clusters.laws import ActiveMaterial
-from warp_corot.kernels.clusters.pair_elements import GeneralPairs, LatticePairs
-from warp_corot.kernels.clusters.pairs import scatter_pairs
+from warp_corot.kernels.clusters.pairs import GeneralPairs, LatticePairs, scatter_pairs
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.cpu import rest_matrices
 from warp_corot.kernels.elements.elements import ForestElements, GeneralElements
@@ -87,7 +86,7 @@ class ClusterScatter:
 
     Attributes:
         clusters: ``kernels.clusters.pairs.PairClusters``.
-        pairs: ``kernels.clusters.pair_elements.LatticePairs`` or ``GeneralPairs``.
+        pairs: ``kernels.clusters.pairs.LatticePairs`` or ``GeneralPairs``.
         count: Number of clusters.
         Pairs, Material, law, layout: The types and options for which the kernel is generated.
     """

@@ -29,8 +29,7 @@ from warp_corot.kernels.elements.cpu import (
 from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.kernels.elements.elements import GeneralElements
 from warp_corot.kernels.elements.forces import repair_forces, scatter_forces
-from warp_corot.kernels.elements.native_laws import IsotropicLaw, NativeLaw
-from warp_corot.kernels.elements.simd8 import LANES
+from warp_corot.kernels.elements.simd8 import LANES, IsotropicLaw, NativeLaw
 from warp_corot.kernels.subtrees.cpu import (
     DilatingMaterial,
     ToleranceMaterial,
@@ -107,7 +106,7 @@ class Dilating:
         lam: Gives lambda [Pa] as elements hold it.
         plan: The plan whose elements are grouped.
         kind: The struct of these elements.
-        starts, members, live: The groups in the form of ``kernels.elements.mean_dilatation.share_in_groups``.
+        starts, members, live: The groups in the form of ``kernels.elements.dilatation.share_in_groups``.
 
     Attributes:
         count: Number of groups in launches.
@@ -192,7 +191,7 @@ class Dilating:
         """Add the forces of groups at displacements u to f, both vec4 [N].
 
         Args:
-            law: A law of ``kernels.elements.native_laws``.
+            law: A law of ``kernels.elements.simd8``.
             repair: Computes the elements that the law leaves out, if any.
         """
         if not self.count:
@@ -220,7 +219,7 @@ class SimdForces:
 
     Args:
         field: The field whose forces these are.
-        law: A law of ``kernels.elements.native_laws``.
+        law: A law of ``kernels.elements.simd8``.
         repair: The kernel for the elements that it leaves out; None: it leaves none out.
         tolerance: The largest angle at which the root's rotation is used [rad]; None: never.
     """

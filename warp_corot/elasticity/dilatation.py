@@ -10,8 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.discretization.deviatoric import deviatoric
-from warp_corot.discretization.discretization import Discretization, discretization_of
+from warp_corot.discretization.discretization import Discretization, deviatoric, discretization_of
 from warp_corot.discretization.groups import Members
 from warp_corot.discretization.plan import Batch, Plan
 from warp_corot.elasticity.cpu import Dilating
@@ -22,12 +21,10 @@ from warp_corot.inputs.checks import checked_choice, shown
 from warp_corot.inputs.choices import AUTO, ELEMENT, SHARED
 from warp_corot.inputs.forwarding import forwards
 from warp_corot.inputs.loading import LoadedKernel, load
-from warp_corot.kernels.elements import mean_dilatation as kernels
+from warp_corot.kernels.elements import dilatation as kernels
 from warp_corot.kernels.elements import mean_dilatation_rows as rows
-from warp_corot.kernels.elements.dilatation import SMALL, VOLUME, Dilatation, not_held
-from warp_corot.kernels.elements.mean_dilatation import DilatedMaterial
-from warp_corot.kernels.elements.native_laws import STRESSLESS
-from warp_corot.kernels.elements.simd8 import LANES
+from warp_corot.kernels.elements.dilatation import SMALL, VOLUME, Dilatation, DilatedMaterial, not_held
+from warp_corot.kernels.elements.simd8 import LANES, STRESSLESS
 from warp_corot.kernels.subtrees import cpu as subtree_cpu
 from warp_corot.kernels.subtrees import cuda as subtree_cuda
 from warp_corot.kernels.subtrees.degenerate import NO_LIST
@@ -356,12 +353,12 @@ class DilatationField(ForceField):
 
     def share_weights(self, u: wp.array, p: wp.array) -> wp.array:
         """Data of the shared dilatation for derivatives with respect to elements' weights, vec4 [T]; see
-        ``kernels.elements.mean_dilatation.weight_law_at``.
+        ``kernels.elements.dilatation.weight_law_at``.
         """
         return self._share(u, p, kernels.share_in_groups(self.kind, kernels.weight_law_at(self.of)))
 
     def _share(self, u: wp.array, p: wp.array, share_in_groups: wp.Kernel) -> wp.array:
-        """Launch the first two passes of ``kernels.elements.mean_dilatation`` for all elements."""
+        """Launch the first two passes of ``kernels.elements.dilatation`` for all elements."""
         self._regions.launch_over(
             self._measure,
             self.element_count,

@@ -12,7 +12,7 @@ from scipy.sparse import coo_matrix, csr_matrix
 
 from warp_corot.errors import ConvergenceError
 from warp_corot.kernels.elements import float64 as kernels
-from warp_corot.kernels.elements.native_laws import IsotropicLaw
+from warp_corot.kernels.elements.simd8 import IsotropicLaw
 from warp_corot.materials.isotropic import Isotropic
 
 from .corotated.model import Corotated
@@ -22,7 +22,7 @@ from .model import Model
 from .springs import EdgeStVK, MassSpring
 
 Array = npt.NDArray[np.float64]
-#: An isotropic law's name or terms, as ``kernels.elements.native_laws`` has them.
+#: An isotropic law's name or terms, as ``kernels.elements.simd8`` has them.
 STVK, COROTATED = "stvk", "corotated"
 #: Keeps |J| away from zero, as in ``kernels.elements.constitutive``.
 LEAST_J = 1.0e-3

@@ -32,7 +32,7 @@ class ElementGroups:
 
     Attributes:
         starts, members, live: The groups of elements outside subtrees, as
-            ``kernels.elements.mean_dilatation.share_in_groups`` takes them.
+            ``kernels.elements.dilatation.share_in_groups`` takes them.
 
     Raises:
         InputError: The forest changes, and the law computes forces leaf by leaf.

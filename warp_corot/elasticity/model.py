@@ -23,22 +23,20 @@ from warp_corot.kernels.corotated.anisotropic import FibreMaterial
 from warp_corot.kernels.corotated.tangent import KeptStrains
 from warp_corot.kernels.elements.added import Prestress, PronyMaterial
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
+from warp_corot.kernels.elements.dilatation import DilatedMaterial
 from warp_corot.kernels.elements.fibres import ReinforcedMaterial
 from warp_corot.kernels.elements.forces import (
+    add_stiffness_diagonal,
+    add_stiffness_product,
     element_energies,
     element_von_mises,
     law_cauchy,
+    law_differential,
     law_stress,
     law_value,
     scatter_forces,
 )
-from warp_corot.kernels.elements.mean_dilatation import DilatedMaterial
-from warp_corot.kernels.elements.native_laws import IsotropicLaw
-from warp_corot.kernels.elements.stiffness_products import (
-    add_stiffness_diagonal,
-    add_stiffness_product,
-    law_differential,
-)
+from warp_corot.kernels.elements.simd8 import IsotropicLaw
 
 if TYPE_CHECKING:
     from warp_corot.elasticity.clusters import ClusterScatter
@@ -98,7 +96,7 @@ class StressLaw:
     Attributes:
         stress: Device function (elements, t, material, u) -> P, see ``kernels.elements.forces``.
         differential: Its exact derivative (elements, t, material, u, dg) -> dP, as
-            ``kernels.elements.stiffness_products`` takes it.
+            ``kernels.elements.forces`` takes it.
         material: The struct that both read.
         Material: Its type; for ``IsotropicMaterial`` the stress is linear in Lamé's parameters.
         sees_shape: Whether the stress depends on an element's rest shape besides its deformation gradient.
@@ -474,7 +472,7 @@ class ElementField(ForceField):
     Args:
         body, deterministic: As for every field.
         stress, density, cauchy: The functions of ``kernels.elements.forces``.
-        differential: The differential of the stress, one of ``kernels.elements.stiffness_products``.
+        differential: The differential of the stress, one of ``kernels.elements.forces``.
         Material: The struct that they read.
     """
 
@@ -539,7 +537,7 @@ class Law(NamedTuple):
 
     Attributes:
         stress, differential, energy: The functions.
-        lanes: The same law of ``kernels.elements.native_laws``, for the CPU; None if it is not in C++.
+        lanes: The same law of ``kernels.elements.simd8``, for the CPU; None if it is not in C++.
         cauchy: The Cauchy stress; None: that of the stress.
     """
 
@@ -611,7 +609,7 @@ class Tangent(ABC):
 
 
 class ElementTangent(Tangent):
-    """K of a law, element by element on every path of forces; see ``kernels.elements.stiffness_products``.
+    """K of a law, element by element on every path of forces; see ``kernels.elements.forces``.
 
     Args:
         field: The field.

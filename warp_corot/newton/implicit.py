@@ -13,8 +13,8 @@ from warp_corot.elasticity.model import isotropic_material
 from warp_corot.errors import InputError
 from warp_corot.kernels.corotated.tangent import PLACES, KeptGradients, add_kept_product
 from warp_corot.kernels.elements.elements import GeneralElements
+from warp_corot.kernels.elements.forces import add_stiffness_product
 from warp_corot.kernels.elements.simd8 import LANES
-from warp_corot.kernels.elements.stiffness_products import add_stiffness_product
 from warp_corot.kernels.implicit import conjugate_gradients, turning
 from warp_corot.kernels.implicit.tangent import add_vectors, find_rest
 from warp_corot.kernels.newton import implicit as kernels

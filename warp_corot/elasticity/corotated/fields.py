@@ -249,7 +249,8 @@ class SubtreeField(CorotatedField):
     def __init__(self, discretization: Discretization, model: CorotatedOptions, deterministic: bool):
         super().__init__(discretization, model, deterministic)
         self._uniform = discretization.material_stride == 0
-        if self.device.is_cpu and self.plan.units is None:
+        fixed = self.plan.counts is None and self.plan.units is None  # a mesh that changes may come to have units
+        if self.device.is_cpu and (model.level is None or fixed):
             self._simd = SimdForces(self, "corotated", repair_elements, model.tolerance)
         self.follow()
 

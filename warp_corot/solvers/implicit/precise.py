@@ -14,7 +14,7 @@ from warp_corot.elasticity import ForceField, Model
 from warp_corot.elasticity.dilatation import DilatationField
 from warp_corot.elasticity.float64 import SharedDilatation, float64_law
 from warp_corot.errors import ConvergenceError, InputError
-from warp_corot.kernels.elements.native_laws import IsotropicLaw
+from warp_corot.kernels.elements.simd8 import IsotropicLaw
 from warp_corot.materials.isotropic import Isotropic
 
 from .precise_elements import PreciseElements

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from scipy.sparse import coo_matrix, diags
 
 from warp_corot.elasticity.float64 import Measured, SharedDilatation, Stresses, stresses
-from warp_corot.kernels.elements.native_laws import IsotropicLaw
+from warp_corot.kernels.elements.simd8 import IsotropicLaw
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
