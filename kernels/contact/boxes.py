@@ -220,8 +220,8 @@ def find_roots(tree: wp.uint64, roots: wp.array[wp.int32]):
     roots[g] = wp.bvh_get_group_root(tree, g)
 
 
-# Atomic minima and maxima that no thread waits for: Warp's own compare and swap, one thread after the other. The bits of
-# numbers without a sign are in order as integers, those of numbers with one in reverse order.
+# Atomic minima and maxima that no thread waits for: Warp's own compare and swap, one thread after the other. The bits
+# of numbers without a sign are in order as integers, those of numbers with one in reverse order.
 @wp.func_native("""
     float* to = reinterpret_cast<float*>(&wp::index(bounds, world, body));
     for (int axis = 0; axis < 3; ++axis) {
