@@ -1,5 +1,7 @@
 """The same run on 1, 2 and 3 ranks; the slow form on 7, too, and in all cases: contact of bodies, multigrid, …"""
 
+import fcntl
+import os
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +22,14 @@ pytestmark = needs_mpi
 
 
 def made_on(count, folder, cases):
-    """The results of this number of ranks; three ranks make those of one and two ranks, too."""
+    """The results of this number of ranks; three ranks make those of one and two ranks, too. Workers that need the same
+    wait for the first."""
     found = {}
-    done = on_ranks(count, str(Path(ranked.__file__)), str(folder), ",".join(cases), timeout=1200.0)
-    assert done.returncode == 0, done.stderr
+    with (folder / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (folder / f"{count}.npz").exists():
+            done = on_ranks(count, str(Path(ranked.__file__)), str(folder), ",".join(cases), timeout=1200.0)
+            assert done.returncode == 0, done.stderr
     for size in SIZES if count == 3 else (count,):
         with np.load(folder / f"{size}.npz") as archive:
             found[size] = dict(archive)
@@ -33,7 +39,10 @@ def made_on(count, folder, cases):
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    return made_on(3, tmp_path_factory.mktemp("ranks"), CASES)
+    shared = tmp_path_factory.getbasetemp()
+    folder = (shared.parent if "PYTEST_XDIST_WORKER" in os.environ else shared) / "ranks"
+    folder.mkdir(exist_ok=True)
+    return made_on(3, folder, CASES)
 
 
 def sizes_of(case):
@@ -149,8 +158,8 @@ def test_rank_0_draws_obstacles(runs):
     stage = Usd.Stage.Open(str(runs["folder"] / "touches.3.usda"))
     tool = stage.GetPrimAtPath("/SoftBody/rank_0000/obstacles/tool_1")
     heights = [UsdGeom.Xformable(tool).ComputeLocalToWorldTransform(k).ExtractTranslation()[1] for k in (0.0, 1.0)]
-    # It comes down from 0.047 m at 0.02 s to 0.03 m at 0.05 s; frames are at 0.04 s and 0.044 s.
-    np.testing.assert_allclose(heights, [0.03 + 0.017 / 3.0, 0.03 + 0.017 / 5.0], atol=1e-6)
+    # It comes down from 0.047 m at 0.02 s to 0.034 m at 0.05 s; frames are at 0.04 s and 0.044 s.
+    np.testing.assert_allclose(heights, [0.034 + 0.013 / 3.0, 0.034 + 0.013 / 5.0], atol=1e-6)
     assert not stage.GetPrimAtPath("/SoftBody/rank_0001/obstacles")
 
 
