@@ -44,9 +44,12 @@ def find_nearest(
     left, top = wp.max(int(wp.ceil(low[0] - 0.5)), 0), wp.max(int(wp.ceil(low[1] - 0.5)), 0)
     right = wp.min(int(wp.floor(high[0] - 0.5)), nearest.shape[1] - 1)
     bottom = wp.min(int(wp.floor(high[1] - 0.5)), nearest.shape[0] - 1)
+    first = shares_at(a, b, c, float(left) + 0.5, float(top) + 0.5)
+    across = shares_at(a, b, c, float(left) + 1.5, float(top) + 0.5) - first
+    down = shares_at(a, b, c, float(left) + 0.5, float(top) + 1.5) - first
     for row in range(top, bottom + 1):
         for column in range(left, right + 1):
-            shares = shares_at(a, b, c, float(column) + 0.5, float(row) + 0.5)
+            shares = first + float(column - left) * across + float(row - top) * down
             if wp.min(shares) >= -1.0e-5:
                 near = wp.int64(1.0e9 * wp.dot(shares, wp.vec3(a[2], b[2], c[2])))
                 wp.atomic_max(nearest, row, column, (near << wp.int64(32)) | wp.int64(f))
@@ -67,6 +70,9 @@ def shade(
     key: wp.vec3,
     fill: wp.vec3,
     edge: float,
+    behind: wp.array2d[wp.uint8],
+    palette: wp.array2d[wp.uint8],
+    encoded: wp.array[wp.uint8],
     # Out
     image: wp.array3d[wp.uint8],
 ):
@@ -79,10 +85,16 @@ def shade(
         viewer: Where the viewer is [m].
         up, key, fill: Unit vectors up and to the lights.
         edge: Half of the width of the lines along edges [pixels]; 0 for none.
-        image: sRGB, [height, width, 3]; other pixels stay.
+        behind: The row of the palette plus one for what is seen beside triangles; 0 for pixels that stay.
+        palette: sRGB [n, 3].
+        encoded: sRGB of evenly spaced linear values.
+        image: sRGB, [height, width, 3].
     """
     row, column = wp.tid()
     if nearest[row, column] == NOTHING:
+        if behind[row, column] > wp.uint8(0):
+            for k in range(3):
+                image[row, column, k] = palette[int(behind[row, column]) - 1, k]
         return
     f = int(nearest[row, column] & wp.int64(0xFFFFFFFF))
     a, b, c = corners[f, 0], corners[f, 1], corners[f, 2]
@@ -104,7 +116,9 @@ def shade(
     # Ambient light is slightly rose: grey light would turn the colour map's yellows olive.
     ambient = 0.13 + 0.24 * sky + 0.30 * wp.max(wp.dot(normal, fill), 0.0)
     light = wp.vec3(1.06 * ambient, 0.96 * ambient, ambient) + wp.vec3(0.74 * lambert)
-    gloss = 0.06 * wp.pow(wp.max(wp.dot(normal, wp.normalize(key + wp.normalize(viewer - point))), 0.0), 24.0)
+    mirrored = wp.max(wp.dot(normal, wp.normalize(key + wp.normalize(viewer - point))), 0.0)
+    eighth = mirrored * mirrored * mirrored * mirrored * mirrored * mirrored * mirrored * mirrored
+    gloss = 0.06 * eighth * eighth * eighth
     if edge > 0.0:
         # The double area of a triangle with a corner here, over its base, is the distance to that edge.
         sides = wp.vec3(wp.length(c - b), wp.length(a - c), wp.length(b - a))
@@ -113,5 +127,4 @@ def shade(
             light *= 0.6
     for k in range(3):
         linear = wp.clamp(base[k] * light[k] + gloss, 0.0, 1.0)
-        encoded = wp.where(linear <= 0.0031308, 12.92 * linear, 1.055 * wp.pow(linear, 1.0 / 2.4) - 0.055)
-        image[row, column, k] = wp.uint8(255.0 * encoded + 0.5)
+        image[row, column, k] = encoded[int(linear * float(encoded.shape[0] - 1) + 0.5)]

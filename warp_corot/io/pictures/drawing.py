@@ -21,6 +21,10 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 INK = "#3b3640"
 _INK, _GHOST, _GHOST_LINE = (59, 54, 64), (230, 232, 237), (189, 194, 204)
+#: sRGB of 4096 evenly spaced linear values.
+_LINEAR = np.linspace(0.0, 1.0, 4096)
+_ENCODED = np.where(_LINEAR <= 0.0031308, 12.92 * _LINEAR, 1.055 * _LINEAR ** (1 / 2.4) - 0.055)
+_ENCODED = np.rint(255.0 * _ENCODED).astype(np.uint8)
 _CREASE = math.cos(math.radians(40.0))  # edges sharper than this stay sharp
 _DOTS_ACROSS = 160  # dots are at least the distance to the viewer over this apart
 _BEFORE = 5e-3  # fraction of the distance to the viewer: a surface that much nearer than a dot hides it
@@ -212,14 +216,15 @@ def render(
         drawn = Image.fromarray(image)
         ImageDraw.Draw(drawn).line(ends, fill=_GHOST_LINE, width=line)
         image = np.array(drawn)
+    behind = np.zeros(image.shape[:2], np.uint8)
     if rest is not None:
         at_rest = checked_surface(rest, faces, "rest")[0]
         ghost = _nearest(window, camera, at_rest[tri[camera.sees_outside(at_rest, tri)]])[0].numpy() >= 0
-        image[binary_dilation(ghost, iterations=line)] = _GHOST_LINE
-        image[ghost] = _GHOST
+        behind[binary_dilation(ghost, iterations=line)] = 1
+        behind[ghost] = 2
     front = camera.sees_outside(x, tri)
     nearest, corners = _nearest(window, camera, x[tri[front]])
-    image[binary_dilation(nearest.numpy() >= 0, iterations=line)] = _INK
+    behind[binary_dilation(nearest.numpy() >= 0, iterations=line)] = 3
     lowest, highest = value_range or value_limits(scalars)
     shares = np.zeros(tri.shape) if values is None else (values - lowest) / max(highest - lowest, 1e-30)
     table = srgb_to_linear(np.array([color]) if values is None else stress_colors())
@@ -231,6 +236,8 @@ def render(
     inputs += [wp.array(shares[front], dtype=float, device="cpu"), wp.array(table, dtype=wp.vec3, device="cpu")]
     inputs += [wp.vec3(*srgb_to_linear(STEEL)), wp.vec3(*(camera.center + camera.distance * towards))]
     inputs += [wp.vec3(*camera.world_up), wp.normalize(wp.vec3(*key)), wp.normalize(wp.vec3(*fill)), 0.5 * line * edges]
+    tables = (behind, np.array([_GHOST_LINE, _GHOST, _INK], np.uint8), _ENCODED)
+    inputs += [wp.array(each, dtype=wp.uint8, device="cpu", copy=False) for each in tables]
     shown = wp.array(image, dtype=wp.uint8, device="cpu", copy=False)
     wp.launch(kernels.shade, nearest.shape, inputs, [shown], device="cpu")
     if held is None or not np.any(held):
