@@ -6,16 +6,46 @@ from dataclasses import dataclass
 QUAD_BYTES = 16
 #: How many of these shared memory reads or writes at once, from groups of banks.
 BANK_GROUPS = 8
+#: Slots of a task of single elements, and how many of their places, in bytes, are in a word.
+TASK_SLOTS, NUMBERS = 8, 4
+
+
+@dataclass(frozen=True)
+class ClusterLayout:
+    """The numbers that a kernel is generated from.
+
+    Attributes:
+        threads: Threads a block.
+        each: Elements a thread.
+        resident: Blocks that a multiprocessor's registers must have room for.
+        early: Whether a thread reads the numbers of its sum before it needs them.
+    """
+
+    threads: int = 128
+    each: int = 1
+    resident: int = 8
+    early: bool = True
+
+    @property
+    def elements(self) -> int:
+        """Elements of a cluster."""
+        return self.threads * self.each
+
+    @property
+    def corners(self) -> int:
+        return 4 * self.elements
+
+
+DEFAULT_LAYOUT = ClusterLayout(early=False)
 
 
 @dataclass(frozen=True)
 class PairLayout:
-    """The numbers that a kernel is generated from; a thread takes a pair of elements.
+    """The same of pairs of elements, one a thread.
 
     Attributes:
         threads: Threads a block, up to 192: slots have ten bits.
-        resident: Blocks that a multiprocessor's registers must have room for.
-        early: Whether a thread reads the numbers of its sum before it needs them.
+        resident, early: As above.
         ahead: How many blocks ahead tables are fetched into the second-level cache, 0: they are not.
     """
 

@@ -1,4 +1,6 @@
-"""Clusters of pairs of elements: their tables, and the kernels' forces."""
+"""Clusters of elements: their tables, axis-aligned elements, and the kernels' forces."""
+
+from types import SimpleNamespace
 
 import numpy as np
 import oracle
@@ -7,16 +9,44 @@ import warp as wp
 from pairs import add_dilatations, add_forces
 
 import warp_corot as wc
-from warp_corot.discretization.clusters import paired
+from warp_corot.discretization.clusters import changing_clusters, find_tables, paired
 from warp_corot.discretization.elements import device_elements
-from warp_corot.elasticity.clusters import ClusterScatter
+from warp_corot.discretization.plan import LeafCounts
+from warp_corot.elasticity.clusters import ChangingClusterScatter, ClusterScatter
 from warp_corot.elasticity.model import isotropic_material
 from warp_corot.kernels.clusters.laws import isotropic_law
 from warp_corot.kernels.clusters.pairs import SLOT_BITS, SLOT_MASK, WORD_SLOTS
+from warp_corot.kernels.clusters.single import (
+    AlignedElements,
+    element_forces,
+    element_gradient,
+    material_scale,
+    shape_word,
+)
 from warp_corot.kernels.corotated.algebraic import corotated_stress
-from warp_corot.kernels.tables.cluster_layout import BANK_GROUPS, QUAD_BYTES
+from warp_corot.kernels.elements.elements import load_node
+from warp_corot.kernels.tables.cluster_layout import BANK_GROUPS, QUAD_BYTES, ClusterLayout
 
 MU, LAM = 900.0, 4000.0
+LAYOUTS = [ClusterLayout(), ClusterLayout(threads=64, each=2), ClusterLayout(threads=64)]
+
+
+@wp.kernel
+def forces_of_elements(
+    elements: AlignedElements, nodes: wp.array[wp.vec4i], u: wp.array[wp.vec4], forces: wp.array2d[wp.vec3]
+):
+    t = wp.tid()
+    n = nodes[t]
+    shape = shape_word(elements, t)
+    w = element_gradient(
+        elements, t, shape, load_node(u, n[0]), load_node(u, n[1]), load_node(u, n[2]), load_node(u, n[3])
+    )
+    scale = material_scale(elements, t, shape)
+    f0, f1, f2, f3 = element_forces(elements, t, shape, corotated_stress(w, scale * MU, scale * LAM))
+    forces[t, 0] = f0
+    forces[t, 1] = f1
+    forces[t, 2] = f2
+    forces[t, 3] = f3
 
 
 @pytest.fixture(scope="module")
@@ -43,6 +73,76 @@ def wanted_forces(mesh: wc.TetForest, u: np.ndarray, share: np.ndarray | float =
     of = oracle.Mesh(mesh.points, mesh.tets)
     ones = np.ones(len(mesh.tets)) * share
     return oracle.continuum(oracle.DENSITIES["corotated"], of, mesh.points + u, MU * ones, LAM * ones)[1]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_leaves_that_change_have_the_oracles_forces(ball, moved, layout, device):
+    """The first half of a list, then all of it: in clusters on CUDA, element by element on a CPU."""
+    elements, count = device_elements(ball, wp.get_device(device)), len(ball.tets)
+    share = np.random.default_rng(3).uniform(0.5, 2.0, count) if elements.nodes.device.is_cuda else np.ones(count)
+    number, goes = (wp.array([n], dtype=wp.int32, device=device) for n in (count, 1))
+    counts = LeafCounts(most=count, now=number, before=number, goes=goes, threads=1)
+    body = SimpleNamespace(sizes=SimpleNamespace(launch_elements=count))
+    scatter = ChangingClusterScatter(body, elements, counts, isotropic_law(corotated_stress), layout)
+    material = isotropic_material([*(wp.array(v * share, dtype=wp.float32, device=device) for v in (MU, LAM)), 1])
+    u = wp.array(in_four(moved), dtype=wp.vec4, device=device)
+    for present in (count // 2, count):
+        number.fill_(present)
+        scatter.derive()
+        f = wp.zeros_like(u)
+        if u.device.is_cuda:
+            scatter(material, u, f)
+            found = f.numpy()[:, :3]
+        else:
+            forces = wp.zeros((present, 4), dtype=wp.vec3, device=device)
+            inputs = [scatter.elements, elements.nodes, u]
+            wp.launch(forces_of_elements, present, inputs=inputs, outputs=[forces], device=device)
+            found = np.zeros(ball.points.shape)
+            np.add.at(found, ball.tets[:present], forces.numpy())
+        part = SimpleNamespace(points=ball.points, tets=ball.tets[:present])
+        wanted = wanted_forces(part, moved, share[:present])
+        assert np.abs(found - wanted).max() < 2e-6 * np.abs(wanted).max()
+    assert len(np.unique(scatter.elements.shape.numpy() & 0xFF)) >= 48
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_tables_lead_every_corner_to_its_node(ball, layout, device):
+    tets, device = ball.tets[:1000], wp.get_device(device)
+    number, goes = (wp.array([n], dtype=wp.int32, device=device) for n in (len(tets), 1))
+    clusters, places = changing_clusters(len(ball.tets), number, layout)
+    for count in (1000, 0, 317):
+        number.fill_(count)
+        nodes = wp.array(ball.tets, dtype=wp.vec4i, device=device)
+        find_tables(clusters, places, nodes, goes, layout)
+        check_tables(clusters, places, ball.tets[:count], layout)
+    goes.zero_()
+    number.fill_(1000)
+    find_tables(clusters, places, nodes, goes, layout)
+    check_tables(clusters, places, ball.tets[:317], layout)
+
+
+def check_tables(clusters, count, tets, layout):
+    size = layout.elements
+    begin, tasks = clusters.begin.numpy(), clusters.task_count.numpy()
+    node_count, nodes = clusters.node_count.numpy(), clusters.nodes.numpy()
+    corners = clusters.corners.numpy().view("<u2").reshape(-1, 4) // QUAD_BYTES
+    slots = clusters.slots.numpy().view("<u2").reshape(-1, 8) // QUAD_BYTES
+    for cluster in range(count):
+        elements = slice(cluster * size, min((cluster + 1) * size, len(tets)))
+        here = slice(begin[cluster], begin[cluster] + tasks[cluster])
+        own, of_cluster = nodes[here], tets[elements]
+        assert len(np.unique(own[: node_count[cluster]])) == node_count[cluster]
+        assert node_count[cluster] == len(np.unique(of_cluster))
+        if not len(of_cluster):
+            assert tasks[cluster] == 0
+            continue
+        np.testing.assert_array_equal(own[corners[elements]], of_cluster)
+        # Slot s + size c is corner c of the s-th element; each is added once, at its node.
+        used = slots[here] < layout.corners
+        of = slots[here][used]
+        assert (slots[here] <= layout.corners).all()
+        assert len(np.unique(of)) == len(of) == of_cluster.size
+        np.testing.assert_array_equal(np.repeat(own, used.sum(axis=1)), of_cluster[of % size, of // size])
 
 
 @pytest.mark.parametrize("of_forest", [True, False])

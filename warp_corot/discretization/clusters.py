@@ -1,4 +1,5 @@
-"""Elements in clusters of pairs that share a face and their nodes' sums; see ``kernels.clusters.pairs``."""
+"""Elements in clusters that share their nodes' sums: in pairs that share a face, see ``kernels.clusters.pairs``, or one
+by one, see ``kernels.clusters.single``."""
 
 from __future__ import annotations
 
@@ -21,8 +22,11 @@ from warp_corot.kernels.clusters.pairs import (
     PairClusters,
     vec4u,
 )
+from warp_corot.kernels.clusters.single import BACKWARDS, SWAPS, Clusters, vec2ul
+from warp_corot.kernels.clusters.single_tables import find_clusters
 from warp_corot.kernels.elements.elements import GeneralElements
-from warp_corot.kernels.tables.cluster_layout import BANK_GROUPS, QUAD_BYTES, PairLayout
+from warp_corot.kernels.tables.cluster_layout import BANK_GROUPS, DEFAULT_LAYOUT, QUAD_BYTES, ClusterLayout, PairLayout
+from warp_corot.kernels.tables.shapes import SQRT2
 
 #: Elements of a stretch that is about a cluster.
 STRETCH = 128
@@ -295,3 +299,83 @@ def _tasks(
     wp.launch(pack_slots, size // BANK_GROUPS, inputs=inputs, outputs=[packed], device=device)
     clusters.slots = packed.view(vec4u)
     return clusters, places.reshape(-1, CORNERS)
+
+
+# --- elements one by one ---------------------------------------------------------------------------------------------
+
+
+def changing_clusters(most: int, count: wp.array, layout: ClusterLayout = DEFAULT_LAYOUT) -> tuple[Clusters, int]:
+    """Allocate clusters of all elements of a changing mesh; ``find_tables`` fills them in.
+
+    Args:
+        most: The largest possible number of elements.
+        count: The number of elements, int32 [1] on the device.
+        layout: The layout for which kernels are generated.
+
+    Returns:
+        ``kernels.clusters.single.Clusters``, and the largest possible number of clusters.
+    """
+    device = count.device
+    clusters, places = Clusters(), -(-most // layout.elements)
+    # A cluster has at most as many tasks as corners.
+    tasks = layout.corners * places
+    clusters.count = count
+    clusters.elements = wp.array(np.arange(most), dtype=wp.int32, device=device)
+    clusters.corners = wp.zeros(layout.elements * places, dtype=wp.uint64, device=device)
+    clusters.begin = wp.array(np.arange(0, tasks, layout.corners), dtype=wp.int32, device=device)
+    clusters.task_count, clusters.node_count = (wp.zeros(places, dtype=wp.int32, device=device) for _ in range(2))
+    clusters.nodes = wp.zeros(tasks, dtype=wp.int32, device=device)
+    clusters.slots = wp.zeros(tasks, dtype=vec2ul, device=device)
+    return clusters, places
+
+
+def find_tables(
+    clusters: Clusters, places: int, nodes: wp.array, goes: wp.array, layout: ClusterLayout = DEFAULT_LAYOUT
+) -> None:
+    """Find the tables for elements with these nodes, vec4i, by launches, if ``goes``, int32 [1], is not zero."""
+    lanes = layout.threads if goes.device.is_cuda else 1
+    wp.launch(
+        find_clusters(layout),
+        dim=places * lanes,
+        inputs=[lanes, nodes, goes],
+        outputs=[clusters],
+        device=goes.device,
+        block_dim=layout.threads,
+    )
+
+
+def axis_words(frames: npt.NDArray[np.float64]) -> npt.NDArray[np.int32]:
+    """The integers of elements without their halvings, by frame, mirrored or not, and type: int32 [n, 2, 3].
+
+    Args:
+        frames: Proper local frames, [n, 3, 3]; if a frame does not occur with a type, its integer has no meaning.
+    """
+    words = np.zeros((len(frames), 2, 3), np.int32)
+    orders = _orders()
+    for mirrored in range(2):
+        columns = frames * [1.0, 1.0, 1.0 - 2.0 * mirrored]
+        q0, q1, q2 = np.moveaxis(columns, 2, 0)
+        halves = np.stack([(q1 - q0) / SQRT2, -(q0 + q1) / SQRT2, q2], axis=2)
+        for shape in range(3):
+            axes = np.round(halves if shape == 2 else columns).astype(int)
+            for k, (entries, order) in enumerate(zip(axes, np.abs(axes).argmax(axis=1), strict=True)):
+                # Axis i points along component order[i], backwards if its entry is negative.
+                swaps = orders.get((int(order[0]), int(order[1]), int(order[2])), 0)
+                backwards = sum(bit for i, bit in enumerate(BACKWARDS) if entries[order[i], i] < 0)
+                words[k, mirrored, shape] = shape | swaps | backwards
+    return words
+
+
+def _orders() -> dict[tuple[int, int, int], int]:
+    """For each order of the three components, the swaps that produce it."""
+    found: dict[tuple[int, int, int], int] = {}
+    for bits in range(8):
+        x, y, z = 0, 1, 2
+        if bits & 1:
+            x, y = y, x
+        if bits & 2:
+            y, z = z, y
+        if bits & 4:
+            x, y = y, x
+        found.setdefault((x, y, z), sum(SWAPS[k] for k in range(3) if bits >> k & 1))
+    return found

@@ -1,4 +1,4 @@
-"""The launch that adds the forces of elements in clusters (CUDA); see ``kernels.clusters.pairs``."""
+"""The launches that add the forces of elements in clusters (CUDA); see ``kernels.clusters``."""
 
 from __future__ import annotations
 
@@ -10,18 +10,33 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.discretization.clusters import order_in_clusters, pairs_in_clusters
+from warp_corot.discretization.clusters import (
+    axis_words,
+    changing_clusters,
+    find_tables,
+    order_in_clusters,
+    pairs_in_clusters,
+)
 from warp_corot.discretization.elements import Elements, in_worlds
-from warp_corot.discretization.plan import GROUPED_LEAVES, Batch, Plan
+from warp_corot.discretization.plan import GROUPED_LEAVES, Batch, LeafCounts, Plan
 from warp_corot.elasticity.cpu import as_general
 from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.clusters.laws import ActiveMaterial
 from warp_corot.kernels.clusters.pairs import GeneralPairs, LatticePairs, scatter_pairs
+from warp_corot.kernels.clusters.single import AlignedElements, align_elements, scatter_clusters
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.cpu import rest_matrices
 from warp_corot.kernels.elements.elements import ForestElements, GeneralElements
 from warp_corot.kernels.elements.fibres import ReinforcedMaterial
-from warp_corot.kernels.tables.cluster_layout import AHEAD, GENERAL, LARGE, LATTICE, PairLayout
+from warp_corot.kernels.tables.cluster_layout import (
+    AHEAD,
+    DEFAULT_LAYOUT,
+    GENERAL,
+    LARGE,
+    LATTICE,
+    ClusterLayout,
+    PairLayout,
+)
 from warp_corot.mesh import TetForest
 
 if TYPE_CHECKING:
@@ -139,6 +154,68 @@ class ClusterScatter:
             self._kernel,
             dim=self.count * threads,
             inputs=[self.clusters, self.pairs, material if self._wrapped is None else self._wrapped(material), u],
+            outputs=[f],
+            device=self._device,
+            block_dim=threads,
+        )
+
+
+class ChangingClusterScatter:
+    """Adds the forces of all leaves of a forest that changes.
+
+    Args:
+        discretization: A forest that changes; launches have its ``launch_elements``.
+        elements: The leaves, with padding.
+        counts: The number of leaves.
+        law: A function of ``kernels.clusters.laws`` that works in any axes.
+        layout: The layout for which kernels are generated.
+
+    Attributes:
+        clusters, elements: ``Clusters`` and ``AlignedElements`` of ``kernels.clusters.single``.
+    """
+
+    def __init__(
+        self,
+        discretization: Discretization,
+        elements: ForestElements,
+        counts: LeafCounts,
+        law: wp.Function,
+        layout: ClusterLayout = DEFAULT_LAYOUT,
+    ):
+        self._discretization, self._leaves, self._counts, self._layout = discretization, elements, counts, layout
+        self._device = elements.nodes.device
+        self.clusters, self._places = changing_clusters(counts.most, counts.now, layout)
+        self._words = wp.array(axis_words(elements.frames.numpy()).ravel(), dtype=wp.int32, device=self._device)
+        size = elements.size.numpy()
+        self.elements = AlignedElements()
+        self.elements.shape = wp.zeros(counts.most, dtype=wp.int32, device=self._device)
+        self.elements.cell, self.elements.inverse_cell = float(size[0]), 1.0 / float(size[0])
+        self._kernel = scatter_clusters(law, layout)
+        wp.load_module(self._kernel.module, self._device, block_dim=layout.threads)
+
+    @classmethod
+    def of(cls, discretization: Discretization, plan: Plan, law: wp.Function) -> ChangingClusterScatter | None:
+        """The clusters of all leaves of a changing plan; None if leaves never change."""
+        return (
+            None
+            if plan.counts is None
+            else cls(discretization, cast("ForestElements", plan.elements), plan.counts, law)
+        )
+
+    def derive(self) -> None:
+        """Launch the search for clusters, if the plan has just been derived; may be recorded."""
+        leaves, counts = self._leaves, self._counts
+        find_tables(self.clusters, self._places, leaves.nodes, counts.goes, self._layout)
+        inputs = [counts.goes, counts.now, leaves.code, self._words]
+        wp.launch(align_elements, dim=counts.most, inputs=inputs, outputs=[self.elements.shape], device=self._device)
+
+    def __call__(self, material: IsotropicMaterial | ActiveMaterial, u: wp.array, f: wp.array) -> None:
+        """Add the forces of displacements u, like ``ClusterScatter``."""
+        threads, count = self._layout.threads, -(-self._discretization.sizes.launch_elements // self._layout.elements)
+        wp.launch(
+            self._kernel,
+            dim=count * threads,
+            inputs=[self.clusters, self.elements, material, u],
             outputs=[f],
             device=self._device,
             block_dim=threads,

@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.plan import Batch, Plan, Sharing, Units
-from warp_corot.elasticity.clusters import ClusterScatter, clustered
+from warp_corot.elasticity.clusters import ChangingClusterScatter, ClusterScatter, clustered
 from warp_corot.elasticity.corotated.launches import DegenerateLeaves, OwnLaunches
 from warp_corot.elasticity.corotated.tangents import (
     FEWEST,
@@ -26,7 +26,7 @@ from warp_corot.elasticity.model import ForceField, Kept, StressLaw, Tangent, ro
 from warp_corot.inputs.cpu_threads import launch
 from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.clusters.laws import isotropic_law
-from warp_corot.kernels.corotated.algebraic import own_energies, own_von_mises
+from warp_corot.kernels.corotated.algebraic import corotated_stress, own_energies, own_von_mises
 from warp_corot.kernels.corotated.corotated import (
     extract_rotations,
     given_cauchy,
@@ -252,7 +252,17 @@ class SubtreeField(CorotatedField):
         fixed = self.plan.counts is None and self.plan.units is None  # a mesh that changes may come to have units
         if self.device.is_cpu and (model.level is None or fixed):
             self._simd = SimdForces(self, "corotated", repair_elements, model.tolerance)
+        #: Adds the forces of all leaves, also of those that come later.
+        self._clusters: ChangingClusterScatter | None = None
+        if self._listed and self.rotation_level is None:
+            self._clusters = ChangingClusterScatter.of(discretization, self.plan, isotropic_law(corotated_stress))
         self.follow()
+        self.derive()
+
+    def derive(self) -> None:
+        super().derive()
+        if self._clusters is not None:
+            self._clusters.derive()
 
     @property
     def _force_kernels(self) -> list[LoadedKernel]:
@@ -306,7 +316,8 @@ class SubtreeField(CorotatedField):
         self._own_launches: OwnLaunches | None = None
         if self._listed:
             if self.rotation_level is None and (OwnLaunches.suit(plan) or self.discretization.awaited is not None):
-                self._own_launches = OwnLaunches(plan, self.isotropic, self.discretization.awaited)
+                given = self.isotropic, self._clusters, self.discretization.awaited
+                self._own_launches = OwnLaunches(plan, *given)
                 self._degenerate = DegenerateLeaves(self._own_launches.places, [], self.device)
                 return
             self._degenerate = DegenerateLeaves.of(plan, self.device)

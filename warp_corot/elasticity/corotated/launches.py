@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import nullcontext
 
 import warp as wp
 
 from warp_corot.discretization.elements import Elements
 from warp_corot.discretization.plan import GROUPED_LEAVES, Awaited, Batch, FlatLeaves, Plan, Sharing
-from warp_corot.elasticity.clusters import ClusterScatter, grouped_and_others
+from warp_corot.elasticity.clusters import ChangingClusterScatter, ClusterScatter, grouped_and_others
 from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.clusters.laws import isotropic_law
 from warp_corot.kernels.corotated.algebraic import corotated_stress
@@ -101,11 +102,12 @@ class OwnLaunches:
 
     If the mesh never changes, the leaves outside subtrees and the subtrees outside groups go in clusters. If few
     subtrees are in groups, all leaves go in clusters: then there is one launch, which leaves out none. If the mesh
-    changes, one launch computes subtrees and single leaves.
+    changes and many subtrees are in groups, one launch computes subtrees and single leaves.
 
     Args:
         plan: The units of work.
         material: Lamé's parameters.
+        changing: Adds the forces of all leaves in clusters if the mesh changes.
         awaited: Nodes whose values arrive later; None if all are present.
 
     Attributes:
@@ -116,16 +118,19 @@ class OwnLaunches:
         self,
         plan: Plan,
         material: IsotropicMaterial,
+        changing: ChangingClusterScatter | None = None,
         awaited: Awaited | None = None,
     ):
         self._device = plan.elements.nodes.device
         self._material = material
         batches, self._flat = list(plan.batches), plan.flat
-        self._clusters: ClusterScatter | None = None
+        self._clusters: Callable[[IsotropicMaterial, wp.array, wp.array], None] | None = None
         if plan.counts is None:
             batches, leaves = grouped_and_others(plan, _fewest_grouped(plan))
             if len(leaves):
                 self._clusters = ClusterScatter(plan.elements, isotropic_law(corotated_stress), chosen=leaves)
+        elif changing is not None and 8 * sum(batch.count for batch in batches if batch.grouped) < GROUPED_LEAVES:
+            batches, self._clusters = [], changing
         self._awaited = awaited
         #: Batches of one type have a separate kernel, which is faster.
         self._is_single = self._clusters is not None or not len(plan.flat)
@@ -145,7 +150,7 @@ class OwnLaunches:
     def in_clusters(self) -> tuple[ClusterScatter, tuple[Batch, ...]] | None:
         """The clusters of a mesh that never changes, and the subtrees outside them, if the plan has them."""
         is_divided = self._awaited is not None and self._awaited.is_used
-        return None if self._clusters is None or is_divided else (self._clusters, self.batches)
+        return (self._clusters, self.batches) if isinstance(self._clusters, ClusterScatter) and not is_divided else None
 
     @property
     def kernels(self) -> list[LoadedKernel]:
@@ -153,7 +158,7 @@ class OwnLaunches:
         found: list[LoadedKernel] = [(self._kernel(batch), BLOCK) for batch in self.batches if self._is_single]
         if self._ranges is not None:
             found.append((scatter_body(self._material.stride == 0), BLOCK))
-        return [*found, *([] if self._clusters is None else [self._clusters.kernel])]
+        return [*found, *([self._clusters.kernel] if isinstance(self._clusters, ClusterScatter) else [])]
 
     @staticmethod
     def suit(plan: Plan) -> bool:
