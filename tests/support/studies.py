@@ -10,6 +10,8 @@ BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 def study(name):
     """The module ``benchmarks/<name>.py``, under a name of its own."""
     spec = importlib.util.spec_from_file_location(f"study_{name}", BENCHMARKS / f"{name}.py")
+    if str(BENCHMARKS) not in sys.path:
+        sys.path.append(str(BENCHMARKS))  # where studies find one another
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # where dataclasses look for their types
     spec.loader.exec_module(module)

@@ -421,8 +421,14 @@ class ForceField(ABC):
             return isotropic_material([*kept, 1])
         if self.discretization.material_stride == 0 or not len(flat):
             return self.isotropic
-        own = [chosen(values, flat.leaves) for values in self._lame]
-        self._flat_lame = flat.leaves, own
+        if self._flat_lame is not None and self._flat_lame[0] is flat.leaves:
+            # One copy for all that read it: ``take_material`` updates one.
+            own = self._flat_lame[1]
+            for copy, values in zip(own, self._lame, strict=True):
+                copy.assign(chosen(values, flat.leaves))
+        else:
+            own = [chosen(values, flat.leaves) for values in self._lame]
+            self._flat_lame = flat.leaves, own
         return isotropic_material([*own, 1])
 
     @property
