@@ -8,8 +8,6 @@ import warp as wp
 
 #: A column of ``PatchBody.rest`` has the inverse of the matrix of rest edges, row by row, then the volume.
 VOLUME_ROW = 9
-#: Threads of whole worlds for which a multiprocessor's registers must have room.
-RESIDENT_THREADS = 768
 
 
 @dataclass(frozen=True)
@@ -24,8 +22,6 @@ class Layout:
             used.
         groups, members: Room for groups that share a dilatation and for the elements of each; zero if none do.
         overlaps: Whether a block computes the elements that need no halo before it waits for the halo.
-        whole: Whether a patch is a whole world. Then blocks exchange nothing, and read elements' constants, which are
-            the same in all worlds, at every step in place of keeping them, so that more blocks are resident.
     """
 
     threads: int
@@ -37,12 +33,6 @@ class Layout:
     groups: int = 0
     members: int = 0
     overlaps: bool = True
-    whole: bool = False
-
-    @property
-    def resident(self) -> int:
-        """Blocks for which a multiprocessor's registers must have room."""
-        return max(RESIDENT_THREADS // self.threads, 1) if self.whole else 1
 
     @property
     def vectors(self) -> int:

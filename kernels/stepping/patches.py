@@ -11,9 +11,9 @@ If elements share their dilatation, a block also measures the other elements of 
 writes its dilatation to the row of its group, one thread for each group sums the row, and a second pass adds the forces
 of the pressure.
 
-All blocks of a launch must be resident at the same time, one on each multiprocessor. Small worlds are one patch each:
-their blocks exchange nothing, and a launch may have any number of them. Sums have a fixed order, so runs are
-reproducible bit for bit. CUDA only; ``solvers.explicit.patch_layout`` divides the work among blocks.
+All blocks of a launch, those of all worlds, must be resident at the same time, one on each multiprocessor. Sums have a
+fixed order, so runs are reproducible bit for bit. CUDA only; ``solvers.explicit.patch_layout`` divides the work among
+blocks.
 """
 
 import functools
@@ -68,7 +68,6 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
         load_vectors: The element type of the array of loads, vec3 or vec4.
     """
     threads, each, halo_each, lanes = layout.threads, layout.elements, layout.halo, layout.lanes
-    exchanges = keeps = not layout.whole
     slot, displacement = vectors_at(0), vectors_at(layout.slots + 1)
     # Weighted dilatations and weights of elements, inverse weights of groups, and pressures of groups.
     shares, groups, members = layout.groups > 0, layout.groups, layout.members
@@ -82,19 +81,6 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
     numbers = wp.types.matrix(shape=(each, CONSTANTS), dtype=wp.float32)
     places = wp.types.vector(length=halo_each, dtype=wp.int32)
     group_places = wp.types.vector(length=each, dtype=wp.int32)
-
-    @wp.func
-    def constants_of(
-        body: PatchBody, e: int, first: int, stride: int, mu: wp.array[wp.float32], lam: wp.array[wp.float32]
-    ):
-        t = (first + body.elements[e]) * stride
-        c = row()
-        for j in range(9):
-            c[j] = body.rest[j, e]
-        volume = body.rest[wp.static(VOLUME_ROW), e]
-        c[9] = volume * mu[t]
-        c[10] = volume * lam[t]
-        return c
 
     @wp.func
     def displacement_gradient(corners: wp.uint64, c: row):
@@ -128,11 +114,6 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
         add_to_slot(number_in(targets, 3), f3)
 
     @wp.func
-    def add_pressure(corners: wp.uint64, targets: wp.uint64, place: int, c: row):
-        pressure = pressure_of(wp.static(LOAD), place % wp.static(groups), 0.0)
-        add_forces(targets, c, pressure_stress(displacement_gradient(corners, c), pressure, c[10]))
-
-    @wp.func
     def sum_of_group(group: int):
         sum = float(0.0)
         for member in range(wp.static(members)):
@@ -147,7 +128,7 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
         slot(wp.static(STORE), number_in(targets, 2), f2)
         slot(wp.static(STORE), number_in(targets, 3), f3)
 
-    @unique_kernel(grid_stride=False, launch_bounds=(threads, layout.resident))
+    @unique_kernel(grid_stride=False, launch_bounds=(threads, 1))
     def step_patches(
         # In
         body: PatchBody,
@@ -182,9 +163,7 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
         dt = float(pace.seconds[DT])
         before = float(length_before(pace))
         damped = 1.0 / (1.0 + dt * damping)
-        number = wp.uint32(0)
-        if wp.static(exchanges):
-            number = exchange.begun[block]
+        number = exchange.begun[block]
 
         # The node whose forces the thread sums together with its neighbours; the first of them moves the node.
         first_own = body.own_start[patch]
@@ -228,13 +207,18 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
         constants = numbers()
         group_place = group_places()
         first_material = world * body.element_count
-        for k in range(wp.static(each if keeps else 0)):
+        for k in range(wp.static(each)):
             at = thread + k * wp.static(threads)
             if at < computed_count:
                 e = first_element + at
                 corners[k] = body.corners[e]
                 targets[k] = body.slots[e]
-                constants[k] = constants_of(body, e, first_material, stride, mu, lam)
+                for j in range(9):
+                    constants[k, j] = body.rest[j, e]
+                volume = body.rest[wp.static(VOLUME_ROW), e]
+                t = (first_material + body.elements[e]) * stride
+                constants[k, 9] = volume * mu[t]
+                constants[k, 10] = volume * lam[t]
                 if wp.static(shares):
                     group_place[k] = body.measures[e]
 
@@ -243,8 +227,7 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
         synchronize_block()
         if moves:
             displacement(wp.static(STORE), place, x)
-            if wp.static(exchanges):
-                publish(exchange.published, int(number & wp.uint32(1)) * exchange.nodes + i, x, number)
+            publish(exchange.published, int(number & wp.uint32(1)) * exchange.nodes + i, x, number)
         if wp.static(shares):
             at = thread
             while at < element_count:
@@ -277,7 +260,7 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                 else:
                     begin = interior_count
                     end = computed_count
-                    for k in range(wp.static(halo_each if exchanges else 0)):
+                    for k in range(wp.static(halo_each)):
                         at = thread + k * wp.static(threads)
                         if at < halo_count:
                             told = await_displacement(exchange.published, buffer + halo[k], number)
@@ -288,26 +271,14 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                 for k in range(wp.static(each)):
                     at = thread + k * wp.static(threads)
                     if at >= begin and at < end:
-                        c = row()
-                        gradient = wp.mat33()
-                        if wp.static(keeps):
-                            c = constants[k]
-                            gradient = displacement_gradient(corners[k], c)
-                        else:
-                            c = constants_of(body, first_element + at, first_material, stride, mu, lam)
-                            gradient = displacement_gradient(body.corners[first_element + at], c)
+                        c = constants[k]
+                        gradient = displacement_gradient(corners[k], c)
                         if wp.static(shares):
                             theta, _slope = measure(gradient)
-                            if wp.static(keeps):
-                                measured(wp.static(STORE), group_place[k], c[10] * theta)
-                            else:
-                                measured(wp.static(STORE), body.measures[first_element + at], c[10] * theta)
+                            measured(wp.static(STORE), group_place[k], c[10] * theta)
                         p, trusted = stretch_stress(gradient, c[9], law_lam(c))
                         if trusted:
-                            if wp.static(keeps):
-                                store_forces(targets[k], c, p)
-                            else:
-                                store_forces(body.slots[first_element + at], c, p)
+                            store_forces(targets[k], c, p)
                         else:
                             left_out |= wp.static(1 << k)
                 phase += 1
@@ -321,16 +292,11 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                 its_corners = corners[0]
                 its_targets = targets[0]
                 c = constants[0]
-                for k in range(1, wp.static(each if keeps else 1)):
+                for k in range(1, wp.static(each)):
                     if chosen == k:
                         its_corners = corners[k]
                         its_targets = targets[k]
                         c = constants[k]
-                if wp.static(not keeps):
-                    e = first_element + thread + chosen * wp.static(threads)
-                    its_corners = body.corners[e]
-                    its_targets = body.slots[e]
-                    c = constants_of(body, e, first_material, stride, mu, lam)
                 f = identity3() + displacement_gradient(its_corners, c)
                 store_forces(its_targets, c, turned_stress(f, c[9], law_lam(c)))
             if wp.static(shares):
@@ -352,15 +318,11 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                     pressure_of(wp.static(STORE), thread, slope_of(mean))
                 synchronize_block()
                 for k in range(wp.static(each)):
-                    at = thread + k * wp.static(threads)
-                    if at < computed_count:
-                        if wp.static(keeps):
-                            c = constants[k]
-                            add_pressure(corners[k], targets[k], group_place[k], c)
-                        else:
-                            e = first_element + at
-                            c = constants_of(body, e, first_material, stride, mu, lam)
-                            add_pressure(body.corners[e], body.slots[e], body.measures[e], c)
+                    if thread + k * wp.static(threads) < computed_count:
+                        c = constants[k]
+                        pressure = pressure_of(wp.static(LOAD), group_place[k] % wp.static(groups), 0.0)
+                        p = pressure_stress(displacement_gradient(corners[k], c), pressure, c[10])
+                        add_forces(targets[k], c, p)
                 synchronize_block()
 
             elastic = wp.vec3()
@@ -396,8 +358,7 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                         store_node(reactions, i, -(force + mass[i] * gravity))
                 x = x + dt * velocity
                 displacement(wp.static(STORE), place, x)
-                if wp.static(exchanges):
-                    publish(exchange.published, int(number & wp.uint32(1)) * exchange.nodes + i, x, number)
+                publish(exchange.published, int(number & wp.uint32(1)) * exchange.nodes + i, x, number)
                 if not is_finite(x):
                     wp.atomic_min(bad_step, 0, pace.counts[DONE] + wp.int64(step + 1))
             before = dt
@@ -410,7 +371,7 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
         if moves:
             store_node(u, i, x)
             store_node(v, i, velocity)
-        if wp.static(exchanges) and thread == 0:
+        if thread == 0:
             exchange.begun[block] = exchange.begun[block] + wp.uint32(steps + 1)
 
     return step_patches

@@ -1,6 +1,6 @@
 """Corotated forces of one complete subtree in registers: ten displacements in, ten nodal forces out.
 
-Kernels that read and write their nodes in different ways share this code (``cuda``, ``laws``). Stresses are
+Kernels that read and write their nodes in different ways share this code (``cuda``, ``stepping.block``). Stresses are
 computed from displacement gradients, so that small strains keep their digits (``corotated.algebraic.stretch_stress``).
 A leaf that is flat, inverted or strained far beyond order one is left out and reported: bit k of the mask stands for
 leaf k in tree order.
@@ -15,6 +15,7 @@ import warp as wp
 
 from warp_corot.kernels.corotated.algebraic import stretch_stress
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, linear_stress
+from warp_corot.kernels.elements.dilatation import VOLUME as VOLUME_CHANGE
 from warp_corot.kernels.elements.dilatation import Dilatation, mean_of, pressure_stress_of
 from warp_corot.kernels.elements.shapes import columns_of, leaf_forces_of
 from warp_corot.kernels.math.rotation import ITERATIONS, column, newton_rotation
@@ -92,23 +93,23 @@ def isotropic_leaves(shape: int, stress: wp.Function) -> wp.Function:
 
 
 @functools.cache
-def subtree_forces(shape: int, uniform: bool, law: wp.Function) -> wp.Function:
-    """Forces of the eight leaves under a law of leaves, and a mask of those that may not be trusted.
+def subtree_forces(shape: int, uniform: bool, law: wp.Function, chosen: range = range(8)) -> wp.Function:
+    """Forces of the chosen leaves under a law of leaves, and a mask of those that may not be trusted.
 
     ``y`` are ten displacements in the subtree's Maubach frame, or one that turns with it, in edge lengths h of a leaf;
     ``first`` is the place of the first leaf's material; unless ``uniform``, those of the other leaves follow.
     """
     columns, leaf_forces = columns_of(shape), leaf_forces_of(shape)
-    leaves, volume = LEAVES[shape], VOLUME[shape]
+    leaves, volume, begin, end = LEAVES[shape], VOLUME[shape], chosen.start, chosen.stop
 
     @wp.func
     def subtree_forces(y: mat10, h: float, material: Any, extra: Any, first: int):
-        _generated_from = wp.static(fingerprint(leaves, FRAMES[shape]))
+        _generated_from = wp.static(fingerprint(leaves, FRAMES[shape], begin, end))
         # P V / h is the stress times this.
         area = wp.static(volume) * h * h
         g = mat10()
         degenerate = int(0)
-        for leaf in range(8):
+        for leaf in range(wp.static(begin), wp.static(end)):
             b0, b1, b2 = columns(
                 y[wp.static(leaves[leaf][0])],
                 y[wp.static(leaves[leaf][1])],
@@ -160,12 +161,14 @@ def turn_out(g: mat10, q0: wp.vec3, q1: wp.vec3, q2: wp.vec3):
 
 
 @functools.cache
-def own_forces(shape: int, uniform: bool, stress: wp.Function = stretch_stress) -> wp.Function:
-    """Forces of the eight leaves from ten displacements under an isotropic law, and a mask of those left out.
+def own_forces(
+    shape: int, uniform: bool, stress: wp.Function = stretch_stress, chosen: range = range(8)
+) -> wp.Function:
+    """Forces of the chosen leaves from ten displacements under an isotropic law, and a mask of those left out.
 
     ``q`` is the subtree's frame, ``h`` a leaf's edge length, ``first`` the place of the first leaf's material.
     """
-    forces = subtree_forces(shape, uniform, isotropic_leaves(shape, stress))
+    forces = subtree_forces(shape, uniform, isotropic_leaves(shape, stress), chosen)
 
     @wp.func
     def own_forces(x: mat10, q: wp.mat33, h: float, mirror: float, material: IsotropicMaterial, first: int):
@@ -262,22 +265,22 @@ def shared_forces(shape: int, uniform: bool, given: bool) -> wp.Function:
 
 
 @functools.cache
-def dilatation_sums_of(shape: int, uniform: bool, of: Dilatation) -> wp.Function:
-    """The sums of lambda theta and of lambda over the eight leaves, which have equal volumes.
+def dilatation_sums_of(shape: int, uniform: bool, of: Dilatation, chosen: range = range(8)) -> wp.Function:
+    """The sums of lambda theta and of lambda over the chosen leaves, which have equal volumes.
 
     The ten displacements are in the frame of ``forces.turn_in``.
     """
     measure, columns = of.measure, columns_of(shape)
-    leaves = LEAVES[shape]
+    leaves, begin, end = LEAVES[shape], chosen.start, chosen.stop
     into_leaf, _out_of_leaf = turns_of(shape)
 
     @wp.func
     def dilatation_sums(y: mat10, lam: wp.array[wp.float32], first: int):
-        _generated_from = wp.static(fingerprint(leaves))
+        _generated_from = wp.static(fingerprint(leaves, begin, end))
         k = lam[first]
         sum = float(0.0)
         weight = float(0.0)
-        for leaf in range(8):
+        for leaf in range(wp.static(begin), wp.static(end)):
             if wp.static(not uniform):
                 k = lam[first + leaf]
             b0, b1, b2 = columns(
@@ -305,6 +308,23 @@ def pressure_leaves(shape: int, of: Dilatation) -> wp.Function:
         return out_of_leaf(leaf, stress(into_leaf(leaf, g), pressure, area * material.lam[t])), True, True
 
     return pressure_leaf
+
+
+@functools.cache
+def dilating_leaves(shape: int) -> wp.Function:
+    """The corotated law of leaves with the pressure, which a leaf has even if its corotated stress may not be trusted.
+    ``lam`` is that of the pressure.
+    """
+    pressure_stress = pressure_stress_of(VOLUME_CHANGE)
+    into_leaf, out_of_leaf = turns_of(shape)
+
+    @wp.func
+    def dilating_leaf(material: IsotropicMaterial, pressure: float, leaf: int, t: int, area: float, g: wp.mat33):
+        a = into_leaf(leaf, g)
+        sigma, trusted = stretch_stress(a, area * material.mu[t], 0.0)
+        return out_of_leaf(leaf, sigma + pressure_stress(a, pressure, area * material.lam[t])), True, trusted
+
+    return dilating_leaf
 
 
 @functools.cache

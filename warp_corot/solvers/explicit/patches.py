@@ -1,4 +1,4 @@
-"""Small bodies and organs on CUDA: many steps in a launch, one thread block for each patch; see
+"""Organs and a few small worlds on CUDA: many steps in a launch, one thread block for each patch; see
 ``kernels.stepping.patches``."""
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from warp_corot.kernels.stepping.patch_body import Exchange, Layout, PatchBody
 from warp_corot.kernels.stepping.patches import step_patches
 from warp_corot.materials.directional import Directional
 
-from .patch_layout import NO_SLOT, WARP, Patches
+from .patch_layout import NO_SLOT, Patches
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
@@ -26,14 +26,14 @@ if TYPE_CHECKING:
     from warp_corot.elasticity.corotated.fields import CorotatedField
     from warp_corot.solvers.system import System
 
-#: The most elements of a world: patches of larger ones do not fit.
-MOST = 150_000
+#: Elements of a world that becomes faster: smaller ones need few blocks, and patches of larger ones do not fit.
+FEWEST, MOST = 500, 150_000
 #: Minimum number of elements in a patch: with fewer, the blocks of small bodies mostly wait for each other.
 PATCH_ELEMENTS = 32
+#: Minimum number of multiprocessors for each world: with fewer, one block for each world is faster.
+FEWEST_BLOCKS = 4
 #: Threads of a block, each for patches that compute at most this many elements; more threads have fewer registers.
 THREADS = ((256, 512), (512, 1024), (384, 1536), (512, 2048))
-#: Elements that a thread computes if a patch is a whole world, and the maximum, which has more threads than nodes.
-WHOLE_EACH, MOST_WHOLE = 4, 8
 #: Number of elements that a thread measures if there are enough threads, and the maximum.
 SOON_MEASURED, MOST_MEASURED = 3, 8
 #: Largest number of elements whose constants a thread keeps in registers, and of halo nodes that it waits for.
@@ -47,7 +47,7 @@ NODE_ROOM, SLOT_ROOM, GROUP_ROOM, MEMBER_ROOM = 128, 512, 64, 4
 
 
 class PatchSteps:
-    """Symplectic Euler steps of a body whose patches are all resident on the GPU at once, or whole worlds.
+    """Symplectic Euler steps of a body whose patches are all resident on the GPU at once.
 
     ``of`` makes it if that is possible.
     """
@@ -59,10 +59,9 @@ class PatchSteps:
         device = body.device
         self._tables = _device_patches(body, patches, layout)
         self._exchange = Exchange()
-        nodes, blocks = (0, 0) if layout.whole else (body.node_count, body.worlds * patches.count)
-        self._exchange.nodes = nodes
-        self._exchange.published = wp.zeros(2 * nodes, dtype=wp.vec4, device=device)
-        self._exchange.begun = wp.array(np.ones(blocks), dtype=wp.uint32, device=device)
+        self._exchange.nodes = body.node_count
+        self._exchange.published = wp.zeros(2 * body.node_count, dtype=wp.vec4, device=device)
+        self._exchange.begun = wp.array(np.ones(body.worlds * patches.count), dtype=wp.uint32, device=device)
         self._trajectories: list[Followed] | None = None
         self.prepare()
 
@@ -70,27 +69,26 @@ class PatchSteps:
     def of(
         cls, body: SoftBody, field: ForceField, *, count: int | None = None, threads: int | None = None
     ) -> PatchSteps | None:
-        """A body's steps by patches; None if it is not on CUDA, is too large, or has another model than the corotated
-        one with own rotations.
+        """A body's steps by patches; None if it is not on CUDA, is too small or large, has too many worlds, or has
+        another model than the corotated one with own rotations.
 
         Args:
-            count: Patches of a world: one, or so many that those of all worlds are at most as many as multiprocessors;
-                None: as many as may be, or fewer for small bodies.
+            count: Patches of a world; those of all worlds are at most as many as multiprocessors; None: as many as may
+                be, or fewer for small bodies.
             threads: Threads of a block; None: chosen by its elements.
         """
         law, sharing = law_of(field)
         if not _suits(body, law):
             return None
-        elements, resident = len(body.mesh.tets), max(body.device.sm_count // body.worlds, 1)
+        elements, resident = len(body.mesh.tets), body.device.sm_count // body.worlds
+        if resident < FEWEST_BLOCKS:
+            return None
+        groups = None if sharing is None else sharing.group_numbers()[:elements]
         count = min(count or max(elements // PATCH_ELEMENTS, 1), resident)
         if elements > count * THREADS[-1][1]:
             return None
-        groups = None if sharing is None else sharing.group_numbers()[:elements]
         room = body.device.max_shared_memory_per_block - TILE_BYTES
-        of_whole = WARP * -(-max(-(-elements // WHOLE_EACH), body.world_node_count) // WARP)
-        sizes = THREADS if count > 1 else ((of_whole, MOST_WHOLE * of_whole),)
-        if threads is not None:
-            sizes = ((threads, (MOST_ELEMENTS if count > 1 else MOST_WHOLE) * threads),)
+        sizes = THREADS if threads is None else ((threads, MOST_ELEMENTS * threads),)
         measured = (MOST_MEASURED,) if groups is None else (SOON_MEASURED, MOST_MEASURED)
         patches: Patches | None = None
         for at_once, (each, most) in itertools.product(measured, sizes):
@@ -163,10 +161,9 @@ def layout_of(patches: Patches, threads: int, most_bytes: int) -> Layout | None:
     slots = -(-(patches.most_slots + 1) // SLOT_ROOM) * SLOT_ROOM - 1
     groups = -(-patches.most_groups // GROUP_ROOM) * GROUP_ROOM
     members = -(-patches.most_members // MEMBER_ROOM) * MEMBER_ROOM
-    whole = patches.count == 1
-    layout = Layout(threads, elements, halo, patches.lanes, nodes, slots, groups, members, not whole, whole)
+    layout = Layout(threads, elements, halo, patches.lanes, nodes, slots, groups, members)
     fits = groups <= threads and 4 * layout.floats <= most_bytes and patches.most_own * patches.lanes <= threads
-    return layout if fits and elements <= (MOST_WHOLE if whole else MOST_ELEMENTS) and halo <= MOST_HALO else None
+    return layout if fits and elements <= MOST_ELEMENTS and halo <= MOST_HALO else None
 
 
 def _suits(body: SoftBody, field: ForceField) -> bool:
@@ -174,7 +171,7 @@ def _suits(body: SoftBody, field: ForceField) -> bool:
         return False
     if isinstance(body.material, Directional) or field.deterministic:
         return False
-    return len(body.mesh.tets) <= MOST and _has_own_rotations(field)
+    return FEWEST <= len(body.mesh.tets) <= MOST and _has_own_rotations(field)
 
 
 def _has_own_rotations(field: ForceField) -> bool:

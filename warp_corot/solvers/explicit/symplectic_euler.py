@@ -18,6 +18,7 @@ from warp_corot.inputs.cpu_threads import Regions
 from warp_corot.kernels.stepping.integrate import STEP_SYMPLECTIC_EULER, take_in_work
 from warp_corot.solvers.integrator import Integrator, Stepper
 
+from .block import BlockSteps
 from .patches import PatchSteps
 
 if TYPE_CHECKING:
@@ -82,7 +83,7 @@ class SymplecticEulerStepper(Stepper):
                 Viscosity(body, field, viscosity, partial(system.ranks.exchange, k, copies=True))
                 for k, (body, field) in bound
             ]
-        self._many = [PatchSteps.of(*pair) for pair in zip(system.bodies, system.fields, strict=True)]
+        self._many = [_steps_in_one_launch(system, k) for k in range(len(system.bodies))]
         shapes = [(body.discretization.team.parts, 2) for body in system.bodies]
         self._work = [wp.zeros(shape, dtype=wp.float64, device=system.device) for shape in shapes]
         self._regions = [Regions(body.discretization.team, system.device) for body in system.bodies]
@@ -91,14 +92,16 @@ class SymplecticEulerStepper(Stepper):
     def many_a_launch(self) -> bool:
         return all(self._launched(k) is not None for k in range(len(self._many)))
 
-    def _launched(self, k: int) -> PatchSteps | None:
+    def _launched(self, k: int) -> BlockSteps | PatchSteps | None:
         """The launches that make many steps of a body, or None."""
+        many = self._many[k]
+        follows = isinstance(many, BlockSteps) and self.system.bodies[k].conditions.trajectories
         others = self.system.forces or self.system.constraints or not self.system.ranks.is_alone
-        return None if others else self._many[k]
+        return None if follows or others else many
 
     def prepare(self) -> None:
         for many in self._many:
-            if many is not None:
+            if isinstance(many, PatchSteps):
                 many.prepare()
 
     def forces(self, offset: int = 0) -> None:
@@ -148,3 +151,10 @@ class SymplecticEulerStepper(Stepper):
         regions.launch_over(kernel, body.sizes.launch_nodes, arguments, offset)
         if not is_one:
             wp.launch(take_in_work, 1, [work], [system.support_work], device=body.device)
+
+
+def _steps_in_one_launch(system: System, k: int) -> BlockSteps | PatchSteps | None:
+    """The steps of a body in one launch, None if there are none: a few worlds are faster on all multiprocessors
+    together, many small worlds are faster on one each."""
+    body, field = system.bodies[k], system.fields[k]
+    return PatchSteps.of(body, field) or BlockSteps.of(body, field)

@@ -1,6 +1,7 @@
-"""Steps of small bodies by patches on CUDA, of many worlds with one patch each, against those launch by launch.
+"""Steps of small bodies in one thread block for each world, on CUDA, against the same steps launch by launch.
 
-Both are float32 and sum in different orders; damped, they agree within ``ONE`` after a step and ``MANY`` after many.
+A few worlds are stepped by patches, in place of blocks, and are tested here, too. All ways are float32 and sum in
+different orders; damped, they agree within ``ONE`` after a step and ``MANY`` after many.
 """
 
 import warnings
@@ -9,20 +10,21 @@ import numpy as np
 import oracle
 import pytest
 import warp as wp
-from cases import CUBE, oracle_mesh, random_displacement
+from cases import CUBE, jittered, mixed_forest, oracle_mesh, random_displacement
 
 import warp_corot as wc
 from warp_corot.elasticity.dilatation import DilatationField
+from warp_corot.solvers.explicit.block import BlockSteps
 from warp_corot.solvers.explicit.patches import PatchSteps
 from warp_corot.solvers.recorded import Segment
 
 DEVICES = [str(device) for device in wp.get_cuda_devices()]
-pytestmark = pytest.mark.skipif(not DEVICES, reason="patches are stepped on CUDA")
+pytestmark = pytest.mark.skipif(not DEVICES, reason="blocks are for CUDA")
 
 DAMPING, GRAVITY, DT = 10.0, (0.3, -9.8, 0.1), 1e-4
 ONE, MANY = 1e-5, 2e-5
 OWN = wc.Corotated()
-MANY_WORLDS = 300  # more than there are multiprocessors: each world is one patch
+MANY_WORLDS = 300  # more than there are multiprocessors, for which a block is divided differently
 
 #: A body for each type of subtree; the last is the paper's beam.
 BODIES = {
@@ -51,8 +53,22 @@ def material(form, mesh, worlds):
     return wc.Isotropic(rng.uniform(2e3, 8e3, size), rng.uniform(0.2, 0.45, size), rng.uniform(500, 1500, size))
 
 
-def made(device, mesh, *, launches, form="uniform", worlds=1, amount=0.1, dt=DT, start=None, loads=True, shared=False):
-    """A block fixed at one end, pulled at the other, with loads everywhere, from a random start."""
+def made(
+    device,
+    mesh,
+    *,
+    launches,
+    by=BlockSteps,
+    form="uniform",
+    worlds=1,
+    amount=0.1,
+    dt=DT,
+    start=None,
+    loads=True,
+    shared=False,
+):
+    """A block fixed at one end, pulled at the other, with loads everywhere, from a random start; stepped launch by
+    launch or ``by`` blocks or patches, even if the other ones are faster."""
     rng = np.random.default_rng(9)
     n = len(mesh.points)
     body = wc.SoftBody(mesh, material(form, mesh, worlds), worlds=worlds, device=device)
@@ -72,8 +88,9 @@ def made(device, mesh, *, launches, form="uniform", worlds=1, amount=0.1, dt=DT,
         model = wc.Corotated(dilatation="shared" if shared else "element")
         sim = wc.Simulation(body, model=model, integrator=integrator, gravity=GRAVITY)
     many = sim.recorded._stepper._many
-    assert isinstance(many[0], PatchSteps)
-    assert many[0].layout.whole == (worlds == MANY_WORLDS or len(mesh.tets) < 64)
+    assert isinstance(many[0], BlockSteps) or worlds < MANY_WORLDS
+    many[0] = by.of(body, sim.fields[0])
+    assert many[0] is not None
     if launches:
         many[0] = None
     assert isinstance(sim.fields[0], DilatationField) == shared
@@ -123,6 +140,40 @@ def test_steps_of_worlds_equal_those_by_launches(form, worlds, device):
     assert_near(*sims, MANY)
 
 
+@pytest.mark.parametrize("shared", [False, True], ids=["each", "shared"])
+@pytest.mark.parametrize("worlds", [1, 3, 16])
+@pytest.mark.parametrize("form", ["uniform", "worlds", "elements", "both"])
+def test_patches_of_a_few_worlds_equal_steps_by_launches(form, worlds, shared, device):
+    """Keyframes move the end of one world, too."""
+    if wp.get_device(device).sm_count < 4 * worlds:
+        pytest.skip("too few multiprocessors")
+    mesh = forest("beam")
+    top = np.flatnonzero(mesh.points[:, 2] > mesh.points[:, 2].max() - 1e-9)
+    sims = pair(device, mesh, by=PatchSteps, form=form, worlds=worlds, dt=5e-5, shared=shared)
+    for sim in sims:
+        sim.step()
+    assert_near(*sims, ONE)
+    for sim in sims:
+        place = sim.body.world(worlds - 1).displacements.numpy()[top]
+        frames = np.stack([place, place + 0.01 * CUBE])
+        sim.body.prescribe(top, times=[0.0, 0.01], displacements=frames, worlds=[worlds - 1])
+        sim.advance_steps(99)
+    assert_near(*sims, MANY)
+
+
+@pytest.mark.parametrize(
+    ("name", "worlds", "steps"),
+    [("beam", 1, PatchSteps), ("beam", 16, PatchSteps)]
+    + [(name, worlds, BlockSteps) for name, worlds in (("type 1", 1), ("type 1", 3), ("beam", MANY_WORLDS))],
+)
+def test_a_few_worlds_are_stepped_by_patches_and_many_by_blocks(name, worlds, steps, device):
+    if wp.get_device(device).sm_count < 64:
+        pytest.skip("too few multiprocessors for 16 worlds")
+    body = wc.SoftBody(forest(name), wc.Isotropic(5e3, 0.4, 1e3), worlds=worlds, device=device)
+    sim = wc.Simulation(body, integrator=wc.SymplecticEuler(dt=1e-5))
+    assert isinstance(sim.recorded._stepper._many[0], steps)
+
+
 @pytest.mark.parametrize("worlds", [1, MANY_WORLDS])
 @pytest.mark.parametrize(("name", "form"), [("type 0", "uniform"), ("type 1", "both"), ("type 2", "elements")])
 def test_steps_that_share_their_dilatation(name, form, worlds, device):
@@ -147,7 +198,7 @@ def check_shared_steps(name, form, worlds, device):
 def test_a_step_is_that_of_float64(worlds, device):
     """v1 = (v0 + dt (f/m + g)) / (1 + dt damping), u1 = u0 + dt v1, reactions -(f + m g), f with the loads."""
     mesh = forest("type 1")
-    sim = made(device, mesh, 0, launches=False, form="both", worlds=worlds)
+    sim = made(device, mesh, launches=False, form="both", worlds=worlds)
     body, reference = sim.body, oracle_mesh(mesh)
     shape = (worlds, len(mesh.points), 3)
     u, v = (getattr(body, name).numpy().astype(float).reshape(shape) for name in ("displacements", "velocities"))
@@ -194,7 +245,7 @@ def test_crushed_and_mirrored_subtrees_are_repaired(worlds, shared, device):
 
 
 def test_single_crushed_subtrees_are_repaired(device):
-    """A few elements of one subtree are inverted: only some of a patch's threads compute it again."""
+    """A few elements of one subtree are inverted: only some of a block's threads repair it."""
     mesh = forest("beam")
     start = random_displacement(mesh, np.random.default_rng(1), 0.1)
     inside = np.linalg.norm(mesh.points - mesh.points.mean(axis=0), axis=1).argmin()
@@ -202,7 +253,7 @@ def test_single_crushed_subtrees_are_repaired(device):
     start[inside] += edge * np.array([0.5, 1.6, 0.3], np.float32)
     gradients = oracle_mesh(mesh).deformation_gradients(mesh.points + start)
     assert 0 < (np.linalg.det(gradients) < 0).sum() < 20
-    sims = pair(device, mesh, 0, start=start[None])
+    sims = pair(device, mesh, start=start[None])
     for sim in sims:
         sim.step()
     assert_near(*sims, ONE)
@@ -229,8 +280,8 @@ def test_supports_and_loads_may_change(device):
 
 
 def test_keyframes_for_a_while(device):
-    """They come and go between launches."""
-    sims = pair(device, forest("type 1"), 0)
+    """From blocks to launches and back: nothing is lost in between."""
+    sims = pair(device, forest("type 1"))
     top = np.flatnonzero(sims[0].body.mesh.points[:, 2] > CUBE - 1e-9)
     for sim in sims:
         sim.advance_steps(40)
@@ -244,7 +295,7 @@ def test_keyframes_for_a_while(device):
 
 def test_recorded_steps(device):
     """In a capture a step is one launch that is replayed."""
-    sims = [made(device, forest("type 1"), 0, launches=False) for _ in range(2)]
+    sims = [made(device, forest("type 1"), launches=False) for _ in range(2)]
     with wp.ScopedCapture(device=device) as capture:
         sims[0].step()
     for _ in range(20):
@@ -307,8 +358,8 @@ def test_an_unstable_step_is_named(share, device):
 
 def test_a_world_that_is_not_finite_leaves_the_others(device):
     mesh = forest("type 1")
-    dt = 0.8 * made(device, mesh, 0, launches=False).stable_dt  # for all worlds, even if one fails
-    sims = [made(device, mesh, 0, launches=False, worlds=3, dt=dt) for _ in range(2)]
+    dt = 0.8 * made(device, mesh, launches=False).stable_dt  # for all worlds, even if one fails
+    sims = [made(device, mesh, launches=False, worlds=3, dt=dt) for _ in range(2)]
     for sim in sims:
         sim.body.set_initial_state()
     free = np.flatnonzero(~sims[0].body.constrained[: len(mesh.points)])
@@ -329,17 +380,21 @@ def test_a_world_that_is_not_finite_leaves_the_others(device):
     np.testing.assert_array_equal(a, b)
 
 
-def test_bodies_that_patches_do_not_step(device):
-    """Worlds too large for one patch each, another law, or shared rotations."""
+def test_bodies_that_blocks_do_not_step(device):
+    """Too large, with several kinds of subtrees, without subtrees, with another law, or with shared rotations."""
     beam = wc.TetForest.box((1, 1, 3), CUBE, 6)
     large = wc.TetForest.box((5, 5, 1), CUBE, 6)
     small = wc.Isotropic(5e3, 0.4, 1e3)
-    for mesh, worlds, model in (
-        (large, MANY_WORLDS, OWN),
-        (beam, 1, wc.Linear()),
-        (beam, 1, wc.Corotated(rotation="svd")),
-        (beam, 1, wc.Corotated(rotation_level=3)),
-        (beam, 1, wc.Linear(dilatation="shared")),
+    for mesh, model in (
+        (large, OWN),
+        (mixed_forest(), OWN),
+        (jittered(), OWN),
+        (beam, wc.Linear()),
+        (beam, wc.Corotated(rotation="svd")),
+        (beam, wc.Corotated(rotation_level=3)),
+        (beam, wc.Linear(dilatation="shared")),
     ):
-        body = wc.SoftBody(mesh, small, worlds=worlds, device=device)
-        assert PatchSteps.of(body, model.bind(body)) is None
+        body = wc.SoftBody(mesh, small, device=device)
+        assert BlockSteps.of(body, model.bind(body)) is None
+    body = wc.SoftBody(beam, small, device="cpu")
+    assert BlockSteps.of(body, OWN.bind(body)) is None
