@@ -149,7 +149,8 @@ def draw_body(
     scale = 2.0 * min(box.width / (window.high - window.low)[0], box.height / (window.high - window.low)[1])
     size = np.maximum(scale * (window.high - window.low), 1.0).astype(int)
     window = Window(window.low, window.high, (int(size[0]), int(size[1])), 3.0)
-    image = render(window, camera, positions, faces, rest=rest, ground=height, **options)
+    ghost = None if rest is None else silhouette(window, camera, rest, faces)
+    image = render(window, camera, positions, faces, ghost=ghost, ground=height, **options)
     (left, bottom), (right, top) = window.low, window.high
     ax.imshow(image, extent=(left, right, bottom, top), interpolation="antialiased")
     ax.set_axis_off()
@@ -173,7 +174,7 @@ def render(
     *,
     scalars: ArrayLike | None = None,
     value_range: tuple[float, float] | None = None,
-    rest: ArrayLike | None = None,
+    ghost: NDArray[np.uint8] | None = None,
     color: tuple[float, float, float] = TISSUE,
     edges: bool = False,
     ground: float | None = None,
@@ -188,7 +189,7 @@ def render(
         faces: Triangles [F, 3], wound counter-clockwise seen from outside (`boundary_faces`).
         scalars: Values to colour by, one a node [N] or one a face [F]; NaN for rigid things, which are grey.
         value_range: Values at the two ends of the colour map; None: 0 to the 99th percentile, rounded up.
-        rest: Nodes at rest [N, 3] [m], drawn as a faint silhouette in the background.
+        ghost: A faint silhouette in the background, from `silhouette`.
         color: Colour of a body without scalars, sRGB.
         edges: Whether to draw the edges of the faces.
         ground: Height [m] of a ground that shows the shadow; None: none.
@@ -216,12 +217,7 @@ def render(
         drawn = Image.fromarray(image)
         ImageDraw.Draw(drawn).line(ends, fill=_GHOST_LINE, width=line)
         image = np.array(drawn)
-    behind = np.zeros(image.shape[:2], np.uint8)
-    if rest is not None:
-        at_rest = checked_surface(rest, faces, "rest")[0]
-        ghost = _nearest(window, camera, at_rest[tri[camera.sees_outside(at_rest, tri)]])[0].numpy() >= 0
-        behind[binary_dilation(ghost, iterations=line)] = 1
-        behind[ghost] = 2
+    behind = np.zeros(image.shape[:2], np.uint8) if ghost is None else ghost.copy()
     front = camera.sees_outside(x, tri)
     nearest, corners = _nearest(window, camera, x[tri[front]])
     behind[binary_dilation(nearest.numpy() >= 0, iterations=line)] = 3
@@ -247,6 +243,21 @@ def render(
         box = (along - 1.5 * line, down - 1.5 * line, along + 1.5 * line, down + 1.5 * line)
         ImageDraw.Draw(drawn).ellipse(box, fill=_INK)
     return np.array(drawn)
+
+
+def silhouette(window: Window, camera: Camera, rest: ArrayLike, faces: ArrayLike) -> NDArray[np.uint8]:
+    """The silhouette of nodes at rest [N, 3] [m], uint8 [height, width]: 2 inside, 1 on its outline, 0 elsewhere.
+
+    Raises:
+        InputError: See `render`.
+    """
+    from scipy.ndimage import binary_dilation
+
+    x, tri = checked_surface(rest, faces, "rest")
+    inside = _nearest(window, camera, x[tri[camera.sees_outside(x, tri)]])[0].numpy() >= 0
+    drawn = binary_dilation(inside, iterations=max(round(window.fineness), 1)).astype(np.uint8)
+    drawn[inside] = 2
+    return drawn
 
 
 def value_limits(scalars: ArrayLike | None) -> tuple[float, float]:

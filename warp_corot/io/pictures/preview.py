@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from warp_corot.errors import InputError
 from warp_corot.io.files.whole import written_whole
 
 from .colors import stress_colors
-from .drawing import INK, Array, Camera, Window, framed, render
+from .drawing import INK, Array, Camera, Window, framed, render, silhouette
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -155,6 +155,16 @@ class Strip:
         half = max(half[1], half[0] * tall / step) * np.array([step / tall, 1.0])
         self._window = Window(middle - half, middle + half, (FINENESS * step, FINENESS * tall), 1.6 * FINENESS)
         self._step = step
+        self._ghosts: dict[int, tuple[NDArray[Any], NDArray[Any], NDArray[np.uint8]]] = {}
+
+    def _ghost(self, index: int, picture: Picture) -> NDArray[np.uint8] | None:
+        """The silhouette at rest, which is drawn again only if it changes."""
+        if picture.rest is None:
+            return None
+        given = np.asarray(picture.rest), np.asarray(picture.faces)
+        if index not in self._ghosts or not all(map(np.array_equal, given, self._ghosts[index][:2])):
+            self._ghosts[index] = (*given, silhouette(self._window, self._cameras[index], *given))
+        return self._ghosts[index][2]
 
     def draw(self, pictures: Sequence[Picture], title: str = "") -> Image:
         """Draw a frame: as many pictures as the first one has, and its title.
@@ -170,7 +180,11 @@ class Strip:
             left, top = index % self._columns * self._step, self._head + index // self._columns * self._row
             options = {"ground": self._ground, **picture.options}
             options["ground"] = None if options["ground"] is False else options["ground"]
-            given = {"scalars": picture.scalars, "value_range": self._limits, "rest": picture.rest, **options}
+            given = {
+                "scalars": picture.scalars,
+                "value_range": self._limits,
+                "ghost": self._ghost(index, picture),
+            } | options
             panel = render(self._window, camera, picture.positions, picture.faces, **given)
             image.paste(Image.fromarray(panel).reduce(FINENESS), (left, top + self._own_head))
             if picture.title:
