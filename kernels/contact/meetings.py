@@ -19,6 +19,21 @@ wp.set_module_options({"enable_backward": False})
 BITS = wp.constant(31)
 
 
+@wp.func
+def gap_ahead(o: int, world: int, x: wp.vec3, step: wp.vec3, shapes: Shapes, motions: Motions, law: Law):
+    """The gap between a point and an obstacle at the end of a step [m], if the point goes by ``step`` [m]; where it is
+    too far to meet the obstacle, how far."""
+    now = motions.now[world, o]
+    moved = carried(now, motions.later[world, o], x)
+    relative = step - moved
+    far = 2.0 * wp.length(relative) + wp.length(moved) + 2.0 * law.tolerance
+    gap, n = distance_to(shapes, o, now, x, far)
+    after, _end = distance_to(shapes, o, motions.later[world, o], x + step, far)
+    if gap > far:
+        return gap
+    return wp.min(gap + wp.dot(n, relative), after)
+
+
 @wp.kernel(enable_backward=False)
 def find_meetings(
     # In
@@ -53,14 +68,7 @@ def find_meetings(
         if kind != APART:
             touched += wp.lshift(1, o % BITS)
         if kind == APART and inverse_mass[i] > 0.0:
-            now = motions.now[world, o]
-            moved = carried(now, motions.later[world, o], x)
-            relative = step - moved
-            far = 2.0 * wp.length(relative) + wp.length(moved) + 2.0 * law.tolerance
-            gap, n = distance_to(shapes, o, now, x, far)
-            after, _end = distance_to(shapes, o, motions.later[world, o], x + step, far)
-            if gap <= far and wp.min(gap + wp.dot(n, relative), after) < 0.0:
-                meets = True
+            meets = meets or gap_ahead(o, world, x, step, shapes, motions, law) < 0.0
     if meets or touched != met[i]:
         begins[0] = 1
     met[i] = touched
@@ -103,15 +111,8 @@ def find_borne_meetings(
         force = forces[o, s]
         if wp.dot(force, force) > 0.0:
             wp.atomic_or(touched, i, wp.lshift(1, o % BITS))
-        else:
-            now = motions.now[world, o]
-            moved = carried(now, motions.later[world, o], x)
-            relative = step - moved
-            far = 2.0 * wp.length(relative) + wp.length(moved) + 2.0 * law.tolerance
-            gap, n = distance_to(shapes, o, now, x, far)
-            after, _end = distance_to(shapes, o, motions.later[world, o], x + step, far)
-            if gap <= far and wp.min(gap + wp.dot(n, relative), after) < -law.tolerance:
-                begins[0] = 1
+        elif gap_ahead(o, world, x, step, shapes, motions, law) < -law.tolerance:
+            begins[0] = 1
 
 
 @wp.kernel(enable_backward=False)
