@@ -24,14 +24,18 @@ def simulate(*args: object) -> int:
     return run("simulate", *args)
 
 
+def lines_of(err: str) -> list[str]:
+    """The lines on stderr but for the one about compiling, which depends on what ran before."""
+    return [line for line in err.splitlines() if "compiling kernels" not in line]
+
+
 def assert_refused(folder: Path, capsys, said: str, *args: object) -> None:
     """The error is one line on stderr and status 2, and no file is touched."""
     before = {file.name: file.read_bytes() for file in folder.iterdir()}
     assert simulate(*args) == 2
     out, err = capsys.readouterr()
     assert out == ""
-    # The message about compiling depends on what ran before.
-    (error,) = [line for line in err.splitlines() if "compiling kernels" not in line]
+    (error,) = lines_of(err)
     assert error.startswith("warp-corot: error: ")
     assert said in error
     assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
