@@ -5,9 +5,9 @@
 
 A blade goes down through the middle of a box. A *blade step* is what follows when a cut is due: the search for what the
 blade has swept, the cut, all that is derived from the mesh, and the host's part; the table has its median and its 90th
-percentile, how often it is due, and what a step of the same body costs with and without the blade. It also says what
-recordings of steps take that a cut has made invalid, and what steps take after cuts, over those of a body that was made
-of the same elements. The script checks that the box is in two pieces in the end.
+percentile, how often it is due, and what a step of the same body costs with and without the blade. It also says how
+long it takes to record steps again after a cut, and how much longer steps take after cuts than those of a body that was
+made of the same elements. The script checks that the box is in two pieces in the end.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ from warp_corot.inputs.device import checked_device
 
 #: Cubes along each edge of the bodies over the tasks' own, and the steps on which policies are tried.
 BODIES = ((1, "explicit"), (1, "implicit"), (2, "explicit"), (2, "implicit"))
-#: The first of the seeds; those of the tables in docs/envs.md.
+#: The first seed, as in the tables of docs/envs.md.
 SEED = 1000
 
 

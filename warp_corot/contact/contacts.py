@@ -24,7 +24,7 @@ from .carried import CarriedForces
 from .joined_rows import JoinedRows
 from .mass_split import MassSplit
 from .obstacles import Obstacles
-from .options import SURFACE, Contact
+from .options import SURFACE, Contact, may_meet
 from .pairs import Pairs, smallest_size
 from .rigid_forces import RigidForces
 from .search import Search
@@ -90,7 +90,7 @@ class Contacts:
     ):
         self.system, self.device, self.options = system, system.device, options
         self.obstacles = Obstacles(obstacles, options.friction, system, dt)
-        meets = len(system.bodies) > 1 or options.self_contact
+        meets = may_meet(len(system.bodies), options)
         are_own = on_surfaces and options.on == SURFACE
         have_own = are_own and any(has_own_surface(system.ranks.owned(body).whole.mesh) for body in system.bodies)
         is_whole = (meets or have_own) and not system.ranks.is_alone

@@ -20,7 +20,7 @@ from warp_corot.kernels.stepping.pace import Pace
 from warp_corot.kernels.stepping.threads import LINE
 
 from .obstacles import have_edges
-from .options import Contact
+from .options import Contact, may_meet
 from .pairs import Pairs
 from .rigid_forces import RigidForces
 from .search import Search
@@ -43,9 +43,12 @@ def solver_of(
     device: wp.Device, obstacles: Sequence[Obstacle], options: Contact, bodies: int
 ) -> tuple[wp.Kernel, int | None]:
     """The kernel of a step, for what may touch, and its threads of a block."""
-    kernel = kernels.solver if device.is_cuda else sweeper
-    meet = bodies > 1 or options.self_contact
-    return kernel(have_edges(obstacles), meet), BLOCK if device.is_cuda else None
+    kernel = _compiled(device, have_edges(obstacles), may_meet(bodies, options))
+    return kernel, BLOCK if device.is_cuda else None
+
+
+def _compiled(device: wp.Device, has_triangles: bool, has_pairs: bool) -> wp.Kernel:
+    return (kernels.solver if device.is_cuda else sweeper)(has_triangles, has_pairs)
 
 
 class MassSplit:
@@ -84,8 +87,7 @@ class MassSplit:
         alone = pairs is None and not surface.is_borne and (rigid is None or rigid.is_separate)
         self._none = wp.zeros(0, dtype=wp.int32, device=self.device)
         self._are_separate, self.iterations = alone, EXACT if alone else ITERATIONS
-        made = kernels.solver if self.device.is_cuda else sweeper
-        self._kernel = made(rigid is not None and rigid.have_edges, pairs is not None)
+        self._kernel = _compiled(self.device, rigid is not None and rigid.have_edges, pairs is not None)
         self.follow()
 
     def follow(self) -> None:

@@ -41,6 +41,11 @@ class Contact:
         checked_choice(self.on, "on", (SURFACE, TETRAHEDRA))
 
 
+def may_meet(bodies: int, options: Contact) -> bool:
+    """Whether soft surfaces may touch: those of several bodies, or of one that touches itself."""
+    return bodies > 1 or options.self_contact
+
+
 def checked_friction(given: float) -> float:
     """A coefficient of friction.
 

@@ -15,7 +15,7 @@ import warp as wp
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.contacts import Contacts
 from warp_corot.contact.mass_split import solver_of
-from warp_corot.contact.options import Contact
+from warp_corot.contact.options import Contact, may_meet
 from warp_corot.contact.reading import ContactPoint, contact_points
 from warp_corot.contact.tool import Obstacle
 from warp_corot.cutting.blade import Blade, checked_blades
@@ -210,7 +210,7 @@ class Simulation(Cutting):
         names = [*(STEPS_ON_CPU if on_cpu else STEPS), *(EXPLICIT if chosen else ()), *(() if explicit else IMPLICIT)]
         meet = False
         if touching and explicit:
-            meet = on_cpu and (len(self.parts) > 1 or touching[1].self_contact)
+            meet = on_cpu and may_meet(len(self.parts), touching[1])
             names = [*(CONTACT_ON_CPU if on_cpu else CONTACT), *(PAIRS_ON_CPU if meet else ()), *names]
         if not explicit and any(body.discretization.element_kind is ForestElements for body in self.parts):
             names += IMPLICIT_ON_FORESTS
