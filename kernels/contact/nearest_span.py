@@ -130,7 +130,7 @@ def find_span(
     distance, _away = distance_to(shapes, o, pose, middle, most)
     if distance > most:
         return found
-    w, gap, n = nearest(shapes, o, pose, most, a, b, c)
+    w, gap, n = nearest(shapes, o, pose, most, far, a, b, c)
     if wp.dot(was, was) > 0.0 and wp.dot(n, side) < 0.0 and shapes.kind[o] == CAPSULE:
         # The axis has passed through since the last time.
         n = -n
