@@ -38,9 +38,7 @@ class Touches:
 
 
 @wp.func
-def nearest(
-    shapes: Shapes, o: int, pose: wp.transform, most: float, far: float, a: wp.vec3, b: wp.vec3, c: wp.vec3
-):
+def nearest(shapes: Shapes, o: int, pose: wp.transform, most: float, far: float, a: wp.vec3, b: wp.vec3, c: wp.vec3):
     """Weights of the corners at the closest point, the gap there, and the direction out of the obstacle; any point if
     all are farther away than ``far``."""
     kind = shapes.kind[o]
@@ -72,10 +70,12 @@ def find_touch(o: int, t: int, rigid: Rigid, triangles: wp.array[wp.vec3i], touc
     """
     was = touches.force[o, t]
     side = touches.normal[o, t]
-    touches.shares[o, t] = wp.vec3()
-    touches.force[o, t] = wp.vec3()
-    touches.more[o, t] = wp.vec3()
-    touches.acts[o, t] = 0
+    # Most triangles that something is near have no contact: these are only read.
+    if wp.length_sq(touches.shares[o, t]) > 0.0 or wp.dot(was, was) > 0.0:
+        touches.shares[o, t] = wp.vec3()
+        touches.force[o, t] = wp.vec3()
+        touches.more[o, t] = wp.vec3()
+        touches.acts[o, t] = 0
     corners = triangles[t]
     pose = rigid.motions.now[rigid.surface.world[corners[0]], o]
     later = rigid.motions.later[rigid.surface.world[corners[0]], o]

@@ -33,10 +33,10 @@ ITERATIONS, EXACT = 4, 1
 BLOCK = int(kernels.BLOCK)
 #: The most contacts that the CPU keeps ready during the iterations.
 RECORDS = 1 << 14
-#: On CUDA one launch makes all phases if there is room for so many blocks of contacts for each multiprocessor. Its
-#: blocks of threads are resident: one on each multiprocessor for few contacts, else so many; and the most blocks of
-#: other launches.
-FEW_TURNS, MOST_TURNS, BLOCKS_EACH, MOST_BLOCKS = 4, 64, 4, 4096
+#: On CUDA one launch makes all phases. Its blocks of threads are resident: one on each multiprocessor if there is room
+#: for at most so many blocks of contacts for each, else so many. Contacts that share no node wait for none; the most
+#: blocks for them.
+FEW_TURNS, BLOCKS_EACH, MOST_BLOCKS = 4, 4, 4096
 
 
 def solver_of(
@@ -114,12 +114,8 @@ class MassSplit:
         self.sums.is_shared = int(self._regions.team.parts > 1)
         if device.is_cuda:
             blocks, each = max(-(-contacts // BLOCK), 1), device.sm_count
-            self._is_one = self._are_separate or blocks <= MOST_TURNS * each
-            if self._is_one and not self._are_separate:
-                most = each if blocks <= FEW_TURNS * each else BLOCKS_EACH * each
-            else:
-                most = MOST_BLOCKS
-            self._threads = BLOCK * min(blocks, most)
+            most = each if blocks <= FEW_TURNS * each else BLOCKS_EACH * each
+            self._is_one, self._threads = True, BLOCK * min(blocks, MOST_BLOCKS if self._are_separate else most)
 
     @property
     def grain(self) -> float:

@@ -64,7 +64,7 @@ class Search:
         self.most = wp.zeros(1, dtype=wp.int32, device=self.device)
         watch, device = kernels.Watch(), self.device
         watch.least = wp.full(1, LEAST * size, dtype=wp.float32, device=device)
-        watch.fastest = wp.zeros(1, dtype=wp.float32, device=device)
+        watch.fastest = wp.zeros(1 + surface.worlds, dtype=wp.float32, device=device)
         watch.size, watch.most_alone, watch.hit = size, float(kernels.ALONE), float(kernels.HIT_BESIDE)
         watch.due, watch.missed, watch.searches = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(3))
         self._arrived = wp.zeros(1, dtype=wp.uint32, device=device)
