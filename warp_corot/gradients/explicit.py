@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_corot.elasticity import ForceField
 from warp_corot.kernels.gradients import steps as kernels
-from warp_corot.solvers.steps.repeated import Replays
+from warp_corot.solvers.graphs import Replays
 
 from .sums import StepSums
 

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from warp_corot.solvers.implicit.precise import PreciseRest
-from warp_corot.solvers.implicit.precise_elements import PreciseElements
+from warp_corot.solvers.implicit.precise import PreciseElements, PreciseRest
 
 from .precise_contact import PreciseContact
 from .rest_state import RestState

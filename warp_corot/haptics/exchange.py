@@ -11,7 +11,7 @@ import warp as wp
 from warp_corot.contact.obstacles import Obstacles
 from warp_corot.kernels.haptics import publish as kernels
 from warp_corot.kernels.stepping.work import separate_forces
-from warp_corot.solvers.guarding.mapped import Mapped
+from warp_corot.solvers.pace import Mapped
 from warp_corot.solvers.system import Constraint, System
 
 Floats = npt.NDArray[np.float64]

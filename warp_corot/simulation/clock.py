@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from warp_corot.solvers.steps.pace import Pace
-from warp_corot.solvers.steps.safe_step import SafeStep
+from warp_corot.solvers.pace import Pace
+from warp_corot.solvers.stability import SafeStep
 
 
 class Clock:

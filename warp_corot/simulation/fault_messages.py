@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 from warp_corot.elasticity import StVenantKirchhoff
 
 if TYPE_CHECKING:
-    from warp_corot.solvers.guarding.guard import Fault
-    from warp_corot.solvers.steps.pace import Pace
+    from warp_corot.solvers.guard import Fault
+    from warp_corot.solvers.pace import Pace
 
 
 class Stepped(Protocol):

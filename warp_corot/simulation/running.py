@@ -19,8 +19,7 @@ import numpy as np
 from warp_corot.errors import StabilityWarning, UnstableError, depth_of_user
 from warp_corot.inputs.simulation_lock import SIMULATION_LOCK
 from warp_corot.kernels.stepping.pace import GROWTH
-from warp_corot.solvers.guarding.energy_control import EnergyControl
-from warp_corot.solvers.guarding.guard import Fault
+from warp_corot.solvers.guard import EnergyControl, Fault
 from warp_corot.solvers.recorded import Segment
 
 from .fault_messages import fault_message

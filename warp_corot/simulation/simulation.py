@@ -42,15 +42,15 @@ from warp_corot.inputs.simulation_lock import SIMULATION_LOCK, under_lock
 from warp_corot.kernels.contact.crushed import count_crushed
 from warp_corot.kernels.contact.search import find_pairs
 from warp_corot.kernels.elements.elements import ForestElements
-from warp_corot.kernels.stepping.gauge import find_strains
 from warp_corot.kernels.stepping.integrate import STEP_SYMPLECTIC_EULER
+from warp_corot.kernels.stepping.stability import find_strains
 from warp_corot.remesh.online import OnlineRemesh
 from warp_corot.remesh.remeshing import Remeshing
 from warp_corot.solvers import Integrator, SymplecticEuler
-from warp_corot.solvers.guarding.guard import Guard
+from warp_corot.solvers.guard import Guard
+from warp_corot.solvers.pace import Pace
 from warp_corot.solvers.recorded import RecordedSteps, Segment
-from warp_corot.solvers.steps.pace import Pace
-from warp_corot.solvers.steps.safe_step import ANY_STEP, SafeStep
+from warp_corot.solvers.stability import ANY_STEP, SafeStep
 from warp_corot.solvers.system import NEVER, Forces, System
 
 from .cutting import Cutting

@@ -19,9 +19,8 @@ from warp_corot.elasticity import Corotated, Model
 from warp_corot.errors import ConvergenceError, InputError
 from warp_corot.inputs.checks import checked_count, checked_number, refuse_tape, shown
 from warp_corot.inputs.simulation_lock import under_lock
-from warp_corot.solvers.implicit.nested import nested_start
 from warp_corot.solvers.implicit.preconditioners import check_preconditioner
-from warp_corot.solvers.implicit.static import StaticSolver, status_words
+from warp_corot.solvers.implicit.static import StaticSolver, nested_start, status_words
 
 from .loaded import LoadedBody
 from .parts import check_whole, checked_gravity, checked_models

@@ -10,7 +10,7 @@ from warp_corot.solvers.implicit.schemes import (
     Newmark,
     QuasiStatic,
 )
-from warp_corot.solvers.steps.stable_step import largest_frequency
+from warp_corot.solvers.stability import largest_frequency
 
 from .integrator import Integrator, Stepper
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 
 import warp as wp
 
-from warp_corot.solvers.guarding.guard import Guard
-from warp_corot.solvers.steps.safe_step import (
+from warp_corot.solvers.guard import Guard
+from warp_corot.solvers.stability import (
     BLOCK_INTERVAL,
     CALM_CHECKS,
     FIRST_INTERVAL,
@@ -21,9 +21,8 @@ from warp_corot.solvers.steps.safe_step import (
     SafeStep,
 )
 
-from .graph_priorities import keep_priorities
+from .graphs import FlushedSubnormals, keep_priorities
 from .integrator import Stepper
-from .subnormals import FlushedSubnormals
 from .system import System
 
 #: The most steps recorded in one graph: on the CPU, where a replay costs almost nothing and recording a step takes as

@@ -11,11 +11,10 @@ from tangents import on_device
 from tree_levels import TreeLevels
 
 import warp_corot as wc
-from warp_corot.solvers.implicit.block_diagonal import BlockDiagonal
 from warp_corot.solvers.implicit.conjugate_gradients import ConjugateGradients
 from warp_corot.solvers.implicit.multigrid import Multigrid
-from warp_corot.solvers.implicit.preconditioners import preconditioner_of
-from warp_corot.solvers.implicit.tangent import TangentOperator
+from warp_corot.solvers.implicit.operator import TangentOperator
+from warp_corot.solvers.implicit.preconditioners import BlockDiagonal, preconditioner_of
 
 
 @functools.cache

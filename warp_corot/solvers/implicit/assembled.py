@@ -21,9 +21,9 @@ from warp_corot.kernels.implicit.multigrid.cycle import Rows
 from warp_corot.materials.directional import Directional
 
 from .dissection import dissected
-from .multigrid.leaf_matrix import LeafMatrix
+from .multigrid.level import LeafMatrix
 from .multigrid.pattern import Pattern, PatternFinder
-from .tangent import TangentOperator
+from .operator import TangentOperator
 
 if TYPE_CHECKING:
     from .block_system import VectorBlocks

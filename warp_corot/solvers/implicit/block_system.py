@@ -14,9 +14,9 @@ from .conjugate_gradients import ConjugateGradients
 from .operator import Preconditioner
 
 if TYPE_CHECKING:
-    from .chosen import ChosenSolve
     from .contact_constraints import ObstacleContact, SoftContact
-    from .tangent import TangentOperator
+    from .operator import TangentOperator
+    from .stepper import ChosenSolve
 
 
 class VectorBlocks:

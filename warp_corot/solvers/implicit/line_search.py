@@ -9,7 +9,7 @@ import warp as wp
 from warp_corot.kernels.implicit import line_search as kernels
 from warp_corot.solvers.halo import ALONE, Halo
 
-from .sums import WorldSums, take_in
+from .conjugate_gradients import WorldSums, take_in
 
 
 class Contacts(Protocol):

@@ -2,27 +2,240 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import warp as wp
 
 from warp_corot.inputs.loading import load
 from warp_corot.kernels.implicit import conjugate_gradients
+from warp_corot.kernels.implicit import increments as kernels
+from warp_corot.kernels.implicit import lagged as choices
 from warp_corot.kernels.implicit import newton as kernels_of_newton
 from warp_corot.solvers.integrator import Stepper
 
 from .assembled import AssembledSolve, suits
 from .block_system import BlockSystem, VectorBlocks
 from .body_steps import BodySteps, SharedSteps, StepCounts
-from .chosen import ChosenSolve
-from .lagged import Lagged
-from .linearised_step import LinearisedStep
+from .contact_solve import ContactSolve
+from .preconditioners import Lagged
 
 if TYPE_CHECKING:
     from warp_corot.solvers.system import System
 
+    from .newton import Newton
+    from .operator import TangentOperator
     from .schemes import ImplicitIntegrator
+
+
+#: The time of an iteration of multigrid over that of an assembled one: on the CPU, the same with a shared dilatation,
+#: which has twice as many entries in a row, and on CUDA. On an H200 it was 29 to 38 for organs of 20,000 and 100,000
+#: elements.
+COST_ON_CPU, SHARED_ON_CPU, COST = 5, 3, 32
+#: So many times as much on the CPU with contact, whose springs multigrid takes into all its matrices before each solve.
+WITH_CONTACT = 2
+#: Multigrid is tried if assembled solves cost as much as so many of its iterations; never where soft surfaces meet,
+#: whose contact it does not know, nor on the CPU with contact, which assembled solves know better there.
+WORTH, NEVER = 10, 1 << 20
+#: The length of a step times the largest frequency of a node among fixed ones, above which multigrid solves first. A
+#: bunny of 20,000 elements has 70 at 5 kPa and 171 at 30 kPa, and takes 190 and 410 iterations on CUDA. With contact
+#: solves need fewer digits: one of 5,000 elements and 1 MPa that falls takes half the time. The long steps of static
+#: answers are beyond both.
+STIFF, STIFF_WITH_CONTACT = 300.0, 3000.0
+
+
+class ChosenSolve:
+    """Both ways of solving, and the choice between them after each step.
+
+    Args:
+        assembled: The assembled matrix.
+        operators: The operators of the bodies.
+        lagged: Multigrid of each body.
+        shares: Whether elements share their dilatation.
+        dt: The length of a step [s].
+
+    Attributes:
+        diagonal: As for ``AssembledSolve``.
+        is_open: Whether the choice is open; otherwise multigrid solves.
+        state: Arrays by name to be kept with the state of the first body, so that a resumed run is the same.
+    """
+
+    def __init__(
+        self,
+        assembled: AssembledSolve,
+        operators: Sequence[TangentOperator],
+        lagged: Sequence[Lagged],
+        *,
+        shares: bool,
+        dt: float,
+    ):
+        self._dt, self._is_prepared = dt, False
+        self.assembled, self._operators, self._lagged = assembled, list(operators), list(lagged)
+        self.device = assembled.device
+        self._is_assembled = wp.ones(1, dtype=wp.int32, device=self.device)
+        self._counts = wp.zeros(choices.CHOICE_COUNTS, dtype=wp.int32, device=self.device)
+        self.is_open = True
+        on_cpu = (SHARED_ON_CPU if shares else COST_ON_CPU) * (WITH_CONTACT if assembled.touches else 1)
+        # Threads share assembled solves, but not cycles of multigrid.
+        self._cost = on_cpu * assembled.threads if self.device.is_cpu else COST
+
+    @property
+    def diagonal(self) -> wp.array:
+        return self.assembled.diagonal
+
+    @property
+    def state(self) -> dict[str, wp.array]:
+        return {"assembled": self._is_assembled, "choice": self._counts}
+
+    def prepare(self) -> None:
+        """Follow the meshes; not while launches are recorded. Launches must be recorded again after this."""
+        self.assembled.follow()
+        # A resumed run goes on with its choice.
+        is_new = not self._is_prepared and not self._counts.numpy().any()
+        most = STIFF_WITH_CONTACT if self.assembled.touches else STIFF
+        if is_new and self._dt * self.assembled.largest_frequency() > most:
+            self._is_assembled.zero_()
+            self._counts[int(choices.ASSEMBLED) : int(choices.ASSEMBLED) + 1].fill_(int(choices.DEAR))
+        self._is_prepared = True
+
+    def update(self) -> None:
+        """Launch the update after new linearisations."""
+        self._either(self.assembled.update, self._update_multigrid)
+
+    def take_contact(self, system: BlockSystem) -> None:
+        """Launch the exchange of the contacts of the system in the matrix for the present ones."""
+        self._either(lambda: self.assembled.take_contact(system.contacts, system.soft), system.take_springs)
+
+    def iterate(self, system: BlockSystem, x: wp.array) -> None:
+        """Launch the iterations of a solve of the system that has begun."""
+        self._either(lambda: self.assembled.iterate(system.solver, x), lambda: system.iterate(x))
+
+    def judge(self, system: BlockSystem, iterations: wp.array, status: wp.array) -> None:
+        """Launch the choice for the next step, after a step with these results, int32 [worlds]."""
+
+        def judge_set_ups() -> None:
+            system.judge_set_ups(iterations, status)
+
+        self._either(None, judge_set_ups)
+        if not self.is_open:
+            return
+        knows_more = system.soft is not None or (self.assembled.touches and self.device.is_cpu)
+        worth = NEVER if knows_more else WORTH
+        inputs = [iterations, status, int(self.assembled.touches), worth, self._cost, self.assembled.couplings]
+        wp.launch(choices.choose, 1, inputs, [self._counts, self._is_assembled], device=self.device)
+
+    def _update_multigrid(self) -> None:
+        blocks = self.assembled.blocks.of(self.diagonal)
+        for lagged, operator, own in zip(self._lagged, self._operators, blocks, strict=True):
+            lagged.update(operator)
+            if self.assembled.touches:
+                wp.copy(own, operator.diagonal_blocks())
+
+    def _either(self, assembled: Callable[[], None] | None, other: Callable[[], None]) -> None:
+        if self.is_open:
+            wp.capture_if(self._is_assembled, assembled, other)
+        else:
+            other()
+
+
+class LinearisedStep:
+    """Solves for the increments of all bodies of a system.
+
+    Without contact there is one linearisation, and its unknown is what increments change by. With contact they begin
+    with zero at free nodes, and the unknown of each linear problem is the whole motion d of the step: A d = r(d0) + A
+    d0 + contact, with the residual r and its derivative -A at the motion d0 so far. So contact has the same unknowns in
+    each of them. Where a scheme balances forces at a stage before the end of the step, increments are those of the
+    stage, a share of d. Contact is that of the end of the step, with its whole force in the balance.
+
+    Args:
+        system: The linear system.
+        newtons: Newton's method of each body, whose residuals are used.
+        tolerance: The iteration ends once no increment changes by more than this share of the largest displacement.
+        most: Maximum number of linearisations.
+
+    Attributes:
+        iterations, linear_iterations, status: Of the step, as in ``kernels.implicit.conjugate_gradients``, int32
+            [worlds].
+    """
+
+    def __init__(self, system: BlockSystem, newtons: list[Newton], *, tolerance: float | None, most: int):
+        self._system, self._newtons, self.device = system, newtons, system.device
+        self._tolerance, self._most = math.inf if tolerance is None else tolerance, 1 if tolerance is None else most
+        touches = system.soft is not None or any(each is not None for each in system.contacts)
+        self._contact = ContactSolve(system, newtons) if touches else None
+        self.iterations = wp.ones(system.worlds, dtype=wp.int32, device=self.device)
+        self.linear_iterations, self.status = system.solver.iterations, system.solver.status
+        if self._contact is not None:
+            self.linear_iterations = self._contact.iterations
+        repeats = self._most > 1
+        self._sizes = wp.zeros((system.worlds * repeats, kernels.COLUMNS), dtype=wp.float32, device=self.device)
+        if repeats:
+            self._product = wp.zeros_like(system.x)
+            self.iterations, self.linear_iterations, self.status = (
+                wp.zeros(system.worlds, dtype=wp.int32, device=self.device) for _ in range(3)
+            )
+            self._going = wp.zeros(1, dtype=wp.int32, device=self.device)
+
+    def launch(self, offset: int) -> None:
+        """Launch the increments and displacements of the ``offset``-th step, from a guess of the unknowns."""
+        self._linearise()
+        if self._contact is None:
+            self._system.solve(guessed=True)
+            self._take_increments()
+            return
+        self._contact.launch_begin(offset)
+        self._contact.launch()
+        self._take_increments()
+        if self._most > 1:
+            self.iterations.zero_()
+            self.linear_iterations.zero_()
+            self._judge()
+            wp.capture_while(self._going, self._go_on)
+        self._contact.launch_end()
+
+    def _linearise(self) -> None:
+        for newton in self._newtons:
+            newton.launch_residual()
+        for newton in self._newtons:
+            newton.linearise()
+        self._system.update()
+
+    def _go_on(self) -> None:
+        assert self._contact is not None
+        self._linearise()
+        system = self._system
+        for newton in self._newtons:
+            inputs = [newton.body.conditions.inverse_mass, newton.share, newton.increment]
+            self._launch(kernels.take_free, inputs, [newton.step])
+        system.apply_bodies(system.x, self._product)
+        self._launch(kernels.add_product, [self._product], [system.b])
+        self._contact.launch_again()
+        self._contact.launch()
+        self._take_increments()
+        self._judge()
+
+    def _take_increments(self) -> None:
+        self._sizes.zero_()
+        ranks = self._system.ranks
+        for newton in self._newtons:
+            body = newton.body
+            inputs = [int(self._contact is None), newton.operator.node_count, body.conditions.inverse_mass]
+            inputs += [newton.base, newton.share, newton.step]
+            self._launch(kernels.take_increments, inputs, [newton.increment, body.state.displacements, self._sizes])
+            ranks.exchange(newton.operator.number, body.state.displacements)
+
+    def _judge(self) -> None:
+        """Launch the decision whether another linearisation follows."""
+        assert self._contact is not None
+        self._system.ranks.max(self._sizes.flatten())
+        self._going.zero_()
+        inputs = [self._sizes, self._contact.iterations, self._system.solver.status, self._tolerance, self._most]
+        outputs = [self.iterations, self.linear_iterations, self.status, self._going]
+        wp.launch(kernels.judge_increments, len(self.status), inputs, outputs, device=self.device)
+
+    def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, len(outputs[0]), inputs, outputs, device=self.device)
 
 
 class ImplicitStepper(Stepper):

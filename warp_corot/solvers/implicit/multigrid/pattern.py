@@ -11,8 +11,8 @@ import warp as wp
 from warp_corot.discretization.groups import Members
 from warp_corot.discretization.plan import Batch
 from warp_corot.kernels.implicit.multigrid import pattern as kernels
-from warp_corot.kernels.implicit.multigrid import roots as roots_kernels
 from warp_corot.kernels.implicit.multigrid import shared
+from warp_corot.kernels.implicit.multigrid import subtrees as roots_kernels
 from warp_corot.kernels.meshing.growth import gather_flagged
 from warp_corot.kernels.plan.levels import flag_first
 
