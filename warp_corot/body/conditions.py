@@ -13,10 +13,9 @@ from warp_corot.discretization.sizes import Clock, same_array
 from warp_corot.kernels.stepping.conditions import LOAD_NODES, follow_activation, free_nodes, hold_nodes, release_nodes
 from warp_corot.kernels.stepping.integrate import follow_trajectory
 
-from .activation import Activation, followed_stress
-from .patch_arrays import PatchArrays
+from .arrays import PatchArrays
+from .keyframes import Activation, Followed, NodeKeyframes, followed_stress
 from .state import State
-from .trajectory import Followed, NodeKeyframes
 
 
 class Conditions:

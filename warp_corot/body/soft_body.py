@@ -26,13 +26,10 @@ from warp_corot.mesh.surfaces.bodies import boundary_surface
 from warp_corot.mesh.surfaces.bound import NOT_OPENED
 from warp_corot.mesh.surfaces.boundary import boundary_faces
 
+from .arrays import NodeArrays, SharedArrays, Views, World
 from .conditions import Conditions
 from .controls import Controls
-from .node_arrays import NodeArrays
-from .shared_arrays import SharedArrays
 from .state import State
-from .views import Views
-from .worlds import World
 
 if TYPE_CHECKING:
     from warp_corot.discretization.changing.transfer import FollowingBinding

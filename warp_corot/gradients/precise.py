@@ -10,9 +10,9 @@ import numpy.typing as npt
 
 from warp_corot.solvers.implicit.precise import PreciseElements, PreciseRest
 
+from .parameters import derivatives
 from .precise_contact import PreciseContact
-from .rest_state import RestState
-from .sums import derivatives
+from .static import RestState
 
 Array = npt.NDArray[np.float64]
 

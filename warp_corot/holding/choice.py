@@ -18,8 +18,7 @@ from warp_corot.mesh.surfaces.boundary import boundary_faces
 from .regions import BodyShape, SupportRegion, broad_sides, flat_region, lowest_part
 
 if TYPE_CHECKING:
-    from .sag import CoarseBody
-    from .sag_mesh import MeshBody
+    from .sag import CoarseBody, MeshBody
 
 #: A patch supports a body whose sag is at most this fraction of its height.
 LARGEST_SAG = 0.3
@@ -127,8 +126,7 @@ class _BodyPiece:
 
     @cached_property
     def body(self) -> CoarseBody | MeshBody:
-        from .sag import CoarseBody
-        from .sag_mesh import MOST_TETS, MeshBody
+        from .sag import MOST_TETS, CoarseBody, MeshBody
 
         kind = MeshBody if len(self.tets) <= MOST_TETS else CoarseBody
         return kind(self.shape.points, self.tets, self.volumes, self.young, self.density)

@@ -27,7 +27,7 @@ from warp_corot.solvers.guard import Guard
 from warp_corot.solvers.halo import ALONE, Halo
 from warp_corot.solvers.system import System
 
-from .clock import Clock
+from .energy import Clock
 from .parts import check_implicit
 
 #: No element of an isotropic material alone vibrates faster than the square root of this many times its modulus

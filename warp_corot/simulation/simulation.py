@@ -54,8 +54,7 @@ from warp_corot.solvers.stability import ANY_STEP, SafeStep
 from warp_corot.solvers.system import NEVER, Forces, System
 
 from .cutting import Cutting
-from .energy import Energy, WorldEnergies, find_energies
-from .hooks import Hooks
+from .energy import Energy, Solves, WorldEnergies, find_energies
 from .parts import (
     check_constraints,
     check_implicit,
@@ -67,8 +66,7 @@ from .parts import (
     checked_models,
     chosen_worlds,
 )
-from .running import Running
-from .solves import Solves
+from .running import Hooks, Running
 
 
 class Simulation(Cutting):

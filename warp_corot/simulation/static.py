@@ -22,9 +22,8 @@ from warp_corot.inputs.simulation_lock import under_lock
 from warp_corot.solvers.implicit.preconditioners import check_preconditioner
 from warp_corot.solvers.implicit.static import StaticSolver, nested_start, status_words
 
-from .loaded import LoadedBody
 from .parts import check_whole, checked_gravity, checked_models
-from .resting import checked_obstacles, rest_on
+from .resting import LoadedBody, checked_obstacles, rest_on
 
 #: Rounding of float32 displacements and forces hides what is smaller: Newton's method would stop without an answer.
 LEAST_TOLERANCE = 1e-6

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import warp as wp
 
-from warp_corot.body.trajectory import Followed
+from warp_corot.body.keyframes import Followed
 from warp_corot.elasticity.corotated.fields import CorotatedGeneralField, SubtreeField
 from warp_corot.elasticity.dilatation import law_of
 from warp_corot.kernels.math.rotation import quick_rotation

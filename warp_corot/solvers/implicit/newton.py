@@ -14,11 +14,12 @@ from warp_corot.kernels.implicit.increments import move_held
 from warp_corot.kernels.implicit.residual import FIND_RESIDUAL
 
 from .block_system import BlockSystem
-from .body_steps import TurnedState
 from .conjugate_gradients import WorldSums
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+
+    from .body_steps import TurnedState
 
 
 @dataclass(frozen=True)
