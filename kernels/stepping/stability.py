@@ -148,161 +148,46 @@ def find_strains(Elements: Any) -> wp.Kernel:
     return find_strains
 
 
-#: The largest number of partial sums, one for each thread, and the number of sums into which these are folded.
+#: The largest number of partial sums, one for each thread.
 PARTS = 16384
-FOLDED = 128
 
 
 @wp.kernel(enable_backward=False)
-def random_motion(seed: int, inverse_mass: wp.array[wp.float32], q: wp.array[wp.vec4]):
-    """Normally distributed numbers at nodes that are free to move."""
-    i = wp.tid()
-    state = wp.rand_init(seed, i)
-    a = wp.vec3(wp.randn(state), wp.randn(state), wp.randn(state))
-    if inverse_mass[i] == 0.0:
-        a = wp.vec3()
-    store_node(q, i, a)
-
-
-@wp.kernel(enable_backward=False)
-def largest_motions(inverse_mass: wp.array[wp.float32], q: wp.array[wp.vec4], largest: wp.array[wp.float64]):
-    """Largest component of M^-1/2 q among every ``len(largest)``-th node."""
+def find_sums(
+    # In
+    inverse_mass: wp.array[wp.float32],
+    a: wp.array[wp.vec4],
+    b: wp.array[wp.vec4],
+    # Out
+    parts: wp.array2d[wp.float64],
+):
+    """Find partial sums of a . b, and the largest components of M^-1/2 b, of every ``len(parts)``-th node."""
     part = wp.tid()
+    total = wp.float64(0.0)
     most = float(0.0)
     i = part
-    while i < q.shape[0]:
-        a = wp.sqrt(inverse_mass[i]) * load_node(q, i)
-        most = wp.max(most, wp.max(wp.abs(a[0]), wp.max(wp.abs(a[1]), wp.abs(a[2]))))
-        i += largest.shape[0]
-    largest[part] = wp.float64(most)
-
-
-@wp.kernel(enable_backward=False)
-def inner_products(a: wp.array[wp.vec4], b: wp.array[wp.vec4], sums: wp.array[wp.float64]):
-    """Partial sums of a . b."""
-    part = wp.tid()
-    total = wp.float64(0.0)
-    i = part
     while i < a.shape[0]:
-        x = load_node(a, i)
         y = load_node(b, i)
-        for axis in range(3):
-            # The product of two float32 numbers may exceed the range of float32.
-            total += wp.float64(x[axis]) * wp.float64(y[axis])
-        i += sums.shape[0]
-    sums[part] = total
+        # The product of two float32 numbers may exceed the range of float32.
+        total += wp.dot(wp.vec3d(load_node(a, i)), wp.vec3d(y))
+        most = wp.max(most, wp.sqrt(inverse_mass[i]) * wp.max(wp.abs(y)))
+        i += parts.shape[0]
+    parts[part, 0] = total
+    parts[part, 1] = wp.float64(most)
 
 
 @wp.kernel(enable_backward=False)
-def fold(parts: wp.array[wp.float64], sums: wp.array[wp.float64], largest: wp.array[wp.float64]):
-    """Sum, and largest value, of every ``FOLDED``-th part."""
-    k = wp.tid()
-    total = wp.float64(0.0)
-    most = wp.float64(0.0)
-    for i in range(k, parts.shape[0], FOLDED):
-        total += parts[i]
-        most = wp.max(most, parts[i])
-    sums[k] = total
-    largest[k] = most
-
-
-@wp.kernel(enable_backward=False)
-def take_scale(probe: float, largest: wp.array[wp.float64], scale: wp.array[wp.float32]):
-    """Find the factor that makes the largest motion ``probe`` [m]."""
-    most = wp.float64(0.0)
-    for k in range(FOLDED):
-        most = wp.max(most, largest[k])
-    scale[0] = 1.0
-    if most > wp.float64(0.0):
-        scale[0] = float(wp.float64(probe) / most)
-
-
-@wp.kernel(enable_backward=False)
-def take_sum(
-    sums: wp.array[wp.float64], root: int, step: wp.array[wp.int32], after: int, numbers: wp.array[wp.float64]
-):
-    """Write a sum, or its square root, to numbers[step + after]."""
-    total = wp.float64(0.0)
-    for k in range(FOLDED):
-        total += sums[k]
-    if root != 0:
-        total = wp.sqrt(total)
-    numbers[step[0] + after] = total
-
-
-@wp.kernel(enable_backward=False)
-def probe_motion(
-    scale: wp.array[wp.float32], inverse_mass: wp.array[wp.float32], q: wp.array[wp.vec4], u: wp.array[wp.vec4]
-):
+def probe_motion(scale: float, inverse_mass: wp.array[wp.float32], q: wp.array[wp.vec4], u: wp.array[wp.vec4]):
     """u = scale M^-1/2 q."""
     i = wp.tid()
-    store_node(u, i, (scale[0] * wp.sqrt(inverse_mass[i])) * load_node(q, i))
+    store_node(u, i, (scale * wp.sqrt(inverse_mass[i])) * load_node(q, i))
 
 
 @wp.kernel(enable_backward=False)
-def apply_stiffness(
-    # In
-    scale: wp.array[wp.float32],
-    off: wp.array[wp.float64],
-    step: wp.array[wp.int32],
-    inverse_mass: wp.array[wp.float32],
-    f: wp.array[wp.vec4],
-    before: wp.array[wp.vec4],
-    # Out
-    w: wp.array[wp.vec4],
-):
-    """w = M^-1/2 K M^-1/2 q - off[step] before, from the forces f = -scale K M^-1/2 q.
-
-    In step 0 ``before`` is not read.
-    """
+def apply_stiffness(scale: float, inverse_mass: wp.array[wp.float32], f: wp.array[wp.vec4], w: wp.array[wp.vec4]):
+    """w = M^-1/2 K M^-1/2 q, from the forces f = -scale K M^-1/2 q."""
     i = wp.tid()
-    a = (-wp.sqrt(inverse_mass[i]) / scale[0]) * load_node(f, i)
-    if step[0] > 0:
-        a -= float(off[step[0]]) * load_node(before, i)
-    store_node(w, i, a)
-
-
-@wp.kernel(enable_backward=False)
-def take_away(numbers: wp.array[wp.float64], step: wp.array[wp.int32], a: wp.array[wp.vec4], b: wp.array[wp.vec4]):
-    """b -= numbers[step] a."""
-    i = wp.tid()
-    store_node(b, i, load_node(b, i) - float(numbers[step[0]]) * load_node(a, i))
-
-
-@wp.func
-def divided(a: wp.vec3, length: wp.float64):
-    if length > wp.float64(0.0):
-        return float(wp.float64(1.0) / length) * a
-    return a
-
-
-@wp.kernel(enable_backward=False)
-def normalise(lengths: wp.array[wp.float64], q: wp.array[wp.vec4]):
-    """q /= lengths[0], if that is not zero."""
-    i = wp.tid()
-    store_node(q, i, divided(load_node(q, i), lengths[0]))
-
-
-@wp.kernel(enable_backward=False)
-def take_next(
-    # In
-    lengths: wp.array[wp.float64],
-    step: wp.array[wp.int32],
-    w: wp.array[wp.vec4],
-    # In and out
-    q: wp.array[wp.vec4],
-    # Out
-    before: wp.array[wp.vec4],
-):
-    """before = q and q = w / lengths[step + 1], where a length of zero does not divide."""
-    i = wp.tid()
-    store_node(before, i, load_node(q, i))
-    store_node(q, i, divided(load_node(w, i), lengths[step[0] + 1]))
-
-
-@wp.kernel(enable_backward=False)
-def count_step(step: wp.array[wp.int32]):
-    step[0] += 1
+    store_node(w, i, (-wp.sqrt(inverse_mass[i]) / scale) * load_node(f, i))
 
 
 @wp.kernel(enable_backward=False)

@@ -17,8 +17,6 @@ import warp as wp
 from warp_corot.inputs.simulation_lock import SIMULATION_LOCK
 from warp_corot.kernels.stepping.subnormals import flush_subnormals, restore_subnormals
 
-from .halo import Halo
-
 #: Flags of ``cuGraphInstantiateWithFlags``: free what a launch has allocated at the next one, as Warp's graphs do;
 #: kernels have the priorities with which they were recorded.
 AUTO_FREE_ON_LAUNCH, USE_NODE_PRIORITY = 1, 8
@@ -115,18 +113,3 @@ class Replays:
     def forget(self) -> None:
         """Forget all recordings, because arrays have changed."""
         self._graphs.clear()
-
-
-def repeat(launch: Callable[[], None], times: int, device: wp.Device, ranks: Halo) -> None:
-    """Launch the same work so many times, with the same arguments each time.
-
-    On the CPU Python takes longer to launch a small body's work than the work takes: the first launch compiles, and the
-    others are replays of a recording. CUDA works while Python launches. Exchanges between ranks are not recorded.
-    """
-    replays = Replays(device)
-    as_it_is = times < 3 or device.is_cuda or not ranks.is_alone
-    for _ in range(times):
-        if as_it_is:
-            launch()
-        else:
-            replays.launch(None, launch)

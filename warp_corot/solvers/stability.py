@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +16,6 @@ from warp_corot.kernels.stepping import pace as clock
 from warp_corot.kernels.stepping import stability as kernels
 from warp_corot.mesh.scattered import normal_numbers, padded
 
-from .graphs import repeat
 from .halo import ALONE, Halo
 from .pace import Pace
 
@@ -30,6 +29,8 @@ if TYPE_CHECKING:
 LANCZOS_STEPS = 30
 #: The best of the last steps is taken, of this many.
 LAST_STEPS = 8
+#: The iteration ends where the next motion is this share of the last one: then all eigenvalues are found.
+ENDED = 1e-6
 
 # Probing displacements as a share of the smallest element's size: small enough to be linear, large enough for float32.
 PROBE = 1e-3
@@ -81,119 +82,66 @@ def largest_eigenvalue(
         ranks, number: As for ``largest_frequency``.
         numbers: The numbers of the nodes in the whole body, which set the first motion; None: they are those here.
     """
-    free = int(ranks.sum(int((inverse_mass[:nodes].numpy() > 0).sum())))
+    is_free = inverse_mass[:nodes].numpy() > 0
+    free = int(ranks.sum(int(is_free.sum())))
     if not free:
         return 0.0
-    probe = PROBE * smallest_volume ** (1.0 / 3.0)
-    iteration = _Lanczos(forces, inverse_mass, probe, launch_nodes or nodes, ranks, number, numbers)
+    probe, count, device = PROBE * smallest_volume ** (1.0 / 3.0), launch_nodes or nodes, inverse_mass.device
+    motion = normal_numbers(np.arange(nodes) if numbers is None else numbers, 0)
+    q, before, after = (wp.zeros(count, dtype=wp.vec4, device=device) for _ in range(3))
+    q.assign(padded(np.where(is_free[:, None], motion, 0.0), count))
+    u, f, at_rest = (wp.zeros(len(inverse_mass), dtype=wp.vec4, device=device) for _ in range(3))
+    shape = (count if ranks.is_reproducible else min(count, kernels.PARTS), 2)
+    parts = wp.empty(shape, dtype=wp.float64, device=device)
+
+    def launch(kernel: wp.Kernel, *arguments: Any) -> None:
+        wp.launch(kernel, count, arguments, device=device)
+
+    def sums(a: wp.array, b: wp.array) -> tuple[float, float]:
+        """a . b and the largest component of M^-1/2 b; waits for the device."""
+        wp.launch(kernels.find_sums, len(parts), [inverse_mass, a, b], [parts], device=device)
+        found = parts.numpy()
+        total = ranks.sum(float(found[:, 0].sum()), found[:, 0] if ranks.is_reproducible else None)
+        return total, ranks.max(float(found[:, 1].max()))
+
+    square, largest = sums(q, q)
+    launch(kernels.scale_by, 1.0 / math.sqrt(square), q)
+    diagonal, off = [], [math.sqrt(square)]
     with forces.state_kept():
-        iteration.find_rest_forces()
-        iteration.launch(min(LANCZOS_STEPS, 3 * free))
-    return max(_largest_value(*iteration.coefficients()), 0.0)
+        # Active stress makes forces at rest, which are subtracted from those of displacements.
+        forces.add_forces(u, at_rest)
+        for step in range(min(LANCZOS_STEPS, 3 * free)):
+            scale = probe * off[-1] / largest if largest > 0.0 else 1.0
+            launch(kernels.probe_motion, scale, inverse_mass, q, u)
+            ranks.exchange(number, u)
+            f.zero_()
+            launch(kernels.add_scaled, -1.0, at_rest, f)
+            forces.add_forces(u, f)
+            launch(kernels.apply_stiffness, scale, inverse_mass, f, after)
+            if step > 0:
+                launch(kernels.add_scaled, -off[-1], before, after)
+            diagonal.append(sums(q, after)[0])
+            launch(kernels.add_scaled, -diagonal[-1], q, after)
+            square, largest = sums(after, after)
+            if not math.isfinite(square):
+                raise InputError("forces of small motions are not finite; moduli must be within the range of float32")
+            off.append(math.sqrt(square))
+            if off[-1] <= ENDED * max(map(abs, diagonal)):
+                break
+            launch(kernels.scale_by, 1.0 / off[-1], after)
+            q, before, after = after, q, before
+    return max(_largest_value(np.array(diagonal), np.array(off)), 0.0)
 
 
 def _largest_value(diagonal: npt.NDArray[np.float64], off: npt.NDArray[np.float64]) -> float:
     """The largest Ritz value plus its residual, the smallest of the last few steps: rounding produces copies of values
-    that were already found, with meaningless residuals.
-
-    Raises:
-        InputError: The forces are not finite.
-    """
+    that were already found, with meaningless residuals."""
     bounds = []
-    if not (np.isfinite(diagonal).all() and np.isfinite(off).all()):
-        raise InputError("forces of small motions are not finite; moduli must be within the range of float32")
     for size in range(max(len(diagonal) - LAST_STEPS, 0) + 1, len(diagonal) + 1):
         tridiagonal = np.diag(diagonal[:size]) + np.diag(off[1:size], 1) + np.diag(off[1:size], -1)
         values, vectors = np.linalg.eigh(tridiagonal)
         bounds.append(values[-1] + off[size] * abs(vectors[-1, -1]))
     return float(max(min(bounds), values[-1]))
-
-
-class _Lanczos:
-    """The iteration's vectors on the device, vec4, as long as launches: the present, the previous and the next one."""
-
-    def __init__(
-        self,
-        forces: SmallForces,
-        inverse_mass: wp.array,
-        probe: float,
-        count: int,
-        ranks: Halo,
-        number: int,
-        numbers: npt.NDArray[np.int64] | None,
-    ):
-        self._ranks, self._number = ranks, number
-        self.forces, self.inverse_mass, self.probe, self.count = forces, inverse_mass, probe, count
-        self.device = inverse_mass.device
-        self.q, self.before, self.next = (wp.empty(count, dtype=wp.vec4, device=self.device) for _ in range(3))
-        places = len(inverse_mass)
-        self.u, self.f, self._rest = (wp.zeros(places, dtype=wp.vec4, device=self.device) for _ in range(3))
-        parts = count if ranks.is_reproducible else min(count, kernels.PARTS)
-        self._parts, self._sums, self._largest, self._diagonal, self._off = (
-            wp.empty(size, dtype=wp.float64, device=self.device)
-            for size in (parts, kernels.FOLDED, kernels.FOLDED, LANCZOS_STEPS, LANCZOS_STEPS + 1)
-        )
-        self._scale = wp.empty(1, dtype=wp.float32, device=self.device)
-        self._step = wp.zeros(1, dtype=wp.int32, device=self.device)
-        self._steps = 0
-        self._launch(kernels.random_motion, [0, inverse_mass, self.q])
-        if numbers is not None:
-            motion = padded(normal_numbers(numbers, 0), count)
-            motion[inverse_mass.numpy()[:count] == 0.0] = 0.0
-            self.q.assign(motion)
-        self._sum(self.q, self.q, self._off, root=True)
-        self._launch(kernels.normalise, [self._off, self.q])
-
-    def find_rest_forces(self) -> None:
-        """Find the forces at rest, which active stress makes; they are subtracted from those of displacements."""
-        self.forces.add_forces(self.u, self._rest)
-        self._launch(kernels.scale_by, [-1.0, self._rest])
-
-    def launch(self, steps: int) -> None:
-        """Launch all steps of the iteration."""
-        repeat(self._launch_step, steps, self.device, self._ranks)
-        self._steps = steps
-
-    def _launch_step(self) -> None:
-        inverse_mass = self.inverse_mass
-        self._launch(kernels.largest_motions, [inverse_mass, self.q, self._parts], len(self._parts))
-        self._launch(kernels.fold, [self._parts, self._sums, self._largest], kernels.FOLDED)
-        self._ranks.max(self._largest)
-        self._launch(kernels.take_scale, [self.probe, self._largest, self._scale], 1)
-        self._launch(kernels.probe_motion, [self._scale, inverse_mass, self.q, self.u])
-        self._ranks.exchange(self._number, self.u)
-        wp.copy(self.f, self._rest, count=self.count)
-        self.forces.add_forces(self.u, self.f)
-        arguments = [self._scale, self._off, self._step, inverse_mass, self.f, self.before, self.next]
-        self._launch(kernels.apply_stiffness, arguments)
-        self._sum(self.q, self.next, self._diagonal)
-        self._launch(kernels.take_away, [self._diagonal, self._step, self.q, self.next])
-        self._sum(self.next, self.next, self._off, after=1, root=True)
-        self._launch(kernels.take_next, [self._off, self._step, self.next, self.q, self.before])
-        self._launch(kernels.count_step, [self._step], 1)
-
-    def coefficients(self) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """Diagonal and off-diagonal entries of the meaningful steps [1/s^2], with one more off-diagonal at either end.
-
-        Waits for the device.
-        """
-        diagonal, off = self._diagonal.numpy()[: self._steps], self._off.numpy()[: self._steps + 1]
-        ended = off[1:] <= 1e-6 * np.maximum.accumulate(np.abs(diagonal))
-        size = int(np.argmax(ended)) + 1 if ended.any() else self._steps
-        return diagonal[:size], off[: size + 1]
-
-    def _sum(self, a: wp.array, b: wp.array, numbers: wp.array, *, after: int = 0, root: bool = False) -> None:
-        """Launch the step's entry of ``numbers``: a . b, or its square root with ``root``."""
-        self._launch(kernels.inner_products, [a, b, self._parts], len(self._parts))
-        self._launch(kernels.fold, [self._parts, self._sums, self._largest], kernels.FOLDED)
-        if not (ranks := self._ranks).is_alone:
-            total = ranks.sum(float(self._sums.numpy().sum()), self._parts.numpy() if ranks.is_reproducible else None)
-            self._sums.assign(np.array([total] + [0.0] * (len(self._sums) - 1)))
-        self._launch(kernels.take_sum, [self._sums, int(root), self._step, after, numbers], 1)
-
-    def _launch(self, kernel: wp.Kernel, arguments: list, dim: int | None = None) -> None:
-        count = self.count if dim is None else dim
-        wp.launch(kernel, dim=count, inputs=arguments, device=self.device)
 
 
 #: Adds the forces of displacements, vec4, to the second array.
@@ -244,11 +192,9 @@ class Curvature:
         u, f = (wp.zeros_like(self.directions) for _ in range(2))
         add_forces(u, f)
 
-        def find_afresh() -> None:
+        for _ in range(REST_TURNS):
             self.found.zero_()
             self.find(add_forces, inverse_mass, u, f, count)
-
-        repeat(find_afresh, REST_TURNS, u.device, self._ranks)
         self._ranks.max(self.found)
         value = float(self.found.numpy()[0])
         self.found.zero_()
