@@ -7,7 +7,7 @@ from tangents import on_device
 
 import warp_corot as wc
 from warp_corot.solvers.implicit.multigrid import Multigrid
-from warp_corot.solvers.implicit.operator import TangentOperator
+from warp_corot.solvers.implicit.tangent import TangentOperator
 
 ROUNDING = float(np.finfo(np.float32).eps)
 MASS = 2.0e3  # a of A = a M + K [1/s^2]

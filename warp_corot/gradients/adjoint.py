@@ -12,8 +12,9 @@ from warp_corot.discretization.sizes import padded
 from warp_corot.elasticity import ForceField
 from warp_corot.errors import ConvergenceError
 from warp_corot.solvers.implicit.conjugate_gradients import ConjugateGradients
-from warp_corot.solvers.implicit.operator import LinearOperator, TangentOperator
+from warp_corot.solvers.implicit.operator import LinearOperator
 from warp_corot.solvers.implicit.preconditioners import preconditioner_of
+from warp_corot.solvers.implicit.tangent import TangentOperator
 
 from .touching import RestingContact, RestingOperator, RestingPreconditioner
 

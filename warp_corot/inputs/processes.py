@@ -6,8 +6,6 @@ import os
 import sys
 import tempfile
 
-import warp as wp
-
 #: Variables with the number of processes and of this one: of Open MPI, of MPICH and Intel MPI, and of PMIx.
 _NAMES = (("OMPI_COMM_WORLD_SIZE", "OMPI_COMM_WORLD_RANK"), ("PMI_SIZE", "PMI_RANK"), ("PMIX_SIZE", "PMIX_RANK"))
 
@@ -33,6 +31,8 @@ def start_warp() -> None:
     Raises:
         OSError: Warp cannot make the folder of its kernel cache.
     """
+    import warp as wp
+
     sys.stderr.flush()
     with tempfile.TemporaryFile() as said:
         kept = os.dup(2)

@@ -10,6 +10,16 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 
+@wp.struct
+class EntrySums:
+    """The contributions to the entries of a matrix; the host's ``Pattern`` explains the arrays."""
+
+    upper: wp.array[wp.vec2i]
+    starts: wp.array[wp.int32]
+    codes: wp.array[wp.int32]
+    places: wp.array[wp.vec2i]
+
+
 @wp.func
 def key_of(i: int, j: int, bits: int):
     return (wp.int64(i) << wp.int64(bits)) | wp.int64(j)

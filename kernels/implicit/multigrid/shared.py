@@ -17,6 +17,7 @@ from warp_corot.kernels.elements.forces import in_local_frame, own_gradient
 from warp_corot.kernels.elements.mean_dilatation_rows import GroupNodes, first_entry
 from warp_corot.kernels.modules import Family
 
+from .cycle import LevelArrays
 from .pattern import key_of
 
 wp.set_module_options({"enable_backward": False})
@@ -193,25 +194,15 @@ def add_held_blocks(of: Dilatation) -> wp.Kernel:
 
 
 @wp.kernel(enable_backward=False)
-def bound_diagonal(
-    # In
-    count: int,
-    entries: int,
-    starts: wp.array[wp.int32],
-    columns: wp.array[wp.int32],
-    blocks: wp.array[wp.mat33],
-    given: wp.array[wp.mat33],
-    # Out
-    inverses: wp.array[wp.mat33],
-):
+def bound_diagonal(level: LevelArrays, given: wp.array[wp.mat33]):
     """Find the inverses of diagonal blocks, and divide each by a quarter of its row's sum of |D^-1/2 A D^-1/2| if that
     is more than one. Then A is at most 4 D, because 4 D - A is diagonally dominant.
     """
     world, i = wp.tid()
-    first = world * count
+    first = world * level.count
     own = given[first + i]
     sum = float(0.0)
-    for p in range(starts[i], starts[i + 1]):
-        block = wp.transpose(blocks[world * entries + p])
-        sum += wp.sqrt(wp.max(wp.ddot(own * block, block * given[first + columns[p]]), 0.0))
-    inverses[first + i] = own / wp.max(0.25 * sum, 1.0)
+    for p in range(level.rows.starts[i], level.rows.starts[i + 1]):
+        block = wp.transpose(level.rows.blocks[world * level.entries + p])
+        sum += wp.sqrt(wp.max(wp.ddot(own * block, block * given[first + level.rows.columns[p]]), 0.0))
+    level.inverses[first + i] = own / wp.max(0.25 * sum, 1.0)

@@ -30,7 +30,8 @@ from warp_corot.kernels.subtrees.memory import memory_of
 from warp_corot.kernels.tables.shapes import VOLUME, fingerprint
 from warp_corot.kernels.tables.subtree import HANDEDNESS, LEAVES, POSITIONS
 
-from .pattern import key_of
+from .cycle import LevelArrays
+from .pattern import EntrySums, key_of
 from .shared import kept_share
 from .values import inverse_block, semidefinite
 
@@ -501,37 +502,30 @@ def find_middles(
 @wp.kernel(enable_backward=False)
 def gather_roots(
     # In
-    ranks: int,
-    count: int,
-    entries: int,
+    level: LevelArrays,
+    sums: EntrySums,
     roots: int,
     stiffening: float,
     scales: wp.array[float],
-    free: wp.array[wp.uint8],
     own: OwnBlocks,
     midpoint_starts: wp.array[wp.int32],
     midpoints: wp.array[wp.int32],
     middles: wp.array[wp.int32],
-    upper: wp.array[wp.vec2i],
-    starts: wp.array[wp.int32],
-    codes: wp.array[wp.int32],
-    places: wp.array[wp.vec2i],
     root_blocks: wp.array[wp.mat33],
     # Out
-    blocks: wp.array[wp.mat33],
     inverses: wp.array[wp.mat33],
 ):
     """Find P^T A P of the level of roots and the inverses of its diagonal blocks. What nodes add, they add to the ends
     of their edge.
     """
     world, u = wp.tid()
-    i = upper[u][0]
-    j = upper[u][1]
-    first = world * ranks
+    i = sums.upper[u][0]
+    j = sums.upper[u][1]
+    first = world * level.ranks
     total = wp.mat33()
-    if free[first + i] != wp.uint8(0) and free[first + j] != wp.uint8(0):
-        for at in range(starts[u], starts[u + 1]):
-            code = codes[at]
+    if level.free[first + i] != wp.uint8(0) and level.free[first + j] != wp.uint8(0):
+        for at in range(sums.starts[u], sums.starts[u + 1]):
+            code = sums.codes[at]
             if code >= 0:
                 block = root_blocks[wp.static(ROOT_BLOCKS) * (world * roots + code / 32) + (code & 31) / 2]
                 if (code & 1) != 0:
@@ -544,11 +538,11 @@ def gather_roots(
                 total += 0.25 * own_block(own, first + midpoints[k])
         elif middles[u] >= 0:
             total += 0.25 * own_block(own, first + middles[u])
-    where = places[u]
-    at = world * entries
+    where = sums.places[u]
+    at = world * level.entries
     if i == j:
         total = 0.5 * (total + wp.transpose(total))
-        inverses[world * count + i] = inverse_block(total)
+        inverses[world * level.count + i] = inverse_block(total)
     else:
-        blocks[at + where[1]] = total
-    blocks[at + where[0]] = wp.transpose(total)
+        level.rows.blocks[at + where[1]] = total
+    level.rows.blocks[at + where[0]] = wp.transpose(total)

@@ -26,7 +26,8 @@ from warp_corot.kernels.elements.simd8 import constants, on_cpu
 from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.kernels.modules import unique_kernel
 
-from .cycle import sum_over_lanes
+from .cycle import LevelArrays, sum_over_lanes
+from .pattern import EntrySums
 from .shared import row_at
 
 wp.set_module_options({"enable_backward": False})
@@ -100,10 +101,7 @@ class Leaves:
     mu: wp.array[float]
     lam: wp.array[float]
     stride: int
-    upper: wp.array[wp.vec2i]
-    starts: wp.array[wp.int32]
-    codes: wp.array[wp.int32]
-    places: wp.array[wp.vec2i]
+    sums: EntrySums
     entries: int
     ranks: int
     row_entries: int
@@ -127,19 +125,19 @@ def gather_leaves(
     """
     world, u = wp.tid()
     scale = scales[2] + scales[1] * stiffening
-    if leaves.upper[u][0] == leaves.upper[u][1]:
+    if leaves.sums.upper[u][0] == leaves.sums.upper[u][1]:
         if more.shape[0] > 1:
             weighted = wp.mat33()
-            for at in range(leaves.starts[u], leaves.starts[u + 1]):
-                if leaves.codes[at] < -1:
-                    place = world * leaves.row_entries + leaves.pairs[-2 - leaves.codes[at]][0]
+            for at in range(leaves.sums.starts[u], leaves.sums.starts[u + 1]):
+                if leaves.sums.codes[at] < -1:
+                    place = world * leaves.row_entries + leaves.pairs[-2 - leaves.sums.codes[at]][0]
                     weighted += wp.outer(leaves.rows[place][3] * row_at(leaves.rows, place), row_at(leaves.rows, place))
-            more[world * leaves.ranks + leaves.upper[u][0]] = scale * weighted
+            more[world * leaves.ranks + leaves.sums.upper[u][0]] = scale * weighted
         return
     first = world * leaves.world_elements
     total = wp.mat33()
-    for at in range(leaves.starts[u], leaves.starts[u + 1]):
-        code = leaves.codes[at]
+    for at in range(leaves.sums.starts[u], leaves.sums.starts[u + 1]):
+        code = leaves.sums.codes[at]
         if code < 0:
             pair = leaves.pairs[-2 - code]
             first_row = world * leaves.row_entries
@@ -157,7 +155,7 @@ def gather_leaves(
         total[1, 1] += d
         total[2, 2] += d
     total = scale * total
-    where = leaves.places[u]
+    where = leaves.sums.places[u]
     blocks[world * leaves.entries + where[0]] = wp.transpose(total)
     blocks[world * leaves.entries + where[1]] = total
 
@@ -253,18 +251,10 @@ def matrix_over_lanes(part: wp.mat33, lanes: int):
 def gather_products(
     # In
     lanes: int,
-    ranks: int,
-    level_nodes: int,
-    entries: int,
-    fine_entries: int,
-    free: wp.array[wp.uint8],
-    upper: wp.array[wp.vec2i],
-    starts: wp.array[wp.int32],
-    codes: wp.array[wp.int32],
-    places: wp.array[wp.vec2i],
-    fine_blocks: wp.array[wp.mat33],
+    level: LevelArrays,
+    sums: EntrySums,
+    fine: LevelArrays,
     # Out
-    blocks: wp.array[wp.mat33],
     inverses: wp.array[wp.mat33],
 ):
     """Find P^T A P of a coarser level and the inverses of its diagonal blocks.
@@ -274,33 +264,33 @@ def gather_products(
     """
     world, thread = wp.tid()
     u, lane = thread // lanes, thread % lanes
-    i = upper[u][0]
-    j = upper[u][1]
+    i = sums.upper[u][0]
+    j = sums.upper[u][1]
     total = wp.mat33()
-    if free[world * ranks + i] != wp.uint8(0) and free[world * ranks + j] != wp.uint8(0):
+    if level.free[world * level.ranks + i] != wp.uint8(0) and level.free[world * level.ranks + j] != wp.uint8(0):
         weights = wp.vec3(1.0, 0.5, 0.25)
-        for at in range(starts[u] + lane, starts[u + 1], lanes):
-            code = codes[at]
-            total += weights[code & 3] * fine_blocks[world * fine_entries + (code >> 2)]
+        for at in range(sums.starts[u] + lane, sums.starts[u + 1], lanes):
+            code = sums.codes[at]
+            total += weights[code & 3] * fine.rows.blocks[world * fine.entries + (code >> 2)]
     total = matrix_over_lanes(total, lanes)
     if lane > 0:
         return
-    where = places[u]
-    first = world * entries
+    where = sums.places[u]
+    first = world * level.entries
     if i == j:
         total = 0.5 * (total + wp.transpose(total))
-        inverses[world * level_nodes + i] = inverse_block(total)
+        inverses[world * level.count + i] = inverse_block(total)
     else:
-        blocks[first + where[1]] = wp.transpose(total)
-    blocks[first + where[0]] = total
+        level.rows.blocks[first + where[1]] = wp.transpose(total)
+    level.rows.blocks[first + where[0]] = total
 
 
 @wp.func_native(
     on_cpu(
         constants(LEVELS=int(LEVEL_MASK)),
         """
-    const auto &upper = leaves.upper, &places = leaves.places, &pairs = leaves.pairs;
-    const auto &starts = leaves.starts, &codes = leaves.codes;
+    const auto &upper = leaves.sums.upper, &places = leaves.sums.places, &pairs = leaves.pairs;
+    const auto &starts = leaves.sums.starts, &codes = leaves.sums.codes;
     const auto &mu = leaves.mu, &lam = leaves.lam;
     const int stride = leaves.stride;
     const float scale = scales.data[2] + scales.data[1] * stiffening;

@@ -17,9 +17,9 @@ from warp_corot.kernels.implicit.lagged import COUNTS
 from warp_corot.solvers.implicit import assembled
 from warp_corot.solvers.implicit.assembled import AssembledSolve, suits
 from warp_corot.solvers.implicit.block_system import VectorBlocks
+from warp_corot.solvers.implicit.chosen import WORTH
 from warp_corot.solvers.implicit.conjugate_gradients import ConjugateGradients
-from warp_corot.solvers.implicit.operator import TangentOperator
-from warp_corot.solvers.implicit.stepper import WORTH
+from warp_corot.solvers.implicit.tangent import TangentOperator
 
 FORESTS = {"uniform": uniform, "mixed": lambda: mixed_forest(level=5), "ball": ball_mesh}
 #: Displacements over edges; with those of 1.5 more than a third of the elements are turned over.

@@ -13,8 +13,8 @@ from tree_levels import TreeLevels
 import warp_corot as wc
 from warp_corot.solvers.implicit.conjugate_gradients import ConjugateGradients
 from warp_corot.solvers.implicit.multigrid import Multigrid
-from warp_corot.solvers.implicit.operator import TangentOperator
 from warp_corot.solvers.implicit.preconditioners import BlockDiagonal, preconditioner_of
+from warp_corot.solvers.implicit.tangent import TangentOperator
 
 
 @functools.cache

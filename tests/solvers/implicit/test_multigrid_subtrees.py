@@ -9,8 +9,8 @@ from tangents import on_device
 import warp_corot as wc
 from warp_corot.solvers.implicit.multigrid import Multigrid
 from warp_corot.solvers.implicit.multigrid.subtrees import RootLevel, SubtreeLevel
-from warp_corot.solvers.implicit.operator import TangentOperator
 from warp_corot.solvers.implicit.preconditioners import preconditioner_of
+from warp_corot.solvers.implicit.tangent import TangentOperator
 
 WORLDS = 2
 MASS, DAMPING, STIFFENING = 2.0e3, 20.0, 0.02  # a [1/s^2] and b [1/s] of A = a M + b D + K, D as stiff as 0.02 s of K

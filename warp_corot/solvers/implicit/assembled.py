@@ -23,7 +23,7 @@ from warp_corot.materials.directional import Directional
 from .dissection import dissected
 from .multigrid.level import LeafMatrix
 from .multigrid.pattern import Pattern, PatternFinder
-from .operator import TangentOperator
+from .tangent import TangentOperator
 
 if TYPE_CHECKING:
     from .block_system import VectorBlocks

@@ -14,9 +14,9 @@ from .conjugate_gradients import ConjugateGradients
 from .operator import Preconditioner
 
 if TYPE_CHECKING:
+    from .chosen import ChosenSolve
     from .contact_constraints import ObstacleContact, SoftContact
-    from .operator import TangentOperator
-    from .stepper import ChosenSolve
+    from .tangent import TangentOperator
 
 
 class VectorBlocks:

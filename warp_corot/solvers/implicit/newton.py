@@ -15,11 +15,10 @@ from warp_corot.kernels.implicit.residual import FIND_RESIDUAL
 
 from .block_system import BlockSystem
 from .conjugate_gradients import WorldSums
+from .turning import TurnedState
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
-
-    from .body_steps import TurnedState
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The linear system of implicit steps and static answers: its interface for iterative solvers, and a body's tangent.
+"""The interface of a linear system for iterative solvers and preconditioners.
 
 Vectors over nodes are ``wp.vec4`` arrays like those of ``body.state.State``: [worlds * nodes], world after world, the
 fourth lane zero. Vectors that A and preconditioners are applied to are zero at nodes that are not free. All methods
@@ -7,19 +7,14 @@ that take vectors launch kernels and do not wait for the device, so that a solve
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import warp as wp
 
-from warp_corot.elasticity import ForceField
-from warp_corot.kernels.implicit.tangent import finish_blocks, finish_rows
-from warp_corot.solvers.halo import ALONE, Halo
-
 if TYPE_CHECKING:
-    from warp_corot.body.soft_body import SoftBody
-    from warp_corot.elasticity.added_stress import Viscosity
+    pass
 
 
 class Product(Protocol):
@@ -110,113 +105,3 @@ class Springs:
     weights: wp.array
     stiffness: wp.array
     update: Callable[[], None]
-
-
-class TangentOperator:
-    """A = a M + b D + c K of a body, a ``LinearOperator``.
-
-    Args:
-        body: The body.
-        field: Its elastic forces.
-        viscosity: Its viscous forces, D, or None.
-        stiff_forces: Other forces that have a stiffness: ``add_stiffness(body, p, y)`` and
-            ``add_diagonal(body, blocks)``, as ``ForceField`` but at the body's present state. Those that couple no two
-            nodes have a true ``is_diagonal``.
-        exact: Whether K is the exact derivative, which may be indefinite, if the law has two.
-        ranks: The ranks with other nodes of the body.
-        number: The number of the body.
-
-    Attributes:
-        tangent: The elastic K.
-        frame: Displacements whose rotations turn viscous forces [m], vec4; None: those of the linearisation.
-    """
-
-    def __init__(
-        self,
-        body: SoftBody,
-        field: ForceField,
-        *,
-        viscosity: Viscosity | None = None,
-        stiff_forces: Sequence[Any] = (),
-        exact: bool = False,
-        ranks: Halo = ALONE,
-        number: int = 0,
-    ):
-        self.body, self.field, self.viscosity = body, field, viscosity
-        self.ranks, self.number = ranks, number
-        self.stiff_forces = tuple(stiff_forces)
-        self.device, self.worlds = body.device, body.worlds
-        self.tangent = field.tangent(exact=exact)
-        self.frame: wp.array | None = None
-        self.scales = wp.array([0.0, 0.0, 1.0], dtype=wp.float32, device=self.device)
-        self._none = wp.zeros(1, dtype=wp.vec4, device=self.device)
-        self._no_blocks = wp.zeros(1, dtype=wp.mat33, device=self.device)
-        self._blocks = wp.zeros(0, dtype=wp.mat33, device=self.device)
-        self.prepare()
-
-    def prepare(self) -> None:
-        """Make room for the body's present nodes; not while launches are recorded."""
-        u = self.body.state.displacements
-        self.tangent.prepare(u)
-        if len(self._blocks) != len(u):
-            self._damped = self._none if self.viscosity is None else wp.zeros_like(u)
-            self._blocks = wp.zeros(len(u), dtype=wp.mat33, device=self.device)
-
-    @property
-    def node_count(self) -> int:
-        return self.body.sizes.launch_nodes // self.worlds
-
-    @property
-    def inverse_mass(self) -> wp.array:
-        return self.body.conditions.inverse_mass
-
-    @property
-    def displacements(self) -> wp.array:
-        return self.tangent.displacements
-
-    @property
-    def revision(self) -> int:
-        return self.body.launch_revision
-
-    def set_scales(self, mass: float, damping: float, stiffness: float) -> None:
-        """Set a [1/s^2], b [1/s] and c; not while launches are recorded."""
-        self.scales.assign([mass, damping, stiffness])
-
-    def take(self, u: wp.array) -> None:
-        """Launch the linearisation at displacements u [m], vec4 [worlds * nodes]."""
-        self.tangent.take(u)
-
-    def apply(self, x: wp.array, y: wp.array) -> None:
-        y.zero_()
-        everywhere = self.ranks.exchange(self.number, x, copies=True)
-        self.tangent.add_product(everywhere, y)
-        for forces in self.stiff_forces:
-            forces.add_stiffness(self.body, x, y)
-        if self.viscosity is not None:
-            self._damped.zero_()
-            frame = self.displacements if self.frame is None else self.frame
-            self.viscosity.scatter(frame, everywhere, self._damped)
-        conditions = self.body.conditions
-        inputs = [self.scales, conditions.mass, conditions.inverse_mass, x, self._damped]
-        self._launch(finish_rows, inputs, [y])
-
-    def diagonal_blocks(self) -> wp.array:
-        blocks, conditions = self._blocks, self.body.conditions
-        blocks.zero_()
-        self.tangent.add_diagonal(blocks)
-        for forces in self.stiff_forces:
-            forces.add_diagonal(self.body, blocks)
-        stiffening = 0.0 if self.viscosity is None else self.viscosity.seconds
-        self._launch(finish_blocks, [self.scales, conditions.mass, conditions.inverse_mass, stiffening], [blocks])
-        return blocks
-
-    def other_blocks(self) -> wp.array:
-        if not self.stiff_forces:
-            return self._no_blocks
-        self._blocks.zero_()
-        for forces in self.stiff_forces:
-            forces.add_diagonal(self.body, self._blocks)
-        return self._blocks
-
-    def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
-        wp.launch(kernel, self.body.sizes.launch_nodes, inputs, outputs, device=self.device)

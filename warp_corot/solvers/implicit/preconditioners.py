@@ -15,7 +15,8 @@ from warp_corot.kernels.implicit.tangent import apply_blocks, invert_blocks
 from warp_corot.solvers.halo import ALONE, Halo
 
 from .multigrid import Multigrid
-from .operator import LinearOperator, Preconditioner, Springs, TangentOperator
+from .operator import LinearOperator, Preconditioner, Springs
+from .tangent import TangentOperator
 
 
 class BlockDiagonal:

@@ -29,8 +29,8 @@ from warp_corot.mesh.coarser import Coarser, coarser
 
 from .block_system import BlockSystem
 from .newton import Newton, NewtonReport
-from .operator import TangentOperator
 from .preconditioners import preconditioner_of
+from .tangent import TangentOperator
 
 #: Lambda over mu of the first body; those that follow have more by this factor.
 FIRST, FACTOR = 4.0, 10.0

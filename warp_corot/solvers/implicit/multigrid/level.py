@@ -61,6 +61,7 @@ class SmoothedLevel:
         inverses: Inverses of the diagonal blocks, mat33 [worlds * n].
         r, z, other: Residual, correction, and a vector to work with, vec4 [worlds * n].
         factors: The factors of the smoother's steps; none: the level only passes its residual on.
+        arrays: The arguments of kernels.
     """
 
     def __init__(self, count: int, worlds: int, ranks: int, free: wp.array, degree: int):
@@ -68,6 +69,9 @@ class SmoothedLevel:
         self.inverses = wp.zeros(worlds * count, dtype=wp.mat33, device=self.device)
         self.r, self.z, self.other = (wp.zeros(worlds * count, dtype=wp.vec4, device=self.device) for _ in range(3))
         self.factors = smoothing_factors(degree)
+        self.arrays = cycle.LevelArrays()
+        self.arrays.count, self.arrays.ranks, self.arrays.free = count, ranks, free
+        self.arrays.inverses, self.arrays.r = self.inverses, self.r
 
     def take_in(self, mesh_nodes: int, nodes: wp.array, given: wp.array) -> None:
         """Launch the finest level's residual, and the smoother's first step.
@@ -77,13 +81,11 @@ class SmoothedLevel:
             nodes: The node number of each rank, int32.
             given: The residual by number, vec4.
         """
-        inputs = [self.count, mesh_nodes, self._first_factor, nodes, self.free, self.inverses, given]
-        self._move(cycle.take_in, self.count, inputs, [self.r, self.z])
+        self._move(cycle.take_in, [mesh_nodes, self._first_factor, nodes, given], self.z)
 
     def hand_out(self, mesh_nodes: int, nodes: wp.array, given: wp.array, result: wp.array) -> None:
         """Launch the finest level's correction by number; held nodes have what is given."""
-        inputs = [self.count, mesh_nodes, nodes, self.free, given, self.z]
-        self._move(cycle.hand_out, self.count, inputs, [result])
+        self._move(cycle.hand_out, [mesh_nodes, nodes, given, self.z], result)
 
     def smooth_before(self) -> None:
         """Smooth from zero; ``z`` already has the first step."""
@@ -111,24 +113,22 @@ class SmoothedLevel:
         if fine.factors:
             fine.find_residual()
         residual = fine.other if fine.factors else fine.r
-        inputs: list[Any] = [self.ranks, self.count, fine.count, self._first_factor, self.free]
-        inputs += [midpoints.starts, midpoints.midpoints, self.inverses, residual]
-        self._move(cycle.restrict_residual, self.count, inputs, [self.r, self.z])
+        inputs = [fine.count, self._first_factor, midpoints.starts, midpoints.midpoints, residual]
+        self._move(cycle.restrict_residual, inputs, self.z)
 
     def take_correction(self, coarse: SmoothedLevel, ends: wp.array) -> None:
         """Add the correction of the coarser level to this one's."""
-        inputs = [self.ranks, coarse.count, self.count, self.free, ends, coarse.z]
-        self._move(cycle.prolongate_correction, self.count, inputs, [self.z])
+        self._move(cycle.prolongate_correction, [coarse.count, ends, coarse.z], self.z)
 
     @property
     def _first_factor(self) -> float:
         """The factor of the smoother's first step from zero; zero: none is made."""
         return self.factors[0][0] if self.factors else 0.0
 
-    def _move(self, kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any]) -> None:
-        """Launch a kernel whose threads share ``count`` nodes of each world; on a CPU there is one."""
-        threads = 1 if self.device.is_cpu else count
-        self.launch(kernel, threads, [threads, *inputs], outputs)
+    def _move(self, kernel: wp.Kernel, inputs: list[Any], output: wp.array) -> None:
+        """Launch a kernel whose threads share the nodes of each world; on a CPU there is one."""
+        threads = 1 if self.device.is_cpu else self.count
+        self.launch(kernel, threads, [threads, self.arrays, *inputs], [output])
 
     def launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any]) -> None:
         """Launch a kernel with ``count`` threads for each world."""
@@ -146,7 +146,6 @@ class Level(SmoothedLevel):
 
     Attributes:
         blocks: Values of the entries, transposed, mat33 [worlds * entries + 1].
-        lanes: Number of threads that share a row.
     """
 
     def __init__(
@@ -159,45 +158,40 @@ class Level(SmoothedLevel):
         is_bounded: bool = False,
     ):
         super().__init__(pattern.count, worlds, ranks, free, degree)
-        self.pattern = pattern
+        self.pattern, arrays = pattern, self.arrays
         # One more, since products read past the last.
         self.blocks = wp.zeros(worlds * pattern.entries + 1, dtype=wp.mat33, device=self.device)
-        self.rows = cycle.Rows()
-        self.rows.starts, self.rows.columns, self.rows.blocks = pattern.starts, pattern.columns, self.blocks
-        self._unbounded = wp.zeros_like(self.inverses) if is_bounded else None
         rows = worlds * self.count
-        self.lanes = next((lanes for most, lanes in LANES if rows > most), MOST_LANES)
+        lanes = next((lanes for most, lanes in LANES if rows > most), MOST_LANES)
+        arrays.entries, arrays.lanes, arrays.diagonal = pattern.entries, lanes, pattern.diagonal
         if self.device.is_cpu:
-            self.lanes = 1
+            arrays.lanes = 1
+        arrays.rows.starts, arrays.rows.columns, arrays.rows.blocks = pattern.starts, pattern.columns, self.blocks
+        self._unbounded = wp.zeros_like(self.inverses) if is_bounded else None
 
     def find_residual(self) -> None:
-        inputs = [self.lanes, self.count, self.pattern.entries, self.rows, self.r, self.z]
-        self.launch(cycle.find_residual, self.count * self.lanes, inputs, [self.other])
+        self.launch_rows(cycle.find_residual, [self.z], [self.other])
 
     def _make_step(self, step: int, *, is_first: bool) -> None:
         alpha, beta = self.factors[step]
-        inputs: list[Any] = [self.lanes, self.count, self.pattern.entries]
-        inputs += [alpha, beta if step else 0.0, is_first, self.rows, self.inverses, self.r, self.z]
-        self.launch(cycle.smooth, self.count * self.lanes, inputs, [self.other])
+        self.launch_rows(cycle.smooth, [alpha, beta if step else 0.0, is_first, self.z], [self.other])
         self.z, self.other = self.other, self.z
+
+    def launch_rows(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:
+        """Launch a kernel with the threads of each row."""
+        self.launch(kernel, self.count * self.arrays.lanes, [self.arrays, *inputs], outputs)
 
     def gather_from(self, fine: SmoothedLevel) -> None:
         """Compute the matrix P^T A P from the finer level's matrix A."""
-        assert isinstance(fine, Level)
-        pattern = self.pattern
         lanes = 1 if self.device.is_cpu else GATHERING_LANES
-        inputs = [lanes, self.ranks, self.count, pattern.entries, fine.pattern.entries, self.free, pattern.upper]
-        inputs += [pattern.sum_starts, pattern.codes, pattern.places, fine.blocks]
-        self.gather(values.gather_products, inputs, lanes)
+        self.gather(values.gather_products, [lanes, self.arrays, self.pattern.sums, fine.arrays], lanes)
 
     def gather(self, kernel: wp.Kernel, inputs: list[Any], lanes: int = 1) -> None:
         """Launch a kernel that computes blocks and inverses, with some threads for each entry of the upper triangle."""
-        pattern = self.pattern
         inverses = self.inverses if self._unbounded is None else self._unbounded
-        self.launch(kernel, lanes * len(pattern.upper), inputs, [self.blocks, inverses])
+        self.launch(kernel, lanes * len(self.pattern.sums.upper), inputs, [inverses])
         if self._unbounded is not None:
-            inputs = [self.count, pattern.entries, pattern.starts, pattern.columns, self.blocks, inverses]
-            self.launch(shared.bound_diagonal, self.count, inputs, [self.inverses])
+            self.launch(shared.bound_diagonal, self.count, [self.arrays, inverses], [])
 
 
 class SweptLevel(Level):
@@ -211,37 +205,27 @@ class SweptLevel(Level):
 
     def __init__(self, pattern: Pattern, worlds: int, ranks: int, free: wp.array, sweeps: int):
         super().__init__(pattern, worlds, ranks, free, degree=1)
-        self._sweeps = sweeps
+        self._is_one = sweeps == 1
+        self._ways = [cycle.BACKWARD] if self._is_one else [cycle.FORWARD, cycle.BACKWARD] * sweeps
 
     def smooth_before(self) -> None:
-        inputs = [*self._sizes, self.rows, self.pattern.diagonal, self.inverses, self.r]
-        self._launch_worlds(cycle.sweep_from_zero, inputs, [self.z, self.other])
-        for number in range(1, 2 * self._sweeps if self._sweeps > 1 else 1):
-            self._sweep(backward=number % 2 == 1)
+        self._sweep(cycle.FROM_ZERO, *([] if self._is_one else self._ways[1:]))
 
     def smooth_after(self) -> None:
-        for number in range(2 * self._sweeps if self._sweeps > 1 else 1):
-            self._sweep(backward=self._sweeps == 1 or number % 2 == 1)
+        self._sweep(*self._ways)
 
     def find_residual(self) -> None:
-        inputs = [*self._sizes, self._sweeps == 1, self.rows, self.pattern.diagonal, self.r, self.z, self.inverses]
-        self._launch_worlds(cycle.find_rest, inputs, [self.other])
+        self._sweep(cycle.RESIDUAL_LEFT if self._is_one else cycle.RESIDUAL)
 
     @property
     def _first_factor(self) -> float:
         """Zero: sweeps begin by themselves."""
         return 0.0
 
-    def _sweep(self, *, backward: bool) -> None:
-        inputs = [*self._sizes, backward, self.rows, self.inverses, self.r]
-        self._launch_worlds(cycle.sweep, inputs, [self.z])
-
-    @property
-    def _sizes(self) -> list[Any]:
-        return [self.count, self.pattern.entries]
-
-    def _launch_worlds(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:
-        wp.launch(kernel, self.worlds, inputs, outputs, device=self.device)
+    def _sweep(self, *kinds: int) -> None:
+        for kind in kinds:
+            inputs = [kind, self.arrays, self.z, self.other]
+            wp.launch(cycle.sweep, self.worlds, inputs, device=self.device)
 
 
 class DenseInverse:
@@ -256,10 +240,9 @@ class DenseInverse:
 
     def update(self) -> None:
         """Launch the inversion of the present matrix."""
-        level, pattern = self.level, self.level.pattern
+        level = self.level
         self._matrix.zero_()
-        inputs = [level.lanes, pattern.entries, pattern.starts, pattern.columns, pattern.diagonal, level.blocks]
-        level.launch(dense.fill_dense, level.lanes * level.count, inputs, [self._matrix, self._scale])
+        level.launch_rows(dense.fill_dense, [], [self._matrix, self._scale])
         if level.device.is_cuda:
             kernel, block = dense.invert_in_registers, dense.SWEEPERS
             wp.launch(kernel, level.worlds * block, [self._matrix], device=level.device, block_dim=block)
@@ -271,9 +254,7 @@ class DenseInverse:
 
     def solve(self) -> None:
         """Launch z = inverse r."""
-        level = self.level
-        inputs = [level.lanes, level.count, self.inverse, level.r]
-        level.launch(dense.apply_dense, level.count * level.lanes, inputs, [level.z])
+        self.level.launch_rows(dense.apply_dense, [self.inverse], [self.level.z])
 
 
 class LeafMatrix:
@@ -371,7 +352,7 @@ class LeafMatrix:
         else:
             wp.launch(
                 values.gather_leaves,
-                (sizes.worlds, len(found.upper)),
+                (sizes.worlds, len(found.sums.upper)),
                 inputs,
                 [blocks, self._more],
                 device=self.device,
@@ -390,8 +371,7 @@ class LeafMatrix:
         leaves.elements, leaves.world_elements = self._elements, body.sizes.world_elements
         leaves.frames, leaves.gradients = self._frames, self._gradients
         leaves.mu, leaves.lam, leaves.stride = body.mu, body.lam, body.material_stride
-        leaves.upper, leaves.starts, leaves.codes = found.upper, found.sum_starts, found.codes
-        leaves.places, leaves.entries, leaves.ranks = found.places, found.entries, len(self._nodes)
+        leaves.sums, leaves.entries, leaves.ranks = found.sums, found.entries, len(self._nodes)
         leaves.row_entries = 0 if self._members is None else self._members.entries
         leaves.pairs, leaves.rows = self._pairs, self._rows
         return leaves

@@ -212,17 +212,6 @@ class RootLevel(Level):
 
     def gather_from(self, fine: SmoothedLevel) -> None:
         assert isinstance(fine, SubtreeLevel)
-        pattern = self.pattern
-        inputs = [
-            self.ranks,
-            self.count,
-            pattern.entries,
-            fine.roots,
-            fine.stiffening,
-            fine.scales,
-            self.free,
-            fine.own,
-        ]
-        inputs += [self._midpoints.starts, self._midpoints.midpoints, self._middles]
-        inputs += [pattern.upper, pattern.sum_starts, pattern.codes, pattern.places, fine.root_blocks]
+        inputs = [self.arrays, self.pattern.sums, fine.roots, fine.stiffening, fine.scales, fine.own]
+        inputs += [self._midpoints.starts, self._midpoints.midpoints, self._middles, fine.root_blocks]
         self.gather(subtrees.gather_roots, inputs)
