@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
 
-from .integrate import by_vectors, vector_at
+from .integrate import Dynamics, by_vectors, load_at, vector_at
 from .pace import BEFORE, CONTROLS, DONE, DONE_THEN, DT, END, SLOT, THEN, Pace, length_before, time_after
 
 wp.set_module_options({"enable_backward": False})
@@ -118,17 +118,11 @@ def sum_nodes(
     # In
     pace: Pace,
     lag: wp.float64,
-    gravity: wp.vec3,
+    body: Dynamics,
+    mass: wp.array[wp.float32],
     count: int,
     threads: int,
     lanes: int,
-    mass: wp.array[wp.float32],
-    inverse_mass: wp.array[wp.float32],
-    has_load: int,
-    load: wp.array[Any],
-    f: wp.array[wp.vec4],
-    u: wp.array[wp.vec4],
-    v: wp.array[wp.vec4],
     pushed: int,
     others: wp.array[wp.vec4],
     constrained: int,
@@ -169,18 +163,18 @@ def sum_nodes(
     k = thread
     while k < count:
         i = world * count + k
-        x = load_node(u, i)
+        x = load_node(body.u, i)
         reach = wp.max(reach, dot64(x, x))
-        velocity = load_node(v, i)
-        force = load_node(f, i)
-        if inverse_mass[i] == 0.0:
+        velocity = load_node(body.v, i)
+        force = load_node(body.f, i)
+        if body.inverse_mass[i] == 0.0:
             supports -= wp.float64(0.5) * before * dot64(force, velocity)
         else:
             m = wp.float64(mass[i])
-            pull = wp.vec3d(force) + m * wp.vec3d(gravity)
-            power = dot64(force, velocity) + m * dot64(gravity, velocity)
-            if has_load != 0:
-                external = vector_at(load, i)
+            pull = wp.vec3d(force) + m * wp.vec3d(body.gravity)
+            power = dot64(force, velocity) + m * dot64(body.gravity, velocity)
+            if body.load.shape[0] > 0:
+                external = load_at(i, body)
                 pull += wp.vec3d(external)
                 power += dot64(external, velocity)
                 work += dot64(external, x) - dot64(external, load_node(kept_u[slot], i))
@@ -192,7 +186,7 @@ def sum_nodes(
                 ahead += wp.float64(0.5) * both * square
             untimely += square
             kinetic += wp.float64(0.5) * m * dot64(velocity, velocity)
-            gravitational -= m * dot64(gravity, x)
+            gravitational -= m * dot64(body.gravity, x)
         if keeps != 0:
             store_node(kept_u[1 - slot], i, x)
             store_node(kept_v[1 - slot], i, velocity)
@@ -321,4 +315,3 @@ def report(
 
 
 TAKE_OVER = by_vectors(take_over, "positions")
-SUM_NODES = by_vectors(sum_nodes, "load")

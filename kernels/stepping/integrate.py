@@ -54,6 +54,37 @@ def is_finite(a: wp.vec3):
     return wp.abs(a[0]) + wp.abs(a[1]) + wp.abs(a[2]) <= 3.0e38
 
 
+@wp.struct
+class Dynamics:
+    """What moves the nodes of a body in a step."""
+
+    damping: float  # [1/s]
+    gravity: wp.vec3  # [m/s^2]
+    inverse_mass: wp.array[wp.float32]  # [1/kg]; zero for held nodes
+    load: wp.array[wp.float32]  # external forces [N]; empty: there are none
+    load_stride: int  # numbers from one node to the next
+    rest: wp.array[wp.vec4]  # [m]
+    f: wp.array[wp.vec4]  # all forces but loads and gravity [N]
+    u: wp.array[wp.vec4]  # [m]
+    v: wp.array[wp.vec4]  # [m/s]
+
+
+@wp.func
+def load_at(i: int, body: Dynamics):
+    """The load on a node [N]."""
+    load = wp.vec3()
+    if body.load.shape[0] > 0:
+        k = body.load_stride * i
+        load = wp.vec3(body.load[k], body.load[k + 1], body.load[k + 2])
+    return load
+
+
+@wp.func
+def force_at(i: int, body: Dynamics):
+    """The force on a node besides gravity [N]."""
+    return load_node(body.f, i) + load_at(i, body)
+
+
 @wp.func
 def symplectic_euler_velocity(
     v: wp.vec3, force: wp.vec3, inverse_mass: float, gravity: wp.vec3, dt: float, damped: float

@@ -4,13 +4,11 @@
 that are not elastic is subtracted here, because the balance has no energy for them.
 """
 
-from typing import Any
-
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
 
-from .integrate import by_vectors, symplectic_euler_velocity, vector_at
+from .integrate import Dynamics, force_at, symplectic_euler_velocity
 from .pace import DT, Pace, length_before
 
 wp.set_module_options({"enable_backward": False})
@@ -32,16 +30,10 @@ def separate_forces(elastic: wp.array[wp.vec4], f: wp.array[wp.vec4], others: wp
 @wp.kernel(enable_backward=False)
 def count_work(
     # In
-    damping: float,
-    gravity: wp.vec3,
-    inverse_mass: wp.array[wp.float32],
-    has_load: int,
-    load: wp.array[Any],
+    body: Dynamics,
     pace: Pace,
     offset: int,
     elastic: wp.array[wp.vec4],
-    f: wp.array[wp.vec4],
-    v: wp.array[wp.vec4],
     # In and out
     others: wp.array[wp.vec4],
     account: wp.array2d[wp.float64],
@@ -53,21 +45,18 @@ def count_work(
     """
     i = wp.tid()
     force = load_node(others, i)
-    total = load_node(f, i)
-    store_node(others, i, total - load_node(elastic, i))
-    w = inverse_mass[i]
+    store_node(others, i, load_node(body.f, i) - load_node(elastic, i))
     if wp.dot(force, force) == 0.0:
         return
     dt = float(pace.seconds[DT])
     before = dt
     if offset == 0:
         before = float(length_before(pace))
-    if has_load != 0:
-        total += vector_at(load, i)
-    velocity = load_node(v, i)
+    w, velocity = body.inverse_mass[i], load_node(body.v, i)
     later = velocity
     if w > 0.0:
-        later = symplectic_euler_velocity(velocity, total, w, gravity, 0.5 * (before + dt), 1.0 / (1.0 + dt * damping))
+        kick, damped = 0.5 * (before + dt), 1.0 / (1.0 + dt * body.damping)
+        later = symplectic_euler_velocity(velocity, force_at(i, body), w, body.gravity, kick, damped)
     add_work(account, i, 0.5 * wp.dot(force, before * velocity + dt * later))
 
 
@@ -109,16 +98,10 @@ def count_constraint(
 @wp.kernel(enable_backward=False)
 def count_constraints(
     # In
-    damping: float,
-    gravity: wp.vec3,
-    inverse_mass: wp.array[wp.float32],
-    has_load: int,
-    load: wp.array[Any],
+    body: Dynamics,
     pace: Pace,
     offset: int,
     constrained: wp.array[wp.vec4],
-    f: wp.array[wp.vec4],
-    v: wp.array[wp.vec4],
     # In and out
     account: wp.array2d[wp.float64],
 ):
@@ -127,11 +110,5 @@ def count_constraints(
     force = load_node(constrained, i)
     if wp.dot(force, force) == 0.0:
         return
-    total = load_node(f, i)
-    if has_load != 0:
-        total += vector_at(load, i)
-    count_constraint(i, force, total, load_node(v, i), damping, gravity, inverse_mass[i], pace, offset, account)
-
-
-COUNT_WORK = by_vectors(count_work, "load")
-COUNT_CONSTRAINTS = by_vectors(count_constraints, "load")
+    velocity, w = load_node(body.v, i), body.inverse_mass[i]
+    count_constraint(i, force, force_at(i, body), velocity, body.damping, body.gravity, w, pace, offset, account)

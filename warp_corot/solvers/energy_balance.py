@@ -33,11 +33,10 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Energies:
-    """The energies of free nodes at one time, for each world [worlds].
+    """The energies of free nodes at one time, for each world [worlds], and what else the device finds then.
 
     Attributes:
         kinetic, gravitational: [J]; gravitational about the rest shape.
-        elastic: [J]; zero if not asked for.
         exact: The elastic energy plus symplectic Euler's own kinetic energy, of the velocities half a step behind times
             those half a step ahead: a linear body keeps this sum to rounding [J]. Meaningless without elastic energies.
         untimely: The kinetic energy at the time of the displacements minus that in ``exact`` [J].
@@ -46,11 +45,12 @@ class Energies:
         supports_absolute: The sum of its absolute values [J].
         worked, worked_absolute: The part of the constraints in these [J].
         reach: The largest displacement [m].
+        has_changed: Whether the state was changed between the run before and the one that ended.
+        bad_step: The first step after which something was not finite, or NEVER.
     """
 
     kinetic: Floats
     gravitational: Floats
-    elastic: Floats
     exact: Floats
     untimely: Floats
     loads: Floats
@@ -59,19 +59,6 @@ class Energies:
     worked: Floats
     worked_absolute: Floats
     reach: Floats
-
-
-@dataclass(frozen=True)
-class Report:
-    """The device's findings at the end of a run.
-
-    Attributes:
-        energies: The energies of the state at that time.
-        has_changed: Whether the state was changed between the run before and this one.
-        bad_step: The first step after which something was not finite, or NEVER.
-    """
-
-    energies: Energies
     has_changed: bool
     bad_step: int
 
@@ -149,7 +136,7 @@ class Balance:
             u, v = (body.state.displacements, body.state.velocities) if at is None else at[k]
             if whole:
                 self._add_elastic(k, body, field, u)
-            self._add_nodal(body, u, v, pace, (copies.u[k], copies.v[k]), keeps)
+            self._add_nodal(k, u, v, pace, keeps)
             if whole:
                 body.state.forces.zero_()
         for account in system.accounts if accounts is None else accounts:
@@ -162,7 +149,7 @@ class Balance:
         dim = (self.worlds, kernels.COLUMNS, self._lanes)
         wp.launch(kernels.report, dim, inputs, [self._totals, self._numbers], device=self.device)
 
-    def wait(self) -> Report:
+    def wait(self) -> Energies:
         """The report; waits for the device once."""
         wp.synchronize_stream(self.device)
         numbers = self._mapped.values[self.worlds * kernels.COLUMNS :]
@@ -171,28 +158,20 @@ class Balance:
         ranks = self._ranks
         reach = ranks.max(total[:, int(kernels.REACH)])
         total = ranks.sum(total, None if self._addends is None else np.moveaxis(self._addends.numpy(), 1, 0))
-        total[:, int(kernels.REACH)] = reach
-        kinetic, ahead, elastic = (total[:, int(c)] for c in (kernels.KINETIC, kernels.AHEAD, kernels.ELASTIC))
-        worked, worked_absolute = total[:, int(kernels.WORKED)], total[:, int(kernels.WORKED_ABSOLUTE)]
-        done = numbers[int(kernels.WORK)] + total[:, int(kernels.SUPPORTS)].sum() + worked
-        energies = Energies(
+        kinetic, ahead, gravitational, loads, supports, _, elastic, untimely, worked, worked_absolute = total.T
+        return Energies(
             kinetic=kinetic,
-            gravitational=total[:, int(kernels.GRAVITATIONAL)],
-            elastic=elastic,
+            gravitational=gravitational,
             exact=kinetic + ahead + elastic,
-            untimely=total[:, int(kernels.UNTIMELY)],
-            loads=total[:, int(kernels.LOADS)],
-            supports=done,
+            untimely=untimely,
+            loads=loads,
+            supports=numbers[int(kernels.WORK)] + supports.sum() + worked,
             supports_absolute=numbers[int(kernels.WORK_ABSOLUTE)] + worked_absolute,
             worked=worked,
             worked_absolute=worked_absolute,
-            reach=total[:, int(kernels.REACH)],
-        )
-        bad_step = -ranks.max(-min(int(numbers[int(kernels.BAD_STEP)]), NEVER))
-        return Report(
-            energies=energies,
+            reach=reach,
             has_changed=bool(numbers[int(kernels.CHANGED)]),
-            bad_step=bad_step,
+            bad_step=-ranks.max(-min(int(numbers[int(kernels.BAD_STEP)]), NEVER)),
         )
 
     def rounding(self) -> Floats:
@@ -216,41 +195,17 @@ class Balance:
         inputs = [energies, len(energies) // self.worlds, self._threads, self._lanes]
         wp.launch(kernels.sum_elements, (self.worlds, self._threads), inputs, [self._sums], device=self.device)
 
-    def _add_nodal(
-        self,
-        body: SoftBody,
-        u: wp.array,
-        v: wp.array,
-        pace: Pace,
-        copies: tuple[wp.array, wp.array],
-        keeps: bool,
-    ) -> None:
-        system = self.system
-        pushing = system.pushing(system.bodies.index(body))
-        inputs = [
-            pace,
-            wp.float64(system.lag),
-            system.gravity,
-            body.sizes.launch_nodes // self.worlds,
-            self._threads,
-            self._lanes,
-            body.conditions.mass,
-            body.conditions.inverse_mass,
-            int(body.conditions.has_loads),
-            body.conditions.loads,
-            body.state.forces,
-            u,
-            v,
-            int(pushing is not None),
-            u if pushing is None else pushing,
-            int(body.state.is_touched),
-            body.state.contact_forces,
-            system.pace.orders,
-            int(keeps),
-        ]
-        kernel = kernels.SUM_NODES[body.conditions.loads.dtype]
-        outputs = [*copies, self._sums]
-        wp.launch(kernel, (self.worlds, self._threads), inputs, outputs, device=self.device)
+    def _add_nodal(self, k: int, u: wp.array, v: wp.array, pace: Pace, keeps: bool) -> None:
+        """Add the sums over the nodes of a body, and keep its state beside the last good one."""
+        system, body, copies = self.system, self.bodies[k], self._copies
+        pushing, dynamics = system.pushing(k), system.dynamics(body, 0.0)
+        dynamics.u, dynamics.v = u, v
+        count = body.sizes.launch_nodes // self.worlds
+        inputs = [pace, wp.float64(system.lag), dynamics, body.conditions.mass, count, self._threads, self._lanes]
+        inputs += [int(pushing is not None), u if pushing is None else pushing]
+        inputs += [int(body.state.is_touched), body.state.contact_forces, system.pace.orders, int(keeps)]
+        outputs = [copies.u[k], copies.v[k], self._sums]
+        wp.launch(kernels.sum_nodes, (self.worlds, self._threads), inputs, outputs, device=self.device)
 
 
 class Copies:

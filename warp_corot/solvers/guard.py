@@ -175,17 +175,16 @@ class Guard:
                 there was and what came in, because elastic energies are never negative.
             counts: Whether energies are counted from this state on, if they were found. Otherwise they only judge it.
         """
-        report = self._balance.wait()
-        self.was_given = report.has_changed
+        found = self._balance.wait()
+        self.was_given = found.has_changed
         full = any(each.is_full for each in self.system.constraints)
         if self.system.constraints and self._ranks.max(float(full)):
             return Fault("more contacts than there is room for", np.arange(self.worlds), is_want_of_room=True)
-        if report.has_changed:
+        if found.has_changed:
             self._begin_before()
-        fault = self._not_finite(report.bad_step)
+        fault = self._not_finite(found.bad_step)
         if fault is not None:
             return fault
-        found = report.energies
         # An extra check at the end of a short run must not make its state differ from that of one long run.
         leave = self._leave * (STRICT if strict and whole else 1.0)
         fault = self._beyond_reach(found) or self._from_nowhere(found, whole, leave, lenient)
@@ -293,7 +292,7 @@ class Guard:
         self.order()
         self.system.pace.launch_orders(self._copies.changed)
         self._balance.launch(whole=whole, at=at, seconds=seconds, accounts=accounts)
-        return self._balance.wait().energies
+        return self._balance.wait()
 
     def _has_changed(self) -> bool:
         self.order()

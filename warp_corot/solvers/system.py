@@ -10,8 +10,8 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.elasticity import ForceField
-from warp_corot.kernels.contact.motion import Dynamics
-from warp_corot.kernels.stepping.work import COUNT_CONSTRAINTS, COUNT_WORK, separate_forces
+from warp_corot.kernels.stepping.integrate import Dynamics
+from warp_corot.kernels.stepping.work import count_constraints, count_work, separate_forces
 
 from .halo import ALONE, Halo
 from .pace import Pace
@@ -73,21 +73,30 @@ class ForcesWork:
     def launch_count(self, offset: int, damping: float) -> None:
         """Launch the sum of their work, after the forces of constraints, which change the motion."""
         for k, body in enumerate(self._bodies):
-            state, conditions = body.state, body.conditions
-            inputs = [damping, self._gravity, conditions.inverse_mass, int(conditions.has_loads), conditions.loads]
-            inputs += [self._pace.arrays, offset, self._elastic[k], state.forces, state.velocities]
+            inputs = [dynamics_of(body, self._gravity, damping), self._pace.arrays, offset, self._elastic[k]]
             outputs = [self.others[k], self.accounts[k]]
-            wp.launch(COUNT_WORK[conditions.loads.dtype], body.sizes.launch_nodes, inputs, outputs, device=body.device)
+            wp.launch(count_work, body.sizes.launch_nodes, inputs, outputs, device=body.device)
 
     def launch_constraints(self, offset: int, damping: float) -> None:
         """Launch the sum of the constraints' work, after all of them have added their forces."""
         for k, account in self.of_constraints.items():
             body = self._bodies[k]
-            state, conditions = body.state, body.conditions
-            inputs = [damping, self._gravity, conditions.inverse_mass, int(conditions.has_loads), conditions.loads]
-            inputs += [self._pace.arrays, offset, state.contact_forces, state.forces, state.velocities]
-            kernel = COUNT_CONSTRAINTS[conditions.loads.dtype]
-            wp.launch(kernel, body.sizes.launch_nodes, inputs, [account], device=body.device)
+            inputs = [dynamics_of(body, self._gravity, damping), self._pace.arrays, offset, body.state.contact_forces]
+            wp.launch(count_constraints, body.sizes.launch_nodes, inputs, [account], device=body.device)
+
+
+def dynamics_of(body: SoftBody, gravity: wp.vec3, damping: float) -> Dynamics:
+    """What moves the nodes of a body in a step with this damping [1/s], as a struct for kernels."""
+    conditions, state, found = body.conditions, body.state, Dynamics()
+    found.damping, found.gravity, found.inverse_mass = damping, gravity, conditions.inverse_mass
+    found.rest, found.f, found.u, found.v = state.rest, state.forces, state.displacements, state.velocities
+    if conditions.has_loads:
+        loads = conditions.loads
+        found.load_stride = loads.strides[0] // 4
+        # Another program's array may have any stride, also zero.
+        size = 3 + abs(found.load_stride) * (len(loads) - 1)
+        found.load = wp.array(ptr=loads.ptr, dtype=wp.float32, shape=size, device=body.device, copy=False)
+    return found
 
 
 #: No step: a number after all steps.
@@ -294,15 +303,7 @@ class System:
 
     def dynamics(self, body: SoftBody, damping: float) -> Dynamics:
         """What moves the nodes of a body in an explicit step with this damping [1/s], as a struct for kernels."""
-        conditions, state, found = body.conditions, body.state, Dynamics()
-        found.damping, found.gravity, found.inverse_mass = damping, self.gravity, conditions.inverse_mass
-        found.rest, found.f, found.u, found.v = state.rest, state.forces, state.displacements, state.velocities
-        if conditions.has_loads:
-            loads = conditions.loads
-            found.load_stride = loads.strides[0] // 4
-            size = found.load_stride * len(loads)
-            found.load = wp.array(ptr=loads.ptr, dtype=wp.float32, shape=size, device=self.device, copy=False)
-        return found
+        return dynamics_of(body, self.gravity, damping)
 
     def support_work_of(self, body: SoftBody) -> wp.array:
         """Where steps add up the work of a body's supports: ``support_work``, or two places for each node, which add up
