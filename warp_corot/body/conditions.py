@@ -10,8 +10,14 @@ import warp as wp
 
 from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.sizes import Clock, same_array
-from warp_corot.kernels.stepping.conditions import LOAD_NODES, follow_activation, free_nodes, hold_nodes, release_nodes
-from warp_corot.kernels.stepping.integrate import follow_trajectory
+from warp_corot.kernels.stepping.integrate import (
+    LOAD_NODES,
+    follow_activation,
+    follow_trajectory,
+    free_nodes,
+    hold_nodes,
+    release_nodes,
+)
 
 from .arrays import PatchArrays
 from .keyframes import Activation, Followed, NodeKeyframes, followed_stress

@@ -21,8 +21,7 @@ from warp_corot.inputs.checks import checked_number, shown
 from warp_corot.simulation.simulation import Simulation
 
 from .devices import Device, DeviceError, Pose, checked_pose, way
-from .exchange import HapticExchange, ToolState
-from .force import LocalModel, PassivityControl
+from .exchange import HapticExchange, LocalModel, PassivityControl, ToolState
 
 if TYPE_CHECKING:
     from warp_corot.materials.isotropic import Isotropic

@@ -26,8 +26,8 @@ MESHING = (
     *("meshing.coarsening", "meshing.surface_points", "meshing.leaves"),
 )
 #: Modules for bodies, for all steps, and for explicit ones whose length is chosen.
-BODY = ("plan.lists", "plan.batches", "stepping.team", "elements.cpu", "stepping.conditions")
-STEPS = ("stepping.integrate", "stepping.balance", "stepping.pace")
+BODY = ("plan.lists", "plan.batches", "stepping.team", "elements.cpu", "stepping.integrate")
+STEPS = ("stepping.balance", "stepping.pace")
 STEPS_ON_CPU = ("subtrees.degenerate", *STEPS, "stepping.subnormals")
 EXPLICIT = ("stepping.stability",)
 #: Modules for implicit steps, and for those of bodies on forests.

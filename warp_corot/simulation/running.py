@@ -2,7 +2,7 @@
 
 ``Simulation.advance`` makes steps until a time. It makes them in runs, which end where a check, a hook or a pass of
 remeshing is due. The host plans a run from the device's last report, launches it (``solvers.recorded``), and waits
-once, for the report at its end (``solvers.guarding``). Most calls of ``advance`` are one run.
+once, for the report at its end (``solvers.guard``). Most calls of ``advance`` are one run.
 """
 
 from __future__ import annotations

@@ -10,8 +10,8 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.elasticity import ForceField
+from warp_corot.kernels.stepping.balance import count_constraints, count_work, separate_forces
 from warp_corot.kernels.stepping.integrate import Dynamics
-from warp_corot.kernels.stepping.work import count_constraints, count_work, separate_forces
 
 from .halo import ALONE, Halo
 from .pace import Pace

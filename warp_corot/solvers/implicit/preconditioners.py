@@ -149,8 +149,6 @@ class Lagged:
 
 #: Elements that share their dilatation, preconditioned by plain ones that are compressible, since these lock.
 PLAIN: dict[str, Any] = {"most_lambda": 4.0}
-#: The same where they share it at nodes. As the two differ, better smoothing saves no iterations there.
-AT_NODES: dict[str, Any] = {"degree": 2, "rise": 0, **PLAIN}
 #: Elements that share their dilatation in groups. A larger lambda would take smoothers that multigrid does not have.
 #: Left to conjugate gradients, it costs fewer iterations.
 IN_GROUPS: dict[str, Any] = {"most_shared": 40.0}
@@ -177,7 +175,7 @@ def _multigrid(operator: TangentOperator, short_cycles: bool, few_digits: bool) 
         # Solves that begin near the answer take few iterations, which are worth less than what they cost.
         options, members = SHORT | (PLAIN if shares else {}), None
     elif shares:
-        options = AT_NODES if members is None else IN_GROUPS
+        options = IN_GROUPS
     elif few_digits and operator.device.is_cpu:
         options = SWEPT
     is_turned = not operator.field.is_linear

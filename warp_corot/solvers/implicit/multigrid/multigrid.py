@@ -83,6 +83,8 @@ class SpringsOnLevels:
 
 #: The largest coarsest level that is inverted [nodes].
 MOST_DENSE = 64
+#: The increase of the degree from a level to the next coarser one, which costs little.
+RISE = 2
 #: By how much degrees are smaller if the second level has more than half as many nodes as the finest one.
 STEPS_LESS = 2
 #: By how much the degree on the finest level is larger if the level of the roots of subtrees does not smooth.
@@ -110,9 +112,7 @@ class Multigrid:
     Args:
         body: A body on a forest, or its discretization.
         is_turned: Whether elements turn; False: linear elasticity.
-        stride: Number of bisections from one level to the next, 1 to 3.
         degree: The degree of the smoother on the finest level, before and after.
-        rise: The increase of the degree from a level to the next coarser one, which costs little.
         few_nodes: Levels with more nodes than this get a coarser one, if there is one.
         stiffening: Viscous over elastic stress at one strain [s], as in the operator's D.
         most_lambda: Lambda is at most this many times mu.
@@ -126,7 +126,7 @@ class Multigrid:
         revision: Changes whenever its launches do, so that they must be recorded again.
 
     Raises:
-        InputError: The mesh is not a forest, or a stride or degree is out of its range.
+        InputError: The mesh is not a forest, or the degree is not positive.
     """
 
     def __init__(
@@ -134,9 +134,7 @@ class Multigrid:
         body: Discretized | Discretization,
         *,
         is_turned: bool = True,
-        stride: int = 3,
         degree: int = 5,
-        rise: int = 2,
         few_nodes: int = MOST_DENSE,
         stiffening: float = 0.0,
         most_lambda: float = np.inf,
@@ -145,14 +143,12 @@ class Multigrid:
         sweeps: int = 0,
         assembled: bool = True,
     ):
-        if stride not in (1, 2, 3):
-            raise InputError(f"stride is {stride!r}; it must be 1, 2 or 3")
         if degree < 1:
             raise InputError(f"degree is {degree!r}; it must be 1 or more")
         self.discretization = discretization_of(body)
-        self.is_turned, self.stride, self.degree, self.stiffening = is_turned, stride, degree, stiffening
+        self.is_turned, self.degree, self.stiffening = is_turned, degree, stiffening
         self.most_shared = min(most_shared, 1e30)
-        self.most_lambda, self.rise, self.few_nodes = most_lambda, rise, few_nodes
+        self.most_lambda, self.few_nodes = most_lambda, few_nodes
         self._find_members = members
         self.sweeps, self._assembled = sweeps, assembled
         self.revision, self._version = -1, -1
@@ -281,7 +277,7 @@ class Multigrid:
 
     def _subtrees(self, members: Members | None) -> tuple[Batch, ...] | None:
         """The subtrees of which the finest level consists, if it goes without its matrix."""
-        if self._assembled or self.sweeps or self.stride != 3 or self.count <= self.few_nodes:
+        if self._assembled or self.sweeps or self.count <= self.few_nodes:
             return None
         batches = suitable_batches(self.discretization)
         if members is not None and members.count != sum(batch.count for batch in batches or ()):
@@ -338,7 +334,7 @@ class Multigrid:
     def _find_degrees(self, counts: list[int], roots_depth: int | None) -> list[int]:
         """The degree of each level's smoother. ``roots_depth`` is the level of the roots of subtrees, if the finest
         level goes over these."""
-        degrees = [self.degree + self.rise * k for k in range(len(counts))]
+        degrees = [self.degree + RISE * k for k in range(len(counts))]
         if roots_depth is not None and roots_depth % 3:
             # Steps on the finest level are cheap there, and take the place of those on the level of roots.
             coarser = degrees[1:-1] if self._members is None else degrees[2:]
@@ -354,9 +350,7 @@ class Multigrid:
         counts, level = [levels.node_count], levels.depth
         while level > 0 and counts[-1] > self.few_nodes:
             # Coarser levels are multiples of three: with others conjugate gradients take 10 iterations in place of 6.
-            stride = (level % 3 or 3) if self.stride == 3 else self.stride
-            if on_roots and len(counts) == 1:
-                stride = 3
+            stride = 3 if on_roots and len(counts) == 1 else level % 3 or 3
             level = max(level - stride, 0)
             counts.append(levels.starts[level + 1])
         return counts
