@@ -126,9 +126,9 @@ class _BodyPiece:
 
     @cached_property
     def body(self) -> CoarseBody | MeshBody:
-        from .sag import MOST_TETS, CoarseBody, MeshBody
+        from .sag import MOST_SOLVED_TETS, CoarseBody, MeshBody
 
-        kind = MeshBody if len(self.tets) <= MOST_TETS else CoarseBody
+        kind = MeshBody if len(self.tets) <= MOST_SOLVED_TETS else CoarseBody
         return kind(self.shape.points, self.tets, self.volumes, self.young, self.density)
 
     def hold(self) -> Support:
@@ -202,7 +202,7 @@ def supports_of(
     A piece stands on the lowest tenth of its height if its centre of mass is above that and stays there when the piece
     sags. Otherwise it is fixed at its largest flat region, or at the first of its broad sides that supports it, each
     with at least a tenth of its nodes; if none does, at the one with the smallest sag. Sags are estimated by linear
-    statics, for large meshes on a coarse grid (`sag_mesh.MeshBody`, `sag.CoarseBody`).
+    statics, for large meshes on a coarse grid (`sag.MeshBody`, `sag.CoarseBody`).
 
     Args:
         mesh: The body.
