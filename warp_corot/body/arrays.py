@@ -15,8 +15,7 @@ from warp_corot.discretization.sizes import Sizes, vec3_view
 from warp_corot.errors import InputError, StaleViewError
 
 if TYPE_CHECKING:
-    from .conditions import Conditions
-    from .state import State
+    from .state import Conditions, State
 
 
 #: Number of cached patches: those of two hands and their former ones.

@@ -26,9 +26,8 @@ from warp_corot.materials.directional import Directional
 from warp_corot.materials.isotropic import Material
 
 from .arrays import Views
-from .conditions import Conditions
 from .keyframes import Activation, NodeKeyframes, constant_stress
-from .state import State
+from .state import Conditions, State
 
 #: Names with a meaning of their own in expressions.
 TAKEN = {"x", "y", "z", *(f"{axis}{end}" for axis in "xyz" for end in ("min", "max"))}

@@ -28,9 +28,8 @@ from warp_corot.mesh.surfaces.bound import NOT_OPENED
 from warp_corot.mesh.surfaces.boundary import boundary_faces
 
 from .arrays import NodeArrays, SharedArrays, Views
-from .conditions import Conditions
 from .controls import Controls
-from .state import State
+from .state import Conditions, State
 
 if TYPE_CHECKING:
     from warp_corot.discretization.changing.transfer import FollowingBinding

@@ -26,9 +26,9 @@ from warp_corot.simulation.parts import checked_gravity, checked_models
 from warp_corot.simulation.resting import checked_obstacles
 from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import BackwardEuler, QuasiStatic, SymplecticEuler
-from warp_corot.solvers.graphs import Replays
 from warp_corot.solvers.implicit.schemes import ImplicitIntegrator
-from warp_corot.solvers.integrator import Integrator
+from warp_corot.solvers.recorded import Replays
+from warp_corot.solvers.system import Integrator
 
 from . import parameters
 from .adjoint import Adjoint

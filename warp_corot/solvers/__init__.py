@@ -12,7 +12,7 @@ from warp_corot.solvers.implicit.schemes import (
 )
 from warp_corot.solvers.stability import largest_frequency
 
-from .integrator import Integrator, Stepper
+from .system import Integrator, Stepper
 
 INTEGRATORS: dict[str, type[Integrator]] = {name: globals()[kind] for name, kind in choices.INTEGRATORS.items()}
 

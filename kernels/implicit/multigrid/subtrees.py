@@ -31,8 +31,7 @@ from warp_corot.kernels.tables.shapes import VOLUME, fingerprint
 from warp_corot.kernels.tables.subtree import HANDEDNESS, LEAVES, POSITIONS
 
 from .cycle import LevelArrays
-from .pattern import EntrySums, key_of
-from .shared import kept_share
+from .pattern import EntrySums, kept_share, key_of
 from .values import inverse_block, semidefinite
 
 wp.set_module_options({"enable_backward": False})

@@ -27,8 +27,7 @@ from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.kernels.modules import unique_kernel
 
 from .cycle import LevelArrays, sum_over_lanes
-from .pattern import EntrySums
-from .shared import row_at
+from .pattern import EntrySums, row_at
 
 wp.set_module_options({"enable_backward": False})
 

@@ -17,8 +17,8 @@ from warp_corot.kernels.implicit.lagged import CHOICE_COUNTS
 from warp_corot.solvers.implicit import assembled
 from warp_corot.solvers.implicit.assembled import AssembledSolve, suits
 from warp_corot.solvers.implicit.block_system import VectorBlocks
-from warp_corot.solvers.implicit.chosen import WORTH
 from warp_corot.solvers.implicit.conjugate_gradients import ConjugateGradients
+from warp_corot.solvers.implicit.preconditioners import WORTH
 from warp_corot.solvers.implicit.tangent import TangentOperator
 
 FORESTS = {"uniform": uniform, "mixed": lambda: mixed_forest(level=5), "ball": ball_mesh}
@@ -277,7 +277,7 @@ def test_the_choice_and_resumed_runs(young, length, ends_assembled, device, tmp_
 def test_a_resumed_run_keeps_its_choice_although_a_new_one_would_begin_otherwise(device, monkeypatch, tmp_path):
     sim = swinging(device)
     sim.save(tmp_path / "state.npz")
-    monkeypatch.setattr("warp_corot.solvers.implicit.chosen.STIFF", 0.0)
+    monkeypatch.setattr("warp_corot.solvers.implicit.preconditioners.STIFF", 0.0)
     later = wc.Simulation.load(tmp_path / "state.npz")
     later.step()
     assert is_assembled(later)
@@ -286,7 +286,7 @@ def test_a_resumed_run_keeps_its_choice_although_a_new_one_would_begin_otherwise
 
 def test_a_beam_that_takes_too_many_iterations_is_solved_for_with_multigrid(device, monkeypatch):
     """Its first step is unfinished, and no other one, if its stiffness is not known before."""
-    monkeypatch.setattr("warp_corot.solvers.implicit.chosen.STIFF", np.inf)
+    monkeypatch.setattr("warp_corot.solvers.implicit.preconditioners.STIFF", np.inf)
     sim = swinging(device, 1e8, 24, linear_iterations=300)
     assert not is_assembled(sim)
     assert sim.solves.unfinished == 1

@@ -12,14 +12,13 @@ from warp_corot.inputs.loading import load
 from warp_corot.kernels.implicit import conjugate_gradients
 from warp_corot.kernels.implicit import increments as kernels
 from warp_corot.kernels.implicit import newton as kernels_of_newton
-from warp_corot.solvers.integrator import Stepper
+from warp_corot.solvers.system import Stepper
 
 from .assembled import AssembledSolve, suits
 from .block_system import BlockSystem, VectorBlocks
 from .body_steps import BodySteps, SharedSteps, StepCounts
-from .chosen import ChosenSolve
 from .contact_solve import ContactSolve
-from .preconditioners import Lagged
+from .preconditioners import ChosenSolve, Lagged
 
 if TYPE_CHECKING:
     from warp_corot.solvers.system import System

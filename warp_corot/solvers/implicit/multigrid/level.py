@@ -13,7 +13,8 @@ from warp_corot.discretization.groups import Members
 from warp_corot.inputs.cpu_threads import Regions, launch
 from warp_corot.kernels.elements.dilatation import not_held
 from warp_corot.kernels.elements.elements import ForestElements
-from warp_corot.kernels.implicit.multigrid import cycle, dense, shared, values
+from warp_corot.kernels.implicit.multigrid import cycle, dense, values
+from warp_corot.kernels.implicit.multigrid import pattern as kernels
 from warp_corot.kernels.implicit.multigrid.values import gather_leaves_on_cpu
 from warp_corot.kernels.tables.shapes import GRADIENT
 from warp_corot.solvers.implicit.operator import LinearOperator
@@ -191,7 +192,7 @@ class Level(SmoothedLevel):
         inverses = self.inverses if self._unbounded is None else self._unbounded
         self.launch(kernel, lanes * len(self.pattern.sums.upper), inputs, [inverses])
         if self._unbounded is not None:
-            self.launch(shared.bound_diagonal, self.count, [self.arrays, inverses], [])
+            self.launch(kernels.bound_diagonal, self.count, [self.arrays, inverses], [])
 
 
 class SweptLevel(Level):
@@ -305,7 +306,7 @@ class LeafMatrix:
     def kernels(self) -> list[wp.Kernel]:
         """Kernels that it launches, beside those of ``loading.IMPLICIT_ON_FORESTS``."""
         found = [self._write_frames, gather_leaves_on_cpu if self.device.is_cpu else values.gather_leaves]
-        return found if self._members is None else [*found, shared.write_rows(self._members.law)]
+        return found if self._members is None else [*found, kernels.write_rows(self._members.law)]
 
     @property
     def _elements(self) -> ForestElements:
@@ -341,7 +342,7 @@ class LeafMatrix:
         if members is not None:
             inputs: list[Any] = [sizes.world_elements, members.entries, members.arrays, elements, u]
             inputs += [body.mu, body.lam, body.material_stride, most_shared]
-            self._launch(shared.write_rows(members.law), members.count, inputs, [self._rows], u.ptr, most_shared)
+            self._launch(kernels.write_rows(members.law), members.count, inputs, [self._rows], u.ptr, most_shared)
         inputs = [self._leaves(), scales, stiffening, most_lambda if members is None else 0.0]
         if self.device.is_cpu:
             parts, outputs = self._regions.team.parts, [blocks, self._more]
@@ -360,7 +361,7 @@ class LeafMatrix:
         if holds and members is not None and members.law.holding is not not_held:
             inputs = [sizes.world_elements, count, found.entries, elements, u, body.lam, body.material_stride]
             inputs += [scales, self._rank, found.starts, found.columns]
-            wp.launch(shared.add_held_blocks(members.law), sizes.elements, inputs, [blocks], device=self.device)
+            wp.launch(kernels.add_held_blocks(members.law), sizes.elements, inputs, [blocks], device=self.device)
         inputs = [count, self._mesh_nodes, found.entries, self._nodes, operator.inverse_mass, scales, self._free]
         inputs += [found.starts, found.columns, found.diagonal, others, self._more]
         key = [blocks.ptr, others.ptr, scales.ptr, operator.inverse_mass.ptr]

@@ -11,7 +11,6 @@ import warp as wp
 from warp_corot.discretization.groups import Members
 from warp_corot.discretization.plan import Batch
 from warp_corot.kernels.implicit.multigrid import pattern as kernels
-from warp_corot.kernels.implicit.multigrid import shared
 from warp_corot.kernels.implicit.multigrid import subtrees as roots_kernels
 from warp_corot.kernels.meshing.growth import gather_flagged
 from warp_corot.kernels.plan.levels import flag_first
@@ -80,13 +79,13 @@ class PatternFinder:
             members: Groups whose nodes are all coupled, if there are any.
 
         Returns:
-            The pattern, and the pairs of the groups' nodes as ``kernels.implicit.multigrid.shared`` has them, vec2i.
+            The pattern, and the pairs of the groups' nodes as ``kernels.implicit.multigrid.pattern`` has them, vec2i.
         """
         nodes = len(rank)
         before, pairs = 6 * leaves + nodes, 0
         if members is not None:
             sums = self._ints(members.count)
-            self._launch(shared.count_pairs, members.count, [members.arrays], [sums])
+            self._launch(kernels.count_pairs, members.count, [members.arrays], [sums])
             wp.utils.array_scan(sums, sums, inclusive=True)
             pairs = int(sums[-1:].numpy()[0])
         keys, codes = self._keys(before + pairs)
@@ -95,7 +94,7 @@ class PatternFinder:
         found = wp.empty(pairs, dtype=wp.vec2i, device=self.device)
         if members is not None:
             inputs = [before, self.bits, members.arrays, rank, sums]
-            self._launch(shared.list_pairs, members.count, inputs, [found, keys, codes])
+            self._launch(kernels.list_pairs, members.count, inputs, [found, keys, codes])
         return self._pattern(nodes, before + pairs, keys, codes), found
 
     def of_roots(self, count: int, batches: Sequence[Batch], roots: int, nodes: wp.array, rank: wp.array) -> Pattern:
