@@ -22,6 +22,7 @@ from warp_corot.inputs.checks import checked_count, shown
 from warp_corot.inputs.simulation_lock import SIMULATION_LOCK
 from warp_corot.kernels.stepping.pace import GROWTH
 from warp_corot.solvers.guard import EnergyControl, Fault
+from warp_corot.solvers.pace import Schedule
 from warp_corot.solvers.recorded import Segment
 
 from .progress import bar_of
@@ -190,11 +191,15 @@ class Running:
     def state(self) -> dict[str, float]:
         """What a run needs besides the guard's state to continue."""
         until = self._wrong_until if self._returns else 0.0
-        return {"returns": self._returns, "wrong_until": until, "judged": self._judged}
+        schedule = self._sim.pace.schedule._asdict()
+        return {"returns": self._returns, "wrong_until": until, "judged": self._judged} | schedule
 
-    def resume(self, *, returns: float, wrong_until: float, judged: float) -> None:
+    def resume(self, *, returns: float, wrong_until: float, judged: float, **schedule: Any) -> None:
         """Continue from what ``state`` gave."""
         self._returns, self._wrong_until, self._judged = int(returns), float(wrong_until), int(judged)
+        self._sim.pace.schedule = Schedule(
+            **{name: type(of)(schedule[name]) for name, of in Schedule()._asdict().items()}
+        )
 
     def begin_again(self) -> None:
         """Go on with other launches and another guard, at the same time."""

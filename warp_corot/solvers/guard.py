@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -18,8 +18,8 @@ import warp as wp
 from warp_corot.kernels.stepping.pace import LEAST
 
 from .energy_balance import Balance, Copies, Energies, Floats
-from .pace import Known
-from .stability import CALM_CHECKS, FIRST_INTERVAL, LIVELY, UNKNOWN, SafeStep, Schedule
+from .pace import CALM_CHECKS, LIVELY, UNKNOWN, Known
+from .stability import FIRST_INTERVAL, SafeStep
 from .system import NEVER, System
 
 if TYPE_CHECKING:
@@ -441,7 +441,7 @@ class EnergyControl:
     """
 
     def __init__(self, guard: Guard, recorded: RecordedSteps, safe_step: SafeStep | None):
-        self._guard, self._recorded, self._safe_step = guard, recorded, safe_step
+        self._guard, self._recorded, self._safe_step, self._pace = guard, recorded, safe_step, guard.system.pace
         self._intervals = CHECK_INTERVALS if safe_step is None else CLOSE_INTERVALS
         recorded.calm = 0 if safe_step is None else UNKNOWN
 
@@ -451,10 +451,11 @@ class EnergyControl:
         return self._intervals * self._recorded.interval
 
     def begin(self) -> None:
-        """Continue with the values on the device, which may come from a checkpoint."""
-        if self._safe_step is not None:
-            schedule = self._safe_step.schedule
-            self._look(schedule if schedule.intervals else schedule._replace(calm=UNKNOWN, intervals=CLOSE_INTERVALS))
+        """Continue with the schedule, which may come from a checkpoint."""
+        if self._pace.schedule.intervals:
+            self._choose()
+        else:
+            self.begin_anew()
 
     def go_on(self, steps: int) -> None:
         """Continue unchecked after a number of steps, without waiting for the device."""
@@ -463,8 +464,7 @@ class EnergyControl:
 
     def begin_anew(self) -> None:
         """Begin again after a user has written to the state, which may now change fast."""
-        if self._safe_step is not None:
-            self._choose(self._safe_step.schedule._replace(calm=UNKNOWN, intervals=CLOSE_INTERVALS))
+        self._choose(calm=UNKNOWN, intervals=CLOSE_INTERVALS)
 
     def follow(self, steps: int) -> None:
         """Make the step shorter if energy came from nowhere, and longer again if none did.
@@ -475,9 +475,8 @@ class EnergyControl:
         if self._safe_step is None:
             return
         guard, share = self._guard, self._safe_step.share
-        schedule = self._safe_step.schedule
-        intervals = (steps - schedule.steps) / self._recorded.interval
-        self._safe_step.schedule = schedule._replace(steps=steps)
+        intervals = (steps - self._pace.schedule.steps) / self._recorded.interval
+        self._pace.schedule = self._pace.schedule._replace(steps=steps)
         leave = LITTLE_GAIN * max(1.0 - guard.surplus / MOST_SURPLUS, LEAST_LEAVE)
         late, more = guard.untimely / UNTIMELY, guard.gain / leave
         if late > 1.0 or more > 1.0:
@@ -496,7 +495,7 @@ class EnergyControl:
     def halve(self, steps: int) -> None:
         """Take half the share, after going back to the state with this number of steps."""
         assert self._safe_step is not None
-        self._safe_step.schedule = self._safe_step.schedule._replace(steps=steps)
+        self._pace.schedule = self._pace.schedule._replace(steps=steps)
         self._take_share(0.5 * self._safe_step.share)
 
     def choose_intervals(self, *, checked: bool) -> None:
@@ -505,7 +504,7 @@ class EnergyControl:
             return
         guard = self._guard
         share, allowed, at_rest = self._safe_step.shares
-        before = self._safe_step.schedule
+        before = self._pace.schedule
         calm = 0
         if not checked or allowed < FALLING * before.allowed:
             calm = LIVELY
@@ -518,17 +517,13 @@ class EnergyControl:
             intervals = STRAINED_INTERVALS if quiet else CLOSE_INTERVALS
         else:
             intervals = CHECK_INTERVALS if calm > 1 else STRAINED_INTERVALS
-        self._choose(before._replace(calm=calm, intervals=intervals, allowed=allowed))
+        self._choose(calm=calm, intervals=intervals, allowed=allowed)
 
-    def _choose(self, schedule: Schedule) -> None:
-        assert self._safe_step is not None
-        self._safe_step.schedule = schedule
-        self._look(schedule)
-
-    def _look(self, schedule: Schedule) -> None:
-        """Measure and check at the intervals of a schedule."""
-        self._intervals = schedule.intervals
-        self._recorded.calm = schedule.calm
+    def _choose(self, **changes: Any) -> None:
+        """Measure and check at the intervals of the schedule after these changes."""
+        if self._safe_step is not None:
+            self._pace.schedule = schedule = self._pace.schedule._replace(**changes)
+            self._intervals, self._recorded.calm = schedule.intervals, schedule.calm
 
     def _take_share(self, share: float) -> None:
         """Set the share of the allowed step from here on."""

@@ -20,15 +20,13 @@ from warp_corot.inputs.simulation_lock import SIMULATION_LOCK
 from warp_corot.kernels.stepping.subnormals import flush_subnormals, restore_subnormals
 
 from .guard import Guard
+from .pace import CALM_CHECKS, LIVELY, UNKNOWN
 from .stability import (
     BLOCK_INTERVAL,
-    CALM_CHECKS,
     FIRST_INTERVAL,
     INTERVAL,
-    LIVELY,
     LIVELY_BLOCK_INTERVAL,
     LIVELY_INTERVAL,
-    UNKNOWN,
     SafeStep,
 )
 from .system import Stepper, System

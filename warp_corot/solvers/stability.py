@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +17,7 @@ from warp_corot.kernels.stepping import stability as kernels
 from warp_corot.mesh.scattered import normal_numbers, padded
 
 from .halo import ALONE, Halo
-from .pace import Pace
+from .pace import Pace, Schedule
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
@@ -274,31 +274,8 @@ class Gauge(Curvature):
 INTERVAL, BLOCK_INTERVAL = 32, 128
 LIVELY_INTERVAL, LIVELY_BLOCK_INTERVAL = 8, 32
 FIRST_INTERVAL = 8
-_SCHEDULE = [int(place) for place in (clock.CALM, clock.CLOSENESS, clock.FOLLOWED, clock.CHECKED)]
 #: The step if nothing can vibrate [s].
 ANY_STEP = 1e-3
-
-
-#: In place of a number of calm checks: some bodies change fast; there was no check yet.
-LIVELY, UNKNOWN = -1, -2
-#: After this many calm checks in a row, measurements are half as frequent.
-CALM_CHECKS = 2
-
-
-class Schedule(NamedTuple):
-    """When energies are checked, and the result of the last check.
-
-    Attributes:
-        calm: How many checks in a row found the bodies calm, or LIVELY or UNKNOWN.
-        intervals: Measurements between two checks; zero if not chosen yet.
-        steps: Steps done at the last check.
-        allowed: The step that the state allowed then [s].
-    """
-
-    calm: int
-    intervals: int
-    steps: int
-    allowed: float
 
 
 class SafeStep:
@@ -367,7 +344,6 @@ class SafeStep:
         else:
             control[:] = longest
             control[clock.SHARE] = 1.0
-            control[_SCHEDULE] = 0.0
         control[clock.AT_REST] = longest
         self.pace.write_control(control)
         self.resume()
@@ -379,8 +355,8 @@ class SafeStep:
             gauge.restart()
         control = self.pace.known.control.copy()
         control[clock.ALLOWED], control[clock.SHARE] = control[clock.AT_REST], 1.0
-        control[_SCHEDULE] = 0.0
         self.pace.write_control(control)
+        self.pace.schedule = Schedule()
         self.resume()
         self.pace.take_given()
 
@@ -434,18 +410,6 @@ class SafeStep:
             float(control[clock.ALLOWED]),
             float(control[clock.AT_REST]),
         )
-
-    @property
-    def schedule(self) -> Schedule:
-        """When energies are checked."""
-        calm, intervals, steps, allowed = self.pace.known.control[_SCHEDULE]
-        return Schedule(int(calm), int(intervals), int(steps), float(allowed))
-
-    @schedule.setter
-    def schedule(self, value: Schedule) -> None:
-        inputs = [*map(wp.float64, value), self._control]
-        wp.launch(clock.set_schedule, dim=1, inputs=inputs, device=self.device)
-        self.pace.note_control(_SCHEDULE, value)
 
     @property
     def state(self) -> dict[str, wp.array]:

@@ -89,7 +89,7 @@ Remesh = OnlineRemesh | Sequence[OnlineRemesh | None] | None
 
 FORMAT = "warp-corot checkpoint"
 #: The version of checkpoints that is written, and the only one that is read.
-VERSION = 12
+VERSION = 13
 
 MATERIALS = {kind.__name__: kind for kind in (Isotropic, TransverselyIsotropic, Orthotropic, FibreReinforced)}
 
