@@ -317,39 +317,23 @@ def sum_nodes(
 
 
 @wp.kernel(enable_backward=False)
-def sum_elements(energies: wp.array[wp.float64], count: int, threads: int, lanes: int, sums: wp.array3d[wp.float64]):
-    """Add up the strain energies, ``count`` of each world."""
+def sum_rows(
+    rows: wp.array2d[wp.float64], count: int, threads: int, lanes: int, column: int, sums: wp.array3d[wp.float64]
+):
+    """Add up rows of numbers, ``count`` of each world, in one column each: strain energies, or the work of constraints
+    and its absolute value."""
     world, thread = wp.tid()
-    total = wp.float64(0.0)
-    k = thread
-    while k < count:
-        total += energies[world * count + k]
-        k += threads
-    if lanes > 1:
-        total = sum_of_lanes(total)
-    if thread % lanes == 0:
-        part = thread / lanes
-        sums[world, part, ELASTIC] = sums[world, part, ELASTIC] + total
-
-
-@wp.kernel(enable_backward=False)
-def sum_work(account: wp.array2d[wp.float64], count: int, threads: int, lanes: int, sums: wp.array3d[wp.float64]):
-    """Add up the work of constraints and its absolute value, from ``count`` places in each world."""
-    world, thread = wp.tid()
-    work = wp.float64(0.0)
-    absolute = wp.float64(0.0)
-    k = thread
-    while k < count:
-        work += account[0, world * count + k]
-        absolute += account[1, world * count + k]
-        k += threads
-    if lanes > 1:
-        work = sum_of_lanes(work)
-        absolute = sum_of_lanes(absolute)
-    if thread % lanes == 0:
-        part = thread / lanes
-        sums[world, part, WORKED] = sums[world, part, WORKED] + work
-        sums[world, part, WORKED_ABSOLUTE] = sums[world, part, WORKED_ABSOLUTE] + absolute
+    for row in range(rows.shape[0]):
+        total = wp.float64(0.0)
+        k = thread
+        while k < count:
+            total += rows[row, world * count + k]
+            k += threads
+        if lanes > 1:
+            total = sum_of_lanes(total)
+        if thread % lanes == 0:
+            part = thread / lanes
+            sums[world, part, column + row] = sums[world, part, column + row] + total
 
 
 @wp.kernel(enable_backward=False)

@@ -140,8 +140,7 @@ class Balance:
             if whole:
                 body.state.forces.zero_()
         for account in system.accounts if accounts is None else accounts:
-            inputs = [account, account.shape[1] // self.worlds, self._threads, self._lanes]
-            wp.launch(kernels.sum_work, (self.worlds, self._threads), inputs, [self._sums], device=self.device)
+            self._add_rows(account, kernels.WORKED)
         if self._addends is not None:
             wp.copy(self._addends, self._sums)
         inputs = [self._lanes, system.pace.orders, system.support_work, system.bad_step, copies.changed]
@@ -192,8 +191,11 @@ class Balance:
         field.add_forces(u, body.state.forces)
         for name, array in field.state.items():
             wp.copy(array, kept[name])
-        inputs = [energies, len(energies) // self.worlds, self._threads, self._lanes]
-        wp.launch(kernels.sum_elements, (self.worlds, self._threads), inputs, [self._sums], device=self.device)
+        self._add_rows(energies.reshape((1, len(energies))), kernels.ELASTIC)
+
+    def _add_rows(self, rows: wp.array, column: int) -> None:
+        inputs = [rows, rows.shape[1] // self.worlds, self._threads, self._lanes, column]
+        wp.launch(kernels.sum_rows, (self.worlds, self._threads), inputs, [self._sums], device=self.device)
 
     def _add_nodal(self, k: int, u: wp.array, v: wp.array, pace: Pace, keeps: bool) -> None:
         """Add the sums over the nodes of a body, and keep its state beside the last good one."""
