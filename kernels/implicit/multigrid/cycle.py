@@ -17,6 +17,29 @@ from warp_corot.kernels.elements.simd8 import constants, on_cpu
 wp.set_module_options({"enable_backward": False})
 
 
+#: Native code: four floats that are added and multiplied at once.
+FOUR = """
+#if defined(__CUDA_ARCH__)
+    struct alignas(16) four {
+        float v[4];
+        __device__ float operator[](int i) const { return v[i]; }
+        __device__ four operator+(const four& b) const {
+            return {v[0] + b.v[0], v[1] + b.v[1], v[2] + b.v[2], v[3] + b.v[3]};
+        }
+        __device__ four operator*(const four& b) const {
+            return {v[0] * b.v[0], v[1] * b.v[1], v[2] * b.v[2], v[3] * b.v[3]};
+        }
+        __device__ four operator*(float s) const { return {s * v[0], s * v[1], s * v[2], s * v[3]}; }
+        __device__ void operator+=(const four& b) { *this = *this + b; }
+        __device__ void operator*=(float s) { *this = *this * s; }
+    };
+#else
+    #pragma clang fp contract(fast)
+    typedef float four __attribute__((vector_size(16), aligned(4)));
+#endif
+"""
+
+
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
     const unsigned int first = threadIdx.x & 31 & ~(lanes - 1);
@@ -118,16 +141,9 @@ def row_of(level: LevelArrays, world: int, i: int, lane: int, z: wp.array[wp.vec
 
 #: Native code of transfers: the vectors of one world, and its flags of free nodes. Warp's own loops over vec4 arrays
 #: take two to three times as long on a CPU.
-_MOVES = """
-#if defined(__CUDA_ARCH__)
-    struct alignas(16) four {
-        float x, y, z, w;
-        __device__ four operator+(const four& b) const { return {x + b.x, y + b.y, z + b.z, w + b.w}; }
-        __device__ four operator*(float s) const { return {s * x, s * y, s * z, s * w}; }
-    };
-#else
-    typedef float four __attribute__((vector_size(16)));
-#endif
+_MOVES = (
+    FOUR
+    + """
     const auto vectors = [&](const auto& all, int nodes) {
         return reinterpret_cast<four*>(all.data) + (long long)world * nodes;
     };
@@ -135,6 +151,7 @@ _MOVES = """
     const four zero = {0.0f, 0.0f, 0.0f, 0.0f};
     const int count = level.count;
 """
+)
 
 
 @wp.func_native(

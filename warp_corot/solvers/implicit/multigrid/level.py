@@ -15,7 +15,6 @@ from warp_corot.kernels.elements.dilatation import not_held
 from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.implicit.multigrid import cycle, dense, values
 from warp_corot.kernels.implicit.multigrid import pattern as kernels
-from warp_corot.kernels.implicit.multigrid.values import gather_leaves_on_cpu
 from warp_corot.kernels.tables.shapes import GRADIENT
 from warp_corot.solvers.implicit.operator import LinearOperator
 
@@ -305,7 +304,7 @@ class LeafMatrix:
     @property
     def kernels(self) -> list[wp.Kernel]:
         """Kernels that it launches, beside those of ``loading.IMPLICIT_ON_FORESTS``."""
-        found = [self._write_frames, gather_leaves_on_cpu if self.device.is_cpu else values.gather_leaves]
+        found = [self._write_frames, values.gather_leaves]
         return found if self._members is None else [*found, kernels.write_rows(self._members.law)]
 
     @property
@@ -344,20 +343,14 @@ class LeafMatrix:
             inputs += [body.mu, body.lam, body.material_stride, most_shared]
             self._launch(kernels.write_rows(members.law), members.count, inputs, [self._rows], u.ptr, most_shared)
         inputs = [self._leaves(), scales, stiffening, most_lambda if members is None else 0.0]
-        if self.device.is_cpu:
-            parts, outputs = self._regions.team.parts, [blocks, self._more]
-            self._regions.launch(
-                (blocks.ptr, scales.ptr, stiffening, most_lambda),
-                lambda part: launch(gather_leaves_on_cpu, sizes.worlds, [part, parts, *inputs], outputs, device="cpu"),
-            )
-        else:
-            wp.launch(
-                values.gather_leaves,
-                (sizes.worlds, len(found.sums.upper)),
-                inputs,
-                [blocks, self._more],
-                device=self.device,
-            )
+        threads = 1 if self.device.is_cpu else len(found.sums.upper)
+        parts, outputs = threads * self._regions.team.parts, [blocks, self._more]
+        self._regions.launch(
+            (blocks.ptr, scales.ptr, stiffening, most_lambda),
+            lambda part: launch(
+                values.gather_leaves, (sizes.worlds, threads), [part, parts, *inputs], outputs, device=self.device
+            ),
+        )
         if holds and members is not None and members.law.holding is not not_held:
             inputs = [sizes.world_elements, count, found.entries, elements, u, body.lam, body.material_stride]
             inputs += [scales, self._rank, found.starts, found.columns]
