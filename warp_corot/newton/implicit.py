@@ -22,9 +22,8 @@ from warp_corot.kernels.newton import implicit_rows as rows
 from warp_corot.kernels.newton.particles import Particles
 from warp_corot.mesh.growing.cut import connected
 from warp_corot.solvers.implicit.block_system import BlockSystem
-from warp_corot.solvers.implicit.conjugate_gradients import WorldSums
+from warp_corot.solvers.implicit.conjugate_gradients import LineSearch, WorldSums
 from warp_corot.solvers.implicit.contact_solve import ContactSolve
-from warp_corot.solvers.implicit.line_search import LineSearch
 from warp_corot.solvers.implicit.operator import Springs
 from warp_corot.solvers.implicit.preconditioners import BlockDiagonal
 from warp_corot.solvers.recorded import Replays

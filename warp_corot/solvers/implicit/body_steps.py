@@ -20,8 +20,7 @@ from .contact_constraints import Hold, ObstacleContact, Touching
 from .multigrid import Multigrid
 from .newton import Newton
 from .preconditioners import Lagged, preconditioner_of
-from .tangent import TangentOperator
-from .turning import TurnedState
+from .tangent import TangentOperator, TurnedState
 
 if TYPE_CHECKING:
     from warp_corot.solvers.system import System

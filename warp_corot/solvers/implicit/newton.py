@@ -15,7 +15,7 @@ from warp_corot.kernels.implicit.residual import FIND_RESIDUAL
 
 from .block_system import BlockSystem
 from .conjugate_gradients import WorldSums
-from .turning import TurnedState
+from .tangent import TurnedState
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
