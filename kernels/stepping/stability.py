@@ -7,8 +7,7 @@ these sums bounds the eigenvalues of A (Gershgorin's circles, for blocks). The n
 each normalised: a power iteration that does not lose the directions at softer places. Where s_i < 0, the body buckles
 and does not vibrate.
 
-The host reads nothing before the last step. Sums are float64 and always have the same order: first partial sums, then
-sums of these.
+Lanczos' iteration needs partial sums, in float64 and always in the same order, which the host adds up.
 """
 
 import functools

@@ -123,7 +123,7 @@ class HapticLoop:
     """Connects a haptic device to a tool of a simulation, in its own thread.
 
     The loop reads the device, lets the tool follow it, and takes the newest published state of the tool without
-    waiting. It writes the force of a local model (`local_model`), bounded in energy (`passivity`). Meanwhile the caller
+    waiting. It writes the force of a local model (`LocalModel`), bounded in energy (`PassivityControl`). Meanwhile the caller
     steps the simulation, by ``run`` or by calls of ``sim.advance``. When the simulation stops, the force fades.
 
     Args:

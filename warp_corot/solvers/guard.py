@@ -417,7 +417,7 @@ FALLING = 0.9
 #: moved; beyond it the step becomes shorter. The more energy came lately, the less is tolerated, down to this share.
 LITTLE_GAIN = 0.001
 LEAST_LEAVE = 0.2
-#: The same for the energy that came lately (``guard.MEMORY``). Above the first share, the step becomes shorter while
+#: The same for the energy that came lately (``MEMORY``). Above the first share, the step becomes shorter while
 #: this energy grows from one window of time to the next, and faster the nearer it is to the second share. Otherwise the
 #: step slowly grows.
 SURPLUS, MOST_SURPLUS = 0.004, 0.008

@@ -1,6 +1,6 @@
 """The finest level over subtrees on CUDA, without its matrix, and the matrix of the level of their roots.
 
-There a leaf's rotation takes sixteen bytes; its part of an assembled matrix has a hundred.
+In products over subtrees a leaf's rotation takes sixteen bytes; its part of an assembled matrix has a hundred.
 
 A root's hat functions are linear in each of its leaves, so P^T K P of a subtree is a sum over its leaves with the
 gradients of these functions, ten blocks for the pairs of its corners. The finest matrix itself is never assembled.
@@ -169,7 +169,7 @@ def finish_residual(
 @functools.cache
 def keep_rows(shape: int, of: Dilatation) -> wp.Kernel:
     """Write the rows of subtrees whose leaves share their dilatation, at displacements u, with w - 1 in the fourth
-    lane; see ``shared``. Those of the first nodes of all subtrees come first, then those of the second ones.
+    lane; see ``pattern``. Those of the first nodes of all subtrees come first, then those of the second ones.
     """
     leaves = LEAVES[shape]
     measure, curvature_of = of.measure, of.curvature

@@ -90,7 +90,7 @@ def write_frames(is_turned: bool) -> wp.Kernel:
 @wp.struct
 class Leaves:
     """What the entries of the finest matrix come from. ``gradients`` come from ``tables.shapes``, [shape, node]; pairs
-    and rows come from ``shared``."""
+    and rows come from ``pattern``."""
 
     elements: ForestElements
     world_elements: int

@@ -269,7 +269,7 @@ class LeafMatrix:
         free: Nonzero for free nodes, by row, uint8 [worlds * rows].
         members: The groups of elements that share their dilatation, or None.
         is_turned: Whether elements turn; False: linear elasticity.
-        is_bounded: Whether the inverses of diagonal blocks keep the bound of ``shared``.
+        is_bounded: Whether the inverses of diagonal blocks keep the bound of ``kernels.implicit.multigrid.pattern``.
 
     Attributes:
         pattern: Where entries are.

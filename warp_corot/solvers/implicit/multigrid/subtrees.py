@@ -1,7 +1,7 @@
 """The finest level without a matrix, for bodies all of whose leaves are in subtrees of one level (CUDA).
 
 Products go over the subtrees, with the rotations of their leaves, and the next level of the cycle is that of the
-subtrees' roots; see ``kernels.implicit.multigrid.subtrees`` and ``roots``.
+subtrees' roots; see ``kernels.implicit.multigrid.subtrees``.
 """
 
 from __future__ import annotations
