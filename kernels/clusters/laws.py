@@ -34,7 +34,7 @@ from warp_corot.kernels.elements.dilatation import Dilatation, mean_of, pressure
 from warp_corot.kernels.elements.fibres import ReinforcedMaterial, stress_in_axes
 from warp_corot.kernels.math.rotation import ITERATIONS, byers_xu, column, identity3, newton_rotation
 from warp_corot.kernels.modules import unique_kernel
-from warp_corot.kernels.stepping.block import LOAD, STORE
+from warp_corot.kernels.stepping.block_memory import LOAD, STORE
 from warp_corot.kernels.stepping.threads import synchronize_block
 from warp_corot.kernels.tables.cluster_layout import QUAD_BYTES, PairLayout
 

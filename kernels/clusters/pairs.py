@@ -16,7 +16,7 @@ import warp as wp
 from warp_corot.kernels.elements.elements import ADD_FORCE
 from warp_corot.kernels.math.matrices import column
 from warp_corot.kernels.modules import unique_kernel
-from warp_corot.kernels.stepping.block import LOAD, STORE
+from warp_corot.kernels.stepping.block_memory import LOAD, STORE
 from warp_corot.kernels.stepping.threads import synchronize_block
 from warp_corot.kernels.tables.cluster_layout import BANK_GROUPS, QUAD_BYTES, PairLayout
 

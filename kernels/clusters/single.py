@@ -13,7 +13,7 @@ from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.elements import LEVEL_MASK
 from warp_corot.kernels.math.matrices import column
 from warp_corot.kernels.modules import unique_kernel
-from warp_corot.kernels.stepping.block import LOAD, STORE
+from warp_corot.kernels.stepping.block_memory import LOAD, STORE
 from warp_corot.kernels.stepping.threads import number_in, synchronize_block
 from warp_corot.kernels.tables.cluster_layout import DEFAULT_LAYOUT, NUMBERS, QUAD_BYTES, ClusterLayout
 from warp_corot.kernels.tables.shapes import MIRROR_BIT, VOLUME

@@ -28,7 +28,7 @@ from warp_corot.kernels.math.matrices import column, identity3
 from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.tables.shapes import fingerprint
 
-from .block import LOAD, STORE, numbers_at, vectors_at
+from .block_memory import LOAD, STORE, numbers_at, vectors_at
 from .integrate import add_support_work, is_finite, symplectic_euler_velocity, vector_at
 from .pace import DONE, DT, Pace, length_before, time_after
 from .threads import lowest_bit, number_in, shuffle_down, synchronize_any, synchronize_block

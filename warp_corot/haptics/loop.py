@@ -123,8 +123,8 @@ class HapticLoop:
     """Connects a haptic device to a tool of a simulation, in its own thread.
 
     The loop reads the device, lets the tool follow it, and takes the newest published state of the tool without
-    waiting. It writes the force of a local model (`LocalModel`), bounded in energy (`PassivityControl`). Meanwhile the caller
-    steps the simulation, by ``run`` or by calls of ``sim.advance``. When the simulation stops, the force fades.
+    waiting. It writes the force of a local model (`LocalModel`), bounded in energy (`PassivityControl`). Meanwhile the
+    caller steps the simulation, by ``run`` or by calls of ``sim.advance``. When the simulation stops, the force fades.
 
     Args:
         sim: The simulation, of one world, with the tool among its obstacles.

@@ -1,7 +1,8 @@
 """How far a body sags if some of its nodes are fixed: linear statics on a coarse grid of cubes, or of its tetrahedra.
 
-On the grid, each cube has the stiffness and the weight of the part of the body inside it. It is a trilinear brick with incompatible
-modes (Wilson et al. 1973; Taylor, Beresford and Wilson 1976), so that parts one cube thick bend as they should.
+On the grid, each cube has the stiffness and the weight of the part of the body inside it. It is a trilinear brick with
+incompatible modes (Wilson et al. 1973; Taylor, Beresford and Wilson 1976), so that parts one cube thick bend as they
+should.
 
 The simulation uses the body's tetrahedra, too. So with these a thin neck bends and adjacent parts stay apart, which
 coarse cubes (`CoarseBody`) do not show. Conjugate gradients are preconditioned by the diagonal and, on a coarse grid of

@@ -4,8 +4,9 @@ An entry in the upper triangle, or on the diagonal, is a sum of contributions: o
 next finer level's entries on the others (Galerkin). Contributions are listed with their pair of ranks as a key, and
 sorted.
 
-A group of elements that share their dilatation adds r r^T with r = sqrt(c) g of ``kernels.elements.mean_dilatation_rows``, so each pair of its nodes
-contributes to an entry. Rows belong to the present state, because lambda may be thousands of times mu.
+A group of elements that share their dilatation adds r r^T with r = sqrt(c) g of
+``kernels.elements.mean_dilatation_rows``, so each pair of its nodes contributes to an entry. Rows belong to the present
+state, because lambda may be thousands of times mu.
 
 A group of k nodes couples all of them: r r^T may be k times its own diagonal blocks. It is at most 4 times these with
 weights w_n = sum of |r_m| / (4 |r_n|), since (sum of r_n . p_n)^2 <= sum of |r_m| times sum of (r_n . p_n)^2 / |r_n|.
