@@ -125,17 +125,19 @@ class RestState:
         moved = motion.numpy()[: body.sizes.nodes, :3].astype(np.float64)
         work = ElementWork(self.field, parameters.needed(names))
         work.add(body.state.displacements, motion)
+        of_obstacles = np.zeros((len(self.obstacles), 3))
+        if self.contact is not None and self._adjoint is not None:
+            of_obstacles = self.contact.of_obstacles(moved, self._adjoint.multipliers)
         found = derivatives(body, work, names, moved, moved @ gravity)
-        if "rest" in names:
-            # Held nodes keep their displacements, so their places follow the rest shape.
-            found["rest"] = found["rest"] + boundary
-        if "boundary" in names:
-            found["boundary"] = boundary
-        if "obstacles" in names:
-            found["obstacles"] = np.zeros((len(self.obstacles), 3))
-            if self.contact is not None and self._adjoint is not None:
-                found["obstacles"] = self.contact.of_obstacles(moved, self._adjoint.multipliers)
-        return found
+        return found | _of_places(found, names, boundary, of_obstacles)
+
+
+def _of_places(found: dict[str, Any], names: Sequence[str], boundary: Array, of_obstacles: Array) -> dict[str, Any]:
+    """The derivatives with respect to places, of those that are asked for; "rest" is found except for held nodes."""
+    # Held nodes keep their displacements, so their places follow the rest shape.
+    of_rest = {"rest": found["rest"] + boundary} if "rest" in names else {}
+    others = {"boundary": boundary, "obstacles": of_obstacles}
+    return of_rest | {name: others[name] for name in names if name in others}
 
 
 def bound(body: SoftBody, law: Model, names: Sequence[str]) -> tuple[ForceField, set[str]]:
@@ -385,13 +387,7 @@ class PreciseState:
         work = _Work(self._rest.elements, self._rest.u, moved)
         flat = moved.reshape(-1, 3)
         found = derivatives(self.body, work, names, flat, flat @ self._gravity)
-        if "rest" in names:
-            found["rest"] = found["rest"] + boundary.reshape(-1, 3)
-        if "boundary" in names:
-            found["boundary"] = boundary.reshape(-1, 3)
-        if "obstacles" in names:
-            found["obstacles"] = of_obstacles
-        return found
+        return found | _of_places(found, names, boundary.reshape(-1, 3), of_obstacles)
 
 
 class _Work:

@@ -277,9 +277,7 @@ def _rolls(body: SoftBody) -> bool:
     held = body.conditions.held_mask().reshape(body.worlds, -1).any(axis=1)
     x, v = (array.numpy().reshape(body.worlds, -1, 3).astype(np.float64) for array in (body.positions, body.velocities))
     for world in np.flatnonzero(~held):
-        turns = np.stack([np.cross(axis, x[world] - x[world].mean(axis=0)) for axis in np.eye(3)])
-        shifts = np.broadcast_to(np.eye(3)[:, None], turns.shape)
-        modes = np.concatenate([shifts, turns]).reshape(6, -1).T
+        modes = _rigid_motions(x[world] - x[world].mean(axis=0)).reshape(-1, 6)
         rest = v[world].ravel() - modes @ np.linalg.lstsq(modes, v[world].ravel(), rcond=None)[0]
         if np.linalg.norm(rest) < 0.5 * np.linalg.norm(v[world]):
             return True

@@ -15,6 +15,7 @@ from warp_corot.kernels.stepping import balance as kernels
 from warp_corot.kernels.stepping import pace as clock
 from warp_corot.kernels.stepping.pace import Pace
 
+from .implicit.conjugate_gradients import WorldSums
 from .pace import Mapped
 from .system import NEVER, System
 
@@ -23,10 +24,8 @@ if TYPE_CHECKING:
     from warp_corot.elasticity import ForceField
 
 
-#: How many nodes a thread adds up, and the most warps of all worlds; a CPU has one thread for each world.
-NODES = 4
+#: The most warps of all worlds.
 WARPS = 2048
-WARP = 32
 
 Floats = npt.NDArray[np.float64]
 
@@ -74,16 +73,15 @@ class Balance:
     def __init__(self, system: System, copies: Copies):
         self.system, self.bodies, self.fields, self._copies = system, system.bodies, system.fields, copies
         self.worlds, self.device = system.worlds, system.device
-        self._lanes = 1 if self.device.is_cpu else WARP
-        wanted = -(-max(body.sizes.launch_nodes for body in self.bodies) // (self.worlds * NODES * WARP))
-        warps = 1 if self.device.is_cpu else max(min(wanted, WARPS // self.worlds), 1)
-        self._threads = warps * self._lanes
-        self._ranks = system.ranks
+        self._ranks, sizes = system.ranks, [body.sizes for body in self.bodies]
+        count = max(each.launch_nodes for each in sizes)
         if self._ranks.is_reproducible:
-            # Every node and every element is an addend, because their sums are the same in any order.
-            self._lanes, warps = 1, max(max(b.sizes.launch_nodes, b.sizes.launch_elements) for b in self.bodies)
-            warps = self._threads = max(warps // self.worlds, 1)
-        self._sums = wp.zeros((self.worlds, warps, kernels.COLUMNS), dtype=wp.float64, device=self.device)
+            # Elements are addends, too.
+            count = max(count, *(each.launch_elements for each in sizes))
+        parts = WorldSums(
+            self.worlds, max(count // self.worlds, 1), kernels.COLUMNS, self.device, self._ranks, most=WARPS
+        )
+        self._sums, self._lanes, self._threads = parts.parts, parts.lanes, parts.shape[1]
         self._addends = wp.zeros_like(self._sums) if self._ranks.is_reproducible else None
         self._energies: list[wp.array] = [wp.empty(0, dtype=wp.float64, device=self.device) for _ in self.bodies]
         self._field_states: list[dict[str, wp.array]] = [{} for _ in self.bodies]

@@ -30,6 +30,7 @@ class WorldSums:
         columns: Number of sums.
         device: The device.
         ranks: The ranks with other nodes of the same worlds.
+        most: Maximum number of warps of all worlds.
 
     Attributes:
         parts: Parts of the sums, float64 [worlds, parts, columns].
@@ -37,11 +38,13 @@ class WorldSums:
         sizes: The arguments count, threads and lanes of its kernel.
     """
 
-    def __init__(self, worlds: int, count: int, columns: int, device: wp.Device, ranks: Halo = ALONE):
+    def __init__(
+        self, worlds: int, count: int, columns: int, device: wp.Device, ranks: Halo = ALONE, most: int = WARPS
+    ):
         self.device, self.worlds, self._ranks = device, worlds, ranks
         self.lanes = 1 if device.is_cpu or ranks.is_reproducible else WARP
         wanted = -(-count // (NODES * WARP))
-        warps = 1 if device.is_cpu else max(min(wanted, WARPS // worlds), 1)
+        warps = 1 if device.is_cpu else max(min(wanted, most // worlds), 1)
         if ranks.is_reproducible:
             # Every node is an addend, because their sums are the same in any order.
             warps = count
