@@ -220,6 +220,11 @@ class Conditions:
 
     # --- loads -----------------------------------------------------------------------------------------------------
 
+    def loads_and_weights(self, gravity: npt.ArrayLike) -> npt.NDArray[np.float64]:
+        """Loads and weights of all nodes in gravity [m/s^2], [N], float64 [worlds * N, 3]; waits for the device."""
+        found = self.discretization.masses[:, None] * np.asarray(gravity, np.float64)
+        return found + self.loads.numpy()[: self.sizes.nodes, :3] if self.has_loads else found
+
     def make_loads(self) -> None:
         """Ensure that there is an array of loads for every node."""
         if not self.has_loads:

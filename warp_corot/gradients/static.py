@@ -348,9 +348,7 @@ class PreciseState:
 
         body, self._gravity = solved.body, solved.gravity
         self.body, self.report = body, solved.report
-        loads = body.masses[:, None] * solved.gravity
-        if body.conditions.has_loads:
-            loads = loads + body.conditions.loads.numpy()[: body.sizes.nodes, :3]
+        loads = body.conditions.loads_and_weights(solved.gravity)
         self._contacts, shapes = [], solved.obstacles
         if solved.contact is not None:
             rest = body.mesh.points

@@ -43,10 +43,7 @@ class LoadedBody:
 
     def __init__(self, body: SoftBody, field: ForceField, gravity: tuple[float, float, float]):
         self.body, self.field = body, field
-        conditions, count = body.conditions, body.sizes.nodes
-        self.loads = body.masses[:, None] * np.array(gravity)
-        if conditions.has_loads:
-            self.loads = self.loads + conditions.loads.numpy()[:count, :3].astype(np.float64)
+        self.loads = body.conditions.loads_and_weights(gravity)
 
     def falls(self) -> bool:
         """Whether nothing holds the body, and its loads do not balance."""

@@ -251,11 +251,7 @@ class StaticSolver:
 
     def _loads(self) -> npt.NDArray[np.float64]:
         """Loads and weight [N], [worlds * N, 3]."""
-        conditions, count = self.body.conditions, self.body.sizes.nodes
-        loads = self.body.masses[:, None] * np.array([*self.newton.gravity], np.float64)
-        if conditions.has_loads:
-            loads = loads + conditions.loads.numpy()[:count, :3]
-        return loads
+        return self.body.conditions.loads_and_weights([*self.newton.gravity])
 
     def _run(self, graph: wp.Graph, share: float) -> NewtonReport:
         """Newton's method at one share of the load."""
