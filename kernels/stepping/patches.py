@@ -29,7 +29,7 @@ from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.tables.shapes import fingerprint
 
 from .block_memory import LOAD, STORE, numbers_at, vectors_at
-from .integrate import add_support_work, is_finite, symplectic_euler_velocity, vector_at
+from .integrate import Dynamics, add_support_work, is_finite, load_at, symplectic_euler_velocity
 from .pace import DONE, DT, Pace, length_before, time_after
 from .threads import lowest_bit, number_in, shuffle_down, synchronize_any, synchronize_block
 
@@ -177,12 +177,11 @@ def key_from(times: wp.array[wp.float64], key: int, last: int, t: wp.float64):
 
 
 @functools.cache
-def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
+def step_patches(layout: Layout) -> wp.Kernel:
     """Symplectic Euler steps of the corotated model with own rotations; launch ``layout.threads`` threads for each
     patch of each world.
 
     Args:
-        load_vectors: The element type of the array of loads, vec3 or vec4.
     """
     threads, each, halo_each, lanes = layout.threads, layout.elements, layout.halo, layout.lanes
     slot, displacement = vectors_at(0), vectors_at(layout.slots + 1)
@@ -250,21 +249,15 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
         # In
         body: PatchBody,
         steps: int,
-        damping: float,
-        gravity: wp.vec3,
+        dynamics: Dynamics,
         mu: wp.array[wp.float32],
         lam: wp.array[wp.float32],
         stride: int,
         mass: wp.array[wp.float32],
-        inverse_mass: wp.array[wp.float32],
-        has_load: int,
-        load: wp.array[load_vectors],
         pace: Pace,
         world_starts: wp.array[wp.float64],
         # In and out
         exchange: Exchange,
-        u: wp.array[wp.vec4],
-        v: wp.array[wp.vec4],
         # Out
         reactions: wp.array[wp.vec4],
         support_work: wp.array[wp.float64],
@@ -279,7 +272,7 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
         first_node = world * body.own.shape[0]
         dt = float(pace.seconds[DT])
         before = float(length_before(pace))
-        damped = 1.0 / (1.0 + dt * damping)
+        damped = 1.0 / (1.0 + dt * dynamics.damping)
         number = exchange.begun[block]
 
         # The node whose forces the thread sums together with its neighbours; the first of them moves the node.
@@ -288,12 +281,10 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
         place = thread // wp.static(lanes)
         moves = place < own_count and thread % wp.static(lanes) == 0
         i = first_node + body.own[first_own + wp.min(place, own_count - 1)]
-        x = load_node(u, i)
-        velocity = load_node(v, i)
-        w = inverse_mass[i]
-        load_here = wp.vec3()
-        if has_load != 0:
-            load_here = vector_at(load, i)
+        x = load_node(dynamics.u, i)
+        velocity = load_node(dynamics.v, i)
+        w = dynamics.inverse_mass[i]
+        load_here = load_at(i, dynamics)
         trajectory = body.trajectory[i]
         key = int(0)
         last_key = int(0)
@@ -468,11 +459,13 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                     velocity = towards
                 force = elastic + load_here
                 if w > 0.0:
-                    velocity = symplectic_euler_velocity(velocity, force, w, gravity, 0.5 * (before + dt), damped)
+                    velocity = symplectic_euler_velocity(
+                        velocity, force, w, dynamics.gravity, 0.5 * (before + dt), damped
+                    )
                 else:
                     add_support_work(elastic, 0.5 * (before + dt) * velocity, support_work)
                     if step == steps - 1:
-                        store_node(reactions, i, -(force + mass[i] * gravity))
+                        store_node(reactions, i, -(force + mass[i] * dynamics.gravity))
                 x = x + dt * velocity
                 displacement(wp.static(STORE), place, x)
                 publish(exchange.published, int(number & wp.uint32(1)) * exchange.nodes + i, x, number)
@@ -486,8 +479,8 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
             x = wp.vec3(wp.nan, wp.nan, wp.nan)
             wp.atomic_min(bad_step, 0, pace.counts[DONE] + wp.int64(step + 1))
         if moves:
-            store_node(u, i, x)
-            store_node(v, i, velocity)
+            store_node(dynamics.u, i, x)
+            store_node(dynamics.v, i, velocity)
         if thread == 0:
             exchange.begun[block] = exchange.begun[block] + wp.uint32(steps + 1)
 

@@ -393,26 +393,20 @@ class PatchSteps:
         """Launch ``count`` steps, the first ones since the clock was last advanced."""
         body = self.body
         wp.launch(
-            step_patches(self.layout, body.conditions.loads.dtype),
+            step_patches(self.layout),
             dim=body.worlds * self.patches.count * self.layout.threads,
             block_dim=self.layout.threads,
             inputs=[
                 self._tables,
                 count,
-                damping,
-                system.gravity,
+                system.dynamics(body, damping),
                 body.discretization.mu,
                 body.discretization.lam,
                 body.discretization.material_stride,
                 body.conditions.mass,
-                body.conditions.inverse_mass,
-                int(body.conditions.has_loads),
-                body.conditions.loads,
                 system.pace.arrays,
                 body.conditions.world_starts,
                 self._exchange,
-                body.state.displacements,
-                body.state.velocities,
             ],
             outputs=[body.state.reactions, system.support_work, system.bad_step],
             device=body.device,
