@@ -27,7 +27,7 @@ from warp_corot.mesh import TetForest
 from warp_corot.mesh.surfaces.boundary import signed_volumes
 from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import SymplecticEuler
-from warp_corot.solvers.integrator import GRAPH_STEPS
+from warp_corot.solvers.system import GRAPH_STEPS
 
 Array = npt.NDArray[np.float64]
 

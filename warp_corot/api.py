@@ -1,6 +1,6 @@
 """The names that ``import warp_corot`` gives."""
 
-from warp_corot.body.activation import Activation
+from warp_corot.body.keyframes import Activation
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.grasp import Grasp
 from warp_corot.contact.options import Contact

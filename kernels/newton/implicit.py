@@ -20,7 +20,7 @@ import warp as wp
 from warp_corot.kernels.corotated.tangent import keep_gradients
 from warp_corot.kernels.elements.constitutive import hooke, symmetric
 from warp_corot.kernels.elements.elements import GeneralElements, load_node, store_node
-from warp_corot.kernels.implicit.turning import COLUMNS, Sums, motion_of
+from warp_corot.kernels.implicit.increments import COLUMNS, Sums, motion_of
 from warp_corot.kernels.math.rotation import byers_xu, identity3
 from warp_corot.kernels.stepping.balance import sum_of_lanes
 
@@ -260,7 +260,7 @@ def count_solves(
     totals[3] = totals[3] + wp.int64(unfinished)
 
 
-# --- how free pieces turn in a step; see ``kernels.implicit.turning`` ------------------------------------------------
+# --- how free pieces turn in a step; see ``kernels.implicit.increments`` ----------------------------------------------
 #
 # A piece is all particles that tetrahedra connect. It is turned about its centre of mass, as it will turn in the step.
 

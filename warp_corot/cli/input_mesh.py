@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from warp_corot.body.places import named_nodes
+from warp_corot.body.controls import named_nodes
 from warp_corot.domain.units import in_units
 from warp_corot.errors import InputError
 from warp_corot.inputs.stopwatch import WATCH

@@ -128,9 +128,8 @@ class ActiveSet:
     def add_slopes(
         self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array, *, apart: bool = False
     ) -> None:
-        """Launch the power of friction along a change; see ``solvers.implicit.line_search``. If there is only one
-        slope,
-        it is that of all worlds together. With ``apart`` there is one for each place, [worlds * count]."""
+        """Launch the power of friction along a change; see ``solvers.implicit.conjugate_gradients``. If there is only
+        one slope, it is that of all worlds together. With ``apart`` there is one for each place, [worlds * count]."""
         motions = self._contacts.obstacles.motions
         inputs = [int(len(search) == 1), int(apart), motions, self._surface, self._holding, d, change, search]
         self._launch(kernels.add_slopes, [*inputs, slopes])

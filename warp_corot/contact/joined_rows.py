@@ -207,7 +207,7 @@ class JoinedRows:
         self._on_rows(kernels.couple_rows, [*self._springs, couplings])
 
     def add_slopes(self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array) -> None:
-        """Launch the power along a change; see ``solvers.implicit.line_search``."""
+        """Launch the power along a change; see ``solvers.implicit.conjugate_gradients``."""
         self._on_rows(kernels.add_row_slopes, [*self._springs, d, change, search, slopes])
 
     def launch_end(self, d: wp.array) -> None:

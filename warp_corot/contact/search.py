@@ -14,7 +14,7 @@ from warp_corot.kernels.contact import near as near_kernels
 from warp_corot.kernels.contact import watch as kernels
 from warp_corot.kernels.contact.touches import Touches
 from warp_corot.kernels.contact.vertices import Rigid
-from warp_corot.solvers.guarding.mapped import Mapped
+from warp_corot.solvers.pace import Mapped
 
 from .obstacles import Obstacles
 from .surface import ContactSurface

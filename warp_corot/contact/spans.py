@@ -169,7 +169,7 @@ class Spans:
             self._on_listed(kernels.couple_spans, each, [*self._places(each), each.touches, each.spans, couplings])
 
     def add_slopes(self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array) -> None:
-        """Launch the power along a change; see ``solvers.implicit.line_search``."""
+        """Launch the power along a change; see ``solvers.implicit.conjugate_gradients``."""
         for each in self._items:
             inputs = [int(len(search) == 1), *self._places(each), each.touches, each.spans, d, change, search, slopes]
             self._on_listed(kernels.add_span_slopes, each, inputs)

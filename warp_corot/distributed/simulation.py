@@ -32,11 +32,11 @@ from warp_corot.remesh.online import OnlineRemesh
 from warp_corot.remesh.remeshing import Remeshing
 from warp_corot.simulation import simulation as on_one
 from warp_corot.simulation.energy import WorldEnergies
-from warp_corot.simulation.hooks import Hooks
 from warp_corot.simulation.parts import checked_bodies, checked_integrator, checked_models, chosen_worlds
+from warp_corot.simulation.running import Hooks
 from warp_corot.solvers import Integrator, SymplecticEuler
-from warp_corot.solvers.steps.pace import Pace
-from warp_corot.solvers.steps.safe_step import ANY_STEP
+from warp_corot.solvers.pace import Pace
+from warp_corot.solvers.stability import ANY_STEP
 
 from . import checkpoint, mpi
 from .divided_mesh import DividedForest, DividedMesh

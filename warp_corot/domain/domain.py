@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.inputs.forwarding import forwards
+from warp_corot.inputs.arguments import forwards
 
 from .combined import DifferenceDomain, IntersectionDomain, NamedDomain, UnionDomain
 from .function import Function, FunctionDomain

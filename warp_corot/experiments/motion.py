@@ -15,7 +15,7 @@ from warp_corot.materials.isotropic import Isotropic
 from warp_corot.mesh import TetForest
 from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import BackwardEuler, SymplecticEuler
-from warp_corot.solvers.integrator import Integrator
+from warp_corot.solvers.system import Integrator
 
 from .case import Row, Setup, case
 from .elastic import faces_where, mapped_grid, spread

@@ -15,19 +15,18 @@ from warp_corot.kernels.corotated.tangent import PLACES, KeptGradients, add_kept
 from warp_corot.kernels.elements.elements import GeneralElements
 from warp_corot.kernels.elements.forces import add_stiffness_product
 from warp_corot.kernels.elements.simd8 import LANES
-from warp_corot.kernels.implicit import conjugate_gradients, turning
+from warp_corot.kernels.implicit import conjugate_gradients, increments
 from warp_corot.kernels.implicit.tangent import add_vectors, find_rest
 from warp_corot.kernels.newton import implicit as kernels
 from warp_corot.kernels.newton import implicit_rows as rows
 from warp_corot.kernels.newton.particles import Particles
 from warp_corot.mesh.growing.cut import connected
-from warp_corot.solvers.implicit.block_diagonal import BlockDiagonal
 from warp_corot.solvers.implicit.block_system import BlockSystem
+from warp_corot.solvers.implicit.conjugate_gradients import LineSearch, WorldSums
 from warp_corot.solvers.implicit.contact_solve import ContactSolve
-from warp_corot.solvers.implicit.line_search import LineSearch
 from warp_corot.solvers.implicit.operator import Springs
-from warp_corot.solvers.implicit.sums import WorldSums
-from warp_corot.solvers.steps.repeated import Replays
+from warp_corot.solvers.implicit.preconditioners import BlockDiagonal
+from warp_corot.solvers.recorded import Replays
 
 from .checks import Step
 from .contact import Contacts
@@ -93,7 +92,7 @@ class Unknowns:
 
 
 class TurnedPieces:
-    """A model whose free pieces are turned as they will turn in a step; see ``solvers.implicit.turning``.
+    """A model whose free pieces are turned as they will turn in a step; see ``solvers.implicit.body_steps``.
 
     Pieces with held particles are not turned.
 
@@ -115,7 +114,7 @@ class TurnedPieces:
         first = np.cumsum(np.bincount(piece + 1))
         first -= first[0]
         count = len(first) - 1
-        self._sums = WorldSums(count, int(np.diff(first).max(initial=0)), turning.COLUMNS, device)
+        self._sums = WorldSums(count, int(np.diff(first).max(initial=0)), increments.MOTION_COLUMNS, device)
         self._piece, self._members, self._first = (
             wp.array(values, dtype=wp.int32, device=device) for values in (piece, members, first)
         )
@@ -132,7 +131,7 @@ class TurnedPieces:
         inputs = [self._first, self._members, particles, q, state.particle_qd, threads, lanes]
         wp.launch(kernels.sum_motion, sums.shape, inputs, [sums.parts], device=sums.device)
         outputs = [self._centres, self._turns, self._any_turns]
-        sums.launch_scalars(turning.find_turns, [wp.float64(dt)], outputs)
+        sums.launch_scalars(increments.find_turns, [wp.float64(dt)], outputs)
         inputs = [self._piece, q, self._centres, self._turns, self._entry]
         outputs = [tets.u, self.positions, self.way]
         wp.launch(kernels.turn_particles, len(self.positions), inputs, outputs, device=sums.device)

@@ -10,8 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.body.activation import Activation, followed_stress
-from warp_corot.body.trajectory import Followed
+from warp_corot.body.keyframes import Activation, Followed, followed_stress
 from warp_corot.discretization.changing.pools import DeviceForest
 from warp_corot.kernels.remesh.anisotropic import READ_LEAVES, WRITE_LEAVES
 from warp_corot.kernels.remesh.state import NO_ROW

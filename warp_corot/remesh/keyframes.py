@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.body.trajectory import Followed, NodeKeyframes
+from warp_corot.body.keyframes import Followed, NodeKeyframes
 from warp_corot.kernels.remesh.state import MIXED_ROWS, NO_ROW
 
 

@@ -21,7 +21,7 @@ from warp_corot.kernels.implicit.multigrid.cycle import Rows
 from warp_corot.materials.directional import Directional
 
 from .dissection import dissected
-from .multigrid.leaf_matrix import LeafMatrix
+from .multigrid.level import LeafMatrix
 from .multigrid.pattern import Pattern, PatternFinder
 from .tangent import TangentOperator
 

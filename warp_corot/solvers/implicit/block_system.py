@@ -14,8 +14,8 @@ from .conjugate_gradients import ConjugateGradients
 from .operator import Preconditioner
 
 if TYPE_CHECKING:
-    from .chosen import ChosenSolve
     from .contact_constraints import ObstacleContact, SoftContact
+    from .preconditioners import ChosenSolve
     from .tangent import TangentOperator
 
 

@@ -17,17 +17,16 @@ from warp_corot.solvers.halo import ALONE
 
 from .block_system import BlockSystem
 from .contact_constraints import Hold, ObstacleContact, Touching
-from .lagged import Lagged
 from .multigrid import Multigrid
 from .newton import Newton
-from .preconditioners import preconditioner_of
-from .tangent import TangentOperator
-from .turning import TurnedState
+from .preconditioners import Lagged, preconditioner_of
+from .tangent import TangentOperator, TurnedState
 
 if TYPE_CHECKING:
     from warp_corot.solvers.system import System
 
     from .schemes import ImplicitIntegrator
+
 
 #: The search for soft surfaces leaves room for this many times what a body that is let go falls in a step.
 FALLS = 0.25

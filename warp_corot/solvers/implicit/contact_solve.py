@@ -11,7 +11,7 @@ from warp_corot.kernels.implicit import contact_solve as kernels
 from warp_corot.kernels.implicit.tangent import find_rest
 
 from .block_system import BlockSystem
-from .line_search import LineSearch, SharedLineSearch
+from .conjugate_gradients import LineSearch, SharedLineSearch
 
 if TYPE_CHECKING:
     from .contact_constraints import ObstacleContact

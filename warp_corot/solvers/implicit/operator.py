@@ -9,9 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import warp as wp
+
+if TYPE_CHECKING:
+    pass
 
 
 class Product(Protocol):

@@ -1,17 +1,157 @@
-"""Arrays of other programs as a body's loads and positions: steps read and write them in place."""
+"""A body's arrays: by name, as views, of one world, of other programs, and those of patches that users move."""
 
 from __future__ import annotations
 
-from typing import Any
+import weakref
+from collections import deque
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import numpy.typing as npt
 import warp as wp
 
 from warp_corot.discretization.discretization import MeshChanges
 from warp_corot.discretization.sizes import Sizes, vec3_view
-from warp_corot.errors import InputError
+from warp_corot.errors import InputError, StaleViewError
 
-from .conditions import Conditions
-from .state import State
+if TYPE_CHECKING:
+    from .state import Conditions, State
+
+
+#: Number of cached patches: those of two hands and their former ones.
+KEPT = 4
+
+
+class PatchArrays:
+    """Indices of the last few patches on a device.
+
+    Args:
+        device: The device.
+
+    Attributes:
+        still: One vector of zeros, vec3 [1].
+    """
+
+    def __init__(self, device: wp.Device):
+        self._device = device
+        self._kept: deque[tuple[npt.NDArray[np.integer], wp.array]] = deque(maxlen=KEPT)
+        self._vectors: dict[int, wp.array] = {}
+        self.still = wp.zeros(1, dtype=wp.vec3, device=device)
+
+    def nodes(self, indices: npt.NDArray[np.integer]) -> wp.array:
+        """Node indices [k] as int32 [k] on the device. The array is shared: do not write to it."""
+        for known, there in self._kept:
+            if len(known) == len(indices) and np.array_equal(known, indices):
+                return there
+        there = wp.array(indices, dtype=wp.int32, device=self._device)
+        self._kept.append((indices.copy(), there))
+        return there
+
+    def vectors(self, values: npt.NDArray[np.float64]) -> wp.array:
+        """Vectors [k, 3] as vec3 [k] on the device, for launches that come before the next call."""
+        count = len(values)
+        if count not in self._vectors:
+            if len(self._vectors) == KEPT:
+                self._vectors.clear()
+            self._vectors[count] = wp.empty(count, dtype=wp.vec3, device=self._device)
+        there = self._vectors[count]
+        there.assign(values.astype(np.float32))
+        return there
+
+
+class Views:
+    """The views that have been handed out since the mesh last changed."""
+
+    def __init__(self) -> None:
+        self._arrays: weakref.WeakSet[wp.array] = weakref.WeakSet()
+
+    def hand_out(self, view: wp.array) -> wp.array:
+        """Return the same view, registered for ``expire``."""
+        self._arrays.add(view)
+        return view
+
+    def expire(self) -> None:
+        """Make every use of these views an error from now on."""
+        for view in tuple(self._arrays):
+            view.__class__ = _StaleView
+        self._arrays.clear()
+
+
+class _StaleView(wp.array):
+    """A view whose nodes the body no longer has."""
+
+    _PLAIN = frozenset({"__class__", "__dict__", "__del__", "__init__", "__repr__", "__str__", "__hash__", "_PLAIN"})
+
+    def __getattribute__(self, name: str) -> Any:
+        if name in _StaleView._PLAIN:
+            return object.__getattribute__(self, name)
+        raise StaleViewError("the body's mesh has changed since this view was made; get it from the body again")
+
+    def __getitem__(self, key: Any) -> Any:
+        return self.shape[key]
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        self.shape[key] = value
+
+    def __len__(self) -> int:
+        return len(self.shape)
+
+    def __repr__(self) -> str:
+        return "<a view of a former mesh of a body>"
+
+    __str__ = __repr__
+
+    def __del__(self) -> None:
+        """Do nothing: a view owns no memory."""
+
+
+class NodeArrays:
+    """The part of ``SoftBody`` that gives its arrays with their layout in memory, one entry a node, [worlds * N] or
+    longer.
+
+    They are the solver's own arrays. Get them again after anything that changes them: a pass of remeshing,
+    ``use_loads``, ``use_positions``, or the first load.
+    """
+
+    state: State
+    conditions: Conditions
+
+    @property
+    def node_rest(self) -> wp.array:
+        """Rest positions [m], vec4."""
+        return self.state.rest
+
+    @property
+    def node_positions(self) -> wp.array:
+        """``positions`` without gaps, vec4, for ``wp.to_jax``, which takes no strided views; or the array given to
+        ``use_positions``."""
+        return self.state.positions
+
+    @property
+    def node_displacements(self) -> wp.array:
+        """Displacements from rest [m], vec4."""
+        return self.state.displacements
+
+    @property
+    def node_velocities(self) -> wp.array:
+        """Velocities [m/s], vec4."""
+        return self.state.velocities
+
+    @property
+    def node_mass(self) -> wp.array:
+        """Masses [kg], float32."""
+        return self.conditions.mass
+
+    @property
+    def node_inverse_mass(self) -> wp.array:
+        """Inverse masses [1/kg], float32; zero for fixed and prescribed nodes."""
+        return self.conditions.inverse_mass
+
+    @property
+    def node_loads(self) -> wp.array:
+        """External forces [N], vec4; or the array given to ``use_loads``."""
+        return self.conditions.loads
+
 
 #: Alignment of start and stride with which kernels read a node of a vec4 array by one load [bytes].
 ALIGNMENT = 16

@@ -1,5 +1,4 @@
-"""The gauge: how stiff a body is now. One force evaluation measures all nodes at once, and the elements' strains tell
-how soon the stiffness may change.
+"""The longest stable step: the largest curvature at rest by Lanczos' iteration, and how stiff a body is now.
 
 Small motions about the present displacements u obey q'' = -A q with A = M^-1/2 K M^-1/2 and q = M^1/2 d. Every free
 node has a direction of its own, |q_i| = 1, so that the stiffest place is found wherever it is. A q comes from a
@@ -7,6 +6,8 @@ difference of forces. s_i = q_i . (A q)_i never exceeds the sum of the norms of 
 these sums bounds the eigenvalues of A (Gershgorin's circles, for blocks). The next directions are the vectors of A q,
 each normalised: a power iteration that does not lose the directions at softer places. Where s_i < 0, the body buckles
 and does not vibrate.
+
+Lanczos' iteration needs partial sums, in float64 and always in the same order, which the host adds up.
 """
 
 import functools
@@ -20,6 +21,7 @@ from warp_corot.kernels.modules import unique_kernel
 from .pace import CURVATURE, DONE, DT, STRAIN, Pace
 
 wp.set_module_options({"enable_backward": False})
+
 
 #: Every element's strain is measured once in this many measurements.
 TURNS = wp.constant(4)
@@ -143,3 +145,58 @@ def find_strains(Elements: Any) -> wp.Kernel:
         keep_largest(most, STRAIN, found)
 
     return find_strains
+
+
+#: The largest number of partial sums, one for each thread.
+PARTS = 16384
+
+
+@wp.kernel(enable_backward=False)
+def find_sums(
+    # In
+    inverse_mass: wp.array[wp.float32],
+    a: wp.array[wp.vec4],
+    b: wp.array[wp.vec4],
+    # Out
+    parts: wp.array2d[wp.float64],
+):
+    """Find partial sums of a . b, and the largest components of M^-1/2 b, of every ``len(parts)``-th node."""
+    part = wp.tid()
+    total = wp.float64(0.0)
+    most = float(0.0)
+    i = part
+    while i < a.shape[0]:
+        y = load_node(b, i)
+        # The product of two float32 numbers may exceed the range of float32.
+        total += wp.dot(wp.vec3d(load_node(a, i)), wp.vec3d(y))
+        most = wp.max(most, wp.sqrt(inverse_mass[i]) * wp.max(wp.abs(y)))
+        i += parts.shape[0]
+    parts[part, 0] = total
+    parts[part, 1] = wp.float64(most)
+
+
+@wp.kernel(enable_backward=False)
+def probe_motion(scale: float, inverse_mass: wp.array[wp.float32], q: wp.array[wp.vec4], u: wp.array[wp.vec4]):
+    """u = scale M^-1/2 q."""
+    i = wp.tid()
+    store_node(u, i, (scale * wp.sqrt(inverse_mass[i])) * load_node(q, i))
+
+
+@wp.kernel(enable_backward=False)
+def apply_stiffness(scale: float, inverse_mass: wp.array[wp.float32], f: wp.array[wp.vec4], w: wp.array[wp.vec4]):
+    """w = M^-1/2 K M^-1/2 q, from the forces f = -scale K M^-1/2 q."""
+    i = wp.tid()
+    store_node(w, i, (-wp.sqrt(inverse_mass[i]) / scale) * load_node(f, i))
+
+
+@wp.kernel(enable_backward=False)
+def add_scaled(factor: float, a: wp.array[wp.vec4], b: wp.array[wp.vec4]):
+    """b += factor a."""
+    i = wp.tid()
+    store_node(b, i, load_node(b, i) + factor * load_node(a, i))
+
+
+@wp.kernel(enable_backward=False)
+def scale_by(factor: float, a: wp.array[wp.vec4]):
+    i = wp.tid()
+    store_node(a, i, factor * load_node(a, i))

@@ -1,4 +1,4 @@
-"""Checks of the state, which must be finite, within reach, and without energy from nowhere; and the last good state.
+"""The guard of a run: its state must be finite, within reach, and without energy from nowhere; and the last good state.
 
 Every run of steps begins with ``launch_begin`` and ends with ``launch_end``, both recorded with the steps. The last
 good state is the one at the end of the last run that ``check`` accepted, with what a user has written to it since.
@@ -9,16 +9,21 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.solvers.steps.pace import Known
-from warp_corot.solvers.system import NEVER, System
+from warp_corot.kernels.stepping.pace import LEAST
 
-from .balance import Balance, Energies, Floats
-from .copies import Copies
+from .energy_balance import Balance, Copies, Energies, Floats
+from .pace import CALM_CHECKS, LIVELY, UNKNOWN, Known
+from .stability import FIRST_INTERVAL, SafeStep
+from .system import NEVER, System
+
+if TYPE_CHECKING:
+    from .recorded import RecordedSteps
 
 #: Energy that may come from nowhere between two checks, and in all, as shares of the most energy that gravity, loads
 #: and supports ever moved or a user gave. The error of a stable step is less than a tenth, and up to a half while
@@ -170,17 +175,16 @@ class Guard:
                 there was and what came in, because elastic energies are never negative.
             counts: Whether energies are counted from this state on, if they were found. Otherwise they only judge it.
         """
-        report = self._balance.wait()
-        self.was_given = report.has_changed
+        found = self._balance.wait()
+        self.was_given = found.has_changed
         full = any(each.is_full for each in self.system.constraints)
         if self.system.constraints and self._ranks.max(float(full)):
             return Fault("more contacts than there is room for", np.arange(self.worlds), is_want_of_room=True)
-        if report.has_changed:
+        if found.has_changed:
             self._begin_before()
-        fault = self._not_finite(report.bad_step)
+        fault = self._not_finite(found.bad_step)
         if fault is not None:
             return fault
-        found = report.energies
         # An extra check at the end of a short run must not make its state differ from that of one long run.
         leave = self._leave * (STRICT if strict and whole else 1.0)
         fault = self._beyond_reach(found) or self._from_nowhere(found, whole, leave, lenient)
@@ -288,7 +292,7 @@ class Guard:
         self.order()
         self.system.pace.launch_orders(self._copies.changed)
         self._balance.launch(whole=whole, at=at, seconds=seconds, accounts=accounts)
-        return self._balance.wait().energies
+        return self._balance.wait()
 
     def _has_changed(self) -> bool:
         self.order()
@@ -395,3 +399,135 @@ class Guard:
             self.trend = None
         self._loads, self._loads_since = self._loads + self._loads_since, np.zeros(self.worlds)
         self._reference = found
+
+
+#: Measurements between two checks with elastic energies: for a body that is as stiff as at rest; for a body that is
+#: strained, so that its step is below a share of the one at rest; and while the step is shorter than the stable one, or
+#: a strained body's error is more than QUIET of what is tolerated.
+CHECK_INTERVALS = 16
+STRAINED_INTERVALS = 4
+CLOSE_INTERVALS = 2
+STRAINED = 0.7
+QUIET = 0.25
+#: Bodies are calm if the step is at least this share of the one at rest. They change fast if it has fallen below this
+#: share of the step at the check before.
+CALM = 0.95
+FALLING = 0.9
+#: Tolerated energy from nowhere between two checks, as a share of the energy that gravity, loads and supports have
+#: moved; beyond it the step becomes shorter. The more energy came lately, the less is tolerated, down to this share.
+LITTLE_GAIN = 0.001
+LEAST_LEAVE = 0.2
+#: The same for the energy that came lately (``MEMORY``). Above the first share, the step becomes shorter while
+#: this energy grows from one window of time to the next, and faster the nearer it is to the second share. Otherwise the
+#: step slowly grows.
+SURPLUS, MOST_SURPLUS = 0.004, 0.008
+LEAST_CUT, MOST_CUT = 0.95, 0.7
+SLOW_RECOVERY = 1.1
+#: The step becomes shorter if the error of fast vibrations is more than this share.
+UNTIMELY = 0.004
+#: The errors of vibrations at different times do not add up, so they alone make the share no smaller than this.
+LEAST_SHARE = 0.3
+#: Growth of the step's share from one measurement to the next: from a half to one in 35 measurements.
+RECOVERY = 1.02
+
+
+class EnergyControl:
+    """Chooses which share of the allowed step is taken.
+
+    Args:
+        guard: Finds energy from nowhere.
+        recorded: The recorded steps, whose interval between measurements it sets.
+        safe_step: The step; None if the user gave one, which stays.
+    """
+
+    def __init__(self, guard: Guard, recorded: RecordedSteps, safe_step: SafeStep | None):
+        self._guard, self._recorded, self._safe_step, self._pace = guard, recorded, safe_step, guard.system.pace
+        self._intervals = CHECK_INTERVALS if safe_step is None else CLOSE_INTERVALS
+        recorded.calm = 0 if safe_step is None else UNKNOWN
+
+    @property
+    def check_steps(self) -> int:
+        """Steps from one check with elastic energies to the next."""
+        return self._intervals * self._recorded.interval
+
+    def begin(self) -> None:
+        """Continue with the schedule, which may come from a checkpoint."""
+        if self._pace.schedule.intervals:
+            self._choose()
+        else:
+            self.begin_anew()
+
+    def go_on(self, steps: int) -> None:
+        """Continue unchecked after a number of steps, without waiting for the device."""
+        if steps >= CLOSE_INTERVALS * FIRST_INTERVAL and self._recorded.calm == UNKNOWN:
+            self._recorded.calm = 0
+
+    def begin_anew(self) -> None:
+        """Begin again after a user has written to the state, which may now change fast."""
+        self._choose(calm=UNKNOWN, intervals=CLOSE_INTERVALS)
+
+    def follow(self, steps: int) -> None:
+        """Make the step shorter if energy came from nowhere, and longer again if none did.
+
+        Args:
+            steps: Steps done at the check.
+        """
+        if self._safe_step is None:
+            return
+        guard, share = self._guard, self._safe_step.share
+        intervals = (steps - self._pace.schedule.steps) / self._recorded.interval
+        self._pace.schedule = self._pace.schedule._replace(steps=steps)
+        leave = LITTLE_GAIN * max(1.0 - guard.surplus / MOST_SURPLUS, LEAST_LEAVE)
+        late, more = guard.untimely / UNTIMELY, guard.gain / leave
+        if late > 1.0 or more > 1.0:
+            least = min(share, LEAST_SHARE)
+            share *= max(1.0 / math.sqrt(max(more, 1.0)), 0.5)
+            share = min(share, max(share / math.sqrt(max(late, 1.0)), least))
+        elif guard.surplus <= SURPLUS:
+            share = min(share * RECOVERY**intervals, 1.0)
+        if guard.surplus > SURPLUS and guard.trend is not None:
+            near = min((guard.surplus - SURPLUS) / (MOST_SURPLUS - SURPLUS), 1.0)
+            cut = LEAST_CUT + near * (MOST_CUT - LEAST_CUT)
+            share = min(share * (cut if guard.trend > 0.0 else SLOW_RECOVERY), 1.0)
+        if share != self._safe_step.share:
+            self._take_share(share)
+
+    def halve(self, steps: int) -> None:
+        """Take half the share, after going back to the state with this number of steps."""
+        assert self._safe_step is not None
+        self._pace.schedule = self._pace.schedule._replace(steps=steps)
+        self._take_share(0.5 * self._safe_step.share)
+
+    def choose_intervals(self, *, checked: bool) -> None:
+        """Check more often if a body is strained, and less often if checks of elastic energies found it calm."""
+        if self._safe_step is None:
+            return
+        guard = self._guard
+        share, allowed, at_rest = self._safe_step.shares
+        before = self._pace.schedule
+        calm = 0
+        if not checked or allowed < FALLING * before.allowed:
+            calm = LIVELY
+        elif share == 1.0 and allowed >= CALM * at_rest:
+            calm = min(max(before.calm, 0) + 1, CALM_CHECKS)
+        if share < 1.0 or calm == LIVELY:
+            intervals = CLOSE_INTERVALS
+        elif allowed < STRAINED * at_rest:
+            quiet = max(guard.gain / LITTLE_GAIN, guard.untimely / UNTIMELY) < QUIET
+            intervals = STRAINED_INTERVALS if quiet else CLOSE_INTERVALS
+        else:
+            intervals = CHECK_INTERVALS if calm > 1 else STRAINED_INTERVALS
+        self._choose(calm=calm, intervals=intervals, allowed=allowed)
+
+    def _choose(self, **changes: Any) -> None:
+        """Measure and check at the intervals of the schedule after these changes."""
+        if self._safe_step is not None:
+            self._pace.schedule = schedule = self._pace.schedule._replace(**changes)
+            self._intervals, self._recorded.calm = schedule.intervals, schedule.calm
+
+    def _take_share(self, share: float) -> None:
+        """Set the share of the allowed step from here on."""
+        assert self._safe_step is not None
+        self._safe_step.share = max(share, float(LEAST))
+        self._safe_step.resume()
+        self._guard.settle()

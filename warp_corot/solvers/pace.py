@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -11,7 +11,51 @@ import warp as wp
 
 from warp_corot.kernels.stepping import balance
 from warp_corot.kernels.stepping import pace as kernels
-from warp_corot.solvers.guarding.mapped import Mapped
+
+
+class Mapped:
+    """float64 numbers in memory that host and device share.
+
+    The host sees what a kernel wrote once the stream has finished it. Few threads should use this memory.
+
+    Args:
+        count: Number of values.
+        device: The device.
+
+    Attributes:
+        values: For the host, float64 [count].
+        array: For kernels, float64 [count].
+    """
+
+    def __init__(self, count: int, device: wp.Device):
+        self._memory = wp.zeros(count, dtype=wp.float64, device="cpu", pinned=device.is_cuda)
+        self.values: npt.NDArray[np.float64] = self._memory.numpy()
+        self.array = self._memory
+        if device.is_cuda:
+            # The same memory: pinned memory has one address on host and device.
+            self.array = wp.array(ptr=self._memory.ptr, shape=count, dtype=wp.float64, device=device)
+
+
+#: In place of a number of calm checks: some bodies change fast; there was no check yet.
+LIVELY, UNKNOWN = -1, -2
+#: After this many calm checks in a row, measurements are half as frequent.
+CALM_CHECKS = 2
+
+
+class Schedule(NamedTuple):
+    """When energies are checked, and the result of the last check.
+
+    Attributes:
+        calm: How many checks in a row found the bodies calm, or LIVELY or UNKNOWN.
+        intervals: Measurements between two checks; zero if not chosen yet.
+        steps: Steps done at the last check.
+        allowed: The step that the state allowed then [s].
+    """
+
+    calm: int = 0
+    intervals: int = 0
+    steps: int = 0
+    allowed: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -42,6 +86,7 @@ class Pace:
         control: Numbers that set the length of steps, if none was given; see ``kernels.stepping.pace``.
         support_work: Work of moving supports, and the sum of its absolute values [J], float64 [2].
         orders: The host's orders for the present run, float64 [ORDERS].
+        schedule: When energies are checked.
         is_shared: Whether users may launch steps that they have recorded, without the host's knowledge.
     """
 
@@ -54,6 +99,7 @@ class Pace:
         self.support_work = wp.zeros(2, dtype=wp.float64, device=device)
         self.orders = wp.zeros(kernels.ORDERS, dtype=wp.float64, device=device)
         self._given = Mapped(kernels.ORDERS, device)
+        self.schedule = Schedule()
         self.is_shared = False
         self._known: Known | None = None
 
@@ -95,13 +141,6 @@ class Pace:
         """Write ``control``."""
         self.control.assign(control)
         self._known = replace(self.known, control=np.array(control))
-
-    def note_control(self, places: Sequence[int], values: Sequence[float]) -> None:
-        """Note a launch that writes these numbers to ``control``."""
-        if self._known is not None:
-            control = self._known.control.copy()
-            control[list(places)] = values
-            self._known = replace(self._known, control=control)
 
     def order(self, *, end: float | None, stop: int, slot: int) -> None:
         """Write the orders for the next run, which begins with ``launch_orders``; no other run may be under way.
