@@ -9,9 +9,6 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 
 #: Maximum number of triangles of its own part that an edge can pass.
 MOST_OWN_HITS = wp.constant(8)
-#: The same for triangles around its points, and how far beyond its ends to search, relative to its length.
-MOST_OWN_TRIANGLES = wp.constant(64)
-BEYOND = wp.constant(1.0e-3)
 #: Fraction of an edge's length that is left out at its ends, where its own triangles begin.
 ENDS = wp.constant(1.0e-4)
 
@@ -66,43 +63,3 @@ def find_crossed_parts(
         if triangle_parts[found.face] != edge_parts[i]:
             crossed[i] = triangle_parts[found.face]
         at += found.t + ENDS * length
-
-
-@wp.kernel(enable_backward=False)
-def find_touched_triangles(
-    # In
-    points: wp.array[wp.vec3],
-    edges: wp.array[wp.vec2i],
-    mesh: wp.uint64,
-    indices: wp.array[wp.int32],
-    # Out
-    touched: wp.array[wp.int32],
-):
-    """A triangle that an edge crosses or ends at, except those around its two points; -1 for none."""
-    i = wp.tid()
-    a = edges[i][0]
-    b = edges[i][1]
-    start = points[a]
-    along = points[b] - start
-    length = wp.length(along)
-    touched[i] = -1
-    if length == 0.0:
-        return
-    direction = along / length
-    at = -BEYOND * length
-    end = (1.0 + BEYOND) * length
-    for _ in range(MOST_OWN_TRIANGLES):
-        if at < end:
-            found = wp.mesh_query_ray(mesh, start + at * direction, direction, end - at)
-            if not found.result:
-                return
-            own = bool(False)
-            for n in range(3):
-                corner = indices[3 * found.face + n]
-                own = own or corner == a or corner == b
-            if not own:
-                touched[i] = found.face
-                return
-            at += found.t + ENDS * length
-    # With more triangles than can be passed no result is certain.
-    touched[i] = -2

@@ -181,9 +181,6 @@ def test_the_plan_is_that_of_the_present_mesh(mesh, grouped, rotation_level, dev
         check(plan, forest, rotation_level, grouped)
         counts.append(forest.leaf_count)
     assert counts[0] < counts[1] > counts[3]
-    forest.compact()
-    plan.derive()
-    check(plan, forest, rotation_level, grouped)
 
 
 def test_a_pass_that_changes_nothing_leaves_the_plan_alone(device):

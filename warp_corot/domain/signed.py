@@ -122,10 +122,6 @@ class SignedFunction:
         """
         return None
 
-    def corners(self) -> np.ndarray:
-        """The known points where three or more sharp edges of the body meet, float64 [n, 3] [m]."""
-        return np.empty((0, 3))
-
     def part(self, name: str) -> SignedFunction:
         """The domain of a single label.
 

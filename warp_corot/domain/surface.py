@@ -20,7 +20,6 @@ from warp_corot.kernels.meshing import domain as kernels
 from warp_corot.kernels.meshing import windings
 
 from .joined import joined_parts
-from .sides import corner_points, sides_of
 from .signed import SignedFunction
 from .units import length, metres_per_unit, unlikely_size, volume
 
@@ -36,8 +35,6 @@ SAMPLES = 16
 LARGEST_REVERSED = 0.05
 #: Rays into the body start this far inside, over their length.
 START = 0.01
-#: If more than this share of the triangles does not tell inside from outside, winding numbers alone do.
-UNSURE = 0.5
 #: Holes above this share of the area draw a warning.
 LARGE_HOLES = 0.01
 
@@ -62,47 +59,38 @@ class SurfaceDomain(SignedFunction):
         self.closed = closed
         self.notes = list(notes)
         self._on: dict[str, wp.Mesh] = {}
-        self._sides: dict[str, list[wp.array]] = {}
         self.lines = lines_through(bounds)
-        self.reversed, self.overlapping, self.undecided = self._windings()
+        self.reversed, self.overlapping = self._windings()
         if self.reversed > LARGEST_REVERSED:
             raise InputError(
                 f"the surface crosses itself so that {self.reversed:.0%} of what it encloses is inside out; it must be "
                 f"wound outwards throughout (at most {LARGEST_REVERSED:.0%})"
             )
-        self.sides = sides_of(closed, self._mesh(self.device), self.lines)
 
     def _phi(self, points: wp.array) -> wp.array:
         phi = wp.empty(points.size, wp.float32, device=points.device)
         mesh = self._mesh(points.device)
-        inputs = [mesh.id, mesh.indices, self.lines, *self._sides_on(points.device)]
+        inputs = [mesh.id, mesh.indices, self.lines]
         launch_side_by_side(
             kernels.evaluate_surface, points.size, lambda own: ([own(points), *inputs], [own(phi)]), points.device
         )
         return phi
 
     def holds(self, points: npt.ArrayLike) -> np.ndarray:
-        # Where signs take winding numbers anyway, the distance is not needed.
-        if np.count_nonzero(self.sides.known == kernels.UNSURE) < UNSURE * len(self.sides.known):
-            return super().holds(points)
         return windings_of(self._mesh(self.device), self.lines, self._on_device(points)) > 0
 
     def exits(self, starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         given, along = self._on_device(starts), self._on_device(ends - starts)
         shares, normals = (wp.empty(given.size, kind, device=self.device) for kind in (wp.float32, wp.vec3))
-        mesh, sides = self._mesh(self.device), self._sides_on(self.device)[0]
+        mesh = self._mesh(self.device)
         launch_side_by_side(
             kernels.find_exits,
             given.size,
-            lambda own: ([own(given), own(along), mesh.id, sides], [own(shares), own(normals)]),
+            lambda own: ([own(given), own(along), mesh.id], [own(shares), own(normals)]),
             self.device,
         )
         found = shares.numpy().astype(np.float64)
         return np.where(found < 0.0, np.nan, found), normals.numpy().astype(np.float64)
-
-    def corners(self) -> np.ndarray:
-        points, triangles = self.closed.points, self.closed.triangles.astype(np.int64)
-        return points[corner_points(points, triangles, self.closed.edges, self.sides.known == kernels.BOUNDARY)]
 
     @cached_property
     def joined(self) -> tuple[int, np.ndarray, bool]:
@@ -138,33 +126,21 @@ class SurfaceDomain(SignedFunction):
         )
         return lengths.numpy()
 
-    def _sides_on(self, device: wp.Device) -> list[wp.array]:
-        key = str(device)
-        if key not in self._sides:
-            self._sides[key] = self.sides.arrays(device)
-        return self._sides[key]
-
     def _mesh(self, device: wp.Device) -> wp.Mesh:
         key = str(device)
         if key not in self._on:
             self._on[key] = surface_mesh(self.closed.points, self.closed.triangles, device)
         return self._on[key]
 
-    def _windings(self) -> tuple[float, float, float]:
-        """Share of the enclosed space that is inside out, that counts twice, and share of all space in which the
-        surface, before its holes were closed, left open whether it is inside."""
+    def _windings(self) -> tuple[float, float]:
+        """Share of the enclosed space that is inside out, and that counts twice."""
         rng = np.random.default_rng(0)
         cells = np.stack(np.meshgrid(*[np.arange(SAMPLES)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
         places = (cells + rng.random(cells.shape)) / SAMPLES
         points = self._on_device(self.bounds[0] + places * np.ptp(self.bounds, axis=0))
         winding = windings_of(self._mesh(self.device), self.lines, points)
         enclosed = max(int(np.count_nonzero(winding)), 1)
-        backward, twice = np.count_nonzero(winding < 0) / enclosed, np.count_nonzero(winding > 1) / enclosed
-        if not self.closed.caps:
-            return backward, twice, 0.0
-        given = surface_mesh(self.closed.points, self.closed.triangles[: -self.closed.caps], self.device, is_open=True)
-        # Between 0.1 and 0.9: neither nearly 0 nor nearly 1.
-        return backward, twice, float(np.mean(count_windings(given, points, [0.1, 0.9]) == 1))
+        return np.count_nonzero(winding < 0) / enclosed, np.count_nonzero(winding > 1) / enclosed
 
     def _details(self) -> list[str]:
         closed = self.closed
@@ -172,7 +148,7 @@ class SurfaceDomain(SignedFunction):
         if closed.open_edges:
             lines.append(
                 f"open: {closed.open_edges} edges in {closed.holes} hole{'s'[: closed.holes != 1]}, closed with "
-                f"{closed.cap_share:.2%} of the area; before that undecided in {self.undecided:.1%} of its box"
+                f"{closed.cap_share:.2%} of the area"
             )
         else:
             lines.append("closed")
@@ -231,12 +207,11 @@ def checked_triangles(
     return x.astype(np.float64), t.astype(np.int64)
 
 
-def surface_mesh(points: np.ndarray, triangles: np.ndarray, device: wp.Device, *, is_open: bool = False) -> wp.Mesh:
-    """A Warp mesh; for an open surface, one that supports winding numbers."""
+def surface_mesh(points: np.ndarray, triangles: np.ndarray, device: wp.Device) -> wp.Mesh:
+    """A Warp mesh of points [N, 3] and triangles [T, 3]."""
     return wp.Mesh(
         wp.array(np.ascontiguousarray(points, dtype=np.float32), dtype=wp.vec3, device=device),
         wp.array(np.ascontiguousarray(triangles, dtype=np.int32).ravel(), dtype=wp.int32, device=device),
-        support_winding_number=is_open,
     )
 
 
@@ -259,14 +234,6 @@ def windings_of(mesh: wp.Mesh, lines: windings.Lines, points: wp.array) -> np.nd
         points.device,
     )
     return found.numpy()
-
-
-def count_windings(mesh: wp.Mesh, points: wp.array, thresholds: Sequence[float]) -> np.ndarray:
-    """The number of thresholds that the winding number of an open surface exceeds at each point, int32 [n]."""
-    above = wp.empty(points.size, wp.int32, device=points.device)
-    limits = wp.array(thresholds, dtype=wp.float32, device=points.device)
-    wp.launch(kernels.count_windings, points.size, [points, mesh.id, limits], [above], device=points.device)
-    return above.numpy()
 
 
 def _given(

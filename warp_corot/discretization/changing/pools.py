@@ -187,16 +187,6 @@ class DeviceForest:
 
         return exported(self)
 
-    def compact(self) -> None:
-        """Renumber nodes and tetrahedra in the order of the leaves, which are in tree order after every pass.
-
-        This helps when neighbours have become scattered in memory. Arrays stay the same; node numbers stored elsewhere
-        become invalid.
-        """
-        from .compaction import compact
-
-        compact(self)
-
     def remember(self) -> None:
         """Save the present mesh and all that it carries for ``restart``. The constructor does this once."""
         self.remembered = Snapshot.of(self.pools, self.carriage.arrays)

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .corners import with_corners
 from .marching import crossing_polygons, plain_triangles
 
 if TYPE_CHECKING:
@@ -57,7 +56,7 @@ def sharpened(points: Array, tets: Array, values: Array, domain: Domain) -> tupl
     x = np.concatenate([x, apexes])
     triangles = np.concatenate([triangles, _fans(x, polygons[chosen], numbers, domain)])
     used, corners = np.unique(triangles, return_inverse=True)
-    return with_corners(x[used], corners.reshape(-1, 3).astype(np.int32), domain)
+    return x[used], corners.reshape(-1, 3).astype(np.int32)
 
 
 def _phi(domain: Domain, points: Array) -> Array:
