@@ -15,7 +15,8 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 #: Search radius for the closest triangle [m]: unlimited.
 FAR = 1.0e15
 
-#: How far beyond a triangle a segment is followed, as a share of its length.
+#: The most triangles through which a segment is followed, and how far beyond each it goes on, as a share of its length.
+MOST_PASSED = wp.constant(8)
 PASSED = wp.constant(1.0e-4)
 
 
@@ -280,22 +281,28 @@ def find_exits(
     starts: wp.array[wp.vec3],
     along: wp.array[wp.vec3],
     mesh: wp.uint64,
+    indices: wp.array[wp.int32],
+    lines: Lines,
     # Out
     shares: wp.array[wp.float32],
     normals: wp.array[wp.vec3],
 ):
     """Where segments from inside to outside leave the body, as a share of their length, and the normal there; -1 for
-    segments that meet several triangles."""
+    segments with more triangles than are passed."""
     i = wp.tid()
     length = wp.length(along[i])
     direction = wp.normalize(along[i])
+    layers = winding_number(mesh, indices, lines, starts[i])
+    at = float(0.0)
     shares[i] = -1.0
-    found = wp.mesh_query_ray(mesh, starts[i], direction, length)
-    if found.result:
-        normals[i] = wp.mesh_eval_face_normal(mesh, found.face)
-        at = found.t + PASSED * length
-        again = at < length
-        if again:
-            again = wp.mesh_query_ray(mesh, starts[i] + at * direction, direction, length - at).result
-        if not again and wp.dot(normals[i], direction) > 0.0:
-            shares[i] = wp.min(found.t / length, 1.0)
+    for _ in range(MOST_PASSED):
+        if layers > 0 and at < length:
+            found = wp.mesh_query_ray(mesh, starts[i] + at * direction, direction, length - at)
+            if found.result:
+                normals[i] = wp.mesh_eval_face_normal(mesh, found.face)
+                layers += wp.where(wp.dot(normals[i], direction) > 0.0, -1, 1)
+                if layers == 0:
+                    shares[i] = wp.min((at + found.t) / length, 1.0)
+                at += found.t + PASSED * length
+            else:
+                at = length

@@ -86,7 +86,7 @@ class SurfaceDomain(SignedFunction):
         launch_side_by_side(
             kernels.find_exits,
             given.size,
-            lambda own: ([own(given), own(along), mesh.id], [own(shares), own(normals)]),
+            lambda own: ([own(given), own(along), mesh.id, mesh.indices, self.lines], [own(shares), own(normals)]),
             self.device,
         )
         found = shares.numpy().astype(np.float64)

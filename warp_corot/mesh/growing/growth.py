@@ -136,14 +136,7 @@ class Growth:
 
     def flagged(self, flags: wp.array, first: int = 0) -> wp.array:
         """The numbers, counted from ``first``, of flags [n] that are one."""
-        if self.device.is_cpu:
-            return wp.array(np.flatnonzero(flags.numpy()) + first, dtype=wp.int32, device=self.device)
-        places = wp.empty(len(flags), dtype=wp.int32, device=self.device)
-        wp.utils.array_scan(flags, places, inclusive=True)
-        count = int(places[-1:].numpy()[0]) if len(flags) else 0
-        chosen = wp.empty(count, dtype=wp.int32, device=self.device)
-        self.launch(kernels.gather_flagged, len(flags), [flags, places, first], [chosen])
-        return chosen
+        return wp.array(np.flatnonzero(flags.numpy()) + first, dtype=wp.int32, device=self.device)
 
     def close(self, judge: Any = None, first: int = 0) -> None:
         """Bisect until the mesh is conforming.

@@ -6,18 +6,16 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import warp as wp
 from scipy.spatial import cKDTree
 
-from warp_corot.kernels.meshing import coarsening as kernels
+from warp_corot.mesh.bisection import far_end
 from warp_corot.mesh.lattice import volume_shares
 from warp_corot.mesh.scattered import spread_over_eighths
 from warp_corot.mesh.tree import LIVE, VOID, Tree
 
 from .cut import connected, inside_shares
 from .growth import lattice_spacing
-from .judging import FARTHER, GAP_ELEMENTS, ROUGH
-from .surface_points import surface_points
+from .judging import FARTHER, GAP_ELEMENTS, ROUGH, surface_points
 from .walls import OF_WALLS, wall_shares
 
 if TYPE_CHECKING:
@@ -148,8 +146,7 @@ class Resolved:
         cut = self.leaves[self.shares < 1.0]
         if len(cut):
             tets, spacing = grown.tree.tets[cut], lattice_spacing(self.cell_size)
-            phi = wp.array(grown.phi, dtype=wp.float32, device=grown.growth.device)
-            x, inward = surface_points(grown.growth.lattice, phi, tets, grown.origin, spacing)
+            x, inward = surface_points(grown.lattice[tets], grown.phi[tets], np.asarray(grown.origin), spacing)
             found[cut] = domain.thickness(x, inward, FARTHER * layers * self.cell_size)
         return self.smallest(found)
 
@@ -202,20 +199,25 @@ class Coarsening:
     """
 
     def __init__(self, resolved: Resolved, needs: np.ndarray, sliver: float):
-        growth, tree = resolved.grown.growth, resolved.grown.tree
-        self.device, count = growth.device, len(tree.level)
-        holds = resolved.held > 0.0
-        self._holds = wp.array(holds.astype(np.uint8), dtype=wp.uint8, device=self.device)
-        self._parent, self._first_child = growth.parent[:count], growth.first_child[:count]
-        self._needs = wp.array(needs, dtype=wp.float32, device=self.device)
-        of_node = wp.zeros(growth.node_count, dtype=wp.float32, device=self.device)
+        tree, holds = resolved.grown.tree, resolved.held > 0.0
+        needs, of_node = needs.copy(), np.zeros(len(resolved.grown.lattice), np.float32)
+        # Everything that can be asked for is in the forest: a conforming mesh of some of its tetrahedra needs no other
+        # bisections. A tetrahedron is bisected if it is asked for, if a child of it is, or if another with the same
+        # refinement edge is; all its other edges are edges of its children. So one sweep from the deepest level up
+        # gives each the threshold up to which it is bisected.
         for elements in resolved.deepest_first():
-            chosen = wp.array(elements, dtype=wp.int32, device=self.device)
-            inputs = [chosen, growth.tets, growth.level, self._first_child]
-            growth.launch(kernels.gather_needs, len(elements), [*inputs, self._holds], [self._needs, of_node])
-            growth.launch(kernels.take_needs, len(elements), [*inputs, of_node], [self._needs])
+            if not len(elements):
+                continue
+            below = tree.first_child[elements]
+            need = np.maximum(needs[elements], np.maximum(needs[below], needs[below + 1]))
+            node = tree.tets[below, far_end(int(tree.level[elements[0]]) % 3)]
+            np.maximum.at(of_node, node[holds[elements]], need[holds[elements]])
+            needs[elements] = np.maximum(need, of_node[node])
         # A tetrahedron without children cannot be bisected, whatever its need.
-        own = np.where(tree.first_child >= 0, self._needs.numpy(), np.float32(0.0))
+        self._own = own = np.where(tree.first_child >= 0, needs, np.float32(0.0))
+        # Nor does one outside the body have children in a mesh.
+        self._above = np.where(tree.parent < 0, np.float32(np.inf), np.where(holds, needs, -1.0)[tree.parent])
+        self._first_child, self._holds = tree.first_child, holds
         counted = holds & (resolved.held >= sliver * resolved.volume)
         roots = np.count_nonzero(counted & (tree.parent < 0))
         above = tree.parent[counted & (tree.parent >= 0)]
@@ -239,10 +241,9 @@ class Coarsening:
         """Bisect all tetrahedra with a need above ``least``; return the number of counted leaves and the mesh, int32
         [M].
         """
-        child = wp.empty(len(self._needs), dtype=wp.int32, device=self.device)
-        inputs = [self._parent, self._first_child, self._needs, float(least), self._holds]
-        wp.launch(kernels.cut_off, len(child), inputs, [child], device=self.device)
-        found = child.numpy()
+        least = np.float32(least)
+        found = np.where(self._holds, np.where(self._own > least, self._first_child, LIVE), VOID).astype(np.int32)
+        found[self._above <= least] = BELOW
         return int(np.count_nonzero(self._counted & (found == LIVE))), found
 
 
