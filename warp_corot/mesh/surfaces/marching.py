@@ -18,27 +18,19 @@ from .boundary import boundary_faces, signed_volumes
 Array = np.ndarray
 
 
-def _triangles_by_code() -> list[list[list[tuple[int, int]]]]:
-    """For each set of inside nodes, the triangles in a right-handed element; corners are (inner node, outer node)."""
-    tables: list[list[list[tuple[int, int]]]] = []
-    for code in range(16):
-        inside = [n for n in range(4) if code >> n & 1]
-        outside = [n for n in range(4) if n not in inside]
-        order = inside + outside
-        odd = sum(a > b for a, b in itertools.combinations(order, 2)) % 2
-        faces: list[list[tuple[int, int]]] = []
-        if len(inside) == 1:
-            faces = [[(inside[0], b) for b in outside]]
-        elif len(inside) == 3:
-            faces = [[(a, outside[0]) for a in inside]]
-        elif len(inside) == 2:
-            (a, b), (c, d) = inside, outside
-            faces = [[(a, c), (a, d), (b, d)], [(a, c), (b, d), (b, c)]]
-        tables.append([face[::-1] if odd else face for face in faces])
-    return tables
+def _polygon(code: int) -> list[tuple[int, int]]:
+    """The polygon in a right-handed element with these inside nodes; its corners are (inner node, outer node)."""
+    inside = [n for n in range(4) if code >> n & 1]
+    outside = [n for n in range(4) if n not in inside]
+    found = list(itertools.product(inside, outside))
+    if len(found) == 4:
+        found[2:] = found[:1:-1]
+    order = inside + outside
+    odd = sum(a > b for a, b in itertools.combinations(order, 2)) % 2
+    return [found[0], *found[:0:-1]] if odd and found else found
 
 
-TRIANGLES = _triangles_by_code()
+POLYGONS = [_polygon(code) for code in range(16)]
 
 
 def marched(points: Array, tets: Array, values: Array) -> SurfaceMesh:
@@ -53,20 +45,8 @@ def marched(points: Array, tets: Array, values: Array) -> SurfaceMesh:
         The surface, counter-clockwise seen from outside. Its points are bound to the two ends of their edges, the inner
         one first.
     """
-    inside = values[tets] < 0
-    code = codes(inside)
-    cut = np.flatnonzero((code > 0) & (code < 15))
-    code, tets = code[cut], tets[cut]
-    mirrored = signed_volumes(points, tets) < 0
-    corners = []
-    for kind in range(1, 15):
-        chosen = np.flatnonzero(code == kind)
-        for face in TRIANGLES[kind]:
-            ends = tets[chosen][:, np.array(face)]
-            turned = mirrored[chosen]
-            ends[turned] = ends[turned][:, ::-1]
-            corners.append(ends)
-    return _merged_surface(points, np.concatenate(corners), values)
+    ends, polygons, _ = crossing_polygons(points, tets, values)
+    return _merged_surface(points, ends[plain_triangles(polygons, ends)], values)
 
 
 def marched_cut(points: Array, tets: Array, values: Array) -> SurfaceMesh:
@@ -143,12 +123,10 @@ def crossing_polygons(points: Array, tets: Array, values: Array) -> tuple[Array,
     corners, cells = [], []
     for kind in range(1, 15):
         chosen = np.flatnonzero(code == kind)
-        faces = TRIANGLES[kind]
-        # The second triangle of a quadrangle adds its last vertex; of a reversed one, its first.
-        order = [*faces[0], faces[0][2]] if len(faces) == 1 else _quadrangle(faces)
-        ends = tets[cut[chosen]][:, np.array(order)]
+        count = len(POLYGONS[kind])
+        ends = tets[cut[chosen]][:, np.array(POLYGONS[kind])[[0, 1, 2, count - 1]]]
         turned = mirrored[chosen]
-        ends[turned] = ends[turned][:, ::-1]
+        ends[turned] = ends[turned][:, [0, 3, 2, 1] if count == 4 else [0, 2, 1, 1]]
         corners.append(ends)
         cells.append(cut[chosen])
     pairs = np.concatenate(corners).reshape(-1, 2).astype(np.int64)
@@ -156,14 +134,6 @@ def crossing_polygons(points: Array, tets: Array, values: Array) -> tuple[Array,
     pairs[at_node, 0] = pairs[at_node, 1]
     keys, place = np.unique(pairs[:, 0] << 32 | pairs[:, 1], return_inverse=True)
     return np.stack([keys >> 32, keys & 0xFFFFFFFF], axis=1), place.reshape(-1, 4), np.concatenate(cells)
-
-
-def _quadrangle(faces: list[list[tuple[int, int]]]) -> list[tuple[int, int]]:
-    """The vertices of two triangles with a common edge, in order."""
-    first, second = faces
-    (alone,) = [vertex for vertex in second if vertex not in first]
-    place = next(n for n in range(3) if first[n] in second and first[(n + 1) % 3] in second)
-    return [*first[: place + 1], alone, *first[place + 1 :]]
 
 
 def plain_triangles(polygons: Array, ends: Array) -> Array:

@@ -16,7 +16,7 @@ from warp_corot.mesh.growing.cut import codes
 
 from .bound import SurfaceMesh
 from .boundary import signed_volumes
-from .marching import TRIANGLES
+from .marching import POLYGONS
 
 Array = np.ndarray
 
@@ -54,8 +54,7 @@ def _add_pairs(pieces: _Pieces, tets: Array, own: Array, mirrored: Array) -> Non
     code = codes(own == high[:, None])
     for kind in range(1, 15):
         chosen = np.flatnonzero(code == kind)
-        for face in TRIANGLES[kind]:
-            pieces.add(tets[chosen], face, high[chosen], low[chosen], mirrored[chosen])
+        pieces.add(tets[chosen], POLYGONS[kind], high[chosen], low[chosen], mirrored[chosen])
 
 
 def _add_triples(pieces: _Pieces, tets: Array, own: Array, mirrored: Array) -> None:
