@@ -9,9 +9,10 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from warp_corot.errors import InputError
+from warp_corot.mesh.pieces import linked
 
 from .edges import Edges
-from .winding import edge_parts, linked, part_volumes, wind_alike, wind_outwards
+from .winding import edge_parts, part_volumes, wind_alike, wind_outwards
 
 #: Where the surface is open, points closer than this share of its size are welded.
 WELD = 1.0e-6
@@ -163,8 +164,8 @@ def weld(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndar
         pairs = cKDTree(points[rims]).sparse_distance_matrix(cKDTree(points), near, output_type="ndarray")
         a, b = rims[pairs["i"]], pairs["j"]
         if (a != b).any():
-            count, place = linked(a, b, len(points))
-            first = np.full(count, len(points))
+            place = linked(np.stack([a, b], axis=1), len(points))
+            first = np.full(int(place.max()) + 1, len(points))
             np.minimum.at(first, place, np.arange(len(points)))
             points, triangles = points[first], place[triangles]
             edges = Edges(triangles)
@@ -257,8 +258,8 @@ def cones(
     rim = np.unique(ends)
     a, b = np.searchsorted(rim, ends).T
     owner, ends = places[ends[:, 0]] // count, places[ends] % count
-    holes, hole = linked(a, b, len(rim))
-    hole = hole[a]
+    hole = linked(np.stack([a, b], axis=1), len(rim))[a]
+    holes = int(hole.max()) + 1
     lengths = np.linalg.norm(points[ends[:, 0]] - points[ends[:, 1]], axis=1)
     weights = np.maximum(lengths, 1e-30) / np.bincount(hole, weights=np.maximum(lengths, 1e-30))[hole]
     centres = np.zeros((holes, 3))

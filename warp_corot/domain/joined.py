@@ -11,8 +11,9 @@ import warp as wp
 
 from warp_corot.inputs.cpu_threads import launch_side_by_side
 from warp_corot.kernels.meshing import measuring as kernels
+from warp_corot.mesh.pieces import linked
 
-from .winding import SurfaceParts, linked, part_volumes
+from .winding import SurfaceParts, part_volumes
 
 if TYPE_CHECKING:
     from .closing import ClosedSurface
@@ -44,8 +45,8 @@ def joined_parts(closed: ClosedSurface, device: wp.Device) -> tuple[int, np.ndar
         links.append(np.stack([np.full(len(around), own), around], axis=1))
         overlap |= len(around) > 0 and bool(outward[own])
     pairs = np.concatenate(links)
-    pieces, of_part = linked(pairs[:, 0], pairs[:, 1], count)
-    return pieces, of_part[part].astype(np.int32), overlap
+    of_part = linked(pairs, count)
+    return int(of_part.max()) + 1, of_part[part].astype(np.int32), overlap
 
 
 def _bounds_around(own: int, holders: list[np.ndarray], outward: np.ndarray) -> np.ndarray:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.sparse import coo_array
-from scipy.sparse.csgraph import breadth_first_order, connected_components
+from scipy.sparse.csgraph import breadth_first_order
+
+from warp_corot.mesh.pieces import linked
 
 from .edges import Edges
 
@@ -20,15 +22,7 @@ def net_edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def edge_parts(triangles: np.ndarray, edges: Edges | None = None) -> np.ndarray:
     """The connected part of each triangle; triangles that share an edge are connected."""
     one, other = (Edges(triangles) if edges is None else edges).pairs
-    return linked(one // 3, other // 3, len(triangles))[1]
-
-
-def linked(a: np.ndarray, b: np.ndarray, count: int) -> tuple[int, np.ndarray]:
-    """Groups of ``count`` items that are connected by links a[i]-b[i]: the number of groups, and the group of each
-    item.
-    """
-    groups, group = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(count, count)), directed=False)
-    return groups, group.astype(np.int64)  # since callers multiply
+    return linked(np.stack([one // 3, other // 3], axis=1), len(triangles))
 
 
 def wind_alike(triangles: np.ndarray, edges: Edges) -> tuple[np.ndarray, int]:
@@ -43,7 +37,7 @@ def wind_alike(triangles: np.ndarray, edges: Edges) -> tuple[np.ndarray, int]:
         return triangles, 0
     a, b = one // 3, other // 3
     count = len(triangles)
-    parts = linked(a, b, count)[1]
+    parts = linked(np.stack([a, b], axis=1), count)
     # One node more, tied to one triangle of each part, makes a single search of all parts.
     heads = np.unique(parts, return_index=True)[1]
     rows, columns = np.append(a, np.full(len(heads), count)), np.append(b, heads)

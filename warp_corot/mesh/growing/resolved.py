@@ -10,10 +10,11 @@ from scipy.spatial import cKDTree
 
 from warp_corot.mesh.bisection import far_end
 from warp_corot.mesh.lattice import volume_shares
+from warp_corot.mesh.pieces import connected
 from warp_corot.mesh.scattered import spread_over_eighths
 from warp_corot.mesh.tree import LIVE, VOID, Tree
 
-from .cut import connected, inside_shares
+from .cut import inside_shares
 from .growth import lattice_spacing
 from .judging import FARTHER, GAP_ELEMENTS, ROUGH, surface_points
 from .walls import OF_WALLS, wall_shares

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .cut import face_pairs, linked
+from warp_corot.mesh.pieces import face_pairs, linked
 
 Array = np.ndarray
 

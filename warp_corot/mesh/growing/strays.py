@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .cut import face_pairs, linked
+from warp_corot.mesh.pieces import face_pairs, linked
 
 if TYPE_CHECKING:
     from warp_corot.domain import Domain

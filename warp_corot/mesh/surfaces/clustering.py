@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from warp_corot.mesh.growing.cut import linked
+from warp_corot.mesh.pieces import linked
 
 from .bound import SurfaceMesh
 from .locating import distances_from, nearest_faces
