@@ -8,7 +8,7 @@ from scipy.sparse.csgraph import connected_components
 
 import warp_corot as wc
 from warp_corot.discretization.groups import MOST, SMALL, neighbour_groups
-from warp_corot.mesh.pieces import face_pairs
+from warp_corot.mesh.topology import face_pairs
 
 
 def general(level):

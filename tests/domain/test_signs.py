@@ -8,8 +8,8 @@ import warp as wp
 import warp.examples
 
 import warp_corot as wc
+from warp_corot.domain.closing import winding_number
 from warp_corot.domain.surface import lines_through, surface_mesh, windings_of
-from warp_corot.domain.winding import winding_number
 
 
 def box(low, high) -> trimesh.Trimesh:

@@ -6,9 +6,8 @@ import trimesh
 
 import warp_corot as wc
 from warp_corot.domain.fidelity import fidelity
-from warp_corot.mesh.growing.slivers import without_slivers
-from warp_corot.mesh.growing.strays import strays
-from warp_corot.mesh.pieces import face_pairs
+from warp_corot.mesh.growing.slivers import strays, without_slivers
+from warp_corot.mesh.topology import face_pairs
 
 TURN = trimesh.transformations.rotation_matrix(0.4, (1.0, 2.0, 3.0))
 

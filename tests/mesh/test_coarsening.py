@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import warp_corot as wc
-from warp_corot.mesh.growing.adapt import grow
-from warp_corot.mesh.growing.judging import Wishes
-from warp_corot.mesh.growing.resolved import BELOW, Coarsening, Resolved
+from warp_corot.mesh.growing.fine_classification import BELOW, Coarsening, Resolved
+from warp_corot.mesh.growing.growth import grow
+from warp_corot.mesh.growing.refinement_criteria import Wishes
 from warp_corot.mesh.tree import LIVE
 
 

@@ -7,8 +7,8 @@ import pytest
 import trimesh
 
 import warp_corot as wc
+from warp_corot.domain.closing import net_edges
 from warp_corot.domain.fidelity import fidelity
-from warp_corot.domain.winding import net_edges
 from warp_corot.io.checkpoint.archive import joined, split
 from warp_corot.io.checkpoint.contents import pack_mesh, unpack_mesh
 

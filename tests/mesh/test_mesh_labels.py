@@ -8,7 +8,7 @@ from meshes import as_trimesh, assert_balanced, assert_bound, held
 
 import warp_corot as wc
 from warp_corot.domain.fidelity import fidelity, held_volumes
-from warp_corot.mesh.surfaces.separating import separated
+from warp_corot.mesh.surfaces.marching import separated
 
 
 def layered():

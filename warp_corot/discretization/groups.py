@@ -13,7 +13,7 @@ from warp_corot.kernels.elements import mean_dilatation_rows as kernels
 from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.kernels.plan.tree import TORN
 from warp_corot.mesh import TetForest, TetMesh
-from warp_corot.mesh.pieces import face_pairs
+from warp_corot.mesh.topology import face_pairs
 
 #: Groups in the form of ``kernels.elements.dilatation.share_in_groups``: starts, members, the number of groups
 #: if launches cover more, and the number in launches.

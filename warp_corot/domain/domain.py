@@ -10,13 +10,22 @@ import warp as wp
 
 from warp_corot.inputs.forwarding import forwards
 
-from .combined import DifferenceDomain, IntersectionDomain, NamedDomain, UnionDomain
-from .function import Function, FunctionDomain
-from .shapes import BoxDomain, CapsuleDomain, SphereDomain, TorusDomain
+from .shapes import (
+    BoxDomain,
+    CapsuleDomain,
+    DifferenceDomain,
+    Function,
+    FunctionDomain,
+    IntersectionDomain,
+    NamedDomain,
+    SphereDomain,
+    TorusDomain,
+    UnionDomain,
+)
 from .signed import SignedFunction
 
 if TYPE_CHECKING:
-    from .grid import Volume
+    from .labels import Volume
     from .surface import Surface
 
 

@@ -19,6 +19,8 @@ from .units import check_float32, length
 #: The shortest step inwards in the search for a body's thickness, relative to its range, and the number of steps.
 SPHERE_STEP = 0.04
 SPHERES = 25
+#: Four directions whose differences give a gradient.
+_AROUND = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]]) / np.sqrt(3.0)
 
 
 class SignedFunction:
@@ -56,6 +58,15 @@ class SignedFunction:
         if isinstance(points, wp.array):
             return self._phi(_checked_vec3(points))
         return self._phi(self._on_device(points)).numpy()
+
+    def sampled(self, points: np.ndarray) -> np.ndarray:
+        """The signed function [m] at points [..., 3], float64 [...]."""
+        return np.asarray(self.phi(points.reshape(-1, 3)), np.float64).reshape(points.shape[:-1])
+
+    def normals(self, points: np.ndarray, apart: np.ndarray) -> np.ndarray:
+        """Unit normals at points [..., 3] from differences over lengths [...] [m], outwards, float64 [..., 3]."""
+        slopes = self.sampled(points[..., None, :] + apart[..., None, None] * _AROUND) @ _AROUND
+        return slopes / np.maximum(np.linalg.norm(slopes, axis=-1, keepdims=True), 1e-300)
 
     def holds(self, points: npt.ArrayLike) -> np.ndarray:
         """Whether points [n, 3] [m] are inside, bool [n]."""

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from scipy.sparse import coo_array, csr_array
 from scipy.spatial import cKDTree
 
-from warp_corot.mesh.surfaces.boundary import signed_volumes
+from warp_corot.mesh.topology import signed_volumes
 
 #: Approximate number of full cubes of a body.
 CUBES = 1000

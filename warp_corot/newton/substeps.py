@@ -20,7 +20,7 @@ from warp_corot.kernels.elements.forces import law_stress, scatter_forces
 from warp_corot.kernels.newton import elements as of_elements
 from warp_corot.kernels.stepping import gauge
 from warp_corot.kernels.stepping.lanczos import add_scaled, scale_by
-from warp_corot.mesh.pieces import linked, node_pairs
+from warp_corot.mesh.topology import linked, node_pairs
 from warp_corot.solvers.guarding.mapped import Mapped
 from warp_corot.solvers.steps.gauge import Curvature
 from warp_corot.solvers.steps.stable_step import largest_eigenvalue

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.elasticity import ForceField
-from warp_corot.mesh.pieces import linked, node_pairs
+from warp_corot.mesh.topology import linked, node_pairs
 
 #: Loads on a free body balance if their sum is less than this share of the sum of their magnitudes.
 BALANCED = 1e-5

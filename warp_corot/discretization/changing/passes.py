@@ -18,8 +18,7 @@ from warp_corot.kernels.remesh import pools as pool_kernels
 from warp_corot.kernels.remesh import simplify as remesh_simplify
 from warp_corot.kernels.remesh import state as remesh_state
 from warp_corot.kernels.remesh.mark import Contents, elongation, marking_kernel
-from warp_corot.mesh.growing.growth import lattice_spacing
-from warp_corot.mesh.lattice import MAX_LEVEL, check_levels
+from warp_corot.mesh.lattice import MAX_LEVEL, check_levels, lattice_spacing
 
 from .checks import checked_criterion, checked_thresholds
 from .pools import DeviceForest

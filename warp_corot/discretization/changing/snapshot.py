@@ -16,7 +16,7 @@ from warp_corot.kernels.remesh.pools import SINKS
 from warp_corot.kernels.remesh.state import NO_ROW, Carried
 from warp_corot.kernels.tables.shapes import FRAME_SHIFT
 from warp_corot.mesh import TetForest
-from warp_corot.mesh.numbering import renumbered
+from warp_corot.mesh.tree import renumbered
 
 if TYPE_CHECKING:
     from warp_corot.discretization.changing.pools import DeviceForest

@@ -23,7 +23,7 @@ from warp_corot.discretization.changing.snapshot import Piece, Snapshot, array_o
 from warp_corot.discretization.changing.survey import Findings
 from warp_corot.errors import InputError
 from warp_corot.mesh import TetForest, TetMesh, Tree
-from warp_corot.mesh.growing.detail import Detail
+from warp_corot.mesh.surfaces.marching import Detail
 from warp_corot.mesh.tree import UniformTree
 from warp_corot.remesh.carried_activation import Keys
 from warp_corot.remesh.conditions import KEPT

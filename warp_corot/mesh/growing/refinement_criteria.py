@@ -13,13 +13,12 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.cpu_threads import launch_side_by_side
 from warp_corot.kernels.meshing import elements as kernels
 from warp_corot.kernels.tables.shapes import CIRCUMRADIUS, EDGE_LENGTHS
-from warp_corot.mesh.lattice import LATTICE_BITS, MAX_LEVEL
+from warp_corot.mesh.lattice import LATTICE_BITS, MAX_LEVEL, lattice_spacing
 from warp_corot.mesh.tree import LIVE
-
-from .growth import Growth, lattice_spacing, with_room
 
 if TYPE_CHECKING:
     from warp_corot.domain import Domain
+    from warp_corot.mesh.growing.growth import Growth
 
 #: A user's function of points [n, 3] -> [n].
 Field = Callable[[np.ndarray], np.ndarray]
@@ -317,6 +316,15 @@ def surface_points(
     step = np.divide(values.mean(axis=1), slope, out=np.zeros(len(slope)), where=slope > 0.0)
     step = np.clip(step, -longest, longest)[:, None]
     return origin + spacing * corners.mean(axis=1) + step * along, along
+
+
+def with_room(array: wp.array, count: int) -> wp.array:
+    """The array, or a longer copy, padded with zeros, if it is shorter than ``count``."""
+    if count <= len(array):
+        return array
+    longer = wp.zeros(max(count, 3 * len(array) // 2), dtype=array.dtype, device=array.device)
+    wp.copy(longer, array, count=len(array))
+    return longer
 
 
 def _checked(function: Callable[[np.ndarray], Any], points: np.ndarray) -> np.ndarray:
