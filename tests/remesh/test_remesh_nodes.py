@@ -6,8 +6,13 @@ from remesh_cases import CUBE, DENSITY, assert_sound, leaf_list, moving, random_
 
 import warp_corot as wc
 from warp_corot.discretization.changing.passes import RemeshPass
-from warp_corot.discretization.changing.pools import DeviceForest
-from warp_corot.discretization.changing.snapshot import CARRIED_BY_NODES, CARRIED_BY_TETRAHEDRA, OF_NODES, OF_TETRAHEDRA
+from warp_corot.discretization.changing.pools import (
+    CARRIED_BY_NODES,
+    CARRIED_BY_TETRAHEDRA,
+    OF_NODES,
+    OF_TETRAHEDRA,
+    DeviceForest,
+)
 
 
 def points_of(device):

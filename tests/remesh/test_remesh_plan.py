@@ -12,7 +12,7 @@ from warp_corot.discretization.changing.plan import DevicePlan, launch_size
 from warp_corot.discretization.changing.pools import DeviceForest
 from warp_corot.discretization.elements import device_elements
 from warp_corot.discretization.plan import Sharing
-from warp_corot.discretization.planning.fixed import ForcePlan, units_of
+from warp_corot.discretization.planner import ForcePlan, units_of
 from warp_corot.kernels.remesh.pools import SINKS
 from warp_corot.kernels.tables.shapes import FRAME_SHIFT
 

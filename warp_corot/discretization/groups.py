@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_corot.kernels.elements import mean_dilatation_rows as kernels
 from warp_corot.kernels.elements.dilatation import Dilatation
-from warp_corot.kernels.plan.tree import TORN
+from warp_corot.kernels.plan.plan import TORN
 from warp_corot.mesh import TetForest, TetMesh
 from warp_corot.mesh.topology import face_pairs
 

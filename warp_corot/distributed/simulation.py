@@ -28,8 +28,7 @@ from warp_corot.inputs.checks import checked_count
 from warp_corot.inputs.device import checked_device
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.uniform import SUBTREE_DEPTH
-from warp_corot.remesh.online import OnlineRemesh
-from warp_corot.remesh.remeshing import Remeshing
+from warp_corot.remesh.remeshing import OnlineRemesh, Remeshing
 from warp_corot.simulation import simulation as on_one
 from warp_corot.simulation.energy import WorldEnergies
 from warp_corot.simulation.hooks import Hooks

@@ -21,7 +21,7 @@ from warp_corot.inputs.cpu_threads import launch_side_by_side
 from warp_corot.inputs.loading import SURFACES, load
 from warp_corot.io.read.surfaces import UP_AXES, LoadedSurface, load_surface
 from warp_corot.kernels.meshing import domain as kernels
-from warp_corot.kernels.meshing import measuring, windings
+from warp_corot.kernels.meshing import windings
 from warp_corot.mesh.topology import linked
 
 if TYPE_CHECKING:
@@ -313,7 +313,7 @@ def _crossings(closed: ClosedSurface, device: wp.Device) -> np.ndarray:
     of_edges += [wp.array(own, dtype=wp.int32, device=device)]
     of_triangles = [mesh.id, wp.array(closed.parts, dtype=wp.int32, device=device)]
     launch_side_by_side(
-        measuring.find_crossed_parts,
+        windings.find_crossed_parts,
         len(edges),
         lambda own: ([placed, *map(own, of_edges), *of_triangles], [own(crossed)]),
         device,

@@ -21,7 +21,7 @@ from warp_corot.inputs.checks import (
 )
 from warp_corot.kernels.tables.shapes import EDGES
 
-from .forest import LabelledMesh
+from .forest_arrays import LabelledMesh
 from .surfaces.bound import embed_in_tets
 from .topology import signed_volumes
 

@@ -178,3 +178,8 @@ def connected(tets: Array) -> Array:
 def node_pairs(tets: Array) -> Array:
     """Pairs of nodes that link all nodes of each element, [3 n, 2]."""
     return np.stack([np.repeat(tets[:, 0], 3), tets[:, 1:].ravel()], axis=1)
+
+
+def codes(inside: Array) -> Array:
+    """The set of inside nodes of elements, bool [n, 4], as a number from 0 to 15."""
+    return inside @ np.array([1, 2, 4, 8])

@@ -24,7 +24,7 @@ class Tree:
         parent: Index of the parent, -1 for roots, int32 [M].
         first_child: Index of the first of the two children, ``LIVE`` (-1) for leaves, ``VOID`` (-2) for leaves that lie
             outside the body and not part of the mesh, int32 [M].
-        cut: What cuts have separated, as ``kernels.plan.tree.Tree.cut``, int32 [M]; None: nothing.
+        cut: What cuts have separated, as ``kernels.plan.plan.Tree.cut``, int32 [M]; None: nothing.
     """
 
     tets: np.ndarray

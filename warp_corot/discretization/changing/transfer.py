@@ -11,7 +11,7 @@ import warp as wp
 
 from warp_corot.discretization.sizes import padded
 from warp_corot.errors import InputError
-from warp_corot.kernels.remesh.follow import bind_points
+from warp_corot.kernels.remesh.derived import bind_points
 from warp_corot.kernels.remesh.pools import SINKS, Pools
 from warp_corot.kernels.remesh.state import MEAN, NO_ROW, Carried
 from warp_corot.mesh import TetForest

@@ -19,7 +19,7 @@ from warp_corot.mesh.bisection import far_end
 from warp_corot.mesh.growing.refinement_criteria import FARTHER, GAP_ELEMENTS, ROUGH, surface_points
 from warp_corot.mesh.lattice import lattice_spacing, volume_shares
 from warp_corot.mesh.scattered import spread_over_eighths
-from warp_corot.mesh.topology import connected
+from warp_corot.mesh.topology import codes, connected
 from warp_corot.mesh.tree import LIVE, VOID, Tree
 
 if TYPE_CHECKING:
@@ -32,11 +32,6 @@ Array = np.ndarray
 #: nodes.
 _INSIDE_FIRST = np.array([sorted(range(4), key=lambda n: 1 - (code >> n & 1)) for code in range(16)])
 _COUNT = np.array([code.bit_count() for code in range(16)])
-
-
-def codes(inside: Array) -> Array:
-    """The set of inside nodes of elements, bool [n, 4], as a number from 0 to 15."""
-    return inside @ np.array([1, 2, 4, 8])
 
 
 def shares(inside: Array, crossing: Callable[[Array, Array], Array]) -> Array:

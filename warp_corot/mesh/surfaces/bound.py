@@ -16,13 +16,13 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_indices, checked_numbers
 from warp_corot.kernels.meshing import embedding as kernels
 from warp_corot.kernels.meshing.embedding import find_holders
-from warp_corot.kernels.meshing.measuring import find_nearest
+from warp_corot.kernels.meshing.windings import find_nearest
 from warp_corot.mesh.lattice import LATTICE_BITS
 from warp_corot.mesh.topology import boundary_faces
 from warp_corot.mesh.tree import VOID, Tree
 
 if TYPE_CHECKING:
-    from warp_corot.mesh.forest import TetForest
+    from warp_corot.mesh.forest_arrays import ForestArrays
 
 #: Points farther away than this many lengths of the mesh are moved to that distance; float32 cannot resolve more.
 FARTHEST = 1.0e3
@@ -117,7 +117,7 @@ def _nearest(
 _WALKS = np.array([[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]])
 
 
-def embed(forest: TetForest, points: npt.ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+def embed(forest: ForestArrays, points: npt.ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """See `TetForest.embed`."""
     points = checked_points(points)
     found = leaves_at(forest.tree, forest.cells, forest.origin, forest.cell_size, points)
@@ -130,7 +130,7 @@ def embed(forest: TetForest, points: npt.ArrayLike) -> tuple[np.ndarray, np.ndar
     return elements, barycentric(forest, elements, points)
 
 
-def barycentric(forest: TetForest, elements: np.ndarray, points: np.ndarray) -> np.ndarray:
+def barycentric(forest: ForestArrays, elements: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Barycentric coordinates of points in leaves, float64 [n, 4]; some are negative for points outside."""
     x = forest.points[forest.tets[elements]]
     edges = np.swapaxes(x[:, 1:] - x[:, :1], 1, 2)
@@ -169,7 +169,7 @@ def leaves_at(
     return found
 
 
-def _nearest_leaves(forest: TetForest, points: np.ndarray) -> np.ndarray:
+def _nearest_leaves(forest: ForestArrays, points: np.ndarray) -> np.ndarray:
     """The element behind the boundary face that is closest to each point, int32 [n]."""
     faces, parents = _boundary_faces(forest)
     # Relative to the centre of the mesh, because float32 keeps few digits far from zero.
@@ -180,7 +180,7 @@ def _nearest_leaves(forest: TetForest, points: np.ndarray) -> np.ndarray:
     return parents[nearest_faces(forest.points - middle, faces, moved, 10.0 * limit)]
 
 
-def _boundary_faces(forest: TetForest) -> tuple[np.ndarray, np.ndarray]:
+def _boundary_faces(forest: ForestArrays) -> tuple[np.ndarray, np.ndarray]:
     """Boundary faces and their leaves; the nodes of these faces are on void tetrahedra or on the border of the grid."""
     tree = forest.tree
     lattice = forest.lattice[: forest.node_count]

@@ -23,9 +23,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from warp_corot.kernels.tables.shapes import EDGES
-from warp_corot.mesh.growing.fine_classification import codes
 from warp_corot.mesh.surfaces.bound import SurfaceMesh
-from warp_corot.mesh.topology import boundary_faces, signed_volumes
+from warp_corot.mesh.topology import boundary_faces, codes, signed_volumes
 
 if TYPE_CHECKING:
     from warp_corot.domain import Domain
