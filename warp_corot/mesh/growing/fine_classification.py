@@ -13,13 +13,12 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from warp_corot.mesh.bisection import far_end
-from warp_corot.mesh.growing.refinement_criteria import FARTHER, GAP_ELEMENTS, ROUGH, surface_points
+from warp_corot.mesh.growing.refinement_criteria import FARTHER, ROUGH, surface_points
 from warp_corot.mesh.lattice import lattice_spacing, volume_shares
 from warp_corot.mesh.scattered import spread_over_eighths
-from warp_corot.mesh.topology import codes, connected
+from warp_corot.mesh.topology import codes
 from warp_corot.mesh.tree import LIVE, VOID, Tree
 
 if TYPE_CHECKING:
@@ -155,8 +154,6 @@ def wall_shares(corners: np.ndarray, points: np.ndarray, sampled: np.ndarray, do
 BELOW = -3
 
 
-#: Pieces below this fraction of the body do not count, and more pieces than this are fragments of unresolved parts.
-LEAST_PIECE, MOST_PIECES = 1.0e-4, 16
 #: Approximate number of all points.
 MOST_POINTS = 250_000
 #: A leaf with a corner inside the body counts as filled to at least this share.
@@ -278,31 +275,6 @@ class Resolved:
             found[cut] = domain.thickness(x, inward, FARTHER * layers * self.cell_size)
         return self.smallest(found)
 
-    def gaps(self) -> np.ndarray | None:
-        """The smallest distance from the surface in each tetrahedron to another piece of the body, float64 [M] [m];
-        None if there is one piece, or implausibly many.
-        """
-        grown = self.grown
-        tets = grown.tree.tets[self.leaves]
-        if not len(tets):
-            return None
-        piece = connected(np.where(grown.phi[tets] < 0, tets, np.int32(-1)))
-        sizes = np.bincount(piece, self.shares * self.volume[self.leaves])
-        real = np.flatnonzero(sizes > LEAST_PIECE * sizes.sum())
-        if not 1 < len(real) <= MOST_PIECES:
-            return None
-        at_surface = (grown.phi[tets] >= 0).any(axis=1)
-        x = grown.lattice[tets].mean(axis=1) * lattice_spacing(self.cell_size)
-        found, reach = np.full(len(self.held), np.inf), GAP_ELEMENTS * self.cell_size
-        for number in real:
-            own = np.flatnonzero(at_surface & (piece == number))
-            other = np.flatnonzero(at_surface & (piece != number) & np.isin(piece, real))
-            own, other = own[_near(x[own], x[other], reach)], other[_near(x[other], x[own], reach)]
-            if len(own) and len(other):
-                tree = cKDTree(x[other], compact_nodes=False, balanced_tree=False)
-                found[self.leaves[own]], _ = tree.query(x[own], distance_upper_bound=reach)
-        return self.smallest(found)
-
     def _upwards(self, values: np.ndarray, ufunc: np.ufunc) -> np.ndarray:
         values, first = values.copy(), self.grown.tree.first_child
         for elements in self.deepest_first():
@@ -373,13 +345,6 @@ class Coarsening:
         found = np.where(self._holds, np.where(self._own > limit, self._first_child, LIVE), VOID).astype(np.int32)
         found[self._above <= limit] = BELOW
         return int(np.count_nonzero(self._counted & (found == LIVE))), found
-
-
-def _near(points: np.ndarray, others: np.ndarray, reach: float) -> np.ndarray:
-    """Mask of the points within a distance of the box around others, bool [n]."""
-    if not len(others):
-        return np.zeros(len(points), bool)
-    return ((points >= others.min(axis=0) - reach) & (points <= others.max(axis=0) + reach)).all(axis=1)
 
 
 def points_within(

@@ -22,9 +22,9 @@ from warp_corot.inputs.device import checked_device
 from warp_corot.inputs.loading import MESHING, load
 from warp_corot.mesh.forest import TetForest
 from warp_corot.mesh.growing.fine_classification import Coarsening, Resolved
-from warp_corot.mesh.growing.growth import Closer, Enough, Growing, grow
+from warp_corot.mesh.growing.growth import Growing
 from warp_corot.mesh.growing.labelling import labels_of, labels_of_nodes
-from warp_corot.mesh.growing.refinement_criteria import GAP_ELEMENTS, THIN_NEED, Field, Wishes
+from warp_corot.mesh.growing.refinement_criteria import THIN_NEED, Field, Wishes
 from warp_corot.mesh.growing.slivers import strays, without_slivers
 from warp_corot.mesh.lattice import check_levels, checked_cell_size, checked_level
 from warp_corot.mesh.surfaces.bound import leaves_at
@@ -46,11 +46,6 @@ MOST_CUBES_OF_BOXES = 7
 #: the longest side need it more, by up to this share; a mesh with less than that share of the elements asked for gets
 #: other cubes first.
 FARTHER_FIRST, FEW = 0.05, 0.6
-#: The assumed error of an element between such pieces, as a fraction of its edge.
-GAP_NEED = 0.5
-#: The thinner of two parts is bisected first: its need is larger by up to this fraction, by which a bisection shortens
-#: elements. Thicknesses are rounded to this many steps, so that equally thin parts stay equal.
-THINNEST_FIRST, THIN_STEPS = 0.26, 16
 #: The drawn surface is closer to the body's than the mesh's threshold by this factor, for which the forest must be
 #: finer still; with many elements it is the mesh's own. Thin parts have no finer elements than the mesh may need.
 FINER_SURFACE, FINER_FOREST, FINER_THIN = 0.3, 0.2, 0.4
@@ -219,23 +214,20 @@ def _of_cubes(
     deepest = more + MAX_LEVEL_THIN if budget.max_level is None else budget.max_level
     looked = max(min(most + 1, CLOSE_LEVEL + more), min(deepest, budget.min_level))
     error = max(CLOSE_ERROR * min(size, suits), 0.5 * budget.surface_error)
-    looking = Wishes(
-        error,
-        min(budget.min_level, looked),
-        looked,
-        wishes.refine_where,
-        wishes.field,
-        wishes.field_tolerance,
-        budget.min_layers,
-        min(deepest, looked + CLOSER_LEVELS),
+    looking = replace(
+        wishes,
+        surface_error=error,
+        min_level=min(budget.min_level, looked),
+        max_level=looked,
+        layers=budget.min_layers,
+        thin_level=min(deepest, looked + CLOSER_LEVELS),
     )
     growing = Growing(domain, size, looking, device)
-    growing.run_until(Enough(target, FIRST_ERROR * min(size, suits)))
-
+    growing.run_until(target, FIRST_ERROR * min(size, suits))
     growing.run_finer(FINER_FOREST if target <= MANY else 1.0, FINER_THIN)
     room = (CLOSE_ELEMENTS if target <= MANY else CLOSE_ELEMENTS_OF_MANY) * target + 40_000
     if growing.growth.element_count + LEAST_CLOSER < room:
-        growing.look_closer(Closer(CLOSER_LEVELS, CLOSER_ERROR, room))
+        growing.look_closer(CLOSER_LEVELS, CLOSER_ERROR, room)
     points, largest = label_floor(domain, target)
     growing.run_around(points, largest)
     resolved = Resolved(growing.grown(), size, domain)
@@ -284,16 +276,8 @@ def needs_of(resolved: Resolved, domain: Domain, layers: float, most: int, deepe
     level, length = resolved.grown.tree.level, resolved.lengths
     needs = np.where(level < most, resolved.grown.need, 0.0)
     if layers > 0:
-        missing = 1.0 - resolved.thin(domain, layers) / (layers * length)
-        thin = (missing > 0.0) & (level < deepest)
-        first = 1.0 + THINNEST_FIRST * np.round(missing[thin] * THIN_STEPS) / THIN_STEPS
-        needs[thin] = np.maximum(needs[thin], THIN_NEED * length[thin]) * first
-    gaps = resolved.gaps()
-    if gaps is not None:
-        # Pieces separate if elements of both, and one between them, have room; without room, bisection is in vain.
-        finest = resolved.cell_size * 0.5 ** (deepest / 3.0)
-        close = (GAP_ELEMENTS * length > gaps) & (gaps > GAP_ELEMENTS * finest) & (level < deepest)
-        needs[close] = np.maximum(needs[close], GAP_NEED * length[close])
+        thin = (resolved.thin(domain, layers) < layers * length) & (level < deepest)
+        needs[thin] = np.maximum(needs[thin], THIN_NEED * length[thin])
     return resolved.largest(np.where(resolved.held > 0.0, needs, 0.0)).astype(np.float32)
 
 
@@ -337,8 +321,12 @@ def mesh_domain(
         return _of_size(domain, budget, sliver, where)
     if cell_size is None:
         raise InputError("cell_size is None; it must be a length in metres where target_elements is not given")
-    closer = Closer(detail, CLOSER_ERROR, CLOSER_ELEMENTS) if detail else None
-    grown = grow(domain, float(cell_size), wishes, where, closer)
+    growing = Growing(domain, float(cell_size), wishes, where)
+    growing.run()
+    wished = growing.growth.first_child[: growing.growth.element_count].numpy().copy()
+    if detail:
+        growing.look_closer(detail, CLOSER_ERROR, CLOSER_ELEMENTS)
+    grown = growing.grown(wished)
     resolved = Resolved(grown, float(cell_size), domain if detail else None)
     forest, left_out = _finished(resolved, resolved.as_wished(), domain, sliver)
     _say(left_out)

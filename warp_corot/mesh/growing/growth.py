@@ -218,35 +218,6 @@ LEFT_OVER = 2.0e-3
 
 
 @dataclass(frozen=True)
-class Closer:
-    """How much more finely a body is sampled than its mesh follows it.
-
-    Attributes:
-        levels: Number of levels below the mesh's deepest.
-        error: The largest distance of the sampled surface from the domain's, as a fraction of an element's edge there.
-        most_elements: The approximate largest number of tetrahedra of all levels: beyond it only the neediest of a
-            level are bisected.
-    """
-
-    levels: int
-    error: float
-    most_elements: int
-
-
-@dataclass(frozen=True)
-class Enough:
-    """The state in which a forest is fine enough for a mesh with a number of elements.
-
-    Attributes:
-        elements: The number of leaves that contain a part of the body.
-        first_error: The first surface error [m].
-    """
-
-    elements: int
-    first_error: float
-
-
-@dataclass(frozen=True)
 class Grown:
     """A grown forest: all lattice points that were evaluated, and the results.
 
@@ -285,31 +256,6 @@ def grid_around(bounds: np.ndarray, cell_size: float) -> tuple[tuple[int, int, i
     x, y, z = (float(c) for c in bounds.mean(axis=0) - 0.5 * cells * cell_size)
     a, b, c = (int(n) for n in cells)
     return (a, b, c), (x, y, z)
-
-
-def grow(
-    domain: Domain,
-    cell_size: float,
-    wishes: Wishes,
-    device: wp.Device,
-    closer: Closer | None = None,
-) -> Grown:
-    """Bisect the grid around a domain by the wishes and for conformity; then, if requested, sample the body more
-    finely.
-
-    Args:
-        domain: The body.
-        cell_size: Edge of a root cube [m].
-        wishes: The required fineness.
-        device: The device of the computation.
-        closer: How finely to sample the body afterwards.
-    """
-    growing = Growing(domain, cell_size, wishes, device)
-    growing.run()
-    wished = growing.growth.first_child[: growing.growth.element_count].numpy().copy()
-    if closer is not None:
-        growing.look_closer(closer)
-    return growing.grown(wished)
 
 
 class Growing:
@@ -370,14 +316,14 @@ class Growing:
             growth.bisect(wished)
         growth.close(self.judge.wished, start)
 
-    def run_until(self, enough: Enough) -> None:
-        """Lower the surface error until there are enough elements."""
+    def run_until(self, elements: int, first_error: float) -> None:
+        """Lower the surface error, from a first one [m], until so many leaves contain a part of the body."""
         judge = self.judge
         least = float(judge.closest[0])
-        error, judge.limited = max(enough.first_error, least), True
+        error, judge.limited = max(first_error, least), True
         judge.tolerances = np.full(MAX_LEVEL + 1, error, np.float32)
         self.run()
-        while error > least and (share := judge.holding() / enough.elements) < 1.0:
+        while error > least and (share := judge.holding() / elements) < 1.0:
             error = max(error * min(max(share, STEEPEST), FLATTEST), least)
             self.lower(error)
 
@@ -411,12 +357,20 @@ class Growing:
             growth.bisect(wp.array(np.unique(leaves[large]), dtype=wp.int32, device=growth.device))
             self.run(first)
 
-    def look_closer(self, closer: Closer) -> None:
-        """Continue in elements that do not represent the surface well."""
+    def look_closer(self, levels: int, error: float, most_elements: int) -> None:
+        """Continue in elements that do not represent the surface well.
+
+        Args:
+            levels: Number of levels below the mesh's deepest.
+            error: The largest distance of the sampled surface from the domain's, as a fraction of an element's edge
+                there.
+            most_elements: The approximate largest number of tetrahedra of all levels: beyond it only the neediest of a
+                level are bisected.
+        """
         growth, judge = self.growth, self.judge
-        self.room = closer.most_elements
+        self.room = most_elements
         first = growth.element_count
-        growth.bisect(self.chosen(judge.unresolved(closer.levels, closer.error)))
+        growth.bisect(self.chosen(judge.unresolved(levels, error)))
         self.run(first)
 
     def grown(self, wished: np.ndarray | None = None) -> Grown:
