@@ -16,7 +16,7 @@ from warp_corot.io.write.animate import record
 from warp_corot.materials.anisotropic import Orthotropic, TransverselyIsotropic
 from warp_corot.materials.isotropic import Isotropic
 from warp_corot.materials.reinforced import FibreReinforced
-from warp_corot.remesh.online import OnlineRemesh
+from warp_corot.remesh.remeshing import OnlineRemesh
 from warp_corot.simulation.energy import Energy, WorldEnergies
 from warp_corot.simulation.progress import show_progress
 from warp_corot.simulation.simulation import Simulation

@@ -22,10 +22,9 @@ from warp_corot.inputs.simulation_lock import SIMULATION_LOCK, under_lock
 from warp_corot.kernels.stepping.integrate import RESET_NODES
 from warp_corot.materials.isotropic import Material
 from warp_corot.mesh import TetForest
-from warp_corot.mesh.pieces import pieces_of
 from warp_corot.mesh.surfaces.bodies import boundary_surface
 from warp_corot.mesh.surfaces.bound import NOT_OPENED
-from warp_corot.mesh.surfaces.boundary import boundary_faces
+from warp_corot.mesh.topology import boundary_faces, pieces_of
 
 from .arrays import NodeArrays, SharedArrays, Views
 from .controls import Controls

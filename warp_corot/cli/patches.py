@@ -21,7 +21,7 @@ from warp_corot.holding.choice import LOWEST, BodyShape, flat_region
 from warp_corot.inputs.checks import checked_times
 from warp_corot.inputs.selection import select_nodes
 from warp_corot.mesh.surfaces.bodies import boundary_surface
-from warp_corot.mesh.surfaces.boundary import boundary_faces
+from warp_corot.mesh.topology import boundary_faces
 
 from .options import LOADS
 

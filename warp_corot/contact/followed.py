@@ -9,10 +9,9 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.discretization.changing.transfer import FollowingBinding
-from warp_corot.kernels.remesh import follow as kernels
+from warp_corot.kernels.remesh import derived as kernels
 from warp_corot.mesh.surfaces.bound import BoundPoints, SurfaceMesh
-from warp_corot.mesh.surfaces.clustering import Clusters, departures, resolved
-from warp_corot.mesh.surfaces.splitting import longest_edge, split
+from warp_corot.mesh.surfaces.clustering import Clusters, departures, longest_edge, resolved, split
 
 from .skin import APART, Skin, apart, levels_at
 

@@ -26,7 +26,7 @@ from warp_corot.contact.keeping import keep_again, kept_arrays
 from warp_corot.elasticity import Corotated
 from warp_corot.inputs.checks import checked_path
 from warp_corot.io.checkpoint.archive import joined, load_checkpoint, pack_body, rebuilt_body, save_checkpoint, split
-from warp_corot.remesh.online import OnlineRemesh
+from warp_corot.remesh.remeshing import OnlineRemesh
 from warp_corot.simulation.simulation import Simulation as OnOne
 from warp_corot.solvers.system import System
 

@@ -27,9 +27,8 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_count
 from warp_corot.inputs.device import checked_device
 from warp_corot.mesh import TetForest
-from warp_corot.mesh.uniform_part import SUBTREE_DEPTH
-from warp_corot.remesh.online import OnlineRemesh
-from warp_corot.remesh.remeshing import Remeshing
+from warp_corot.mesh.uniform import SUBTREE_DEPTH
+from warp_corot.remesh.remeshing import OnlineRemesh, Remeshing
 from warp_corot.simulation import simulation as on_one
 from warp_corot.simulation.energy import WorldEnergies
 from warp_corot.simulation.parts import checked_bodies, checked_integrator, checked_models, chosen_worlds

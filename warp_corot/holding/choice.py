@@ -11,8 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_corot.discretization.elements import Mesh
-from warp_corot.mesh.pieces import pieces_of
-from warp_corot.mesh.surfaces.boundary import boundary_faces
+from warp_corot.mesh.topology import boundary_faces, pieces_of
 
 if TYPE_CHECKING:
     from .sag import CoarseBody, MeshBody

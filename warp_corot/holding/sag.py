@@ -22,7 +22,7 @@ from scipy.sparse import block_array, coo_array, csr_array, diags_array
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
-from warp_corot.mesh.surfaces.boundary import signed_volumes
+from warp_corot.mesh.topology import signed_volumes
 
 #: Approximate number of full cubes of a body.
 CUBES = 1000

@@ -20,11 +20,8 @@ from .cpu_threads import core_count
 from .stopwatch import KERNELS, WATCH
 
 #: Modules of ``warp_corot.kernels`` for closed surfaces and for meshes of domains, the slowest to compile first.
-SURFACES = ("meshing.domain", "meshing.measuring", "meshing.windings")
-MESHING = (
-    *("meshing.domain", "meshing.elements", "meshing.embedding", "meshing.growth"),
-    *("meshing.coarsening", "meshing.surface_points", "meshing.leaves"),
-)
+SURFACES = ("meshing.domain", "meshing.windings")
+MESHING = ("meshing.domain", "meshing.elements", "meshing.embedding", "meshing.growth")
 #: Modules for bodies, for all steps, and for explicit ones whose length is chosen.
 BODY = ("plan.lists", "plan.batches", "stepping.team", "elements.cpu", "stepping.integrate")
 STEPS = ("stepping.balance", "stepping.pace")

@@ -13,7 +13,7 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import InputError, depth_of_user
-from warp_corot.mesh.surfaces.boundary import boundary_faces
+from warp_corot.mesh.topology import boundary_faces
 
 from .library import ModelView, newton
 from .scene import STATE, attribute_of

@@ -19,8 +19,7 @@ from warp_corot.errors import InputError
 from warp_corot.kernels.newton import explicit_rows, rows
 from warp_corot.kernels.newton.pairs import PairLists, Surfaces, count_pair_loads, scatter_pairs
 from warp_corot.kernels.newton.particles import NO_ROW, UNKNOWN_BEFORE, Bodies, Particles
-from warp_corot.mesh.growing.cut import linked, node_pairs
-from warp_corot.mesh.surfaces.boundary import boundary_faces
+from warp_corot.mesh.topology import boundary_faces, linked, node_pairs
 
 from .checks import Step
 from .library import newton

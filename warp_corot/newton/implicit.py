@@ -20,7 +20,7 @@ from warp_corot.kernels.implicit.tangent import add_vectors, find_rest
 from warp_corot.kernels.newton import implicit as kernels
 from warp_corot.kernels.newton import implicit_rows as rows
 from warp_corot.kernels.newton.particles import Particles
-from warp_corot.mesh.growing.cut import connected
+from warp_corot.mesh.topology import connected
 from warp_corot.solvers.implicit.block_system import BlockSystem
 from warp_corot.solvers.implicit.conjugate_gradients import LineSearch, WorldSums
 from warp_corot.solvers.implicit.contact_solve import ContactSolve

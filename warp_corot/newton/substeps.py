@@ -20,7 +20,7 @@ from warp_corot.kernels.elements.forces import law_stress, scatter_forces
 from warp_corot.kernels.newton import elements as of_elements
 from warp_corot.kernels.stepping import stability
 from warp_corot.kernels.stepping.stability import add_scaled, scale_by
-from warp_corot.mesh.growing.cut import linked, node_pairs
+from warp_corot.mesh.topology import linked, node_pairs
 from warp_corot.solvers.pace import Mapped
 from warp_corot.solvers.stability import Curvature, largest_eigenvalue
 

@@ -20,8 +20,7 @@ from warp_corot.errors import InputError, StabilityWarning, depth_of_user
 from warp_corot.inputs.checks import checked_number
 from warp_corot.inputs.simulation_lock import under_lock
 from warp_corot.kernels.remesh.cut_surface import Surface
-from warp_corot.remesh.online import OnlineRemesh
-from warp_corot.remesh.remeshing import Remeshing
+from warp_corot.remesh.remeshing import OnlineRemesh, Remeshing
 from warp_corot.solvers import Integrator, largest_frequency
 from warp_corot.solvers.guard import Guard
 from warp_corot.solvers.halo import ALONE, Halo

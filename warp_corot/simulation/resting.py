@@ -18,7 +18,7 @@ from warp_corot.contact.tool import Tool
 from warp_corot.elasticity import ForceField, Model
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.checks import checked_things
-from warp_corot.mesh.growing.cut import linked, node_pairs
+from warp_corot.mesh.topology import linked, node_pairs
 from warp_corot.solvers import BackwardEuler
 
 from .simulation import Simulation

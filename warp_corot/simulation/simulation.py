@@ -44,8 +44,7 @@ from warp_corot.kernels.contact.search import find_pairs
 from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.stepping.integrate import STEP_SYMPLECTIC_EULER
 from warp_corot.kernels.stepping.stability import find_strains
-from warp_corot.remesh.online import OnlineRemesh
-from warp_corot.remesh.remeshing import Remeshing
+from warp_corot.remesh.remeshing import OnlineRemesh, Remeshing
 from warp_corot.solvers import Integrator, SymplecticEuler
 from warp_corot.solvers.guard import Guard
 from warp_corot.solvers.pace import Pace

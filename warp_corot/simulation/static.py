@@ -280,7 +280,7 @@ class _Answer(LoadedBody):
 
 def _what_stopped(answer: _Answer, solver: StaticSolver, why: str, converged: npt.NDArray[np.bool_]) -> str:
     """The message of a solve that did not converge in all worlds."""
-    from warp_corot.mesh.pieces import pieces_of
+    from warp_corot.mesh.topology import pieces_of
 
     body = answer.body
     piece = pieces_of(body.mesh.tets)

@@ -15,7 +15,7 @@ from warp_corot.contact.nodal import pressure_at_nodes
 from warp_corot.io.pictures.colors import round_limit
 from warp_corot.kernels.viewing import values as kernels
 from warp_corot.mesh import TetForest
-from warp_corot.mesh.surfaces.boundary import signed_volumes
+from warp_corot.mesh.topology import signed_volumes
 from warp_corot.simulation.simulation import Simulation
 
 from .shown import Shown

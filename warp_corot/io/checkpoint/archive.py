@@ -23,7 +23,7 @@ from warp_corot.materials.anisotropic import Orthotropic, TransverselyIsotropic
 from warp_corot.materials.isotropic import Isotropic
 from warp_corot.materials.reinforced import FibreReinforced
 from warp_corot.mesh import TetForest, TetMesh
-from warp_corot.remesh.online import OnlineRemesh
+from warp_corot.remesh.remeshing import OnlineRemesh
 from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import INTEGRATORS
 

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from warp_corot.discretization.plan import Batch
-from warp_corot.discretization.planning.fixed import ForcePlan
+from warp_corot.discretization.planner import ForcePlan
 from warp_corot.elasticity.corotated.fields import SubtreeField
 from warp_corot.elasticity.dilatation import law_of
 from warp_corot.kernels.stepping.block import BlockBody, step_block

@@ -12,27 +12,21 @@ import warp as wp
 from warp_corot.errors import InputError
 from warp_corot.inputs.cpu_threads import launch_side_by_side
 from warp_corot.kernels.meshing import elements as kernels
-from warp_corot.kernels.meshing import leaves
 from warp_corot.kernels.tables.shapes import CIRCUMRADIUS, EDGE_LENGTHS
-from warp_corot.mesh.lattice import LATTICE_BITS, MAX_LEVEL
+from warp_corot.mesh.lattice import LATTICE_BITS, MAX_LEVEL, lattice_spacing
 from warp_corot.mesh.tree import LIVE
-
-from .growth import Growth, lattice_spacing, with_room
-from .surface_points import surface_points
 
 if TYPE_CHECKING:
     from warp_corot.domain import Domain
+    from warp_corot.mesh.growing.growth import Growth
 
 #: A user's function of points [n, 3] -> [n].
 Field = Callable[[np.ndarray], np.ndarray]
 
-#: The assumed error of an element where the body is thinner than its layers, as a fraction of its edge; and the number
-#: of elements that must fit between pieces of the body so that these stay separate.
-THIN_NEED, GAP_ELEMENTS = 0.4, 2.0
+#: The assumed error of an element where the body is thinner than its layers, as a fraction of its edge.
+THIN_NEED = 0.4
 #: Thickness is searched up to this multiple of the value it is compared with, because larger ones are cut off there.
 FARTHER = 1.01
-#: The need [m] of elements that are sampled finely only for thickness; it counts when the mesh is chosen.
-LOOKED = 1.0e-12
 #: Elements with an error below this fraction of their edge need no finer sampling.
 ROUGH = 0.03
 #: The assumed error of an element with two labels, as a fraction of its edge.
@@ -50,7 +44,7 @@ class Wishes:
         field: Function of points [n, 3] -> numbers [n]: elements in which it varies are bisected ...
         field_tolerance: ... by more than this.
         layers: Elements at the surface are bisected to level ``thin_level`` where the body is thinner than this many of
-            them, or where its pieces are closer to each other.
+            them.
     """
 
     surface_error: float
@@ -125,16 +119,14 @@ class Judge:
         growth.launch(kernels.judge_by_corners, count, inputs, [growth.first_child, states, self.need])
         self._judge_all(first, states)
         if not self.limited:
-            growth.launch(kernels.take_wishes, count, [states, first], [growth.wished])
+            growth.wished[first : growth.element_count].assign(states.numpy() == int(kernels.SPLIT))
         return self.of_state(states, kernels.SPLIT, first)
 
     def off(self) -> wp.array:
         """Leaves whose errors exceed the present tolerances."""
-        growth = self.growth
-        flags = wp.empty(growth.element_count, dtype=wp.int32, device=self.device)
-        inputs = [growth.first_child, growth.level, self.need, self._on_device(self.tolerances), self.max_level]
-        growth.launch(leaves.flag_off, growth.element_count, inputs, [flags])
-        return growth.flagged(flags)
+        level, leaf, need = self._now(self.growth.level), self._now(self.growth.first_child), self._now(self.need)
+        found = np.flatnonzero((leaf == LIVE) & (level < self.max_level) & (need > self.tolerances[level]))
+        return wp.array(found, dtype=wp.int32, device=self.device)
 
     def unresolved(self, levels: int, error: float) -> wp.array:
         """Begin to sample more finely, by this many levels; return the leaves of the present deepest level that must be
@@ -149,28 +141,30 @@ class Judge:
         self.max_level = min(before + levels, MAX_LEVEL)
         self.tolerances = np.maximum(self.tolerances, error * self.lengths).astype(np.float32)
         self.closest = self.tolerances
-        states = wp.empty(growth.element_count, dtype=wp.int32, device=self.device)
-        inputs = [growth.first_child, growth.level, growth.parent, growth.tets, self.phi, self.need, self.circumradius]
-        inputs += [float(self.domain.lipschitz), before, ROUGH]
-        growth.launch(leaves.open_leaves, growth.element_count, inputs, [states])
-        self._judge_all(0, states)
-        return self.of_state(states, kernels.SPLIT, 0)
+        level, parent = self._now(growth.level), self._now(growth.parent)
+        size = self.circumradius.numpy()[level]
+        rough = (parent < 0) | (self._now(self.need)[parent] > np.float32(ROUGH) * size)
+        chosen = np.flatnonzero((self._now(growth.first_child) == LIVE) & (level >= before) & rough)
+        highest = self.phi.numpy()[self._now(growth.tets)[chosen]].max(axis=1)
+        states = np.full(len(level), kernels.LEFT, np.int32)
+        states[chosen[highest >= np.float32(-self.domain.lipschitz) * size[chosen]]] = kernels.OPEN
+        on_device = wp.array(states, dtype=wp.int32, device=self.device)
+        self._judge_all(0, on_device)
+        return self.of_state(on_device, kernels.SPLIT, 0)
 
     def holding(self) -> int:
         """Number of leaves with a corner inside."""
-        growth = self.growth
-        count = wp.zeros(1, dtype=wp.int32, device=self.device)
-        inputs = [growth.first_child, growth.tets, self.phi]
-        growth.launch(leaves.count_holding, growth.element_count, inputs, [count])
-        return int(count.numpy()[0])
+        tets = self._now(self.growth.tets)[self._now(self.growth.first_child) == LIVE]
+        return int(np.count_nonzero((self.phi.numpy()[tets] < 0).any(axis=1)))
 
     def of_state(self, states: wp.array, state: int, first: int) -> wp.array:
-        if self.device.is_cpu:
-            found = np.flatnonzero(states.numpy() == int(state)) + first
-            return wp.array(found, dtype=wp.int32, device=self.device)
-        flags = wp.empty(len(states), dtype=wp.int32, device=self.device)
-        self.growth.launch(kernels.flag_equal, len(states), [states, state], [flags])
-        return self.growth.flagged(flags, first)
+        """The elements, counted from ``first``, that have a state."""
+        found = np.flatnonzero(states.numpy() == int(state)) + first
+        return wp.array(found, dtype=wp.int32, device=self.device)
+
+    def _now(self, array: wp.array) -> np.ndarray:
+        """The values of all present elements."""
+        return array[: self.growth.element_count].numpy()
 
     def _judge_all(self, first: int, states: wp.array) -> None:
         self.judge_surface(first, states)
@@ -214,7 +208,7 @@ class Judge:
             growth.launch(kernels.judge_by_probes, len(chosen), inputs, [states, self.need])
 
     def judge_thickness(self, first: int, states: wp.array) -> None:
-        """Mark elements where the body, or a gap between its pieces, is thinner than a few elements."""
+        """Mark elements where the body is thinner than a few elements."""
         wishes, growth, domain = self.wishes, self.growth, self.domain
         if not wishes.layers or not len(states):
             return
@@ -224,32 +218,22 @@ class Judge:
         # Without a limit on their number, elements are not finer than the rest for this reason.
         deepest = wishes.thin_level if self.closer else wishes.max_level
         chosen = np.flatnonzero((state == kernels.DONE) & (leaf == LIVE) & (level < deepest))
-        # Thickness is accurate at the surface; gaps are only estimated, so any ray will do.
-        known = self.need[first : growth.element_count].numpy()[chosen] <= self.closest[level[chosen]]
-        if not domain.has_pieces:
-            chosen, known = chosen[known], known[known]
+        # Thickness is accurate where the surface is.
+        chosen = chosen[self.need[first : growth.element_count].numpy()[chosen] <= self.closest[level[chosen]]]
         tets = growth.tets[first : growth.element_count].numpy()[chosen]
         phi = self.phi.numpy()[tets]
         crossed = (phi < 0).any(axis=1) & (phi >= 0).any(axis=1)
-        chosen, tets, known = chosen[crossed], tets[crossed], known[crossed]
+        chosen, tets, phi = chosen[crossed], tets[crossed], phi[crossed]
         if not len(chosen):
             return
-        x, inward = surface_points(growth.lattice, self.phi, tets, self.origin, self.spacing)
+        x, inward = surface_points(growth.lattice.numpy()[tets], phi, np.asarray(self.origin), self.spacing)
         # By volume: a cube's edge halves in three levels.
         length = self.lengths[0] * 0.5 ** (level[chosen] / 3.0)
-        reach = FARTHER * wishes.layers * float(length.max())
-        thin = known & (wishes.layers * length > domain.thickness(x, inward, reach))
+        thin = wishes.layers * length > domain.thickness(x, inward, FARTHER * wishes.layers * float(length.max()))
         thin &= THIN_NEED * length > self.thin_tolerance
         need = np.where(thin, THIN_NEED * length, 0.0)
         limits = np.maximum(self.tolerances[level[chosen]], self.thin_tolerance) if self.limited else 0.0
-        wanted = THIN_NEED * length > limits
-        split = thin & wanted
-        if domain.has_pieces:
-            # Whether this is a gap between pieces is known later; then its need counts.
-            reach = FARTHER * GAP_ELEMENTS * float(length.max())
-            near = GAP_ELEMENTS * length > domain.thickness(x, inward, reach, outside=True)
-            need = np.where(near, np.maximum(need, LOOKED), need)
-            split |= near & (wanted | (not self.closer))
+        split = thin & (THIN_NEED * length > limits)
         state[chosen[split]] = kernels.SPLIT
         states.assign(state)
         needs = self.need.numpy()
@@ -295,6 +279,39 @@ class Judge:
 
     def _on_device(self, tolerances: np.ndarray) -> wp.array:
         return wp.array(tolerances, dtype=wp.float32, device=self.device)
+
+
+def surface_points(
+    corners: np.ndarray, phi: np.ndarray, origin: np.ndarray, spacing: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """A point where the linear interpolant is zero, or nearly, in elements, and the unit vector inwards there, float64
+    [n, 3].
+
+    The search goes from the middle along the gradient, but no farther than the longest edge at the first corner.
+
+    Args:
+        corners: Lattice points of the elements' nodes [n, 4, 3].
+        phi: Values there [n, 4].
+        origin: Where the lattice begins [m].
+        spacing: One of its intervals [m].
+    """
+    values = phi.astype(np.float64)
+    edges = spacing * (corners[:, 1:] - corners[:, :1])
+    gradient = np.linalg.solve(edges, (values[:, 1:] - values[:, :1])[..., None])[..., 0]
+    slope, longest = np.linalg.norm(gradient, axis=1), np.linalg.norm(edges, axis=2).max(axis=1)
+    along = -gradient / np.maximum(slope, 1e-30)[:, None]
+    step = np.divide(values.mean(axis=1), slope, out=np.zeros(len(slope)), where=slope > 0.0)
+    step = np.clip(step, -longest, longest)[:, None]
+    return origin + spacing * corners.mean(axis=1) + step * along, along
+
+
+def with_room(array: wp.array, count: int) -> wp.array:
+    """The array, or a longer copy, padded with zeros, if it is shorter than ``count``."""
+    if count <= len(array):
+        return array
+    longer = wp.zeros(max(count, 3 * len(array) // 2), dtype=array.dtype, device=array.device)
+    wp.copy(longer, array, count=len(array))
+    return longer
 
 
 def _checked(function: Callable[[np.ndarray], Any], points: np.ndarray) -> np.ndarray:

@@ -1,36 +1,159 @@
-"""A forest finer than the mesh: the parts of a body in tetrahedra of all levels, and the meshes in the forest."""
+"""A forest finer than the mesh: the parts of a body in tetrahedra of all levels, and the meshes in the forest.
+
+A node is inside if its value is negative; zero counts as outside, so that the surface lies in elements that contain a
+part of the body. The share of an element that the surface cuts belongs to the linear interpolant of the values.
+
+Random points miss walls that are thinner than the elements that they pass, so such an element holds a part of the wall
+if the point of the body's surface that is nearest to it lies in it. The wall's thickness there says how much; all of
+them together hold what random points say."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import warp as wp
-from scipy.spatial import cKDTree
 
-from warp_corot.kernels.meshing import coarsening as kernels
-from warp_corot.mesh.lattice import volume_shares
+from warp_corot.mesh.bisection import far_end
+from warp_corot.mesh.growing.refinement_criteria import FARTHER, ROUGH, surface_points
+from warp_corot.mesh.lattice import lattice_spacing, volume_shares
 from warp_corot.mesh.scattered import spread_over_eighths
+from warp_corot.mesh.topology import codes
 from warp_corot.mesh.tree import LIVE, VOID, Tree
-
-from .cut import connected, inside_shares
-from .growth import lattice_spacing
-from .judging import FARTHER, GAP_ELEMENTS, ROUGH
-from .surface_points import surface_points
-from .walls import OF_WALLS, wall_shares
 
 if TYPE_CHECKING:
     from warp_corot.domain import Domain
+    from warp_corot.mesh.growing.growth import Grown
 
-    from .adapt import Grown
+Array = np.ndarray
+
+#: Node orders that put the inside nodes first, by the set of inside nodes (bit n for node n), and the number of inside
+#: nodes.
+_INSIDE_FIRST = np.array([sorted(range(4), key=lambda n: 1 - (code >> n & 1)) for code in range(16)])
+_COUNT = np.array([code.bit_count() for code in range(16)])
+
+
+def shares(inside: Array, crossing: Callable[[Array, Array], Array]) -> Array:
+    """Share of each element's volume around its inside nodes, float64 [n].
+
+    Args:
+        inside: bool [n, 4].
+        crossing: A function of a node inside and one outside of each element, both int [n]: the fraction of their edge,
+            from the inside node to the border, [n].
+    """
+    code = codes(inside)
+    found = (code == 15).astype(np.float64)
+    for count, share in ((1, _share_of_one), (2, _share_of_two), (3, _share_of_three)):
+        chosen = np.flatnonzero(_COUNT[code] == count)
+        nodes = _INSIDE_FIRST[code[chosen]]
+
+        def at(i: int, j: int, chosen: Array = chosen, nodes: Array = nodes) -> Array:
+            return crossing(chosen, nodes[:, [i, j]])
+
+        found[chosen] = share(at)
+    return found
+
+
+def _share_of_one(t: Callable[[int, int], Array]) -> Array:
+    return t(0, 1) * t(0, 2) * t(0, 3)
+
+
+def _share_of_two(t: Callable[[int, int], Array]) -> Array:
+    """The wedge from a-ac-ad to b-bc-bd, in three tetrahedra."""
+    ac, ad, bc, bd = t(0, 2), t(0, 3), t(1, 2), t(1, 3)
+    return ac * ad + (1 - ad) * ac * bd + (1 - ac) * bc * bd
+
+
+def _share_of_three(t: Callable[[int, int], Array]) -> Array:
+    return 1 - (1 - t(0, 3)) * (1 - t(1, 3)) * (1 - t(2, 3))
+
+
+def inside_shares(values: Array) -> Array:
+    """Fraction of each element's volume in which the linear interpolant of its nodes' values [n, 4] is negative."""
+
+    def crossing(elements: Array, ends: Array) -> Array:
+        inner, outer = values[elements[:, None], ends].T.astype(np.float64)
+        return inner / (inner - outer)
+
+    return shares(values < 0, crossing)
+
+
+def label_shares(values: Array, labels: Array) -> Array:
+    """Share of each element's volume that the label of each of its nodes takes, float64 [n, 4].
+
+    If several inside nodes have a label, its fraction is stored at the first of them. Between nodes of two labels the
+    border is halfway; towards the outside it is at the zero of the interpolant. Each label is cut out separately; if
+    three labels meet, these cuts leave a gap, which the labels share in proportion.
+
+    Args:
+        values: Signed function at the nodes [n, 4].
+        labels: int32 [n, 4].
+    """
+    inside = values < 0
+
+    def crossing(elements: Array, ends: Array) -> Array:
+        own, other = values[elements[:, None], ends].T.astype(np.float64)
+        return np.divide(own, own - other, out=np.full(len(own), 0.5), where=other >= 0)
+
+    found = np.zeros(values.shape)
+    counted = np.zeros(values.shape, bool)
+    for node in range(4):
+        alike = inside & (labels == labels[:, [node]])
+        found[:, node] = np.where(inside[:, node] & ~counted[:, node], shares(alike, crossing), 0.0)
+        counted |= alike & inside[:, [node]]
+    total = found.sum(axis=1, keepdims=True)
+    return np.divide(found * inside_shares(values)[:, None], total, out=np.zeros_like(found), where=total > 0)
+
+
+#: A body is one of walls if elements without a corner inside hold more than this share of it.
+OF_WALLS = 0.2
+#: Normals come from differences over this share of the distance to the surface, and at least and at most of an element.
+APART, LEAST_APART, MOST_APART = 0.2, 1.0e-3, 0.05
+#: How far from the surface a point that was moved there may be, and how thick a wall, over the length of the element.
+OFF, THICKEST = 0.02, 0.25
+#: How far outside an element the surface may be, as a barycentric coordinate.
+OUTSIDE = -1.0e-3
+
+
+def wall_shares(corners: np.ndarray, points: np.ndarray, sampled: np.ndarray, domain: Domain) -> np.ndarray:
+    """The share of each element without a corner inside that is wall, float64 [n].
+
+    Args:
+        corners: Corners of the elements [m], float64 [n, 4, 3].
+        points: A point in each that is near the body [m], float64 [n, 3].
+        sampled: The share of random points in each that are inside [n].
+        domain: The body.
+    """
+    edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+    volumes = np.abs(np.linalg.det(edges)) / 6.0
+    lengths = np.cbrt(6.0 * volumes)
+    value = domain.sampled(points)
+    apart = np.clip(APART * np.abs(value), LEAST_APART * lengths, MOST_APART * lengths)
+    normal = domain.normals(points, apart)
+    at = points - value[:, None] * normal
+    later = np.linalg.solve(edges, (at - corners[:, 0])[:, :, None])[:, :, 0]
+    within = np.minimum(later.min(axis=1), 1.0 - later.sum(axis=1)) > OUTSIDE
+    crossed = np.flatnonzero(within & (np.abs(domain.sampled(at)) < OFF * lengths))
+    reach = THICKEST * float(lengths[crossed].max(initial=0.0))
+    if not reach:
+        return sampled
+    thickness = domain.thickness(at[crossed], -normal[crossed], reach)
+    wall = thickness < THICKEST * lengths[crossed]
+    crossed, thickness = crossed[wall], thickness[wall]
+    # A plane through an element cuts it in about so large an area.
+    weights = thickness * np.cbrt(volumes[crossed]) ** 2
+    rest = sampled.copy()
+    rest[crossed] = 0.0
+    held = float((sampled - rest) @ volumes) if len(crossed) else 0.0
+    found = rest
+    found[crossed] = np.minimum(held * weights / max(float(weights.sum()), 1e-300) / volumes[crossed], 1.0)
+    return found
+
 
 #: Below the mesh, in place of a first child.
 BELOW = -3
 
 
-#: Pieces below this fraction of the body do not count, and more pieces than this are fragments of unresolved parts.
-LEAST_PIECE, MOST_PIECES = 1.0e-4, 16
 #: Approximate number of all points.
 MOST_POINTS = 250_000
 #: A leaf with a corner inside the body counts as filled to at least this share.
@@ -148,34 +271,8 @@ class Resolved:
         cut = self.leaves[self.shares < 1.0]
         if len(cut):
             tets, spacing = grown.tree.tets[cut], lattice_spacing(self.cell_size)
-            phi = wp.array(grown.phi, dtype=wp.float32, device=grown.growth.device)
-            x, inward = surface_points(grown.growth.lattice, phi, tets, grown.origin, spacing)
+            x, inward = surface_points(grown.lattice[tets], grown.phi[tets], np.asarray(grown.origin), spacing)
             found[cut] = domain.thickness(x, inward, FARTHER * layers * self.cell_size)
-        return self.smallest(found)
-
-    def gaps(self) -> np.ndarray | None:
-        """The smallest distance from the surface in each tetrahedron to another piece of the body, float64 [M] [m];
-        None if there is one piece, or implausibly many.
-        """
-        grown = self.grown
-        tets = grown.tree.tets[self.leaves]
-        if not len(tets):
-            return None
-        piece = connected(np.where(grown.phi[tets] < 0, tets, np.int32(-1)))
-        sizes = np.bincount(piece, self.shares * self.volume[self.leaves])
-        real = np.flatnonzero(sizes > LEAST_PIECE * sizes.sum())
-        if not 1 < len(real) <= MOST_PIECES:
-            return None
-        at_surface = (grown.phi[tets] >= 0).any(axis=1)
-        x = grown.lattice[tets].mean(axis=1) * lattice_spacing(self.cell_size)
-        found, reach = np.full(len(self.held), np.inf), GAP_ELEMENTS * self.cell_size
-        for number in real:
-            own = np.flatnonzero(at_surface & (piece == number))
-            other = np.flatnonzero(at_surface & (piece != number) & np.isin(piece, real))
-            own, other = own[_near(x[own], x[other], reach)], other[_near(x[other], x[own], reach)]
-            if len(own) and len(other):
-                tree = cKDTree(x[other], compact_nodes=False, balanced_tree=False)
-                found[self.leaves[own]], _ = tree.query(x[own], distance_upper_bound=reach)
         return self.smallest(found)
 
     def _upwards(self, values: np.ndarray, ufunc: np.ufunc) -> np.ndarray:
@@ -202,20 +299,25 @@ class Coarsening:
     """
 
     def __init__(self, resolved: Resolved, needs: np.ndarray, sliver: float):
-        growth, tree = resolved.grown.growth, resolved.grown.tree
-        self.device, count = growth.device, len(tree.level)
-        holds = resolved.held > 0.0
-        self._holds = wp.array(holds.astype(np.uint8), dtype=wp.uint8, device=self.device)
-        self._parent, self._first_child = growth.parent[:count], growth.first_child[:count]
-        self._needs = wp.array(needs, dtype=wp.float32, device=self.device)
-        of_node = wp.zeros(growth.node_count, dtype=wp.float32, device=self.device)
+        tree, holds = resolved.grown.tree, resolved.held > 0.0
+        needs, of_node = needs.copy(), np.zeros(len(resolved.grown.lattice), np.float32)
+        # Everything that can be asked for is in the forest: a conforming mesh of some of its tetrahedra needs no other
+        # bisections. A tetrahedron is bisected if it is asked for, if a child of it is, or if another with the same
+        # refinement edge is; all its other edges are edges of its children. So one sweep from the deepest level up
+        # gives each the threshold up to which it is bisected.
         for elements in resolved.deepest_first():
-            chosen = wp.array(elements, dtype=wp.int32, device=self.device)
-            inputs = [chosen, growth.tets, growth.level, self._first_child]
-            growth.launch(kernels.gather_needs, len(elements), [*inputs, self._holds], [self._needs, of_node])
-            growth.launch(kernels.take_needs, len(elements), [*inputs, of_node], [self._needs])
+            if not len(elements):
+                continue
+            below = tree.first_child[elements]
+            need = np.maximum(needs[elements], np.maximum(needs[below], needs[below + 1]))
+            node = tree.tets[below, far_end(int(tree.level[elements[0]]) % 3)]
+            np.maximum.at(of_node, node[holds[elements]], need[holds[elements]])
+            needs[elements] = np.maximum(need, of_node[node])
         # A tetrahedron without children cannot be bisected, whatever its need.
-        own = np.where(tree.first_child >= 0, self._needs.numpy(), np.float32(0.0))
+        self._own = own = np.where(tree.first_child >= 0, needs, np.float32(0.0))
+        # Nor does one outside the body have children in a mesh.
+        self._above = np.where(tree.parent < 0, np.float32(np.inf), np.where(holds, needs, -1.0)[tree.parent])
+        self._first_child, self._holds = tree.first_child, holds
         counted = holds & (resolved.held >= sliver * resolved.volume)
         roots = np.count_nonzero(counted & (tree.parent < 0))
         above = tree.parent[counted & (tree.parent >= 0)]
@@ -239,18 +341,10 @@ class Coarsening:
         """Bisect all tetrahedra with a need above ``least``; return the number of counted leaves and the mesh, int32
         [M].
         """
-        child = wp.empty(len(self._needs), dtype=wp.int32, device=self.device)
-        inputs = [self._parent, self._first_child, self._needs, float(least), self._holds]
-        wp.launch(kernels.cut_off, len(child), inputs, [child], device=self.device)
-        found = child.numpy()
+        limit = np.float32(least)
+        found = np.where(self._holds, np.where(self._own > limit, self._first_child, LIVE), VOID).astype(np.int32)
+        found[self._above <= limit] = BELOW
         return int(np.count_nonzero(self._counted & (found == LIVE))), found
-
-
-def _near(points: np.ndarray, others: np.ndarray, reach: float) -> np.ndarray:
-    """Mask of the points within a distance of the box around others, bool [n]."""
-    if not len(others):
-        return np.zeros(len(points), bool)
-    return ((points >= others.min(axis=0) - reach) & (points <= others.max(axis=0) + reach)).all(axis=1)
 
 
 def points_within(
