@@ -21,7 +21,7 @@ class Carriers:
 
     entry: wp.array[wp.int32]  # of the node in the vectors of the step; -1: unused
     compliance: wp.array[wp.float32]  # of the node alone [m/N]; zero: it is held
-    crowd: wp.array[wp.float32]  # the sum of shares in contacts that push
+    crowd: wp.array2d[wp.float32]  # [2, C] the sum of weights in obstacles that push, and in pairs
     gone: wp.array[wp.vec3]  # how far a held node has gone in the step [m]
 
 
@@ -58,7 +58,6 @@ def begin_carriers(
     surface.d[s] = wp.vec3()
     surface.yielding[s] = 0.0
     carriers.compliance[c] = 0.0
-    carriers.crowd[c] = 0.0
     carriers.gone[c] = wp.vec3()
     carriers.entry[c] = -1
     if i < 0:
@@ -139,21 +138,21 @@ def couple_at(c: int, places: int, s: int, part: wp.vec3, surface: Surface, carr
 
 
 @wp.func
-def crowd_at(s: int, share: float, surface: Surface, carriers: Carriers):
-    """Count a contact that pushes at a place with a share of its force."""
+def crowd_at(kind: int, s: int, share: float, surface: Surface, carriers: Carriers):
+    """Count a contact that pushes at a place with a share of its force; ``kind``: 1 for pairs, else 0."""
     if is_borne(s, surface):
         first = surface.node.shape[0]
         b = surface.bearing.bearers[s]
         w = surface.bearing.weights[s]
         for k in range(4):
             if w[k] != 0.0:
-                wp.atomic_add(carriers.crowd, first + b[k], wp.abs(w[k] * share))
+                wp.atomic_add(carriers.crowd, kind, first + b[k], wp.abs(w[k] * share))
     else:
-        wp.atomic_add(carriers.crowd, s, wp.abs(share))
+        wp.atomic_add(carriers.crowd, kind, s, wp.abs(share))
 
 
 @wp.func
-def ease_at(s: int, share: float, surface: Surface, carriers: Carriers):
+def ease_at(kind: int, s: int, share: float, surface: Surface, carriers: Carriers):
     """How far a contact moves with a place that has this share in it, for each unit of force, if all contacts around
     push alike [m/N].
     """
@@ -167,9 +166,9 @@ def ease_at(s: int, share: float, surface: Surface, carriers: Carriers):
             part = share * wp.abs(w[k])
             c = first + b[k]
             if part > 0.0:
-                total += part * wp.max(carriers.crowd[c], part) * carriers.compliance[c]
+                total += part * wp.max(carriers.crowd[kind, c], part) * carriers.compliance[c]
         return total
-    return share * wp.max(carriers.crowd[s], share) * carriers.compliance[s]
+    return share * wp.max(carriers.crowd[kind, s], share) * carriers.compliance[s]
 
 
 @wp.func
@@ -181,17 +180,17 @@ def is_held_at(s: int, surface: Surface, carriers: Carriers):
 
 
 @wp.func
-def mark_carriers(s: int, surface: Surface, marked: wp.array[wp.int32]):
-    """Mark the carriers of a place."""
+def mark_carriers(s: int, mark: int, surface: Surface, marked: wp.array[wp.int32]):
+    """Add a mark to the carriers of a place."""
     if is_borne(s, surface):
         first = surface.node.shape[0]
         b = surface.bearing.bearers[s]
         w = surface.bearing.weights[s]
         for k in range(4):
             if w[k] != 0.0:
-                marked[first + b[k]] = 1
+                wp.atomic_or(marked, first + b[k], mark)
     else:
-        marked[s] = 1
+        wp.atomic_or(marked, s, mark)
 
 
 @wp.kernel(enable_backward=False)

@@ -17,11 +17,9 @@ from warp_corot.kernels.contact.law import SETTLING, Law
 from warp_corot.solvers.halo import ALONE
 from warp_corot.solvers.system import System
 
-from .active_set import ActiveSet
 from .approach import Approach
-from .borne_set import BorneSet
 from .carried import CarriedForces
-from .joined_rows import JoinedRows
+from .implicit import ImplicitContact
 from .mass_split import MassSplit
 from .obstacles import Obstacles
 from .options import SURFACE, Contact, may_meet
@@ -240,15 +238,9 @@ class Contacts:
         if self.obstacles.count:
             self.obstacles.launch_motion(offset, self.search.watch)
 
-    def active_set(self, k: int) -> ActiveSet | BorneSet | None:
-        """The contact of a body with obstacles in implicit steps; None without obstacles."""
-        if self.rigid is None:
-            return None
-        return BorneSet(self.system, self.rigid, self.law, k) if self.surface.parts[k].bearers else ActiveSet(self, k)
-
-    def joined_rows(self) -> JoinedRows | None:
-        """The contact of soft surfaces in implicit steps, if they may touch."""
-        return None if self.pairs is None else JoinedRows(self.system, self.pairs, self.law)
+    def implicit(self) -> ImplicitContact | None:
+        """Contact in implicit steps, if anything may touch."""
+        return None if self.rigid is None and self.pairs is None else ImplicitContact(self)
 
     def measure(self) -> None:
         thinnest = self.obstacles.thinnest

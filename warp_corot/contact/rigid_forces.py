@@ -26,8 +26,6 @@ class RigidForces:
         forces: The force of each obstacle on each surface node itself in the last step [N], vec3 [O, S].
         totals: The same with the nodes' shares of the forces between them, when they were last published.
         touches: Obstacles at triangles.
-        kinds: The state of each surface node with each obstacle in implicit steps; see
-            ``kernels.contact.active``, [O, S].
         have_edges: Whether any of the obstacles can pass between the nodes.
     """
 
@@ -47,7 +45,6 @@ class RigidForces:
         count, obstacles = self.surface.count, self.obstacles.count
         self.forces = wp.zeros((obstacles, count), dtype=wp.vec3, device=device)
         self.totals = wp.zeros_like(self.forces)
-        self.kinds = wp.zeros((obstacles, count), dtype=wp.int32, device=device)
         self.anchors = wp.zeros((obstacles, count), dtype=wp.vec4, device=device)
         self._away, self._moved = wp.zeros_like(self.anchors), wp.zeros_like(self.forces)
         self.allowances = wp.zeros((obstacles, count), dtype=wp.float32, device=device)
@@ -60,7 +57,7 @@ class RigidForces:
         self.touches.warmth = self.surface.warmth
         self.touches.acts = wp.zeros(shape, dtype=wp.int32, device=device)
         self._more = wp.zeros_like(self.forces)
-        self._acts = wp.zeros_like(self.kinds)
+        self._acts = wp.zeros((obstacles, count), dtype=wp.int32, device=device)
 
     @property
     def is_separate(self) -> bool:
@@ -70,7 +67,6 @@ class RigidForces:
     def forget(self) -> None:
         """Forget the last step."""
         self.anchors.zero_()
-        self.kinds.zero_()
         self.touches.force.zero_()
         for allowances in (self.allowances, self.touches.allowance):
             allowances.zero_()
@@ -84,7 +80,7 @@ class RigidForces:
             sums.forget_places,
             (self.obstacles.count, count),
             inputs,
-            [self.arrays, self.kinds, self.touches],
+            [self.arrays, self.touches],
             device=self.device,
         )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import warp as wp
 
@@ -11,6 +11,9 @@ from warp_corot.solvers.halo import ALONE, Halo
 
 from .sums import WorldSums, take_in
 
+if TYPE_CHECKING:
+    from .contact_constraints import Contact
+
 
 class Contacts(Protocol):
     """Forces of contacts as functions of the motions in a step."""
@@ -18,21 +21,6 @@ class Contacts(Protocol):
     def add_slopes(self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array) -> None:
         """Launch the addition of the contacts' power along a change from motions d, at the share in ``search``, to
         ``slopes``, float64 [worlds]."""
-        ...
-
-
-class ContactsApart(Protocol):
-    """Contacts whose power ranks can add up."""
-
-    @property
-    def count(self) -> int:
-        """Number of places of one world."""
-        ...
-
-    def add_slopes(
-        self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array, *, apart: bool = False
-    ) -> None:
-        """As ``Contacts``, or with ``apart`` to one number for each place, float64 [worlds * count]."""
         ...
 
 
@@ -95,17 +83,20 @@ class SharedLineSearch(LineSearch):
 
     Args:
         worlds, count, contacts, device: As for ``LineSearch``.
+        body: The number of the body.
         ranks: The ranks with the other entries of each world.
     """
 
-    def __init__(self, worlds: int, count: int, contacts: ContactsApart, device: wp.Device, ranks: Halo):
-        self._ranks, self._apart = ranks, contacts
+    def __init__(self, worlds: int, count: int, contacts: Contact, body: int, device: wp.Device, ranks: Halo):
+        self._ranks, self._apart, self._body = ranks, contacts, body
         super().__init__(worlds, count, contacts, device)
         # The sums of worlds are in the first places.
-        self._addends = wp.zeros((worlds, max(contacts.count, 1), 1), dtype=wp.float64, device=device)
+        self._addends = wp.zeros(
+            (worlds, max(contacts.places_of(body) // worlds, 1), 1), dtype=wp.float64, device=device
+        )
         self._slopes = self._addends[:, 0, 0]
 
     def _add_slopes(self, d: wp.array, change: wp.array) -> None:
         self._addends.zero_()
-        self._apart.add_slopes(d, change, self._search, self._addends.flatten(), apart=True)
+        self._apart.add_slopes(d, change, self._search, self._addends.flatten(), apart=self._body)
         take_in(self._addends, [0], self._ranks)

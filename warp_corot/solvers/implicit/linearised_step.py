@@ -39,8 +39,7 @@ class LinearisedStep:
     def __init__(self, system: BlockSystem, newtons: list[Newton], *, tolerance: float | None, most: int):
         self._system, self._newtons, self.device = system, newtons, system.device
         self._tolerance, self._most = math.inf if tolerance is None else tolerance, 1 if tolerance is None else most
-        touches = system.soft is not None or any(each is not None for each in system.contacts)
-        self._contact = ContactSolve(system, newtons) if touches else None
+        self._contact = None if system.contact is None else ContactSolve(system, newtons)
         self.iterations = wp.ones(system.worlds, dtype=wp.int32, device=self.device)
         self.linear_iterations, self.status = system.solver.iterations, system.solver.status
         if self._contact is not None:
@@ -87,7 +86,6 @@ class LinearisedStep:
             self._launch(kernels.take_free, inputs, [newton.step])
         system.apply_bodies(system.x, self._product)
         self._launch(kernels.add_product, [self._product], [system.b])
-        self._contact.launch_again()
         self._contact.launch()
         self._take_increments()
         self._judge()
