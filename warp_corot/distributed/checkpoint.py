@@ -42,7 +42,7 @@ Arrays = dict[str, npt.NDArray[Any]]
 Longs = npt.NDArray[np.int64]
 
 #: The beginnings of the names of kept nodal arrays; other kept arrays are the same on all ranks.
-DIRECTIONS, VELOCITIES, HISTORY, MEETINGS, SETUP = "directions", "velocities.", "history.", "meetings.", "setup."
+DIRECTIONS, VELOCITIES, HISTORY, TOUCHED, SETUP = "directions", "velocities.", "history.", "touched.", "setup."
 #: What a simulation continues from, besides arrays.
 RESUMED = ("stable_dt", "steps_before_reset", "time_before_reset")
 #: What a checkpoint has of a simulation, besides its bodies, their contact and kept arrays.
@@ -139,7 +139,7 @@ def _body_of(name: str, sim: OnOne) -> int | None:
     if name.startswith(HISTORY):
         count = sum(each.startswith(HISTORY) for each in sim.kept)
         return int(name.removeprefix(HISTORY)) * len(sim.bodies) // count
-    for first in (DIRECTIONS, VELOCITIES, MEETINGS):
+    for first in (DIRECTIONS, VELOCITIES, TOUCHED):
         if name.startswith(first):
             return int(name.removeprefix(first))
     if name.startswith(SETUP) and name.endswith(".at"):

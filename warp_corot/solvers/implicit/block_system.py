@@ -128,11 +128,11 @@ class BlockSystem:
         """Launch the same in the bodies' own preconditioners."""
         assert self.contact is not None
         self.contact.update_springs()
-        for preconditioner in self.preconditioners:
-            if self._knows_springs(preconditioner):
-                preconditioner.take_springs()
+        preconditioners: list[Any] = [each for each in self.preconditioners if self._knows_springs(each)]
+        for preconditioner in preconditioners:
+            preconditioner.take_springs()
 
-    def _knows_springs(self, preconditioner: Any) -> bool:
+    def _knows_springs(self, preconditioner: Preconditioner) -> bool:
         return hasattr(preconditioner, "take_springs") and self.ranks.is_alone
 
     def apply_inverse(self, r: wp.array, z: wp.array) -> None:
