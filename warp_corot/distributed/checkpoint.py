@@ -55,7 +55,7 @@ KEYFRAMES = (("trajectories", "nodes", "displacements"), ("activations", "elemen
 #: Arrays of a body with an entry for each node of all worlds, by the ends of their names.
 NODAL = ("displacements", "velocities", "reactions", "constrained", "loads")
 #: Arrays of obstacles and surface places, and of triangles, that one step leaves for the next.
-OF_PLACES, OF_TRIANGLES = ("anchors", "kinds", "forces"), ("normal", "force")
+OF_PLACES, OF_TRIANGLES = ("anchors", "forces"), ("normal", "force")
 #: Arrays of obstacles and numbers of the law, which are the same on all ranks.
 MOTIONS, LAW = ("now", "later", "target"), ("tolerance", "recovery", "whole", "grain")
 
