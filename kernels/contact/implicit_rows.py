@@ -71,7 +71,6 @@ class ImplicitRows:
     counts: wp.array[wp.int32]  # [4] the lengths of the lists
     due: wp.array[wp.int32]  # [1] whether obstacles are to be located
     locates: wp.array[wp.int32]  # [1] whether pairs are
-    goes: wp.array[wp.int32]  # [1] whether another solve follows anyway
     solves: wp.array[wp.int32]  # [1] how many linear solves the step has had so far
 
 
@@ -205,7 +204,9 @@ def push_corners(r: int, m: wp.vec3, rows: ImplicitRows, surface: Surface, carri
 
 
 @wp.kernel(enable_backward=False)
-def stiffen_rows(threads: int, which: int, surface: Surface, carriers: Carriers, rows: ImplicitRows):
+def stiffen_rows(
+    threads: int, which: int, changed: wp.array[wp.int32], surface: Surface, carriers: Carriers, rows: ImplicitRows
+):
     """Stiffness of rows that have been located: those that share nodes share it. A row whose nodes are all held does
     nothing.
 
@@ -215,7 +216,7 @@ def stiffen_rows(threads: int, which: int, surface: Surface, carriers: Carriers,
     if k == 0:
         rows.counts[PUSHING] = 0
     count = near_count(rows)
-    if (which == AGAIN and rows.due[0] == 0 and rows.locates[0] == 0) or (which == MISSING and rows.goes[0] != 0):
+    if which == AGAIN and rows.due[0] == 0 and rows.locates[0] == 0 and changed[0] == 0:
         count = 0
     while k < count:
         r = near_row(k, rows)

@@ -122,9 +122,9 @@ def find_on_triangle(
 
 
 @wp.func
-def is_done(which: int, rows: ImplicitRows):
+def is_done(which: int, going: wp.array[wp.int32], rows: ImplicitRows):
     """Whether nothing is to be found: contacts are not located again before the next solve, or no step is to end."""
-    return (which == AGAIN and rows.due[0] == 0) or (which == MISSING and rows.goes[0] != 0)
+    return (which == AGAIN and rows.due[0] == 0) or (which == MISSING and going[0] != 0)
 
 
 @wp.func
@@ -355,19 +355,21 @@ def locate_obstacles(
     d: wp.array[wp.vec4],
     forces: wp.array2d[wp.vec3],
     touches: Touches,
+    going: wp.array[wp.int32],
     # In and out
     carriers: Carriers,
     rows: ImplicitRows,
     # Out
     changed: wp.array[wp.int32],
 ):
-    """Find obstacles at all places, and at triangles if there are rows for them."""
+    """Find obstacles at all places, and at triangles if there are rows for them; missing ones only if no solve is
+    ``going`` to follow."""
     k = wp.tid()
     places = surface.node.shape[0]
     count = places
     if rows.first_pair > rows.first_triangle:
         count += triangles.shape[0]
-    while k < count and not is_done(which, rows):
+    while k < count and not is_done(which, going, rows):
         if k < places:
             locate_place(k, which, shapes, motions, law, pace, surface, d, forces, carriers, rows, changed)
         else:

@@ -34,7 +34,7 @@ OF_ROWS = {
 }
 OF_TRIANGLES = {"rolling": Rolling, "bend": wp.float32, "tilt": wp.vec3, "moment": wp.vec3}
 OF_PAIRS = dict.fromkeys(("pushed", "begun"), wp.int32)
-NUMBERS = ("due", "locates", "goes", "solves")
+NUMBERS = ("due", "locates", "solves")
 #: Maximum number of threads of launches over those that are listed.
 MOST_THREADS = 1 << 14
 
@@ -236,9 +236,8 @@ class ImplicitContact:
             going: Whether another solve follows, int32 [1].
         """
         if self._rigid is not None:
-            wp.copy(self._rows.goes, going)
             self.changed.zero_()
-            self._locate(kernels.MISSING, d)
+            self._locate_obstacles(kernels.MISSING, d, going)
         inputs = [self.changed, rounds, most, self._rows, going]
         wp.launch(kernels.judge_rows, 1, inputs, device=self.device)
 
@@ -290,19 +289,23 @@ class ImplicitContact:
     def _locate(self, which: int, d: wp.array) -> None:
         contacts, surface = self._contacts, self._surface
         law, pace = contacts.law, self._system.pace.arrays
-        if which != kernels.MISSING:
-            inputs = [int(which), d, surface.arrays, self._located, self._carriers, self._rows]
-            wp.launch(kernels.begin_location, len(self._marked), inputs, device=self.device)
+        inputs = [int(which), d, surface.arrays, self._located, self._carriers, self._rows]
+        wp.launch(kernels.begin_location, len(self._marked), inputs, device=self.device)
         if self._rigid is not None and which != kernels.REPEATED:
-            obstacles, rigid = contacts.obstacles, self._rigid
-            inputs = [int(which), obstacles.shapes, obstacles.motions, law, pace, surface.arrays, surface.triangles, d]
-            inputs += [rigid.forces, rigid.touches, self._carriers, self._rows, self.changed]
-            self._launch(locate_obstacles, self._items, inputs, most=self._items)
-        if self._pairs is not None and which != kernels.MISSING:
+            self._locate_obstacles(which, d, self._none)
+        if self._pairs is not None:
             meeting, pairs = self._of_pairs
             inputs = [int(which), law, pace, d, self._located, meeting, self._carriers, pairs, self._rows]
             self._on_pairs(locate_pairs, inputs)
-        self._on_rows(kernels.stiffen_rows, [int(which), *self._table])
+        self._on_rows(kernels.stiffen_rows, [int(which), self.changed, *self._table])
+
+    def _locate_obstacles(self, which: int, d: wp.array, going: wp.array) -> None:
+        assert self._rigid is not None
+        contacts, surface, rigid = self._contacts, self._surface, self._rigid
+        obstacles, pace = contacts.obstacles, self._system.pace.arrays
+        inputs = [int(which), obstacles.shapes, obstacles.motions, contacts.law, pace, surface.arrays]
+        inputs += [surface.triangles, d, rigid.forces, rigid.touches, going, self._carriers, self._rows, self.changed]
+        self._launch(locate_obstacles, self._items, inputs, most=self._items)
 
     @property
     def _of_pairs(self) -> tuple[Meeting, Rows]:
