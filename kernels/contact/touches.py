@@ -38,9 +38,7 @@ class Touches:
 
 
 @wp.func
-def nearest(
-    shapes: Shapes, o: int, pose: wp.transform, most: float, far: float, a: wp.vec3, b: wp.vec3, c: wp.vec3
-):
+def nearest(shapes: Shapes, o: int, pose: wp.transform, most: float, far: float, a: wp.vec3, b: wp.vec3, c: wp.vec3):
     """Weights of the corners at the closest point, the gap there, and the direction out of the obstacle; any point if
     all are farther away than ``far``."""
     kind = shapes.kind[o]

@@ -14,8 +14,8 @@ from warp_corot.kernels.implicit import steps as rows
 from warp_corot.solvers.implicit.schemes import ImplicitIntegrator
 
 from .adjoint import Adjoint
+from .contact import RestingContact
 from .sums import StepSums
-from .touching import RestingContact
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody

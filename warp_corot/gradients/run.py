@@ -27,13 +27,12 @@ from warp_corot.solvers.implicit.schemes import ImplicitIntegrator
 from warp_corot.solvers.integrator import Integrator
 
 from . import parameters
+from .contact import RestingContact, rows_after
 from .explicit import ExplicitRun
 from .implicit import ImplicitRun
 from .objective import Objective, value_and_derivative
 from .rest_state import bound, friction_of
 from .sums import StepSums
-from .touches import touches_after
-from .touching import RestingContact
 
 Array = npt.NDArray[np.float64]
 
@@ -190,7 +189,7 @@ def _implicit(
         sim.step()
         states.append(wp.clone(body.state.displacements))
         if sim.contact is not None:
-            contacts.append(RestingContact(body, sim.contact, touches_after(body, sim.contact), friction))
+            contacts.append(RestingContact(body, sim.contact, rows_after(body, sim.contact), friction))
     check_finite(body)
     run = ImplicitRun(body, sums.field, integrator, sums, states, tolerance, contacts)
     for step in reversed(range(given.steps)):
