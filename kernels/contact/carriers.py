@@ -77,78 +77,65 @@ def begin_carriers(
 
 
 @wp.func
+def carriers_of(s: int, surface: Surface):
+    """The numbers of a place's carriers, and its weights, zero for none."""
+    if is_borne(s, surface):
+        first = surface.node.shape[0]
+        return surface.bearing.bearers[s] + wp.vec4i(first, first, first, first), surface.bearing.weights[s]
+    return wp.vec4i(s, s, s, s), wp.vec4(1.0, 0.0, 0.0, 0.0)
+
+
+@wp.func
 def motion_at(s: int, surface: Surface, carriers: Carriers, d: wp.array[wp.vec4]):
     """The motion of a place after motions d [m]."""
-    if is_borne(s, surface):
-        e = wp.vec3()
-        first = surface.node.shape[0]
-        b = surface.bearing.bearers[s]
-        w = surface.bearing.weights[s]
-        for k in range(4):
-            if w[k] != 0.0:
-                e += w[k] * load_node(d, carriers.entry[first + b[k]])
-        return e
-    return load_node(d, carriers.entry[s])
+    c, w = carriers_of(s, surface)
+    e = wp.vec3()
+    for k in range(4):
+        if w[k] != 0.0:
+            e += w[k] * load_node(d, carriers.entry[c[k]])
+    return e
 
 
 @wp.func
 def gone_at(s: int, surface: Surface, carriers: Carriers):
     """How far held nodes have moved a place in the step [m]."""
-    if is_borne(s, surface):
-        e = wp.vec3()
-        first = surface.node.shape[0]
-        b = surface.bearing.bearers[s]
-        w = surface.bearing.weights[s]
-        for k in range(4):
-            if w[k] != 0.0:
-                e += w[k] * carriers.gone[first + b[k]]
-        return e
-    return carriers.gone[s]
+    c, w = carriers_of(s, surface)
+    e = wp.vec3()
+    for k in range(4):
+        if w[k] != 0.0:
+            e += w[k] * carriers.gone[c[k]]
+    return e
 
 
 @wp.func
 def push_at(s: int, force: wp.vec3, surface: Surface, carriers: Carriers, y: wp.array[wp.vec4]):
     """Add a force at a place to its carriers that are free [N]."""
-    if is_borne(s, surface):
-        first = surface.node.shape[0]
-        b = surface.bearing.bearers[s]
-        w = surface.bearing.weights[s]
-        for k in range(4):
-            c = first + b[k]
-            if w[k] != 0.0 and carriers.compliance[c] > 0.0:
-                add_force(y, carriers.entry[c], w[k] * force)
-    elif carriers.compliance[s] > 0.0:
-        add_force(y, carriers.entry[s], force)
+    c, w = carriers_of(s, surface)
+    for k in range(4):
+        if w[k] != 0.0 and carriers.compliance[c[k]] > 0.0:
+            add_force(y, carriers.entry[c[k]], w[k] * force)
 
 
 @wp.func
-def couple_at(c: int, places: int, s: int, part: wp.vec3, surface: Surface, carriers: Carriers, couplings: Couplings):
-    """Add a place's free carriers to the c-th product of an assembled matrix, which has ``places`` nodes; returns how
-    many it has then."""
-    if is_borne(s, surface):
-        first = surface.node.shape[0]
-        b = surface.bearing.bearers[s]
-        w = surface.bearing.weights[s]
-        for k in range(4):
-            if w[k] != 0.0 and carriers.compliance[first + b[k]] > 0.0:
-                places = couple(c, places, carriers.entry[first + b[k]], w[k] * part, couplings)
-    elif carriers.compliance[s] > 0.0:
-        places = couple(c, places, carriers.entry[s], part, couplings)
+def couple_at(
+    number: int, places: int, s: int, part: wp.vec3, surface: Surface, carriers: Carriers, couplings: Couplings
+):
+    """Add a place's free carriers to a product of an assembled matrix with this number, which has ``places`` nodes;
+    returns how many it has then."""
+    c, w = carriers_of(s, surface)
+    for k in range(4):
+        if w[k] != 0.0 and carriers.compliance[c[k]] > 0.0:
+            places = couple(number, places, carriers.entry[c[k]], w[k] * part, couplings)
     return places
 
 
 @wp.func
 def crowd_at(kind: int, s: int, share: float, surface: Surface, carriers: Carriers):
     """Count a contact that pushes at a place with a share of its force; ``kind``: 1 for pairs, else 0."""
-    if is_borne(s, surface):
-        first = surface.node.shape[0]
-        b = surface.bearing.bearers[s]
-        w = surface.bearing.weights[s]
-        for k in range(4):
-            if w[k] != 0.0:
-                wp.atomic_add(carriers.crowd, kind, first + b[k], wp.abs(w[k] * share))
-    else:
-        wp.atomic_add(carriers.crowd, kind, s, wp.abs(share))
+    c, w = carriers_of(s, surface)
+    for k in range(4):
+        if w[k] != 0.0:
+            wp.atomic_add(carriers.crowd, kind, c[k], wp.abs(w[k] * share))
 
 
 @wp.func
@@ -156,41 +143,32 @@ def ease_at(kind: int, s: int, share: float, surface: Surface, carriers: Carrier
     """How far a contact moves with a place that has this share in it, for each unit of force, if all contacts around
     push alike [m/N].
     """
-    share = wp.abs(share)
-    if is_borne(s, surface):
-        total = float(0.0)
-        first = surface.node.shape[0]
-        b = surface.bearing.bearers[s]
-        w = surface.bearing.weights[s]
-        for k in range(4):
-            part = share * wp.abs(w[k])
-            c = first + b[k]
-            if part > 0.0:
-                total += part * wp.max(carriers.crowd[kind, c], part) * carriers.compliance[c]
-        return total
-    return share * wp.max(carriers.crowd[kind, s], share) * carriers.compliance[s]
+    c, w = carriers_of(s, surface)
+    total = float(0.0)
+    for k in range(4):
+        part = wp.abs(share * w[k])
+        if part > 0.0:
+            total += part * wp.max(carriers.crowd[kind, c[k]], part) * carriers.compliance[c[k]]
+    return total
 
 
 @wp.func
 def is_held_at(s: int, surface: Surface, carriers: Carriers):
     """Whether all carriers of a place are held."""
-    if is_borne(s, surface):
-        return surface.yielding[s] == 0.0
-    return carriers.compliance[s] == 0.0
+    c, w = carriers_of(s, surface)
+    free = bool(False)
+    for k in range(4):
+        free = free or (w[k] != 0.0 and carriers.compliance[c[k]] > 0.0)
+    return not free
 
 
 @wp.func
 def mark_carriers(s: int, mark: int, surface: Surface, marked: wp.array[wp.int32]):
     """Add a mark to the carriers of a place."""
-    if is_borne(s, surface):
-        first = surface.node.shape[0]
-        b = surface.bearing.bearers[s]
-        w = surface.bearing.weights[s]
-        for k in range(4):
-            if w[k] != 0.0:
-                wp.atomic_or(marked, first + b[k], mark)
-    else:
-        wp.atomic_or(marked, s, mark)
+    c, w = carriers_of(s, surface)
+    for k in range(4):
+        if w[k] != 0.0:
+            wp.atomic_or(marked, c[k], mark)
 
 
 @wp.kernel(enable_backward=False)
