@@ -21,18 +21,15 @@ from .approach import Approach
 from .carried import CarriedForces
 from .implicit import ImplicitContact
 from .mass_split import MassSplit
-from .obstacles import Obstacles
+from .obstacles import Obstacles, RigidForces
 from .options import SURFACE, Contact, may_meet
 from .pairs import Pairs, smallest_size
-from .rigid_forces import RigidForces
-from .search import Search
+from .search import Search, Sleep
 from .skin import has_own_surface
-from .sleep import Sleep
 from .surface import ContactSurface
-from .surface_halo import SurfaceHalo
 from .tool import Obstacle
 from .warned import OVERLAP, warn_of_crushed, warn_of_overlaps
-from .whole_surface import WholeSurface
+from .whole_surface import SurfaceHalo, WholeSurface
 
 #: Gaps that come from rounding, in roundings of the largest coordinate.
 ROUNDINGS = 16.0

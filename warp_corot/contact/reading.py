@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
 
     from .contacts import Contacts
+    from .obstacles import RigidForces
     from .pairs import Pairs
-    from .rigid_forces import RigidForces
     from .tool import Obstacle
 
 Floats = npt.NDArray[np.float64]

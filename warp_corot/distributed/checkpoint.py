@@ -21,8 +21,8 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
+from warp_corot.contact.carried import keep_again, kept_arrays
 from warp_corot.contact.contacts import Contacts
-from warp_corot.contact.keeping import keep_again, kept_arrays
 from warp_corot.elasticity import Corotated
 from warp_corot.inputs.checks import checked_path
 from warp_corot.io.checkpoint.archive import joined, load_checkpoint, pack_body, rebuilt_body, save_checkpoint, split

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from copy import copy
 
-from warp_corot.contact.keeping import take_state
+from warp_corot.contact.carried import take_state
 from warp_corot.contact.shapes import Shape
 from warp_corot.contact.tool import Tool
 from warp_corot.errors import InputError
