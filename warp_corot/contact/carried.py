@@ -13,10 +13,10 @@ import warp as wp
 from warp_corot.errors import InputError
 from warp_corot.mesh.surfaces.bound import vertex_normals
 
-from .contacts import Contacts
 from .skin import Skin
 
 if TYPE_CHECKING:
+    from .contacts import Contacts
     from .obstacles import RigidForces
     from .pairs import Pairs
     from .surface import ContactSurface

@@ -17,13 +17,12 @@ from warp_corot.kernels.contact.touches import Touches
 from warp_corot.kernels.contact.vertices import Rigid
 from warp_corot.solvers.guarding.mapped import Mapped
 
-from .obstacles import Obstacles
 from .surface import ContactSurface
 
 if TYPE_CHECKING:
     from warp_corot.solvers.system import System
 
-    from .obstacles import RigidForces
+    from .obstacles import Obstacles, RigidForces
 
 #: The least motion that is reserved for anything between two searches, as a fraction of the smallest element's size,
 #: and how many times as much after something that was hit has moved farther in one step than was reserved.
