@@ -229,6 +229,9 @@ def locate_triangle(
     If a motion is fast, its path may lead through the obstacle, so the row stays where the step begins.
     """
     corners = triangles[t]
+    if which == FIRST:
+        for o in range(shapes.kind.shape[0]):
+            rows.listed[rows.first_triangle + o * triangles.shape[0] + t] = 0
     if corners[0] < 0:
         return
     world = surface.world[corners[0]]
@@ -242,7 +245,6 @@ def locate_triangle(
     for o in range(shapes.kind.shape[0]):
         r = rows.first_triangle + o * triangles.shape[0] + t
         if which == FIRST:
-            rows.listed[r] = 0
             rows.force[r] = touches.force[o, t]
             rows.normal[r] = touches.normal[o, t]
             before = touches.shares[o, t]
@@ -302,9 +304,11 @@ def locate_place(
     changed: wp.array[wp.int32],
 ):
     """The same at a place; nothing sinks in there."""
-    if surface.node[s] < 0:
+    if which == FIRST:
+        for o in range(shapes.kind.shape[0]):
+            rows.listed[o * surface.node.shape[0] + s] = 0
+    if surface.node[s] < 0 or is_held_at(s, surface, carriers):
         return
-    is_held = is_held_at(s, surface, carriers)
     world = surface.world[s]
     x = surface.x[s]
     e = motion_at(s, surface, carriers, d)
@@ -312,9 +316,8 @@ def locate_place(
     for o in range(shapes.kind.shape[0]):
         r = o * surface.node.shape[0] + s
         if which == FIRST:
-            rows.listed[r] = 0
             rows.force[r] = forces[o, s]
-        if is_held or (which == MISSING and rows.listed[r] != 0):
+        if which == MISSING and rows.listed[r] != 0:
             continue
         now = motions.now[world, o]
         later = motions.later[world, o]

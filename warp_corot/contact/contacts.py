@@ -237,7 +237,9 @@ class Contacts:
 
     def implicit(self) -> ImplicitContact | None:
         """Contact in implicit steps, if anything may touch."""
-        return None if self.rigid is None and self.pairs is None else ImplicitContact(self)
+        if self.rigid is None and self.pairs is None:
+            return None
+        return ImplicitContact(self.system, self.surface, self.obstacles, self.law, self.rigid, self.pairs)
 
     def measure(self) -> None:
         thinnest = self.obstacles.thinnest

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 import warp as wp
@@ -12,6 +11,7 @@ from warp_corot.kernels.contact import bearing, onsets
 from warp_corot.kernels.contact import carriers as of_carriers
 from warp_corot.kernels.contact import implicit_rows as kernels
 from warp_corot.kernels.contact.contact_curvature import Rolling
+from warp_corot.kernels.contact.law import Law
 from warp_corot.kernels.contact.motion import Surface
 from warp_corot.kernels.contact.obstacle_rows import locate_obstacles
 from warp_corot.kernels.contact.pair_rows import find_strays, locate_pairs
@@ -19,9 +19,11 @@ from warp_corot.kernels.contact.rows import Meeting, Rows
 from warp_corot.kernels.contact.touches import Touches
 from warp_corot.kernels.implicit.assembled import Couplings
 from warp_corot.solvers.implicit.operator import Springs
+from warp_corot.solvers.system import System
 
-if TYPE_CHECKING:
-    from .contacts import Contacts
+from .obstacles import Obstacles, RigidForces
+from .pairs import Pairs
+from .surface import ContactSurface
 
 #: Types of the arrays of ``ImplicitRows``: of all rows, of triangles, of pairs, and of one number.
 OF_ROWS = {
@@ -43,7 +45,12 @@ class ImplicitContact:
     """The contact of all bodies with obstacles and with one another in implicit steps.
 
     Args:
-        contacts: The contact of the system.
+        system: The bodies.
+        surface: Their surfaces.
+        obstacles: The obstacles.
+        law: How fast things that overlap are pushed apart.
+        rigid: Forces of obstacles; None without.
+        pairs: Soft surfaces against one another; None if they cannot touch.
 
     Attributes:
         couples: Whether bodies may touch one another, so that all of them are solved for together.
@@ -53,9 +60,17 @@ class ImplicitContact:
         total: Number of pairs, int32 [1].
     """
 
-    def __init__(self, contacts: Contacts):
-        self._contacts, self._system, self.device = contacts, contacts.system, contacts.device
-        self._rigid, self._pairs, self._surface = contacts.rigid, contacts.pairs, contacts.surface
+    def __init__(
+        self,
+        system: System,
+        surface: ContactSurface,
+        obstacles: Obstacles,
+        law: Law,
+        rigid: RigidForces | None,
+        pairs: Pairs | None,
+    ):
+        self._system, self._surface, self._obstacles, self._law = system, surface, obstacles, law
+        self._rigid, self._pairs, self.device = rigid, pairs, system.device
         self.couples = self._pairs is not None
         self.changed, self._searches, self._none = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(3))
         self._rows = kernels.ImplicitRows()
@@ -73,7 +88,7 @@ class ImplicitContact:
     def prepare(self) -> None:
         """Update to the present surfaces and the room for pairs; not while launches are recorded."""
         surface, rows = self._surface, self._rows
-        obstacles = 0 if self._rigid is None else self._contacts.obstacles.count
+        obstacles = self._obstacles.count
         room = 0 if self._pairs is None else self._pairs.room
         if (surface.revision, room) == self._made:
             return
@@ -133,7 +148,7 @@ class ImplicitContact:
             touched: What the nodes of each body have touched, int32 [worlds * nodes]; see ``launch_touched``.
             begins: Nonzero afterwards if so, int32 [1].
         """
-        pace, surface, law = self._system.pace.arrays, self._surface.arrays, self._contacts.law
+        pace, surface, law = self._system.pace.arrays, self._surface.arrays, self._law
         for k, body in enumerate(self._system.bodies):
             start, _, count, own = self._nodes_of(k)
             state = body.state
@@ -141,7 +156,7 @@ class ImplicitContact:
             wp.launch(onsets.foresee_places, count, inputs, [own, begins], device=self.device)
             self._launch_places(k)
         if self._rigid is not None:
-            obstacles = self._contacts.obstacles
+            obstacles = self._obstacles
             inputs = [obstacles.shapes, obstacles.motions, law, surface, self._carriers, self._rigid.forces]
             wp.launch(onsets.find_onsets, self._surface.count, inputs, [begins], device=self.device)
         if self._pairs is not None:
@@ -151,7 +166,7 @@ class ImplicitContact:
 
     def launch_touched(self, touched: Sequence[wp.array]) -> None:
         """Launch the record, after a step, of what the nodes of each body have touched."""
-        inputs = [max(self._contacts.obstacles.count, 1), self._surface.arrays, self._rows, self._marked]
+        inputs = [max(self._obstacles.count, 1), self._surface.arrays, self._rows, self._marked]
         self._on_rows(kernels.mark_acting, inputs)
         for k, array in enumerate(touched):
             start, offset, count, own = self._nodes_of(k)
@@ -287,8 +302,7 @@ class ImplicitContact:
         self._locate(kernels.REPEATED, d)
 
     def _locate(self, which: int, d: wp.array) -> None:
-        contacts, surface = self._contacts, self._surface
-        law, pace = contacts.law, self._system.pace.arrays
+        surface, law, pace = self._surface, self._law, self._system.pace.arrays
         inputs = [int(which), d, surface.arrays, self._located, self._carriers, self._rows]
         wp.launch(kernels.begin_location, len(self._marked), inputs, device=self.device)
         if self._rigid is not None and which != kernels.REPEATED:
@@ -301,9 +315,8 @@ class ImplicitContact:
 
     def _locate_obstacles(self, which: int, d: wp.array, going: wp.array) -> None:
         assert self._rigid is not None
-        contacts, surface, rigid = self._contacts, self._surface, self._rigid
-        obstacles, pace = contacts.obstacles, self._system.pace.arrays
-        inputs = [int(which), obstacles.shapes, obstacles.motions, contacts.law, pace, surface.arrays]
+        surface, rigid, obstacles, pace = self._surface, self._rigid, self._obstacles, self._system.pace.arrays
+        inputs = [int(which), obstacles.shapes, obstacles.motions, self._law, pace, surface.arrays]
         inputs += [surface.triangles, d, rigid.forces, rigid.touches, going, self._carriers, self._rows, self.changed]
         self._launch(locate_obstacles, self._items, inputs, most=self._items)
 
