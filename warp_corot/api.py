@@ -4,8 +4,7 @@ from warp_corot.body.keyframes import Activation
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.grasp import Grasp
 from warp_corot.contact.options import Contact
-from warp_corot.contact.sampled import SignedDistance, TriangleMesh
-from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, Sphere
+from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, SignedDistance, Sphere, TriangleMesh
 from warp_corot.contact.tool import Tool
 from warp_corot.cutting.blade import Blade
 from warp_corot.cutting.plane import Plane

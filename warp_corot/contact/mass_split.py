@@ -19,14 +19,13 @@ from warp_corot.kernels.contact.vertices import Rigid
 from warp_corot.kernels.stepping.pace import Pace
 from warp_corot.kernels.stepping.threads import LINE
 
-from .obstacles import have_edges
+from .obstacles import RigidForces, have_edges
 from .options import Contact, may_meet
 from .pairs import Pairs
-from .rigid_forces import RigidForces
 from .search import Search
 from .surface import ContactSurface
-from .surface_halo import SurfaceHalo
 from .tool import Obstacle
+from .whole_surface import SurfaceHalo
 
 #: Number of iterations if contacts share nodes, and otherwise: then the first one is exact.
 ITERATIONS, EXACT = 4, 1

@@ -7,8 +7,7 @@ import numpy.typing as npt
 
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.options import Contact
-from warp_corot.contact.sampled import SignedDistance
-from warp_corot.contact.shapes import Capsule, Ground
+from warp_corot.contact.shapes import Capsule, Ground, SignedDistance
 from warp_corot.contact.tool import Tool
 from warp_corot.elasticity import Linear
 from warp_corot.materials.isotropic import Isotropic

@@ -32,11 +32,10 @@ from warp_corot.solvers.system import Integrator
 
 from . import parameters
 from .adjoint import Adjoint
+from .contact import RestingContact, rows_after
 from .objective import Objective, value_and_derivative
 from .parameters import StepSums
 from .static import bound, friction_of
-from .touches import touches_after
-from .touching import RestingContact
 
 
 class ExplicitRun:
@@ -355,7 +354,7 @@ def _implicit(
         sim.step()
         states.append(wp.clone(body.state.displacements))
         if sim.contact is not None:
-            contacts.append(RestingContact(body, sim.contact, touches_after(body, sim.contact), friction))
+            contacts.append(RestingContact(body, sim.contact, rows_after(body, sim.contact), friction))
     check_finite(body)
     run = ImplicitRun(body, sums.field, integrator, sums, states, tolerance, contacts)
     for step in reversed(range(given.steps)):

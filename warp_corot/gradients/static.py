@@ -11,9 +11,8 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
-from warp_corot.contact.contacts import Contacts
 from warp_corot.contact.options import Contact
-from warp_corot.contact.reading import obstacle_touches
+from warp_corot.contact.reading import acting_rows
 from warp_corot.contact.shapes import Shape
 from warp_corot.elasticity import Corotated, ForceField, Model
 from warp_corot.errors import ConvergenceError, InputError
@@ -25,10 +24,9 @@ from warp_corot.simulation.static import StaticReport, static_answer
 
 from . import parameters
 from .adjoint import Adjoint
+from .contact import RestingContact
 from .objective import Objective, value_and_derivative
 from .parameters import ElementWork, derivatives
-from .touches import pairs_of
-from .touching import RestingContact
 
 if TYPE_CHECKING:
     from warp_corot.solvers.implicit.precise import PreciseElements
@@ -86,7 +84,7 @@ class RestState:
         self.report, touching = static_answer(body, model=law, gravity=gravity, **options)
         if not self.report.converged:
             raise ConvergenceError(f"there is no gradient: {self.report.message}")
-        touched = None if touching is None else _resting(body, touching, friction)
+        touched = None if touching is None else RestingContact(body, touching, list(acting_rows(touching)), friction)
         self.contact = touched if touched is not None and touched.pushes else None
         self.obstacles = checked_obstacles(obstacles)
         self.law, self._preconditioner, self._tolerance = law, preconditioner, adjoint_tolerance
@@ -154,11 +152,6 @@ def bound(body: SoftBody, law: Model, names: Sequence[str]) -> tuple[ForceField,
             "the model shares rotations, and has no exact stiffness; for gradients each element needs its own"
         )
     return law.bind(body), parameters.needed(names)
-
-
-def _resting(body: SoftBody, contacts: Contacts, friction: Sequence[float]) -> RestingContact:
-    """The contacts of a body at rest."""
-    return RestingContact(body, contacts, [*obstacle_touches(contacts), *pairs_of(contacts)], friction)
 
 
 def friction_of(obstacles: Sequence[Shape], contact: Contact | None) -> list[float]:

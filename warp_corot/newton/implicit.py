@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import warp as wp
@@ -24,7 +24,6 @@ from warp_corot.mesh.topology import connected
 from warp_corot.solvers.implicit.block_system import BlockSystem
 from warp_corot.solvers.implicit.conjugate_gradients import LineSearch, WorldSums
 from warp_corot.solvers.implicit.contact_solve import ContactSolve
-from warp_corot.solvers.implicit.operator import Springs
 from warp_corot.solvers.implicit.preconditioners import BlockDiagonal
 from warp_corot.solvers.recorded import Replays
 
@@ -138,21 +137,14 @@ class TurnedPieces:
 
 
 class RowForces:
-    """Forces and stiffness of rows as functions of the motions in a step: what ``ContactSolve`` asks of an
-    ``ObstacleContact`` of springs only.
+    """Forces and stiffness of rows as functions of the motions in a step: a ``SolvedContact`` of ``ContactSolve``.
 
     Args:
         model: The model.
         contacts: Its contacts.
         unknowns: The entries of vectors.
         free: Whether an entry is free, float32 [entries].
-
-    Attributes:
-        springs: What the preconditioner takes into account.
     """
-
-    #: No node is held.
-    nodes = None
 
     def __init__(self, model: newton.Model, contacts: Contacts, unknowns: Unknowns, free: wp.array):
         self.device, self._contacts, self._unknowns = model.device, contacts, unknowns
@@ -196,43 +188,44 @@ class RowForces:
     def add_blocks(self, blocks: wp.array) -> None:
         self._launch(rows.add_row_blocks, [self._rows], [blocks])
 
-    # --- as a contact of solves, see ``ObstacleContact`` -------------------------------------------------------------
+    # --- as a contact of solves, see ``SolvedContact`` ---------------------------------------------------------------
 
-    def launch_imposed(self, d: wp.array) -> None:
+    def locate(self, d: wp.array) -> None:
         pass
 
-    def launch_drag(self, x: wp.array, y: wp.array) -> None:
+    def update(self, d: wp.array, *, is_solved: bool = False) -> None:
+        self._launch(rows.update_springs, [*self._law, int(is_solved), d], [self._rows])
+
+    def add_forces(self, y: wp.array) -> None:
+        self._launch(rows.add_row_forces, [self._rows], [y])
+
+    def add_products(self, x: wp.array, y: wp.array) -> None:
         self._launch(rows.add_row_products, [self._rows, x], [y])
 
-    def launch_friction(self, d: wp.array, r: wp.array) -> None:
-        self._update(d, is_solved=False)
-        self._launch(rows.add_row_forces, [self._rows], [r])
+    def update_springs(self) -> None:
+        pass
+
+    def find_reached(self, d: wp.array, change: wp.array) -> None:
+        pass
 
     def add_slopes(
-        self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array, *, apart: bool = False
+        self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array, *, apart: int | None = None
     ) -> None:
         inputs = [*self._law, self._rows, self._unknowns.count, d, change, search]
         self._launch(rows.add_row_slopes, inputs, [slopes])
 
-    def launch_judgement(self, b: wp.array, q: wp.array, d: wp.array) -> None:
-        self._update(d, is_solved=True)
-
-    def launch_going(self, d: wp.array, locates: wp.array, rounds: wp.array, most: int, going: wp.array) -> None:
+    def launch_going(self, d: wp.array, rounds: wp.array, most: int, going: wp.array) -> None:
         wp.copy(self._rows.solves, rounds)
 
     def launch_end(self, d: wp.array) -> None:
-        self._update(d, is_solved=True)
+        self.update(d, is_solved=True)
 
     # --- pieces ------------------------------------------------------------------------------------------------------
-
-    def _update(self, d: wp.array, *, is_solved: bool) -> None:
-        self._launch(rows.update_springs, [*self._law, int(is_solved), d], [self._rows])
 
     def _make_room(self) -> None:
         self._room, made = self.count, self._rows
         for name, dtype in FIELDS.items():
             setattr(made, name, wp.zeros(self.count, dtype=dtype, device=self.device))
-        self.springs = Springs(made.nodes, made.weights, made.stiffness, update=lambda: None)
 
     def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
         if self.count:
@@ -361,8 +354,8 @@ class ImplicitSteps(Steps):
         self._rows = RowForces(model, contacts, unknowns, self._free)
         self._turned = TurnedPieces(model, tetrahedra, unknowns)
         self._operator = StepOperator(model, tetrahedra, unknowns, self._free, self._rows)
-        parts: list[Any] = [self._operator, self._rows]
-        self._system = BlockSystem(parts[:1], [RowBlocks(parts[0])], contacts=parts[1:], most=ITERATIONS)
+        operator, contact = cast("Any", self._operator), cast("Any", self._rows)
+        self._system = BlockSystem([operator], [RowBlocks(operator)], contact=contact, most=ITERATIONS)
         self._system.solver.tolerance.fill_(TOLERANCE)
         self._solve = ContactSolve(self._system, [])
         self._motions = [unknowns.particle, self._system.x]
@@ -407,12 +400,13 @@ class ImplicitSteps(Steps):
         operator.take_diagonal()
         operator.add_product(self._turned.way, system.b)
         self._launch(kernels.clear_held, len(x), [self._free], [system.b])
-        rows.launch_judgement(system.b, self._product, x)
+        rows.update(x, is_solved=True)
         system.update()
         operator.apply(x, self._product)
         self._launch(find_rest, len(x), [system.b, self._product], [self._rest])
         wp.copy(self._r, self._rest)
-        rows.launch_friction(x, self._r)
+        rows.update(x)
+        rows.add_forces(self._r)
         system.solve(self._r, self._change, guessed=True, like=system.b)
         wp.copy(self._first, system.solver.iterations)
         if rows.count:

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from warp_corot.body.soft_body import SoftBody
+from warp_corot.contact.carried import take_state
 from warp_corot.contact.contacts import Contacts
-from warp_corot.contact.keeping import take_state
 from warp_corot.contact.options import Contact
 from warp_corot.contact.shapes import Shape
 from warp_corot.contact.tool import Tool

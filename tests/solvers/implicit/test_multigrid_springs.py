@@ -29,7 +29,7 @@ def springs_of(mesh, device, rng, worlds=1):
     arrays = [wp.array(np.concatenate(nodes), dtype=wp.vec4i, device=device)]
     arrays += [wp.array(weights.reshape(-1, 4), dtype=wp.vec4, device=device)]
     arrays += [wp.array(stiffness, dtype=wp.mat33, device=device)]
-    return Springs(*arrays, update=lambda: None), shares, stiffness.reshape(worlds, PLACES, 3, 3)
+    return Springs(*arrays), shares, stiffness.reshape(worlds, PLACES, 3, 3)
 
 
 def with_springs(mesh, device, springs, *, worlds=1, **options):

@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from warp_corot.contact.carried import keep_again, kept_arrays
 from warp_corot.contact.contacts import Contacts
 from warp_corot.contact.grasp import Grasp
-from warp_corot.contact.keeping import keep_again, kept_arrays
 from warp_corot.contact.options import Contact
-from warp_corot.contact.sampled import SignedDistance, TriangleMesh
-from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, Shape, Sphere
+from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, Shape, SignedDistance, Sphere, TriangleMesh
 from warp_corot.contact.tool import Obstacle, Tool
 from warp_corot.cutting.blade import Blade, Edge
 from warp_corot.discretization.changing.passes import Findings

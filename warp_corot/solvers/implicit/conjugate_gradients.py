@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,9 @@ from warp_corot.kernels.implicit.conjugate_gradients import sum_products
 from warp_corot.solvers.halo import ALONE, Halo
 
 from .operator import Preconditioner, Product
+
+if TYPE_CHECKING:
+    from .contact_constraints import Contact
 
 #: Number of lanes in a warp, minimum number of nodes of a thread, and maximum number of warps of all worlds.
 WARP, NODES, WARPS = 32, 4, 512
@@ -227,21 +230,6 @@ class Contacts(Protocol):
         ...
 
 
-class ContactsApart(Protocol):
-    """Contacts whose power ranks can add up."""
-
-    @property
-    def count(self) -> int:
-        """Number of places of one world."""
-        ...
-
-    def add_slopes(
-        self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array, *, apart: bool = False
-    ) -> None:
-        """As ``Contacts``, or with ``apart`` to one number for each place, float64 [worlds * count]."""
-        ...
-
-
 class LineSearch:
     """Finds how much of a change of the motions to take, in each world.
 
@@ -301,17 +289,20 @@ class SharedLineSearch(LineSearch):
 
     Args:
         worlds, count, contacts, device: As for ``LineSearch``.
+        body: The number of the body.
         ranks: The ranks with the other entries of each world.
     """
 
-    def __init__(self, worlds: int, count: int, contacts: ContactsApart, device: wp.Device, ranks: Halo):
-        self._ranks, self._apart = ranks, contacts
+    def __init__(self, worlds: int, count: int, contacts: Contact, body: int, device: wp.Device, ranks: Halo):
+        self._ranks, self._apart, self._body = ranks, contacts, body
         super().__init__(worlds, count, contacts, device)
         # The sums of worlds are in the first places.
-        self._addends = wp.zeros((worlds, max(contacts.count, 1), 1), dtype=wp.float64, device=device)
+        self._addends = wp.zeros(
+            (worlds, max(contacts.places_of(body) // worlds, 1), 1), dtype=wp.float64, device=device
+        )
         self._slopes = self._addends[:, 0, 0]
 
     def _add_slopes(self, d: wp.array, change: wp.array) -> None:
         self._addends.zero_()
-        self._apart.add_slopes(d, change, self._search, self._addends.flatten(), apart=True)
+        self._apart.add_slopes(d, change, self._search, self._addends.flatten(), apart=self._body)
         take_in(self._addends, [0], self._ranks)

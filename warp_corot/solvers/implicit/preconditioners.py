@@ -306,7 +306,9 @@ class ChosenSolve:
 
     def take_contact(self, system: BlockSystem) -> None:
         """Launch the exchange of the contacts of the system in the matrix for the present ones."""
-        self._either(lambda: self.assembled.take_contact(system.contacts, system.soft), system.take_springs)
+        assert system.contact is not None
+        contact = system.contact
+        self._either(lambda: self.assembled.take_contact(contact), system.take_springs)
 
     def iterate(self, system: BlockSystem, x: wp.array) -> None:
         """Launch the iterations of a solve of the system that has begun."""
@@ -321,7 +323,7 @@ class ChosenSolve:
         self._either(None, judge_set_ups)
         if not self.is_open:
             return
-        knows_more = system.soft is not None or (self.assembled.touches and self.device.is_cpu)
+        knows_more = system.couples or (self.assembled.touches and self.device.is_cpu)
         worth = NEVER if knows_more else WORTH
         inputs = [iterations, status, int(self.assembled.touches), worth, self._cost, self.assembled.couplings]
         wp.launch(kernels.choose, 1, inputs, [self._counts, self._is_assembled], device=self.device)

@@ -50,8 +50,7 @@ class LinearisedStep:
     def __init__(self, system: BlockSystem, newtons: list[Newton], *, tolerance: float | None, most: int):
         self._system, self._newtons, self.device = system, newtons, system.device
         self._tolerance, self._most = math.inf if tolerance is None else tolerance, 1 if tolerance is None else most
-        touches = system.soft is not None or any(each is not None for each in system.contacts)
-        self._contact = ContactSolve(system, newtons) if touches else None
+        self._contact = None if system.contact is None else ContactSolve(system, newtons)
         self.iterations = wp.ones(system.worlds, dtype=wp.int32, device=self.device)
         self.linear_iterations, self.status = system.solver.iterations, system.solver.status
         if self._contact is not None:
@@ -98,7 +97,6 @@ class LinearisedStep:
             self._launch(kernels.take_free, inputs, [newton.step])
         system.apply_bodies(system.x, self._product)
         self._launch(kernels.add_product, [self._product], [system.b])
-        self._contact.launch_again()
         self._contact.launch()
         self._take_increments()
         self._judge()
@@ -148,7 +146,7 @@ class ImplicitStepper(Stepper):
         self.totals = self.shared.totals
         self._is_sturdy = False
         self._bodies = [BodySteps(self.shared, k) for k in range(len(system.bodies))]
-        coupled = [[body] for body in self._bodies] if self.shared.rows is None else [self._bodies]
+        coupled = [self._bodies] if self.shared.couples else [[body] for body in self._bodies]
         self._solves = [StepSolve(self.shared, bodies) for bodies in coupled]
 
     @property
@@ -156,7 +154,6 @@ class ImplicitStepper(Stepper):
         arrays = enumerate(array for body in self._bodies for array in body.history)
         kept = {f"history.{number}": array for number, array in arrays}
         kept |= {f"velocities.{k}": body.before for k, body in enumerate(self._bodies)}
-        kept |= {f"meetings.{k}": body.met for k, body in enumerate(self._bodies) if body.met.size}
         kept |= {f"touched.{k}": body.touched for k, body in enumerate(self._bodies) if body.touched.size}
         states = [
             (k, body.preconditioner.state)
@@ -167,10 +164,10 @@ class ImplicitStepper(Stepper):
         return kept | {f"setup.{k}.{name}": array for k, state in states for name, array in state.items()}
 
     def prepare(self) -> None:
+        if self.shared.contact is not None:
+            self.shared.contact.prepare()
         for solve in self._solves:
             solve.prepare()
-        if self.shared.rows is not None:
-            self.shared.rows.prepare()
 
     def continue_from(self, other: Stepper) -> None:
         assert isinstance(other, ImplicitStepper)
@@ -218,8 +215,7 @@ class StepSolve:
 
     def __init__(self, shared: SharedSteps, bodies: Sequence[BodySteps]):
         self._shared, self._bodies, self._versions = shared, list(bodies), [-1]
-        self._soft = shared.rows
-        self._touches = shared.rows is not None or bodies[0].held is not None
+        self._touches = shared.contact is not None
         self.choice = self._made_choice()
 
     def _made_choice(self) -> ChosenSolve | None:
@@ -229,7 +225,7 @@ class StepSolve:
         if options.preconditioner is not None or len(lagged) < len(bodies) or not all(map(suits, operators)):
             return None
         blocks = VectorBlocks([len(operator.inverse_mass) for operator in operators])
-        assembled = AssembledSolve(operators, blocks, together=self._soft is not None, touches=self._touches)
+        assembled = AssembledSolve(operators, blocks, together=self._shared.couples, touches=self._touches)
         load((), assembled.device, assembled.kernels)
         shares = any(body.field.shares_dilatation for body in bodies)
         return ChosenSolve(assembled, operators, lagged, shares=shares, dt=options.dt)
@@ -259,8 +255,8 @@ class StepSolve:
         self._system = BlockSystem(
             [body.operator for body in bodies],
             [body.preconditioner for body in bodies],
-            contacts=[body.held for body in bodies],
-            soft=self._soft,
+            contact=self._shared.contact,
+            couples=self._shared.couples,
             choice=self.choice,
             most=options.linear_iterations,
             ranks=self._shared.system.ranks,
@@ -283,19 +279,21 @@ class StepSolve:
     def launch(self, offset: int, *, is_last: bool) -> None:
         """Launch the ``offset``-th step since the clock was last advanced; ``is_last`` as for ``BodySteps``."""
         bodies, shared = self._bodies, self._shared
-        if self._soft is not None:
+        if shared.couples:
             wp.copy(shared.begins, shared.sturdy)
         for body in bodies:
             body.launch_changes(offset)
-        touched = [body.touched for body in bodies]
-        keeps = self._soft is not None and shared.integrator.history > 0
-        if self._soft is not None and keeps:
-            self._soft.launch_meetings(offset, touched, shared.begins)
+        # Velocities jump when bodies meet things, so schemes of second order begin again.
+        touched, contact = [body.touched for body in bodies], shared.contact if shared.integrator.history else None
+        if contact is not None:
+            contact.launch_onsets(offset, touched, bodies[0].begins)
+        if shared.integrator.history:
+            shared.system.ranks.max(bodies[0].begins)
         for body in bodies:
             body.launch_begin()
         self._solve(offset)
-        if self._soft is not None and keeps:
-            self._soft.launch_touched(touched)
+        if contact is not None:
+            contact.launch_touched(touched)
         for body in bodies:
             body.launch_end(offset, self._counts, is_last=is_last)
 
