@@ -4,9 +4,9 @@ import os
 import sys
 from dataclasses import replace
 
-import nibabel
 import numpy as np
 import pytest
+import SimpleITK
 import trimesh
 import warp as wp
 from command_line import SHORT, simulate
@@ -145,8 +145,10 @@ def test_material_follows_the_labels(folder, labels, noted, capsys):
 def test_voxels_that_are_not_numbers_are_outside(folder, capsys):
     values = np.full((8, 8, 8), np.nan, np.float32)
     values[2:6, 2:6, 2:6] = 1.0
-    nibabel.save(nibabel.Nifti1Image(values, np.diag([10.0, 10.0, 10.0, 1.0])), folder / "scan.nii.gz")
-    assert simulate("scan.nii.gz", "-o", "a.usd", "--tets", 300, *SHORT) == 0
+    image = SimpleITK.GetImageFromArray(values)  # in NIfTI files they are zeros to ITK
+    image.SetSpacing((10.0, 10.0, 10.0))
+    SimpleITK.WriteImage(image, str(folder / "scan.mha"))
+    assert simulate("scan.mha", "-o", "a.usd", "--tets", 300, *SHORT) == 0
     out, err = capsys.readouterr()
     assert "448 voxels are not a number and count as outside" in err
     assert "64 in 1 piece" in out

@@ -56,7 +56,7 @@ REFUSED = [
     (["grey.nii.gz"], "grey.nii.gz: has 301 different values or more, -20 to 280, as intensities do"),
     (["zeros.nii.gz", "--unit", "mm"], "the volume is empty: all of its voxels are 0"),
     (["halves.nii.gz"], "halves.nii.gz: has values such as 0.5, as probabilities and intensities do"),
-    (["colours.nii.gz"], "colours.nii.gz: has voxels of type"),
+    (["colours.nii.gz"], "it has 3 dimensions and 3 numbers a voxel"),
     (["organ.obj", "--tets", "999999999"], "--tets is 999999999; it must be at most 100000000"),
     (["organ.obj", "--pull", "right", "0", "0", "1cm", "--tets", "500"], "--pull: expression 'right': 'right' is not"),
     (["organ.obj", "--labels", "liver=3kPa"], "--labels is for scans, and organ.obj is not one"),

@@ -164,9 +164,9 @@ def test_meshes_without_usable_tetrahedra_are_refused(tmp_path):
 
 def test_a_missing_reader_is_named(tmp_path, monkeypatch):
     original = importlib.util.find_spec
-    missing = ("meshio", "gmsh", "vtkmodules")
+    missing = ("vtkmodules", "SimpleITK")
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name in missing else original(name))
-    for suffix, extra in ((".msh", "gmsh"), (".msh", "mesh"), (".vtu", "mesh")):
+    for suffix, extra in ((".vtp", "mesh"), (".vtu", "mesh"), (".nii.gz", "scans")):
         path = tmp_path / f"body{suffix}"
         path.write_text("something")
         refused(path, re.escape(f'pip install "warp-corot[{extra}]"'))

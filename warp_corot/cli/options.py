@@ -265,7 +265,7 @@ class InputOptions:
             with a TetMesh, or a Mesh with tetraIndices; .vtk, .vtu, .vtm, .msh of Gmsh, .inp of Abaqus, .mesh, .node,
             .ele, .vol and others; warp:bear, a toy bear; or box, the beam of Tagawa et al. 2013. A closed surface:
             .obj, .stl, .ply, .off, .glb, .vtp, a USD file with only Mesh prims, one of the other files with only
-            triangles; or warp:bunny. A segmented scan: .nii, .nii.gz, .mgz, .mha, .mhd, .nrrd, .vti, or a folder with a
+            triangles; or warp:bunny. A segmented scan: .nii, .nii.gz, .mha, .mhd, .nrrd, .vti, or a folder with a
             DICOM series. Or a run file, .toml
     """
 
@@ -278,8 +278,8 @@ class OutputOptions:
 
     Attributes:
         output (OUT.usd): animation to write (.usd, .usdc or .usda)
-        also (OUT.pvd): also write for ParaView, with displacement, velocity, strain and stress: .pvd or .xdmf with all
-            frames, or .vtu with the last; can be given several times
+        also (OUT.pvd): also write for ParaView, with displacement, velocity, strain and stress: .pvd with all frames, or
+            .vtu with the last; can be given several times
         static: find where the body is at rest in place of its motion: one frame, or with --pull, --twist or --press a
             state of rest for each frame
     """

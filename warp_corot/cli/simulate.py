@@ -79,7 +79,7 @@ def simulated(args: argparse.Namespace) -> Recording:
 def _check_output(args: argparse.Namespace, shared: argparse.Namespace) -> None:
     """Check, before a long run, that its results can be written."""
     from warp_corot.io.files.whole import check_output
-    from warp_corot.io.write import check_also
+    from warp_corot.io.write.paraview import check_also
     from warp_corot.io.write.animate import frame_count
     from warp_corot.io.write.usd.pieces import PieceStore
 

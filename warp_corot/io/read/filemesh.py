@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -17,11 +16,6 @@ FACES = {"triangle": 3, "quad": 4}
 CORNERS = {**SOLIDS, **FACES}
 #: Arrays with more distinct numbers than this do not define node sets.
 MOST_SETS = 32
-#: Arrays of VTK that number neither regions nor sets of nodes.
-INTERNAL = (
-    *("vtkGhostType", "vtkOriginalCellIds", "vtkOriginalPointIds"),
-    *("GlobalCellIds", "GlobalElementId", "GlobalPointIds", "GlobalNodeId"),
-)
 
 
 class Unreadable(Exception):
@@ -141,30 +135,6 @@ def sets_of_numbers(name: str, values: NDArray[np.int64]) -> dict[str, NDArray[n
     return {f"{name}_{number}": np.flatnonzero(values == number) for number in numbers.tolist()}
 
 
-def whole(word: str) -> int:
-    """Convert a text to a whole number.
-
-    Raises:
-        Unreadable: It is not a whole number.
-    """
-    try:
-        return int(word)
-    except ValueError:
-        raise Unreadable(f"{word[:40]!r} is not a whole number") from None
-
-
-def real(word: str) -> float:
-    """Convert a text to a number; the exponent may have Fortran's letter D.
-
-    Raises:
-        Unreadable: It is not a number.
-    """
-    try:
-        return float(word.replace("D", "e").replace("d", "e"))
-    except ValueError:
-        raise Unreadable(f"{word[:40]!r} is not a number") from None
-
-
 def corners_note(kind: str, order: int | None = 2) -> str:
     """The note about cells of higher order, of which only the corners are used."""
     word = {2: "second-order", 3: "third-order"}.get(order or 0, "higher-order")
@@ -233,19 +203,6 @@ def triangles_of(blocks: Iterable[Block]) -> NDArray[np.int64]:
     for block in blocks:
         found.append(block.nodes if block.kind == "triangle" else _halves(block.nodes).reshape(-1, 3))
     return np.concatenate(found)
-
-
-def split_polyhedron(faces: Sequence[Sequence[int]]) -> list[tuple[int, int, int, int]]:
-    """The tetrahedra of one convex cell of any kind, given by the corners of its faces, by the same rule."""
-    apex = min(min(face) for face in faces)
-    return [(a, b, c, apex) for face in faces if apex not in face for a, b, c in fan(face)]
-
-
-def fan(polygon: Sequence[int]) -> list[tuple[int, int, int]]:
-    """The triangles of a convex polygon around its corner with the smallest number."""
-    start = min(range(len(polygon)), key=polygon.__getitem__)
-    turned = [*polygon[start:], *polygon[:start]]
-    return [(turned[0], b, c) for b, c in pairwise(turned[1:])]
 
 
 def _cones(block: Block) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

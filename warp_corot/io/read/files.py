@@ -18,75 +18,38 @@ from .filemesh import FileImage, FileMesh
 
 @dataclass(frozen=True)
 class Reader:
-    """A function of a module of this folder that reads a path.
+    """A module of this folder with a function that reads a path.
 
     Attributes:
         name: Its name in messages.
-        function: The function, after its module's name in this folder; ``read`` if it has only that.
+        module: The module of this folder whose ``read`` it is.
         package: The Python package that it needs, if any.
         extra: The extra that installs this package, as in ``pip install "warp-corot[EXTRA]"``.
     """
 
     name: str
-    function: str
+    module: str
     package: str | None = None
     extra: str | None = None
 
 
 VTK = Reader("VTK", "vtk_files", "vtkmodules", "mesh")
-GMSH = Reader("Gmsh", "gmsh_files", "gmsh", "gmsh")
-MESHIO = Reader("meshio", "meshio_files", "meshio", "mesh")
-NIBABEL = Reader("nibabel", "nibabel_files", "nibabel", "scans")
+MESHIO = Reader("meshio", "meshio_files")
 ITK = Reader("SimpleITK", "itk_files", "SimpleITK", "scans")
-ABAQUS = Reader("the reader of Abaqus input files", "text_files.read_abaqus")
-TETGEN = Reader("the reader of TetGen's files", "text_files.read_tetgen")
-
+BY_MESHIO = (
+    *(".msh", ".mesh", ".meshb", ".bdf", ".nas", ".fem", ".inp", ".node", ".ele", ".vol", ".vol.gz", ".xdmf", ".xmf"),
+    *(".e", ".ex2", ".exo", ".med", ".cgns", ".h5m", ".avs", ".su2", ".f3grid", ".mdpa", ".post", ".dato", ".ugrid"),
+    *(".tec", ".xml"),
+)
 #: Readers by extension, starting with the most complete one.
 READERS: dict[str, tuple[Reader, ...]] = {
-    ".msh": (GMSH, MESHIO),
-    ".mesh": (GMSH, MESHIO),
-    ".meshb": (GMSH, MESHIO),
-    ".unv": (GMSH,),
-    ".bdf": (GMSH, MESHIO),
-    ".nas": (GMSH, MESHIO),
-    ".fem": (MESHIO,),
-    ".vtk": (VTK, MESHIO),
-    ".vtu": (VTK, MESHIO),
-    ".vtp": (VTK,),
-    ".vtm": (VTK,),
-    ".vtmb": (VTK,),
-    ".vts": (VTK,),
-    ".vtr": (VTK,),
-    ".pvtu": (VTK,),
-    ".pvtp": (VTK,),
-    ".vtkhdf": (VTK,),
-    ".inp": (ABAQUS,),
-    ".node": (TETGEN,),
-    ".ele": (TETGEN,),
-    ".vol": (MESHIO,),
-    ".vol.gz": (MESHIO,),
-    ".xdmf": (MESHIO,),
-    ".xmf": (MESHIO,),
-    ".e": (MESHIO,),
-    ".ex2": (MESHIO,),
-    ".exo": (MESHIO,),
-    ".med": (MESHIO,),
-    ".cgns": (MESHIO,),
-    ".h5m": (MESHIO,),
-    ".avs": (MESHIO,),
-    ".su2": (MESHIO,),
-    ".f3grid": (MESHIO,),
-    ".mdpa": (MESHIO,),
-    ".post": (MESHIO,),
-    ".dato": (MESHIO,),
-    ".ugrid": (MESHIO,),
-    ".tec": (MESHIO,),
-    ".xml": (MESHIO,),
+    **dict.fromkeys(BY_MESHIO, (MESHIO,)),
+    **dict.fromkeys((".vtk", ".vtu"), (VTK, MESHIO)),
+    **dict.fromkeys((".vtp", ".vtm", ".vtmb", ".vts", ".vtr", ".pvtu", ".pvtp", ".vtkhdf"), (VTK,)),
 }
 #: Readers of scans by extension.
 SCANS: dict[str, tuple[Reader, ...]] = {
-    **dict.fromkeys((".nii.gz", ".nii", ".mgz", ".mgh"), (NIBABEL,)),
-    **dict.fromkeys((".mha", ".mhd", ".nrrd", ".nhdr", ".dcm"), (ITK,)),
+    **dict.fromkeys((".nii.gz", ".nii", ".mha", ".mhd", ".nrrd", ".nhdr", ".dcm"), (ITK,)),
     ".vti": (VTK,),
 }
 #: The extensions of all these files.
@@ -125,7 +88,7 @@ def read_mesh_file(path: Path) -> FileMesh | FileImage:
         if reader.package and importlib.util.find_spec(reader.package) is None:
             missing.append(reader)
             continue
-        found, reason = read_with(reader.function, path)
+        found, reason = read_with(reader.module, path)
         if isinstance(found, FileImage):
             return found
         if found is not None and len(found.points):
@@ -142,11 +105,11 @@ def read_mesh_file(path: Path) -> FileMesh | FileImage:
     raise InputError(f"{path}: {what} that can be read ({'; '.join(reasons)}){also}")
 
 
-def read_with(function: str, path: Path) -> tuple[Any, str | None]:
+def read_with(module: str, path: Path) -> tuple[Any, str | None]:
     """Let a reader read a file, without output of its library and with memory for no more than the file can need.
 
     Args:
-        function: See `Reader`.
+        module: See `Reader`.
         path: The file.
 
     Returns:
@@ -154,9 +117,7 @@ def read_with(function: str, path: Path) -> tuple[Any, str | None]:
     """
     try:
         with quietly(), bounded(path):
-            module, _, name = function.partition(".")
-            read = getattr(importlib.import_module(f".{module}", __package__), name or "read")
-            return read(path), None
+            return importlib.import_module(f".{module}", __package__).read(path), None
     except MemoryError:
         return None, "it asks for more memory than such a file can need"
     except ModuleNotFoundError as error:

@@ -1,4 +1,4 @@
-"""Formats of SimpleITK: MetaImage, NRRD, single DICOM files, and folders with DICOM series."""
+"""Formats of SimpleITK: NIfTI, MetaImage, NRRD, single DICOM files, and folders with DICOM series."""
 
 from __future__ import annotations
 
@@ -37,6 +37,8 @@ def read(path: Path) -> FileImage:
     except RuntimeError as error:
         # ITK names itself and its source files first; the reason comes last.
         raise Unreadable(re.split(r"(?:sitk::|ITK )ERROR:", str(error))[-1]) from None
+    if path.name.lower().endswith((".nii", ".nii.gz")):
+        return _as_nifti_says(image, _header(str(path)))
     if path.suffix.lower() != ".dcm":
         return image
     if image.values.shape[2] < 2:
@@ -44,7 +46,19 @@ def read(path: Path) -> FileImage:
     return replace(image, unit="mm")
 
 
+def _as_nifti_says(image: FileImage, header: Any) -> FileImage:
+    """The image of a NIfTI file, whose lengths ITK converts to mm, with the unit and the orientation that it names."""
+    unit, *codes = (int(header.GetMetaData(key)) for key in ("xyzt_units", "qform_code", "sform_code"))
+    image = replace(image, unit="mm" if unit & 7 in (1, 2, 3) else None, notes=[])
+    if any(codes):
+        return image
+    note = "the header gives no orientation: its axes are taken as right, anterior, superior"
+    return replace(image, affine=np.diag([*header.GetSpacing()[:3], 1.0]), notes=[note])
+
+
 def _voxels(image: Any, notes: list[str]) -> FileImage:
+    while image.GetDimension() > 3 and image.GetSize()[-1] == 1:
+        image = image[..., 0]
     dimensions, numbers = image.GetDimension(), image.GetNumberOfComponentsPerPixel()
     if (dimensions, numbers) != (3, 1):
         raise Unreadable(f"it has {dimensions} dimensions and {numbers} numbers a voxel; it must have 3 and 1")

@@ -136,12 +136,10 @@ def placed_meshes(path: Path, **options: Any) -> list[tuple[Any, NDArray[Any], s
         options: More arguments of trimesh's ``load_scene``.
 
     Raises:
-        InputError: trimesh is not installed, or cannot read it.
+        InputError: trimesh cannot read it.
     """
-    try:
-        import trimesh
-    except ImportError:
-        raise InputError(f'{path}: reading {path.suffix} files needs: pip install "warp-corot[surface]"') from None
+    import trimesh
+
     try:
         options |= {"split_objects": True} if path.suffix.lower() == ".obj" else {}
         with quietly(), bounded(path):

@@ -1,4 +1,4 @@
-"""Scans: volumes of voxels from NIfTI and MGH (nibabel), MetaImage, NRRD and DICOM (SimpleITK) and VTK image files."""
+"""Scans: volumes of voxels from NIfTI, MetaImage, NRRD and DICOM (SimpleITK) and VTK image files."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class LoadedVolume:
 
 
 def load_volume(path: str | PathLike[str]) -> LoadedVolume:
-    """Read a scan: .nii, .nii.gz, .mgz, .mgh, .mha, .mhd, .nrrd, .nhdr, .vti, an image in a .vtk, or DICOM: a .dcm
+    """Read a scan: .nii, .nii.gz, .mha, .mhd, .nrrd, .nhdr, .vti, an image in a .vtk, or DICOM: a .dcm
     with several slices, or the largest series in a folder.
 
     Raises:

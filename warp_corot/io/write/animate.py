@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from warp_corot.io.write.usd.prims import Touched
     from warp_corot.io.write.usd.writer import UsdWriter
 
-    from .paraview import Writer
+    from .paraview import ParaViewWriter
     from .skins import Surface
 
 Progress = Callable[[int, int], None]
@@ -214,8 +214,8 @@ def record(
             materials; parts without materials and colours show the stress.
         tets: Whether to write the TetMesh prim; None: only without a smooth surface.
         labels: Draw each label of the mesh as a separate closed surface, in place of one around all.
-        also: Files for ParaView with displacement, velocity, strain and stress: .pvd or .xdmf with all frames, .vtu
-            with the last one.
+        also: Files for ParaView with displacement, velocity, strain and stress: .pvd with all frames, .vtu with the
+            last one.
         progress: Called with the number of finished frames and of all frames after each; None: terminals show a bar
             after two seconds.
         recording: Filled during the run, so that it is available if the run ends early.
@@ -233,7 +233,7 @@ def record(
     """
     from warp_corot.io.write.usd.writer import UsdWriter
 
-    from . import also_writer, fields_of
+    from .paraview import ParaViewWriter, fields_of
 
     if not isinstance(sim, Simulation):
         raise InputError(f"sim is {shown(sim)}; it must be a Simulation, for example Simulation(body)")
@@ -241,7 +241,7 @@ def record(
     count = 0 if duration is None else frame_count(duration, fps)
     for body in sim.bodies:
         check_whole(body)
-    others = [also_writer(Path(other)) for other in also if sim.is_root]
+    others = [ParaViewWriter(Path(other)) for other in also if sim.is_root]
     if world is None and sim.worlds > 1:
         raise InputError(f"the simulation has {sim.worlds} worlds; choose the one to draw, for example world=0")
     joined = _Joined(sim, world or 0)
@@ -350,7 +350,7 @@ def _touched(sim: Simulation, joined: _Joined) -> Touched | None:
 
 
 @contextmanager
-def closed_whole(writer: ColoredStage, done: Recording, others: Sequence[Writer] = ()) -> Iterator[None]:
+def closed_whole(writer: ColoredStage, done: Recording, others: Sequence[ParaViewWriter] = ()) -> Iterator[None]:
     """Close the writers at the end in any case, with signals delayed and the time measured."""
     try:
         yield

@@ -1,16 +1,15 @@
-"""Frames for ParaView: one .vtu, a .pvd with a .vtu for each frame, or an .xdmf with its numbers in HDF5.
+"""Frames for ParaView: one .vtu, or a .pvd with a .vtu for each frame.
 
 Points are rest positions; *Warp By Vector* with ``displacement`` shows the moving body.
 """
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
-from xml.sax.saxutils import escape, quoteattr
+from typing import TYPE_CHECKING, Any
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import numpy.typing as npt
@@ -93,14 +92,38 @@ def fields_of(sim: Simulation, worlds: Sequence[Any], time: float) -> Fields:
     )
 
 
-# --- vTK's files -----------------------------------------------------------------------------------------------------
+# --- VTK's files -----------------------------------------------------------------------------------------------------
 
-#: The packages that each format needs.
-PACKAGES = {".vtu": "meshio", ".pvd": "meshio", ".xdmf": "h5py"}
+#: Extensions of files with the last frame, and of lists of all frames.
+LAST, ALL = ".vtu", ".pvd"
 
 
-class Writer(Protocol):
-    """Takes one frame after the other."""
+def check_also(path: Path) -> None:
+    """Check, before a simulation, that its result can be written.
+
+    Raises:
+        InputError: Another extension, a folder with this name, or an output folder that does not exist or cannot be
+            written to.
+    """
+    check_output(path, (LAST, ALL))
+    frames = _frames_folder(path)
+    if path.suffix.lower() == ALL and frames.exists() and not frames.is_dir():
+        raise InputError(f"{frames}: is a file; it must be a folder for the frames of {path.name}")
+
+
+class ParaViewWriter:
+    """The last frame as one .vtu; or all frames, files in a folder beside a list with their times, a .pvd, which is
+    complete after every frame.
+
+    Raises:
+        InputError: See `check_also`.
+    """
+
+    def __init__(self, path: Path):
+        check_also(path)
+        self._path = path
+        self._listed: list[str] = []
+        self._last: Fields | None = None
 
     def write(self, fields: Fields) -> None:
         """Write a frame, or keep it.
@@ -108,6 +131,20 @@ class Writer(Protocol):
         Raises:
             WriteError: It could not be written.
         """
+        if self._path.suffix.lower() == LAST:
+            self._last = fields
+            return
+        folder = _frames_folder(self._path)
+        with writing(folder):
+            folder.mkdir(exist_ok=True)
+        name = f"{self._path.stem}_{len(self._listed):05}.vtu"
+        write_vtu(folder / name, fields)
+        file = quoteattr(f"{folder.name}/{name}")
+        self._listed.append(f'    <DataSet timestep="{fields.time:.9g}" part="0" file={file}/>')
+        lines = ['<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">']
+        lines += ["  <Collection>", *self._listed, "  </Collection>", "</VTKFile>", ""]
+        with written_whole(self._path) as part:
+            part.write_text("\n".join(lines), "utf-8")
 
     def close(self) -> None:
         """Finish the file.
@@ -115,75 +152,9 @@ class Writer(Protocol):
         Raises:
             WriteError: It could not be written.
         """
-
-
-def check_also(path: Path) -> None:
-    """Check, before a simulation, that its result can be written.
-
-    Raises:
-        InputError: Another extension, a library that is not installed, a folder with this name, or an output folder
-            that does not exist or cannot be written to.
-    """
-    check_output(path, tuple(PACKAGES))
-    if importlib.util.find_spec(PACKAGES[path.suffix.lower()]) is None:
-        raise InputError(f'{path}: writing {path.suffix} files needs: pip install "warp-corot[paraview]"')
-    frames = _frames_folder(path)
-    if path.suffix.lower() == ".pvd" and frames.exists() and not frames.is_dir():
-        raise InputError(f"{frames}: is a file; it must be a folder for the frames of {path.name}")
-
-
-def also_writer(path: Path) -> Writer:
-    """The writer of a file by its extension.
-
-    Raises:
-        InputError: See `check_also`.
-    """
-    check_also(path)
-    suffix = path.suffix.lower()
-    if suffix == ".xdmf":
-        return XdmfWriter(path)
-    return VtuWriter(path) if suffix == ".vtu" else PvdWriter(path)
-
-
-class VtuWriter:
-    """The last frame, as one file."""
-
-    def __init__(self, path: Path):
-        self._path = path
-        self._last: Fields | None = None
-
-    def write(self, fields: Fields) -> None:
-        self._last = fields
-
-    def close(self) -> None:
         if self._last is not None:
             write_vtu(self._path, self._last)
         self._last = None
-
-
-class PvdWriter:
-    """All frames: files in a folder beside a list with their times, which is complete after every frame."""
-
-    def __init__(self, path: Path):
-        self._path = path
-        self._listed: list[str] = []
-
-    def write(self, fields: Fields) -> None:
-        folder = _frames_folder(self._path)
-        with writing(folder):
-            folder.mkdir(exist_ok=True)
-        name = f"{self._path.stem}_{len(self._listed):05}.vtu"
-        write_vtu(folder / name, fields)
-        self._listed.append(
-            f'    <DataSet timestep="{fields.time:.9g}" part="0" file="{_xml(folder.name)}/{_xml(name)}"/>'
-        )
-        lines = ['<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">']
-        lines += ["  <Collection>", *self._listed, "  </Collection>", "</VTKFile>", ""]
-        with written_whole(self._path) as part:
-            part.write_text("\n".join(lines), "utf-8")
-
-    def close(self) -> None:
-        pass
 
 
 def write_vtu(path: Path, fields: Fields) -> None:
@@ -202,80 +173,3 @@ def write_vtu(path: Path, fields: Fields) -> None:
 
 def _frames_folder(path: Path) -> Path:
     return path.with_name(f"{path.stem}_frames")
-
-
-def _xml(text: str) -> str:
-    from xml.sax.saxutils import quoteattr
-
-    return quoteattr(text)[1:-1]
-
-
-# --- xDMF: an XML file that refers to each frame's arrays in an HDF5 file beside it ----------------------------------
-
-HEAD = (
-    '<?xml version="1.0"?>\n<Xdmf Version="3.0">\n <Domain>\n  <Grid CollectionType="Temporal" GridType="Collection">\n'
-)
-TAIL = "  </Grid>\n </Domain>\n</Xdmf>\n"
-KINDS = {1: "Scalar", 3: "Vector", 9: "Tensor"}
-
-
-class XdmfWriter:
-    """All frames. The XML file is complete after every frame; a mesh is stored once for all frames with it.
-
-    Args:
-        path: The .xdmf; its arrays go to the .h5 file of the same name.
-    """
-
-    def __init__(self, path: Path):
-        self._path = path
-        self._numbers: Any = None
-        self._grids: list[str] = []
-        self._mesh: tuple[np.ndarray, np.ndarray] | None = None
-        self._mesh_text = ""
-
-    def write(self, fields: Fields) -> None:
-        with writing(self._path):
-            self._write(fields)
-
-    def close(self) -> None:
-        if self._numbers is not None:
-            with writing(self._path):
-                self._numbers.close()
-        self._numbers = None
-
-    def _write(self, fields: Fields) -> None:
-        if self._numbers is None:
-            import h5py
-
-            self._numbers = h5py.File(self._path.with_suffix(".h5"), "w")
-        frame = f"frame{len(self._grids):05}"
-        same = self._mesh is not None and np.array_equal(self._mesh[0], fields.points)
-        if self._mesh is None or not (same and np.array_equal(self._mesh[1], fields.tets)):
-            self._mesh = fields.points, fields.tets
-            nodes = self._stored(f"{frame}/tets", fields.tets)
-            points = self._stored(f"{frame}/points", fields.points)
-            self._mesh_text = (
-                f'<Topology TopologyType="Tetrahedron" NumberOfElements="{len(fields.tets)}">{nodes}</Topology>'
-                f'<Geometry GeometryType="XYZ">{points}</Geometry>'
-            )
-        parts = [f'<Time Value="{fields.time:.9g}"/>', self._mesh_text]
-        for centre, arrays in (("Node", fields.nodal), ("Cell", fields.elemental)):
-            for name, values in arrays.items():
-                kind = KINDS[1 if values.ndim == 1 else values.shape[1]]
-                stored = self._stored(f"{frame}/{name}", values)
-                named = quoteattr(name)
-                parts.append(f'<Attribute Name={named} AttributeType="{kind}" Center="{centre}">{stored}</Attribute>')
-        self._grids.append(f'   <Grid Name="{frame}" GridType="Uniform">{"".join(parts)}</Grid>\n')
-        self._numbers.flush()
-        with written_whole(self._path) as part:
-            part.write_text(HEAD + "".join(self._grids) + TAIL, "utf-8")
-
-    def _stored(self, name: str, values: np.ndarray) -> str:
-        self._numbers.create_dataset(name, data=values)
-        kind = "Float" if values.dtype.kind == "f" else "Char" if values.dtype.itemsize == 1 else "Int"
-        size = " ".join(map(str, values.shape))
-        where = f"{escape(self._path.with_suffix('.h5').name)}:/{name}"
-        precision = values.dtype.itemsize
-        return (
-            f'<DataItem Dimensions="{size}" NumberType="{kind}" Precision="{precision}" Format="HDF">{where}</DataItem>'
-        )
