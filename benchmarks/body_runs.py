@@ -34,7 +34,7 @@ def measured(path: Path, options: list[str], tets: int, device: str) -> dict[str
     from warp_corot.cli.input_file import bodies_in, open_input
     from warp_corot.cli.input_mesh import find_organ
     from warp_corot.errors import InputError
-    from warp_corot.io.read.tetrahedra import load_tets
+    from warp_corot.io.read.meshes import load_tets
 
     wp.config.log_level = wp.LOG_ERROR
     line = ["simulate", str(path), "-o", "out.usd", "--tets", str(tets), "--device", device, *options]

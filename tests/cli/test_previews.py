@@ -8,8 +8,7 @@ pytest.importorskip("matplotlib")
 from pictures import CUBE, FACES, picture_of, render_preview, render_strip
 from PIL import Image, ImageChops
 
-from warp_corot.io.pictures.film import write_film
-from warp_corot.io.pictures.preview import Picture, fit_line
+from warp_corot.io.pictures.preview import Picture, fit_line, write_film
 
 RUN = ["box", "-o", "a.usd", *SHORT]  # frames 0, 1 and 2
 
@@ -164,6 +163,6 @@ def test_what_is_refused(folder, capsys, options, said):
 
 
 def test_a_film_without_its_package_is_one_line(folder, capsys, monkeypatch):
-    monkeypatch.setattr("warp_corot.io.pictures.film.find_spec", lambda name: None)
+    monkeypatch.setattr("warp_corot.io.pictures.preview.find_spec", lambda name: None)
     assert simulate(*RUN, "--preview", "a.mp4") == 2
     assert 'pip install "warp-corot[film]"; a .gif needs no package' in capsys.readouterr().err

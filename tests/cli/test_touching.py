@@ -14,7 +14,7 @@ from pxr import Usd, UsdGeom, UsdValidation
 from stages import drawn
 
 import warp_corot as wc
-from warp_corot.cli.tool_paths import read_tool_path
+from warp_corot.cli.contact import read_tool_path
 from warp_corot.errors import InputError
 
 BLOCK = wc.TetForest.box((2, 2, 1), 0.02, 3)

@@ -8,7 +8,7 @@ from pxr import Usd, UsdGeom
 from stages import SURFACE, TETS, assert_whole, edges_meet_in_pairs, faults, prims
 
 import warp_corot as wc
-from warp_corot.io.read.tetrahedra import load_tets
+from warp_corot.io.read.meshes import load_tets
 from warp_corot.io.write.animate import Recording, record
 
 REMESH = wc.OnlineRemesh(refine_above=1.02, simplify_below=1.005, max_level=8)

@@ -10,7 +10,7 @@ from stages import SURFACE, TETS, assert_whole, edges_meet_in_pairs, faults
 
 import warp_corot as wc
 from warp_corot.io.pictures.colors import VertexAverage, color_index
-from warp_corot.io.read.tetrahedra import load_tets
+from warp_corot.io.read.meshes import load_tets
 from warp_corot.io.write.skins import BoundSkins
 from warp_corot.io.write.usd.writer import UsdWriter
 

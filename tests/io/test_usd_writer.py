@@ -17,7 +17,7 @@ from written import Cube, frames_of
 
 from warp_corot.errors import InputError
 from warp_corot.io.pictures.colors import color_index, stress_colors
-from warp_corot.io.read.tetrahedra import load_tets
+from warp_corot.io.read.meshes import load_tets
 from warp_corot.io.write.usd import pieces as usd_pieces
 from warp_corot.io.write.usd.writer import SURFACE, TETS, UsdWriter
 from warp_corot.mesh.surfaces.boundary import signed_volumes

@@ -1,7 +1,5 @@
 """Hexahedra, wedges and pyramids as tetrahedra: they fit one another and fill the cells."""
 
-import itertools
-
 import numpy as np
 import pytest
 from foreign_meshes import VOLUME, grid

@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 
 import warp_corot as wc
-from warp_corot.io.read.tetrahedra import load_tets
+from warp_corot.io.read.meshes import load_tets
 
 DENSITY = 1000.0
 GRAVITY = 9.81

@@ -20,14 +20,17 @@ from warp_corot.inputs.likely import meant
 from warp_corot.inputs.stopwatch import WATCH
 
 from .options import COMMANDS, EXIT_CODES, StrictParser, add_command
-from .ranks import end_others, fall_silent, let_others_speak, speaks
 from .terminal import (
     as_option,
     complain,
+    end_others,
+    fall_silent,
     interrupt_status,
     leaving_at_once,
+    let_others_speak,
     open_streams,
     silence,
+    speaks,
     terminable,
 )
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from warp_corot.body.soft_body import SoftBody
+from warp_corot.domain.units import pressure
 from warp_corot.elasticity import MODELS, Corotated, Model
 from warp_corot.errors import InputError
 from warp_corot.holding.choice import supports_of
@@ -22,12 +23,7 @@ from .input_file import InputFile, bodies_in, open_input, refuse_options, with_u
 from .input_mesh import InputMesh, covers_all, find_organ, find_subject, label_material, region_material
 from .options import is_static, stands_free
 from .patches import BodyPatches, Load, loads_of, move_patches, probes_body, ramp_of, up_of
-from .summary import pressure
 from .terminal import as_options
-
-if TYPE_CHECKING:
-    from .input_mesh import InputMesh
-    from .patches import BodyPatches
 
 #: A density below this [kg/m^3] is most likely meant in g/cm^3.
 LIGHT = 5.0

@@ -17,8 +17,7 @@ from warp_corot.body.places import named_nodes
 from warp_corot.domain.units import in_units
 from warp_corot.errors import InputError
 from warp_corot.inputs.stopwatch import WATCH
-from warp_corot.io.read.surfaces import LoadedSurface
-from warp_corot.io.read.tetrahedra import LoadedMesh
+from warp_corot.io.read.meshes import LoadedMesh, LoadedSurface
 from warp_corot.materials.isotropic import Isotropic
 from warp_corot.mesh import TetForest, TetMesh
 from warp_corot.mesh.lattice import checked_level
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
     from warp_corot.domain import Domain
     from warp_corot.domain.fidelity import Fidelity
     from warp_corot.io.read.assets import Asset
-    from warp_corot.io.read.regions import Regions
+    from warp_corot.io.read.meshes import Regions
     from warp_corot.io.read.volumes import LoadedVolume
     from warp_corot.io.write.skins import OwnSurface
     from warp_corot.mesh import SurfaceMesh

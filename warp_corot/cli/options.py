@@ -148,13 +148,6 @@ def ground_height(text: str) -> float | str:
         raise argparse.ArgumentTypeError(f"{error}; it must be a height or {AUTO} (INPUT stands before it)") from None
 
 
-def tool_shape(text: str) -> Any:
-    """A `ToolShape` from the text of ``--tool``."""
-    from .tool_paths import tool_shape as read
-
-    return read(text)
-
-
 #: Types of options, with the functions that read them.
 Number = Annotated[float, number]
 WholeNumber = Annotated[int, whole_number]
@@ -168,7 +161,6 @@ UnitOfLength = Annotated[str, unit_of_length]
 RotationLevel = Annotated[int | float | str, rotation_level]
 ValueRange = Annotated[Interval, value_range]
 GroundHeight = Annotated[float | str, ground_height]
-Tool = Annotated[Any, tool_shape]
 
 
 # --- declared options ------------------------------------------------------------------------------------------------
@@ -278,8 +270,8 @@ class OutputOptions:
 
     Attributes:
         output (OUT.usd): animation to write (.usd, .usdc or .usda)
-        also (OUT.pvd): also write for ParaView, with displacement, velocity, strain and stress: .pvd with all frames, or
-            .vtu with the last; can be given several times
+        also (OUT.pvd): also write for ParaView, with displacement, velocity, strain and stress: .pvd with all frames,
+            or .vtu with the last; can be given several times
         static: find where the body is at rest in place of its motion: one frame, or with --pull, --twist or --press a
             state of rest for each frame
     """
@@ -453,7 +445,7 @@ class ContactOptions:
     ground: GroundHeight | None = field(default=None, metadata={"nargs": "?", "const": AUTO})
     no_ground: bool = False
     drop: Metres | None = None
-    tool: list[Tool] | None = None
+    tool: list[str] | None = None
     tool_path: list[Path] | None = None
     blade: list[Path] | None = None
     blade_length: Metres | None = None

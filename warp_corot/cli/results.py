@@ -23,7 +23,7 @@ from warp_corot.contact.tool import Obstacle, Tool
 from warp_corot.errors import InputError
 from warp_corot.inputs.loading import begin_loading
 from warp_corot.io.files.whole import check_output, writing
-from warp_corot.io.pictures.film import FILMS, check_film, frames_shown, write_film
+from warp_corot.io.pictures.preview import FILMS, check_film, frames_shown, write_film
 from warp_corot.simulation.progress import bar_of
 
 from .options import VIEWS, is_static
@@ -192,7 +192,7 @@ class DrawnBodies:
     def frame(self, sim: Simulation) -> Picture:
         """The current state; values are NaN on obstacles."""
         from warp_corot.io.pictures.preview import Picture
-        from warp_corot.io.write.solids import ground_corners, poses_of, shape_of, solid_of
+        from warp_corot.io.write.skins import ground_corners, poses_of, shape_of, solid_of
 
         u = np.concatenate([soft.displacements.numpy() for soft in self._soft])
         held = np.concatenate([soft.constrained.astype(float) for soft in self._soft])

@@ -36,13 +36,11 @@ from warp_corot.simulation.static import solve_static
 from warp_corot.solvers import INTEGRATORS, BackwardEuler, Integrator, QuasiStatic, SymplecticEuler
 
 from .bodies import REMESH_ARGUMENTS, RunBody, asked_bodies, find_body, find_patches, gravity_of, make_body
-from .contact import RunContact, place_ground, say_overlaps, say_reach, touched_by
+from .contact import RunContact, make_blade, place_ground, say_overlaps, say_reach, touched_by
 from .options import IMPLICIT_DT, integrator_name, is_static
 from .patches import press_patches, ramp_of
-from .ranks import are_several
 from .results import Probe
-from .terminal import as_options, complain, tell_compiling, waiting
-from .tool_paths import make_blade
+from .terminal import are_several, as_options, complain, tell_compiling, waiting
 
 #: The command warns that a run will take long if a frame has more steps than this.
 MANY_STEPS = 1e5

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from warp_corot.domain.units import length
+from warp_corot.domain.units import length, pressure
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.device import checked_device
 from warp_corot.inputs.stopwatch import WATCH
 
-from .summary import aligned, milliseconds, pressure, speed, unfinished, wall_time
+from .simulate import aligned, milliseconds, speed, unfinished, wall_time
 from .terminal import complain, early_end, tell_compiling
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""What a command tells its terminal: exit statuses and the line with the reason, signals, waiting, compiling."""
+"""What a command tells its terminal: exit statuses and the reason, signals, waiting, compiling; on several ranks."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import re
 import signal
 import sys
 import threading
+import time
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
@@ -17,6 +18,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any, TextIO
 
 from warp_corot.errors import InputError, UnstableError
+from warp_corot.inputs.processes import process_count, process_number
 from warp_corot.inputs.stopwatch import KERNELS, WATCH
 
 if TYPE_CHECKING:
@@ -270,3 +272,38 @@ def _heard(event: str, args: tuple[Any, ...]) -> None:
         device, _device = _device, ""
         if device:
             complain(f"compiling kernels for {device}, once: this takes some seconds ...", kind="")
+
+
+#: Time for rank 0 to reach the place where another rank failed, and to report it [s].
+REPORTED_WITHIN = 5.0
+
+
+def are_several() -> bool:
+    """Whether ``mpirun`` has started several processes."""
+    return process_count() > 1
+
+
+def speaks() -> bool:
+    """Whether this process prints: the only one, or the first of several."""
+    return process_number() == 0
+
+
+def fall_silent() -> None:
+    """Print nothing from here on: rank 0 prints for all ranks."""
+    null = open(os.devnull, "w")  # noqa: SIM115 (open as long as the process lives)
+    sys.stdout = sys.stderr = null
+
+
+def end_others(status: int) -> None:
+    """On rank 0 of several, after a report: end this process with a status at once, and so all others. MPI's own end
+    would wait for them, and they wait for this report."""
+    if are_several():
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(OSError, ValueError):
+                stream.flush()
+        os._exit(status)
+
+
+def let_others_speak() -> None:
+    """Wait before a failed rank ends, because ``mpirun`` then ends all others: rank 0 first reports the error."""
+    time.sleep(REPORTED_WITHIN)

@@ -15,7 +15,7 @@ import warp as wp
 from warp_corot.errors import InputError
 from warp_corot.inputs.cpu_threads import launch_side_by_side
 from warp_corot.inputs.loading import SURFACES, load
-from warp_corot.io.read.surfaces import UP_AXES, LoadedSurface, load_surface
+from warp_corot.io.read.meshes import UP_AXES, LoadedSurface, load_surface
 from warp_corot.kernels.meshing import domain as kernels
 from warp_corot.kernels.meshing import windings
 

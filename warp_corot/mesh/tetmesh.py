@@ -145,7 +145,7 @@ class TetMesh(LabelledMesh):
             InputError: The file does not exist, its format is unknown, it has no volume cells, or its mesh cannot be
                 simulated.
         """
-        from warp_corot.io.read.tetrahedra import load_tets
+        from warp_corot.io.read.meshes import load_tets
 
         loaded = load_tets(path, scale=scale, unit=unit, regions=regions)
         found = loaded.regions

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from warp_corot.errors import InputError, UnstableError
-from warp_corot.io.pictures.film import write_film
+from warp_corot.io.pictures.preview import write_film
 from warp_corot.io.write.animate import frame_count, record
 from warp_corot.simulation.simulation import Simulation
 

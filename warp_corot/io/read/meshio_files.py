@@ -84,14 +84,14 @@ def _mesh(mesh: Any) -> FileMesh:
 
 
 def _cell_sets(mesh: Any) -> tuple[dict[int, str], list[NDArray[np.int64]]]:
-    """Names of sets of cells by number, and the number of each cell's set by block: of the smallest that contains it."""
+    """Names of sets of cells by number, and the number of each cell's smallest set, by block."""
     sets: dict[str, list[tuple[int, NDArray[np.int64]]]] = {}
     for name, parts in _own_sets(mesh):
         sets.setdefault(name, []).extend(enumerate(parts))
     numbers = [np.zeros(len(block.data), np.int64) for block in mesh.cells]
     numbered = list(enumerate(sets.items(), start=1))
-    for number, (_, parts) in sorted(numbered, key=lambda each: -sum(len(part) for _, part in each[1][1])):
-        for place, part in parts:
+    for number, (_, own) in sorted(numbered, key=lambda each: -sum(len(part) for _, part in each[1][1])):
+        for place, part in own:
             numbers[place][part.astype(np.int64)] = number
     return {number: name for number, (name, _) in numbered}, numbers
 
