@@ -16,7 +16,7 @@ from stages import frames
 from warp_corot.cli.terminal import interrupt_status, terminable
 
 OPTIONS = ["young", "poisson", "density", "model", "rotation-level", "fix", "scale", "gravity", "duration", "fps", "dt"]
-OPTIONS += ["damping", "device", "preview", "unit", "tets", "cell-size", "max-level", "surface-error", "labels"]
+OPTIONS += ["damping", "device", "preview", "unit", "tets", "min-layers", "labels"]
 OPTIONS += ["smoothing", "draw-tets", "draw-labels"]
 
 

@@ -17,7 +17,6 @@ from stages import SURFACE, TETS, drawn, prims
 import warp_corot as wc
 import warp_corot.cli.run_setup as command
 from warp_corot.cli import bodies
-from warp_corot.cli.input_mesh import DETAIL
 from warp_corot.domain import Domain
 
 
@@ -99,19 +98,15 @@ def test_the_level_of_detail_is_kept(folder, capsys):
 
 def test_options_of_the_mesh_reach_it(folder, capsys):
     write_surface(folder / "organ.glb", False)
-    assert simulate("organ.glb", "-o", "a.usd", "--cell-size", 0.05, "--max-level", 4, *SHORT) == 0
+    assert simulate("organ.glb", "-o", "a.usd", "--level", 1, *SHORT) == 0
     said = capsys.readouterr().out
-    assert "from 2 x 2 x 2 cubes of 0.05 m" in said
-    assert "level 4, type 1" in said
-    assert "level 5" not in said
-    marched = ["--skin", "marched", *SHORT]
-    assert simulate("organ.glb", "-o", "a.usd", "--cell-size", 0.05, "--surface-error", 1e-3, *marched) == 0
-    count = tetrahedra_in(capsys.readouterr().out)
+    assert "from 10 x 13 x 16 cubes" in said
+    assert "level 1, type" in said
+    assert "level 2" not in said
     domain = Domain.from_surface("organ.glb")
-    assert count == len(wc.TetForest.from_domain(domain, 0.05, surface_error=1e-3, detail=DETAIL).tets)
-    assert np.abs(domain.phi(drawn(Usd.Stage.Open("a.usd")).vertices)).max() < 1e-3
-    assert simulate("organ.glb", "-o", "a.usd", "--surface-error", 1e-5, "--tets", 2000, *SHORT) == 0
-    assert 1000 < tetrahedra_in(capsys.readouterr().out) <= 2000
+    assert simulate("organ.glb", "-o", "a.usd", "--tets", 2000, "--min-layers", 3, *SHORT) == 0
+    count = tetrahedra_in(capsys.readouterr().out)
+    assert count == len(wc.TetForest.from_domain(domain, target_elements=2000, min_layers=3).tets)
 
 
 @pytest.mark.parametrize(

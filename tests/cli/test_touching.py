@@ -66,7 +66,7 @@ def test_a_dropped_body_falls_by_the_given_height(block, folder):
 
 
 def press(folder: Path, *more: object) -> int:
-    write_path(folder, "time [ms],x [mm],y,z [mm]\n0,20,0.02,30\n100,20,2cm,28\n200,20,2cm,28\n")
+    write_path(folder, "time [ms],x [mm],y,z [mm]\n0,20,0.02,30\n100,20,0.02,28\n200,20,0.02,28\n")
     tool = ["--tool", "sphere:r=1cm", "--tool-path", "path.csv", "--fix", "z == zmin", "--gravity", 0, 0, 0]
     return simulate("block.vtk", *tool, "-o", "a.usd", "--duration", 0.2, "--fps", 20, *SOFT, *more)
 
@@ -198,9 +198,9 @@ def test_bodies_of_a_run_file_touch_if_asked(block, folder):
     [
         ("0,0,0,0\n0.1,0,nan,0\n", "line 2: y is 'nan'"),
         ("0,0,0,0\n0.1,0,0,x\n", "line 2: z is 'x'"),
-        ("1,0,0,0\n0.1,0,0,0\n", "times must increase"),
-        ("0,0,0,0\n0,0,0,1\n", "times must increase"),
-        ("0,0,0\n1,0,0\n", "3 columns"),
+        ("1,0,0,0\n0.1,0,0,0\n", "increasing numbers"),
+        ("0,0,0,0\n0,0,0,1\n", "increasing numbers"),
+        ("0,0,0\n1,0,0\n", "no column 'z'"),
         ("time,x,y\n0,0,0\n", "no column 'z'"),
         ("time,x,y,z,qx\n0,0,0,0,0\n", "no column 'qy'"),
         ("time,x,y,z,u\n0,0,0,0,0\n", "column 'u'"),

@@ -159,7 +159,7 @@ def _warn(message: str, said: set[str]) -> None:
     """Print a warning, once."""
     if message not in said:
         said.add(message)
-        complain(message, kind="warning")
+        complain(as_option(message), kind="warning")
 
 
 def configure_warp() -> None:

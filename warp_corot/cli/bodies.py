@@ -23,7 +23,6 @@ from .input_file import InputFile, bodies_in, open_input, refuse_options, with_u
 from .input_mesh import InputMesh, covers_all, find_organ, find_subject, label_material, region_material
 from .options import is_static, stands_free
 from .patches import BodyPatches, Load, loads_of, move_patches, probes_body, ramp_of, up_of
-from .terminal import as_options
 
 #: A density below this [kg/m^3] is most likely meant in g/cm^3.
 LIGHT = 5.0
@@ -274,15 +273,6 @@ def held_by_default(
 
 # --- ``--remesh`` ----------------------------------------------------------------------------------------------------
 
-#: Names of Python's arguments on the command line.
-REMESH_ARGUMENTS = {
-    "refine_above": "--refine-above",
-    "simplify_below": "--simplify-below",
-    "min_level": "--remesh-levels MIN",
-    "max_level": "--remesh-levels MAX",
-    "every": "--remesh-every",
-    "capacity": "--capacity",
-}
 #: Options that need ``--remesh``.
 REMESH_OPTIONS = ("refine_above", "simplify_below", "remesh_levels", "remesh_every", "capacity")
 
@@ -310,5 +300,4 @@ def remesh_of(args: argparse.Namespace, kind: str) -> OnlineRemesh | None:
     asked = {name: getattr(args, name) for name in ("refine_above", "simplify_below", "capacity")}
     asked |= {"every": args.remesh_every}
     asked |= dict(zip(("min_level", "max_level"), args.remesh_levels or (None, None), strict=True))
-    with as_options(REMESH_ARGUMENTS):
-        return OnlineRemesh(**{name: value for name, value in asked.items() if value is not None})
+    return OnlineRemesh(**{name: value for name, value in asked.items() if value is not None})

@@ -99,10 +99,10 @@ def read_tool_path(path: Path) -> tuple[Floats, Floats, Floats | None]:
     """Times [s], [K], positions [m], [K, 3], and quaternions (x, y, z, w), [K, 4], or None without.
 
     The first row names the columns, with optional units ("x [mm]"); without names there are four or eight columns in
-    the order of `COLUMNS`. A value may also have its own unit.
+    the order of `COLUMNS`.
 
     Raises:
-        InputError: No such file, other columns, a value that is not a finite number, or times that do not increase.
+        InputError: No such file, other columns, or a value that is not a finite number.
     """
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
@@ -113,21 +113,25 @@ def read_tool_path(path: Path) -> tuple[Floats, Floats, Floats | None]:
         raise InputError(f"{path}: cannot be read as CSV ({error})") from None
     if not rows:
         raise InputError(f"{path}: is empty; it must have rows of {KNOWN}")
-    first = rows[0][1]
-    units = dict.fromkeys(list(COLUMNS)[: len(first)], 1.0)
-    if first[0].strip()[:1].isalpha():
-        units, rows = _named_columns(first, path), rows[1:]
-    elif len(first) not in (len(POSITION), len(COLUMNS)):
-        raise InputError(f"{path}: has {len(first)} columns without names; they must be {KNOWN}")
-    if not rows:
-        raise InputError(f"{path}: has names of columns and no rows; it must have one at least")
-    values = np.array([_values(row, units, f"{path}: line {number}") for number, row in rows])
+    units = dict.fromkeys(list(COLUMNS)[: len(rows[0][1])], 1.0)
+    if rows[0][1][0].strip()[:1].isalpha():
+        units = _named_columns(rows.pop(0)[1], path)
+    missing = [name for name in (COLUMNS if units.keys() - POSITION else POSITION) if name not in units]
+    if missing or not rows:
+        lacks = f"column {missing[0]!r}" if missing else "rows"
+        raise InputError(f"{path}: has no {lacks}; it must have rows of {KNOWN}")
+    values = np.empty((len(rows), len(units)))
+    for place, (number, row) in enumerate(rows):
+        if len(row) != len(units):
+            raise InputError(f"{path}: line {number} has {len(row)} values; it must have {len(units)}")
+        for column, (text, (name, unit)) in enumerate(zip(row, units.items(), strict=True)):
+            try:
+                values[place, column] = unit * float(text)
+            except ValueError:
+                values[place, column] = math.nan
+            if not math.isfinite(values[place, column]):
+                raise InputError(f"{path}: line {number}: {name} is {text.strip()!r}; it must be a finite number")
     of = dict(zip(units, values.T, strict=True))
-    late = np.flatnonzero(np.diff(of["time"]) <= 0.0)
-    if len(late):
-        before, after = of["time"][late[0] : late[0] + 2]
-        line = rows[late[0] + 1][0]
-        raise InputError(f"{path}: line {line}: time is {after:g} s after {before:g} s; times must increase")
     turns = np.stack([of[name] for name in ("qx", "qy", "qz", "qw")], axis=1) if "qw" in of else None
     return of["time"], np.stack([of[axis] for axis in "xyz"], axis=1), turns
 
@@ -136,41 +140,18 @@ def _named_columns(row: list[str], path: Path) -> dict[str, float]:
     """The columns that a row names, each with its unit in SI units.
 
     Raises:
-        InputError: Other names or units, or one is missing.
+        InputError: Other names or units.
     """
     found: dict[str, float] = {}
     for word in row:
         match = _HEADER.fullmatch(word)
-        name = match[1].lower() if match else word
-        name = "time" if name == "t" else name
+        name = {"t": "time"}.get(match[1].lower(), match[1].lower()) if match else word
         if not match or name not in COLUMNS or name in found:
             raise InputError(f"{path}: has a column {word.strip()!r}; its columns must be {KNOWN}")
         try:
             found[name] = in_units(f"1 {match[2]}", COLUMNS[name]) if match[2] and name in POSITION else 1.0
         except InputError as error:
             raise InputError(f"{path}: column {word.strip()!r}: {error}") from None
-    needed = COLUMNS if found.keys() - POSITION else POSITION
-    missing = [name for name in needed if name not in found]
-    if missing:
-        raise InputError(f"{path}: has no column {missing[0]!r}; its columns must be {KNOWN}")
-    return found
-
-
-def _values(row: list[str], units: dict[str, float], where: str) -> list[float]:
-    """The values of a row in SI units."""
-    if len(row) != len(units):
-        raise InputError(f"{where} has {len(row)} values; it must have {len(units)}")
-    found = []
-    for text, (name, unit) in zip(row, units.items(), strict=True):
-        try:
-            found.append(unit * float(text))
-        except ValueError:  # it has a unit of its own
-            try:
-                found.append(in_units(text, COLUMNS[name]))
-            except InputError:
-                found.append(math.nan)
-        if not math.isfinite(found[-1]):
-            raise InputError(f"{where}: {name} is {text.strip()!r}; it must be a finite number")
     return found
 
 

@@ -199,7 +199,7 @@ RULES = (
         "scans without --labels and --materials",
     ),
     Rule(
-        ("cell_size", "max_level", "surface_error", "tets", "min_layers", "draw_tets"),
+        ("tets", "min_layers", "draw_tets"),
         lambda _, opened: opened.kind in ("surface", "scan"),
         "surfaces and scans",
     ),
@@ -234,8 +234,8 @@ def refuse_options(args: argparse.Namespace, opened: InputFile) -> None:
                 option = f"--{name.replace('_', '-')}"
                 instead = "; use --scale" if name == "unit" else ""
                 raise InputError(f"{option} is for {rule.purpose}, and {args.input} is not one{instead}")
-    if opened.kind != "box" and args.level is not None and (args.tets is not None or args.max_level is not None):
-        raise InputError("--level is given, with which neither --tets nor --max-level has an effect")
+    if opened.kind != "box" and args.level is not None and args.tets is not None:
+        raise InputError("--level is given, with which --tets has no effect")
     if args.labels is not None and args.young is not None:
         raise InputError("--young is given, but --labels gives each label its own")
     if args.draw_labels and args.labels is None and args.materials is None:
@@ -278,11 +278,10 @@ def bodies_in(opened: InputFile, args: argparse.Namespace) -> list[tuple[InputFi
         shares /= shares.sum()
     names = ", ".join(part.name for part in parts[:8]) + (", ..." if len(parts) > 8 else "")
     opened.notes.append(f"{len(parts)} separate bodies: {names} (--join makes them one)")
-    fineness = (args.level, args.max_level, args.surface_error, args.cell_size)
     found = []
     for place, part in enumerate(parts):
         own = argparse.Namespace(**vars(args))
-        if len(shares) and (args.tets is not None or all(given is None for given in fineness)):
+        if len(shares) and args.level is None:
             own.tets = max(FEWEST_TETS, int((args.tets or TETS) * shares[place]))
         found.append((replace(opened, loaded=part, notes=opened.notes if place == 0 else []), own))
     return found

@@ -23,8 +23,7 @@ from warp_corot.mesh import TetForest, TetMesh
 from warp_corot.mesh.lattice import checked_level
 
 from .input_file import InputFile, merged_nodes, offset_of, placed
-from .options import BOX_LEVEL, CUBES_OF_LEVEL, LABEL, MAX_LEVEL_FOR_ERROR, STIFFNESS_PER_WEIGHT, TETS
-from .terminal import as_options
+from .options import BOX_LEVEL, CUBES_OF_LEVEL, LABEL, STIFFNESS_PER_WEIGHT, TETS
 
 if TYPE_CHECKING:
     from warp_corot.discretization.elements import Mesh
@@ -196,18 +195,8 @@ def box_subject(mesh: TetForest) -> InputMesh:
 
 # --- surfaces and scans, which have no tetrahedra --------------------------------------------------------------------
 
-#: With a surface error or a level instead of a number of tetrahedra: the default number for each root cube in a cube of
-#: the body's length, which gives the size of root cubes.
-TETS_PER_CUBE = 30
-#: With a surface error: the number of further levels for details between nodes.
-DETAIL = 6
 #: Root cubes extend beyond the body by this fraction of its length.
 MARGIN = 1.0e-3
-#: Names of Python's arguments on the command line.
-ARGUMENTS = {
-    name: f"--{name.replace('_', '-')}"
-    for name in ("unit", "cell_size", "max_level", "surface_error", "min_layers", "smoothing")
-} | {"target_elements": "--tets"}
 #: A scan with more distinct values, or with negative ones, holds intensities, not labels.
 MOST_LABELS = 256
 #: Number of voxels that are checked for this.
@@ -224,16 +213,15 @@ def find_organ(opened: InputFile, args: argparse.Namespace) -> InputMesh:
     Raises:
         InputError: It encloses no body, or an option is out of its range.
     """
-    with as_options(ARGUMENTS):
-        started = WATCH.clock()
-        entries: list[LabelMaterial] = []
-        domain = domain_of(opened, args, entries)
-        meshing = WATCH.clock()
-        mesh = _mesh(args, domain)
-        surface = mesh.surface()
-        done = WATCH.clock()
-        measured = _measured(args, mesh, domain, surface)
-        skin = _own_surface(opened, args, domain)
+    started = WATCH.clock()
+    entries: list[LabelMaterial] = []
+    domain = domain_of(opened, args, entries)
+    meshing = WATCH.clock()
+    mesh = _mesh(args, domain)
+    surface = mesh.surface()
+    done = WATCH.clock()
+    measured = _measured(mesh, domain, surface)
+    skin = _own_surface(opened, args, domain)
     asset, loaded = opened.asset, opened.loaded
     assert loaded is not None
     subject = InputMesh(
@@ -260,15 +248,6 @@ def domain_of(opened: InputFile, args: argparse.Namespace, entries: list[LabelMa
     if opened.kind == "scan":
         return _scan(opened, args, entries)
     return Domain.from_surface(placed(opened, args), unit=opened.unit, device=args.device)
-
-
-def fineness_of(args: argparse.Namespace, domain: Domain) -> dict[str, Any]:
-    """The arguments of ``from_domain`` for a level."""
-    size = args.cell_size
-    if size is None:
-        size = float(np.ptp(domain.bounds, axis=0).max()) * (1.0 + MARGIN) / CUBES_OF_LEVEL
-    checked_level(args.level, "--level")
-    return {"cell_size": size, "max_level": args.level, "surface_error": args.surface_error, "device": args.device}
 
 
 def _scan(opened: InputFile, args: argparse.Namespace, entries: list[LabelMaterial]) -> Domain:
@@ -322,34 +301,16 @@ def _see_labels(volume: LoadedVolume) -> None:
 
 def _mesh(args: argparse.Namespace, domain: Domain) -> TetForest:
     if args.level is not None:
-        return TetForest.from_domain(domain, **fineness_of(args, domain))
-    count = args.tets
-    if count is None and args.max_level is None and args.surface_error is None:
-        count = TETS
-    size, level, detail = args.cell_size, args.max_level, 0
-    if count is None:
-        detail = DETAIL
-        if size is None:
-            cubes = max(1, round((TETS / TETS_PER_CUBE) ** (1.0 / 3.0)))
-            size = float(np.ptp(domain.bounds, axis=0).max()) * (1.0 + MARGIN) / cubes
-        if level is None:
-            level = MAX_LEVEL_FOR_ERROR
+        checked_level(args.level, "--level")
+        size = float(np.ptp(domain.bounds, axis=0).max()) * (1.0 + MARGIN) / CUBES_OF_LEVEL
+        return TetForest.from_domain(domain, size, max_level=args.level, device=args.device)
+    count = TETS if args.tets is None else args.tets
     layers = {} if args.min_layers is None else {"min_layers": args.min_layers}
     try:
-        return TetForest.from_domain(
-            domain,
-            size,
-            max_level=level,
-            surface_error=args.surface_error,
-            target_elements=count,
-            detail=detail,
-            device=args.device,
-            **layers,
-        )
+        return TetForest.from_domain(domain, target_elements=count, device=args.device, **layers)
     except InputError as error:
-        unsaid = count is not None and count >= 1 and args.surface_error is None and "target_elements" not in str(error)
-        with_tets = f"with --tets {count}, " if unsaid else ""
-        raise InputError(f"{with_tets}{error}") from None
+        said = count < 1 or "target_elements" in str(error)
+        raise InputError(f"{'' if said else f'with --tets {count}, '}{error}") from None
 
 
 def _own_surface(opened: InputFile, args: argparse.Namespace, domain: Domain) -> OwnSurface | None:
@@ -364,10 +325,9 @@ def _own_surface(opened: InputFile, args: argparse.Namespace, domain: Domain) ->
     return found
 
 
-def _measured(args: argparse.Namespace, mesh: TetForest, domain: Domain, surface: SurfaceMesh) -> Fidelity:
+def _measured(mesh: TetForest, domain: Domain, surface: SurfaceMesh) -> Fidelity:
     """Measure how well the mesh approximates the body, and warn of deviations."""
     from warp_corot.domain.fidelity import fidelity
-    from warp_corot.domain.units import length
 
     found = fidelity(mesh, domain, surface=surface)
     more, through = 2 * len(mesh.tets), ""
@@ -377,18 +337,6 @@ def _measured(args: argparse.Namespace, mesh: TetForest, domain: Domain, surface
     for doubt in found.doubts():
         said = doubt.replace("more tetrahedra", f"more tetrahedra (--tets {more}{through})")
         warnings.warn(said.replace("tetrahedra in all", "tetrahedra in all (--tets)"), stacklevel=2)
-    off = max(found.distance_95)
-    if args.surface_error is not None and off > args.surface_error:
-        helps = (
-            "a larger --tets"
-            if args.tets is not None
-            else f"--{'max-' * (args.level is None)}level {int(mesh.levels.max()) + 3}"
-        )
-        warnings.warn(
-            f"--surface-error is {length(args.surface_error)}, and 95 % of the surface are within {length(off)}; "
-            f"{helps} would bring it nearer",
-            stacklevel=2,
-        )
     return found
 
 

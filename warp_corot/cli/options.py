@@ -32,8 +32,6 @@ BOX_LEVEL = 6
 STIFFNESS_PER_WEIGHT = 20.0
 #: With a level: the number of root cubes along the body's longest side.
 CUBES_OF_LEVEL = 16
-#: Maximum number of bisections of cubes with a surface error.
-MAX_LEVEL_FOR_ERROR = 12
 #: The step of implicit integrators if none is given [s].
 IMPLICIT_DT = 0.01
 #: The height of the ground that lies just below the bodies.
@@ -292,7 +290,6 @@ class BodyOptions:
             and prims, blocks and instances of tetrahedra, are separate bodies)
         level (L): number of bisections of the cubes of the box; three halve the edge (default: {BOX_LEVEL}). For
             surfaces and scans, in place of --tets: of the cubes at the surface, {CUBES_OF_LEVEL} along the longest side
-            if --cell-size is not given
         scale (S): multiply the coordinates by this, after --unit
         offset (DX DY DZ): move the body by this much before the run starts [m], after --scale; this places the bodies
             of a run file
@@ -345,14 +342,8 @@ class OrganOptions:
     """A body from a surface or a scan.
 
     Attributes:
-        tets (N): largest number of tetrahedra; the mesh has nearly as many (default: {TETS}, unless --max-level or
-            --surface-error is given)
+        tets (N): largest number of tetrahedra; the mesh has nearly as many (default: {TETS})
         min_layers (K): tetrahedra through the thickness of thin parts, where --tets allows (default: 2)
-        cell_size (M): edge of the coarsest cubes [m] (default: chosen to suit --tets)
-        max_level (L): maximum number of bisections of a cube; three halve the edge (default: chosen to suit --tets;
-            {MAX_LEVEL_FOR_ERROR} with --surface-error)
-        surface_error (M): largest distance of the mesh's surface from the input's [m] (default: as small as the other
-            options allow)
         labels (LIST): for a scan: the labels that make up the body, and their materials, for example
             liver=3kPa:0.45,vessel@4=30kPa:0.45 (default: all labels, one material)
         smoothing (M): smooth away the steps of voxels, over this length [m]
@@ -368,9 +359,6 @@ class OrganOptions:
 
     tets: WholeNumber | None = None
     min_layers: Number | None = None
-    cell_size: Metres | None = None
-    max_level: WholeNumber | None = None
-    surface_error: Metres | None = None
     labels: str | None = None
     smoothing: Metres | None = None
     threshold: ValueRange | None = None

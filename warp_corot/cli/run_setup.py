@@ -35,12 +35,12 @@ from warp_corot.simulation.simulation import Simulation
 from warp_corot.simulation.static import solve_static
 from warp_corot.solvers import INTEGRATORS, BackwardEuler, Integrator, QuasiStatic, SymplecticEuler
 
-from .bodies import REMESH_ARGUMENTS, RunBody, asked_bodies, find_body, find_patches, gravity_of, make_body
+from .bodies import RunBody, asked_bodies, find_body, find_patches, gravity_of, make_body
 from .contact import RunContact, make_blade, place_ground, say_overlaps, say_reach, touched_by
 from .options import IMPLICIT_DT, integrator_name, is_static
 from .patches import press_patches, ramp_of
 from .results import Probe
-from .terminal import are_several, as_options, complain, tell_compiling, waiting
+from .terminal import are_several, complain, tell_compiling, waiting
 
 #: The command warns that a run will take long if a frame has more steps than this.
 MANY_STEPS = 1e5
@@ -184,25 +184,19 @@ def make_simulation(args: argparse.Namespace, bodies: Sequence[RunBody], touched
         steps = steps_per_frame(args.fps, args.dt or tried)  # refuses an excessive number
         integrator = SymplecticEuler(None if args.dt is None else 1.0 / (args.fps * steps), damping, viscosity)
     cuts = blades_of(args, bodies)
-    with as_options(REMESH_ARGUMENTS):
-        made: Simulation = (_on_ranks() if are_several() else Simulation)(
-            bodies=[body.soft for body in bodies],
-            model=[body.model for body in bodies],
-            integrator=integrator,
-            gravity=gravity_of(args, first),
-            remesh=[body.remesh for body in bodies] if any(body.remesh for body in bodies) else None,
-            obstacles=list(touched.obstacles.values()),
-            contact=touched.contact,
-            cuts=cuts or None,
-        )
-        return made
-
-
-def _on_ranks() -> type[Simulation]:
-    """The simulation that all ranks step."""
-    from warp_corot.distributed import Simulation as OnRanks
-
-    return OnRanks
+    kind = Simulation
+    if are_several():
+        from warp_corot.distributed import Simulation as kind
+    return kind(
+        bodies=[body.soft for body in bodies],
+        model=[body.model for body in bodies],
+        integrator=integrator,
+        gravity=gravity_of(args, first),
+        remesh=[body.remesh for body in bodies] if any(body.remesh for body in bodies) else None,
+        obstacles=list(touched.obstacles.values()),
+        contact=touched.contact,
+        cuts=cuts or None,
+    )
 
 
 def blades_of(args: argparse.Namespace, bodies: Sequence[RunBody]) -> list[Blade]:
@@ -230,8 +224,7 @@ def _tried_step(one: RunBody, damping: float, viscosity: float) -> float:
         tried, remesh = SoftBody(body.mesh, body.material, device=body.device, threads=1), replace(remesh, every=1)
         tried.fix(body.constrained)
     integrator = SymplecticEuler(damping=damping, viscosity=viscosity)
-    with as_options(REMESH_ARGUMENTS):
-        trial = Simulation(tried, model=model, integrator=integrator, gravity=(0, 0, 0), remesh=remesh)
+    trial = Simulation(tried, model=model, integrator=integrator, gravity=(0, 0, 0), remesh=remesh)
     dt = trial.dt
     trial.step()
     trial.von_mises()

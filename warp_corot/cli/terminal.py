@@ -10,8 +10,7 @@ import signal
 import sys
 import threading
 import time
-import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import fields
 from types import FrameType
@@ -36,34 +35,23 @@ def interrupt_status(signalled: KeyboardInterrupt) -> int:
     return 128 + (signal.SIGTERM if isinstance(signalled, Terminated) else signal.SIGINT)
 
 
+#: Arguments of Python that the options name otherwise.
+NAMED = {"target_elements": "--tets", "every": "--remesh-every"}
+NAMED |= {f"{end}_level": f"--remesh-levels {end.upper()}" for end in ("min", "max")}
+
+
 def as_option(message: str) -> str:
-    """Turn a message that begins with an argument of Python into one about the option with this name."""
+    """Turn a message about arguments of Python into one about the options with these names."""
     from .options import RunOptions
 
-    names = "|".join(each.name for each in fields(RunOptions))
-    message = re.sub(rf"^({names}) is ", lambda found: f"--{found[1].replace('_', '-')} is ", message)
+    names = {each.name: f"--{each.name.replace('_', '-')}" for each in fields(RunOptions)}
+    message = re.sub(rf"^({'|'.join(names)}) is ", lambda found: f"{names[found[1]]} is ", message)
+    names = {name: option for name, option in names.items() if "_" in name or name in ("unit", "smoothing", "capacity")}
+    for name, option in (names | NAMED).items():
+        message = re.sub(rf"(?<![-\w]){name}(?=,? (which )?is )", option, message)
+        message = re.sub(rf"(?<![-\w]){name}=", f"{option} ", message)
     message = message.replace("take a shorter step, or dt=None, which", "take a shorter --dt, or none, which")
     return re.sub(r", or None$", "", message).replace("it must be None, a", "it must be a")
-
-
-@contextmanager
-def as_options(names: Mapping[str, str]) -> Iterator[None]:
-    """Replace names of Python's arguments by those of options, anywhere in errors and warnings."""
-
-    def named(text: str) -> str:
-        for name, option in names.items():
-            text = re.sub(rf"(?<![-\w]){name}(?=,? (which )?is )", option, text)
-            text = re.sub(rf"(?<![-\w]){name}=", f"{option} ", text)
-        return text
-
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        try:
-            yield
-        except InputError as error:
-            raise InputError(named(str(error))) from None
-    for warning in said:
-        warnings.warn(named(str(warning.message)), warning.category, stacklevel=3)
 
 
 def early_end(error: BaseException, done: Recording) -> int:

@@ -12,13 +12,11 @@ import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.nodal import pressure_at_nodes
-from warp_corot.io.pictures.colors import round_limit
+from warp_corot.io.pictures.colors import VertexAverage, round_limit
 from warp_corot.io.write.skins import BoundSkins, OwnSurface, has_domain, joined_surfaces
-from warp_corot.kernels.viewing import values as kernels
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.surfaces.bodies import boundary_surface
 from warp_corot.mesh.surfaces.bound import BoundPoints, DeviceBinding, SurfaceMesh
-from warp_corot.mesh.surfaces.boundary import signed_volumes
 from warp_corot.mesh.surfaces.locating import nearest_faces
 from warp_corot.mesh.surfaces.marching import marched
 from warp_corot.simulation.simulation import Simulation
@@ -116,6 +114,10 @@ class Shown:
             faces = nearest_faces(self.positions - middle, self.triangles, (x - middle)[None], 1e3 * size)
         triangle = int(faces[0])
         return Pick(body, triangle, barycentric(self.positions[self.triangles[triangle]].astype(np.float64), x))
+
+    def carried(self, nodal: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
+        """Values at the nodes of the shown world, [N], at the points, [V]."""
+        return np.einsum("vn,vn->v", self.binding.weights.numpy(), nodal[self.binding.nodes.numpy()])
 
     def at(self, pick: Pick, values: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
         """Values at the points, [V, 3], at a place, float64 [3]."""
@@ -254,63 +256,17 @@ def displacement(sim: Simulation, shown: Shown) -> Values:
     return np.linalg.norm(shown.positions - shown.rest, axis=1)
 
 
-class ElementValues:
-    """Values of elements, averaged to nodes by volume and carried to the points of a surface, on the device.
+class NodalAverages:
+    """Values of elements [T], averaged to the nodes around them by volume, at the points of a shown surface [V]."""
 
-    Args:
-        values: The values of the shown world's elements, float32 [T], on the body's device.
-    """
+    def __init__(self) -> None:
+        self._averages: dict[SoftBody, tuple[int, VertexAverage]] = {}
 
-    def __init__(self, values: Callable[[Simulation, Shown], wp.array]):
-        self._values = values
-        self._averages: dict[SoftBody, _Average] = {}
-
-    def __call__(self, sim: Simulation, shown: Shown) -> Values:
+    def __call__(self, values: Values, shown: Shown) -> Values:
         body = shown.body
-        average = self._averages.get(body)
-        if average is None or average.version != body.version:
-            average = self._averages[body] = _Average(body)
-        return average(self._values(sim, shown), shown)
-
-
-class _Average:
-    """Averages of the elements around each node of a body's present mesh."""
-
-    def __init__(self, body: SoftBody):
-        mesh, self._device, self.version = body.mesh, body.device, body.version
-        volumes = np.abs(signed_volumes(mesh.points, mesh.tets))
-        around = np.bincount(mesh.tets.ravel(), np.repeat(volumes, 4), len(mesh.points))
-        self._tets = wp.array(mesh.tets, dtype=wp.vec4i, device=self._device)
-        # Over the mean, as float32 holds no cubes of small lengths.
-        scale = float(volumes.mean())
-        self._volumes, self._around = (
-            wp.array(each / scale, dtype=wp.float32, device=self._device) for each in (volumes, around)
-        )
-        self._sums = wp.zeros_like(self._around)
-
-    def __call__(self, values: wp.array, shown: Shown) -> Values:
-        binding, found = shown.binding, wp.empty(len(shown.rest), dtype=wp.float32, device=self._device)
-        self._sums.zero_()
-        inputs = [values, self._tets, self._volumes]
-        wp.launch(kernels.add_to_nodes, len(self._tets), inputs, [self._sums], device=self._device)
-        inputs = [binding.nodes, binding.weights, self._sums, self._around]
-        wp.launch(kernels.carry_to_points, len(found), inputs, [found], device=self._device)
-        return found.numpy()
-
-
-def _stress(sim: Simulation, shown: Shown) -> wp.array:
-    body = shown.body
-    field = sim.fields[sim.bodies.index(body)]
-    stress = wp.zeros(field.element_count, dtype=wp.float32, device=body.device)
-    with field.state_kept():
-        field.write_von_mises(body.state.displacements, stress)
-    return stress[shown.world.elements]
-
-
-def _level(sim: Simulation, shown: Shown) -> wp.array:
-    mesh = shown.body.mesh
-    assert isinstance(mesh, TetForest)
-    return wp.array(mesh.levels, dtype=wp.float32, device=shown.body.device)
+        if body not in self._averages or self._averages[body][0] != body.version:
+            self._averages[body] = body.version, VertexAverage.of(body.mesh)
+        return shown.carried(self._averages[body][1](values))
 
 
 def contact_pressure(sim: Simulation, shown: Shown) -> Values:
@@ -318,7 +274,7 @@ def contact_pressure(sim: Simulation, shown: Shown) -> Values:
     body = shown.body
     pressure = body.contact_pressure.numpy().reshape(body.worlds, -1)[shown.world.index]
     nodal = pressure_at_nodes(body.contact_surface, body.world_node_count, pressure)
-    return np.einsum("vn,vn->v", shown.binding.weights.numpy(), nodal[shown.binding.nodes.numpy()])
+    return shown.carried(nodal)
 
 
 def _least_motion(shown: Shown) -> float:
@@ -331,14 +287,22 @@ def _least_stress(shown: Shown) -> float:
 
 def sources() -> dict[str, Source]:
     """The sources by name. Sources that keep data of a body belong to one session."""
+    averages = NodalAverages()
+
+    def stress(sim: Simulation, shown: Shown) -> Values:
+        return averages(sim.von_mises(shown.body)[shown.world.elements], shown)
+
     return {
-        "stress": Source("von Mises stress", "Pa", ElementValues(_stress), _least_stress),
+        "stress": Source("von Mises stress", "Pa", stress, _least_stress),
         "displacement": Source("displacement", "m", displacement, _least_motion),
         "contact pressure": Source(
             "contact pressure", "Pa", contact_pressure, _least_stress, lambda body: body.state.is_touched
         ),
         "level": Source(
-            "level of the mesh", "", ElementValues(_level), applies=lambda body: isinstance(body.mesh, TetForest)
+            "level of the mesh",
+            "",
+            lambda _, shown: averages(shown.body.mesh.levels, shown),  # type: ignore[union-attr]
+            applies=lambda body: isinstance(body.mesh, TetForest),
         ),
     }
 

@@ -5,7 +5,6 @@ Points are rest positions; *Warp By Vector* with ``displacement`` shows the movi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +20,8 @@ from warp_corot.mesh.surfaces.boundary import right_handed, signed_volumes
 
 if TYPE_CHECKING:
     from warp_corot.simulation.simulation import Simulation
+
+    from .animate import JoinedBodies
 
 # --- the fields of a frame: displacements and velocities of nodes, strain and stress of elements ---------------------
 
@@ -44,7 +45,7 @@ class Fields:
     elemental: dict[str, npt.NDArray[Any]]
 
 
-def fields_of(sim: Simulation, worlds: Sequence[Any], time: float) -> Fields:
+def fields_of(sim: Simulation, joined: JoinedBodies, time: float) -> Fields:
     """The current state of bodies in one world, body after body.
 
     Nodes have ``displacement`` [m], ``velocity`` [m/s] and ``fixed``; elements ``strain`` (Green-Lagrange), ``stress``
@@ -52,44 +53,26 @@ def fields_of(sim: Simulation, worlds: Sequence[Any], time: float) -> Fields:
 
     Args:
         sim: The simulation.
-        worlds: A view of one world of each body.
+        joined: Its bodies in one world.
         time: Time of the frame [s].
     """
-    meshes = [world.body.mesh for world in worlds]
-    offsets = np.cumsum([0, *(len(mesh.points) for mesh in meshes)])
-    nodal: dict[str, list[npt.NDArray[Any]]] = {}
-    elemental: dict[str, list[npt.NDArray[Any]]] = {}
-    tensors = all(has_tensor(model, w.body.material) for model, w in zip(sim.models, worlds, strict=True))
-    labelled = any(getattr(mesh, "labels", None) is not None for mesh in meshes)
-    for model, world, mesh in zip(sim.models, worlds, meshes, strict=True):
-        displacements, body = world.displacements.numpy().astype(np.float64), world.body
-        nodal.setdefault("displacement", []).append(displacements.astype(np.float32))
-        nodal.setdefault("velocity", []).append(world.velocities.numpy())
-        nodal.setdefault("fixed", []).append(body.constrained[world.nodes].astype(np.int8))
-        a = displacement_gradients(mesh.points, mesh.tets, displacements)
-        elemental.setdefault("strain", []).append(green_strain(a).reshape(-1, 9).astype(np.float32))
-        if tensors:
-            count = len(mesh.tets)
-            young, poisson = (
-                np.broadcast_to(getattr(body.material, name), (body.worlds, count))[world.index]
-                for name in ("young", "poisson")
-            )
-            stress = cauchy_stress(model, a, young, poisson)
-            elemental.setdefault("stress", []).append(stress.reshape(-1, 9).astype(np.float32))
-        elemental.setdefault("von_mises", []).append(sim.von_mises(body)[world.elements])
-        if labelled:
-            labels = getattr(mesh, "labels", None)
-            own = np.zeros(len(mesh.tets), np.int32) if labels is None else labels
-            elemental.setdefault("region", []).append(own.astype(np.int32))
-    points = np.concatenate([mesh.points for mesh in meshes])
-    tets = np.concatenate([mesh.tets + n for mesh, n in zip(meshes, offsets[:-1], strict=True)]).astype(np.int32)
-    return Fields(
-        time,
-        points,
-        right_handed(tets, signed_volumes(points, tets) < 0.0),
-        {name: np.concatenate(parts) for name, parts in nodal.items()},
-        {name: np.concatenate(parts) for name, parts in elemental.items()},
-    )
+    u = joined.nodal("displacements")
+    nodal = {"displacement": u, "velocity": joined.nodal("velocities"), "fixed": joined.fixed.astype(np.int8)}
+    gradients = displacement_gradients(joined.points, joined.tets, u.astype(np.float64))
+    elemental = {"strain": green_strain(gradients).reshape(-1, 9).astype(np.float32)}
+    counts = [len(mesh.tets) for mesh in joined.meshes]
+    if all(has_tensor(model, w.body.material) for model, w in zip(sim.models, joined.worlds, strict=True)):
+        parts = np.split(gradients, np.cumsum(counts)[:-1])
+        moduli = [np.split(np.broadcast_to(of, sum(counts)), np.cumsum(counts)[:-1]) for of in joined.moduli]
+        stress = [cauchy_stress(*each) for each in zip(sim.models, parts, *moduli, strict=True)]
+        elemental["stress"] = np.concatenate(stress).reshape(-1, 9).astype(np.float32)
+    elemental["von_mises"] = joined.von_mises(sim)
+    labels = [getattr(mesh, "labels", None) for mesh in joined.meshes]
+    if any(own is not None for own in labels):
+        numbers = [np.zeros(n, np.int32) if own is None else own for own, n in zip(labels, counts, strict=True)]
+        elemental["region"] = np.concatenate(numbers).astype(np.int32)
+    tets = right_handed(joined.tets, signed_volumes(joined.points, joined.tets) < 0.0)
+    return Fields(time, joined.points, tets, nodal, elemental)
 
 
 # --- VTK's files -----------------------------------------------------------------------------------------------------

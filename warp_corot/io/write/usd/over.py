@@ -16,7 +16,7 @@ from warp_corot.io.files.usd import reason, usd_name
 from warp_corot.io.files.whole import sync
 from warp_corot.io.pictures.colors import VertexAverage, color_index
 from warp_corot.io.read.usd.scene import Scene, TetPrim
-from warp_corot.mesh.surfaces.boundary import boundary_faces, signed_volumes
+from warp_corot.mesh.surfaces.boundary import boundary_faces
 
 from .pieces import ColoredStage, Samples
 from .prims import declare_moving, declare_tet_stress, drawn_material, extent
@@ -59,8 +59,7 @@ class TetsOver(PointsOver):
         if prim.repaired or not scene.has(prim.path, "surfaceFaceVertexIndices"):
             faces = boundary_faces(prim.tets, prim.points)[0][:, :: -1 if prim.left_handed else 1]
             mesh.CreateSurfaceFaceVertexIndicesAttr(Vt.Vec3iArray.FromNumpy(np.ascontiguousarray(faces)))
-        volumes = np.abs(signed_volumes(prim.points, prim.tets))
-        self._average = VertexAverage(prim.tets, volumes, len(prim.points))
+        self._average = VertexAverage.of(prim)
 
     def samples(  # type: ignore[override]
         self, positions: NDArray[np.float32], velocities: NDArray[np.float32], stress: NDArray[np.float32]
