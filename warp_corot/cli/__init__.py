@@ -12,14 +12,14 @@ from collections.abc import Collection, Sequence
 from importlib import import_module
 from importlib.metadata import version
 from types import ModuleType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.importing import uncollected
 from warp_corot.inputs.likely import meant
 from warp_corot.inputs.stopwatch import WATCH
 
-from .options import COMMANDS, EXIT_CODES, StrictParser, add_command
+from .options import COMMANDS, EXIT_CODES, add_command
 from .terminal import (
     as_option,
     complain,
@@ -41,6 +41,19 @@ FAILED = (1, 2, 3)
 def subcommand(name: str) -> ModuleType:
     """The module that runs a subcommand; it imports the whole package, which takes a while."""
     return import_module(f".{name.replace('-', '_')}", __name__)
+
+
+class StrictParser(argparse.ArgumentParser):
+    """Accepts neither abbreviations nor ``--`` as a value, which argparse turns into an empty list."""
+
+    def __init__(self, **options: Any):
+        options.setdefault("allow_abbrev", False)
+        super().__init__(**options)
+
+    def _get_values(self, action: argparse.Action, arg_strings: list[str]) -> Any:
+        if action.option_strings and "--" in arg_strings:
+            self.error(f"argument {'/'.join(action.option_strings)}: '--' is not a value")
+        return super()._get_values(action, arg_strings)
 
 
 class Parser(StrictParser):

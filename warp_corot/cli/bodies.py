@@ -21,7 +21,7 @@ from warp_corot.simulation.parts import checked_gravity
 
 from .input_file import InputFile, bodies_in, open_input, refuse_options, with_unit
 from .input_mesh import InputMesh, covers_all, find_organ, find_subject, label_material, region_material
-from .options import is_static, stands_free
+from .options import is_static
 from .patches import BodyPatches, Load, loads_of, move_patches, probes_body, ramp_of, up_of
 
 #: A density below this [kg/m^3] is most likely meant in g/cm^3.
@@ -132,6 +132,11 @@ def make_body(body: RunBody, duration: float, *, alone: bool) -> None:
         subject.notes.append(
             f"--density is {args.density:g} kg/m^3, far less than water; write {args.density:g}g/cm3 for g/cm^3"
         )
+
+
+def stands_free(args: argparse.Namespace) -> bool:
+    """Whether a ground carries the body in place of fixed nodes."""
+    return args.fix is None and (args.ground is not None or args.drop is not None)
 
 
 def gravity_of(args: argparse.Namespace, subject: InputMesh) -> np.ndarray:

@@ -14,7 +14,8 @@ from typing import Any, NoReturn
 from warp_corot.errors import InputError
 from warp_corot.io.files.whole import check_output, written_whole
 
-from .options import LOADS, OF_THE_RUN, RunOptions, StrictParser, add_declared
+from . import StrictParser
+from .options import LOADS, OF_THE_RUN, RUN, add_options
 from .patches import Load, value_of
 
 #: Keys in tables of loads, besides times and shares.
@@ -119,7 +120,7 @@ def option_of(name: str) -> Callable[[str], Any]:
 def _parser(path: Path) -> tuple[_Parser, dict[str, argparse.Action]]:
     parser = _Parser(add_help=False, prog="simulate")
     parser.path = path
-    add_declared(parser, RunOptions)
+    add_options(parser, RUN)
     return parser, {action.dest: action for action in parser._actions if action.dest != "write_run"}
 
 

@@ -12,7 +12,6 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import fields
 from types import FrameType
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -42,9 +41,9 @@ NAMED |= {f"{end}_level": f"--remesh-levels {end.upper()}" for end in ("min", "m
 
 def as_option(message: str) -> str:
     """Turn a message about arguments of Python into one about the options with these names."""
-    from .options import RunOptions
+    from .options import RUN, options_of
 
-    names = {each.name: f"--{each.name.replace('_', '-')}" for each in fields(RunOptions)}
+    names = {each.name: f"--{each.name.replace('_', '-')}" for each in options_of(RUN)}
     message = re.sub(rf"^({'|'.join(names)}) is ", lambda found: f"{names[found[1]]} is ", message)
     names = {name: option for name, option in names.items() if "_" in name or name in ("unit", "smoothing", "capacity")}
     for name, option in (names | NAMED).items():

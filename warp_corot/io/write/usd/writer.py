@@ -18,6 +18,7 @@ from warp_corot.io.files.usd import free_name
 from warp_corot.io.pictures.colors import STEEL, VertexAverage, srgb_to_linear
 from warp_corot.io.write.animate import KEY
 from warp_corot.io.write.skins import Skin, ground_corners, shape_of
+from warp_corot.mesh.surfaces.bodies import boundary_surface
 from warp_corot.mesh.surfaces.boundary import right_handed, signed_volumes
 
 from .pieces import ColoredStage, Samples
@@ -259,11 +260,11 @@ class UsdWriter(ColoredStage):
     *guide*, and ``surface``, a `UsdGeom.Mesh` of only the surface nodes, which viewers draw. Frame i is time code i.
     Both have ``points``, ``velocities`` [m/s] and ``extent`` in each frame. The TetMesh has primvars ``rest`` (vertex),
     ``fixed`` (vertex, 1 if held), ``young`` [Pa], ``poisson``, ``density`` [kg/m³] (constant, or uniform: one a
-    tetrahedron) and ``vonMises`` [Pa] (uniform, in each frame). With contact, both have ``contactForce`` [N] and
-    ``contactPressure`` [Pa] (vertex, in each frame). Both show the stress as ``displayColor``: averages over the
-    tetrahedra around each node, as indices into the 256 colours of `colors.stress_colors`; custom
-    data of ``/SoftBody`` name the map and its range. ``/SoftBody/physics`` has the physics materials, and with
-    ``gravity`` a physics scene, see `usd.physics.declare_physics`.
+    tetrahedron) and ``vonMises`` [Pa] (uniform, in each frame), the Mesh has averages of that at its nodes. With
+    contact, both have ``contactPressure`` [Pa], and the TetMesh ``contactForce`` [N] (vertex, in each frame). Both show
+    the stress as ``displayColor``: averages over the tetrahedra around each node, as indices into the 256 colours of
+    `colors.stress_colors`; custom data of ``/SoftBody`` name the map and its range. ``/SoftBody/physics`` has the
+    physics materials, and with ``gravity`` a physics scene, see `declare_physics`.
 
     Mirrored tetrahedra are written with two indices swapped, so that all are right-handed as the schema requires.
 
@@ -335,7 +336,8 @@ class UsdWriter(ColoredStage):
         self._gravity = gravity
         self.about: dict[str, Any] = {}
         self._present = _present(mesh, fixed, material)
-        self._tets = TetPrims(self._present, boundary=not skins, changing=changing) if tets or not skins else None
+        self._tets = TetPrims(self._present, changing=changing) if tets or not skins else None
+        skins = skins or _boundary(self._present)
         named = zip(skins, skin_paths(skins), strict=True)
         self._skins = [SkinPrim(skin, path, mesh.points, changing=changing) for skin, path in named]
         self._prims: list[TetPrims | SkinPrim | ObstaclePrim] = [*([self._tets] if self._tets else []), *self._skins]
@@ -357,9 +359,10 @@ class UsdWriter(ColoredStage):
         """
         if not self._changing:
             raise InputError(f"{self.path}: the mesh cannot change; the writer must be made with changing=True")
+        self._present = _present(mesh, fixed, material)
+        skins = skins or _boundary(self._present)
         if len(skins) != len(self._skins):
             raise InputError(f"there are {len(skins)} skins now; there must be {len(self._skins)} as before")
-        self._present = _present(mesh, fixed, material)
         if self._tets:
             self._tets.follow(self._present)
         for prim, skin in zip(self._skins, skins, strict=True):
@@ -440,6 +443,10 @@ class UsdWriter(ColoredStage):
             gravity=self._gravity,
         )
         return layer
+
+
+def _boundary(present: Present) -> list[Skin]:
+    return [Skin("surface", boundary_surface(present), is_boundary=True)]
 
 
 def _present(mesh: Mesh, fixed: ArrayLike | None, material: Any) -> Present:
