@@ -13,7 +13,7 @@ import pytest
 from command_line import run
 
 import warp_corot as wc
-from warp_corot.cli import StrictParser, make_parser
+from warp_corot.cli import Parser, make_parser
 from warp_corot.cli.options import RUN, add_options
 from warp_corot.cli.run_file import bodies_of
 from warp_corot.cli.run_setup import set_up
@@ -34,7 +34,7 @@ def asked(*words):
 
 
 def test_options_are_those_of_simulate():
-    parser = StrictParser(prog="simulate")
+    parser = Parser(prog="simulate")
     add_options(parser, RUN)
     (args,) = asked("box", "--device", "cpu")
     for action in parser._actions:

@@ -43,26 +43,20 @@ def subcommand(name: str) -> ModuleType:
     return import_module(f".{name.replace('-', '_')}", __name__)
 
 
-class StrictParser(argparse.ArgumentParser):
-    """Accepts neither abbreviations nor ``--`` as a value, which argparse turns into an empty list."""
+class Parser(argparse.ArgumentParser):
+    """Reports errors in one line, and accepts -1e3 as a number, but neither abbreviations nor ``--`` as a value, which
+    argparse turns into an empty list."""
 
     def __init__(self, **options: Any):
         options.setdefault("allow_abbrev", False)
+        options.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
         super().__init__(**options)
+        self._negative_number_matcher = re.compile(r"^-(\d|\.\d|inf|nan)")
 
     def _get_values(self, action: argparse.Action, arg_strings: list[str]) -> Any:
         if action.option_strings and "--" in arg_strings:
             self.error(f"argument {'/'.join(action.option_strings)}: '--' is not a value")
         return super()._get_values(action, arg_strings)
-
-
-class Parser(StrictParser):
-    """Reports errors in one line, and accepts -1e3 as a number."""
-
-    def __init__(self, **options):
-        options.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
-        super().__init__(**options)
-        self._negative_number_matcher = re.compile(r"^-(\d|\.\d|inf|nan)")
 
     def error(self, message: str) -> NoReturn:
         known = re.search(r"invalid choice: '([^']*)' \(choose from (.*)\)$", message)

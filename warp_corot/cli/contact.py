@@ -23,8 +23,9 @@ from warp_corot.domain.units import in_units, length
 from warp_corot.errors import InputError
 from warp_corot.solvers import INTEGRATORS
 
-from .options import AUTO, integrator_name
+from .options import integrator_name
 from .patches import up_of
+from .quantities import AUTO
 from .terminal import are_several
 
 if TYPE_CHECKING:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -164,76 +163,36 @@ def _longest(points: np.ndarray, cells: np.ndarray) -> float:
 # --- an option without effect on this input is refused, with the reason ----------------------------------------------
 
 
-class Rule(NamedTuple):
-    """A rule for when options have an effect.
-
-    Attributes:
-        options: Their names in Python.
-        applies: Whether they have an effect, given the command's arguments and the input.
-        purpose: Their purpose, to follow "--NAME is for".
-    """
-
-    options: tuple[str, ...]
-    applies: Callable[[argparse.Namespace, InputFile], bool]
-    purpose: str
-
-
-RULES = (
-    Rule(
-        ("skin",),
-        lambda args, opened: opened.kind == "surface" or (opened.kind == "scan" and args.skin == "marched"),
-        "surfaces",
-    ),
-    Rule(("level",), lambda _, opened: opened.kind != "tets", "the box, surfaces and scans"),
-    Rule(("unit", "up"), lambda _, opened: opened.kind != "box", "files"),
-    Rule(("rotation_level",), lambda _, opened: opened.kind != "tets", "box, surfaces and scans"),
-    Rule(
-        ("join",),
-        lambda args, opened: opened.kind == "tets" or len(getattr(opened.loaded, "objects", ())) > 1,
-        "surfaces of several objects and meshes of tetrahedra",
-    ),
-    Rule(("labels", "smoothing"), lambda _, opened: opened.kind == "scan", "scans"),
-    Rule(
-        ("threshold",),
-        lambda args, opened: opened.kind == "scan" and args.labels is None and args.materials is None,
-        "scans without --labels and --materials",
-    ),
-    Rule(
-        ("tets", "min_layers", "draw_tets"),
-        lambda _, opened: opened.kind in ("surface", "scan"),
-        "surfaces and scans",
-    ),
-    Rule(
-        ("materials",),
-        lambda args, opened: (opened.kind == "scan" and args.labels is None) or opened.has_regions,
-        "scans without --labels and meshes of tetrahedra whose file numbers regions",
-    ),
-    Rule(
-        ("regions_by",),
-        lambda args, opened: args.materials is not None and opened.has_regions,
-        "--materials on meshes of tetrahedra whose file numbers regions",
-    ),
-    Rule(
-        ("draw_labels",),
-        lambda args, opened: opened.has_regions or opened.kind == "scan",
-        "scans and meshes of tetrahedra whose file numbers regions",
-    ),
-)
-
-
 def refuse_options(args: argparse.Namespace, opened: InputFile) -> None:
     """Check that every given option has an effect.
 
     Raises:
         InputError: An option has none; the message names it and its purpose.
     """
-    for rule in RULES:
-        for name in rule.options:
-            given = getattr(args, name, None)
-            if given is not None and given is not False and not rule.applies(args, opened):
-                option = f"--{name.replace('_', '-')}"
-                instead = "; use --scale" if name == "unit" else ""
-                raise InputError(f"{option} is for {rule.purpose}, and {args.input} is not one{instead}")
+    is_scan, regions = opened.kind == "scan", opened.has_regions
+    is_organ, is_forest = opened.kind in ("surface", "scan"), opened.kind != "tets"
+    organs, forests, numbered = "surfaces and scans", "box, surfaces and scans", "tetrahedra whose file numbers regions"
+    rules = {
+        "skin": (opened.kind == "surface" or (is_scan and args.skin == "marched"), "surfaces"),
+        "level": (is_forest, forests),
+        "rotation_level": (is_forest, forests),
+        "unit": (opened.kind != "box", "files"),
+        "up": (opened.kind != "box", "files"),
+        "join": (not is_forest or len(getattr(opened.loaded, "objects", ())) > 1, "several objects and tetrahedra"),
+        "labels": (is_scan, "scans"),
+        "smoothing": (is_scan, "scans"),
+        "threshold": (is_scan and args.labels is args.materials is None, "scans without --labels and --materials"),
+        "tets": (is_organ, organs),
+        "min_layers": (is_organ, organs),
+        "draw_tets": (is_organ, organs),
+        "materials": ((is_scan and args.labels is None) or regions, f"scans without --labels and {numbered}"),
+        "regions_by": (args.materials is not None and regions, f"--materials on {numbered}"),
+        "draw_labels": (is_scan or regions, f"scans and {numbered}"),
+    }
+    for name, (applies, purpose) in rules.items():
+        if getattr(args, name, None) not in (None, False) and not applies:
+            instead = "; use --scale" if name == "unit" else ""
+            raise InputError(f"--{name.replace('_', '-')} is for {purpose}, and {args.input} is not one{instead}")
     if opened.kind != "box" and args.level is not None and args.tets is not None:
         raise InputError("--level is given, with which --tets has no effect")
     if args.labels is not None and args.young is not None:

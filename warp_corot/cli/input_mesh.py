@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import re
 import warnings
 from collections.abc import Callable, Sequence
@@ -381,43 +380,24 @@ def parse_labels(text: str, option: str = "--labels") -> list[LabelMaterial]:
     return found
 
 
-def parse_pressure(text: str) -> float:
-    """A pressure [Pa] from "3kPa", "0.1 MPa" or "500".
-
-    Raises:
-        InputError: Not a number, or another unit.
-    """
-    return _quantity(text, "Pa", "Young's modulus", "500, 3kPa or 0.1MPa")
-
-
 def _entry(part: str, option: str, form: str | None = None) -> LabelMaterial:
     match = _ENTRY.fullmatch(part)
     values = match["values"].split(":") if match else []
     if not match or not 1 <= len(values) <= 3:
-        raise InputError(form or f"{option} {part.strip()!r}: it must be {LABEL}, for example3kPa:0.45=3kPa:0.45")
+        raise InputError(form or f"{option} {part.strip()!r}: it must be {LABEL}, for example liver=3kPa:0.45")
     name = match["name"]
     numbers = tuple(int(number) for number in (match["numbers"] or "").split("+") if number)
     if not numbers and name.isdecimal():
         numbers = (int(name),)
+    found: list[Any] = [None, None]
     try:
-        young = parse_pressure(values[0])
-        poisson = _quantity(values[1], "", "Poisson's ratio", "0.45") if len(values) > 1 else None
-        density = _quantity(values[2], "kg/m^3", "density", "1060 or 1.06g/cm3") if len(values) > 2 else None
-        Isotropic(young, 0.0 if poisson is None else poisson, 1.0 if density is None else density)
+        found = [in_units(value, unit) for value, unit in zip(values, ("Pa", "", "kg/m^3"), strict=False)] + found
+        young, poisson, density = found[:3]
+        Isotropic(young, poisson or 0.0, 1.0 if density is None else density)
     except InputError as error:
         said = f"{option} {part.strip()!r}" if form is None else form.split(": it must")[0]
         raise InputError(f"{said}: {error}") from None
     return LabelMaterial(name, numbers, young, poisson, density)
-
-
-def _quantity(text: str, unit: str, what: str, such_as: str) -> float:
-    try:
-        value = in_units(text, unit)
-    except InputError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise InputError(f"{what} is {text.strip()!r}; it must be a value like {such_as}")
-    return value
 
 
 def numbers_by_name(

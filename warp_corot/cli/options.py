@@ -12,9 +12,10 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from warp_corot.errors import InputError
 from warp_corot.inputs import choices
 from warp_corot.inputs.choices import INTEGRATORS, MODELS
+
+from .quantities import AUTO, ground_height, number, quantity, rotation_level, unit_of_length, value_range, whole_number
 
 # --- values of options that are not given ----------------------------------------------------------------------------
 
@@ -28,8 +29,6 @@ STIFFNESS_PER_WEIGHT = 20.0
 CUBES_OF_LEVEL = 16
 #: The step of implicit integrators if none is given [s].
 IMPLICIT_DT = 0.01
-#: The height of the ground that lies just below the bodies.
-AUTO = "auto"
 #: The form of a label or region and its material.
 LABEL = "NAME[@NUMBER[+NUMBER...]]=YOUNG[:POISSON[:DENSITY]]"
 #: Loads: number of values after PATCH.
@@ -45,99 +44,6 @@ VIEWS = {
     "bottom": (0.0, -89.9),
 }
 SIDES = ", ".join(VIEWS)
-
-
-# --- quantities: a number in SI units, or with a unit, for example 5kPa ----------------------------------------------
-
-
-def quantity(unit: str) -> Callable[[str], float]:
-    """A function that converts an option's text to a number in a unit, for ``add_argument(type=...)``."""
-
-    def parse(text: str) -> float:
-        from warp_corot.domain.units import in_units
-
-        try:
-            return in_units(text, unit)
-        except InputError as error:
-            raise argparse.ArgumentTypeError(str(error)) from None
-
-    return parse
-
-
-def number(text: str) -> float:
-    """A number."""
-    try:
-        return float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} must be a number, for example 0.45") from None
-
-
-def whole_number(text: str) -> int:
-    """A whole number: 20000 or 2e4."""
-    try:
-        value = float(text)
-        if value == int(value):
-            return int(text) if text.strip().lstrip("+-").isdecimal() else int(value)
-    except (ValueError, OverflowError):
-        pass
-    raise argparse.ArgumentTypeError(f"{text!r} must be a whole number, for example 20000 or 2e4")
-
-
-def rotation_level(text: str) -> int | float | str:
-    """A level of the tree, a tolerance [rad], or "auto"."""
-    if text == "auto":
-        return text
-    try:
-        return int(text)
-    except ValueError:
-        return number(text)
-
-
-metres = quantity("m")
-
-
-class Interval(NamedTuple):
-    """A range of numbers with both ends."""
-
-    low: float
-    high: float
-
-    def __str__(self) -> str:
-        return f"{self.low!r}:{self.high!r}"
-
-
-def value_range(text: str) -> Interval:
-    """Two numbers LOW:HIGH, or one without an upper limit."""
-    words = text.split(":")
-    try:
-        low, high = [float(word) for word in words] if len(words) == 2 else (float(text), float("inf"))
-    except ValueError:
-        low, high = float("nan"), float("nan")
-    if not low <= high:
-        raise argparse.ArgumentTypeError(f"{text!r} must be a number or LOW:HIGH, for example 200 or -200:300")
-    return Interval(low, high)
-
-
-def unit_of_length(text: str) -> str:
-    """A unit, or a length used as a unit: mm or 3.2cm."""
-    from warp_corot.domain.units import metres_per_unit
-
-    try:
-        metres_per_unit(text)
-    except InputError as error:
-        raise argparse.ArgumentTypeError(str(error).removeprefix("unit is ")) from None
-    return text
-
-
-def ground_height(text: str) -> float | str:
-    """A height [m] or "auto", for ``add_argument(type=...)``."""
-    if text == AUTO:
-        return text
-    try:
-        return metres(text)
-    except argparse.ArgumentTypeError as error:
-        raise argparse.ArgumentTypeError(f"{error}; it must be a height or {AUTO} (INPUT stands before it)") from None
-
 
 EXIT_CODES = """exit status:
   0    done
@@ -371,6 +277,21 @@ class Option(NamedTuple):
     flags: tuple[str, ...]
     settings: dict[str, Any]
 
+    @property
+    def default(self) -> Any:
+        """Its value if it is not given."""
+        return self.settings.get("default")
+
+    @property
+    def is_flag(self) -> bool:
+        """Whether it has no value."""
+        return self.settings.get("action") == "store_true"
+
+    @property
+    def is_list(self) -> bool:
+        """Whether it can be given several times."""
+        return self.settings.get("action") == "append"
+
 
 _ENTRY = re.compile(r"((?:-\w )?)(\S+?)([!*]?)((?: (?!\[)\S+)*) \[([^\]=]*)=?([^\]]*)\](\.*): (.*)")
 
@@ -602,7 +523,7 @@ def add_command(subparsers: Any, name: str) -> argparse.ArgumentParser:
     )
     add_options(parser, command.groups)
     there = {option.name for option in options_of(command.groups)}
-    more = {option.name: option.settings.get("default") for option in options_of(command.files)}
+    more = {option.name: option.default for option in options_of(command.files)}
     parser.set_defaults(**{name: default for name, default in more.items() if name not in there})
     return parser
 
