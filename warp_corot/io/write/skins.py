@@ -296,8 +296,8 @@ def joined_surfaces(parts: Sequence[SurfaceMesh]) -> SurfaceMesh:
     )
 
 
-#: Points around a round shape, and from the pole of a ball to its equator.
-AROUND, TO_EQUATOR = 32, 8
+#: Points around a round shape.
+AROUND = 32
 #: Height of a drawn blade over the length of its edge.
 BLADE_HEIGHT = 0.15
 #: Half of the edge of a drawn ground, in sizes of the bodies on it.
@@ -333,21 +333,22 @@ def solid_of(shape: Shape) -> Solid | None:
     """The surface of a shape; None for a ground, which has no end, and for a signed distance."""
     if isinstance(shape, TriangleMesh):
         return Solid(np.asarray(shape.points, dtype=np.float64), np.asarray(shape.triangles, dtype=np.int32))
-    if isinstance(shape, Box):
-        return _box(np.array(shape.size))
     if isinstance(shape, Edge):
         return _sheet(shape.points)
+    if not isinstance(shape, Box | Sphere | Capsule | Cylinder):
+        return None
+    from trimesh import creation  # takes longer than ``import warp_corot``
+
     radius, half, _ = shape.size
-    if isinstance(shape, Sphere | Capsule):
-        angles = np.linspace(0.0, 0.5 * np.pi, TO_EQUATOR + 1)
-        arc = radius * np.stack([np.sin(angles), np.cos(angles)], axis=1)
-        end = half if isinstance(shape, Capsule) else 0.0
-        upper = arc + np.array([0.0, end])
-        lower = (arc * [1.0, -1.0] - np.array([0.0, end]))[::-1]
-        return _revolved(np.concatenate([upper, lower if end else lower[1:]]))
-    if isinstance(shape, Cylinder):
-        return _revolved(np.array([(0.0, half), (radius, half), (radius, -half), (0.0, -half)]))
-    return None
+    if isinstance(shape, Box):
+        made = creation.box(extents=2.0 * np.array(shape.size))
+    elif isinstance(shape, Sphere):
+        made = creation.uv_sphere(radius=radius, count=[AROUND // 2 + 1, AROUND])
+    elif isinstance(shape, Capsule):
+        made = creation.capsule(radius=radius, height=2.0 * half, count=[AROUND // 2 + 1, AROUND])
+    else:
+        made = creation.cylinder(radius=radius, height=2.0 * half, sections=AROUND)
+    return Solid(np.asarray(made.vertices, np.float64), np.asarray(made.faces, np.int32))
 
 
 def ground_corners(ground: Ground, points: npt.ArrayLike) -> Floats:
@@ -368,27 +369,6 @@ def poses_of(obstacles: Sequence[Obstacle], world: int = 0) -> Floats:
     return np.array(poses, dtype=np.float64).reshape(-1, 7)
 
 
-def _revolved(profile: Floats) -> Solid:
-    """A profile of radius and height [n, 2], from its upper end on the axis to its lower one, turned about z."""
-    turns = np.linspace(0.0, 2.0 * np.pi, AROUND, endpoint=False)
-    rings = profile[1:-1]
-    around = np.stack([np.cos(turns), np.sin(turns)], axis=1)
-    points = np.concatenate([np.c_[r * around, np.full(AROUND, z)] for r, z in rings])
-    points = np.concatenate([[(0.0, 0.0, profile[0, 1])], points, [(0.0, 0.0, profile[-1, 1])]])
-    last = len(points) - 1
-    this = np.arange(AROUND)
-    following = (this + 1) % AROUND
-    triangles = [np.stack([np.zeros_like(this), 1 + this, 1 + following], axis=1)]
-    for ring in range(len(rings) - 1):
-        a = 1 + ring * AROUND
-        b = a + AROUND
-        triangles.append(np.stack([a + this, b + this, b + following], axis=1))
-        triangles.append(np.stack([a + this, b + following, a + following], axis=1))
-    a = 1 + (len(rings) - 1) * AROUND
-    triangles.append(np.stack([a + this, np.full_like(this, last), a + following], axis=1))
-    return Solid(points, np.concatenate(triangles).astype(np.int32))
-
-
 def _sheet(edge: Floats) -> Solid:
     """Both sides of a sheet behind a polyline [n, 3]."""
     along = edge[-1] - edge[0]
@@ -397,13 +377,6 @@ def _sheet(edge: Floats) -> Solid:
     a, n = np.arange(len(edge) - 1), len(edge)
     front = np.concatenate([np.stack([a, a + 1, a + n + 1], axis=1), np.stack([a, a + n + 1, a + n], axis=1)])
     return Solid(np.concatenate([edge, edge + back]), np.concatenate([front, front[:, ::-1]]).astype(np.int32))
-
-
-def _box(half: Floats) -> Solid:
-    points = half * np.array([(x, y, z) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    triangles = [corner for a, b, c, d in quads for corner in ((a, b, c), (a, c, d))]
-    return Solid(points, np.array(triangles, np.int32))
 
 
 def _rotation(quaternion: npt.ArrayLike) -> Any:

@@ -359,10 +359,11 @@ class UsdWriter(ColoredStage):
         """
         if not self._changing:
             raise InputError(f"{self.path}: the mesh cannot change; the writer must be made with changing=True")
-        self._present = _present(mesh, fixed, material)
-        skins = skins or _boundary(self._present)
+        present = _present(mesh, fixed, material)
+        skins = skins or _boundary(present)
         if len(skins) != len(self._skins):
             raise InputError(f"there are {len(skins)} skins now; there must be {len(self._skins)} as before")
+        self._present = present
         if self._tets:
             self._tets.follow(self._present)
         for prim, skin in zip(self._skins, skins, strict=True):
