@@ -20,7 +20,7 @@ from foreign_meshes import (
 
 import warp_corot as wc
 from warp_corot.errors import InputError
-from warp_corot.io.read.files import read_mesh_file
+from warp_corot.io.read.filemesh import read_mesh_file
 from warp_corot.io.read.meshes import load_surface, load_tets
 from warp_corot.mesh.surfaces.boundary import signed_volumes
 

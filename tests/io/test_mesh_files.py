@@ -9,8 +9,7 @@ import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
 from warp_corot.errors import InputError
-from warp_corot.io.read.assets import ASSETS
-from warp_corot.io.read.meshes import load_tets
+from warp_corot.io.read.meshes import ASSETS, load_tets
 from warp_corot.mesh.surfaces.boundary import boundary_faces, signed_volumes
 
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]], dtype=np.float64)

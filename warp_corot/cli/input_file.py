@@ -13,8 +13,16 @@ import numpy.typing as npt
 from warp_corot.domain.units import length, likely_unit, metres_per_unit, unlikely_size
 from warp_corot.errors import InputError
 from warp_corot.io.read import FileMesh
-from warp_corot.io.read.assets import Asset, find_asset
-from warp_corot.io.read.meshes import LoadedMesh, LoadedSurface, check_file, load_surface, load_tets, read_file
+from warp_corot.io.read.meshes import (
+    Asset,
+    LoadedMesh,
+    LoadedSurface,
+    check_file,
+    find_asset,
+    load_surface,
+    load_tets,
+    read_file,
+)
 from warp_corot.io.read.volumes import LoadedVolume, volume_of_image
 
 from .options import TETS

@@ -1,7 +1,8 @@
-"""Meshes of tetrahedra and surfaces of triangles from files: USD, mesh files, and what trimesh reads."""
+"""Meshes of tetrahedra and surfaces of triangles from files: USD, mesh files, what trimesh reads, and Warp's assets."""
 
 from __future__ import annotations
 
+import importlib.util
 import logging
 import os
 from dataclasses import dataclass, field
@@ -16,9 +17,108 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, checked_path
 from warp_corot.io.files.quiet import bounded, quietly
 
-from .assets import find_asset
-from .filemesh import FileImage, FileMesh, joined_triangles, split_solids, triangles_of
-from .files import checked_mesh, read_mesh_file, suffix_of
+from .filemesh import (
+    FileImage,
+    FileMesh,
+    checked_mesh,
+    joined_triangles,
+    read_mesh_file,
+    split_solids,
+    suffix_of,
+    triangles_of,
+)
+
+
+@dataclass(frozen=True)
+class Asset:
+    """A mesh with default values.
+
+    Attributes:
+        name: Short name, after ``warp:``.
+        file: Path below Warp's package folder.
+        scale: Factor on the file's coordinates.
+        young: Young's modulus [Pa].
+        poisson: Poisson's ratio.
+        density: Mass density [kg/m³].
+        fix_below: Nodes below this height are fixed: the scaled rest coordinate along y [m].
+        damping: Mass-proportional damping [1/s].
+        duration: Simulated time [s] after which it is nearly at rest.
+        note: Explanation of the values.
+    """
+
+    name: str
+    file: str
+    scale: float
+    young: float
+    poisson: float
+    density: float
+    fix_below: float
+    damping: float
+    duration: float
+    note: str
+
+    @property
+    def path(self) -> Path:
+        """The path of the file.
+
+        Raises:
+            InputError: Warp is not installed, or lacks its examples.
+        """
+        spec = importlib.util.find_spec("warp")
+        folders = list(spec.submodule_search_locations or ()) if spec else []
+        for folder in folders:
+            candidate = Path(folder) / self.file
+            if candidate.is_file():
+                return candidate
+        raise InputError(f"warp:{self.name}: {self.file} is not in the installed Warp package")
+
+
+ASSETS: dict[str, Asset] = {
+    asset.name: asset
+    for asset in [
+        Asset(
+            name="bunny",
+            file="examples/assets/bunny.usd",
+            scale=0.1,
+            young=3.0e4,
+            poisson=0.45,
+            density=1000.0,
+            fix_below=0.01,
+            damping=2.0,
+            duration=4.0,
+            note="the Stanford bunny, 16 cm long, of silicone gel",
+        ),
+        Asset(
+            name="bear",
+            file="examples/assets/bear.usd",
+            scale=0.1,
+            young=1.0e5,
+            poisson=0.45,
+            density=1000.0,
+            fix_below=0.01,
+            damping=2.0,
+            duration=5.0,
+            note="a toy bear of 55 cm of soft silicone rubber: its back sags by 9 % of its height, its nose by 14 %, "
+            "after some seconds of swaying",
+        ),
+    ]
+}
+
+
+def find_asset(name: str | PathLike[str]) -> Asset | None:
+    """The asset with the name ``warp:NAME``, or None for a name without ``warp:``.
+
+    Raises:
+        InputError: There is no such asset.
+    """
+    prefix, colon, rest = str(name).partition(":")
+    if prefix != "warp" or not colon:
+        return None
+    if rest not in ASSETS:
+        known = ", ".join(f"warp:{known}" for known in ASSETS)
+        raise InputError(f"warp:{rest}: no such asset; it must be {known}")
+    return ASSETS[rest]
+
 
 USD_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
 #: Formats that only hold surfaces, see `warp_corot.io.read.meshes`.
@@ -78,7 +178,7 @@ def load_tets(
     OpenUSD reads USD stages (unit, up axis and world transforms applied, several prims joined); VTK, Gmsh, meshio or
     readers of this package read other files, see `warp_corot.io.read`. Hexahedra, wedges and pyramids are
     split into tetrahedra that fit those of their neighbours; cells of higher order become linear ones on their corners.
-    ``warp:NAME`` names an asset in Warp's wheel, see `warp_corot.io.read.assets`.
+    ``warp:NAME`` names an asset in Warp's wheel, see `warp_corot.io.read.meshes`.
 
     Args:
         path: File, or asset name.

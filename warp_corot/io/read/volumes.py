@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_numbers, checked_vector, shown
 
-from .filemesh import FileImage
-from .files import SCANS, read_mesh_file, suffix_of
+from .filemesh import SCANS, FileImage, read_mesh_file, suffix_of
 
 
 @dataclass(frozen=True)
