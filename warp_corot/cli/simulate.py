@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
         _record(args, shared, ready, done, table, previews)
         if previews is not None:
             with WATCH.part("drawing"):
-                previews.draw(ready.bodies, title_of(ready.bodies, ready.sim.gravity))
+                previews.draw(ready.bodies, title_of(ready.bodies))
     except (KeyboardInterrupt, UnstableError, OSError) as error:
         return early_end(error, done)
     print(summary(ready.bodies, ready.sim, done, ready.touched.rows, rested))
@@ -218,8 +218,6 @@ def _text(text: str) -> str:
 
 #: Maximum number of regions whose materials are listed.
 MOST_KINDS = 8
-#: What loads do to a body, for its title.
-DONE = {"pull": "pulled", "twist": "twisted", "press": "pressed"}
 
 
 def summary(
@@ -282,35 +280,13 @@ def names_of(bodies: Sequence[RunBody]) -> str:
     return ", ".join(body.subject.name for body in bodies[:NAMED]) + (f" and {left} more" if left > 0 else "")
 
 
-def title_of(bodies: Sequence[RunBody], gravity: Sequence[float]) -> str:
-    """The title of a picture: the bodies, and what happens to them under this gravity [m/s^2]."""
+def title_of(bodies: Sequence[RunBody]) -> str:
+    """The title of a picture: the bodies, their elements and their stiffness."""
     words = [names_of(bodies)]
     if not any(body.remesh for body in bodies):
         words.append(f"{sum(len(body.soft.mesh.tets) for body in bodies):,} elements")
     young = np.unique(np.concatenate([np.ravel(body.soft.material.isotropic.young) for body in bodies]))
-    words += [pressure(float(young[0]))] if len(young) == 1 else []
-    return ", ".join([*words, *_happening(bodies, any(gravity))])
-
-
-def _happening(bodies: Sequence[RunBody], heavy: bool) -> list[str]:
-    """What happens to bodies, which may have weight, in words."""
-    args = bodies[0].args
-    kinds = {load.kind for body in bodies for load in body.loads}
-    words = ["at rest"] if is_static(args) else []
-    words += [word for kind, word in DONE.items() if kind in kinds]
-    if args.tool:
-        words.append("pressed by a tool" if len(args.tool) == 1 else f"pressed by {len(args.tool)} tools")
-    if args.blade:
-        words.append("cut by a blade" if len(args.blade) == 1 else f"cut by {len(args.blade)} blades")
-    if args.drop is not None:
-        words.append("dropped on a ground")
-    elif args.ground is not None:
-        words.append("on a ground")
-    elif not any(body.held.count for body in bodies):
-        words.append("falling freely" if heavy else "moving freely")
-    elif not words:
-        words.append(f"under {'its' if len(bodies) == 1 else 'their'} weight" if heavy else "held at the dots")
-    return words
+    return ", ".join([*words, *([pressure(float(young[0]))] if len(young) == 1 else [])])
 
 
 def _body_rows(body: RunBody) -> list[tuple[str, str]]:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,51 +28,6 @@ from warp_corot.io.read.meshes import UP_AXES, USD_SUFFIXES, placed_meshes
 # --- surfaces --------------------------------------------------------------------------------------------------------
 
 
-class DrawnMesh(NamedTuple):
-    """A visible Mesh prim at its first time.
-
-    Attributes:
-        mesh: The prim, a `UsdGeom.Mesh`.
-        points: Points in the world, in the stage's unit, float64 [N, 3].
-        triangles: Fans of its faces without holes, int64 [T, 3], counter-clockwise seen from outside.
-        faces: The face of each triangle, int64 [T].
-        left_handed: Whether the listed faces have the other orientation in the world.
-        smooth: Whether it is a subdivision surface.
-    """
-
-    mesh: Any
-    points: NDArray[np.float64]
-    triangles: NDArray[np.int64]
-    faces: NDArray[np.int64]
-    left_handed: bool
-    smooth: bool
-
-
-def drawn_meshes(stage: Any, path: Path) -> Iterator[DrawnMesh]:
-    """The visible Mesh prims with faces, instances included.
-
-    Raises:
-        InputError: Faces that do not match their points.
-    """
-    for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
-        mesh = UsdGeom.Mesh(prim)
-        if not mesh or mesh.ComputePurpose() in ("guide", "proxy"):
-            continue
-        points, triangles, faces = _triangles(mesh, path)
-        if not len(triangles):
-            continue
-        left_handed = mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
-        left_handed ^= bool(np.linalg.det(world_matrix(prim)[:3, :3]) < 0.0)
-        yield DrawnMesh(
-            mesh,
-            in_world(prim, points),
-            triangles[:, ::-1] if left_handed else triangles,
-            faces,
-            left_handed,
-            mesh.GetSubdivisionSchemeAttr().Get() != UsdGeom.Tokens.none,
-        )
-
-
 @reads_stage
 def read_usd_surface(path: Path) -> FileMesh:
     """All visible Mesh prims of a stage as triangles in the world.
@@ -81,11 +36,10 @@ def read_usd_surface(path: Path) -> FileMesh:
         InputError: The file is not a stage, or a damaged one.
     """
     stage = open_stage(path)
-    drawn = list(drawn_meshes(stage, path))
-    smooth = [each.mesh.GetPath() for each in drawn if each.smooth]
+    looks = list(looks_of(stage, path, 1.0))
     return joined_triangles(
-        [(each.mesh.GetPrim().GetName(), each.points, each.triangles) for each in drawn],
-        notes=[f"{name} is a subdivision surface; its control mesh is used" for name in smooth],
+        [(look.name, look.points, look.triangles) for look in looks],
+        notes=[f"{look.path} is a subdivision surface; its control mesh is used" for look in looks if look.smooth],
         metres=metres_per_unit(stage, path),
         up_axis=str(UsdGeom.GetStageUpAxis(stage)),
     )
@@ -329,9 +283,8 @@ def has_looks(path: str | PathLike[str]) -> bool:
 def look_of_triangles(path: str | PathLike[str], points: NDArray[Any], triangles: NDArray[Any]) -> Look:
     """The triangles of a file as a prim with the file's name."""
     source = Path(path)
-    stage = stage_of_triangles(source.stem, points, triangles)
-    (drawn,) = drawn_meshes(stage, source)
-    return _look(drawn, stage, source, 1.0)
+    (look,) = looks_of(stage_of_triangles(source.stem, points, triangles), source, 1.0)
+    return look
 
 
 def read_looks(path: str | PathLike[str]) -> list[Look]:
@@ -351,29 +304,42 @@ def read_looks(path: str | PathLike[str]) -> list[Look]:
     else:
         stage = _flattened(open_stage(source))
         metres = metres_per_unit(stage, source)
-    looks = [_look(drawn, stage, source, metres) for drawn in drawn_meshes(stage, source)]
+    looks = list(looks_of(stage, source, metres))
     if not looks:
         raise InputError(f"{source}: has no Mesh prim with faces")
     return looks
 
 
-def _look(drawn: DrawnMesh, stage: Any, source: Path, metres: float) -> Look:
-    prim = drawn.mesh.GetPrim()
-    normals = drawn.mesh.GetNormalsAttr().HasAuthoredValue() or prim.GetAttribute("primvars:normals").HasValue()
-    return Look(
-        prim.GetName(),
-        str(prim.GetPath()),
-        source,
-        metres * drawn.points,
-        drawn.triangles.astype(np.int32),
-        drawn.faces,
-        np.full(len(drawn.triangles), drawn.left_handed),
-        False,
-        bool(normals),
-        drawn.smooth,
-        _is_plain(prim),
-        stage,
-    )
+def looks_of(stage: Any, source: Path, metres: float) -> Iterator[Look]:
+    """The visible Mesh prims with faces at their first time, instances included; a unit has so many metres.
+
+    Raises:
+        InputError: Faces that do not match their points.
+    """
+    for prim in stage.Traverse(Usd.TraverseInstanceProxies()):
+        mesh = UsdGeom.Mesh(prim)
+        if not mesh or mesh.ComputePurpose() in ("guide", "proxy"):
+            continue
+        points, triangles, faces = _triangles(mesh, source)
+        if not len(triangles):
+            continue
+        left_handed = mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
+        left_handed ^= bool(np.linalg.det(world_matrix(prim)[:3, :3]) < 0.0)
+        normals = mesh.GetNormalsAttr().HasAuthoredValue() or prim.GetAttribute("primvars:normals").HasValue()
+        yield Look(
+            prim.GetName(),
+            str(prim.GetPath()),
+            source,
+            metres * in_world(prim, points),
+            (triangles[:, ::-1] if left_handed else triangles).astype(np.int32),
+            faces,
+            np.full(len(triangles), left_handed),
+            False,
+            bool(normals),
+            mesh.GetSubdivisionSchemeAttr().Get() != UsdGeom.Tokens.none,
+            _is_plain(prim),
+            stage,
+        )
 
 
 def _is_plain(prim: Any) -> bool:
