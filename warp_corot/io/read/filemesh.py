@@ -96,20 +96,25 @@ class FileMesh:
 
 
 @dataclass(frozen=True)
-class FileImage:
-    """The voxels of a file, see `warp_corot.io.read.volumes.LoadedVolume`.
+class LoadedVolume:
+    """The voxels of a file.
 
     Attributes:
-        values: [nx, ny, nz].
-        affine: From voxel indices to positions, float64 [4, 4].
+        values: [nx, ny, nz], with the file's own number type.
+        affine: Matrix from voxel indices to positions in ``unit``, float64 [4, 4]; right-anterior-superior if the
+            format names directions.
         notes: Notes for the user, one line each.
         unit: "m", "cm", "mm", or None if the file does not say.
+        name: Short name for a title.
+        source: The file.
     """
 
     values: NDArray[Any]
     affine: NDArray[np.float64]
-    notes: list[str]
+    notes: list[str] = field(default_factory=list)
     unit: str | None = None
+    name: str = ""
+    source: Path = Path()
 
 
 def joined_triangles(parts: Iterable[tuple[str, NDArray[Any], NDArray[Any]]], **about: Any) -> FileMesh:
@@ -302,7 +307,7 @@ def suffix_of(path: Path) -> str | None:
     return next((suffix for suffix in sorted(SUFFIXES, key=len, reverse=True) if name.endswith(suffix)), None)
 
 
-def read_mesh_file(path: Path) -> FileMesh | FileImage:
+def read_mesh_file(path: Path) -> FileMesh | LoadedVolume:
     """Read a mesh file, a scan, or a folder with a DICOM series.
 
     Readers are tried one after the other until one can read the file.
@@ -325,7 +330,7 @@ def read_mesh_file(path: Path) -> FileMesh | FileImage:
             missing.append(reader)
             continue
         found, reason = read_with(reader.module, path)
-        if isinstance(found, FileImage):
+        if isinstance(found, LoadedVolume):
             return found
         if found is not None and len(found.points):
             return checked_mesh(found, path)

@@ -18,8 +18,8 @@ from warp_corot.inputs.checks import checked_number, checked_path
 from warp_corot.io.files.quiet import bounded, quietly
 
 from .filemesh import (
-    FileImage,
     FileMesh,
+    LoadedVolume,
     checked_mesh,
     joined_triangles,
     read_mesh_file,
@@ -249,7 +249,7 @@ def load_tets(
     )
 
 
-def read_tetrahedra(path: Path) -> FileMesh | FileImage:
+def read_tetrahedra(path: Path) -> FileMesh | LoadedVolume:
     """The content of a mesh file; of a USD stage, its tetrahedra.
 
     Raises:
@@ -399,7 +399,7 @@ def load_surface(path: str | PathLike[str], *, found: FileMesh | None = None) ->
     )
 
 
-def read_surface(path: Path) -> FileMesh | FileImage:
+def read_surface(path: Path) -> FileMesh | LoadedVolume:
     """The triangles of a file: of USD stages those of Mesh prims.
 
     Raises:
@@ -420,7 +420,7 @@ def read_surface(path: Path) -> FileMesh | FileImage:
     raise InputError(f"{path}: unknown format {suffix or '(no extension)'}; it must be {known}")
 
 
-def read_file(path: Path) -> FileMesh | FileImage:
+def read_file(path: Path) -> FileMesh | LoadedVolume:
     """What a file holds: cells with volume, or else triangles, or the voxels of a VTK file with an image.
 
     Raises:

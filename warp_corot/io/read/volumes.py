@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -14,29 +14,7 @@ from numpy.typing import NDArray
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_numbers, checked_vector, shown
 
-from .filemesh import SCANS, FileImage, read_mesh_file, suffix_of
-
-
-@dataclass(frozen=True)
-class LoadedVolume:
-    """A volume from a file.
-
-    Attributes:
-        values: [nx, ny, nz], with the file's own number type.
-        affine: Matrix from voxel indices to positions in ``unit``, float64 [4, 4]; right-anterior-superior if the
-            format names directions.
-        unit: "m", "cm", "mm", or None if the file does not say.
-        name: Short name for a title.
-        source: The file.
-        notes: Notes for the user, one line each.
-    """
-
-    values: NDArray[Any]
-    affine: NDArray[np.float64]
-    unit: str | None
-    name: str
-    source: Path
-    notes: list[str] = field(default_factory=list)
+from .filemesh import SCANS, LoadedVolume, read_mesh_file, suffix_of
 
 
 def load_volume(path: str | PathLike[str]) -> LoadedVolume:
@@ -54,12 +32,12 @@ def load_volume(path: str | PathLike[str]) -> LoadedVolume:
         known = ", ".join(SCANS)
         raise InputError(f"{source}: unknown format {source.suffix or '(no extension)'}; it must be {known}")
     image = read_mesh_file(source)
-    if not isinstance(image, FileImage):
+    if not isinstance(image, LoadedVolume):
         raise InputError(f"{source}: holds a mesh; it must be an image")
     return volume_of_image(source, image)
 
 
-def volume_of_image(source: Path, image: FileImage) -> LoadedVolume:
+def volume_of_image(source: Path, image: LoadedVolume) -> LoadedVolume:
     """The volume of a file's voxels.
 
     Raises:
@@ -77,7 +55,7 @@ def volume_of_image(source: Path, image: FileImage) -> LoadedVolume:
     if not values.size:
         raise InputError(f"{source}: has no voxels, its shape is {values.shape}")
     name = source.resolve().name if source.is_dir() else source.name.removesuffix(suffix_of(source) or "")
-    return LoadedVolume(values, image.affine, image.unit, name, source, image.notes)
+    return replace(image, values=values, name=name, source=source)
 
 
 def affine_of(spacing: Any, origin: Any) -> NDArray[np.float64]:

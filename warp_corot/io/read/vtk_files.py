@@ -21,7 +21,7 @@ from vtkmodules.vtkCommonDataModel import (
 from vtkmodules.vtkFiltersCore import vtkAppendFilter, vtkTriangleFilter
 from vtkmodules.vtkFiltersGeneral import vtkDataSetTriangleFilter
 
-from .filemesh import CORNERS, Block, FileImage, FileMesh, Unreadable, corners_note, sets_of_numbers, whole_numbers
+from .filemesh import CORNERS, Block, FileMesh, LoadedVolume, Unreadable, corners_note, sets_of_numbers, whole_numbers
 
 #: VTK's cell types by the kind that their corners make; corners come first in cells of any order.
 KINDS = {
@@ -43,7 +43,7 @@ INTERNAL = (
 MANY_FACED = {6: "strips", 7: "polygons", 15: "pentagonal prisms", 16: "hexagonal prisms", 42: "polyhedra"}
 
 
-def read(path: Path) -> FileMesh | FileImage:
+def read(path: Path) -> FileMesh | LoadedVolume:
     """The cells of a file, or the voxels of an image.
 
     Raises:
@@ -234,7 +234,7 @@ def _ints(array: Any) -> NDArray[np.int64]:
         return np.array([array.GetComponent(k, 0) for k in range(array.GetNumberOfTuples())], dtype=np.int64)
 
 
-def _image(grid: Any) -> FileImage:
+def _image(grid: Any) -> LoadedVolume:
     extent = np.array(grid.GetExtent()).reshape(3, 2)
     at_points = grid.GetPointData().GetNumberOfArrays() > 0
     data = grid.GetPointData() if at_points else grid.GetCellData()
@@ -252,4 +252,4 @@ def _image(grid: Any) -> FileImage:
     affine[:3, 3] += affine[:3, :3] @ (extent[:, 0] + (0.0 if at_points else 0.5))
     notes = [] if at_points else ["values belong to cells: voxel centres lie between the grid's points"]
     values = np.array(vtk_to_numpy(array).reshape(tuple(shape), order="F"), order="F")
-    return FileImage(values, affine, notes)
+    return LoadedVolume(values, affine, notes)
