@@ -46,7 +46,7 @@ def measured(path: Path, options: list[str], tets: int, device: str) -> dict[str
             wall, cpu, own = time.perf_counter(), time.process_time(), time.thread_time()
             opened = open_input(str(path))
             if opened.kind == "tets":
-                return {"tets": len(load_tets(path).tets)}
+                return {"tets": len(load_tets(path).cells)}
             subjects = [find_organ(part, own) for part, own in bodies_in(opened, args)]
             seconds, cpu_seconds = time.perf_counter() - wall, time.process_time() - cpu
             own_seconds = time.thread_time() - own

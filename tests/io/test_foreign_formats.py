@@ -132,8 +132,8 @@ def test_polygons_and_strips_are_surfaces(tmp_path, suffix):
     data.SetPolys(polygons)
     data.SetStrips(strips)
     loaded = load_surface(write_with_vtk(tmp_path / f"box{suffix}", data))
-    assert len(loaded.triangles) == 12
-    assert np.linalg.det(loaded.points[loaded.triangles]).sum() / 6.0 == pytest.approx(6.0)
+    assert len(loaded.cells) == 12
+    assert np.linalg.det(loaded.points[loaded.cells]).sum() / 6.0 == pytest.approx(6.0)
     with pytest.raises(InputError, match=r"has no tetrahedra \(cell types: triangle\)"):
         load_tets(tmp_path / f"box{suffix}")
 
@@ -200,7 +200,7 @@ def test_second_order_cells_are_said(tmp_path):
     middles = [(corners[a] + corners[b]) / 2 for a, b in ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3))]
     path = write_gmsh(tmp_path / "a.msh", [*corners, *middles], [(11, 0, list(range(10)))])
     loaded = load_tets(path)
-    assert loaded.tets.tolist() == [[0, 1, 2, 3]]
+    assert loaded.cells.tolist() == [[0, 1, 2, 3]]
     assert loaded.notes == ["second-order cells (tetra) are taken by their corners, with straight edges"]
 
 
@@ -228,4 +228,4 @@ def test_orientation_of_split_cells_is_positive(tmp_path, mixed):
     points, cells = mixed
     path = write_gmsh(tmp_path / "a.msh", points, [(GMSH_KINDS[kind], 1, row) for kind, row in cells])
     loaded = load_tets(path)
-    assert (signed_volumes(loaded.points, loaded.tets) > 0).all()
+    assert (signed_volumes(loaded.points, loaded.cells) > 0).all()

@@ -165,7 +165,7 @@ def test_a_stage_that_changes_is_a_mesh_again_the_first_one(tmp_path):
     write(tmp_path / "a.usd", shown=[FINER, BOX, OTHER])
     loaded = load_tets(tmp_path / "a.usd")
     np.testing.assert_allclose(loaded.points, FINER.points, atol=1e-7)
-    np.testing.assert_array_equal(np.sort(loaded.tets, axis=1), np.sort(FINER.tets, axis=1))
+    np.testing.assert_array_equal(np.sort(loaded.cells, axis=1), np.sort(FINER.tets, axis=1))
 
 
 def test_a_surface_stays_the_same_on_every_mesh(tmp_path, rng):

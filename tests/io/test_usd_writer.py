@@ -171,7 +171,7 @@ def test_a_written_stage_is_a_mesh_again(tmp_path):
     write_all(path, 3)
     loaded = load_tets(path)
     assert np.allclose(loaded.points, Cube.points)  # the rest shape, not the first frame
-    assert [sorted(tet) for tet in loaded.tets.tolist()] == [sorted(tet) for tet in Cube.tets.tolist()]
+    assert [sorted(tet) for tet in loaded.cells.tolist()] == [sorted(tet) for tet in Cube.tets.tolist()]
     assert loaded.up_axis == "Z"
 
 

@@ -44,7 +44,7 @@ def _plate(count):
 
 def _bear(_):
     bear = load_tets("warp:bear", scale=0.1)
-    return wc.TetMesh(bear.points, bear.tets, up_axis=bear.up_axis)
+    return wc.TetMesh(bear.points, bear.cells, up_axis=bear.up_axis)
 
 
 SHAPES = {

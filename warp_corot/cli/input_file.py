@@ -16,7 +16,6 @@ from warp_corot.io.read import FileMesh
 from warp_corot.io.read.meshes import (
     Asset,
     LoadedMesh,
-    LoadedSurface,
     check_file,
     find_asset,
     load_surface,
@@ -46,7 +45,7 @@ class InputFile:
     kind: str
     asset: Asset | None = None
     found: FileMesh | None = None
-    loaded: LoadedMesh | LoadedSurface | LoadedVolume | None = None
+    loaded: LoadedMesh | LoadedVolume | None = None
     notes: list[str] = field(default_factory=list)
     unit: str | float | None = None
 
@@ -98,16 +97,13 @@ def with_unit(opened: InputFile, args: argparse.Namespace) -> InputFile:
     """
     if args.scale is not None and not 0.0 < args.scale < np.inf:
         raise InputError(f"scale is {args.scale:g}; it must be a positive number")
-    named: str | float | None = None
     loaded = opened.loaded
     if opened.kind == "tets":
-        given = None if args.unit is None else metres_per_unit(args.unit)
-        loaded = load_tets(opened.name, unit=given, regions=args.regions_by, found=opened.found)
+        loaded = load_tets(opened.name, unit=1.0, regions=args.regions_by, found=opened.found)
         opened = replace(opened, loaded=loaded)
     if isinstance(loaded, LoadedMesh):
-        size, named = _longest(loaded.points, loaded.tets), 1.0 if loaded.says_unit else None
-    elif isinstance(loaded, LoadedSurface):
-        size, named = _longest(loaded.points, loaded.triangles), loaded.metres
+        named: str | float | None = loaded.metres
+        size = longest_side(loaded.points[np.unique(loaded.cells)])
     elif isinstance(loaded, LoadedVolume):
         steps = np.linalg.norm(loaded.affine[:3, :3], axis=0)
         size, named = float((loaded.values.shape * steps).max()), loaded.unit
@@ -134,10 +130,8 @@ def placed(opened: InputFile, args: argparse.Namespace) -> Any:
     loaded, asset, offset = opened.loaded, opened.asset, offset_of(args)
     scale = 1.0 if args.scale is None else args.scale
     as_asset = asset is not None and args.scale is None and args.unit is None
-    if isinstance(loaded, LoadedMesh):
-        if args.unit is None and not loaded.says_unit and not asset:
-            scale *= metres_per_unit(opened.unit or 1.0)
-        scale = asset.scale if asset and as_asset else scale
+    if isinstance(loaded, LoadedMesh) and not loaded.is_surface:
+        scale = (asset.scale if asset and as_asset else scale) * metres_per_unit(opened.unit or 1.0)
         opened.notes += loaded.notes
         return replace(loaded, points=loaded.points * scale + offset, up_axis=args.up or loaded.up_axis)
     assert loaded is not None
@@ -161,11 +155,6 @@ def longest_side(points: np.ndarray) -> float:
     """The longest side of the box around points."""
     with np.errstate(invalid="ignore"):
         return float(np.ptp(points, axis=0).max()) if len(points) else 0.0
-
-
-def _longest(points: np.ndarray, cells: np.ndarray) -> float:
-    """The longest side of the box around the points that cells name."""
-    return longest_side(points[np.unique(cells)])
 
 
 # --- an option without effect on this input is refused, with the reason ----------------------------------------------
@@ -227,16 +216,16 @@ def bodies_in(opened: InputFile, args: argparse.Namespace) -> list[tuple[InputFi
     tetrahedra are separate bodies, too.
     """
     loaded = opened.loaded
-    several = isinstance(loaded, LoadedMesh | LoadedSurface) and 2 <= len(loaded.objects) <= MOST_BODIES
+    several = isinstance(loaded, LoadedMesh) and 2 <= len(loaded.objects) <= MOST_BODIES
     if args.join or not several:
         return [(opened, args)]
-    assert isinstance(loaded, LoadedMesh | LoadedSurface)
+    assert isinstance(loaded, LoadedMesh)
     parts, shares = _parts(loaded), np.zeros(0)
-    if isinstance(loaded, LoadedSurface):
+    if loaded.is_surface:
         from warp_corot.domain.closing import close_surface
 
         try:
-            whole, *closed = (close_surface(part.points, part.triangles) for part in (loaded, *parts))
+            whole, *closed = (close_surface(part.points, part.cells) for part in (loaded, *parts))
         except InputError:
             return [(opened, args)]
         if whole.cavities or any(part.caps for part in closed):
@@ -254,31 +243,20 @@ def bodies_in(opened: InputFile, args: argparse.Namespace) -> list[tuple[InputFi
     return found
 
 
-def _parts(loaded: LoadedMesh | LoadedSurface) -> list[Any]:
+def _parts(loaded: LoadedMesh) -> list[LoadedMesh]:
     """The objects of a file, which share no nodes."""
-    cells = loaded.tets if isinstance(loaded, LoadedMesh) else loaded.triangles
+    cells, parts = loaded.cells, list[LoadedMesh]()
     ends = np.cumsum([count for _, count in loaded.objects])
-    parts: list[LoadedMesh | LoadedSurface] = []
     for (name, count), chosen in zip(loaded.objects, np.split(np.arange(len(cells)), ends[:-1]), strict=True):
         if not count:
             continue
         used, renumbered = np.unique(cells[chosen], return_inverse=True)
         own = np.asarray(renumbered.reshape(-1, cells.shape[1]), dtype=np.int32)
-        part = replace(loaded, points=loaded.points[used], name=name, objects=[])
-        if isinstance(part, LoadedSurface):
-            parts.append(replace(part, triangles=own))
-            continue
-        sets = {known: np.flatnonzero(np.isin(used, nodes)) for known, nodes in part.node_sets.items()}
-        regions = part.regions
-        parts.append(
-            replace(
-                part,
-                tets=own,
-                regions=None if regions is None else replace(regions, of_tet=regions.of_tet[chosen]),
-                notes=[] if parts else part.notes,
-                node_sets={known: nodes for known, nodes in sets.items() if len(nodes)},
-            )
-        )
+        sets = {known: np.flatnonzero(np.isin(used, nodes)) for known, nodes in loaded.node_sets.items()}
+        regions = loaded.regions and replace(loaded.regions, of_tet=loaded.regions.of_tet[chosen])
+        sets = {known: nodes for known, nodes in sets.items() if len(nodes)}
+        about: dict[str, Any] = {"regions": regions, "node_sets": sets, "notes": [] if parts else loaded.notes}
+        parts.append(replace(loaded, points=loaded.points[used], cells=own, name=name, objects=[], **about))
     return parts
 
 

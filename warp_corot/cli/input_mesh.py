@@ -16,7 +16,7 @@ from warp_corot.body.places import named_nodes
 from warp_corot.domain.units import in_units
 from warp_corot.errors import InputError
 from warp_corot.inputs.stopwatch import WATCH
-from warp_corot.io.read.meshes import LoadedMesh, LoadedSurface
+from warp_corot.io.read.meshes import LoadedMesh
 from warp_corot.materials.isotropic import Isotropic
 from warp_corot.mesh import TetForest, TetMesh
 from warp_corot.mesh.lattice import checked_level
@@ -127,7 +127,7 @@ def find_subject(opened: InputFile, args: argparse.Namespace) -> InputMesh:
         x, y, z = offset_of(args).tolist()
         return box_subject(TetForest.box(CELLS, CELL_SIZE * (args.scale or 1.0), level, origin=(x, y, z)))
     loaded: LoadedMesh = placed(opened, args)
-    points, tets = loaded.points, loaded.tets
+    points, tets = loaded.points, loaded.cells
     sets = {name: np.isin(np.arange(len(points)), nodes) for name, nodes in loaded.node_sets.items()}
     if args.join:
         points, tets, sets = _joined(loaded, sets, opened.notes)
@@ -137,7 +137,7 @@ def find_subject(opened: InputFile, args: argparse.Namespace) -> InputMesh:
             raise InputError("its arrays number no regions, so that --materials has no effect")
         names, entries = of_regions(entries, found) if found is not None else ((), entries)
         labels = None if found is None else found.of_tet
-        mesh = TetMesh(points, tets, up_axis=loaded.up_axis, labels=labels, label_names=names, node_sets=sets)
+        mesh = TetMesh(points, tets, up_axis=loaded.up_axis or "Z", labels=labels, label_names=names, node_sets=sets)
     except InputError as error:
         raise InputError(f"{loaded.source}: {error}") from None
     subject = InputMesh(mesh, loaded.name, loaded.source, labels=entries, notes=opened.notes)
@@ -163,7 +163,7 @@ def _joined(
     Raises:
         InputError: There are no coincident nodes.
     """
-    points, tets, place = merged_nodes(loaded.points, loaded.tets)
+    points, tets, place = merged_nodes(loaded.points, loaded.cells)
     merged = len(place) - len(points)
     if not merged and not loaded.objects:
         raise InputError(f"{loaded.source}: no two nodes coincide, so that --join has no effect")
@@ -313,7 +313,7 @@ def _mesh(args: argparse.Namespace, domain: Domain) -> TetForest:
 
 def _own_surface(opened: InputFile, args: argparse.Namespace, domain: Domain) -> OwnSurface | None:
     """The input surface, if it is to be drawn."""
-    if not isinstance(opened.loaded, LoadedSurface) or args.skin == "marched":
+    if not isinstance(opened.loaded, LoadedMesh) or args.skin == "marched":
         return None
     from warp_corot.io.write.skins import OwnSurface
 

@@ -151,8 +151,8 @@ class TetMesh(LabelledMesh):
         found = loaded.regions
         return cls(
             loaded.points,
-            loaded.tets,
-            up_axis=up_axis or loaded.up_axis,
+            loaded.cells,
+            up_axis=up_axis or loaded.up_axis or "Z",
             labels=None if found is None else found.of_tet,
             label_names=() if found is None else found.names,
             node_sets=loaded.node_sets,

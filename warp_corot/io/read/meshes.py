@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import logging
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
@@ -135,34 +136,52 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class LoadedMesh:
-    """A tetrahedral mesh from a file.
+    """Tetrahedra or triangles from a file.
 
     Attributes:
-        points: Rest positions, float64 [N, 3] [m].
-        tets: Vertex indices, int32 [T, 4]; orientation as in the file.
-        up_axis: "X", "Y" or "Z"; for formats without one, "Z", the convention of the mesh generators that write them.
-        metres_per_unit: Length of the file's unit [m], before ``scale``.
+        points: float64 [N, 3]: of tetrahedra [m], of a surface in the file's unit; an asset has a likely size then.
+        cells: Tetrahedra [T, 4] or triangles [T, 3], int32, with the orientation in the file.
+        metres: Length of the file's unit [m]; None if the file does not say.
+        up_axis: "X", "Y" or "Z"; if the file does not say, None for a surface, and for tetrahedra "Z", the convention
+            of the mesh generators that write them.
         name: Short name for a title.
         source: The file.
-        regions: Its regions, if the file numbers any.
-        says_unit: Whether the file says its unit.
         notes: Notes for the user, one line each.
+        objects: Names of the file's objects (parts that share no nodes: prims, blocks), and the number of cells of
+            each, in order; empty if it has no parts.
+        regions: Its regions, if the file numbers any.
         node_sets: Named sets of nodes in the file, indices int64 [n].
-        objects: Names of the file's parts that share no nodes (prims, blocks, instances), and the number of tetrahedra
-            of each, in order; empty if the file has no parts.
     """
 
     points: NDArray[np.float64]
-    tets: NDArray[np.int32]
-    up_axis: str
-    metres_per_unit: float
+    cells: NDArray[np.int32]
+    metres: float | None
+    up_axis: str | None
     name: str
     source: Path
-    regions: Regions | None = None
-    says_unit: bool = False
     notes: list[str] = field(default_factory=list)
-    node_sets: dict[str, NDArray[np.int64]] = field(default_factory=dict)
     objects: list[tuple[str, int]] = field(default_factory=list)
+    regions: Regions | None = None
+    node_sets: dict[str, NDArray[np.int64]] = field(default_factory=dict)
+
+    @property
+    def is_surface(self) -> bool:
+        """Whether it has triangles."""
+        return self.cells.shape[1] == 3
+
+
+def _opened(
+    path: str | PathLike[str], kind: str, read: Callable[[Path], Any], found: FileMesh | None
+) -> tuple[Asset | None, Path, FileMesh]:
+    """The asset with a name, the file, and what it holds, if its points are finite."""
+    asset = find_asset(path)
+    source = asset.path if asset else checked_path(path, "path")
+    check_file(source, kind)
+    mesh = read(source) if found is None else found
+    if not isinstance(mesh, FileMesh):
+        raise InputError(f"{source}: has no {'triangles' if kind == 'surface' else 'tetrahedra'} (it holds an image)")
+    check_finite(mesh.points, source)
+    return asset, source, mesh
 
 
 def load_tets(
@@ -175,10 +194,9 @@ def load_tets(
 ) -> LoadedMesh:
     """Load the tetrahedra of a file, in metres.
 
-    OpenUSD reads USD stages (unit, up axis and world transforms applied, several prims joined); VTK, Gmsh, meshio or
-    readers of this package read other files, see `warp_corot.io.read`. Hexahedra, wedges and pyramids are
-    split into tetrahedra that fit those of their neighbours; cells of higher order become linear ones on their corners.
-    ``warp:NAME`` names an asset in Warp's wheel, see `warp_corot.io.read.meshes`.
+    OpenUSD reads USD stages (unit, up axis and world transforms applied, several prims joined); VTK or meshio read
+    other files. Hexahedra, wedges and pyramids are split into tetrahedra that fit those of their neighbours; cells of
+    higher order become linear ones on their corners. ``warp:NAME`` names an asset in Warp's wheel, see `Asset`.
 
     Args:
         path: File, or asset name.
@@ -197,19 +215,13 @@ def load_tets(
     """
     if not 0.0 < checked_number(scale, "scale") < np.inf:
         raise InputError(f"scale is {scale}; it must be a positive number")
-    asset = find_asset(path)
-    source = asset.path if asset else checked_path(path, "path")
-    check_file(source, "mesh")
-    mesh = read_tetrahedra(source) if found is None else found
-    if not isinstance(mesh, FileMesh):
-        raise InputError(f"{source}: has no tetrahedra (it holds an image)")
+    asset, source, mesh = _opened(path, "mesh", read_tetrahedra, found)
     if not mesh.solids:
         is_stage = source.suffix.lower() in USD_SUFFIXES
         kinds = "no TetMesh prim and no Mesh prim with tetraIndices" if is_stage else f"cell types: {mesh.kinds()}"
         raise InputError(f"{source}: has no tetrahedra ({kinds})")
     from warp_corot.domain.units import metres_per_unit  # late: domains read files
 
-    check_finite(mesh.points, source)
     metres = 1.0 if mesh.metres is None else mesh.metres
     points = mesh.points * (scale * (metres if unit is None else metres_per_unit(unit)))
     check_finite(points, source)
@@ -234,19 +246,42 @@ def load_tets(
         numbered = find_regions(mesh, cells, regions)
     except InputError as error:
         raise InputError(f"{source}: {error}") from None
-    return LoadedMesh(
-        points,
-        tets.astype(np.int32),
-        mesh.up_axis or "Z",
-        metres,
-        asset.name if asset else short_name(source),
-        source,
-        numbered,
-        mesh.metres is not None,
-        notes,
-        mesh.node_sets,
-        mesh.objects or _objects(mesh, cells),
-    )
+    name, objects = asset.name if asset else short_name(source), mesh.objects or _objects(mesh, cells)
+    about = (mesh.up_axis or "Z", name, source, notes, objects, numbered, mesh.node_sets)
+    return LoadedMesh(points, tets.astype(np.int32), mesh.metres, *about)
+
+
+def load_surface(path: str | PathLike[str], *, found: FileMesh | None = None) -> LoadedMesh:
+    """Read all triangles of a file, placed by its scene; polygons are cut into fans.
+
+    Args:
+        path: A file, or ``warp:NAME`` for one in Warp's wheel.
+        found: The result of `read_file`, if the file was read before.
+
+    Raises:
+        InputError: The file does not exist, has another format, cannot be read, or has no triangles; one line says
+            which.
+    """
+    asset, source, mesh = _opened(path, "surface", read_surface, found)
+    if mesh.solids:
+        raise InputError(f"{source}: has cells with volume, which TetMesh.load reads; it must have only triangles")
+    blocks = sorted(mesh.faces, key=lambda block: int(block.data.get("block", np.zeros(1))[0]))
+    triangles = triangles_of(blocks)
+    if not len(triangles):
+        raise InputError(f"{source}: has no triangles")
+    used, renumbered = np.unique(triangles, return_inverse=True)
+    points, notes = mesh.points[used], list(mesh.notes)
+    objects: dict[str, int] = {}
+    for number, name in mesh.names.get("block", {}).items():
+        own = [block for block in blocks if number in block.data.get("block", ())]
+        if own:
+            objects[name if name not in objects else f"{name} {number}"] = len(triangles_of(own))
+    if asset:
+        points = points * asset.scale
+        notes.append(f"scaled by {asset.scale:g}: {asset.note}")
+    about = (mesh.up_axis, asset.name if asset else short_name(source), source, notes)
+    objects_of = mesh.objects or list(objects.items())
+    return LoadedMesh(points, renumbered.reshape(-1, 3).astype(np.int32), mesh.metres, *about, objects_of)
 
 
 def read_tetrahedra(path: Path) -> FileMesh | LoadedVolume:
@@ -326,77 +361,6 @@ def _objects(mesh: FileMesh, cells: NDArray[np.int64]) -> list[tuple[str, int]]:
 #: Formats read with trimesh, and the usual up axis if the format names none; glTF's is in its standard.
 UP_AXES = {".obj": "Y", ".stl": "Z", ".ply": "Z", ".off": "Z", ".glb": "Y", ".gltf": "Y"}
 GLTF = (".glb", ".gltf")
-
-
-@dataclass(frozen=True)
-class LoadedSurface:
-    """A triangle surface from a file.
-
-    Attributes:
-        points: float64 [N, 3] in the file's unit; an asset is scaled to a likely size.
-        triangles: int32 [T, 3], wound as in the file.
-        metres: Metres in that unit, None if the file does not say.
-        up_axis: "X", "Y" or "Z"; None if the file does not say.
-        name: Short name for a title.
-        source: The file.
-        notes: Notes for the user, one line each.
-        objects: Names of the file's objects and the number of triangles of each, in order.
-    """
-
-    points: NDArray[np.float64]
-    triangles: NDArray[np.int32]
-    metres: float | None
-    up_axis: str | None
-    name: str
-    source: Path
-    notes: list[str] = field(default_factory=list)
-    objects: list[tuple[str, int]] = field(default_factory=list)
-
-
-def load_surface(path: str | PathLike[str], *, found: FileMesh | None = None) -> LoadedSurface:
-    """Read all triangles of a file, placed by its scene; polygons are cut into fans.
-
-    Args:
-        path: A file, or ``warp:NAME`` for one in Warp's wheel.
-        found: The result of `read_file`, if the file was read before.
-
-    Raises:
-        InputError: The file does not exist, has another format, cannot be read, or has no triangles; one line says
-            which.
-    """
-    asset = find_asset(path)
-    source = asset.path if asset else Path(path)
-    check_file(source, "surface")
-    mesh = read_surface(source) if found is None else found
-    if not isinstance(mesh, FileMesh):
-        raise InputError(f"{source}: has no triangles (it holds an image)")
-    if mesh.solids:
-        raise InputError(f"{source}: has cells with volume, which TetMesh.load reads; it must have only triangles")
-    check_finite(mesh.points, source)
-    blocks = sorted(mesh.faces, key=lambda block: int(block.data.get("block", np.zeros(1))[0]))
-    triangles = triangles_of(blocks)
-    if not len(triangles):
-        raise InputError(f"{source}: has no triangles")
-    used, renumbered = np.unique(triangles, return_inverse=True)
-    points, notes = mesh.points[used], list(mesh.notes)
-    objects: dict[str, int] = {}
-    for number, name in mesh.names.get("block", {}).items():
-        own = [block for block in blocks if number in block.data.get("block", ())]
-        if own:
-            objects[name if name not in objects else f"{name} {number}"] = len(triangles_of(own))
-    if asset:
-        points = points * asset.scale
-        notes.append(f"scaled by {asset.scale:g}: {asset.note}")
-    return LoadedSurface(
-        points,
-        renumbered.reshape(-1, 3).astype(np.int32),
-        mesh.metres,
-        mesh.up_axis,
-        asset.name if asset else short_name(source),
-        source,
-        notes,
-        mesh.objects or list(objects.items()),
-    )
 
 
 def read_surface(path: Path) -> FileMesh | LoadedVolume:

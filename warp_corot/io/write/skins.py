@@ -22,7 +22,7 @@ from warp_corot.mesh.surfaces.bound import SurfaceMesh
 if TYPE_CHECKING:
     from typing import TypeAlias
 
-    from warp_corot.io.read.meshes import LoadedSurface
+    from warp_corot.io.read.meshes import LoadedMesh
     from warp_corot.io.read.usd.meshes import Look
 
     Surface: TypeAlias = "SurfaceMesh | OwnSurface | str | PathLike[str]"
@@ -47,7 +47,7 @@ class OwnSurface:
     def of_domain(
         cls,
         path: str | PathLike[str],
-        loaded: LoadedSurface,
+        loaded: LoadedMesh,
         bounds: npt.ArrayLike,
         offset: npt.ArrayLike = (0.0, 0.0, 0.0),
     ) -> OwnSurface | None:
@@ -65,7 +65,7 @@ class OwnSurface:
         """
         from warp_corot.io.read.usd.meshes import has_looks, look_of_triangles, read_looks
 
-        looks = read_looks(path) if has_looks(path) else [look_of_triangles(path, loaded.points, loaded.triangles)]
+        looks = read_looks(path) if has_looks(path) else [look_of_triangles(path, loaded.points, loaded.cells)]
         moved = np.asarray(offset, dtype=np.float64)
         given = np.asarray(bounds, dtype=np.float64) - moved
         length = float(np.ptp(given, axis=0).max())
