@@ -11,8 +11,7 @@ from warp_corot.cli import main
 from warp_corot.domain import Domain
 from warp_corot.domain.closing import close_surface
 from warp_corot.errors import InputError
-from warp_corot.io.read.filemesh import FileMesh, Unreadable
-from warp_corot.io.read.volumes import load_volume
+from warp_corot.io.read.filemesh import FileMesh, Unreadable, load_volume
 
 
 def test_a_stage_that_is_cut_off_gets_one_line(tmp_path):

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from warp_corot.domain.units import length, likely_unit, metres_per_unit, unlikely_size
 from warp_corot.errors import InputError
 from warp_corot.io.read import FileMesh
+from warp_corot.io.read.filemesh import LoadedVolume, volume_of_image
 from warp_corot.io.read.meshes import (
     Asset,
     LoadedMesh,
@@ -22,7 +23,6 @@ from warp_corot.io.read.meshes import (
     load_tets,
     read_file,
 )
-from warp_corot.io.read.volumes import LoadedVolume, volume_of_image
 
 from .options import TETS
 

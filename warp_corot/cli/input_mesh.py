@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from warp_corot.discretization.elements import Mesh
     from warp_corot.domain import Domain
     from warp_corot.domain.fidelity import Fidelity
+    from warp_corot.io.read.filemesh import LoadedVolume
     from warp_corot.io.read.meshes import Asset, Regions
-    from warp_corot.io.read.volumes import LoadedVolume
     from warp_corot.io.write.skins import OwnSurface
     from warp_corot.mesh import SurfaceMesh
 

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, checked_numbers, shown
-from warp_corot.io.read.volumes import LoadedVolume, affine_of, load_volume
+from warp_corot.io.read.filemesh import LoadedVolume, affine_of, load_volume
 
 from .units import metres_per_unit
 
