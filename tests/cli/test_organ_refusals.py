@@ -77,7 +77,7 @@ REFUSED = [
     (["scan.nii.gz", "--labels", "a=soft,b=3kPa"], "'soft' is not a number, with or without a unit"),
     (["scan.nii.gz", "--labels", "a=3inch,b=3kPa"], "3inch"),
     (["scan.nii.gz", "--labels", "a=3kPa:half,b=3kPa"], "'half' is not a number"),
-    (["scan.nii.gz", "--labels", "a=3kPa:nan,b=3kPa"], "'nan'"),
+    (["scan.nii.gz", "--labels", "a=3kPa:nan,b=3kPa"], "poisson is nan"),
     (["scan.nii.gz", "--labels", "a=3kPa:0.5,b=3kPa"], "--labels 'a=3kPa:0.5': poisson is 0.5"),
     (["scan.nii.gz", "--labels", "a=-3kPa,b=3kPa"], "young is -3000 Pa"),
     (["scan.nii.gz", "--labels", "a=3kPa:0.4:0,b=3kPa"], "density is 0"),

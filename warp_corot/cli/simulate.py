@@ -286,7 +286,8 @@ def title_of(bodies: Sequence[RunBody]) -> str:
     if not any(body.remesh for body in bodies):
         words.append(f"{sum(len(body.soft.mesh.tets) for body in bodies):,} elements")
     young = np.unique(np.concatenate([np.ravel(body.soft.material.isotropic.young) for body in bodies]))
-    return ", ".join([*words, *([pressure(float(young[0]))] if len(young) == 1 else [])])
+    words += [pressure(float(young[0]))] if len(young) == 1 else []
+    return ", ".join([*words, *(["at rest"] if is_static(bodies[0].args) else [])])
 
 
 def _body_rows(body: RunBody) -> list[tuple[str, str]]:

@@ -254,7 +254,7 @@ def record(
     """
     from warp_corot.io.write.usd.writer import UsdWriter
 
-    from .paraview import ParaViewWriter, fields_of
+    from .paraview import ParaViewWriter, frame_of
 
     if not isinstance(sim, Simulation):
         raise InputError(f"sim is {shown(sim)}; it must be a Simulation, for example Simulation(body)")
@@ -294,9 +294,9 @@ def record(
         writer.about = {**told, **steps_made(sim)}
         _write_frame(writer, sim, joined, done)
         if also:
-            fields = fields_of(sim, joined, sim.total_time - first_time)
+            shown_mesh = frame_of(sim, joined)
             for other in others:
-                other.write(fields)
+                other.write(sim.total_time - first_time, shown_mesh)
 
     with closed_whole(writer, done, others), progress_bar(count, wanted=progress is None) as bar:
         make_frames(sim, fps, count, done, write, progress or bar)

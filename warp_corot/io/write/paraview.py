@@ -5,13 +5,11 @@ Points are rest positions; *Warp By Vector* with ``displacement`` shows the movi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
-import numpy.typing as npt
 
 from warp_corot.elasticity.float64 import cauchy_stress, displacement_gradients, green_strain, has_tensor
 from warp_corot.errors import InputError
@@ -23,39 +21,16 @@ if TYPE_CHECKING:
 
     from .animate import JoinedBodies
 
-# --- the fields of a frame: displacements and velocities of nodes, strain and stress of elements ---------------------
 
-
-@dataclass(frozen=True)
-class Fields:
-    """A frame.
-
-    Attributes:
-        time: Time [s].
-        points: Rest positions [m], float64 [N, 3].
-        tets: int32 [T, 4], none mirrored.
-        nodal: Fields of nodes by name, [N] or [N, 3].
-        elemental: Fields of elements by name, [T] or [T, 9], tensors row by row.
-    """
-
-    time: float
-    points: npt.NDArray[np.float64]
-    tets: npt.NDArray[np.int32]
-    nodal: dict[str, npt.NDArray[Any]]
-    elemental: dict[str, npt.NDArray[Any]]
-
-
-def fields_of(sim: Simulation, joined: JoinedBodies, time: float) -> Fields:
-    """The current state of bodies in one world, body after body.
+def frame_of(sim: Simulation, joined: JoinedBodies) -> Any:
+    """The current state of bodies in one world, body after body, as a mesh of meshio at rest.
 
     Nodes have ``displacement`` [m], ``velocity`` [m/s] and ``fixed``; elements ``strain`` (Green-Lagrange), ``stress``
-    [Pa] if the elastic law is local and isotropic, ``von_mises`` [Pa], and ``region`` if meshes have labels.
-
-    Args:
-        sim: The simulation.
-        joined: Its bodies in one world.
-        time: Time of the frame [s].
+    [Pa] if the elastic law is local and isotropic, ``von_mises`` [Pa], and ``region`` if meshes have labels; tensors
+    are [T, 9], row by row.
     """
+    import meshio
+
     u = joined.nodal("displacements")
     nodal = {"displacement": u, "velocity": joined.nodal("velocities"), "fixed": joined.fixed.astype(np.int8)}
     gradients = displacement_gradients(joined.points, joined.tets, u.astype(np.float64))
@@ -72,7 +47,8 @@ def fields_of(sim: Simulation, joined: JoinedBodies, time: float) -> Fields:
         numbers = [np.zeros(n, np.int32) if own is None else own for own, n in zip(labels, counts, strict=True)]
         elemental["region"] = np.concatenate(numbers).astype(np.int32)
     tets = right_handed(joined.tets, signed_volumes(joined.points, joined.tets) < 0.0)
-    return Fields(time, joined.points, tets, nodal, elemental)
+    cells = {name: [values] for name, values in elemental.items()}
+    return meshio.Mesh(joined.points, [("tetra", tets)], point_data=nodal, cell_data=cells)
 
 
 # --- VTK's files -----------------------------------------------------------------------------------------------------
@@ -106,24 +82,24 @@ class ParaViewWriter:
         check_also(path)
         self._path = path
         self._listed: list[str] = []
-        self._last: Fields | None = None
+        self._last: Any = None
 
-    def write(self, fields: Fields) -> None:
-        """Write a frame, or keep it.
+    def write(self, time: float, mesh: Any) -> None:
+        """Write the frame of a time [s], a mesh of meshio, or keep it.
 
         Raises:
             WriteError: It could not be written.
         """
         if self._path.suffix.lower() == LAST:
-            self._last = fields
+            self._last = mesh
             return
         folder = _frames_folder(self._path)
         with writing(folder):
             folder.mkdir(exist_ok=True)
         name = f"{self._path.stem}_{len(self._listed):05}.vtu"
-        write_vtu(folder / name, fields)
+        write_vtu(folder / name, mesh)
         file = quoteattr(f"{folder.name}/{name}")
-        self._listed.append(f'    <DataSet timestep="{fields.time:.9g}" part="0" file={file}/>')
+        self._listed.append(f'    <DataSet timestep="{time:.9g}" part="0" file={file}/>')
         lines = ['<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1" byte_order="LittleEndian">']
         lines += ["  <Collection>", *self._listed, "  </Collection>", "</VTKFile>", ""]
         with written_whole(self._path) as part:
@@ -140,16 +116,14 @@ class ParaViewWriter:
         self._last = None
 
 
-def write_vtu(path: Path, fields: Fields) -> None:
-    """Write a frame as a .vtu, completely or not at all.
+def write_vtu(path: Path, mesh: Any) -> None:
+    """Write a mesh of meshio as a .vtu, completely or not at all.
 
     Raises:
         WriteError: It could not be written.
     """
     import meshio
 
-    cells = {name: [values] for name, values in fields.elemental.items()}
-    mesh = meshio.Mesh(fields.points, [("tetra", fields.tets)], point_data=fields.nodal, cell_data=cells)
     with written_whole(path) as part:
         meshio.write(part, mesh, file_format="vtu")
 
