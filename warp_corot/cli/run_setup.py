@@ -14,20 +14,8 @@ from warp_corot.body.soft_body import SoftBody
 from warp_corot.cutting.blade import Blade
 from warp_corot.elasticity import Corotated
 from warp_corot.errors import InputError, UnstableError
+from warp_corot.inputs import loading
 from warp_corot.inputs.device import checked_device
-from warp_corot.inputs.loading import (
-    BODY,
-    CONTACT,
-    CONTACT_ON_CPU,
-    EXPLICIT,
-    IMPLICIT,
-    IMPLICIT_ON_FORESTS,
-    MESHING,
-    STEPS,
-    STEPS_ON_CPU,
-    SURFACES,
-    begin_loading,
-)
 from warp_corot.inputs.stopwatch import WATCH
 from warp_corot.mesh import TetForest
 from warp_corot.simulation.beginning import bring_to_rest
@@ -101,7 +89,7 @@ def _made_ready(options: Sequence[argparse.Namespace], touches: bool, chooses: b
             inputs.append(asked_bodies(each))
     bodies = [body for found in inputs for body in found]
     tell_compiling(device)
-    begin_loading(_modules(bodies, touches or touched.contact is not None, chooses, device), device)
+    loading.begin_loading(_modules(bodies, touches or touched.contact is not None, chooses, device), device)
     for body in bodies:
         with waiting(f"meshing {body.args.input}"):
             body.subject = find_body(body)
@@ -131,13 +119,15 @@ def _made_ready(options: Sequence[argparse.Namespace], touches: bool, chooses: b
 def _modules(bodies: Sequence[RunBody], touches: bool, chooses: bool, device: wp.Device) -> list[str]:
     """Modules of kernels that the run is known to launch, in the order in which it needs them."""
     meshed = any(body.opened.kind in ("surface", "scan") for body in bodies)
-    names = [*SURFACES, *MESHING] if meshed else []
+    names = [*loading.SURFACES, *loading.MESHING] if meshed else []
     explicit = not INTEGRATORS[integrator_name(bodies[0].args)].is_implicit
-    contact, steps = (CONTACT_ON_CPU, STEPS_ON_CPU) if device.is_cpu else (CONTACT, STEPS)
-    names += [*BODY, *(contact if touches and explicit else ()), *steps]
+    contact, steps = (
+        (loading.CONTACT_ON_CPU, loading.STEPS_ON_CPU) if device.is_cpu else (loading.CONTACT, loading.STEPS)
+    )
+    names += [*loading.BODY, *(contact if touches and explicit else ()), *steps]
     if meshed and not touches and chooses and may_choose(bodies):
-        return [*names, *IMPLICIT, *IMPLICIT_ON_FORESTS]
-    return [*names, *(EXPLICIT if explicit else ())]
+        return [*names, *loading.IMPLICIT, *loading.IMPLICIT_ON_FORESTS]
+    return [*names, *(loading.EXPLICIT if explicit else ())]
 
 
 def _frames(args: argparse.Namespace, bodies: Sequence[RunBody], touched: RunContact) -> tuple[float, int]:

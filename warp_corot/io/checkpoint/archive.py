@@ -32,19 +32,7 @@ from warp_corot.remesh.online import OnlineRemesh
 from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import INTEGRATORS
 
-from .contents import (
-    blades_of,
-    obstacles_of,
-    pack_blades,
-    pack_changing,
-    pack_contact,
-    pack_mesh,
-    remesh_options,
-    unpack_blades,
-    unpack_changing,
-    unpack_contact,
-    unpack_mesh,
-)
+from . import contents
 
 if TYPE_CHECKING:
     from warp_corot.remesh.changing import Changing
@@ -131,7 +119,7 @@ def save_checkpoint(sim: Simulation, path: str | PathLike[str], *, in_parts: boo
     if target.is_dir():
         raise InputError(f"cannot save {target}: it is a folder")
     packed = zip(sim.bodies, sim.models, sim.fields, sim.remeshing.changing, strict=True)
-    cuts = pack_blades(sim.blades) | {"stable_steps": sim.stable_steps} if sim.remeshing.are_cut else None
+    cuts = contents.pack_blades(sim.blades) | {"stable_steps": sim.stable_steps} if sim.remeshing.are_cut else None
     plain, arrays = split(
         {
             "format": FORMAT,
@@ -149,7 +137,7 @@ def save_checkpoint(sim: Simulation, path: str | PathLike[str], *, in_parts: boo
             "guard": sim.guard.state,
             "running": sim.running.state,
             "cuts": cuts,
-            "contact": pack_contact(sim.contact, sim.grasps),
+            "contact": contents.pack_contact(sim.contact, sim.grasps),
         }
         | ({"in_parts": True} if in_parts else {})
     )
@@ -171,13 +159,13 @@ def pack_body(
         mesh, material = changing.forest.source, changing.carried_material.given
     return {
         "model": model,
-        "mesh": pack_mesh(mesh) if with_mesh else None,
+        "mesh": contents.pack_mesh(mesh) if with_mesh else None,
         "material": material,
         "threads": body.threads,
         "world_starts": body.conditions.world_starts,
         "field": field.state,
         "state": None if changing is not None else _pack_state(body),
-        "remesh": None if changing is None else pack_changing(changing),
+        "remesh": None if changing is None else contents.pack_changing(changing),
     }
 
 
@@ -237,7 +225,7 @@ def load_checkpoint(
 
 def _rebuilt_simulation(tree: dict[str, Any], device: str | wp.Device | None, remesh: Remesh) -> Simulation:
     place = tree["device"] if device is None else device
-    touching = obstacles_of(tree["contact"])
+    touching = contents.obstacles_of(tree["contact"])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", StabilityWarning)  # the warning was shown when the simulation was made
         sim = Simulation(
@@ -246,8 +234,8 @@ def _rebuilt_simulation(tree: dict[str, Any], device: str | wp.Device | None, re
             integrator=tree["integrator"],
             gravity=tree["gravity"],
             deterministic=tree["deterministic"],
-            remesh=remesh_options(tree["bodies"], place, remesh, touching.get("obstacles", ())),
-            cuts=blades_of(tree["cuts"]),
+            remesh=contents.remesh_options(tree["bodies"], place, remesh, touching.get("obstacles", ())),
+            cuts=contents.blades_of(tree["cuts"]),
             **touching,
         )
     sim.steps_before_reset, sim.time_before_reset = tree["steps_before_reset"], tree["time_before_reset"]
@@ -256,7 +244,7 @@ def _rebuilt_simulation(tree: dict[str, Any], device: str | wp.Device | None, re
     bodies = zip(tree["bodies"], sim.bodies, sim.fields, sim.remeshing.changing, strict=True)
     for packed, body, field, changing in bodies:
         if changing is not None and packed["remesh"] is not None:
-            unpack_changing(changing, packed["remesh"])
+            contents.unpack_changing(changing, packed["remesh"])
         body.conditions.world_starts.assign(packed["world_starts"].astype(np.float64))
         for name, values in packed["field"].items():
             field.state[name].assign(values)
@@ -264,8 +252,8 @@ def _rebuilt_simulation(tree: dict[str, Any], device: str | wp.Device | None, re
         sim.kept[name].assign(values)
     if tree["cuts"] is not None:
         sim.stable_steps = tree["cuts"]["stable_steps"]
-        unpack_blades(sim.blades, tree["cuts"])
-    unpack_contact(sim.contact, tree["contact"])
+        contents.unpack_blades(sim.blades, tree["cuts"])
+    contents.unpack_contact(sim.contact, tree["contact"])
     sim.guard.resume(**tree["guard"])
     sim.running.resume(**tree["running"])
     return sim
@@ -275,7 +263,7 @@ def rebuilt_body(
     packed: dict[str, Any], worlds: int, device: str | wp.Device, mesh: TetForest | TetMesh | None = None
 ) -> SoftBody:
     """The body that ``pack_body`` packed, with another mesh if it was packed without."""
-    mesh = unpack_mesh(packed["mesh"]) if mesh is None else mesh
+    mesh = contents.unpack_mesh(packed["mesh"]) if mesh is None else mesh
     body = SoftBody(mesh, packed["material"], worlds=worlds, device=device, threads=packed["threads"])
     if packed["state"] is not None:
         _unpack_state(body, packed["state"])

@@ -265,12 +265,7 @@ def _write_mp4(path: Path, images: Iterator[Image], fps: float) -> None:
     from imageio.v2 import get_writer
 
     options = {"codec": "libx264", "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
-    named = path.with_name(f"{path.name}.mp4")  # FFmpeg chooses the format by the name
-    try:
-        writer: Any
-        with get_writer(named, format="FFMPEG", mode="I", fps=fps, **options) as writer:
-            for image in images:
-                writer.append_data(np.asarray(image))
-        named.replace(path)
-    finally:
-        named.unlink(missing_ok=True)
+    writer: Any
+    with get_writer(path, format="FFMPEG", mode="I", fps=fps, **options) as writer:
+        for image in images:
+            writer.append_data(np.asarray(image))

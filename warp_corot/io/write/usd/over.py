@@ -13,7 +13,7 @@ from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, Vt
 
 from warp_corot.errors import InputError
 from warp_corot.io.files.usd import reason, usd_name
-from warp_corot.io.files.whole import sync
+from warp_corot.io.files.whole import written_whole
 from warp_corot.io.pictures.colors import VertexAverage, color_index
 from warp_corot.io.read.usd.scene import Scene, TetPrim
 from warp_corot.mesh.surfaces.boundary import boundary_faces
@@ -280,12 +280,8 @@ def _way(path: Path, below: Path) -> str:
 
 
 def _flatten(path: Path) -> None:
-    part = path.with_name(f".{path.stem}-flat{path.suffix}")
     try:
-        Usd.Stage.Open(usd_name(path)).Flatten().Export(usd_name(part))
-        sync(part)
-        os.replace(part, path)
+        with written_whole(path) as part:
+            Usd.Stage.Open(usd_name(path)).Flatten().Export(usd_name(part))
     except Tf.ErrorException as error:
         raise OSError(f"{path}: cannot be flattened: {reason(error)}") from None
-    finally:
-        part.unlink(missing_ok=True)
