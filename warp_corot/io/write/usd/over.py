@@ -248,7 +248,7 @@ class SceneWriter(ColoredStage):
         root.subLayerPaths.append(self._below)
         return root
 
-    def _colors(self, samples: Samples, nodal: NDArray[np.float64] | None = None) -> Samples:
+    def _colors(self, samples: Samples) -> Samples:
         colors: Samples = {}
         for soft in self._soft:
             colors |= soft.colors(samples, self.stress_range[1])

@@ -422,21 +422,19 @@ class ColoredStage(PieceStore):
         if self._closed:
             raise InputError(f"{self.path}: is closed; frames must be added before")
 
-    def _add(
-        self, samples: Samples, stress: NDArray[np.float32] | None, nodal: NDArray[np.float64] | None = None
-    ) -> None:
-        """Add a frame with stresses of tetrahedra [T] [Pa], if any, and their averages at nodes [N], if known."""
+    def _add(self, samples: Samples, stress: NDArray[np.float32] | None) -> None:
+        """Add a frame with stresses of tetrahedra [T] [Pa], if any."""
         if stress is not None:
             self.widen_range(self.range_for(stress))
             self._ranges_used.add(self.stress_range)
             lowest, highest = self.stress_range
             legend = {"map": COLORMAP_NAME, "quantity": "von Mises stress", "unit": "Pa"}
             self.custom_data["stressColors"] = legend | {"lowest": lowest, "highest": highest}
-            samples |= self._colors(samples, nodal)
+            samples |= self._colors(samples)
         self.add(float(self.frames), samples)
         self.frames += 1
 
-    def _colors(self, samples: Samples, nodal: NDArray[np.float64] | None = None) -> Samples:
+    def _colors(self, samples: Samples) -> Samples:
         """Colours for the stresses of a frame, in the present range."""
         raise NotImplementedError
 

@@ -15,7 +15,7 @@ from warp_corot.io.files.usd import free_name
 from warp_corot.io.pictures.colors import TISSUE, VertexAverage, color_index, srgb_to_linear, stress_colors
 from warp_corot.io.write.skins import Skin
 from warp_corot.mesh.surfaces.bound import vertex_normals
-from warp_corot.mesh.surfaces.boundary import boundary_faces, signed_volumes
+from warp_corot.mesh.surfaces.boundary import boundary_faces
 
 from .pieces import Samples
 
@@ -183,7 +183,7 @@ class SkinPrim:
             self._said = self._skin
         return samples
 
-    def colors(self, samples: Samples, limits: Limits, _: Any = None) -> Samples:
+    def colors(self, samples: Samples, limits: Limits) -> Samples:
         """As in `TetPrims.colors`."""
         stress = samples.get(f"{self._path}.primvars:vonMises")
         if not self._with_colors or stress is None:
@@ -329,7 +329,7 @@ class TetPrims:
         if statics.velocities:
             tets.CreateVelocitiesAttr()
         self._declare_primvars(UsdGeom.PrimvarsAPI(tets), statics)
-        declare_moving(tets, statics.stress)
+        declare_moving(tets, statics.stress, colored=False)
         if statics.touched:
             declare_touched(tets)
         if not self._changing:
@@ -348,22 +348,9 @@ class TetPrims:
             samples |= frame.touched.samples(TETS)
         return samples | self._changes() if self._changing else samples
 
-    def colors(self, samples: Samples, limits: Limits, nodal: NDArray[np.float64] | None = None) -> Samples:
-        """Colours for the stresses of a frame, and the data of the mesh if it has changed."""
-        if STRESS not in samples:
-            return {}
-        if nodal is None:
-            nodal = self._averaged(samples)
-        indices = Vt.IntArray.FromNumpy(color_index(nodal, *limits))
-        return {f"{TETS}.primvars:displayColor:indices": indices}
-
-    def _averaged(self, samples: Samples) -> NDArray[np.float64]:
-        stress = np.asarray(samples[STRESS])
-        if INDICES in samples and self._changing:
-            points, tets = np.asarray(samples[REST], dtype=np.float64), np.asarray(samples[INDICES])
-            average = VertexAverage(tets, np.abs(signed_volumes(points, tets)), len(points))
-            self._present = self._present._replace(points=points, tets=tets, average=average)
-        return self._present.average(stress)
+    def colors(self, samples: Samples, limits: Limits) -> Samples:
+        """Colours for the stresses of a frame: none, as viewers draw the surfaces."""
+        return {}
 
     def _changes(self) -> Samples:
         """Changed values among those that do not change in every frame."""

@@ -183,7 +183,7 @@ class ObstaclePrim:
             f"{self._path}.{TORQUE}": Gf.Vec3f(*wrench[3:]),
         }
 
-    def colors(self, samples: Samples, limits: Limits, _: Any = None) -> Samples:
+    def colors(self, samples: Samples, limits: Limits) -> Samples:
         """As in `TetPrims.colors`."""
         return {}
 
@@ -261,10 +261,10 @@ class UsdWriter(ColoredStage):
     Both have ``points``, ``velocities`` [m/s] and ``extent`` in each frame. The TetMesh has primvars ``rest`` (vertex),
     ``fixed`` (vertex, 1 if held), ``young`` [Pa], ``poisson``, ``density`` [kg/m³] (constant, or uniform: one a
     tetrahedron) and ``vonMises`` [Pa] (uniform, in each frame), the Mesh has averages of that at its nodes. With
-    contact, both have ``contactPressure`` [Pa], and the TetMesh ``contactForce`` [N] (vertex, in each frame). Both show
-    the stress as ``displayColor``: averages over the tetrahedra around each node, as indices into the 256 colours of
-    `colors.stress_colors`; custom data of ``/SoftBody`` name the map and its range. ``/SoftBody/physics`` has the
-    physics materials, and with ``gravity`` a physics scene, see `declare_physics`.
+    contact, both have ``contactPressure`` [Pa], and the TetMesh ``contactForce`` [N] (vertex, in each frame). The Mesh
+    shows its stress as ``displayColor``, by indices into the 256 colours of `colors.stress_colors`; custom data of
+    ``/SoftBody`` name the map and its range. ``/SoftBody/physics`` has the physics materials, and with ``gravity`` a
+    physics scene, see `declare_physics`.
 
     Mirrored tetrahedra are written with two indices swapped, so that all are right-handed as the schema requires.
 
@@ -408,12 +408,12 @@ class UsdWriter(ColoredStage):
         samples: Samples = {}
         for prim in self._prims:
             samples |= prim.samples(frame)
-        self._add(samples, stress, nodal)
+        self._add(samples, stress)
 
-    def _colors(self, samples: Samples, nodal: NDArray[np.float64] | None = None) -> Samples:
+    def _colors(self, samples: Samples) -> Samples:
         colors: Samples = {}
         for prim in self._prims:
-            colors |= prim.colors(samples, self.stress_range, nodal)
+            colors |= prim.colors(samples, self.stress_range)
         return colors
 
     def _drawn_anew(self) -> dict[str, str]:
