@@ -20,7 +20,7 @@ from warp_corot.remesh.online import OnlineRemesh
 from warp_corot.simulation.parts import checked_gravity
 
 from .input_file import InputFile, bodies_in, open_input, refuse_options, with_unit
-from .input_mesh import InputMesh, covers_all, find_organ, find_subject, label_material, region_material
+from .input_mesh import InputMesh, covers_all, find_organ, find_subject, mixed_material, region_entries
 from .options import is_static
 from .patches import BodyPatches, Load, loads_of, move_patches, probes_body, ramp_of, up_of
 
@@ -173,14 +173,13 @@ def _material(
     if young is None:
         young = float(f"{stiffer * subject.young_from_weight(density, args.gravity):.1e}")
         chosen = None if covered else young
-    if subject.labels:
-        material = label_material(subject.mesh, subject.labels, young, poisson, density)
-    else:
-        material = Isotropic(young, poisson, density)
+    material = Isotropic(young, poisson, density)
+    mixed = [(subject.mesh.elements_of(entry.name), entry) for entry in subject.labels]
+    mixed += region_entries(patches.tetrahedra, args.region or ())
+    if mixed:
+        material = mixed_material(material, mixed, len(subject.mesh.tets))
     if args.toughness is not None:
         material = replace(material, toughness=args.toughness)
-    if args.region:
-        material = region_material(subject.mesh, patches.tetrahedra, args.region, material)
     return material, chosen
 
 

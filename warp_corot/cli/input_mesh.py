@@ -25,7 +25,6 @@ from .input_file import InputFile, merged_nodes, offset_of, placed
 from .options import BOX_LEVEL, CUBES_OF_LEVEL, LABEL, STIFFNESS_PER_WEIGHT, TETS
 
 if TYPE_CHECKING:
-    from warp_corot.discretization.elements import Mesh
     from warp_corot.domain import Domain
     from warp_corot.domain.fidelity import Fidelity
     from warp_corot.io.read.filemesh import LoadedVolume
@@ -461,28 +460,6 @@ def of_regions(entries: Sequence[LabelMaterial], regions: Regions) -> tuple[tupl
     return tuple(names), found
 
 
-def label_material(
-    mesh: TetForest | TetMesh, entries: Sequence[LabelMaterial], young: float, poisson: float, density: float
-) -> Isotropic:
-    """The material of each element by its label.
-
-    Args:
-        mesh: A mesh with labels.
-        entries: Materials by label.
-        young: Young's modulus [Pa] of elements without a label, or whose label has no entry.
-        poisson: Poisson's ratio of these elements, and of entries without one.
-        density: Density [kg/m^3] of these elements, and of entries without one.
-    """
-    of_label = {name: number for number, name in enumerate(mesh.label_names, start=1)}
-    table = np.repeat([[young], [poisson], [density]], len(mesh.label_names) + 1, axis=1)
-    for entry in entries:
-        own = (entry.poisson, poisson), (entry.density, density)
-        table[:, of_label[entry.name]] = [entry.young, *(default if given is None else given for given, default in own)]
-    assert mesh.labels is not None
-    youngs, poissons, densities = table[:, mesh.labels]
-    return Isotropic(youngs, poissons, densities)
-
-
 def covers_all(mesh: TetForest | TetMesh, entries: Sequence[LabelMaterial]) -> bool:
     """Whether each element's label has an entry."""
     assert mesh.labels is not None
@@ -490,29 +467,38 @@ def covers_all(mesh: TetForest | TetMesh, entries: Sequence[LabelMaterial]) -> b
     return all(number and mesh.label_names[number - 1] in named for number in np.unique(mesh.labels).tolist())
 
 
-def region_material(
-    mesh: Mesh, inside: Callable[[str], np.ndarray], regions: Sequence[Sequence[str]], base: Isotropic
-) -> Isotropic:
-    """The material with those that ``--region`` gives to tetrahedra.
+def region_entries(
+    inside: Callable[[str], np.ndarray], regions: Sequence[Sequence[str]]
+) -> list[tuple[np.ndarray, LabelMaterial]]:
+    """The tetrahedra, bool [T], and the material of each ``--region``.
 
     Args:
-        mesh: The body's mesh.
         inside: Which tetrahedra are in a patch, bool [T].
-        regions: Pairs of a patch and ``YOUNG[:POISSON[:DENSITY]]``; the last one that contains a tetrahedron is used.
-        base: The material of other tetrahedra, and the source of omitted values.
+        regions: Pairs of a patch and ``YOUNG[:POISSON[:DENSITY]]``.
 
     Raises:
         InputError: Another form, or no tetrahedron in a region.
     """
-    count = len(mesh.tets)
-    values = [np.array(np.broadcast_to(value, count)) for value in (base.young, base.poisson, base.density)]
+    found = []
     for expression, text in regions:
         option = f"--region {expression!r} {text!r}"
         entry = _entry(f"region={text}", "--region", f"{option}: it must be PATCH YOUNG[:POISSON[:DENSITY]]")
-        chosen = inside(expression)
-        if not chosen.any():
+        found.append((inside(expression), entry))
+        if not found[-1][0].any():
             raise InputError(f"--region {expression!r}: there is no tetrahedron in it")
+    return found
+
+
+def mixed_material(base: Isotropic, chosen: Sequence[tuple[np.ndarray, LabelMaterial]], count: int) -> Isotropic:
+    """A material with others in some of ``count`` tetrahedra.
+
+    Args:
+        base: The material of other tetrahedra, and the source of omitted values.
+        chosen: Tetrahedra, bool [T], and their material; the last one that contains a tetrahedron is used.
+    """
+    values = [np.array(np.broadcast_to(value, count)) for value in (base.young, base.poisson, base.density)]
+    for inside, entry in chosen:
         for array, value in zip(values, (entry.young, entry.poisson, entry.density), strict=True):
             if value is not None:
-                array[chosen] = value
+                array[inside] = value
     return Isotropic(*values)

@@ -239,7 +239,7 @@ device [text]: "cpu", "cuda:0", ... (default: Warp's choice)
 all [flag]: also all elastic models, remeshing, states of rest and own surfaces
 
 == verify
-CASE* [text]: names of cases (default: all)
+CASES* CASE [text]: names of cases (default: all)
 list [flag]: list the cases, and run none
 full [flag]: finer meshes and longer times: minutes on a CPU core, where the quick form takes half a minute
 json FILE [path]: also write the rows as JSON
@@ -322,7 +322,8 @@ def _option(line: str) -> Option:
     else:
         settings["type"] = KINDS[kind] if kind in KINDS else quantity(kind)
     if name.isupper():
-        return Option(dest, (dest,), settings | ({"nargs": "*", "metavar": name} if mark else {"metavar": name}))
+        settings |= {"metavar": shown[0] if shown else name} | ({"nargs": "*"} if mark else {})
+        return Option(dest, (dest,), settings)
     if shown:
         settings |= {"metavar": shown, "nargs": len(shown)} if len(shown) > 1 else {"metavar": shown[0]}
     settings |= {"nargs": "?", "const": AUTO} if kind == "height" else {}

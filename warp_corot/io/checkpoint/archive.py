@@ -42,11 +42,15 @@ if TYPE_CHECKING:
 Arrays = dict[str, np.ndarray]
 #: The only key of what stands for an array in JSON; its value is the array's name.
 ARRAY = "array"
-#: The keys of what stands for an instance of a class of `KINDS`: its name and the values of its fields.
+#: The keys of what stands for a dataclass: its name and the values of its fields.
 INSTANCE = ("kind of", "values")
-_LISTED: tuple[Any, ...] = (*MODELS.values(), *INTEGRATORS.values(), Contact, Detail, Findings, Keys, Row)
-_LISTED += (Isotropic, TransverselyIsotropic, Orthotropic, FibreReinforced)
-KINDS = {kind.__name__: kind for kind in _LISTED}
+
+
+def kinds() -> dict[str, Any]:
+    """The dataclasses that checkpoints hold, by name: laws and integrators that are listed, materials, and parts."""
+    listed: list[Any] = [*MODELS.values(), *INTEGRATORS.values(), Contact, Detail, Findings, Keys, Row]
+    listed += [Isotropic, TransverselyIsotropic, Orthotropic, FibreReinforced]
+    return {kind.__name__: kind for kind in listed}
 
 
 def split(tree: Any, name: str = "") -> tuple[Any, Arrays]:
@@ -54,7 +58,7 @@ def split(tree: Any, name: str = "") -> tuple[Any, Arrays]:
     the keys and numbers on the way to them, with dots; arrays of Warp are read.
 
     Raises:
-        InputError: A dataclass that is none of `KINDS`, such as a law of your own.
+        InputError: A dataclass that is none of `kinds`, such as a law of your own.
     """
     if isinstance(tree, wp.array):
         tree = tree.numpy()
@@ -62,8 +66,8 @@ def split(tree: Any, name: str = "") -> tuple[Any, Arrays]:
         return {ARRAY: name}, {name: tree}
     if dataclasses.is_dataclass(tree):
         kind = type(tree).__name__
-        if KINDS.get(kind) is not type(tree):
-            raise InputError(f"a {kind} cannot be saved; only {', '.join(KINDS)}")
+        if kinds().get(kind) is not type(tree):
+            raise InputError(f"a {kind} cannot be saved; only {', '.join(kinds())}")
         values = {each.name: getattr(tree, each.name) for each in dataclasses.fields(tree)}
         tree = {INSTANCE[0]: kind, INSTANCE[1]: values}
     if isinstance(tree, np.generic):
@@ -89,7 +93,7 @@ def joined(plain: Any, arrays: Arrays) -> Any:
         if plain.keys() == {ARRAY}:
             return arrays[plain[ARRAY]]
         found = {key: joined(value, arrays) for key, value in plain.items()}
-        return KINDS[found[INSTANCE[0]]](**found[INSTANCE[1]]) if found.keys() == set(INSTANCE) else found
+        return kinds()[found[INSTANCE[0]]](**found[INSTANCE[1]]) if found.keys() == set(INSTANCE) else found
     return [joined(value, arrays) for value in plain] if isinstance(plain, list) else plain
 
 
