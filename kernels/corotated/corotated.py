@@ -19,17 +19,9 @@ from warp_corot.kernels.elements.constitutive import (
     rotated_stress,
 )
 from warp_corot.kernels.elements.elements import (
-    ForestElements,
-    add_force,
-    edge_length,
     frame,
-    load_node,
     local_gradient,
-    mirror_sign,
-    shape_of,
 )
-from warp_corot.kernels.elements.shapes import rest_shape, stiffness_product, vec12
-from warp_corot.kernels.math.rotation import identity3
 from warp_corot.kernels.modules import unique_kernel
 
 wp.set_module_options({"enable_backward": False})
@@ -102,58 +94,3 @@ def extract_rotations(Elements: type, rotation: wp.Function) -> wp.Kernel:
         rotations[t] = rotation(q + local_gradient(units, t, u)) * wp.transpose(q)
 
     return extract_rotations
-
-
-# --- the explicit 12x12 product ------------------------------------------------------------------------------------
-
-
-@functools.cache
-def scatter_matrix_product(skip_zeros: bool) -> wp.Kernel:
-    """Corotated forces with given rotations by the explicit K_T of each type, zeros skipped or not."""
-    product0 = stiffness_product(0, skip_zeros)
-    product1 = stiffness_product(1, skip_zeros)
-    product2 = stiffness_product(2, skip_zeros)
-
-    @unique_kernel()
-    def scatter_matrix_product(
-        # In
-        elements: ForestElements,
-        material: RotatedMaterial,
-        u: wp.array[wp.vec4],
-        # Out
-        f: wp.array[wp.vec4],
-    ):
-        t = wp.tid()
-        nodes = elements.nodes[t]
-        targets = elements.targets[t]
-        code = elements.code[t]
-        shape = shape_of(code)
-        h = edge_length(elements, t)
-        s = mirror_sign(code)
-        mirror = wp.mat33(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, s)
-        q = frame(elements, t) * mirror
-        r = material.rotations[material.unit[t]] * q
-        origin = load_node(u, nodes[0])
-        turned = wp.transpose(r) * q - identity3()
-        x0 = rest_shape(shape)
-        z = vec12()
-        for n in range(4):
-            # R^T x - x0 with x = Q x0 + u, from displacements so that nothing large cancels.
-            d = turned * (x0[n] * h) + wp.transpose(r) * (load_node(u, nodes[n]) - origin)
-            z[3 * n] = d[0]
-            z[3 * n + 1] = d[1]
-            z[3 * n + 2] = d[2]
-        y = vec12()
-        i = t * material.isotropic.stride
-        m = material.isotropic.mu[i] * h
-        k = material.isotropic.lam[i] * h
-        if shape == 0:
-            y = product0(z, m, k)
-        elif shape == 1:
-            y = product1(z, m, k)
-        else:
-            y = product2(z, m, k)
-        for n in range(4):
-            add_force(f, targets[n], -(r * wp.vec3(y[3 * n], y[3 * n + 1], y[3 * n + 2])))
-
-    return scatter_matrix_product

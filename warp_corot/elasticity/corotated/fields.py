@@ -33,7 +33,6 @@ from warp_corot.kernels.corotated.corotated import (
     given_density,
     given_stress,
     own_stress,
-    scatter_matrix_product,
 )
 from warp_corot.kernels.corotated.tangent import exact_differential
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
@@ -72,14 +71,11 @@ class CorotatedField(ForceField):
         super().__init__(discretization, deterministic)
         kind = discretization.element_kind
         self._shared: Rotations | None = None
-        self._fused = model.level is None and model.stiffness == "factored"
+        self._fused = model.level is None
         self._rotated = Kept(rotated_material)
         self._extract = extract_rotations(kind, model.own_rotation)
         self._own = scatter_forces(kind, IsotropicMaterial, own_stress(model.own_rotation))
-        if model.stiffness == "factored":
-            self._forces = scatter_forces(kind, RotatedMaterial, given_stress)
-        else:
-            self._forces = scatter_matrix_product(model.stiffness == "sparse")
+        self._forces = scatter_forces(kind, RotatedMaterial, given_stress)
         self._has_own_outputs = model.level is None and model.own_rotation is quick_rotation
         if self._has_own_outputs:
             self._energies, self._von_mises = own_energies(kind), own_von_mises(kind)
