@@ -14,11 +14,11 @@ from typing import Any
 
 import warp as wp
 
-from warp_corot.kernels.elements.constitutive import IsotropicMaterial, corotated_strain, green_strain, hooke, symmetric
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial, corotated_strain, hooke, symmetric
 from warp_corot.kernels.elements.elements import ForestElements, frame, local_gradient
-from warp_corot.kernels.elements.simd8 import headers, on_cpu
+from warp_corot.kernels.elements.simd8 import headers, law_kernel, on_cpu
 from warp_corot.kernels.math.matrices import axial, identity3
-from warp_corot.kernels.math.rotation import byers_xu, identity3
+from warp_corot.kernels.math.rotation import byers_xu
 from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.plan.plan import Plan, extent, leaf_row
 from warp_corot.kernels.stepping.pace import DT, Pace
@@ -41,102 +41,15 @@ class PronyMaterial:
     count: int
 
 
-@wp.func
-def deviator(a: wp.mat33):
-    return a - (wp.trace(a) / 3.0) * identity3()
-
-
-@wp.func
-def read_tensor(material: PronyMaterial, block: int, t: int):
-    first = 6 * block * material.count + t
-    n = material.count
-    xx = material.known[first]
-    yy = material.known[first + n]
-    zz = material.known[first + 2 * n]
-    xy = material.known[first + 3 * n]
-    xz = material.known[first + 4 * n]
-    yz = material.known[first + 5 * n]
-    return wp.mat33(xx, xy, xz, xy, yy, yz, xz, yz, zz)
-
-
-@wp.func
-def write_tensor(material: PronyMaterial, block: int, t: int, a: wp.mat33):
-    first = 6 * block * material.count + t
-    n = material.count
-    material.known[first] = a[0, 0]
-    material.known[first + n] = a[1, 1]
-    material.known[first + 2 * n] = a[2, 2]
-    material.known[first + 3 * n] = a[0, 1]
-    material.known[first + 4 * n] = a[0, 2]
-    material.known[first + 5 * n] = a[1, 2]
-
-
-@wp.func
-def fading(time: float, tau: float):
-    """exp(-t / tau) and phi, to all their digits, also for an infinite time."""
-    x = time / tau
-    left = wp.exp(-x)
-    mean = 1.0 - 0.5 * x * (1.0 - x / 3.0 * (1.0 - 0.25 * x))
-    if x > 0.02:
-        mean = (1.0 - left) / x
-    return left, mean
-
-
-@wp.func
-def rest_gradient(elements: Any, t: int, u: wp.array[wp.vec4]):
-    """du/dX in the axes of rest space."""
-    return local_gradient(elements, t, u) * wp.transpose(frame(elements, t))
-
-
-@wp.func
-def second_stress(material: PronyMaterial, t: int, strain: wp.mat33):
-    """The second Piola-Kirchhoff stress of all terms, of E."""
-    change = strain - read_tensor(material, 0, t)
-    s = wp.mat33()
-    for i in range(material.g.shape[0]):
-        left, mean = fading(material.elapsed[0], material.tau[i])
-        s += material.g[i] * (left * read_tensor(material, i + 1, t) + mean * change)
-    return (2.0 * material.isotropic.mu[t * material.isotropic.stride]) * s
-
-
-@wp.func
-def prony_stress(elements: Any, t: int, material: PronyMaterial, u: wp.array[wp.vec4]):
-    a = rest_gradient(elements, t, u)
-    s = second_stress(material, t, deviator(green_strain(a)))
-    return (s + a * s) * frame(elements, t)
-
-
-@wp.func
-def prony_differential(elements: Any, t: int, material: PronyMaterial, u: wp.array[wp.vec4], dg: wp.mat33):
-    a = rest_gradient(elements, t, u)
-    da = dg * wp.transpose(frame(elements, t))
-    s = second_stress(material, t, deviator(green_strain(a)))
-    d_strain = deviator(symmetric(da + wp.transpose(a) * da))
-    stiffness = float(0.0)
-    for i in range(material.g.shape[0]):
-        _left, mean = fading(material.elapsed[0], material.tau[i])
-        stiffness += material.g[i] * mean
-    d_s = (2.0 * stiffness * material.isotropic.mu[t * material.isotropic.stride]) * d_strain
-    return (da * s + d_s + a * d_s) * frame(elements, t)
-
-
-@wp.func
-def prony_density(elements: Any, t: int, material: PronyMaterial, u: wp.array[wp.vec4]):
-    change = deviator(green_strain(rest_gradient(elements, t, u))) - read_tensor(material, 0, t)
-    density = float(0.0)
-    for i in range(material.g.shape[0]):
-        left, mean = fading(material.elapsed[0], material.tau[i])
-        s = read_tensor(material, i + 1, t)
-        own = mean * wp.ddot(change, change) + left * (2.0 * wp.ddot(s, change) + wp.ddot(s, s))
-        density += material.g[i] * own
-    return density * material.isotropic.mu[t * material.isotropic.stride]
+@wp.func_native("corot::relax_at(material, t, g, q, time);")
+def relax_element(t: int, g: wp.mat33, q: wp.mat33, time: float, material: PronyMaterial): ...
 
 
 @functools.cache
 def relax(Elements: type) -> wp.Kernel:
     """Make the state at displacements u, after a step of the clock's length, the known one."""
 
-    @unique_kernel()
+    @law_kernel()
     def relax(
         # In
         elements: Elements,
@@ -146,13 +59,7 @@ def relax(Elements: type) -> wp.Kernel:
         material: PronyMaterial,
     ):
         t = wp.tid()
-        strain = deviator(green_strain(rest_gradient(elements, t, u)))
-        change = strain - read_tensor(material, 0, t)
-        time = float(pace.seconds[DT])
-        for i in range(material.g.shape[0]):
-            left, mean = fading(time, material.tau[i])
-            write_tensor(material, i + 1, t, left * read_tensor(material, i + 1, t) + mean * change)
-        write_tensor(material, 0, t, strain)
+        relax_element(t, local_gradient(elements, t, u), frame(elements, t), float(pace.seconds[DT]), material)
         if t == 0:
             material.elapsed[0] = 0.0
 
@@ -270,23 +177,6 @@ class Prestress:
 
     stress: wp.array[wp.mat33]
     stride: int
-
-
-@wp.func
-def prestress_stress(elements: Any, t: int, material: Prestress, u: wp.array[wp.vec4]):
-    s = material.stress[t * material.stride]
-    return (s + rest_gradient(elements, t, u) * s) * frame(elements, t)
-
-
-@wp.func
-def prestress_differential(elements: Any, t: int, material: Prestress, u: wp.array[wp.vec4], dg: wp.mat33):
-    q = frame(elements, t)
-    return dg * wp.transpose(q) * material.stress[t * material.stride] * q
-
-
-@wp.func
-def prestress_density(elements: Any, t: int, material: Prestress, u: wp.array[wp.vec4]):
-    return wp.ddot(material.stress[t * material.stride], green_strain(rest_gradient(elements, t, u)))
 
 
 # --- viscosity -------------------------------------------------------------------------------------------------------

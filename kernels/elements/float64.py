@@ -33,7 +33,7 @@ def stresses(law: IsotropicLaw) -> wp.Kernel:
         dp: wp.array[wp.mat33d],
     ) -> bool: ...
 
-    @unique_kernel(native=headers("float64"))
+    @unique_kernel(native=headers("single"))
     def stresses(
         # In
         a: wp.array[wp.mat33d],
@@ -66,7 +66,7 @@ def dilatations(of: Dilatation) -> wp.Kernel:
         turning: wp.array[wp.mat33d],
     ): ...
 
-    @unique_kernel(native=headers("float64"))
+    @unique_kernel(native=headers("single"))
     def dilatations(
         # In
         a: wp.array[wp.mat33d],
@@ -90,7 +90,7 @@ def pressures(of: Dilatation) -> wp.Kernel:
     @wp.func_native(on_cpu(f"{code}{pair}(w.value, w.slope);", otherwise=f"{pair}();\n"))
     def pressure(theta: wp.float64) -> wp.vec2d: ...
 
-    @unique_kernel(native=headers("float64"))
+    @unique_kernel(native=headers("single"))
     def pressures(theta: wp.array[wp.float64], found: wp.array[wp.vec2d]):
         i = wp.tid()
         found[i] = pressure(theta[i])

@@ -33,12 +33,13 @@ def native(name: str) -> str:
 
 
 @functools.cache
-def headers(*names: str, types: str = "") -> wp.ModuleBuildOptions:
+def headers(*names: str, types: str = "", cuda: bool = False) -> wp.ModuleBuildOptions:
     """Options of a module for the CPU that includes headers, and compiles again if one of them has changed.
 
     Args:
         names: The headers.
         types: C++ that follows them.
+        cuda: Whether the module includes them on CUDA, too.
     """
     found = {NATIVE / f"{name}.h": None for name in names}
     includes = "".join(f'#include "{path.as_posix()}"\n' for path in found)
@@ -47,7 +48,17 @@ def headers(*names: str, types: str = "") -> wp.ModuleBuildOptions:
             if NATIVE / name not in found:
                 found[NATIVE / name] = None
                 waiting.append(NATIVE / name)
-    return wp.ModuleBuildOptions(extra_cpu_preamble=includes + types, extra_build_dependencies=list(found))
+    return wp.ModuleBuildOptions(
+        extra_cpu_preamble=includes + types,
+        extra_cuda_preamble=includes if cuda else "",
+        extra_build_dependencies=list(found),
+    )
+
+
+#: What modules of kernels that call laws of single elements include.
+LAW_HEADERS = headers("single", cuda=True)
+#: The decorator of such kernels.
+law_kernel = functools.partial(unique_kernel, native=LAW_HEADERS)
 
 
 def constants(**values: float) -> str:

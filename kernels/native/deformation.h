@@ -134,7 +134,7 @@ template <class S> COROT_INLINE Invariants<S> invariants_of(const S* e, const S&
     i.c = e[0] * i.adjugate[0] + e[3] * i.adjugate[3] + e[4] * i.adjugate[4];
     i.squared = i.a * i.a - 2.0f * i.b;
     i.small = (i.squared < 0.4f) & (det > 0.0f);
-    i.j = i.small ? (i.a + i.b + i.c) / (1.0f + det) : det - 1.0f;
+    i.j = i.small ? over(i.a + i.b + i.c, 1.0f + det) : det - 1.0f;
     return i;
 }
 

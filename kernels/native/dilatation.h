@@ -1,5 +1,6 @@
 // The dilatation that elements share; see elements/dilatation.py. A kind of it has ``theta`` of an element, the columns p
-// of d theta / dF, w' of a mean theta (``pressure``) and h' of an element's own (``holding``).
+// of d theta / dF, w' of a mean theta (``pressure``) and h' of an element's own (``holding``); ``energy`` and
+// ``held_energy`` are w and h.
 #pragma once
 
 #include "laws.h"
@@ -21,10 +22,12 @@ template <class S> COROT_INLINE S trace_of(const triple<S>* a, const triple<S>* 
 
 struct SquareEnergy {
     template <class S> static COROT_INLINE S pressure(const S& theta) { return theta; }
+    static COROT_INLINE float energy(float theta) { return 0.5f * theta * theta; }
 };
 
 struct NotHeld {
     template <class S> static COROT_INLINE S holding(const S&) { return spread<S>(0.0f); }
+    static COROT_INLINE float held_energy(float) { return 0.0f; }
 };
 
 // Linear elasticity: theta = tr e.
@@ -78,6 +81,11 @@ struct VolumeChange {
         const S near = beyond < RAMP ? beyond : spread<S>(RAMP), slope = (0.5f / RAMP) * near * near + (beyond - near);
         return theta < 0.0f ? -slope : slope;
     }
+    static COROT_INLINE float held_energy(float theta) {
+        const float size = theta < 0.0f ? -theta : theta, beyond = size > FREE ? size - FREE : 0.0f;
+        const float near = beyond < RAMP ? beyond : RAMP, far = beyond - near, slope = (0.5f / RAMP) * near * near;
+        return near * slope * (1.0f / 3) + far * (slope + 0.5f * far);
+    }
 };
 
 // Corotated: w = theta^2 / 2.
@@ -91,7 +99,12 @@ struct LogVolumeDilatation : VolumeChange {
         const mask_of<S> crushed = theta < j0 - 1.0f;
         const S safe = crushed ? spread<S>(0.0f) : theta;
         const S line = log0 / j0 + (1.0f - log0) / (j0 * j0) * (theta + (1.0f - j0));
-        return crushed ? line : log_of(safe) / (1.0f + safe);
+        return crushed ? line : over(log_of(safe), 1.0f + safe);
+    }
+    static COROT_INLINE float energy(float theta) {
+        const float low = CONTINUED_BELOW - 1.0f, inside = theta < low ? low : theta, step = theta - inside;
+        const float log = log_of(inside), over_j = over(1.0f, 1.0f + inside);
+        return 0.5f * log * log + step * over_j * (log + 0.5f * over_j * (1.0f - log) * step);
     }
 };
 
@@ -104,6 +117,7 @@ COROT_INLINE void add_pressure(const D& d, const S& theta, const S& pressure, co
     for (int j = 0; j < 3; ++j) p[j] = added(p[j], w, slopes[j]);
 }
 
+#if !defined(__CUDACC__)
 // A law whose elements share a dilatation: all those that a traversal of subtrees gathers in a lane. The law's own lambda is
 // zero; this one is in ``lam``.
 template <class Of, class Law, class Values> struct Dilating {
@@ -140,5 +154,6 @@ template <class Of, class Law, class Values>
 COROT_INLINE Dilating<Of, Law, Values> dilating(const Law& law, const Values& lam, int stride) {
     return {law, lam, stride, spread<lanes8>(0.0f)};
 }
+#endif
 
 }  // namespace corot

@@ -1,14 +1,27 @@
 // Isotropic laws as functions of a ``Deformation``: ``stress`` writes the columns p of the first Piola-Kirchhoff stress
-// times the frame and returns where they may be trusted. mu and lambda are already multiplied by the weight of P. All is
-// computed from E, which keeps its digits however small it is, so P keeps them, too.
+// times the frame and returns where they may be trusted; ``energy`` is the energy density of a single element. mu and lambda
+// are already multiplied by the weight of P. All is computed from E, which keeps its digits however small it is, so P and the
+// density keep them, too. No law subtracts numbers near one.
 #pragma once
 
 #include "deformation.h"
 
 namespace corot {
 
+// mu e : e + lambda / 2 (tr e)^2.
+template <class S, class N> COROT_INLINE S hooke_energy(const S* e, const N& m, const N& k) {
+    const S trace = e[0] + e[1] + e[2];
+    return m * (e[0] * e[0] + e[1] * e[1] + e[2] * e[2] + 2.0f * (e[3] * e[3] + e[4] * e[4] + e[5] * e[5]))
+        + 0.5f * k * trace * trace;
+}
+
 // P = sigma(e) of the small strain e.
 struct Linear {
+    template <class D, class S = typename D::S> static COROT_INLINE S energy(const D& d, const S& m, const S& k) {
+        S e[6];
+        small_strain(d.a, d.frame, e);
+        return hooke_energy(e, m, k);
+    }
     template <class D, class S = typename D::S>
     static COROT_INLINE mask_of<S> stress(const D& d, const S& m, const S& k, triple<S>* p) {
         S e[6], sigma[6];
@@ -23,6 +36,9 @@ struct Linear {
 
 // P = F (mu E + lambda / 2 tr E).
 struct StVenantKirchhoff {
+    template <class D, class S = typename D::S> static COROT_INLINE S energy(const D& d, const S& m, const S& k) {
+        return hooke_energy(d.e, 0.25f * m, 0.25f * k);
+    }
     template <class D, class S = typename D::S>
     static COROT_INLINE mask_of<S> stress(const D& d, const S& m, const S& k, triple<S>* p) {
         S sigma[6];
@@ -77,6 +93,20 @@ constexpr double LOG_CONTINUED = -0.6931471805599453;
 
 // P = cof F (mu E + lambda ln J) / J; below J0 = CONTINUED_BELOW mu F + U'(J) cof F, with U' continued linearly.
 struct NeoHookean {
+    // mu / 2 tr E - mu ln J + lambda / 2 (ln J)^2; where E is small, the first two from J^2 - 1 = a + b + c.
+    template <class D, class S = typename D::S> static COROT_INLINE S energy(const D& d, const S& m, const S& k) {
+        const triple<S>* f = d.f;
+        const Invariants<S> i = invariants_of(d.e, handedness_of(d.frame) * dot(f[0], cross(f[1], f[2])));
+        const S low = CONTINUED_BELOW - 1.0f, inside = i.j < low ? low : i.j, step = i.j - inside;
+        const S square = i.a + i.b + i.c;
+        S excess, unused;
+        const S log = log_of(inside, unused);
+        const bool near = i.small && square > -0.5f && square < 0.5f;
+        log_of(near ? square : inside, excess);
+        const S shear = near ? 0.5f * (excess - i.b - i.c) : 0.5f * i.a - log;
+        const S slope = over(k * log - m, 1.0f + inside), curvature = over(m + k * (1.0f - log), (1.0f + inside) * (1.0f + inside));
+        return m * shear + 0.5f * k * log * log + step * (slope + 0.5f * curvature * step);
+    }
     template <class D, class S = typename D::S>
     static COROT_INLINE mask_of<S> stress(const D& d, const S& m, const S& k, triple<S>* p) {
         const triple<S>* f = d.f;
@@ -85,7 +115,7 @@ struct NeoHookean {
         const S j = invariants_of(d.e, handedness * dot(f[0], cofactor[0])).j;
         const mask_of<S> crushed = j < CONTINUED_BELOW - 1.0f;
         const S safe = crushed ? spread<S>(0.0f) : j;
-        const S w = handedness / (1.0f + safe);
+        const S w = over(handedness, 1.0f + safe);
         const S pressure = w * k * log_of(safe), mw = m * w;
         S sigma[6];
         for (int i = 0; i < 6; ++i) sigma[i] = mw * d.e[i];
@@ -107,7 +137,23 @@ struct NeoHookean {
 // ``begin`` is called once with the nodes that a traversal has gathered; then ``stress`` for each element, with the place
 // ``at``: see elements8.h and subtrees8.h. The stress is nothing in lanes that are ``done``.
 
-// ``COUNT`` numbers of each lane's element, from arrays of one entry (stride 0) or one for each element.
+// A single element, whose stresses have no weight.
+struct Single {
+    typedef float N;
+    const int t;
+    COROT_INLINE float weight() const { return 1.0f; }
+    COROT_INLINE float values_of(const float* values) const { return values[t]; }
+    template <class Values> COROT_INLINE float value(const Values& values, int stride) const { return values.data[t * stride]; }
+    COROT_INLINE void write(const float* values, float a) const { const_cast<float*>(values)[t] = a; }
+    COROT_INLINE bool done() const { return false; }
+};
+
+// ``COUNT`` numbers of each element, from arrays of one entry (stride 0) or one for each element.
+template <int COUNT, class Entry> COROT_INLINE void gather_numbers(const Single& at, const Entry& entry, int stride, float* to) {
+    for (int i = 0; i < COUNT; ++i) to[i] = entry(at.t * stride)[i];
+}
+
+#if !defined(__CUDACC__)
 template <int COUNT, class Entry, class At> COROT_INLINE void gather_numbers(const At& at, const Entry& entry, int stride, lanes8* to) {
     if (!stride) {
         for (int i = 0; i < COUNT; ++i) to[i] = spread<lanes8>(entry(0)[i]);
@@ -116,6 +162,7 @@ template <int COUNT, class Entry, class At> COROT_INLINE void gather_numbers(con
     for (int i = 0; i + 4 <= COUNT; i += 4) gather([&](int lane) { return entry(at.element(lane)) + i; }, to + i);
     if (COUNT % 4) to[COUNT - 1] = gather_one([&](int lane) { return entry(at.element(lane)) + COUNT - 1; });
 }
+#endif
 
 // A law with Lame's parameters of a Warp struct that has mu, lam and stride.
 template <class Law, class Material> struct Elastic {
@@ -129,6 +176,9 @@ template <class Law, class Material> struct Elastic {
             weight * at.value(material.lam, material.stride), p);
         for (int j = 0; j < 3; ++j) p[j] = chosen(at.done(), nothing<S>(), p[j]);
         return valid;
+    }
+    template <class D> COROT_INLINE float energy(const D& d, const Single& at) const {
+        return law.energy(d, at.value(material.mu, material.stride), at.value(material.lam, material.stride));
     }
 };
 

@@ -28,7 +28,7 @@ from warp_corot.kernels.elements.elements import (
     node_displacements,
     root_of,
 )
-from warp_corot.kernels.modules import unique_kernel
+from warp_corot.kernels.elements.simd8 import law_kernel
 
 from .degenerate import DegenerateList, append, list_of, reserve
 from .forces import (
@@ -99,7 +99,7 @@ def scatter_subtrees(
     forces = subtree_forces(shape, uniform, leaves)
     listed, options = missed == "list", {"launch_bounds": (BLOCK, resident)} if resident else {}
 
-    @unique_kernel(grid_stride=False, **options)
+    @law_kernel(grid_stride=False, **options)
     def scatter_subtrees(
         # In
         subtrees: Subtrees,
@@ -156,7 +156,7 @@ def scatter_subtrees_shared(shape: int, grouped: bool, uniform: bool, given: boo
     load, add = memory_of(shape, grouped)
     forces = shared_forces(shape, uniform, given)
 
-    @unique_kernel(grid_stride=False)
+    @law_kernel(grid_stride=False)
     def scatter_subtrees_shared(
         # In
         subtrees: Subtrees,
@@ -232,7 +232,7 @@ def scatter_body(uniform: bool) -> wp.Kernel:
     subtree0, subtree1, subtree2 = (_scatter_subtree(shape, uniform) for shape in range(3))
     add_neighbours = add_four_forces(2)
 
-    @unique_kernel(grid_stride=False, launch_bounds=(BLOCK, min(RESIDENT)))
+    @law_kernel(grid_stride=False, launch_bounds=(BLOCK, min(RESIDENT)))
     def scatter_body(
         # In
         ranges: wp.array[WorkRange],

@@ -22,7 +22,7 @@ from warp_corot.inputs.checks import checked_number, checked_numbers, shown
 from warp_corot.inputs.forwarding import forwards
 from warp_corot.kernels.elements import added as kernels
 from warp_corot.kernels.elements.added import ViscousMaterial, relax_simd8, viscosity_stress
-from warp_corot.kernels.elements.forces import element_energies
+from warp_corot.kernels.elements.forces import element_energies, element_law
 from warp_corot.kernels.elements.simd8 import LANES, PRESTRESS, PRONY, VISCOUS, NativeLaw
 
 if TYPE_CHECKING:
@@ -41,9 +41,7 @@ class AddedStressField(ForceField):
         discretization: The mesh and the material.
         law: The elastic law's field.
         Material: The struct that the other stress reads.
-        stress, differential, density: The other stress, its differential, and its energy density, as
-            ``kernels.elements.forces`` and ``kernels.elements.forces`` take them.
-        lanes: The other stress in C++, for the CPU, if it is there.
+        added: The other stress.
 
     Attributes:
         law: The same.
@@ -56,17 +54,14 @@ class AddedStressField(ForceField):
         discretization: Discretization,
         law: ForceField,
         Material: type,
-        stress: wp.Function,
-        differential: wp.Function,
-        density: wp.Function,
-        lanes: NativeLaw | None = None,
+        added: NativeLaw,
     ):
         self.law = law
         super().__init__(discretization, law.deterministic)
-        kind = discretization.element_kind
-        self._forces = ByElements(discretization, self.plan, Material, stress, lanes, slotted=self.deterministic)
-        self._energies = element_energies(kind, Material, density, adds=True)
-        self._own_law = differential, lambda: self.material, Material
+        kind, own = discretization.element_kind, element_law(added.code, Material)
+        self._forces = ByElements(discretization, self.plan, Material, own.stress, added, slotted=self.deterministic)
+        self._energies = element_energies(kind, Material, own.density, adds=True)
+        self._own_law = own.differential, lambda: self.material, Material
 
     @property
     @abstractmethod
@@ -246,8 +241,7 @@ class PronyField(AddedStressField):
     """
 
     def __init__(self, discretization: Discretization, model: Prony, law: ForceField):
-        functions = (kernels.prony_stress, kernels.prony_differential, kernels.prony_density)
-        super().__init__(discretization, law, kernels.PronyMaterial, *functions, lanes=PRONY)
+        super().__init__(discretization, law, kernels.PronyMaterial, PRONY)
         g, tau = (np.array(values, np.float32) for values in model.terms)
         self._carried, counts = model.carried, self.plan.counts
         #: The number of elements may grow if the mesh changes.
@@ -369,8 +363,7 @@ class PrestressedField(AddedStressField):
     """
 
     def __init__(self, discretization: Discretization, model: Prestressed, law: ForceField):
-        functions = (kernels.prestress_stress, kernels.prestress_differential, kernels.prestress_density)
-        super().__init__(discretization, law, kernels.Prestress, *functions, lanes=PRESTRESS)
+        super().__init__(discretization, law, kernels.Prestress, PRESTRESS)
         stress, count = np.array(model.stress), len(discretization.mesh.tets)
         if stress.ndim == 3 and len(stress) != count:
             raise InputError(f"stress has {len(stress)} tensors; the mesh has {count} elements")

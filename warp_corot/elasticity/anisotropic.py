@@ -33,13 +33,7 @@ from warp_corot.kernels.corotated.anisotropic import (
 from warp_corot.kernels.corotated.well_conditioned import quaternions_of
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import LOG_VOLUME
-from warp_corot.kernels.elements.fibres import (
-    ReinforcedMaterial,
-    reinforced_cauchy,
-    reinforced_density,
-    reinforced_differential,
-    reinforced_stress,
-)
+from warp_corot.kernels.elements.fibres import REINFORCED, ReinforcedMaterial, reinforced_cauchy
 from warp_corot.kernels.elements.forces import element_energies, repair_forces
 from warp_corot.kernels.elements.simd8 import FIBRES
 from warp_corot.kernels.math.rotation import byers_xu, quick_rotation
@@ -283,15 +277,15 @@ class ReinforcedField(FibreField):
     def __init__(self, discretization: Discretization, deterministic: bool):
         super().__init__(
             discretization,
-            stress=reinforced_stress,
-            differential=reinforced_differential,
-            density=reinforced_density,
+            stress=REINFORCED.stress,
+            differential=REINFORCED.differential,
+            density=REINFORCED.density,
             cauchy=reinforced_cauchy,
             Material=ReinforcedMaterial,
             deterministic=deterministic,
         )
         _, self._clusters = divided(discretization, self.plan, reinforced_law, ReinforcedMaterial)
-        self._by_elements = ByElements(discretization, self.plan, ReinforcedMaterial, reinforced_stress, FIBRES)
+        self._by_elements = ByElements(discretization, self.plan, ReinforcedMaterial, REINFORCED.stress, FIBRES)
         self._made = Kept(_material)
 
     def plan_of(self, discretization: Discretization) -> Plan:

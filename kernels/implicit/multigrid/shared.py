@@ -15,13 +15,14 @@ from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.kernels.elements.elements import ForestElements, nodal_forces, rest_volume
 from warp_corot.kernels.elements.forces import in_local_frame, own_gradient
 from warp_corot.kernels.elements.mean_dilatation_rows import GroupNodes, first_entry
+from warp_corot.kernels.elements.simd8 import LAW_HEADERS
 from warp_corot.kernels.modules import Family
 
 from .pattern import key_of
 
 wp.set_module_options({"enable_backward": False})
 
-OF_MATRIX = Family(__name__)
+OF_MATRIX = Family(__name__, LAW_HEADERS)
 
 
 @wp.kernel(enable_backward=False)
