@@ -105,7 +105,7 @@ def log_and_excess(d: float) -> wp.vec2: ...
 
 @wp.func
 def log_of_dilation(d: float):
-    """ln(1 + d) and d - ln(1 + d), both to all their digits, for d >= -1/2."""
+    """ln(1 + d) and d - ln(1 + d), both to all their digits."""
     both = log_and_excess(d)
     return both[0], both[1]
 

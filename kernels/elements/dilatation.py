@@ -11,7 +11,7 @@ theta_e is J - 1, W also has lambda_e V_e h(theta_e) for each element. h is zero
 h'' grows from 0 to 1 over 0.5. Forces are exact derivatives: P_e = lambda_e (w'(theta) + h'(theta_e)) d theta_e /
 dF.
 
-Functions here take the displacement gradient A as ``constitutive`` has it; they are those of ``native/dilatation.h``. The
+Functions here are those of ``native/dilatation.h`` and take the displacement gradient A as ``constitutive`` has it. The
 kernels of subtrees' forces are in ``subtrees.forces``.
 """
 

@@ -18,9 +18,7 @@ def stresses(law: IsotropicLaw) -> wp.Kernel:
     """P of displacement gradients A and its differential in a direction dA; and whether the law holds there, which
     without a definite rotation the corotated one does not."""
     native = bare(law)
-    # Ogden's law has eigenvalues to float32's digits and no differential.
-    change, into = ("", "") if isinstance(law, tuple) else ("da.data[i], ", ", dp.data[i]")
-    call = f"corot::stress_of({native.code}, a.data[i], {change}mu.data[i], lam.data[i], p.data[i]{into})"
+    call = f"corot::stress_of({native.code}, a.data[i], da.data[i], mu.data[i], lam.data[i], p.data[i], dp.data[i])"
 
     @wp.func_native(on_cpu(f"return {call};", otherwise="return false;\n"))
     def stress(

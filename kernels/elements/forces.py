@@ -125,7 +125,7 @@ class ElementLaw(NamedTuple):
 def element_law(law: str, Material: type) -> ElementLaw:
     """The functions of a law in C++, whose ``material`` is a struct of this type."""
 
-    @wp.func_native(f"return corot::stress_at({law}, t, g, corot::frame_of<float>(q));")
+    @wp.func_native(f"return corot::stress_at({law}, t, g, corot::frame_of(q));")
     def stress_at(t: int, g: wp.mat33, q: wp.mat33, material: Material) -> wp.mat33: ...
 
     @wp.func_native(f"return corot::differential_at({law}, t, g, q, dg);")

@@ -18,7 +18,6 @@ from typing import NamedTuple
 
 import warp as wp
 
-from warp_corot.kernels.elements.ogden import part_of_volume, stretch_limits
 from warp_corot.kernels.modules import unique_kernel
 
 LANES = 8
@@ -146,6 +145,22 @@ STRESSLESS = "stressless"
 
 #: An isotropic law: a name, or the terms (share, alpha) of Ogden's.
 IsotropicLaw = str | tuple[tuple[float, float], ...]
+
+
+#: A term of Ogden's law continues as a parabola where it would be this many times as stiff as at rest.
+STIFFENING = 1000.0
+
+
+def stretch_limits(alpha: float) -> tuple[float, float]:
+    """Smallest and largest principal stretch at which a term with this exponent is the plain law."""
+    low = STIFFENING ** (-1.0 / (2.0 - alpha)) if alpha < 0.0 else 0.5 if alpha < 2.0 else 0.01
+    high = STIFFENING ** (1.0 / max(alpha - 2.0, 1.0))
+    return low, high
+
+
+def part_of_volume(share: float, alpha: float) -> float:
+    """v_p of a term, see ``native/law_ogden.h``."""
+    return 2.0 * share / alpha if alpha > 0.0 else share
 
 
 def bare(law: IsotropicLaw) -> NativeLaw:

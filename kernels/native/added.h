@@ -142,12 +142,12 @@ template <class Material> struct Prestressed {
     const Material& material;
     template <class Nodes> COROT_INLINE void begin(const Nodes&) {}
     template <class D, class At, class S = typename D::S> COROT_INLINE mask_of<S> stress(const D& d, const At& at, triple<S>* p) const {
-        typename At::N s[9];
-        S turned[6];
+        typedef typename At::N N;
+        N s[9], turned[6];
         gather_numbers<9>(at, [&](int t) { return &material.stress.data[t].data[0][0]; }, material.stride, s);
-        const S six[6] = {s[0], s[4], s[8], s[1], s[2], s[5]};
+        const N six[6] = {s[0], s[4], s[8], s[1], s[2], s[5]};
         into_frame(d.frame, six, turned);
-        for (int i = 0; i < 6; ++i) turned[i] = turned[i] * at.weight();
+        for (int i = 0; i < 6; ++i) turned[i] *= at.weight();
         times(d.f, turned, p);
         return every<S>();
     }

@@ -26,21 +26,21 @@ template <class Material, bool FILLED> struct Fibres {
     template <class Nodes> COROT_INLINE void begin(const Nodes&) {}
 
     // The fibres of an element: k1, k2, the dispersion and the angle; how many directions they have; and the first axis.
-    template <class S, class N> struct Families {
+    template <class N> struct Families {
         N numbers[4], held;
-        triple<S> along, first, second;
+        triple<N> along, first, second;
         mask_of<N> have_two;
     };
 
-    template <class D, class At, class S = typename D::S> COROT_INLINE Families<S, typename At::N> families(const D& d, const At& at) const {
+    template <class D, class At> COROT_INLINE Families<typename At::N> families(const D& d, const At& at) const {
         typedef typename At::N N;
         const auto& fibres = material.fibres;
-        Families<S, N> of;
+        Families<N> of;
         N turn[9], c, s;
         gather_numbers<9>(at, [&](int t) { return &fibres.axes.data[t].data[0][0]; }, fibres.axes_stride, turn);
         gather_numbers<4>(at, [&](int t) { return &fibres.stiffness.data[t][0]; }, fibres.stride, of.numbers);
-        of.along = into_frame(d.frame, triple<S>{turn[0], turn[3], turn[6]});
-        const triple<S> beside = into_frame(d.frame, triple<S>{turn[1], turn[4], turn[7]});
+        of.along = into_frame(d.frame, triple<N>{turn[0], turn[3], turn[6]});
+        const triple<N> beside = into_frame(d.frame, triple<N>{turn[1], turn[4], turn[7]});
         const N& angle = of.numbers[3];
         of.held = FILLED ? at.weight() * at.value(fibres.fill, fibres.fill_stride) : at.weight();
         cosine_and_sine(angle, c, s);
@@ -53,16 +53,16 @@ template <class Material, bool FILLED> struct Fibres {
     template <class D, class At, class S = typename D::S> COROT_INLINE mask_of<S> stress(const D& d, const At& at, triple<S>* p) const {
         typedef typename At::N N;
         const mask_of<S> valid = elastic(NeoHookean{}, material.matrix).stress(d, at, p);
-        const Families<S, N> of = families(d, at);
+        const Families<N> of = families(d, at);
         add_family(d, of.numbers, of.first, of.held, p);
         if (any(of.have_two)) add_family(d, of.numbers, of.second, of.have_two ? of.held : spread<N>(0.0f), p);
-        if (material.is_active) pull(d, of.along, S(of.held * at.values_of(material.activation.data)), p);
+        if (material.is_active) pull(d, of.along, N(of.held * at.values_of(material.activation.data)), p);
         return valid;
     }
 
     // Active stress has no energy density.
     template <class D> COROT_INLINE float energy(const D& d, const Single& at) const {
-        const Families<float, float> of = families(d, at);
+        const Families<float> of = families(d, at);
         float unused, sum = energy_of(strain_of(d, of.numbers[2], of.first, unused), of.numbers[0], of.numbers[1]);
         if (of.have_two) sum += energy_of(strain_of(d, of.numbers[2], of.second, unused), of.numbers[0], of.numbers[1]);
         return elastic(NeoHookean{}, material.matrix).energy(d, at) + of.held * sum;
@@ -87,7 +87,7 @@ template <class Material, bool FILLED> struct Fibres {
     }
 
     // Adds w F (v v^T).
-    template <class D, class S> static COROT_INLINE void pull(const D& d, const triple<S>& v, const S& w, triple<S>* p) {
+    template <class D, class N, class W, class S> static COROT_INLINE void pull(const D& d, const triple<N>& v, const W& w, triple<S>* p) {
         const triple<S> pulled = combined(v.x, d.f[0], v.y, d.f[1], v.z, d.f[2]) * w;
         p[0] = added(p[0], v.x, pulled);
         p[1] = added(p[1], v.y, pulled);
@@ -96,21 +96,21 @@ template <class Material, bool FILLED> struct Fibres {
 
     // The strain of a direction with a dispersion, and the share of what is along it.
     template <class D, class N, class S = typename D::S>
-    static COROT_INLINE S strain_of(const D& d, const N& kappa, const triple<S>& v, N& along) {
+    static COROT_INLINE S strain_of(const D& d, const N& kappa, const triple<N>& v, N& along) {
         const S* e = d.e;
         along = 1.0f - 3.0f * kappa;
-        const triple<S> rows = {dot({e[0], e[3], e[4]}, v), dot({e[3], e[1], e[5]}, v), dot({e[4], e[5], e[2]}, v)};
+        const triple<S> rows = {dot(triple<S>{e[0], e[3], e[4]}, v), dot(triple<S>{e[3], e[1], e[5]}, v), dot(triple<S>{e[4], e[5], e[2]}, v)};
         return kappa * (e[0] + e[1] + e[2]) + along * dot(v, rows);
     }
 
     // Adds a weight times the stress of the family of a direction; ``numbers`` are k1, k2 and the dispersion.
     template <class D, class N, class S = typename D::S>
-    static COROT_INLINE void add_family(const D& d, const N* numbers, const triple<S>& v, const N& w, triple<S>* p) {
+    static COROT_INLINE void add_family(const D& d, const N* numbers, const triple<N>& v, const N& w, triple<S>* p) {
         N along;
         const S strain = strain_of(d, numbers[2], v, along);
         const S stress = (2.0f * w) * slope(strain, numbers[0], numbers[1]);
-        for (int j = 0; j < 3; ++j) p[j] = added(p[j], S(numbers[2] * stress), d.f[j]);
-        pull(d, v, S(along * stress), p);
+        for (int j = 0; j < 3; ++j) p[j] = added(p[j], numbers[2] * stress, d.f[j]);
+        pull(d, v, along * stress, p);
     }
 };
 

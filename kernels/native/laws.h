@@ -22,8 +22,8 @@ struct Linear {
         small_strain(d.a, d.frame, e);
         return hooke_energy(e, m, k);
     }
-    template <class D, class S = typename D::S>
-    static COROT_INLINE mask_of<S> stress(const D& d, const S& m, const S& k, triple<S>* p) {
+    template <class D, class N, class S = typename D::S>
+    static COROT_INLINE mask_of<S> stress(const D& d, const N& m, const N& k, triple<S>* p) {
         S e[6], sigma[6];
         small_strain(d.a, d.frame, e);
         const S pressure = k * (e[0] + e[1] + e[2]);
@@ -39,8 +39,8 @@ struct StVenantKirchhoff {
     template <class D, class S = typename D::S> static COROT_INLINE S energy(const D& d, const S& m, const S& k) {
         return hooke_energy(d.e, 0.25f * m, 0.25f * k);
     }
-    template <class D, class S = typename D::S>
-    static COROT_INLINE mask_of<S> stress(const D& d, const S& m, const S& k, triple<S>* p) {
+    template <class D, class N, class S = typename D::S>
+    static COROT_INLINE mask_of<S> stress(const D& d, const N& m, const N& k, triple<S>* p) {
         S sigma[6];
         const S pressure = 0.5f * k * (d.e[0] + d.e[1] + d.e[2]);
         for (int i = 0; i < 6; ++i) sigma[i] = m * d.e[i];
@@ -54,11 +54,11 @@ struct StVenantKirchhoff {
 // t)) - a (10 + t) - 2j - y (1 + a), and P = F (2 mu (I - S^-1) + lambda t S^-1), where E is small; elsewhere by R. P is
 // zero where it is not trusted.
 struct Corotated {
-    template <class D, class S = typename D::S>
-    static COROT_INLINE mask_of<S> stress(const D& d, const S& m, const S& k, triple<S>* p) {
+    template <class D, class N, class S = typename D::S>
+    static COROT_INLINE mask_of<S> stress(const D& d, const N& m, const N& k, triple<S>* p) {
         const triple<S>* f = d.f;
         const triple<S> last = cross(f[0], f[1]);
-        const S handedness = handedness_of(d.frame);
+        const auto handedness = handedness_of(d.frame);
         const Stretch<S> s = stretch_of(d.e, handedness * dot(f[2], last));
         const S &a = s.of.a, &j = s.of.j, &t = s.t;
         const S kt = k * t;
@@ -91,7 +91,18 @@ struct Corotated {
 constexpr float CONTINUED_BELOW = 0.5f;
 constexpr double LOG_CONTINUED = -0.6931471805599453;
 
-// P = cof F (mu E + lambda ln J) / J; below J0 = CONTINUED_BELOW mu F + U'(J) cof F, with U' continued linearly.
+// V'(J) of V = U + mu (J - 1), which is zero at rest, with U = -mu ln J + lambda / 2 (ln J)^2: a straight line below J0.
+template <class S, class N> COROT_INLINE S volumetric_slope(const S& j, const N& m, const N& k) {
+    const float j0 = CONTINUED_BELOW;
+    const N log0 = spread<N>(LOG_CONTINUED);
+    const mask_of<S> crushed = j < j0 - 1.0f;
+    const S safe = crushed ? spread<S>(0.0f) : j;
+    const S line = (k * log0 + m * (j0 - 1.0f)) / j0 + (m + k * (1.0f - log0)) / (j0 * j0) * (j + (1.0f - j0));
+    return crushed ? line : over(k * log_of(safe) + m * safe, 1.0f + safe);
+}
+
+// P = cof F (mu E + lambda ln J) / J; below J0 = CONTINUED_BELOW mu F + U'(J) cof F, with U' continued linearly. In the axes of
+// rest space P = mu (F - cof F) + V' cof F, F - cof F = A + A^T - tr A I - cof A, where nothing of order one cancels.
 struct NeoHookean {
     // mu / 2 tr E - mu ln J + lambda / 2 (ln J)^2; where E is small, the first two from J^2 - 1 = a + b + c.
     template <class D, class S = typename D::S> static COROT_INLINE S energy(const D& d, const S& m, const S& k) {
@@ -107,12 +118,25 @@ struct NeoHookean {
         const S slope = over(k * log - m, 1.0f + inside), curvature = over(m + k * (1.0f - log), (1.0f + inside) * (1.0f + inside));
         return m * shear + 0.5f * k * log * log + step * (slope + 0.5f * curvature * step);
     }
-    template <class D, class S = typename D::S>
-    static COROT_INLINE mask_of<S> stress(const D& d, const S& m, const S& k, triple<S>* p) {
+    template <class S, class N>
+    static COROT_INLINE mask_of<S> stress(const Deformation<S, RestAxes<N>>& d, const N& m, const N& k, triple<S>* p) {
+        const triple<S>* a = d.a;
+        triple<S> c[3];
+        cofactors(a, c);
+        const S slope = volumetric_slope(volume_change(a, c), m, k), rest = m - slope;
+        const S diagonal = slope - rest * (a[0].x + a[1].y + a[2].z);
+        p[0] = added(a[0] * m, rest, triple<S>{a[0].x, a[1].x, a[2].x} - c[0]);
+        p[1] = added(a[1] * m, rest, triple<S>{a[0].y, a[1].y, a[2].y} - c[1]);
+        p[2] = added(a[2] * m, rest, triple<S>{a[0].z, a[1].z, a[2].z} - c[2]);
+        p[0].x += diagonal, p[1].y += diagonal, p[2].z += diagonal;
+        return every<S>();
+    }
+    template <class S, class N>
+    static COROT_INLINE mask_of<S> stress(const Deformation<S, Frame<N>>& d, const N& m, const N& k, triple<S>* p) {
         const triple<S>* f = d.f;
-        const S handedness = handedness_of(d.frame);
+        const auto handedness = d.frame.handedness;
         const triple<S> cofactor[3] = {cross(f[1], f[2]), cross(f[2], f[0]), cross(f[0], f[1])};
-        const S j = invariants_of(d.e, handedness * dot(f[0], cofactor[0])).j;
+        const S j = volume_change(d.a, d.frame);
         const mask_of<S> crushed = j < CONTINUED_BELOW - 1.0f;
         const S safe = crushed ? spread<S>(0.0f) : j;
         const S w = over(handedness, 1.0f + safe);
@@ -122,10 +146,7 @@ struct NeoHookean {
         for (int i = 0; i < 3; ++i) sigma[i] += pressure;
         times(cofactor, sigma, p);
         if (any(crushed)) {
-            const float j0 = CONTINUED_BELOW;
-            const S log0 = spread<S>(LOG_CONTINUED);
-            const S slope = handedness * ((k * log0 - m) / j0
-                + (m + k * (1.0f - log0)) / (j0 * j0) * (j + (1.0f - j0)));
+            const S slope = handedness * (volumetric_slope(j, m, k) - m);
             for (int i = 0; i < 3; ++i) p[i] = chosen(crushed, added(f[i] * m, slope, cofactor[i]), p[i]);
         }
         return every<S>();
@@ -171,9 +192,8 @@ template <class Law, class Material> struct Elastic {
     template <class Nodes> COROT_INLINE void begin(const Nodes&) {}
     template <class D, class At, class S = typename D::S>
     COROT_INLINE mask_of<S> stress(const D& d, const At& at, triple<S>* p) const {
-        const S weight = at.weight();
-        const mask_of<S> valid = law.stress(d, weight * at.value(material.mu, material.stride),
-            weight * at.value(material.lam, material.stride), p);
+        const typename At::N weight = at.weight(), m = weight * at.value(material.mu, material.stride);
+        const mask_of<S> valid = law.stress(d, m, weight * at.value(material.lam, material.stride), p);
         for (int j = 0; j < 3; ++j) p[j] = chosen(at.done(), nothing<S>(), p[j]);
         return valid;
     }

@@ -98,18 +98,18 @@ template <class T> COROT_INLINE dual_of<T> root(const dual_of<T>& a) {
     return {r, over(T(0.5) * a.slope, r)};
 }
 
-// ln(1 + d) and d - ln(1 + d), both to all their digits, for d >= -1/2: ln(1 + d) = 2 artanh(s) with s = d / (2 + d), a series
-// to s^11 where |s| <= 1/3, which leaves out 1.4e-7 at most.
+// ln(1 + d) and d - ln(1 + d), both to all their digits: ln(1 + d) = 2 artanh(s) with s = d / (2 + d), a series to s^11 where
+// |s| <= 1/3, which leaves out 1.4e-7 at most.
 COROT_INLINE float log_of(float d, float& excess) {
     const float s = over(d, 2.0f + d), z = s * s;
     const float series = z * (1.0f / 3 + z * (1.0f / 5 + z * (1.0f / 7 + z * (1.0f / 9 + z * (1.0f / 11)))));
     float log = 2.0f * s * (1.0f + series);
     excess = s * (d - 2.0f * series);
-    if (d > 1.0f) log = log_of_large(1.0f + d), excess = d - log;
+    if (d > 1.0f || d < -0.5f) log = log_of_large(1.0f + d), excess = d - log;
     return log;
 }
 
-// ln(1 + j) of 1 + j >= 1/2, and exp(x) - 1, to all their digits.
+// ln(1 + j) of positive 1 + j, and exp(x) - 1, to all their digits.
 #if defined(__CUDACC__)
 COROT_INLINE float log_of(float j) {
     float excess;
@@ -186,29 +186,30 @@ COROT_INLINE lanes8 power_excess(const lanes8& x) {
 
 // --- triples --------------------------------------------------------------------------------------------------------
 
+// Numbers that do not change may stand beside dual ones.
 template <class S> struct triple {
     S x, y, z;
-    COROT_INLINE triple operator+(const triple& b) const { return {x + b.x, y + b.y, z + b.z}; }
-    COROT_INLINE triple operator-(const triple& b) const { return {x - b.x, y - b.y, z - b.z}; }
+    template <class W> COROT_INLINE auto operator+(const triple<W>& b) const { return triple<decltype(x + b.x)>{x + b.x, y + b.y, z + b.z}; }
+    template <class W> COROT_INLINE auto operator-(const triple<W>& b) const { return triple<decltype(x - b.x)>{x - b.x, y - b.y, z - b.z}; }
     COROT_INLINE triple operator-() const { return {-x, -y, -z}; }
-    template <class W> COROT_INLINE triple operator*(const W& w) const { return {w * x, w * y, w * z}; }
+    template <class W> COROT_INLINE auto operator*(const W& w) const { return triple<decltype(w * x)>{w * x, w * y, w * z}; }
 };
 
 // a + w b
-template <class S> COROT_INLINE triple<S> added(const triple<S>& a, const S& w, const triple<S>& b) {
-    return {a.x + w * b.x, a.y + w * b.y, a.z + w * b.z};
+template <class A, class W, class B> COROT_INLINE auto added(const triple<A>& a, const W& w, const triple<B>& b) {
+    return triple<decltype(a.x + w * b.x)>{a.x + w * b.x, a.y + w * b.y, a.z + w * b.z};
 }
 
 // u a + v b + w c
-template <class S> COROT_INLINE triple<S> combined(const S& u, const triple<S>& a, const S& v, const triple<S>& b, const S& w,
+template <class W, class S> COROT_INLINE auto combined(const W& u, const triple<S>& a, const W& v, const triple<S>& b, const W& w,
         const triple<S>& c) {
-    return {u * a.x + v * b.x + w * c.x, u * a.y + v * b.y + w * c.y, u * a.z + v * b.z + w * c.z};
+    return triple<decltype(u * a.x)>{u * a.x + v * b.x + w * c.x, u * a.y + v * b.y + w * c.y, u * a.z + v * b.z + w * c.z};
 }
 
-template <class S> COROT_INLINE S dot(const triple<S>& a, const triple<S>& b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+template <class A, class B> COROT_INLINE auto dot(const triple<A>& a, const triple<B>& b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
 
-template <class S> COROT_INLINE triple<S> cross(const triple<S>& a, const triple<S>& b) {
-    return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+template <class A, class B> COROT_INLINE auto cross(const triple<A>& a, const triple<B>& b) {
+    return triple<decltype(a.x * b.x)>{a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
 
 template <class S> COROT_INLINE triple<S> chosen(const mask_of<S>& which, const triple<S>& a, const triple<S>& b) {
@@ -218,7 +219,7 @@ template <class S> COROT_INLINE triple<S> chosen(const mask_of<S>& which, const 
 template <class S> COROT_INLINE triple<S> nothing() { return {spread<S>(0.0f), spread<S>(0.0f), spread<S>(0.0f)}; }
 
 // P = F S of a symmetric S: 00, 11, 22, 01, 02, 12, as all symmetric tensors here.
-template <class S> COROT_INLINE void times(const triple<S>* f, const S* s, triple<S>* p) {
+template <class A, class W, class S> COROT_INLINE void times(const triple<A>* f, const W* s, triple<S>* p) {
     p[0] = combined(s[0], f[0], s[3], f[1], s[4], f[2]);
     p[1] = combined(s[3], f[0], s[1], f[1], s[5], f[2]);
     p[2] = combined(s[4], f[0], s[5], f[1], s[2], f[2]);

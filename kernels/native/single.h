@@ -34,8 +34,7 @@ template <class Law, class M, class T>
 COROT_INLINE bool stress_of(const Law& law, const M& a, const M& da, T mu, T lam, M& p, M& dp) {
     triple<dual_of<T>> columns[3], stress[3];
     columns_of(a, da, columns);
-    const bool valid
-        = law.stress(deformation_of(columns, RestAxes<dual_of<T>>()), dual_of<T>(mu), dual_of<T>(lam), stress);
+    const bool valid = law.stress(deformation_of(columns, RestAxes<T>()), mu, lam, stress);
     matrices_of(stress, p, dp);
     return valid;
 }
@@ -56,10 +55,10 @@ template <class Law, class M, class T> COROT_INLINE T energy_of(const Law& law, 
 }
 
 // The proper frame Q of an element.
-template <class S, class M> COROT_INLINE Frame<S> frame_of(const M& q) {
-    Frame<S> frame;
+template <class M> COROT_INLINE Frame<float> frame_of(const M& q) {
+    Frame<float> frame;
     columns_of(q, frame.q);
-    frame.handedness = spread<S>(1.0f);
+    frame.handedness = 1.0f;
     return frame;
 }
 
@@ -78,7 +77,7 @@ template <class Law, class M> COROT_INLINE M differential_at(const Law& law, int
     typedef dual_of<float> S;
     triple<S> columns[3], stress[3];
     columns_of(g, dg, columns);
-    law.stress(deformation_of(columns, frame_of<S>(q)), Single{t}, stress);
+    law.stress(deformation_of(columns, frame_of(q)), Single{t}, stress);
     M p, dp;
     matrices_of(stress, p, dp);
     return dp;
@@ -87,14 +86,14 @@ template <class Law, class M> COROT_INLINE M differential_at(const Law& law, int
 template <class Law, class M> COROT_INLINE float energy_at(const Law& law, int t, const M& g, const M& q) {
     triple<float> columns[3];
     columns_of(g, columns);
-    return law.energy(deformation_of(columns, frame_of<float>(q)), Single{t});
+    return law.energy(deformation_of(columns, frame_of(q)), Single{t});
 }
 
 // Makes the state of element t a time later the known one of a ``PronyMaterial``.
 template <class Material, class M> COROT_INLINE void relax_at(const Material& material, int t, const M& g, const M& q, float time) {
     triple<float> columns[3];
     columns_of(g, columns);
-    prony(material).relax(deformation_of(columns, frame_of<float>(q)), Single{t}, time);
+    prony(material).relax(deformation_of(columns, frame_of(q)), Single{t}, time);
 }
 
 // theta of a displacement gradient; d theta / dF, and its differential.
@@ -116,7 +115,7 @@ template <class Of, class M> COROT_INLINE M slopes_of(const M& a) {
 template <class Of, class M> COROT_INLINE M turning_of(const M& a, const M& da) {
     triple<dual_of<float>> columns[3], slopes[3];
     columns_of(a, da, columns);
-    Of::slopes(columns, RestAxes<dual_of<float>>(), slopes);
+    Of::slopes(columns, RestAxes<float>(), slopes);
     M p, dp;
     matrices_of(slopes, p, dp);
     return dp;
@@ -127,7 +126,7 @@ template <class Of, class M, class Vector>
 COROT_INLINE void dilatation_of(const M& a, const M& da, Vector& numbers, M& slope, M& turning) {
     triple<dual> columns[3], slopes[3];
     columns_of(a, da, columns);
-    const RestAxes<dual> axes;
+    const RestAxes<double> axes;
     const double theta = Of::theta(columns, axes).value;
     Of::slopes(columns, axes, slopes);
     matrices_of(slopes, slope, turning);
