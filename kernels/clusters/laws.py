@@ -24,8 +24,7 @@ from warp_corot.kernels.corotated.anisotropic import (
     OrthotropicMaterial,
     axes_of,
     filled,
-    material_strain,
-    turned_stress_of,
+    orthotropic_stress,
     vec9,
 )
 from warp_corot.kernels.corotated.well_conditioned import definite_law, definite_strain, is_definite, load_axes
@@ -73,8 +72,7 @@ def robust_stress(g: wp.mat33, m: wp.mat33, c: vec9, mu: float, lam: float):
     """
     turned_gradient = g * m
     r = byers_xu(m + turned_gradient)
-    stress, a = turned_stress_of(material_strain(turned_gradient, m, r), c, mu, lam)
-    return r * (stress + wp.skew(a)) * wp.transpose(m)
+    return orthotropic_stress(turned_gradient, m, r, c, mu, lam) * wp.transpose(m)
 
 
 @functools.cache

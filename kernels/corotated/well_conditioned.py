@@ -8,9 +8,12 @@ import warp as wp
 
 from warp_corot.kernels.math.rotation import ITERATIONS, column, identity3, reciprocal
 
-from .anisotropic import INDEFINITE, vec9
+from .anisotropic import vec9
 
 wp.set_module_options({"enable_backward": False})
+
+#: ``BLENDED`` of ``native/law_anisotropic.h``.
+INDEFINITE = wp.constant(0.4)
 
 
 @wp.func_native("""

@@ -14,10 +14,9 @@ from typing import Any
 
 import warp as wp
 
-from warp_corot.kernels.elements.constitutive import IsotropicMaterial, corotated_strain, hooke, symmetric
+from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.elements import ForestElements, frame, local_gradient
 from warp_corot.kernels.elements.simd8 import headers, law_kernel, on_cpu
-from warp_corot.kernels.math.matrices import axial, identity3
 from warp_corot.kernels.math.rotation import byers_xu
 from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.plan.plan import Plan, extent, leaf_row
@@ -188,11 +187,10 @@ class Prestress:
 # whole, at any strain. The stress s = eta (2 mu Udot + lambda tr(Udot) I) works against Udot; the force that does the
 # same work at the nodes is that of P = R (s + [a]x), with (tr(U) I - U) a the axial vector of U s - s U: it takes out
 # s : Udot >= 0 of power and has no torque.
-
-#: Below this determinant of tr(U) I - U, which is 8 at rest, the turning of a crushed or inverted element is hardly
-#: determined. With stretches a > 0 > b it is (a - b) / (a + b) times Udot and so faster than the nodes, which no
-#: explicit step survives. Below, the symmetric part of A stands for Udot, which still takes power out.
-LEAST = wp.constant(0.05)
+#
+# Below a determinant of 0.05 of tr(U) I - U, which is 8 at rest, the turning of a crushed or inverted element is hardly
+# determined. With stretches a > 0 > b it is (a - b) / (a + b) times Udot and so faster than the nodes, which no
+# explicit step survives. Below, the symmetric part of A stands for Udot, which still takes power out.
 
 
 @wp.struct
@@ -204,27 +202,18 @@ class ViscousMaterial:
     velocities: wp.array[wp.vec4]
 
 
-@wp.func
-def viscous_stress(u: wp.mat33, a: wp.mat33, mu: float, lam: float):
-    """R^T P of a stretch U, a rate A and viscosities [Pa s]."""
-    m = wp.trace(u) * identity3() - u
-    if wp.determinant(m) < LEAST or wp.determinant(u) < 0.0:
-        return hooke(symmetric(a), mu, lam)
-    inverse = wp.inverse(m)
-    rate = symmetric(a - wp.skew(inverse * axial(a)) * u)
-    s = hooke(rate, mu, lam)
-    return s + wp.skew(inverse * axial(u * s))
+@wp.func_native("return corot::viscous_at(f, r, rate, mu, lam);")
+def viscous_stress(f: wp.mat33, r: wp.mat33, rate: wp.mat33, mu: float, lam: float) -> wp.mat33:
+    """P Q of F Q, its rotation, its rate and viscosities [Pa s]."""
+    ...
 
 
 @wp.func
 def viscosity_stress(elements: Any, t: int, material: ViscousMaterial, u: wp.array[wp.vec4]):
     """The viscous stress of element t for the kernels of ``forces``; forces are the stiffness times seconds times
     velocities, for small motions."""
-    g = local_gradient(elements, t, u)
-    q = frame(elements, t)
-    r = byers_xu(q + g)
-    stretch = identity3() + corotated_strain(g, q, r)
-    rate = wp.transpose(r) * local_gradient(elements, t, material.velocities)
-    eta = material.seconds
+    f = frame(elements, t) + local_gradient(elements, t, u)
+    rate = local_gradient(elements, t, material.velocities)
     i = t * material.isotropic.stride
-    return r * viscous_stress(stretch, rate, eta * material.isotropic.mu[i], eta * material.isotropic.lam[i])
+    m = material.seconds * material.isotropic.mu[i]
+    return viscous_stress(f, byers_xu(f), rate, m, material.seconds * material.isotropic.lam[i])

@@ -22,7 +22,7 @@ COROT_INLINE void viscous_stress(const triple<S>* f, const triple<S>* r, const t
     const triple<S> adjugate[3] = {cross(turn[1], turn[2]), cross(turn[2], turn[0]), cross(turn[0], turn[1])};
     const S det = dot(turn[0], adjugate[0]);
     const mask_of<S> crushed = (det < LEAST_TURNING) | (dot(u[0], cross(u[1], u[2])) < 0.0f);
-    const S inverse = crushed ? spread<S>(0.0f) : 1.0f / det;
+    const S inverse = crushed ? spread<S>(0.0f) : over(1.0f, det);
     const auto solve = [&](const triple<S>& x) {
         return triple<S>{dot(adjugate[0], x) * inverse, dot(adjugate[1], x) * inverse, dot(adjugate[2], x) * inverse};
     };

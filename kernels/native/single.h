@@ -3,6 +3,7 @@
 #pragma once
 
 #include "added.h"
+#include "law_anisotropic.h"
 #include "law_fibres.h"
 #include "law_ogden.h"
 
@@ -87,6 +88,75 @@ template <class Law, class M> COROT_INLINE float energy_at(const Law& law, int t
     triple<float> columns[3];
     columns_of(g, columns);
     return law.energy(deformation_of(columns, frame_of(q)), Single{t});
+}
+
+// Of an orthotropic material, from G M, its axes M and R M: P M, its differential in a direction dF M, the energy density, and
+// the symmetric part of R^T P, both in the axes.
+template <class M> COROT_INLINE Deformation<float, Frame<float>> in_axes(const M& g, const M& m) {
+    triple<float> columns[3];
+    columns_of(g, columns);
+    return deformation_of(columns, frame_of(m));
+}
+
+template <class M> COROT_INLINE M orthotropic_stress(const Orthotropic& law, const M& g, const M& m, const M& r) {
+    triple<float> turn[3], stress[3];
+    columns_of(r, turn);
+    law.stress(in_axes(g, m), turn, stress);
+    M p;
+    matrix_of(stress, p);
+    return p;
+}
+
+template <class M> COROT_INLINE M orthotropic_differential(const Orthotropic& law, const M& g, const M& m, const M& r, const M& dg) {
+    triple<dual_of<float>> columns[3], turned[3], stress[3];
+    triple<float> turn[3];
+    float e[6];
+    columns_of(g, dg, columns);
+    columns_of(r, turn);
+    stretch_strain(in_axes(g, m), turn, e);
+    const auto d = deformation_of(columns, frame_of(m));
+    turn_of(d, e, turn, turned);
+    law.stress(d, turned, stress);
+    M p, dp;
+    matrices_of(stress, p, dp);
+    return dp;
+}
+
+template <class M> COROT_INLINE float orthotropic_energy(const Orthotropic& law, const M& g, const M& m, const M& r) {
+    triple<float> turn[3];
+    float e[6];
+    columns_of(r, turn);
+    stretch_strain(in_axes(g, m), turn, e);
+    return law.energy(e);
+}
+
+template <class M> COROT_INLINE M orthotropic_cauchy(const Orthotropic& law, const M& g, const M& m, const M& r) {
+    triple<float> turn[3], a;
+    float e[6], s[6];
+    columns_of(r, turn);
+    stretch_strain(in_axes(g, m), turn, e);
+    law.stress(e, s, a);
+    return M(s[0], s[3], s[4], s[3], s[1], s[5], s[4], s[5], s[2]);
+}
+
+// The matrix by which axial(R^T dF) is the turning of R, of a strain.
+template <class M> COROT_INLINE M turning_of(const M& strain) {
+    const float e[6] = {strain.data[0][0], strain.data[1][1], strain.data[2][2], strain.data[0][1], strain.data[0][2], strain.data[1][2]};
+    float w[6];
+    turning_matrix(e, w);
+    return M(w[0], w[3], w[4], w[3], w[1], w[5], w[4], w[5], w[2]);
+}
+
+// The viscous stress P Q of F Q, R Q and dF/dt Q.
+template <class M> COROT_INLINE M viscous_at(const M& f, const M& r, const M& rate, float m, float k) {
+    triple<float> columns[3], turn[3], changes[3], stress[3];
+    columns_of(f, columns);
+    columns_of(r, turn);
+    columns_of(rate, changes);
+    viscous_stress(columns, turn, changes, m, k, stress);
+    M p;
+    matrix_of(stress, p);
+    return p;
 }
 
 // Makes the state of element t a time later the known one of a ``PronyMaterial``.

@@ -19,6 +19,7 @@ from warp_corot.kernels.elements.elements import (
     scatter_stress,
 )
 from warp_corot.kernels.elements.forces import repair_forces
+from warp_corot.kernels.elements.simd8 import law_kernel
 from warp_corot.kernels.math.matrices import identity3
 from warp_corot.kernels.math.rotation import rotation_out_of_line
 from warp_corot.kernels.modules import unique_kernel
@@ -330,7 +331,7 @@ def repair_listed_shared(
 
 
 @functools.cache
-def repair_flagged(Material: type, stress: wp.Function, kernel: Callable = unique_kernel) -> wp.Kernel:
+def repair_flagged(Material: type, stress: wp.Function, kernel: Callable = law_kernel) -> wp.Kernel:
     """Add the forces of flagged leaves under a law of ``elements.forces`` that is right for every F.
 
     So many ``lanes`` share a word of 64 bits, one for each leaf of eight subtrees; nearly always all bits are zero. In
