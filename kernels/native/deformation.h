@@ -143,7 +143,7 @@ template <class S> struct Invariants {
     mask_of<S> small;
 };
 
-template <class S> COROT_INLINE Invariants<S> invariants_of(const S* e, const S& det) {
+template <class S> COROT_INLINE Invariants<S> invariants_of(const S* e) {
     Invariants<S> i;
     i.adjugate[0] = e[1] * e[2] - e[5] * e[5];
     i.adjugate[1] = e[0] * e[2] - e[4] * e[4];
@@ -155,6 +155,11 @@ template <class S> COROT_INLINE Invariants<S> invariants_of(const S* e, const S&
     i.b = i.adjugate[0] + i.adjugate[1] + i.adjugate[2];
     i.c = e[0] * i.adjugate[0] + e[3] * i.adjugate[3] + e[4] * i.adjugate[4];
     i.squared = i.a * i.a - 2.0f * i.b;
+    return i;
+}
+
+template <class S> COROT_INLINE Invariants<S> invariants_of(const S* e, const S& det) {
+    Invariants<S> i = invariants_of(e);
     i.small = (i.squared < 0.4f) & (det > 0.0f);
     i.j = i.small ? over(i.a + i.b + i.c, 1.0f + det) : det - 1.0f;
     return i;
@@ -170,9 +175,46 @@ template <class S> constexpr float INDEFINITE = IS_FINE<S> ? 1e-3f : 1.0f;
 // where q and the root are good.
 template <class S> struct Stretch {
     Invariants<S> of;
-    S t, q;
+    S t, q, volume;
     mask_of<S> valid;
 };
+
+// Of single floats: in a fixed number of steps, where F is neither flat, turned over (J up to ``FLAT``) nor far from order one;
+// there J - 1 comes from E, however large it is.
+constexpr float FLAT = 0.03f, FAR = 50.0f;
+
+COROT_INLINE Stretch<float> stretch_of(const float* e, const float& det) {
+    Stretch<float> s;
+    s.of = invariants_of(e);
+    const float a = s.of.a, b = s.of.b, c = s.of.c, p2 = s.of.squared;
+    // A comparison with NaN is false.
+    s.valid = det > FLAT && a < FAR;
+    s.of.small = true;
+    if (!s.valid) return s;
+    const float j = s.of.j = over(a + b + c, 1.0f + det);
+    // The series of tr sqrt(I + E).
+    const float p3 = a * (p2 - b) + 3.0f * c, p4 = a * (p3 + c) - b * p2;
+    float t = 0.5f * a + 0.0625f * p3 - 0.125f * p2 - 0.0390625f * p4;
+    if (p2 >= 0.4f) {
+        // Where it ends too early: x = tr S from x^2 = tr C + 2 y, y^2 = tr adj C + 2 J x, from x <= sqrt(3 tr C) on. In each
+        // round the error shrinks to a ninth or less.
+        const float first = a + 3.0f, second = b + 2.0f * a + 3.0f, twice = 2.0f + 2.0f * j;
+        float x = root(3.0f * first);
+        for (int round = 0; round < 2; ++round) x = root(first + 2.0f * root(second + twice * x));
+        t = x - 3.0f;
+    }
+    const float c0 = a * (a - 20.0f) - 24.0f * j - 4.0f * b, c1 = 64.0f - 12.0f * a - 8.0f * j, c2 = 48.0f - 2.0f * a;
+    const auto step_of = [&](float t) {
+        return over((((t + 12.0f) * t + c2) * t + c1) * t + c0, ((4.0f * t + 36.0f) * t + 2.0f * c2) * t + c1);
+    };
+    // From a step of 1e-4 x, Newton's iteration leaves at most some 1e-7.
+    const float step = step_of(t);
+    t -= step;
+    if (magnitude(step) > 1.0e-4f * (t + 3.0f)) t -= step_of(t);
+    s.t = t, s.volume = det;
+    s.q = 16.0f + t * (24.0f + t * (9.0f + t)) - a * (3.0f + t) - 2.0f * j;
+    return s;
+}
 
 template <class S> COROT_INLINE Stretch<S> stretch_of(const S* e, const S& det) {
     Stretch<S> s;
@@ -200,7 +242,7 @@ template <class S> COROT_INLINE Stretch<S> stretch_of(const S* e, const S& det) 
         const double x = t.value, slope = ((4.0 * x + 36.0) * x + 2.0 * c2.value) * x + c1.value;
         t.slope = -((c2.slope * x + c1.slope) * x + c0.slope) / slope;
     }
-    s.t = t;
+    s.t = t, s.volume = 1.0f + j;
     s.q = 16.0f + t * (24.0f + t * (9.0f + t)) - a * (3.0f + t) - 2.0f * j;
     s.valid = inverted(open) & (s.q > INDEFINITE<S>) & (a < 1000.0f);
     return s;

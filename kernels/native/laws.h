@@ -54,16 +54,33 @@ struct StVenantKirchhoff {
 // t)) - a (10 + t) - 2j - y (1 + a), and P = F (2 mu (I - S^-1) + lambda t S^-1), where E is small; elsewhere by R. P is
 // zero where it is not trusted.
 struct Corotated {
+    // mu |D|^2 + lambda / 2 t^2 with D = S - I, of invariants t, i2, i3: |D|^2 = t^2 - 2 i2. From 2 i2 = t^2 + 2t - tr E come few
+    // digits where the strain is small. There E = D^2 + 2D gives tr adj E = i2 (4 + 2t + i2) - i3 (6 + 2t) and det E = i3 (8 +
+    // 4t + 2 i2 + i3), in which the sums need no more digits than that i2 has.
+    template <class D> static COROT_INLINE float energy(const D& d, float m, float k) {
+        const triple<float>* f = d.f;
+        const Stretch<float> s = stretch_of(d.e, handedness_of(d.frame) * dot(f[0], cross(f[1], f[2])));
+        const float t = s.t;
+        float i2 = 0.5f * (t * (2.0f + t) - s.of.a);
+        if (s.of.squared < 0.4f) {
+            const float i3 = over(s.of.c, 8.0f + 4.0f * t + 2.0f * i2 + (s.of.j - t - i2));
+            i2 = over(s.of.b + i3 * (6.0f + 2.0f * t), 4.0f + 2.0f * t + i2);
+        }
+        return m * (t * t - 2.0f * i2) + 0.5f * k * t * t;
+    }
     template <class D, class N, class S = typename D::S>
     static COROT_INLINE mask_of<S> stress(const D& d, const N& m, const N& k, triple<S>* p) {
         const triple<S>* f = d.f;
         const triple<S> last = cross(f[0], f[1]);
         const auto handedness = handedness_of(d.frame);
         const Stretch<S> s = stretch_of(d.e, handedness * dot(f[2], last));
+        if constexpr (same<S, float>::value) {
+            if (!s.valid) return false;
+        }
         const S &a = s.of.a, &j = s.of.j, &t = s.t;
         const S kt = k * t;
-        const S w = (2.0f * m - kt) / s.q;
-        const S y = (2.0f * t - 6.0f * j) / (1.0f + j);
+        const S w = over(2.0f * m - kt, s.q);
+        const S y = over(2.0f * t - 6.0f * j, s.volume);
         S s0 = kt + w * (t * (18.0f + t * (8.0f + t)) - a * (10.0f + t) - 2.0f * j - y * (1.0f + a));
         S s1 = w * (8.0f + y), s2 = -w * (6.0f + y);
         const bool mixed = any(inverted(s.of.small));
@@ -73,8 +90,7 @@ struct Corotated {
             s2 = s.of.small ? s2 : spread<S>(0.0f);
         }
         S sigma[6];
-        for (int i = 0; i < 6; ++i) sigma[i] = s1 * d.e[i] + s2 * s.of.adjugate[i];
-        for (int i = 0; i < 3; ++i) sigma[i] += s0;
+        for (int i = 0; i < 6; ++i) sigma[i] = (i < 3 ? s0 + s1 * d.e[i] : s1 * d.e[i]) + s2 * s.of.adjugate[i];
         times(f, sigma, p);
         if (mixed) {
             const S v = s.of.small ? spread<S>(0.0f) : -2.0f * (3.0f + t) * w * handedness;

@@ -50,6 +50,7 @@ COROT_INLINE float over(float a, float b) {
 }
 COROT_INLINE float log_of_large(float a) { return ::logf(a); }
 COROT_INLINE float power_of(float x) { return ::expf(x); }
+COROT_INLINE float magnitude(float a) { return ::fabsf(a); }
 COROT_INLINE float root(float a) {
     float r;
     asm("sqrt.approx.ftz.f32 %0, %1;" : "=f"(r) : "f"(a));
@@ -59,6 +60,7 @@ COROT_INLINE double root(double a) { return ::sqrt(a); }
 #else
 COROT_INLINE float log_of_large(float a) { return __builtin_logf(a); }
 COROT_INLINE float power_of(float x) { return __builtin_expf(x); }
+COROT_INLINE float magnitude(float a) { return __builtin_fabsf(a); }
 COROT_INLINE float root(float a) { return __builtin_sqrtf(a); }
 COROT_INLINE double root(double a) { return __builtin_sqrt(a); }
 #endif

@@ -49,6 +49,14 @@ template <class Law, class M, class T> COROT_INLINE bool stress_of(const Law& la
     return valid;
 }
 
+// Whether the closed form of the corotated law may be trusted at a displacement gradient.
+template <class M> COROT_INLINE bool has_stretch(const M& a) {
+    triple<float> columns[3];
+    columns_of(a, columns);
+    const auto d = deformation_of(columns, RestAxes<float>());
+    return stretch_of(d.e, dot(d.f[2], cross(d.f[0], d.f[1]))).valid;
+}
+
 template <class Law, class M, class T> COROT_INLINE T energy_of(const Law& law, const M& a, T mu, T lam) {
     triple<T> columns[3];
     columns_of(a, columns);

@@ -20,8 +20,8 @@ from warp_corot.kernels.elements.dilatation import VOLUME as VOLUME_CHANGE
 from warp_corot.kernels.elements.dilatation import mean_of
 from warp_corot.kernels.elements.elements import Subtrees, load_node, root_of, store_node
 from warp_corot.kernels.elements.shapes import columns_of, leaf_forces_of
+from warp_corot.kernels.elements.simd8 import law_kernel
 from warp_corot.kernels.math.matrices import column
-from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.subtrees.forces import (
     dilatation_sums_of,
     dilating_leaves,
@@ -240,7 +240,7 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
     sums = shared_numbers(max(layout.sum_count, 1), "sums of dilatations")
     waiting, enlist, do_one, collect = _left_out_of(layout, displacement, slot)
 
-    @unique_kernel(
+    @law_kernel(
         grid_stride=False,
         launch_bounds=(threads, max(BUSY_THREADS // threads, 1)),
     )

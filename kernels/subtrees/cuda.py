@@ -29,7 +29,6 @@ from warp_corot.kernels.elements.elements import (
     root_of,
 )
 from warp_corot.kernels.elements.simd8 import law_kernel
-from warp_corot.kernels.modules import unique_kernel
 
 from .degenerate import DegenerateList, append, list_of, reserve
 from .forces import (
@@ -233,7 +232,7 @@ def scatter_body(uniform: bool) -> wp.Kernel:
     subtree0, subtree1, subtree2 = (_scatter_subtree(shape, uniform) for shape in range(3))
     add_neighbours = add_four_forces(2)
 
-    @unique_kernel(grid_stride=False, launch_bounds=(BLOCK, min(RESIDENT)))
+    @law_kernel(grid_stride=False, launch_bounds=(BLOCK, min(RESIDENT)))
     def scatter_body(
         # In
         ranges: wp.array[WorkRange],

@@ -19,12 +19,12 @@ from warp_corot.kernels.elements.elements import (
     scatter_stress,
 )
 from warp_corot.kernels.elements.forces import repair_forces
-from warp_corot.kernels.elements.simd8 import law_kernel
+from warp_corot.kernels.elements.simd8 import LAW_HEADERS, law_kernel
 from warp_corot.kernels.math.matrices import identity3
 from warp_corot.kernels.math.rotation import rotation_out_of_line
 from warp_corot.kernels.modules import unique_kernel
 
-wp.set_module_options({"enable_backward": False})
+wp.set_module_options({"enable_backward": False, "extra_build_options": LAW_HEADERS})
 
 #: Number of leaves of a subtree.
 LEAVES = 8
@@ -243,7 +243,7 @@ def root_rotation(roots: ForestElements, s: int, u: wp.array[wp.vec4]):
 # --- by a list ------------------------------------------------------------------------------------------------------
 
 
-@unique_kernel(grid_stride=False)
+@law_kernel(grid_stride=False)
 def repair_listed_own(
     # In
     threads: int,
