@@ -90,9 +90,10 @@ def turned_energy(f: wp.mat33, mu: float, lam: float):
 def corotated_energy(a: wp.mat33, mu: float, lam: float):
     """The density of any displacement gradient A."""
     density = float(0.0)
-    if has_stretch(a):
+    trusted = has_stretch(a)
+    if trusted:
         density = closed_energy(a, mu, lam)
-    else:
+    if not trusted:
         density = turned_energy(identity3() + a, mu, lam)
     return density
 

@@ -108,7 +108,8 @@ struct Orthotropic {
     // s and a.
     template <class S> COROT_INLINE void stress(const S* e, S* s, triple<S>& a) const {
         own_stress(e, s);
-        const Turning<S> t = turning_of(e, 1.0e-30f);
+        // Changes of a stretch may be far larger than it.
+        const Turning<S> t = turning_of(e, same<S, float>::value ? 1.0e-30f : LEAST_STRETCH);
         const S squared = at_least(1.0e-12f, t.squared), cubed = squared * root(squared), x = over(t.det, cubed);
         S turning[6];
         for (int i = 0; i < 6; ++i) turning[i] = s[i];

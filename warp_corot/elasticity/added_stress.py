@@ -16,7 +16,8 @@ from warp_corot.discretization.discretization import Discretization, discretizat
 from warp_corot.discretization.plan import Plan
 from warp_corot.elasticity.corotated.model import Corotated
 from warp_corot.elasticity.cpu import ByElements
-from warp_corot.elasticity.model import ElementMaterial, ElementTangent, ForceField, Model, SmallForces, Tangent
+from warp_corot.elasticity.model import ElementMaterial, ForceField, Model, SmallForces
+from warp_corot.elasticity.tangents import ElementTangent, SumTangent, Tangent
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, checked_numbers, shown
 from warp_corot.inputs.forwarding import forwards
@@ -129,40 +130,6 @@ class Stiffest:
         """Add the forces [N] of displacements u to f; both vec4 [worlds * N]."""
         self._field.law.stiffest.add_forces(u, f)
         self._field.add_own_forces(u, f)
-
-
-class SumTangent(Tangent):
-    """The sum of two stiffnesses.
-
-    Args:
-        first, second: The two.
-    """
-
-    def __init__(self, first: Tangent, second: Tangent):
-        super().__init__(second.field)
-        self._both = first, second
-
-    @property
-    def kernels(self) -> list[wp.Kernel]:
-        return [kernel for each in self._both for kernel in each.kernels]
-
-    def prepare(self, u: wp.array) -> None:
-        super().prepare(u)
-        for each in self._both:
-            each.prepare(u)
-
-    def take(self, u: wp.array) -> None:
-        super().take(u)
-        for each in self._both:
-            each.take(u)
-
-    def add_product(self, p: wp.array, y: wp.array) -> None:
-        for each in self._both:
-            each.add_product(p, y)
-
-    def add_diagonal(self, blocks: wp.array) -> None:
-        for each in self._both:
-            each.add_diagonal(blocks)
 
 
 # --- viscoelastic tissue: a Prony series of Maxwell elements ---------------------------------------------------------

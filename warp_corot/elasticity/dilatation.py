@@ -15,7 +15,8 @@ from warp_corot.discretization.groups import Members
 from warp_corot.discretization.plan import Batch, Plan
 from warp_corot.elasticity.cpu import Dilating
 from warp_corot.elasticity.groups import ClusteredGroups, ElementGroups, elements_of, group_numbers
-from warp_corot.elasticity.model import ElementTangent, ForceField, SmallForces, Tangent
+from warp_corot.elasticity.model import ForceField, SmallForces
+from warp_corot.elasticity.tangents import ElementTangent, Tangent
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_choice, shown
 from warp_corot.inputs.choices import AUTO, ELEMENT, SHARED

@@ -22,7 +22,8 @@ from warp_corot.elasticity.corotated.tangents import (
     subtrees_of,
 )
 from warp_corot.elasticity.cpu import Dilating, SimdForces
-from warp_corot.elasticity.model import ForceField, Kept, StressLaw, Tangent, rotated_material
+from warp_corot.elasticity.model import ForceField, Kept, StressLaw, rotated_material
+from warp_corot.elasticity.tangents import Tangent
 from warp_corot.inputs.cpu_threads import launch
 from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.clusters.laws import isotropic_law
@@ -363,12 +364,11 @@ class SubtreeField(CorotatedField):
     ) -> None:
         own = batch.sharing is Sharing.OWN
         unit = self._no_unit if batch.unit is None else batch.unit
+        material = self.isotropic if own else kept(self.isotropic, self._rotations, unit)
         if self.device.is_cuda:
-            threads, rotations = batch.count, [] if own else [self._rotations, unit]
-            inputs = [batch.subtrees, self.isotropic, u, *rotations]
+            threads, inputs = batch.count, [batch.subtrees, material, u]
             outputs = [f, batch.flagged, NO_LIST if self._degenerate is None else self._degenerate.list_of(batch)]
         else:
-            material = self.isotropic if own else kept(self.isotropic, self._rotations, unit)
             threads, inputs = -(-batch.count // LANES), [batch.subtrees, batch.count, material, u]
             outputs = [f, batch.flagged]
         launch(kernel, threads, inputs, outputs, device=self.device, block_dim=self._block)
