@@ -127,16 +127,3 @@ def corotated_strain(g: wp.mat33, q: wp.mat33, r: wp.mat33):
 def rotated_stress(g: wp.mat33, q: wp.mat33, r: wp.mat33, mu: float, lam: float):
     """The corotated stress times Q, of G, the frame Q and the rotation of F Q."""
     return r * hooke(corotated_strain(g, q, r), mu, lam)
-
-
-@wp.func
-def stretch_strain(rough: wp.mat33, a: wp.mat33):
-    """e = S - I of F = I + A to all its digits, from a ``rough`` one; S is the stretch in F = R S.
-
-    The rough one is a difference of numbers near one. But S^2 = F^T F, so e = E - e^2 / 2 with Green's strain E, and
-    where e is small, the error of the rough one hardly changes this.
-    """
-    strain = rough
-    if wp.ddot(rough, rough) < 0.25:
-        strain = green_strain(a) - 0.5 * (rough * rough)
-    return strain

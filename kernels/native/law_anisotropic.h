@@ -30,6 +30,40 @@ template <class A, class B> COROT_INLINE auto applied(const A* a, const triple<B
     return triple<S>{a[0] * v.x + a[3] * v.y + a[4] * v.z, a[3] * v.x + a[1] * v.y + a[5] * v.z, a[4] * v.x + a[5] * v.y + a[2] * v.z};
 }
 
+// Adjugate of H, whose diagonal is h and whose other entries are those of -s, and its determinant.
+template <class S> COROT_INLINE S turning_adjugate(const S* h, const S* s, S* adjugate) {
+    adjugate[0] = h[1] * h[2] - s[5] * s[5];
+    adjugate[1] = h[0] * h[2] - s[4] * s[4];
+    adjugate[2] = h[0] * h[1] - s[3] * s[3];
+    adjugate[3] = s[4] * s[5] + s[3] * h[2];
+    adjugate[4] = s[3] * s[5] + s[4] * h[1];
+    adjugate[5] = s[3] * s[4] + h[0] * s[5];
+    return h[0] * adjugate[0] - s[3] * adjugate[3] - s[4] * adjugate[4];
+}
+
+// axial(e s) of symmetric tensors.
+template <class S> COROT_INLINE triple<S> commutator(const S* e, const S* s) {
+    const triple<S> rows[3] = {{e[0], e[3], e[4]}, {e[3], e[1], e[5]}, {e[4], e[5], e[2]}};
+    const triple<S> columns[3] = {{s[0], s[3], s[4]}, {s[3], s[1], s[5]}, {s[4], s[5], s[2]}};
+    return {dot(rows[2], columns[1]) - dot(rows[1], columns[2]), dot(rows[0], columns[2]) - dot(rows[2], columns[0]),
+        dot(rows[1], columns[0]) - dot(rows[0], columns[1])};
+}
+
+// Columns of R (s + [a]x).
+template <class S> COROT_INLINE void turned_columns(const S* s, const triple<S>& a, const triple<S>* r, triple<S>* p) {
+    p[0] = combined(s[0], r[0], s[3] + a.z, r[1], s[4] - a.y, r[2]);
+    p[1] = combined(s[3] - a.z, r[0], s[1], r[1], s[5] + a.x, r[2]);
+    p[2] = combined(s[4] + a.y, r[0], s[5] - a.x, r[1], s[2], r[2]);
+}
+
+// The stress of a strain, both in the material's axes, by a stiffness C_11, C_22, C_33, C_12, C_13, C_23, G_12, G_13, G_23.
+template <class N, class S> COROT_INLINE void orthotropic_stress(const N* c, const S* e, S* s) {
+    s[0] = c[0] * e[0] + c[3] * e[1] + c[4] * e[2];
+    s[1] = c[3] * e[0] + c[1] * e[1] + c[5] * e[2];
+    s[2] = c[4] * e[0] + c[5] * e[1] + c[2] * e[2];
+    for (int i = 3; i < 6; ++i) s[i] = 2.0f * c[3 + i] * e[i];
+}
+
 // S = I + e scaled to order one, so that no power of it is out of range; |S|^2; and adjugate and determinant of H.
 template <class S> struct Turning {
     float scale;
@@ -48,13 +82,7 @@ template <class S> COROT_INLINE Turning<S> turning_of(const S* e, float least) {
     const S* s = t.stretch;
     const S h[3] = {s[1] + s[2], s[0] + s[2], s[0] + s[1]};
     t.squared = inner(s, s);
-    t.adjugate[0] = h[1] * h[2] - s[5] * s[5];
-    t.adjugate[1] = h[0] * h[2] - s[4] * s[4];
-    t.adjugate[2] = h[0] * h[1] - s[3] * s[3];
-    t.adjugate[3] = s[4] * s[5] + s[3] * h[2];
-    t.adjugate[4] = s[3] * s[5] + s[4] * h[1];
-    t.adjugate[5] = s[3] * s[4] + h[0] * s[5];
-    t.det = h[0] * t.adjugate[0] - s[3] * t.adjugate[3] - s[4] * t.adjugate[4];
+    t.det = turning_adjugate(h, s, t.adjugate);
     return t;
 }
 
@@ -82,18 +110,10 @@ template <class D, class S> COROT_INLINE void stretch_strain(const D& d, const t
     }
 }
 
-// Stiffness c (C_11, C_22, C_33, C_12, C_13, C_23, G_12, G_13, G_23) of an orthotropic material in its axes, and the nearest
-// isotropic one.
+// The stiffness c of an orthotropic material, and the nearest isotropic one.
 struct Orthotropic {
     const float* c;
     const float mu, lam;
-
-    template <class S> COROT_INLINE void own_stress(const S* e, S* s) const {
-        s[0] = c[0] * e[0] + c[3] * e[1] + c[4] * e[2];
-        s[1] = c[3] * e[0] + c[1] * e[1] + c[5] * e[2];
-        s[2] = c[4] * e[0] + c[5] * e[1] + c[2] * e[2];
-        for (int i = 3; i < 6; ++i) s[i] = 2.0f * c[3 + i] * e[i];
-    }
 
     // s less that of the isotropic material.
     template <class S> COROT_INLINE void excess(const S* e, const S* s, S* more) const {
@@ -107,7 +127,7 @@ struct Orthotropic {
 
     // s and a.
     template <class S> COROT_INLINE void stress(const S* e, S* s, triple<S>& a) const {
-        own_stress(e, s);
+        orthotropic_stress(c, e, s);
         // Changes of a stretch may be far larger than it.
         const Turning<S> t = turning_of(e, same<S, float>::value ? 1.0e-30f : LEAST_STRETCH);
         const S squared = at_least(1.0e-12f, t.squared), cubed = squared * root(squared), x = over(t.det, cubed);
@@ -124,19 +144,14 @@ struct Orthotropic {
                 s[i] = s[i] - more[i] + turning[i] + slope * (over(of_det, cubed) - over(3.0f * x, squared) * t.stretch[i]);
             }
         }
-        const triple<S> rows[3] = {{e[0], e[3], e[4]}, {e[3], e[1], e[5]}, {e[4], e[5], e[2]}};
-        const triple<S> columns[3] = {{turning[0], turning[3], turning[4]}, {turning[3], turning[1], turning[5]},
-            {turning[4], turning[5], turning[2]}};
-        const triple<S> axial = {dot(rows[2], columns[1]) - dot(rows[1], columns[2]), dot(rows[0], columns[2]) - dot(rows[2], columns[0]),
-            dot(rows[1], columns[0]) - dot(rows[0], columns[1])};
-        a = applied(t.adjugate, axial) * over(spread<S>(t.scale), at_least(1.0e-20f, t.det));
+        a = applied(t.adjugate, commutator(e, turning) * t.scale) * over(spread<S>(1.0f), at_least(1.0e-20f, t.det));
     }
 
     COROT_INLINE float energy(const float* e) const {
         const Turning<float> t = turning_of(e, 1.0e-30f);
         const float squared = at_least(1.0e-12f, t.squared), x = over(t.det, squared * root(squared));
         float s[6], more[6];
-        own_stress(e, s);
+        orthotropic_stress(c, e, s);
         excess(e, s, more);
         return 0.5f * (inner(e, s) - (x < BLENDED ? 1.0f - share(bounded(x * (1.0f / BLENDED))) : 0.0f) * inner(e, more));
     }
@@ -147,9 +162,7 @@ struct Orthotropic {
         triple<S> a;
         stretch_strain(d, r, e);
         stress(e, s, a);
-        p[0] = combined(s[0], r[0], s[3] + a.z, r[1], s[4] - a.y, r[2]);
-        p[1] = combined(s[3] - a.z, r[0], s[1], r[1], s[5] + a.x, r[2]);
-        p[2] = combined(s[4] + a.y, r[0], s[5] - a.x, r[1], s[2], r[2]);
+        turned_columns(s, a, r, p);
     }
 };
 

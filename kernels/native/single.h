@@ -19,8 +19,8 @@ template <class M, class T> COROT_INLINE void columns_of(const M& a, const M& da
         to[j] = {{a.data[0][j], da.data[0][j]}, {a.data[1][j], da.data[1][j]}, {a.data[2][j], da.data[2][j]}};
 }
 
-template <class M, class S> COROT_INLINE void matrix_of(const triple<S>* columns, M& a) {
-    for (int j = 0; j < 3; ++j) a.data[0][j] = columns[j].x, a.data[1][j] = columns[j].y, a.data[2][j] = columns[j].z;
+template <class M, class S> COROT_INLINE M matrix_of(const triple<S>* c) {
+    return M(c[0].x, c[1].x, c[2].x, c[0].y, c[1].y, c[2].y, c[0].z, c[1].z, c[2].z);
 }
 
 template <class M, class T> COROT_INLINE void matrices_of(const triple<dual_of<T>>* columns, M& a, M& da) {
@@ -28,6 +28,12 @@ template <class M, class T> COROT_INLINE void matrices_of(const triple<dual_of<T
         const dual_of<T> column[3] = {columns[j].x, columns[j].y, columns[j].z};
         for (int i = 0; i < 3; ++i) a.data[i][j] = column[i].value, da.data[i][j] = column[i].slope;
     }
+}
+
+template <class M, class T> COROT_INLINE M slope_of(const triple<dual_of<T>>* columns) {
+    M a, da;
+    matrices_of(columns, a, da);
+    return da;
 }
 
 // P of a displacement gradient A and its differential in a direction; whether the law holds there.
@@ -45,7 +51,7 @@ template <class Law, class M, class T> COROT_INLINE bool stress_of(const Law& la
     triple<T> columns[3], stress[3];
     columns_of(a, columns);
     const bool valid = law.stress(deformation_of(columns, RestAxes<T>()), mu, lam, stress);
-    matrix_of(stress, p);
+    p = matrix_of<M>(stress);
     return valid;
 }
 
@@ -77,9 +83,7 @@ template <class Law, class M, class Axes> COROT_INLINE M stress_at(const Law& la
     triple<float> columns[3], stress[3];
     columns_of(g, columns);
     law.stress(deformation_of(columns, frame), Single{t}, stress);
-    M p;
-    matrix_of(stress, p);
-    return p;
+    return matrix_of<M>(stress);
 }
 
 template <class Law, class M> COROT_INLINE M differential_at(const Law& law, int t, const M& g, const M& q, const M& dg) {
@@ -87,9 +91,7 @@ template <class Law, class M> COROT_INLINE M differential_at(const Law& law, int
     triple<S> columns[3], stress[3];
     columns_of(g, dg, columns);
     law.stress(deformation_of(columns, frame_of(q)), Single{t}, stress);
-    M p, dp;
-    matrices_of(stress, p, dp);
-    return dp;
+    return slope_of<M>(stress);
 }
 
 template <class Law, class M> COROT_INLINE float energy_at(const Law& law, int t, const M& g, const M& q) {
@@ -110,9 +112,7 @@ template <class M> COROT_INLINE M orthotropic_stress(const Orthotropic& law, con
     triple<float> turn[3], stress[3];
     columns_of(r, turn);
     law.stress(in_axes(g, m), turn, stress);
-    M p;
-    matrix_of(stress, p);
-    return p;
+    return matrix_of<M>(stress);
 }
 
 template <class M> COROT_INLINE M orthotropic_differential(const Orthotropic& law, const M& g, const M& m, const M& r, const M& dg) {
@@ -125,26 +125,30 @@ template <class M> COROT_INLINE M orthotropic_differential(const Orthotropic& la
     const auto d = deformation_of(columns, frame_of(m));
     turn_of(d, e, turn, turned);
     law.stress(d, turned, stress);
-    M p, dp;
-    matrices_of(stress, p, dp);
-    return dp;
+    return slope_of<M>(stress);
+}
+
+// The strain S - I from the same.
+template <class M> COROT_INLINE void strain_of(const M& g, const M& m, const M& r, float* e) {
+    triple<float> turn[3];
+    columns_of(r, turn);
+    stretch_strain(in_axes(g, m), turn, e);
 }
 
 template <class M> COROT_INLINE float orthotropic_energy(const Orthotropic& law, const M& g, const M& m, const M& r) {
-    triple<float> turn[3];
     float e[6];
-    columns_of(r, turn);
-    stretch_strain(in_axes(g, m), turn, e);
+    strain_of(g, m, r, e);
     return law.energy(e);
 }
 
+template <class M> COROT_INLINE M symmetric_of(const float* s) { return M(s[0], s[3], s[4], s[3], s[1], s[5], s[4], s[5], s[2]); }
+
 template <class M> COROT_INLINE M orthotropic_cauchy(const Orthotropic& law, const M& g, const M& m, const M& r) {
-    triple<float> turn[3], a;
+    triple<float> a;
     float e[6], s[6];
-    columns_of(r, turn);
-    stretch_strain(in_axes(g, m), turn, e);
+    strain_of(g, m, r, e);
     law.stress(e, s, a);
-    return M(s[0], s[3], s[4], s[3], s[1], s[5], s[4], s[5], s[2]);
+    return symmetric_of<M>(s);
 }
 
 // The matrix by which axial(R^T dF) is the turning of R, of a strain.
@@ -152,7 +156,7 @@ template <class M> COROT_INLINE M turning_of(const M& strain) {
     const float e[6] = {strain.data[0][0], strain.data[1][1], strain.data[2][2], strain.data[0][1], strain.data[0][2], strain.data[1][2]};
     float w[6];
     turning_matrix(e, w);
-    return M(w[0], w[3], w[4], w[3], w[1], w[5], w[4], w[5], w[2]);
+    return symmetric_of<M>(w);
 }
 
 // The viscous stress P Q of F Q, R Q and dF/dt Q.
@@ -162,9 +166,7 @@ template <class M> COROT_INLINE M viscous_at(const M& f, const M& r, const M& ra
     columns_of(r, turn);
     columns_of(rate, changes);
     viscous_stress(columns, turn, changes, m, k, stress);
-    M p;
-    matrix_of(stress, p);
-    return p;
+    return matrix_of<M>(stress);
 }
 
 // Makes the state of element t a time later the known one of a ``PronyMaterial``.
@@ -185,18 +187,14 @@ template <class Of, class M> COROT_INLINE M slopes_of(const M& a) {
     triple<float> columns[3], slopes[3];
     columns_of(a, columns);
     Of::slopes(columns, RestAxes<float>(), slopes);
-    M p;
-    matrix_of(slopes, p);
-    return p;
+    return matrix_of<M>(slopes);
 }
 
 template <class Of, class M> COROT_INLINE M turning_of(const M& a, const M& da) {
     triple<dual_of<float>> columns[3], slopes[3];
     columns_of(a, da, columns);
     Of::slopes(columns, RestAxes<float>(), slopes);
-    M p, dp;
-    matrices_of(slopes, p, dp);
-    return dp;
+    return slope_of<M>(slopes);
 }
 
 // theta, h' and h'' of an element; d theta / dF and its differential.

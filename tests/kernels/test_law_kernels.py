@@ -20,13 +20,13 @@ from warp_corot.elasticity.clusters import ClusterScatter, clustered
 from warp_corot.elasticity.laws import law_of
 from warp_corot.elasticity.model import isotropic_material
 from warp_corot.kernels.clusters.laws import ActiveMaterial, anisotropic_law, isotropic_law, reinforced_law
+from warp_corot.kernels.corotated.algebraic import corotated_stress
 from warp_corot.kernels.corotated.anisotropic import FibreMaterial, fibre_stress
 from warp_corot.kernels.corotated.well_conditioned import quaternions_of
 from warp_corot.kernels.elements import constitutive
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.fibres import ReinforcedMaterial
 from warp_corot.kernels.elements.forces import scatter_forces
-from warp_corot.kernels.elements.general_cuda import corotated_law
 from warp_corot.kernels.math.rotation import byers_xu, quick_rotation
 from warp_corot.kernels.subtrees.anisotropic import repair_leaves, scatter_anisotropic_subtrees, scatter_flat
 from warp_corot.kernels.subtrees.cuda import scatter_law_subtrees
@@ -117,7 +117,7 @@ def test_general_elements(law, uniform, device, rng):
     u, x = state(mesh, law, rng)
     on_device = wp.array(u, dtype=wp.vec4, device=device)
     f = wp.zeros_like(on_device)
-    stress = LAWS.get(law) or corotated_law(quick_rotation)
+    stress = LAWS.get(law) or corotated_stress
     material = isotropic_of(body.discretization)
     add_forces(ClusterScatter(body.discretization.elements, isotropic_law(stress)), material, on_device, f)
     assert_right(f.numpy()[:, :3], oracle.evaluate(law, oracle_mesh(mesh), x, mu, lam)[1])

@@ -38,7 +38,6 @@ from warp_corot.kernels.corotated.corotated import (
 from warp_corot.kernels.corotated.tangent import exact_differential
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
 from warp_corot.kernels.elements.forces import element_energies, element_von_mises, scatter_forces
-from warp_corot.kernels.elements.general_cuda import corotated_law
 from warp_corot.kernels.elements.simd8 import LANES
 from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.kernels.subtrees import cpu as subtree_cpu
@@ -62,7 +61,7 @@ class Rotations:
 
 
 class CorotatedField(ForceField):
-    """Forces by one kernel if each element uses its own rotation; otherwise by two, rotations first."""
+    """Forces leaf by leaf, by one kernel if each element uses its own rotation; otherwise by two, rotations first."""
 
     #: Whether complete subtrees are units of work.
     takes_subtrees: ClassVar[bool] = False
@@ -83,6 +82,8 @@ class CorotatedField(ForceField):
         else:
             self._energies = element_energies(kind, RotatedMaterial, given_density)
             self._von_mises = element_von_mises(kind, RotatedMaterial, given_cauchy)
+        if not self.takes_subtrees:
+            self.follow()
 
     @property
     def kernels(self) -> list[LoadedKernel]:
@@ -104,6 +105,8 @@ class CorotatedField(ForceField):
     def follow(self) -> None:
         super().follow()
         self._shared = None
+        if not self.takes_subtrees and not self._fused:
+            self._sharing()
 
     @property
     def unit_count(self) -> int:
@@ -193,29 +196,15 @@ class CorotatedField(ForceField):
         self.launch(kernel, self.element_count, [self.elements, material, u], [output])
 
 
-class LeafField(CorotatedField):
-    """Leaf by leaf."""
-
-    def __init__(self, discretization: Discretization, model: CorotatedOptions, deterministic: bool):
-        super().__init__(discretization, model, deterministic)
-        if not self._fused:
-            self._sharing()
-
-    def follow(self) -> None:
-        super().follow()
-        if not self._fused:
-            self._sharing()
-
-
 # --- elements in clusters on CUDA ------------------------------------------------------------------------------------
 
 
-class CorotatedGeneralField(LeafField):
+class CorotatedGeneralField(CorotatedField):
     """General elements with own rotations."""
 
     def __init__(self, discretization: Discretization, model: CorotatedOptions):
         super().__init__(discretization, model, deterministic=False)
-        law = isotropic_law(corotated_law(model.own_rotation))
+        law = isotropic_law(corotated_stress)
         self._scatter = ClusterScatter(self.elements, law, chosen=clustered(discretization))
 
     @property

@@ -12,7 +12,6 @@ from warp_corot.elasticity.anisotropic import AnisotropicCudaField, AnisotropicF
 from warp_corot.elasticity.corotated.fields import (
     CorotatedField,
     CorotatedGeneralField,
-    LeafField,
     SubtreeField,
 )
 from warp_corot.elasticity.dilatation import AUTO, bind_law, check_dilatation
@@ -141,7 +140,7 @@ class Corotated(CorotatedOptions):
             return SubtreeField(discretization, self, deterministic)
         elif fast and not deterministic:
             return CorotatedGeneralField(discretization, self)
-        return LeafField(discretization, self, deterministic)
+        return CorotatedField(discretization, self, deterministic)
 
     def _bind_anisotropic(self, discretization: Discretization, deterministic: bool) -> AnisotropicField:
         if not isinstance(discretization.material, Anisotropic):
