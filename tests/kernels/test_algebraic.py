@@ -79,7 +79,8 @@ def test_small_strains_keep_their_digits(size, device, rng):
     assert ok.all()
     # In float64 the reference itself loses 1e-16 / size.
     assert relative_error(P, expected(A)).max() < 1e-5
-    assert np.array_equal(P, Q)
+    # Two places of one function, where a compiler may fuse other products and sums.
+    np.testing.assert_allclose(P, Q, rtol=0, atol=3e-7 * np.abs(P).max())
 
 
 @pytest.mark.parametrize(("low", "high"), [(0.8, 1.25), (0.5, 2.0), (0.35, 4.0)])
