@@ -155,8 +155,10 @@ def scatter_dilatation(shape: int, grouped: bool, uniform: bool, of: Dilatation)
 def scatter_subtrees_shared(shape: int, grouped: bool, uniform: bool, given: bool, listed: bool) -> wp.Kernel:
     """Corotated forces of subtrees whose leaves share a rotation: that of the subtree's root, or a given one."""
     leaves, missed = isotropic_leaves(shape, always_trusted(linear_stress)), "list" if listed else "flags"
-    turn, missed = shared_turn(shape, given), "" if given else missed
-    return scatter_subtrees(shape, grouped, uniform, leaves, RotatedMaterial, missed=missed, turn=turn)
+    turn, missed, resident = shared_turn(shape, given), "" if given else missed, 0 if given else 7
+    return scatter_subtrees(
+        shape, grouped, uniform, leaves, RotatedMaterial, missed=missed, resident=resident, turn=turn
+    )
 
 
 # --- all of a body in one launch ------------------------------------------------------------------------------------
