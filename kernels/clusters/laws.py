@@ -21,7 +21,9 @@ from warp_corot.kernels.clusters.pairs import (
     vector_of,
 )
 from warp_corot.kernels.corotated.anisotropic import (
+    REINFORCED,
     OrthotropicMaterial,
+    ReinforcedMaterial,
     axes_of,
     filled,
     orthotropic_stress,
@@ -30,7 +32,6 @@ from warp_corot.kernels.corotated.anisotropic import (
 from warp_corot.kernels.corotated.well_conditioned import definite_law, definite_strain, is_definite, load_axes
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import Dilatation, mean_of, pressure_stress_of
-from warp_corot.kernels.elements.fibres import REINFORCED, ReinforcedMaterial
 from warp_corot.kernels.elements.simd8 import law_kernel
 from warp_corot.kernels.math.rotation import ITERATIONS, byers_xu, column, identity3, newton_rotation
 from warp_corot.kernels.stepping.block_memory import LOAD, STORE

@@ -1,5 +1,5 @@
-// Stresses beside a law: viscosity (elements/viscosity.py), the Maxwell elements of a Prony series (elements/prony.py), and
-// one that a body has at rest (elements/prestress.py).
+// Stresses beside a law: viscosity, the Maxwell elements of a Prony series, and one that a body has at rest; see
+// elements/added.py.
 #pragma once
 
 #include "elements8.h"

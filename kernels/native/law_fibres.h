@@ -1,4 +1,4 @@
-// The law of Holzapfel, Gasser and Ogden; see elements/fibres.py.
+// The law of Holzapfel, Gasser and Ogden; see corotated/anisotropic.py.
 #pragma once
 
 #include "laws.h"

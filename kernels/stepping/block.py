@@ -14,7 +14,7 @@ import functools
 
 import warp as wp
 
-from warp_corot.kernels.corotated.algebraic import turned_stress
+from warp_corot.kernels.corotated.corotated import turned_stress
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import VOLUME as VOLUME_CHANGE
 from warp_corot.kernels.elements.dilatation import mean_of

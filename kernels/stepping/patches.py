@@ -20,7 +20,7 @@ import functools
 
 import warp as wp
 
-from warp_corot.kernels.corotated.algebraic import stretch_stress, turned_stress
+from warp_corot.kernels.corotated.corotated import stretch_stress, turned_stress
 from warp_corot.kernels.elements.dilatation import VOLUME, pressure_stress_of
 from warp_corot.kernels.elements.elements import load_node, store_node
 from warp_corot.kernels.elements.simd8 import law_kernel

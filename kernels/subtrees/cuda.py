@@ -3,7 +3,7 @@
 Three things make it fast. Forces are summed over the eight leaves in registers, and over a group of eight subtrees in
 shared memory, where a table tells each lane which slots to add up; so each node of a group takes one atomic addition.
 Sums go to global memory as 16-byte vector reductions if the card has them. The stress comes from a root of one
-polynomial (``corotated.algebraic``), in the same way for small strains and large ones.
+polynomial (``corotated.corotated``), in the same way for small strains and large ones.
 
 A leaf that is flat, inverted or strained far beyond order one adds nothing. Its bit is set in its subtree's byte, and
 the subtree is put on a list; ``degenerate`` computes those leaves. A body whose subtrees are all of one type has a
@@ -15,7 +15,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_corot.kernels.corotated.algebraic import stretch_stress
+from warp_corot.kernels.corotated.corotated import stretch_stress
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial, linear_stress
 from warp_corot.kernels.elements.dilatation import Dilatation
 from warp_corot.kernels.elements.elements import (

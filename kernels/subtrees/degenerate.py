@@ -6,7 +6,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_corot.kernels.corotated.algebraic import corotated_stress
+from warp_corot.kernels.corotated.corotated import corotated_stress
 from warp_corot.kernels.corotated.tangent import keep_gradients
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, rotated_stress
 from warp_corot.kernels.elements.elements import (

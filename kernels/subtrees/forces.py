@@ -1,7 +1,7 @@
 """Corotated forces of one complete subtree in registers: ten displacements in, ten nodal forces out.
 
 Kernels that read and write their nodes in different ways share this code (``cuda``, ``stepping.block``). Stresses are
-computed from displacement gradients, so that small strains keep their digits (``corotated.algebraic.stretch_stress``).
+computed from displacement gradients, so that small strains keep their digits (``corotated.corotated.stretch_stress``).
 A leaf that is flat, inverted or strained far beyond order one is left out and reported: bit k of the mask stands for
 leaf k in tree order.
 """
@@ -13,7 +13,7 @@ from typing import Any
 
 import warp as wp
 
-from warp_corot.kernels.corotated.algebraic import stretch_stress
+from warp_corot.kernels.corotated.corotated import stretch_stress
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
 from warp_corot.kernels.elements.dilatation import VOLUME as VOLUME_CHANGE
 from warp_corot.kernels.elements.dilatation import Dilatation, mean_of, pressure_stress_of

@@ -9,7 +9,7 @@ from fibres import random_axes
 from tangents import assert_diagonal, assert_equal, assert_symmetric, difference, product
 
 import warp_corot as wc
-from warp_corot.kernels.elements.fibres import REINFORCED, ReinforcedMaterial
+from warp_corot.kernels.corotated.anisotropic import REINFORCED, ReinforcedMaterial
 from warp_corot.kernels.elements.forces import scatter_forces
 from warp_corot.kernels.elements.simd8 import LANES
 

@@ -5,7 +5,7 @@ import oracle
 import pytest
 import warp as wp
 
-from warp_corot.kernels.corotated.algebraic import corotated_energy, corotated_stress, stretch_stress
+from warp_corot.kernels.corotated.corotated import corotated_energy, corotated_stress, stretch_stress
 from warp_corot.kernels.elements.simd8 import LAW_HEADERS
 
 wp.set_module_options({"extra_build_options": LAW_HEADERS})

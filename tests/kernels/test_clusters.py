@@ -23,7 +23,7 @@ from warp_corot.kernels.clusters.single import (
     material_scale,
     shape_word,
 )
-from warp_corot.kernels.corotated.algebraic import corotated_stress
+from warp_corot.kernels.corotated.corotated import corotated_stress
 from warp_corot.kernels.elements.elements import load_node
 from warp_corot.kernels.tables.cluster_layout import BANK_GROUPS, QUAD_BYTES, ClusterLayout
 

@@ -20,12 +20,11 @@ from warp_corot.elasticity.clusters import ClusterScatter, clustered
 from warp_corot.elasticity.laws import law_of
 from warp_corot.elasticity.model import isotropic_material
 from warp_corot.kernels.clusters.laws import ActiveMaterial, anisotropic_law, isotropic_law, reinforced_law
-from warp_corot.kernels.corotated.algebraic import corotated_stress
-from warp_corot.kernels.corotated.anisotropic import FibreMaterial, fibre_stress
+from warp_corot.kernels.corotated.anisotropic import FibreMaterial, ReinforcedMaterial, fibre_stress
+from warp_corot.kernels.corotated.corotated import corotated_stress
 from warp_corot.kernels.corotated.well_conditioned import quaternions_of
 from warp_corot.kernels.elements import constitutive
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
-from warp_corot.kernels.elements.fibres import ReinforcedMaterial
 from warp_corot.kernels.elements.forces import scatter_forces
 from warp_corot.kernels.math.rotation import byers_xu, quick_rotation
 from warp_corot.kernels.subtrees.anisotropic import repair_leaves, scatter_anisotropic_subtrees, scatter_flat

@@ -13,7 +13,7 @@ from warp_corot.discretization.sizes import Sizes, vec3_view
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_indices
 from warp_corot.inputs.simulation_lock import under_lock
-from warp_corot.materials.directional import Directional
+from warp_corot.materials.anisotropic import Directional
 from warp_corot.materials.isotropic import Material
 
 from .activation import Activation, constant_stress

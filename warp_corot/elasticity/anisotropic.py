@@ -19,13 +19,16 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.loading import LoadedKernel
 from warp_corot.kernels.clusters.laws import ActiveMaterial, anisotropic_law, reinforced_law
 from warp_corot.kernels.corotated.anisotropic import (
+    REINFORCED,
     FibreMaterial,
     OrthotropicMaterial,
+    ReinforcedMaterial,
     active_density,
     fibre_cauchy,
     fibre_density,
     fibre_differential,
     fibre_stress,
+    reinforced_cauchy,
     scatter_anisotropic_simd8,
     turn_changed,
     turn_elements,
@@ -33,7 +36,6 @@ from warp_corot.kernels.corotated.anisotropic import (
 from warp_corot.kernels.corotated.well_conditioned import quaternions_of
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.dilatation import LOG_VOLUME
-from warp_corot.kernels.elements.fibres import REINFORCED, ReinforcedMaterial, reinforced_cauchy
 from warp_corot.kernels.elements.forces import element_energies, repair_forces
 from warp_corot.kernels.elements.simd8 import FIBRES
 from warp_corot.kernels.math.rotation import byers_xu, quick_rotation
@@ -41,8 +43,7 @@ from warp_corot.kernels.subtrees.anisotropic import repair_leaves, scatter_aniso
 from warp_corot.kernels.subtrees.degenerate import NO_LIST
 from warp_corot.kernels.subtrees.memory import BLOCK
 from warp_corot.kernels.tables.cluster_layout import ANISOTROPIC
-from warp_corot.materials.anisotropic import TransverselyIsotropic
-from warp_corot.materials.reinforced import FibreReinforced
+from warp_corot.materials.anisotropic import FibreReinforced, TransverselyIsotropic
 
 if TYPE_CHECKING:
     from warp_corot.discretization.discretization import Discretized

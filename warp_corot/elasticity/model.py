@@ -20,12 +20,11 @@ from warp_corot.elasticity.tangents import ElementTangent, Tangent
 from warp_corot.errors import InputError
 from warp_corot.inputs.cpu_threads import Regions, Team, launch
 from warp_corot.inputs.loading import LoadedKernel, load
-from warp_corot.kernels.corotated.anisotropic import FibreMaterial
+from warp_corot.kernels.corotated.anisotropic import FibreMaterial, ReinforcedMaterial
 from warp_corot.kernels.corotated.tangent import KeptStrains
 from warp_corot.kernels.elements.added import Prestress, PronyMaterial
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial
 from warp_corot.kernels.elements.dilatation import DilatedMaterial
-from warp_corot.kernels.elements.fibres import ReinforcedMaterial
 from warp_corot.kernels.elements.forces import (
     element_energies,
     element_von_mises,

@@ -13,7 +13,7 @@ from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.levels import TreeNodes
 from warp_corot.inputs.cpu_threads import team_of
 from warp_corot.kernels.corotated.anisotropic import OrthotropicMaterial
-from warp_corot.materials.directional import Directional
+from warp_corot.materials.anisotropic import Directional
 from warp_corot.mesh import TetForest
 
 from .carried_material import ACTIVATION, CarriedMaterial

@@ -27,13 +27,15 @@ from warp_corot.elasticity.tangents import Tangent
 from warp_corot.inputs.cpu_threads import launch
 from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.clusters.laws import isotropic_law
-from warp_corot.kernels.corotated.algebraic import corotated_stress, own_energies, own_von_mises
 from warp_corot.kernels.corotated.corotated import (
+    corotated_stress,
     extract_rotations,
     given_cauchy,
     given_density,
     given_stress,
+    own_energies,
     own_stress,
+    own_von_mises,
 )
 from warp_corot.kernels.corotated.tangent import exact_differential
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial, RotatedMaterial

@@ -16,7 +16,7 @@ from warp_corot.elasticity.dilatation import law_of
 from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.kernels.stepping.patch_body import Exchange, Layout, PatchBody
 from warp_corot.kernels.stepping.patches import step_patches
-from warp_corot.materials.directional import Directional
+from warp_corot.materials.anisotropic import Directional
 
 from .patch_layout import NO_SLOT, Patches
 
