@@ -269,8 +269,9 @@ def turn_changed(
 # In the material's axes a family has the direction a = (cos angle, +-sin angle, 0), a dispersion kappa and the strain
 #     e = kappa (tr C - 3) + (1 - 3 kappa) (a . C a - 1) = 2 B : E,  B = kappa I + (1 - 3 kappa) a a^T,
 # with C = F^T F and Green's strain E. Its energy density is phi(e) = k1 / (2 k2) (exp(k2 e^2) - 1) where e > 0, and
-# zero elsewhere: P = F S with S = 2 phi'(e) B. Beyond e = sqrt(ln(100) / k2), where phi'' is a thousand times k1, phi is its
-# own Taylor polynomial of second order, so that the stiffness stays bounded. The law is in ``native/law_fibres.h``.
+# zero elsewhere: P = F S with S = 2 phi'(e) B. Beyond e = sqrt(ln(100) / k2), where phi'' is a thousand times k1, phi
+# is its own Taylor polynomial of second order, so that the stiffness stays bounded. The law is in
+# ``native/law_fibres.h``.
 
 
 @wp.struct

@@ -103,8 +103,8 @@ def extract_rotations(Elements: type, rotation: wp.Function) -> wp.Kernel:
 # --- own rotations in closed form ------------------------------------------------------------------------------------
 #
 # The corotated stress without an iteration on matrices: the stretch S of F = R S by a root of its trace, with the
-# digits of E = F^T F - I however small it is, for J > 0: see ``native/laws.h``. Flat and turned over elements have their
-# rotations from ``robust_rotation``.
+# digits of E = F^T F - I however small it is, for J > 0: see ``native/laws.h``. Flat and turned over elements have
+# their rotations from ``robust_rotation``.
 
 
 @wp.func_native("return corot::has_stretch(a);")

@@ -4,28 +4,25 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import Any
 
 import warp as wp
 
 from warp_corot.kernels.elements.constitutive import IsotropicMaterial
 from warp_corot.kernels.elements.forces import add_stiffness_diagonal, add_stiffness_product
 
-if TYPE_CHECKING:
-    from warp_corot.elasticity.model import ElementMaterial, ForceField
-
 
 class Tangent(ABC):
     """K(u) of a force field, with the same u from one ``take`` to the next.
 
     Args:
-        field: The field.
+        field: The ``ForceField``.
 
     Attributes:
         displacements: u [m], vec4, with the length of the first one; ``take`` fills it.
     """
 
-    def __init__(self, field: ForceField):
+    def __init__(self, field: Any):
         self.field = field
         self.displacements = wp.zeros(0, dtype=wp.vec4, device=field.device)
 
@@ -64,9 +61,9 @@ class ElementTangent(Tangent):
 
     def __init__(
         self,
-        field: ForceField,
+        field: Any,
         differential: wp.Function,
-        material: Callable[[], ElementMaterial],
+        material: Callable[[], Any],
         Material: type = IsotropicMaterial,
     ):
         super().__init__(field)
