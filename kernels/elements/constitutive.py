@@ -8,8 +8,6 @@ direction dA, which has the digits of dA. Stresses in Pa, energy densities in J/
 No law subtracts numbers near one: each is written in A, so that its stress has float32's digits at any strain.
 """
 
-from typing import NamedTuple
-
 import warp as wp
 
 wp.set_module_options({"enable_backward": False})
@@ -69,18 +67,10 @@ def green_strain(a: wp.mat33):
 # --- laws of ``native/laws.h`` ---------------------------------------------------------------------------------------
 
 
-class LawFunctions(NamedTuple):
-    """A law as device functions: P of (A, mu, lambda), dP of (A, dA, mu, lambda), and the energy density of (A, mu,
-    lambda). The modules of kernels that call them need ``simd8.LAW_HEADERS``.
+def law_functions(law: str) -> tuple[wp.Function, wp.Function, wp.Function]:
+    """A law, an expression in C++, as device functions: P of (A, mu, lambda), dP of (A, dA, mu, lambda), and the energy
+    density of (A, mu, lambda). The modules of kernels that call them need ``simd8.LAW_HEADERS``.
     """
-
-    stress: wp.Function
-    differential: wp.Function
-    energy: wp.Function
-
-
-def law_functions(law: str) -> LawFunctions:
-    """The functions of a law, an expression in C++."""
 
     @wp.func_native(f"wp::mat33 p;\ncorot::stress_of({law}, a, mu, lam, p);\nreturn p;")
     def stress(a: wp.mat33, mu: float, lam: float) -> wp.mat33: ...
@@ -91,7 +81,7 @@ def law_functions(law: str) -> LawFunctions:
     @wp.func_native(f"return corot::energy_of({law}, a, mu, lam);")
     def energy(a: wp.mat33, mu: float, lam: float) -> float: ...
 
-    return LawFunctions(stress, differential, energy)
+    return stress, differential, energy
 
 
 linear_stress, linear_differential, linear_energy = law_functions("corot::Linear{}")
