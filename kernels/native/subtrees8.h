@@ -10,6 +10,7 @@ namespace corot {
 
 // A leaf of each of eight subtrees; see elements8.h for what a place has.
 template <class Subtrees> struct Leaf {
+    typedef lanes8 N;
     const Subtrees& of;
     const int number;
     const masks8 excluded;

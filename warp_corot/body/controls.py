@@ -22,7 +22,7 @@ from warp_corot.inputs.checks import FLOAT32, checked_indices, shown
 from warp_corot.inputs.device import vectors_on_device
 from warp_corot.inputs.selection import CONSTANTS, FUNCTIONS, REGIONS, select_nodes
 from warp_corot.inputs.simulation_lock import under_lock
-from warp_corot.materials.directional import Directional
+from warp_corot.materials.anisotropic import Directional
 from warp_corot.materials.isotropic import Material
 
 from .arrays import Views

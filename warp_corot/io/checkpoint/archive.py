@@ -21,9 +21,8 @@ from warp_corot.errors import InputError, StabilityWarning
 from warp_corot.inputs.checks import checked_path
 from warp_corot.io.files.quiet import bounded
 from warp_corot.io.files.whole import written_whole
-from warp_corot.materials.anisotropic import Orthotropic, TransverselyIsotropic
+from warp_corot.materials.anisotropic import FibreReinforced, Orthotropic, TransverselyIsotropic
 from warp_corot.materials.isotropic import Isotropic
-from warp_corot.materials.reinforced import FibreReinforced
 from warp_corot.mesh import TetForest, TetMesh
 from warp_corot.mesh.surfaces.marching import Detail
 from warp_corot.remesh.carried_material import Keys

@@ -18,7 +18,7 @@ from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.implicit import assembled as kernels
 from warp_corot.kernels.implicit.multigrid import values
 from warp_corot.kernels.implicit.multigrid.cycle import Rows
-from warp_corot.materials.directional import Directional
+from warp_corot.materials.anisotropic import Directional
 
 from .dissection import dissected
 from .multigrid.level import LeafMatrix
