@@ -6,12 +6,11 @@ restored. If the input was not finite, the world is not written at all. Entities
 arrays over worlds.
 """
 
-import functools
-from typing import NamedTuple
+from typing import Any
 
 import warp as wp
 
-from warp_corot.kernels.elements.elements import load_node, store_node
+from warp_corot.kernels.elements.elements import add_force, load_node, store_node
 from warp_corot.kernels.stepping.integrate import is_finite
 
 wp.set_module_options({"enable_backward": False})
@@ -190,36 +189,6 @@ def add_nodes(
     store_node(nodal, k, wp.vec3())
 
 
-@wp.func
-def take_motion(
-    i: int,
-    at: wp.vec3,
-    v: wp.vec3,
-    dt: float,
-    most: float,
-    fastest: float,
-    particles: Particles,
-    q_out: wp.array[wp.vec3],
-    qd_out: wp.array[wp.vec3],
-    trouble: wp.array[wp.int32],
-):
-    """Write an active particle's state after a step with a velocity, no faster than ``most`` [m/s].
-
-    One faster than ``fastest`` marks its world, like a value that is not finite.
-    """
-    # Scaled, so that nothing overflows.
-    size = wp.max(wp.max(wp.abs(v)), 1.0)
-    speed = size * wp.length(v / size)
-    velocity = v
-    if speed > most:
-        velocity = v * (most / speed)
-    to = at + dt * velocity
-    if speed >= fastest or not is_finite(to):
-        mark(i, UNSTABLE, particles, trouble)
-    store_vector(q_out, i, to)
-    store_vector(qd_out, i, velocity)
-
-
 @wp.kernel(enable_backward=False)
 def step_particles(
     # In
@@ -238,10 +207,11 @@ def step_particles(
     qd_out: wp.array[wp.vec3],
     trouble: wp.array[wp.int32],
 ):
-    """v <- (v + dt (f/m + g)) / (1 + dt damping), or d/dt of solved motions d; x <- x + dt v; see ``take_motion``.
+    """v <- (v + dt (f/m + g)) / (1 + dt damping), or d/dt of solved motions d; x <- x + dt v.
 
     A particle without mass is kinematic: it keeps its velocity. An inactive one is frozen. In worlds marked before
-    nothing moves.
+    nothing moves. No active particle is faster than ``most`` [m/s]; one faster than ``fastest`` marks its world, like a
+    value that is not finite.
 
     Args:
         entry, d: Where the motion of each particle is, and motions [m], see ``implicit``; empty in explicit steps.
@@ -250,6 +220,7 @@ def step_particles(
     wrong = trouble_of(i, particles, trouble)
     if wrong == BAD_INPUT:
         return
+    at = q[i]
     velocity = qd[i]
     if wrong == SOUND and is_active(i, particles):
         w = particles.inv_mass[i]
@@ -257,10 +228,16 @@ def step_particles(
             velocity = load_node(d, entry[i]) / dt
         elif w > 0.0:
             velocity = (velocity + dt * (w * load_node(f, i) + gravity_of(i, particles))) / (1.0 + dt * damping)
-        take_motion(i, q[i], velocity, dt, most, fastest, particles, q_out, qd_out, trouble)
-    else:
-        store_vector(q_out, i, q[i])
-        store_vector(qd_out, i, velocity)
+        # Scaled, so that nothing overflows.
+        size = wp.max(wp.max(wp.abs(velocity)), 1.0)
+        speed = size * wp.length(velocity / size)
+        if speed > most:
+            velocity = velocity * (most / speed)
+        at += dt * velocity
+        if speed >= fastest or not is_finite(at):
+            mark(i, UNSTABLE, particles, trouble)
+    store_vector(q_out, i, at)
+    store_vector(qd_out, i, velocity)
 
 
 @wp.kernel(enable_backward=False)
@@ -286,6 +263,24 @@ def damp_particles(
 def unpad(a: wp.array[wp.vec4], b: wp.array[wp.vec3]):
     i = wp.tid()
     b[i] = load_node(a, i)
+
+
+@wp.kernel(enable_backward=False)
+def scatter_blocks(
+    # In
+    pairs: wp.array[wp.vec2i],
+    stiffness: wp.array[wp.mat33],
+    damping: wp.array[wp.mat33],
+    a: float,
+    b: float,
+    u: wp.array[wp.vec4],
+    # Out
+    f: wp.array[wp.vec4],
+):
+    """f -= (a K + b C) u of matrices that are given by blocks of pairs of particles, which may repeat."""
+    k = wp.tid()
+    pair = pairs[k]
+    add_force(f, pair[0], -(a * stiffness[k] + b * damping[k]) * load_node(u, pair[1]))
 
 
 # --- rigid bodies within a step, between the states that another solver gives ----------------------------------------
@@ -338,90 +333,81 @@ def is_sound(q: wp.transform, qd: wp.spatial_vector, fastest: float):
     return size <= 3.0e38
 
 
-class StateKernels(NamedTuple):
-    """Kernels over states of particles or bodies."""
+@wp.kernel(enable_backward=False)
+def check_state(
+    # In
+    q: wp.array[Any],
+    qd: wp.array[Any],
+    fastest: float,
+    world: wp.array[wp.int32],
+    wrong: int,
+    # Out
+    trouble: wp.array[wp.int32],
+):
+    """Mark worlds with a value that is not finite, or a particle that is too fast."""
+    i = wp.tid()
+    if not is_sound(q[i], qd[i], fastest):
+        wp.atomic_max(trouble, place_of(world[i], trouble.shape[0]), wrong)
 
-    check: wp.Kernel
-    put_back: wp.Kernel
-    reset: wp.Kernel
 
+@wp.kernel(enable_backward=False)
+def put_back(
+    # In
+    world: wp.array[wp.int32],
+    trouble: wp.array[wp.int32],
+    before_q: wp.array[Any],
+    before_qd: wp.array[Any],
+    kept_q: wp.array[Any],
+    kept_qd: wp.array[Any],
+    # Out
+    q: wp.array[Any],
+    qd: wp.array[Any],
+):
+    """Undo what was written in marked worlds.
 
-@functools.cache
-def state_kernels(Place: type, Velocity: type) -> StateKernels:
-    """The kernels for states with these types: of particles vec3 both, of bodies transforms and spatial vectors.
-
-    They are one module, so that those of resets are loaded with those of steps and may be recorded.
+    Args:
+        before_q, before_qd: The state before the step.
+        kept_q, kept_qd: Former values of the output state, for worlds whose input was not finite; or empty,
+            if those were not written.
     """
-    module = wp.get_module(f"newton_states_{Place.__name__}")
-    module.options["enable_backward"] = False
+    i = wp.tid()
+    wrong = trouble[place_of(world[i], trouble.shape[0])]
+    if wrong == BAD_INPUT:
+        if kept_q.shape[0] > 0:
+            q[i] = kept_q[i]
+            qd[i] = kept_qd[i]
+    elif wrong != SOUND:
+        q[i] = before_q[i]
+        qd[i] = before_qd[i]
 
-    @wp.kernel(module=module, enable_backward=False)
-    def check(
-        # In
-        q: wp.array[Place],
-        qd: wp.array[Velocity],
-        fastest: float,
-        world: wp.array[wp.int32],
-        wrong: int,
-        # Out
-        trouble: wp.array[wp.int32],
-    ):
-        """Mark worlds with a value that is not finite, or a particle that is too fast."""
-        i = wp.tid()
-        if not is_sound(q[i], qd[i], fastest):
-            wp.atomic_max(trouble, place_of(world[i], trouble.shape[0]), wrong)
 
-    @wp.kernel(module=module, enable_backward=False)
-    def put_back(
-        # In
-        world: wp.array[wp.int32],
-        trouble: wp.array[wp.int32],
-        before_q: wp.array[Place],
-        before_qd: wp.array[Velocity],
-        kept_q: wp.array[Place],
-        kept_qd: wp.array[Velocity],
-        # Out
-        q: wp.array[Place],
-        qd: wp.array[Velocity],
-    ):
-        """Undo what was written in marked worlds.
+@wp.kernel(enable_backward=False)
+def reset_state(
+    # In
+    chosen: wp.array[wp.bool],
+    world: wp.array[wp.int32],
+    with_q: int,
+    with_qd: int,
+    initial_q: wp.array[Any],
+    initial_qd: wp.array[Any],
+    # Out
+    q: wp.array[Any],
+    qd: wp.array[Any],
+):
+    i = wp.tid()
+    if chosen[place_of(world[i], chosen.shape[0])]:
+        if with_q != 0:
+            q[i] = initial_q[i]
+        if with_qd != 0:
+            qd[i] = initial_qd[i]
 
-        Args:
-            before_q, before_qd: The state before the step.
-            kept_q, kept_qd: Former values of the output state, for worlds whose input was not finite; or empty,
-                if those were not written.
-        """
-        i = wp.tid()
-        wrong = trouble[place_of(world[i], trouble.shape[0])]
-        if wrong == BAD_INPUT:
-            if kept_q.shape[0] > 0:
-                q[i] = kept_q[i]
-                qd[i] = kept_qd[i]
-        elif wrong != SOUND:
-            q[i] = before_q[i]
-            qd[i] = before_qd[i]
 
-    @wp.kernel(module=module, enable_backward=False)
-    def reset(
-        # In
-        chosen: wp.array[wp.bool],
-        world: wp.array[wp.int32],
-        with_q: int,
-        with_qd: int,
-        initial_q: wp.array[Place],
-        initial_qd: wp.array[Velocity],
-        # Out
-        q: wp.array[Place],
-        qd: wp.array[Velocity],
-    ):
-        i = wp.tid()
-        if chosen[place_of(world[i], chosen.shape[0])]:
-            if with_q != 0:
-                q[i] = initial_q[i]
-            if with_qd != 0:
-                qd[i] = initial_qd[i]
-
-    return StateKernels(check, put_back, reset)
+# States of particles and of bodies. All are made here, since loading a kernel would end a recording.
+for kernel in (check_state, put_back, reset_state):
+    generic = [arg.label for arg in kernel.adj.args if getattr(arg.type, "dtype", None) is Any]
+    for place, velocity in ((wp.vec3, wp.vec3), (wp.transform, wp.spatial_vector)):
+        types = {name: wp.array(dtype=velocity if name.endswith("qd") else place) for name in generic}
+        wp.overload(kernel, types)
 
 
 @wp.kernel(enable_backward=False)

@@ -26,9 +26,6 @@ from .tetrahedra import Tetrahedra
 RUNAWAY = float(kernels.RUNAWAY)
 #: Fewer substeps are not recorded, since recording one takes as long as several.
 FEW = 32
-#: Kernels over the states of particles and of bodies.
-OF_PARTICLES = kernels.state_kernels(wp.vec3, wp.vec3)
-OF_BODIES = kernels.state_kernels(wp.transform, wp.spatial_vector)
 #: What there is no room for, and what to do.
 _NO_ROOM = {
     int(kernels.TOO_MANY_PAIRS): "pairs of soft bodies than Newton has room for: call pipeline.init_soft_self_contact "
@@ -88,26 +85,6 @@ class Steps:
         with self._flushed():
             self._launch_step(step, count, following)
 
-    def launch_retried(self, step: Step, following: Following) -> None:
-        """Launch a step on the CPU, and repeat it after a failure, each time with twice the substeps."""
-        state_in, dt = step.state_in, step.dt
-        kept = self.model.body_count and not self.others.has_bodies
-        if kept:
-            wp.copy(self._body_f, state_in.body_f)
-        share = following.share
-        for attempt in range(RETRIES + 1):
-            self.launch(step, following.count_for(dt), following)
-            if not self.report.is_unstable:
-                return
-            if attempt == RETRIES:
-                break
-            following.share *= 0.5
-            self.report.forget_unstable()
-            self._bring_back(state_in, step.state_out)
-            if kept:
-                wp.copy(state_in.body_f, self._body_f)
-        following.share = share
-
     def _launch_step(self, step: Step, count: int, following: Following | None) -> None:
         state_in, state_out, dt = step.state_in, step.state_out, step.dt
         if step.reported is not None:
@@ -159,12 +136,12 @@ class Steps:
             wanted = [int(bool(flags & bit)) for bit in (bits.PARTICLE_Q, bits.PARTICLE_QD)]
             inputs = [mask, model.particle_world, *wanted, model.particle_q, model.particle_qd]
             outputs = [state.particle_q, state.particle_qd]
-            self._launch(OF_PARTICLES.reset, model.particle_count, inputs, outputs)
+            self._launch(kernels.reset_state, model.particle_count, inputs, outputs)
             self.tetrahedra.write_attributes(state)
         if self.others.has_bodies and flags & (bits.BODY_Q | bits.BODY_QD):
             wanted = [int(bool(flags & bit)) for bit in (bits.BODY_Q, bits.BODY_QD)]
             inputs = [mask, model.body_world, *wanted, model.body_q, model.body_qd]
-            self._launch(OF_BODIES.reset, model.body_count, inputs, [state.body_q, state.body_qd])
+            self._launch(kernels.reset_state, model.body_count, inputs, [state.body_q, state.body_qd])
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
@@ -195,16 +172,6 @@ class Steps:
             self._activation = step.control.tet_activations
         self.tetrahedra.look_at(self._activation)
         return particles, bodies
-
-    def _bring_back(self, state_in: newton.State, state_out: newton.State) -> None:
-        """Undo a step that was made in place."""
-        particles = [state_in.particle_q, state_in.particle_qd]
-        if _overlap(particles, [state_out.particle_q, state_out.particle_qd]):
-            _copy(particles, self._particles_before)
-        if self.others.has_bodies:
-            bodies = [state_in.body_q, state_in.body_qd]
-            if _overlap(bodies, [state_out.body_q, state_out.body_qd]):
-                _copy(bodies, self._bodies_before)
 
     def _launch_gathering(self, now: newton.State, state_in: newton.State, number: int, copied: bool) -> None:
         """Gather external forces and positions of particles; these are copied if the step begins with them and
@@ -279,7 +246,7 @@ class Steps:
             self._check_bodies(out, kernels.UNSTABLE)
         if others.has_particles:
             inputs = [out.particle_q, out.particle_qd, fastest, model.particle_world, int(kernels.UNSTABLE)]
-            self._launch(OF_PARTICLES.check, model.particle_count, inputs, [self.report.trouble])
+            self._launch(kernels.check_state, model.particle_count, inputs, [self.report.trouble])
 
     def _steps_of_others(self, dt: float) -> int:
         """Number of steps in which everything else makes a substep."""
@@ -287,7 +254,7 @@ class Steps:
 
     def _check_bodies(self, state: newton.State, wrong: int) -> None:
         inputs = [state.body_q, state.body_qd, 0.0, self.model.body_world, int(wrong)]
-        self._launch(OF_BODIES.check, self.model.body_count, inputs, [self.report.trouble])
+        self._launch(kernels.check_state, self.model.body_count, inputs, [self.report.trouble])
 
     def _launch_undoing(self, out: newton.State, particles: list[wp.array], bodies: list[wp.array]) -> None:
         """Restore the worlds with a failure."""
@@ -296,10 +263,10 @@ class Steps:
         model = self.model
         inputs = [model.particle_world, self.report.trouble, *particles, *self._kept_particles]
         outputs = [out.particle_q, out.particle_qd]
-        self._launch(OF_PARTICLES.put_back, model.particle_count, inputs, outputs)
+        self._launch(kernels.put_back, model.particle_count, inputs, outputs)
         if self.others.has_bodies:
             inputs = [model.body_world, self.report.trouble, *bodies, *self._kept_bodies]
-            self._launch(OF_BODIES.put_back, model.body_count, inputs, [out.body_q, out.body_qd])
+            self._launch(kernels.put_back, model.body_count, inputs, [out.body_q, out.body_qd])
 
     def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
@@ -328,15 +295,6 @@ class Report:
         """Whether a world may have failed in the present step."""
         # On the CPU a check costs less than a launch; a recorded step must handle all cases.
         return self._device.is_cuda or self._device.is_capturing or bool(self.trouble.numpy().any())
-
-    @property
-    def is_unstable(self) -> bool:
-        """Whether a step's result was not finite; waits for the device."""
-        return bool(self._found.numpy()[kernels.UNSTABLE])
-
-    def forget_unstable(self) -> None:
-        """The step is made again."""
-        self._found[kernels.UNSTABLE : kernels.UNSTABLE + 1].zero_()
 
     def launch(self) -> None:
         """Launch the kernel that stores the failures of a step, at its end."""
@@ -375,12 +333,10 @@ class Report:
         raise UnstableError(self._unstable(where, stable_dt, following))
 
     def _unstable(self, where: str, stable_dt: float | None, following: Following | None) -> str:
-        """The message; from now on steps have more substeps if these follow the state and steps are not repeated."""
+        """The message; from now on steps have more substeps if these follow the state."""
         hint = "" if stable_dt is None else f"; the largest stable step at rest is about {stable_dt:.3g} s"
         wrong = "not finite" if following is None else "not finite or beyond reason"
-        if following is not None and self._device.is_cpu and not following.was_recorded:
-            hint += f"; {2**RETRIES} times the substeps did not help"
-        elif following is not None:
+        if following is not None:
             following.share *= 0.5
             hint += "; from now on steps have twice the substeps, recorded ones when they are recorded again"
         return f"the step's result is {wrong}{where}; that state was not changed{hint}"
