@@ -6,7 +6,8 @@ restored. If the input was not finite, the world is not written at all. Entities
 arrays over worlds.
 """
 
-from typing import Any
+import functools
+from typing import NamedTuple
 
 import warp as wp
 
@@ -333,81 +334,90 @@ def is_sound(q: wp.transform, qd: wp.spatial_vector, fastest: float):
     return size <= 3.0e38
 
 
-@wp.kernel(enable_backward=False)
-def check_state(
-    # In
-    q: wp.array[Any],
-    qd: wp.array[Any],
-    fastest: float,
-    world: wp.array[wp.int32],
-    wrong: int,
-    # Out
-    trouble: wp.array[wp.int32],
-):
-    """Mark worlds with a value that is not finite, or a particle that is too fast."""
-    i = wp.tid()
-    if not is_sound(q[i], qd[i], fastest):
-        wp.atomic_max(trouble, place_of(world[i], trouble.shape[0]), wrong)
+class StateKernels(NamedTuple):
+    """Kernels over states of particles or bodies."""
+
+    check: wp.Kernel
+    put_back: wp.Kernel
+    reset: wp.Kernel
 
 
-@wp.kernel(enable_backward=False)
-def put_back(
-    # In
-    world: wp.array[wp.int32],
-    trouble: wp.array[wp.int32],
-    before_q: wp.array[Any],
-    before_qd: wp.array[Any],
-    kept_q: wp.array[Any],
-    kept_qd: wp.array[Any],
-    # Out
-    q: wp.array[Any],
-    qd: wp.array[Any],
-):
-    """Undo what was written in marked worlds.
+@functools.cache
+def state_kernels(Place: type, Velocity: type) -> StateKernels:
+    """The kernels for states with these types: of particles vec3 both, of bodies transforms and spatial vectors.
 
-    Args:
-        before_q, before_qd: The state before the step.
-        kept_q, kept_qd: Former values of the output state, for worlds whose input was not finite; or empty,
-            if those were not written.
+    They are one module, so that those of resets are loaded with those of steps and may be recorded.
     """
-    i = wp.tid()
-    wrong = trouble[place_of(world[i], trouble.shape[0])]
-    if wrong == BAD_INPUT:
-        if kept_q.shape[0] > 0:
-            q[i] = kept_q[i]
-            qd[i] = kept_qd[i]
-    elif wrong != SOUND:
-        q[i] = before_q[i]
-        qd[i] = before_qd[i]
+    module = wp.get_module(f"newton_states_{Place.__name__}")
+    module.options["enable_backward"] = False
 
+    @wp.kernel(module=module, enable_backward=False)
+    def check(
+        # In
+        q: wp.array[Place],
+        qd: wp.array[Velocity],
+        fastest: float,
+        world: wp.array[wp.int32],
+        wrong: int,
+        # Out
+        trouble: wp.array[wp.int32],
+    ):
+        """Mark worlds with a value that is not finite, or a particle that is too fast."""
+        i = wp.tid()
+        if not is_sound(q[i], qd[i], fastest):
+            wp.atomic_max(trouble, place_of(world[i], trouble.shape[0]), wrong)
 
-@wp.kernel(enable_backward=False)
-def reset_state(
-    # In
-    chosen: wp.array[wp.bool],
-    world: wp.array[wp.int32],
-    with_q: int,
-    with_qd: int,
-    initial_q: wp.array[Any],
-    initial_qd: wp.array[Any],
-    # Out
-    q: wp.array[Any],
-    qd: wp.array[Any],
-):
-    i = wp.tid()
-    if chosen[place_of(world[i], chosen.shape[0])]:
-        if with_q != 0:
-            q[i] = initial_q[i]
-        if with_qd != 0:
-            qd[i] = initial_qd[i]
+    @wp.kernel(module=module, enable_backward=False)
+    def put_back(
+        # In
+        world: wp.array[wp.int32],
+        trouble: wp.array[wp.int32],
+        before_q: wp.array[Place],
+        before_qd: wp.array[Velocity],
+        kept_q: wp.array[Place],
+        kept_qd: wp.array[Velocity],
+        # Out
+        q: wp.array[Place],
+        qd: wp.array[Velocity],
+    ):
+        """Undo what was written in marked worlds.
 
+        Args:
+            before_q, before_qd: The state before the step.
+            kept_q, kept_qd: Former values of the output state, for worlds whose input was not finite; or empty,
+                if those were not written.
+        """
+        i = wp.tid()
+        wrong = trouble[place_of(world[i], trouble.shape[0])]
+        if wrong == BAD_INPUT:
+            if kept_q.shape[0] > 0:
+                q[i] = kept_q[i]
+                qd[i] = kept_qd[i]
+        elif wrong != SOUND:
+            q[i] = before_q[i]
+            qd[i] = before_qd[i]
 
-# States of particles and of bodies. All are made here, since loading a kernel would end a recording.
-for kernel in (check_state, put_back, reset_state):
-    generic = [arg.label for arg in kernel.adj.args if getattr(arg.type, "dtype", None) is Any]
-    for place, velocity in ((wp.vec3, wp.vec3), (wp.transform, wp.spatial_vector)):
-        types = {name: wp.array(dtype=velocity if name.endswith("qd") else place) for name in generic}
-        wp.overload(kernel, types)
+    @wp.kernel(module=module, enable_backward=False)
+    def reset(
+        # In
+        chosen: wp.array[wp.bool],
+        world: wp.array[wp.int32],
+        with_q: int,
+        with_qd: int,
+        initial_q: wp.array[Place],
+        initial_qd: wp.array[Velocity],
+        # Out
+        q: wp.array[Place],
+        qd: wp.array[Velocity],
+    ):
+        i = wp.tid()
+        if chosen[place_of(world[i], chosen.shape[0])]:
+            if with_q != 0:
+                q[i] = initial_q[i]
+            if with_qd != 0:
+                qd[i] = initial_qd[i]
+
+    return StateKernels(check, put_back, reset)
 
 
 @wp.kernel(enable_backward=False)

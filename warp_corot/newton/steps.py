@@ -26,6 +26,9 @@ from .tetrahedra import Tetrahedra
 RUNAWAY = float(kernels.RUNAWAY)
 #: Fewer substeps are not recorded, since recording one takes as long as several.
 FEW = 32
+#: Kernels over the states of particles and of bodies.
+OF_PARTICLES = kernels.state_kernels(wp.vec3, wp.vec3)
+OF_BODIES = kernels.state_kernels(wp.transform, wp.spatial_vector)
 #: What there is no room for, and what to do.
 _NO_ROOM = {
     int(kernels.TOO_MANY_PAIRS): "pairs of soft bodies than Newton has room for: call pipeline.init_soft_self_contact "
@@ -136,12 +139,12 @@ class Steps:
             wanted = [int(bool(flags & bit)) for bit in (bits.PARTICLE_Q, bits.PARTICLE_QD)]
             inputs = [mask, model.particle_world, *wanted, model.particle_q, model.particle_qd]
             outputs = [state.particle_q, state.particle_qd]
-            self._launch(kernels.reset_state, model.particle_count, inputs, outputs)
+            self._launch(OF_PARTICLES.reset, model.particle_count, inputs, outputs)
             self.tetrahedra.write_attributes(state)
         if self.others.has_bodies and flags & (bits.BODY_Q | bits.BODY_QD):
             wanted = [int(bool(flags & bit)) for bit in (bits.BODY_Q, bits.BODY_QD)]
             inputs = [mask, model.body_world, *wanted, model.body_q, model.body_qd]
-            self._launch(kernels.reset_state, model.body_count, inputs, [state.body_q, state.body_qd])
+            self._launch(OF_BODIES.reset, model.body_count, inputs, [state.body_q, state.body_qd])
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
@@ -246,7 +249,7 @@ class Steps:
             self._check_bodies(out, kernels.UNSTABLE)
         if others.has_particles:
             inputs = [out.particle_q, out.particle_qd, fastest, model.particle_world, int(kernels.UNSTABLE)]
-            self._launch(kernels.check_state, model.particle_count, inputs, [self.report.trouble])
+            self._launch(OF_PARTICLES.check, model.particle_count, inputs, [self.report.trouble])
 
     def _steps_of_others(self, dt: float) -> int:
         """Number of steps in which everything else makes a substep."""
@@ -254,7 +257,7 @@ class Steps:
 
     def _check_bodies(self, state: newton.State, wrong: int) -> None:
         inputs = [state.body_q, state.body_qd, 0.0, self.model.body_world, int(wrong)]
-        self._launch(kernels.check_state, self.model.body_count, inputs, [self.report.trouble])
+        self._launch(OF_BODIES.check, self.model.body_count, inputs, [self.report.trouble])
 
     def _launch_undoing(self, out: newton.State, particles: list[wp.array], bodies: list[wp.array]) -> None:
         """Restore the worlds with a failure."""
@@ -263,10 +266,10 @@ class Steps:
         model = self.model
         inputs = [model.particle_world, self.report.trouble, *particles, *self._kept_particles]
         outputs = [out.particle_q, out.particle_qd]
-        self._launch(kernels.put_back, model.particle_count, inputs, outputs)
+        self._launch(OF_PARTICLES.put_back, model.particle_count, inputs, outputs)
         if self.others.has_bodies:
             inputs = [model.body_world, self.report.trouble, *bodies, *self._kept_bodies]
-            self._launch(kernels.put_back, model.body_count, inputs, [out.body_q, out.body_qd])
+            self._launch(OF_BODIES.put_back, model.body_count, inputs, [out.body_q, out.body_qd])
 
     def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
