@@ -146,7 +146,7 @@ def test_materials_of_each_tetrahedron(device, rng):
     young = 1e4 * (1 + rng.random(len(forest.tets)))
     made = builder()
     wn.add_forest(made, forest, wc.Isotropic(young=young, poisson=0.3, density=1000.0))
-    mesh = wc.TetMesh(np.add(forest.points, [2.0, 0.0, 0.0]), wn.scene.right_handed(forest))
+    mesh = wc.TetMesh(np.add(forest.points, [2.0, 0.0, 0.0]), wn.scene.outward_tets(forest))
     wn.add_mesh(made, mesh, wc.Isotropic(young=young, poisson=0.3, density=1000.0))
     model = made.finalize(device=device)
     rest = model.particle_q.numpy().astype(float)

@@ -216,7 +216,7 @@ def test_unsupported_models_are_refused(device):
     made = builder()
     block(made)
     model = made.finalize(device=device)
-    with pytest.raises(wc.InputError, match="integrator is 'midpoint'; it must be one of explicit, implicit"):
+    with pytest.raises(wc.InputError, match="integrator is 'midpoint'; it must be 'explicit' or 'implicit'"):
         wn.SolverCorotated(model, integrator="midpoint")
     with pytest.raises(wc.InputError, match="the number of a Newton model's particles is fixed"):
         wn.SolverCorotated(model, cuts=[wc.Blade([(0, 0, 0), (0, 0, 1)])])

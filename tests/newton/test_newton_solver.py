@@ -374,7 +374,7 @@ class TestBadInput:
             wn.add_mesh(None, mesh, material)
         with pytest.raises(wc.InputError, match="rot is"):
             wn.add_mesh(made, mesh, material, rot=(0, 0, 0))
-        with pytest.raises(wc.InputError, match="k_damp must be"):
+        with pytest.raises(wc.InputError, match="k_damp is -1"):
             wn.add_mesh(made, mesh, material, k_damp=-1.0)
         assert made.particle_count == made.tet_count == 0
 

@@ -17,7 +17,6 @@ newton = pytest.importorskip("newton")
 examples = pytest.importorskip("newton.examples")
 
 import warp_corot as wc  # noqa: E402
-import warp_corot.newton as wn  # noqa: E402
 
 FOLDER = Path(__file__).parents[2] / "examples" / "newton"
 FRAMES = 3

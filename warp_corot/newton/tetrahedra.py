@@ -32,7 +32,7 @@ from warp_corot.mesh import TetForest
 
 from .checks import LAME, warn_of_lost, why_none
 from .library import newton
-from .scene import STATE, attribute_of, mesh_fill, right_handed
+from .scene import STATE, attribute_of, mesh_fill, outward_tets
 
 
 class ForestGroup:
@@ -130,7 +130,7 @@ def _is_there(
     first: npt.NDArray[np.integer],
 ) -> bool:
     """Whether a model's tetrahedra have the forest's nodes, which no others have, and its rest shapes, in any axes."""
-    own = right_handed(forest)
+    own = outward_tets(forest)
     if not ((particles >= 0).all() and (particles + len(forest.points) <= model.particle_count).all()):
         return False
     corners = forest.points[own]
