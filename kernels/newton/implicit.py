@@ -8,8 +8,8 @@ linearisation of the elastic forces is
 K is R K R^T with each element's rotation where free pieces are turned as they will turn in the step (``turning``). The
 forces f are those there plus K times the way to there. D is the viscosity midway, where a turn has none.
 
-A vector has an entry for each particle, and two for each body, of its translation and its rotation. Entries of what is
-held, or moves as prescribed, are not free.
+A vector has an entry for each particle, and two for each body, of its translation t and of its rotation r = G s, scaled
+so that all three components of s have one moment of inertia. Entries of what is held, or moves as prescribed, are not free.
 
 A row is a spring and a damper between a soft surface and a rigid body. It sees the difference e = sum of b_j d_j -
 (t + r x arm) of its two sides. Its force at the end of the step is a function of e, whose derivative S, symmetric and
@@ -27,6 +27,7 @@ from warp_corot.kernels.contact.vertices import across
 from warp_corot.kernels.corotated.tangent import keep_gradients
 from warp_corot.kernels.elements.constitutive import hooke, symmetric
 from warp_corot.kernels.elements.elements import GeneralElements, add_force, load_node, store_node
+from warp_corot.kernels.implicit.assembled import root_columns
 from warp_corot.kernels.implicit.line_search import TRIED
 from warp_corot.kernels.implicit.turning import COLUMNS, Sums, motion_of
 from warp_corot.kernels.math.rotation import byers_xu, identity3
@@ -133,30 +134,28 @@ def begin_particles(
     # In and out
     b: wp.array[wp.vec4],
     # Out
-    free: wp.array[wp.float32],
-    inertia: wp.array[wp.mat33],
+    mass: wp.array[wp.float32],
     d: wp.array[wp.vec4],
     fall: wp.array[wp.vec4],
 ):
-    """Inertia of particles, their right side, in addition to K times the way, their first motion, and the guess of how
-    gravity changes that: a solve to a share of large forces would not find that a body falls freely. Nothing moves in
-    worlds that have failed."""
+    """Inertia of particles [kg/s^2], their right side, in addition to K times the way, their first motion, and the
+    guess of how gravity changes that: a solve to a share of large forces would not find that a body falls freely.
+    Nothing moves in worlds that have failed. The right side of what is not free is its motion."""
     i = wp.tid()
     k = entry[i]
-    free[k] = 0.0
-    right = wp.vec3()
+    mass[k] = 0.0
     motion = wp.vec3()
     falls = wp.vec3()
     if trouble_of(i, particles, trouble) == SOUND and is_active(i, particles):
         motion = dt * qd[i]
-        if particles.inv_mass[i] > 0.0:
-            m = 1.0 / particles.inv_mass[i]
-            free[k] = 1.0
-            inertia[k] = (m * (1.0 / dt + damping) / dt) * wp.identity(3, dtype=wp.float32)
-            g = gravity_of(i, particles)
-            right = load_node(b, k) + (m / dt) * qd[i] + load_node(f, i) + m * g
-            motion = motion / (1.0 + dt * damping)
-            falls = (dt * dt / (1.0 + dt * damping)) * g
+    right = wp.vec3(motion)
+    if is_moved(i, particles) and trouble_of(i, particles, trouble) == SOUND:
+        m = 1.0 / particles.inv_mass[i]
+        g = gravity_of(i, particles)
+        mass[k] = m * (1.0 / dt + damping) / dt
+        right = load_node(b, k) + (m / dt) * qd[i] + load_node(f, i) + m * g
+        motion = motion / (1.0 + dt * damping)
+        falls = (dt * dt / (1.0 + dt * damping)) * g
     store_node(b, k, right)
     store_node(d, k, motion)
     store_node(fall, k, falls)
@@ -174,68 +173,52 @@ def begin_bodies(
     entry: wp.array[wp.int32],
     # Out
     b: wp.array[wp.vec4],
-    free: wp.array[wp.float32],
-    inertia: wp.array[wp.mat33],
+    mass: wp.array[wp.float32],
     d: wp.array[wp.vec4],
     fall: wp.array[wp.vec4],
+    roots: wp.array[wp.mat33],
 ):
     """The same of bodies, as if nothing but soft bodies, gravity and ``body_f`` acted on them.
 
     Args:
         moves: Whether bodies move by their own velocities; else they stay.
+        roots: G of each body, with G G^T its inverse inertia times a mean moment of inertia.
     """
     i = wp.tid()
     k = entry[i]
+    linear = wp.vec3()
+    angular = wp.vec3()
+    w = float(0.0)
+    if trouble[place_of(bodies.world[i], trouble.shape[0])] == SOUND and moves != 0:
+        linear = dt * wp.spatial_top(bodies.qd[i])
+        angular = dt * wp.spatial_bottom(bodies.qd[i])
+        if not is_fixed(i, bodies):
+            w = bodies.inv_mass[i]
     for part in range(2):
-        free[k + part] = 0.0
-        store_node(b, k + part, wp.vec3())
-        store_node(d, k + part, wp.vec3())
+        mass[k + part] = 0.0
         store_node(fall, k + part, wp.vec3())
-    if trouble[place_of(bodies.world[i], trouble.shape[0])] != SOUND or moves == 0:
-        return
-    linear = dt * wp.spatial_top(bodies.qd[i])
-    angular = dt * wp.spatial_bottom(bodies.qd[i])
+    root = wp.identity(3, dtype=wp.float32)
+    right = wp.vec3(linear)
+    right_turn = wp.vec3(angular)
+    if w > 0.0:
+        g = gravity[place_of(bodies.world[i], gravity.shape[0])]
+        inertia = 1.0 / (w * dt * dt)
+        mass[k] = inertia
+        right = inertia * linear + wp.spatial_top(body_f[i]) + g / w
+        store_node(fall, k, (dt * dt) * g)
+        if wp.determinant(bodies.inv_inertia[i]) > 0.0:
+            turn = wp.quat_to_matrix(wp.transform_get_rotation(bodies.q[i]))
+            moment = 3.0 / wp.trace(bodies.inv_inertia[i])
+            root = wp.sqrt(moment) * root_columns(turn * bodies.inv_inertia[i] * wp.transpose(turn))
+            mass[k + 1] = moment / (dt * dt)
+            spin = turn * (bodies.inertia[i] * (wp.transpose(turn) * angular))
+            angular = (wp.transpose(root) * spin) / moment
+            right_turn = mass[k + 1] * angular + wp.transpose(root) * wp.spatial_bottom(body_f[i])
+    roots[i] = root
+    store_node(b, k, right)
+    store_node(b, k + 1, right_turn)
     store_node(d, k, linear)
     store_node(d, k + 1, angular)
-    w = bodies.inv_mass[i]
-    if w == 0.0 or is_fixed(i, bodies):
-        return
-    g = gravity[place_of(bodies.world[i], gravity.shape[0])]
-    free[k] = 1.0
-    inertia[k] = (1.0 / (w * dt * dt)) * wp.identity(3, dtype=wp.float32)
-    store_node(b, k, linear / (w * dt * dt) + wp.spatial_top(body_f[i]) + g / w)
-    store_node(fall, k, (dt * dt) * g)
-    if wp.determinant(bodies.inv_inertia[i]) > 0.0:
-        turn = wp.quat_to_matrix(wp.transform_get_rotation(bodies.q[i]))
-        free[k + 1] = 1.0
-        inertia[k + 1] = (turn * bodies.inertia[i] * wp.transpose(turn)) / (dt * dt)
-        store_node(b, k + 1, inertia[k + 1] * angular + wp.spatial_bottom(body_f[i]))
-
-
-@wp.kernel(enable_backward=False)
-def finish_rows(
-    # In
-    free: wp.array[wp.float32],
-    inertia: wp.array[wp.mat33],
-    x: wp.array[wp.vec4],
-    # In and out
-    y: wp.array[wp.vec4],
-):
-    """y += M x at free entries, y = 0 at others."""
-    k = wp.tid()
-    v = wp.vec3()
-    if free[k] > 0.0:
-        v = load_node(y, k) + inertia[k] * load_node(x, k)
-    store_node(y, k, v)
-
-
-@wp.kernel(enable_backward=False)
-def finish_blocks(free: wp.array[wp.float32], inertia: wp.array[wp.mat33], blocks: wp.array[wp.mat33]):
-    k = wp.tid()
-    block = wp.identity(3, dtype=wp.float32)
-    if free[k] > 0.0:
-        block = blocks[k] + inertia[k]
-    blocks[k] = block
 
 
 @wp.kernel(enable_backward=False)
@@ -327,6 +310,7 @@ class RowSprings:
     weights: wp.array[wp.vec4]  # [R]
     body: wp.array[wp.int32]  # [R] entry of the body's translation, before that of its rotation; -1: there is none
     arm: wp.array[wp.vec3]  # [R] from the centre of mass, or from the origin [m]
+    lever: wp.array[wp.mat33]  # [R] the matrix of s in r x arm
     normal: wp.array[wp.vec3]  # [R] zero: an attachment
     gap: wp.array[wp.vec3]  # [R] at the beginning [m]; of a contact the first component
     slide: wp.array[wp.vec3]  # [R] velocity of the shape on its body [m/s]
@@ -335,7 +319,7 @@ class RowSprings:
     force: wp.array[wp.vec3]  # [R] on the particles [N]
     most: wp.array[wp.float32]  # [R] bound of friction [N]
     solves: wp.array[wp.int32]  # [1] number of linear solves that the step has had so far
-    free: wp.array[wp.float32]  # of each entry, whether it is free
+    mass: wp.array[wp.float32]  # of each entry, zero if it is not free
 
 
 @wp.kernel(enable_backward=False)
@@ -349,6 +333,7 @@ def begin_springs(
     bodies: Bodies,
     particle_entry: wp.array[wp.int32],
     body_entry: wp.array[wp.int32],
+    roots: wp.array[wp.mat33],
     # Out
     springs: RowSprings,
 ):
@@ -370,6 +355,7 @@ def begin_springs(
         if row.body >= 0:
             entry = body_entry[row.body]
             slide = wp.transform_vector(bodies.q[row.body], slide)
+            springs.lever[c] = -wp.skew(arm) * roots[row.body]
         apart = sum_of(row, q) - point
         stiffness = float(row.stiffness)
         if not is_attachment(row):
@@ -399,7 +385,7 @@ def difference(springs: RowSprings, c: int, d: wp.array[wp.vec4]):
             e += weights[k] * load_node(d, nodes[k])
     body = springs.body[c]
     if body >= 0:
-        e -= load_node(d, body) + wp.cross(load_node(d, body + 1), springs.arm[c])
+        e -= load_node(d, body) + springs.lever[c] * load_node(d, body + 1)
     return e
 
 
@@ -519,14 +505,14 @@ def add_row_forces(springs: RowSprings, x: wp.array[wp.vec4], y: wp.array[wp.vec
     weights = springs.weights[c]
     for k in range(4):
         if nodes[k] >= 0:  # noqa: SIM102 - the next value exists only then
-            if springs.free[nodes[k]] > 0.0:
+            if springs.mass[nodes[k]] > 0.0:
                 add_force(y, nodes[k], weights[k] * force)
     body = springs.body[c]
     if body >= 0:
-        if springs.free[body] > 0.0:
+        if springs.mass[body] > 0.0:
             add_force(y, body, -force)
-        if springs.free[body + 1] > 0.0:
-            add_force(y, body + 1, -wp.cross(springs.arm[c], force))
+        if springs.mass[body + 1] > 0.0:
+            add_force(y, body + 1, -(wp.transpose(springs.lever[c]) * force))
 
 
 @wp.kernel(enable_backward=False)
@@ -543,9 +529,9 @@ def add_row_blocks(springs: RowSprings, blocks: wp.array[wp.mat33]):
             wp.atomic_add(blocks, nodes[k], weights[k] * weights[k] * s)
     body = springs.body[c]
     if body >= 0:
-        turn = wp.skew(springs.arm[c])
+        lever = springs.lever[c]
         wp.atomic_add(blocks, body, s)
-        wp.atomic_add(blocks, body + 1, turn * s * wp.transpose(turn))
+        wp.atomic_add(blocks, body + 1, wp.transpose(lever) * s * lever)
 
 
 @wp.kernel(enable_backward=False)

@@ -17,7 +17,7 @@ from warp_corot.kernels.elements.forces import add_stiffness_product
 from warp_corot.kernels.elements.simd8 import LANES
 from warp_corot.kernels.implicit import conjugate_gradients, turning
 from warp_corot.kernels.implicit.steps import count_solves
-from warp_corot.kernels.implicit.tangent import add_vectors, find_rest
+from warp_corot.kernels.implicit.tangent import add_vectors, find_rest, finish_blocks, finish_rows
 from warp_corot.kernels.newton import implicit as kernels
 from warp_corot.kernels.newton.particles import Particles
 from warp_corot.mesh.growing.cut import connected
@@ -60,7 +60,8 @@ class Unknowns:
         count: Number of entries of each.
         particle, body: Entries of particles, and of bodies' translations, int32 [P], [B].
         owner: The body of an entry, or -1, int32 [worlds * count].
-        free: Whether an entry is free, float32 [worlds * count].
+        mass: Inertia of each entry [kg/s^2], zero if it is not free, float32 [worlds * count].
+        roots: The matrix from each body's entry to its rotation, mat33 [B].
     """
 
     def __init__(self, model: newton.Model):
@@ -85,11 +86,12 @@ class Unknowns:
             wp.array(values, dtype=wp.int32, device=model.device)
             for values in (entry[:particles], np.ascontiguousarray(entry[particles::2]), owner)
         )
-        self.free = wp.zeros(len(owner), dtype=wp.float32, device=model.device)
+        self.mass = wp.zeros(len(owner), dtype=wp.float32, device=model.device)
+        self.roots = wp.zeros(bodies, dtype=wp.mat33, device=model.device)
 
     def zeros(self, dtype: type = wp.vec4) -> wp.array:
         """Zero in each entry."""
-        return wp.zeros(len(self.free), dtype=dtype, device=self.free.device)
+        return wp.zeros(len(self.mass), dtype=dtype, device=self.mass.device)
 
 
 class TurnedPieces:
@@ -173,7 +175,7 @@ class RowForces:
         if is_new:
             self._make_room()
         inputs = [step.dt, contacts.law, contacts.rows, contacts.count_loads(state, of_bodies), state.particle_q]
-        inputs += [contacts.bodies(of_bodies), self._unknowns.particle, self._unknowns.body]
+        inputs += [contacts.bodies(of_bodies), self._unknowns.particle, self._unknowns.body, self._unknowns.roots]
         self._launch(kernels.begin_springs, inputs, [self._rows])
         return is_new
 
@@ -219,10 +221,10 @@ class RowForces:
 
     def _make_room(self) -> None:
         self._rows = made = kernels.RowSprings()
-        made.free, made.solves = self._unknowns.free, self.solves
+        made.mass, made.solves = self._unknowns.mass, self.solves
         fields: Any = kernels.RowSprings
         for name, variable in fields.vars.items():
-            if name not in ("free", "solves"):
+            if name not in ("mass", "solves"):
                 setattr(made, name, wp.zeros(self.count, dtype=variable.type.dtype, device=self.device))
         self.springs = Springs(made.nodes, made.weights, made.stiffness, update=lambda: None)
 
@@ -234,7 +236,7 @@ class RowForces:
 class StepOperator:
     """M (1/dt^2 + damping/dt) + K + D/dt, of a system whose contact adds the stiffness of rows.
 
-    Rows of entries that are not free are zero, so that the others see how these move.
+    Rows of entries that are not free are those of the identity.
 
     Args:
         model: The model.
@@ -243,16 +245,17 @@ class StepOperator:
         rows: Contacts and attachments, which are part of the blocks on the diagonal.
 
     Attributes:
-        inverse_mass: Whether an entry is free, float32 [entries].
-        inertia: The first term, mat33 [entries].
+        inverse_mass: Positive if an entry is free, float32 [entries].
         damped: Whether elements are viscous.
     """
 
     def __init__(self, model: newton.Model, tetrahedra: Tetrahedra, unknowns: Unknowns, rows: RowForces):
         self.device, self.worlds, self.node_count = model.device, unknowns.worlds, unknowns.count
         self._tetrahedra, self._rows, self._count = tetrahedra, rows, int(model.tet_count)
-        self.inverse_mass, self.damped = unknowns.free, False
-        self.inertia, self._of_elements, self._blocks = (unknowns.zeros(wp.mat33) for _ in range(3))
+        self.inverse_mass, self.damped = unknowns.mass, False
+        self._of_elements, self._blocks = (unknowns.zeros(wp.mat33) for _ in range(2))
+        scales = wp.array([1.0, 0.0, 1.0], dtype=wp.float32, device=self.device)
+        self._masses = [scales, unknowns.mass, unknowns.mass]
         self._none, self._no_list = (wp.zeros(0, dtype=dtype, device=self.device) for dtype in (wp.vec4, wp.int32))
         own, self._elements = tetrahedra.elements, GeneralElements()
         self._elements.nodes = wp.array(unknowns.particle.numpy()[tetrahedra.tets], dtype=wp.vec4i, device=self.device)
@@ -286,14 +289,14 @@ class StepOperator:
         """Launch the blocks on the diagonal, with those of rows, mat33 [entries]."""
         wp.copy(self._blocks, self._of_elements)
         self._rows.add_blocks(self._blocks)
-        self._launch(kernels.finish_blocks, len(self._blocks), [self.inverse_mass, self.inertia], [self._blocks])
+        self._launch(finish_blocks, len(self._blocks), [*self._masses, 0.0], [self._blocks])
         return self._blocks
 
     def apply(self, x: wp.array, y: wp.array) -> None:
         """Launch y = A x."""
         y.zero_()
         self.add_product(x, y)
-        self._launch(kernels.finish_rows, len(y), [self.inverse_mass, self.inertia, x], [y])
+        self._launch(finish_rows, len(y), [*self._masses, x, self._none], [y])
 
     def add_product(self, x: wp.array, y: wp.array) -> None:
         """Launch y += (K + D/dt) x."""
@@ -364,9 +367,9 @@ class ImplicitSteps(Steps):
         self._turned.launch(substep.state_in, self.contacts.particles, substep.dt)
         self.tetrahedra.add_forces(self._turned_state, self._activation, self._f)
         of_bodies = self._bodies_after(done, substep, given)
+        self._launch_unknowns(substep, of_bodies, given)
         if self._rows.begin(substep, of_bodies):
             self._replays.forget()
-        self._launch_unknowns(substep, of_bodies, given)
         self._replays.launch((substep.dt, self.contacts.law.adhesion, self._operator.damped), self._launch_solve)
         self._rows.report(substep, share)
         self._launch_reactions(given, share)
@@ -377,13 +380,14 @@ class ImplicitSteps(Steps):
         operator.take(now.particle_q, self._turned.positions, dt)
         system.b.zero_()
         operator.add_product(self._turned.way, system.b)
-        trouble, outputs = self.report.trouble, [system.b, self._unknowns.free, operator.inertia]
-        outputs += [system.x, self._change]
-        inputs = [dt, self.damping, self.contacts.particles, self._f, now.particle_qd, trouble]
-        self._launch(kernels.begin_particles, model.particle_count, [*inputs, self._unknowns.particle], outputs)
+        unknowns, trouble = self._unknowns, self.report.trouble
+        outputs = [system.b, unknowns.mass, system.x, self._change]
+        inputs = [dt, self.damping, self.contacts.particles, self._f, now.particle_qd, trouble, unknowns.particle]
+        self._launch(kernels.begin_particles, model.particle_count, inputs, outputs)
         if model.body_count:
             inputs = [dt, self.contacts.bodies(of_bodies), model.gravity, given.body_f, int(self.others.has_bodies)]
-            self._launch(kernels.begin_bodies, model.body_count, [*inputs, trouble, self._unknowns.body], outputs)
+            inputs += [trouble, unknowns.body]
+            self._launch(kernels.begin_bodies, model.body_count, inputs, [*outputs, unknowns.roots])
 
     def _launch_solve(self) -> None:
         """Launch the solve for the motions: with the contacts that act, and then until these are the right ones."""
