@@ -9,7 +9,8 @@ K is R K R^T with each element's rotation where free pieces are turned as they w
 forces f are those there plus K times the way to there. D is the viscosity midway, where a turn has none.
 
 A vector has an entry for each particle, and two for each body, of its translation t and of its rotation r = G s, scaled
-so that all three components of s have one moment of inertia. Entries of what is held, or moves as prescribed, are not free.
+so that all three components of s have one moment of inertia. Entries of what is held, or moves as prescribed, are not
+free.
 
 A row is a spring and a damper between a soft surface and a rigid body. It sees the difference e = sum of b_j d_j -
 (t + r x arm) of its two sides. Its force at the end of the step is a function of e, whose derivative S, symmetric and

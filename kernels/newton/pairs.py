@@ -52,16 +52,17 @@ class Surfaces:
 
 @wp.struct
 class PairLists:
-    """Newton's lists of pairs: a row for each vertex and for each edge."""
+    """Newton's lists of pairs, with its names: a row for each vertex and for each edge."""
 
     margin: float  # distance at which surfaces begin to push one another [m]
     parallel: float  # sine of an angle below which two edges are parallel
-    triangle_starts: wp.array[wp.int32]
-    triangle_counts: wp.array[wp.int32]
-    triangles: wp.array[wp.int32]  # of each pair the vertex and the triangle
-    edge_starts: wp.array[wp.int32]
-    edge_counts: wp.array[wp.int32]
-    edges: wp.array[wp.int32]  # of each pair both edges
+    # Of each pair the vertex and the triangle, or both edges.
+    vertex_colliding_triangles: wp.array[wp.int32]
+    vertex_colliding_triangles_offsets: wp.array[wp.int32]
+    vertex_colliding_triangles_count: wp.array[wp.int32]
+    edge_colliding_edges: wp.array[wp.int32]
+    edge_colliding_edges_offsets: wp.array[wp.int32]
+    edge_colliding_edges_count: wp.array[wp.int32]
 
 
 @wp.func
@@ -158,35 +159,31 @@ def edge_row(surfaces: Surfaces, e: int, other: int, margin: float, parallel: fl
 
 @wp.func
 def row_size(starts: wp.array[wp.int32], counts: wp.array[wp.int32], n: int):
-    """Number of pairs that row n of a list holds, no more than fit."""
+    """Number of pairs that row n of a list holds, no more than fit, and whether more were found."""
     if n >= counts.shape[0]:
-        return 0
-    return wp.min(counts[n], starts[n + 1] - starts[n])
+        return 0, False
+    room = starts[n + 1] - starts[n]
+    return wp.min(counts[n], room), counts[n] > room
 
 
 @wp.func
-def is_cut_short(starts: wp.array[wp.int32], counts: wp.array[wp.int32], n: int):
-    """Whether row n of a list holds fewer pairs than were found."""
-    return n < counts.shape[0] and row_size(starts, counts, n) < counts[n]
-
-
-@wp.func
-def pair_count(lists: PairLists, n: int):
-    """Number of pairs in the rows of vertex n and edge n."""
-    in_triangles = row_size(lists.triangle_starts, lists.triangle_counts, n)
-    return in_triangles + row_size(lists.edge_starts, lists.edge_counts, n)
+def row_sizes(lists: PairLists, n: int):
+    """The same of vertex n and of edge n."""
+    in_triangles, lacks = row_size(lists.vertex_colliding_triangles_offsets, lists.vertex_colliding_triangles_count, n)
+    in_edges, lacks_edges = row_size(lists.edge_colliding_edges_offsets, lists.edge_colliding_edges_count, n)
+    return in_triangles, lacks, in_edges, lacks_edges
 
 
 @wp.func
 def listed_row(surfaces: Surfaces, lists: PairLists, law: ContactLaw, n: int, c: int, q: wp.array[wp.vec3]):
     """The c-th pair in the rows of vertex n and edge n, if it touches, and its gap. Two edges are listed twice."""
-    in_triangles = row_size(lists.triangle_starts, lists.triangle_counts, n)
+    in_triangles, _lacks, _in_edges, _lacks_edges = row_sizes(lists, n)
     row = no_row()
     if c < in_triangles:
-        t = lists.triangles[2 * (lists.triangle_starts[n] + c) + 1]
+        t = lists.vertex_colliding_triangles[2 * (lists.vertex_colliding_triangles_offsets[n] + c) + 1]
         row = vertex_row(surfaces, n, t, lists.margin, q)
     else:
-        other = lists.edges[2 * (lists.edge_starts[n] + c - in_triangles) + 1]
+        other = lists.edge_colliding_edges[2 * (lists.edge_colliding_edges_offsets[n] + c - in_triangles) + 1]
         if n < other:
             row = edge_row(surfaces, n, other, lists.margin, lists.parallel, q)
     gap = float(1.0)
@@ -212,7 +209,8 @@ def count_pair_loads(
 ):
     """Add twice the weights of all pairs that touch."""
     n = wp.tid()
-    for c in range(pair_count(lists, n)):
+    in_triangles, _lacks, in_edges, _lacks_edges = row_sizes(lists, n)
+    for c in range(in_triangles + in_edges):
         row, gap = listed_row(surfaces, lists, law, n, c, q)
         if gap < 0.0:
             add_load(row, load)
@@ -236,11 +234,12 @@ def scatter_pairs(
 ):
     """Forces of all pairs. A row that holds fewer pairs than were found marks the world."""
     n = wp.tid()
-    if is_cut_short(lists.triangle_starts, lists.triangle_counts, n):
+    in_triangles, lacks, in_edges, lacks_edges = row_sizes(lists, n)
+    if lacks:
         mark(n, TOO_MANY_PAIRS, particles, trouble)
-    if is_cut_short(lists.edge_starts, lists.edge_counts, n):
+    if lacks_edges:
         mark(surfaces.edges[n, 2], TOO_MANY_PAIRS, particles, trouble)
-    for c in range(pair_count(lists, n)):
+    for c in range(in_triangles + in_edges):
         row, gap = listed_row(surfaces, lists, law, n, c, q)
         if gap < 0.0:
             m = Mobility()

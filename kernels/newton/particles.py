@@ -242,28 +242,20 @@ def step_particles(
 
 
 @wp.kernel(enable_backward=False)
-def damp_particles(
+def add_changes(
     # In
     dt: float,
-    damping: float,
     particles: Particles,
+    before: wp.array[wp.vec3],
+    after: wp.array[wp.vec3],
     # In and out
-    q: wp.array[wp.vec3],
-    qd: wp.array[wp.vec3],
+    f: wp.array[wp.vec4],
 ):
-    """Apply the damping of ``step_particles`` after a step without it."""
+    """Add the forces besides gravity that changed velocities in a step."""
     i = wp.tid()
     if is_moved(i, particles):
-        velocity = qd[i]
-        slower = velocity / (1.0 + dt * damping)
-        q[i] += dt * (slower - velocity)
-        qd[i] = slower
-
-
-@wp.kernel(enable_backward=False)
-def unpad(a: wp.array[wp.vec4], b: wp.array[wp.vec3]):
-    i = wp.tid()
-    b[i] = load_node(a, i)
+        change = (after[i] - before[i]) / dt - gravity_of(i, particles)
+        store_node(f, i, load_node(f, i) + change / particles.inv_mass[i])
 
 
 @wp.kernel(enable_backward=False)
@@ -322,22 +314,27 @@ def add_wrenches(
 # --- worlds ----------------------------------------------------------------------------------------------------------
 
 
-@wp.func
-def is_sound(q: wp.vec3, qd: wp.vec3, fastest: float):
-    return is_finite(q) and wp.max(wp.abs(qd)) < 0.5 * fastest
-
-
-@wp.func
-def is_sound(q: wp.transform, qd: wp.spatial_vector, fastest: float):
-    size = wp.dot(wp.abs(q[0:3]), wp.vec3(1.0)) + wp.dot(wp.abs(wp.spatial_top(qd)), wp.vec3(1.0))
-    size += wp.dot(wp.abs(wp.spatial_bottom(qd)), wp.vec3(1.0))
-    return size <= 3.0e38
+@wp.kernel(enable_backward=False)
+def check_bodies(
+    # In
+    q: wp.array[wp.transform],
+    qd: wp.array[wp.spatial_vector],
+    world: wp.array[wp.int32],
+    wrong: int,
+    # Out
+    trouble: wp.array[wp.int32],
+):
+    """Mark worlds with a body whose pose or velocity is not finite."""
+    i = wp.tid()
+    size = wp.dot(wp.abs(q[i][0:3]), wp.vec3(1.0)) + wp.dot(wp.abs(wp.spatial_top(qd[i])), wp.vec3(1.0))
+    size += wp.dot(wp.abs(wp.spatial_bottom(qd[i])), wp.vec3(1.0))
+    if not size <= 3.0e38:
+        wp.atomic_max(trouble, place_of(world[i], trouble.shape[0]), wrong)
 
 
 class StateKernels(NamedTuple):
     """Kernels over states of particles or bodies."""
 
-    check: wp.Kernel
     put_back: wp.Kernel
     reset: wp.Kernel
 
@@ -350,22 +347,6 @@ def state_kernels(Place: type, Velocity: type) -> StateKernels:
     """
     module = wp.get_module(f"newton_states_{Place.__name__}")
     module.options["enable_backward"] = False
-
-    @wp.kernel(module=module, enable_backward=False)
-    def check(
-        # In
-        q: wp.array[Place],
-        qd: wp.array[Velocity],
-        fastest: float,
-        world: wp.array[wp.int32],
-        wrong: int,
-        # Out
-        trouble: wp.array[wp.int32],
-    ):
-        """Mark worlds with a value that is not finite, or a particle that is too fast."""
-        i = wp.tid()
-        if not is_sound(q[i], qd[i], fastest):
-            wp.atomic_max(trouble, place_of(world[i], trouble.shape[0]), wrong)
 
     @wp.kernel(module=module, enable_backward=False)
     def put_back(
@@ -417,7 +398,7 @@ def state_kernels(Place: type, Velocity: type) -> StateKernels:
             if with_qd != 0:
                 qd[i] = initial_qd[i]
 
-    return StateKernels(check, put_back, reset)
+    return StateKernels(put_back, reset)
 
 
 @wp.kernel(enable_backward=False)

@@ -104,16 +104,6 @@ class TestWhatTheBuilderLeftOut:
         with pytest.raises(wc.InputError, match="the model has no tetrahedra; add some with add_soft_mesh"):
             wn.SolverCorotated(to.finalize(device=device))
 
-    def test_a_tetrahedron_at_a_corner(self, device):
-        """Its corner was in no other tetrahedron; now there are fewer outer faces, not more."""
-        points = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.0, 1.0]])
-        to = builder()
-        soft_mesh(to, points, np.array([[0, 1, 2, 3], [2, 1, 3, 4]]))
-        model = to.finalize(device=device)
-        assert (model.tet_count, model.tri_count) == (1, 6)
-        with pytest.warns(UserWarning, match="1 particles of soft bodies are in no tetrahedron.*add_mesh"):
-            wn.SolverCorotated(model)
-
     @pytest.mark.filterwarnings("error")
     def test_points_that_no_tetrahedron_has(self, device):
         """They are not reported as lost."""

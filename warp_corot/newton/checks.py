@@ -1,5 +1,4 @@
-"""Checks of what users give to ``SolverCorotated``: arguments; models whose builder left tetrahedra out; and recordings
-that do not go on from one another."""
+"""Checks of what users give to ``SolverCorotated``: arguments, and recordings that do not go on from one another."""
 
 from __future__ import annotations
 
@@ -8,12 +7,10 @@ import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import warp as wp
 
 from warp_corot.errors import InputError, depth_of_user
 from warp_corot.inputs.checks import checked_choice, checked_count, checked_number, shown
-from warp_corot.mesh.surfaces.boundary import boundary_faces
 
 from .library import ModelView, newton
 from .scene import STATE, attribute_of
@@ -21,10 +18,6 @@ from .scene import STATE, attribute_of
 INTEGRATORS = ("explicit", "implicit")
 #: Meanings of k_mu and k_lambda: mu = a k_mu, lambda = k_lambda + b k_mu, as (a, b).
 LAME = {"documented": (1.0, 0.0), "semi-implicit": (0.75, -0.625)}
-_LOST = (
-    "Newton's builder leaves out wrongly wound tetrahedra and their mass{}; build with "
-    "warp_corot.newton.add_mesh(builder, warp_corot.TetMesh(points, tets), ...), which repairs them"
-)
 
 
 class Step(NamedTuple):
@@ -148,35 +141,10 @@ def why_none(model: newton.Model) -> str:
         return "the model has no tetrahedra; add some with add_soft_mesh, add_soft_grid or add_forest"
     labels = [str(label) for label in model.volume_label]
     named = f"{bodies} soft bod{'y' if bodies == 1 else 'ies'} ({', '.join(labels[:3])}{', ...' * (bodies > 3)})"
-    return f"the model has no tetrahedra, though {named}: {_LOST.format(', and all of these are wrongly wound')}"
-
-
-def warn_of_lost(model: newton.Model, tets: npt.NDArray[np.integer]) -> None:
-    """Warn if soft bodies of a model seem to lack tetrahedra.
-
-    Their surface triangles were found from all tetrahedra: if some were left out, the rest have more outer faces. Or
-    particles are in no tetrahedron, and the triangles do not show that they never were in one.
-    """
-    if model.volume_particle_start is None or not len(model.volume_particle_start):
-        return
-    in_body, of_body = np.zeros(model.particle_count, bool), np.zeros(len(tets), bool)
-    ranges = (model.volume_particle_start, model.volume_particle_end, model.volume_tet_start, model.volume_tet_end)
-    for first, last, first_tet, last_tet in zip(*(array.numpy() for array in ranges), strict=True):
-        in_body[first:last] = True
-        of_body[first_tet:last_tet] = True
-    single = in_body.copy()
-    single[tets] = False
-    surface = faces = 0
-    if model.tri_count:
-        surface = int(np.count_nonzero(in_body[model.tri_indices.numpy().reshape(-1, 3)].all(axis=1)))
-        faces = len(boundary_faces(tets[of_body])[0])
-    lost = []
-    if single.any() and not faces == surface > 0:
-        lost.append(f"{np.count_nonzero(single)} particles of soft bodies are in no tetrahedron")
-    if faces > surface > 0:
-        lost.append(f"soft bodies with {surface} surface triangles have {faces} outer faces")
-    if lost:
-        warnings.warn(f"{' and '.join(lost)}: {_LOST.format('')}", UserWarning, stacklevel=depth_of_user())
+    return (
+        f"the model has no tetrahedra, though {named}: Newton's builder leaves out those that are wrongly wound; "
+        "build with warp_corot.newton.add_mesh(builder, warp_corot.TetMesh(points, tets), ...), which repairs them"
+    )
 
 
 class Recordings:

@@ -323,6 +323,7 @@ class SoftPairs:
                 "add_forest and add_mesh surface=True"
             )
         self.margin, self.device = margin, model.device
+        self._lists: _Given | None = None
         self.size = max(model.particle_count, model.edge_count)
         triangles = model.tri_indices.numpy().reshape(-1, 3)
         edges = model.edge_indices.numpy().reshape(-1, 4)
@@ -347,14 +348,10 @@ class SoftPairs:
                 "pipeline.init_soft_self_contact(margin=..., gap=...) before pipeline.contacts(), and "
                 "pipeline.collide(state, contacts, soft_self_contact=True)"
             )
-        lists = PairLists()
+        if self._lists is None:
+            self._lists = _Given(PairLists, "", data)
+        lists = self._lists.of(data)
         lists.margin, lists.parallel = self.margin, PARALLEL
-        lists.triangle_starts = data.vertex_colliding_triangles_offsets
-        lists.triangle_counts = data.vertex_colliding_triangles_count
-        lists.triangles = data.vertex_colliding_triangles
-        lists.edge_starts = data.edge_colliding_edges_offsets
-        lists.edge_counts = data.edge_colliding_edges_count
-        lists.edges = data.edge_colliding_edges
         return lists
 
     def _on_device(self, values: npt.NDArray[Any], dtype: type) -> wp.array:

@@ -12,7 +12,6 @@ import copy
 import math
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
 
 import numpy as np
 import numpy.typing as npt
@@ -50,7 +49,8 @@ class Others:
         damped: Whether springs, triangles or bending edges have dampers.
         is_own: Whether the bodies' solver is the one that is made here.
         contact: Stiffness [N/m] and damping [N s/m] of each contact between particles.
-        particle_forces: The forces on particles in the step [N], vec3 [P].
+        moved: Particles as the solvers of bodies have moved them in the last step, without the forces of this package:
+            positions and velocities, vec3 [P].
     """
 
     def __init__(self, model: newton.Model, rigid_solver: SolverBase | str | None, particle_contact: bool):
@@ -90,7 +90,8 @@ class Others:
                 raise InputError(f"{error} Give another rigid_solver, or None.") from None
         #: Copies of contacts without those of particles, by the original contacts.
         self._rigid_contacts: tuple[newton.Contacts, newton.Contacts] | None = None
-        self.particle_forces = wp.empty(model.particle_count, dtype=wp.vec3, device=model.device)
+        count = model.particle_count if self._solver is not None or self._rigid is not None else 0
+        self._no_forces, *self.moved = (wp.zeros(count, dtype=wp.vec3, device=model.device) for _ in range(3))
         self.refresh()
 
     def refresh(self) -> None:
@@ -132,14 +133,17 @@ class Others:
             yield _hinges(x, model.edge_indices.numpy().reshape(-1, 4), model.edge_bending_properties.numpy())
 
     def step(self, substep: Step, body_f: wp.array | None) -> None:
-        """Make a step with the given wrenches on bodies and forces on particles."""
-        now, out, control, contacts, dt, _ = substep
-        rigid = self._without_soft(contacts)
-        with _forces(now, self.particle_forces if self.has_particles else now.particle_f, body_f):
-            if self._solver is not None:
-                self._solver.step(now, out, control, rigid, dt)
-            if self._rigid is not None and self.has_bodies:
-                self._rigid.step(now, out, control, rigid, dt)
+        """Make a step of bodies with the given wrenches, and of particles into ``moved``."""
+        if self.has_particles:
+            self._no_forces.zero_()  # Newton's solver adds its own
+        now, out = copy.copy(substep.state_in), copy.copy(substep.state_out)
+        now.particle_f, now.body_f = self._no_forces, body_f
+        out.particle_q, out.particle_qd = self.moved
+        rigid = self._without_soft(substep.contacts)
+        if self._solver is not None:
+            self._solver.step(now, out, substep.control, rigid, substep.dt)
+        if self._rigid is not None and self.has_bodies:
+            self._rigid.step(now, out, substep.control, rigid, substep.dt)
 
     @property
     def solvers(self) -> list[SolverBase]:
@@ -166,17 +170,6 @@ def _warn_of_ignored(model: newton.Model) -> None:
             UserWarning,
             stacklevel=4,
         )
-
-
-@contextmanager
-def _forces(state: newton.State, particle_f: wp.array | None, body_f: wp.array | None) -> Iterator[None]:
-    """Replace a state's forces inside the block."""
-    kept = state.particle_f, state.body_f
-    state.particle_f, state.body_f = particle_f, body_f
-    try:
-        yield
-    finally:
-        state.particle_f, state.body_f = kept
 
 
 # --- small motions ---------------------------------------------------------------------------------------------------

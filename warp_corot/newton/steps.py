@@ -69,8 +69,6 @@ class Steps:
         #: Where particles' motions are and what they are, if they are solved for.
         self._motions = [wp.empty(0, dtype=dtype, device=self.device) for dtype in (wp.int32, wp.vec4)]
         self._no_numbers = wp.empty(0, dtype=wp.float32, device=self.device)
-        kept = p if others.has_particles else 0
-        self._kept_particles = [wp.empty(kept, dtype=dtype, device=self.device) for dtype in types]
         self._body_f = wp.empty(b, dtype=wp.spatial_vector, device=self.device)
         of_bodies = (wp.transform, wp.spatial_vector)
         self._bodies_before = [wp.empty(b, dtype=dtype, device=self.device) for dtype in of_bodies]
@@ -155,8 +153,6 @@ class Steps:
             Particles and bodies before the step: those of ``state_in``, or copies if the step overwrites them.
         """
         model, others, state_in, state_out = self.model, self.others, step.state_in, step.state_out
-        if others.has_particles:
-            _copy(self._kept_particles, [state_out.particle_q, state_out.particle_qd])
         particles = [state_in.particle_q, state_in.particle_qd]
         if _overlap(particles, [state_out.particle_q, state_out.particle_qd]):
             particles = self._particles_before
@@ -230,41 +226,35 @@ class Steps:
     def _launch_motion(self, substep: Step, fastest: float) -> None:
         model, others = self.model, self.others
         now, out, dt = substep.state_in, substep.state_out, substep.dt
-        if others.has_particles:
-            self._launch(kernels.unpad, model.particle_count, [self._f], [others.particle_forces])
-        else:
-            inputs = [dt, self.damping, model.particle_max_velocity, fastest, self.contacts.particles, self._f]
-            inputs += [now.particle_q, now.particle_qd, *self._motions]
-            outputs = [out.particle_q, out.particle_qd, self.report.trouble]
-            self._launch(kernels.step_particles, model.particle_count, inputs, outputs)
         count = self._steps_of_others(dt)
         part = substep._replace(dt=dt / count)
         for _ in range(count if others.has_bodies or others.has_particles else 0):
             others.step(part, self._body_f if others.has_bodies else now.body_f)
             part = part._replace(state_in=out)
-        if others.has_particles and self.damping > 0:
-            inputs = [dt, self.damping, self.contacts.particles]
-            self._launch(kernels.damp_particles, model.particle_count, inputs, [out.particle_q, out.particle_qd])
+        if others.has_particles:
+            inputs = [dt, self.contacts.particles, now.particle_qd, others.moved[1]]
+            self._launch(kernels.add_changes, model.particle_count, inputs, [self._f])
+        inputs = [dt, self.damping, model.particle_max_velocity, fastest, self.contacts.particles, self._f]
+        inputs += [now.particle_q, now.particle_qd, *self._motions]
+        outputs = [out.particle_q, out.particle_qd, self.report.trouble]
+        self._launch(kernels.step_particles, model.particle_count, inputs, outputs)
         if others.has_bodies:
             self._check_bodies(out, kernels.UNSTABLE)
-        if others.has_particles:
-            inputs = [out.particle_q, out.particle_qd, fastest, model.particle_world, int(kernels.UNSTABLE)]
-            self._launch(OF_PARTICLES.check, model.particle_count, inputs, [self.report.trouble])
 
     def _steps_of_others(self, dt: float) -> int:
         """Number of steps in which everything else makes a substep."""
         return 1
 
     def _check_bodies(self, state: newton.State, wrong: int) -> None:
-        inputs = [state.body_q, state.body_qd, 0.0, self.model.body_world, int(wrong)]
-        self._launch(OF_BODIES.check, self.model.body_count, inputs, [self.report.trouble])
+        inputs = [state.body_q, state.body_qd, self.model.body_world, int(wrong)]
+        self._launch(kernels.check_bodies, self.model.body_count, inputs, [self.report.trouble])
 
     def _launch_undoing(self, out: newton.State, particles: list[wp.array], bodies: list[wp.array]) -> None:
         """Restore the worlds with a failure."""
         if not self.report.may_be_wrong:
             return
         model = self.model
-        inputs = [model.particle_world, self.report.trouble, *particles, *self._kept_particles]
+        inputs = [model.particle_world, self.report.trouble, *particles, *self._nothing]
         outputs = [out.particle_q, out.particle_qd]
         self._launch(OF_PARTICLES.put_back, model.particle_count, inputs, outputs)
         if self.others.has_bodies:

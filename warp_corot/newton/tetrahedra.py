@@ -18,7 +18,6 @@ from warp_corot.kernels.elements.constitutive import IsotropicMaterial, linear_s
 from warp_corot.kernels.elements.elements import GeneralElements
 from warp_corot.kernels.elements.forces import law_stress, repair_forces, scatter_forces
 from warp_corot.kernels.elements.general_cuda import BLOCK, PosedElements
-from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.kernels.newton.elements import (
     EACH,
     posed_stress,
@@ -30,7 +29,7 @@ from warp_corot.kernels.newton.elements import (
 from warp_corot.kernels.newton.particles import add_nodes, gather_nodes
 from warp_corot.mesh import TetForest
 
-from .checks import LAME, warn_of_lost, why_none
+from .checks import LAME, why_none
 from .library import newton
 from .scene import STATE, attribute_of, mesh_fill, outward_tets
 
@@ -207,7 +206,6 @@ class Tetrahedra:
         self._fill = wp.ones(1, dtype=wp.float32, device=self.device) if fill is None else fill
         self._nothing = {name: wp.empty(0, dtype=dtype, device=self.device) for name, dtype in STATE.items()}
         self.refresh()
-        warn_of_lost(model, self.tets)
 
     def refresh(self) -> None:
         """Read the model's current materials.
@@ -287,7 +285,7 @@ class Tetrahedra:
         """Add elastic forces, and others in the same kernel."""
         if self._fused and self.single_count:
             inputs = [self._single, *self._single_materials, self._single_ids, activation, u, v]
-            self._launch(scatter_posed(quick_rotation, self.damped), self.single_count, inputs, [f], BLOCK)
+            self._launch(scatter_posed(self.damped), self.single_count, inputs, [f], BLOCK)
         elif self.single_count:
             self._lanes.scatter_forces(self._single_isotropic(*self._single_materials[:2]), u, f)
         for group in self.groups:
