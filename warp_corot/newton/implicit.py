@@ -348,7 +348,8 @@ class ImplicitSteps(Steps):
         self._unknowns = unknowns = Unknowns(model)
         self._rows = RowForces(contacts, unknowns)
         self._turned = TurnedPieces(model, tetrahedra, unknowns)
-        self._operator = operator = StepOperator(model, tetrahedra, unknowns, self._rows)
+        self._operator = StepOperator(model, tetrahedra, unknowns, self._rows)
+        operator: Any = self._operator
         contact: Any = self._rows
         self._system = BlockSystem([operator], [RowBlocks(operator)], contacts=[contact], most=ITERATIONS)
         self._system.solver.tolerance.fill_(TOLERANCE)

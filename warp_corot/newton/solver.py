@@ -141,7 +141,7 @@ class SolverCorotated(SolverBase, CouplingInterface):
         self._steps = ImplicitSteps(*parts) if self._is_implicit else Steps(*parts)
         follows = substeps is None and not self._is_implicit
         self._following = Following(model, self.tetrahedra) if follows else None
-        self._shape_wrenches = wp.zeros(model.shape_count, dtype=wp.spatial_vector, device=self.device)
+        self._shape_wrenches = wp.zeros(model.shape_count, dtype=wp.spatial_vectorf, device=self.device)
         self._all_worlds = wp.ones(max(int(model.world_count), 1) + 1, dtype=wp.bool, device=self.device)
         self._seen: list[np.ndarray] = []
         self._has_changed()
