@@ -547,7 +547,7 @@ def report_rows(
     body_f: wp.array[wp.spatial_vector],
     reported: wp.array[wp.spatial_vector],
 ):
-    """Wrenches on bodies, about their centres of mass, and of each contact; see ``explicit_rows.scatter_rows``."""
+    """Wrenches on bodies, about their centres of mass, and of each contact; see ``explicit.scatter_rows``."""
     c = wp.tid()
     if springs.nodes[c][0] < 0:
         return

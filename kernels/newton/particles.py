@@ -7,7 +7,6 @@ arrays over worlds.
 """
 
 import functools
-from typing import NamedTuple
 
 import warp as wp
 
@@ -52,7 +51,7 @@ class Bodies:
     inertia: wp.array[wp.mat33]
     com: wp.array[wp.vec3]
     places: wp.array[wp.int32]  # at how many places each is touched or held
-    yielding: wp.array[wp.spatial_vector]  # see ``explicit_rows``
+    yielding: wp.array[wp.spatial_vector]  # see ``explicit``
     q: wp.array[wp.transform]
     qd: wp.array[wp.spatial_vector]
 
@@ -332,16 +331,10 @@ def check_bodies(
         wp.atomic_max(trouble, place_of(world[i], trouble.shape[0]), wrong)
 
 
-class StateKernels(NamedTuple):
-    """Kernels over states of particles or bodies."""
-
-    put_back: wp.Kernel
-    reset: wp.Kernel
-
-
 @functools.cache
-def state_kernels(Place: type, Velocity: type) -> StateKernels:
-    """The kernels for states with these types: of particles vec3 both, of bodies transforms and spatial vectors.
+def state_kernels(Place: type, Velocity: type) -> tuple[wp.Kernel, wp.Kernel]:
+    """The kernels that undo a step and that reset a state, for states with these types: of particles vec3 both, of
+    bodies transforms and spatial vectors.
 
     They are one module, so that those of resets are loaded with those of steps and may be recorded.
     """
@@ -398,7 +391,7 @@ def state_kernels(Place: type, Velocity: type) -> StateKernels:
             if with_qd != 0:
                 qd[i] = initial_qd[i]
 
-    return StateKernels(put_back, reset)
+    return put_back, reset
 
 
 @wp.kernel(enable_backward=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from functools import partial
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -27,8 +28,8 @@ RUNAWAY = float(kernels.RUNAWAY)
 #: Fewer substeps are not recorded, since recording one takes as long as several.
 FEW = 32
 #: Kernels over the states of particles and of bodies.
-OF_PARTICLES = kernels.state_kernels(wp.vec3, wp.vec3)
-OF_BODIES = kernels.state_kernels(wp.transform, wp.spatial_vector)
+PUT_BACK_PARTICLES, RESET_PARTICLES = kernels.state_kernels(wp.vec3, wp.vec3)
+PUT_BACK_BODIES, RESET_BODIES = kernels.state_kernels(wp.transform, wp.spatial_vector)
 #: What there is no room for, and what to do.
 _NO_ROOM = {
     int(kernels.TOO_MANY_PAIRS): "pairs of soft bodies than Newton has room for: call pipeline.init_soft_self_contact "
@@ -131,18 +132,22 @@ class Steps:
         self._launch_undoing(step.state_out, *before)
 
     def reset(self, state: newton.State, mask: wp.array, flags: int) -> None:
-        model, bits = self.model, newton.StateFlags
+        bits = newton.StateFlags
         self.contacts.forget()
         if flags & bits.PARTICLE:
-            wanted = [int(bool(flags & bit)) for bit in (bits.PARTICLE_Q, bits.PARTICLE_QD)]
-            inputs = [mask, model.particle_world, *wanted, model.particle_q, model.particle_qd]
-            outputs = [state.particle_q, state.particle_qd]
-            self._launch(OF_PARTICLES.reset, model.particle_count, inputs, outputs)
+            self._reset(RESET_PARTICLES, "particle", mask, state, flags & bits.PARTICLE_Q, flags & bits.PARTICLE_QD)
             self.tetrahedra.write_attributes(state)
         if self.others.has_bodies and flags & (bits.BODY_Q | bits.BODY_QD):
-            wanted = [int(bool(flags & bit)) for bit in (bits.BODY_Q, bits.BODY_QD)]
-            inputs = [mask, model.body_world, *wanted, model.body_q, model.body_qd]
-            self._launch(OF_BODIES.reset, model.body_count, inputs, [state.body_q, state.body_qd])
+            self._reset(RESET_BODIES, "body", mask, state, flags & bits.BODY_Q, flags & bits.BODY_QD)
+
+    def _reset(
+        self, kernel: wp.Kernel, of: str, mask: wp.array, state: newton.State, with_q: int, with_qd: int
+    ) -> None:
+        model, names = self.model, (f"{of}_q", f"{of}_qd")
+        inputs = [mask, getattr(model, f"{of}_world"), int(bool(with_q)), int(bool(with_qd))]
+        inputs += [getattr(model, name) for name in names]
+        outputs = [getattr(state, name) for name in names]
+        self._launch(kernel, len(outputs[0]), inputs, outputs)
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
@@ -256,10 +261,10 @@ class Steps:
         model = self.model
         inputs = [model.particle_world, self.report.trouble, *particles, *self._nothing]
         outputs = [out.particle_q, out.particle_qd]
-        self._launch(OF_PARTICLES.put_back, model.particle_count, inputs, outputs)
+        self._launch(PUT_BACK_PARTICLES, model.particle_count, inputs, outputs)
         if self.others.has_bodies:
             inputs = [model.body_world, self.report.trouble, *bodies, *self._kept_bodies]
-            self._launch(OF_BODIES.put_back, model.body_count, inputs, [out.body_q, out.body_qd])
+            self._launch(PUT_BACK_BODIES, model.body_count, inputs, [out.body_q, out.body_qd])
 
     def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)

@@ -78,7 +78,7 @@ def stable_step(
         stiffness: Stiffness of a spring at every particle [N/m], for contact.
         damping: Damping of a damper at every particle [N s/m].
         of_bodies: Stiffness over mass at the other end of this spring [1/s^2]; 0: that end does not move. Bodies that
-            are touched in several places need no shorter steps; see ``kernels.newton.explicit_rows``.
+            are touched in several places need no shorter steps; see ``kernels.newton.explicit``.
     """
     inverse = free_inverse_masses(tets.model)
     inverse_mass = wp.array(inverse, dtype=wp.float32, device=tets.device)
