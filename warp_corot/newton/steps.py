@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from functools import partial
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import warp as wp
