@@ -333,7 +333,7 @@ def check_bodies(
 
 @functools.cache
 def state_kernels(Place: type, Velocity: type) -> tuple[wp.Kernel, wp.Kernel]:
-    """The kernels that undo a step and that reset a state, for states with these types: of particles vec3 both, of
+    """The kernels that finish a step and that reset a state, for states with these types: of particles vec3 both, of
     bodies transforms and spatial vectors.
 
     They are one module, so that those of resets are loaded with those of steps and may be recorded.
@@ -342,32 +342,30 @@ def state_kernels(Place: type, Velocity: type) -> tuple[wp.Kernel, wp.Kernel]:
     module.options["enable_backward"] = False
 
     @wp.kernel(module=module, enable_backward=False)
-    def put_back(
+    def finish(
         # In
         world: wp.array[wp.int32],
         trouble: wp.array[wp.int32],
         before_q: wp.array[Place],
         before_qd: wp.array[Velocity],
-        kept_q: wp.array[Place],
-        kept_qd: wp.array[Velocity],
+        made_q: wp.array[Place],
+        made_qd: wp.array[Velocity],
         # Out
         q: wp.array[Place],
         qd: wp.array[Velocity],
     ):
-        """Undo what was written in marked worlds.
+        """Write what a step has made, and the state before it in marked worlds; where that was not finite, nothing.
 
         Args:
             before_q, before_qd: The state before the step.
-            kept_q, kept_qd: Former values of the output state, for worlds whose input was not finite; or empty,
-                if those were not written.
+            made_q, made_qd: The result; empty if it is in q and qd already.
         """
         i = wp.tid()
         wrong = trouble[place_of(world[i], trouble.shape[0])]
-        if wrong == BAD_INPUT:
-            if kept_q.shape[0] > 0:
-                q[i] = kept_q[i]
-                qd[i] = kept_qd[i]
-        elif wrong != SOUND:
+        if wrong == SOUND and made_q.shape[0] > 0:
+            q[i] = made_q[i]
+            qd[i] = made_qd[i]
+        elif wrong != SOUND and wrong != BAD_INPUT:
             q[i] = before_q[i]
             qd[i] = before_qd[i]
 
@@ -391,7 +389,7 @@ def state_kernels(Place: type, Velocity: type) -> tuple[wp.Kernel, wp.Kernel]:
             if with_qd != 0:
                 qd[i] = initial_qd[i]
 
-    return put_back, reset
+    return finish, reset
 
 
 @wp.kernel(enable_backward=False)

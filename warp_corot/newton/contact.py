@@ -32,6 +32,8 @@ PARALLEL = 1e-5
 ROUNDS = 4
 #: The stiffness of all contacts that share a particle is at most this many times the stiffness of one.
 CROWD = 4.0
+#: The most states whose bodies are remembered.
+STATES = 8
 #: Speed at which what was found too late is pushed out [m/s].
 RECOVERY = 0.25
 
@@ -70,7 +72,7 @@ class Contacts:
         self._slope, self._yielding, self.reactions = (
             wp.zeros(bodies, dtype=wp.spatial_vectorf, device=self.device) for _ in range(3)
         )
-        self._bodies = Kept(self._made_bodies)
+        self._bodies: dict[tuple, Bodies] = {}
         self._particles, self._shapes = _Given(Particles, "particle_", model), _Given(rows.Shapes, "shape_", model)
         self._attachments = _Given(rows.Attachments, "attachment_particle_body_", model)
         self._of_bodies = _Given(Bodies, "body_", model)
@@ -215,8 +217,13 @@ class Contacts:
         return self._load
 
     def bodies(self, of_bodies: newton.State) -> Bodies:
-        """Bodies in a state."""
-        return self._bodies(of_bodies.body_q, of_bodies.body_qd)
+        """Bodies in a state; made once for each of the states that take turns."""
+        arrays = of_bodies.body_q, of_bodies.body_qd
+        if arrays not in self._bodies:
+            if len(self._bodies) == STATES:
+                self._bodies.clear()
+            self._bodies[arrays] = self._made_bodies(*arrays)
+        return self._bodies[arrays]
 
     def _find_yielding(self, state: newton.State, bodies: Bodies, load: wp.array, dt: float) -> None:
         """Find how far bodies yield to springs, and at how many places they are touched."""

@@ -136,8 +136,8 @@ class Others:
         """Make a step of bodies with the given wrenches, and of particles into ``moved``."""
         if self.has_particles:
             self._no_forces.zero_()  # Newton's solver adds its own
-        now = _with(substep.state_in, particle_f=self._no_forces, body_f=body_f)
-        out = _with(substep.state_out, particle_q=self.moved[0], particle_qd=self.moved[1])
+        now = with_changes(substep.state_in, particle_f=self._no_forces, body_f=body_f)
+        out = with_changes(substep.state_out, particle_q=self.moved[0], particle_qd=self.moved[1])
         rigid = self._without_soft(substep.contacts)
         if self._solver is not None:
             self._solver.step(now, out, substep.control, rigid, substep.dt)
@@ -153,7 +153,7 @@ class Others:
         if contacts is None:
             return None
         if self._rigid_contacts is None or self._rigid_contacts[0] is not contacts:
-            self._rigid_contacts = contacts, _with(contacts, soft_contact_max=0)
+            self._rigid_contacts = contacts, with_changes(contacts, soft_contact_max=0)
         return self._rigid_contacts[1]
 
 
@@ -169,7 +169,7 @@ def _warn_of_ignored(model: newton.Model) -> None:
         )
 
 
-def _with(given: Any, **changes: Any) -> Any:
+def with_changes(given: Any, **changes: Any) -> Any:
     """An object with the same attributes but for some; faster than ``copy.copy``, since it is made in every substep."""
     made = object.__new__(type(given))
     made.__dict__.update(vars(given), **changes)

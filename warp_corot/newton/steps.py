@@ -18,7 +18,7 @@ from warp_corot.solvers.subnormals import FlushedSubnormals
 from .checks import Step
 from .contact import Contacts
 from .library import newton
-from .others import Others
+from .others import Others, with_changes
 from .substeps import RETRIES, Following
 from .tetrahedra import Tetrahedra
 
@@ -27,8 +27,8 @@ RUNAWAY = float(kernels.RUNAWAY)
 #: Fewer substeps are not recorded, since recording one takes as long as several.
 FEW = 32
 #: Kernels over the states of particles and of bodies.
-PUT_BACK_PARTICLES, RESET_PARTICLES = kernels.state_kernels(wp.vec3, wp.vec3)
-PUT_BACK_BODIES, RESET_BODIES = kernels.state_kernels(wp.transform, wp.spatial_vector)
+FINISH_PARTICLES, RESET_PARTICLES = kernels.state_kernels(wp.vec3, wp.vec3)
+FINISH_BODIES, RESET_BODIES = kernels.state_kernels(wp.transform, wp.spatial_vector)
 #: What there is no room for, and what to do.
 _NO_ROOM = {
     int(kernels.TOO_MANY_PAIRS): "pairs of soft bodies than Newton has room for: call pipeline.init_soft_self_contact "
@@ -71,9 +71,9 @@ class Steps:
         self._no_numbers = wp.empty(0, dtype=wp.float32, device=self.device)
         self._body_f = wp.empty(b, dtype=wp.spatial_vector, device=self.device)
         of_bodies = (wp.transform, wp.spatial_vector)
-        self._bodies_before = [wp.empty(b, dtype=dtype, device=self.device) for dtype in of_bodies]
         self._moved = SimpleNamespace(body_q=wp.empty(b, dtype=wp.transform, device=self.device), body_qd=None)
-        self._kept_bodies = [wp.empty(b, dtype=dtype, device=self.device) for dtype in of_bodies]
+        #: Bodies within a step: their solver never overwrites those before it.
+        self._bodies_made = [wp.empty(b, dtype=dtype, device=self.device) for dtype in of_bodies]
 
     def launch(self, step: Step, count: int, following: Following | None = None) -> None:
         """Launch a step of ``count`` substeps. A failure in one substep of a world undoes and ends the world's step.
@@ -91,6 +91,9 @@ class Steps:
         if step.reported is not None:
             step.reported.zero_()
         before = self._launch_begin(step)
+        if self.others.has_bodies:
+            made = with_changes(state_out, body_q=self._bodies_made[0], body_qd=self._bodies_made[1])
+            step = step._replace(state_out=made)
         replays = Replays(self.device)
         now, number, left, done, each = state_in, 0, count, 0.0, dt / count
         while left:
@@ -99,7 +102,7 @@ class Steps:
                 # All substeps until the next measurement are alike.
                 replays.launch(each, partial(self._launch_substep, step, now, each, before, following))
             else:
-                copied = number == 0 and before[0] is self._particles_before
+                copied = number == 0 and before is self._particles_before
                 self._launch_gathering(now, state_in, number, copied)
                 if due and following is not None:
                     following.measure(now, dt - done, each)
@@ -108,27 +111,31 @@ class Steps:
                         each = (dt - done) / left
                 self._launch_gathered(step, now, each, before, following, done)
             number, left, done = number + 1, left - 1, done + each
-            now = state_out
+            now = step.state_out
+        if self.others.has_bodies:
+            inputs = [self.model.body_world, self.report.trouble, state_in.body_q, state_in.body_qd]
+            outputs = [state_out.body_q, state_out.body_qd]
+            self._launch(FINISH_BODIES, self.model.body_count, [*inputs, *self._bodies_made], outputs)
         self.tetrahedra.write_attributes(state_out)
         if following is not None:
             following.made = number
         self.report.launch()
 
     def _launch_substep(
-        self, step: Step, now: newton.State, each: float, before: tuple, following: Following | None
+        self, step: Step, now: newton.State, each: float, before: list, following: Following | None
     ) -> None:
         """Launch a substep that is not the first one."""
         self._launch_gathering(now, step.state_in, 1, False)
         self._launch_gathered(step, now, each, before, following, 0.0)
 
     def _launch_gathered(
-        self, step: Step, now: newton.State, each: float, before: tuple, following: Following | None, done: float
+        self, step: Step, now: newton.State, each: float, before: list, following: Following | None, done: float
     ) -> None:
         """Launch a substep from gathered positions, after some time of the step [s]."""
         substep = step._replace(state_in=now, dt=each)
         self._launch_forces(substep, step.state_in, each / step.dt, done)
         self._launch_motion(substep, RUNAWAY if following is None else min(RUNAWAY, following.reach / each))
-        self._launch_undoing(step.state_out, *before)
+        self._launch_undoing(step.state_out, before)
 
     def reset(self, state: newton.State, mask: wp.array, flags: int) -> None:
         bits = newton.StateFlags
@@ -150,31 +157,24 @@ class Steps:
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
-    def _launch_begin(self, step: Step) -> tuple[list[wp.array], list[wp.array]]:
+    def _launch_begin(self, step: Step) -> list[wp.array]:
         """Launch everything that is done once in a step.
 
         Returns:
-            Particles and bodies before the step: those of ``state_in``, or copies if the step overwrites them.
+            Particles before the step: those of ``state_in``, or copies if the step overwrites them.
         """
-        model, others, state_in, state_out = self.model, self.others, step.state_in, step.state_out
+        model, state_in, state_out = self.model, step.state_in, step.state_out
         particles = [state_in.particle_q, state_in.particle_qd]
-        if _overlap(particles, [state_out.particle_q, state_out.particle_qd]):
+        if {array.ptr for array in particles} & {state_out.particle_q.ptr, state_out.particle_qd.ptr}:
             particles = self._particles_before
-        bodies: list[wp.array] = []
         if model.body_count:
-            bodies = [state_in.body_q, state_in.body_qd]
             self._check_bodies(state_in, kernels.BAD_INPUT)
-        if others.has_bodies:
-            _copy(self._kept_bodies, [state_out.body_q, state_out.body_qd])
-            if _overlap(bodies, [state_out.body_q, state_out.body_qd]):
-                _copy(self._bodies_before, bodies)
-                bodies = self._bodies_before
         self.contacts.begin(step, self.report.trouble)
         self._activation = model.tet_activations
         if step.control is not None and step.control.tet_activations is not None:
             self._activation = step.control.tet_activations
         self.tetrahedra.look_at(self._activation)
-        return particles, bodies
+        return particles
 
     def _launch_gathering(self, now: newton.State, state_in: newton.State, number: int, copied: bool) -> None:
         """Gather external forces and positions of particles; these are copied if the step begins with them and
@@ -253,17 +253,11 @@ class Steps:
         inputs = [state.body_q, state.body_qd, self.model.body_world, int(wrong)]
         self._launch(kernels.check_bodies, self.model.body_count, inputs, [self.report.trouble])
 
-    def _launch_undoing(self, out: newton.State, particles: list[wp.array], bodies: list[wp.array]) -> None:
-        """Restore the worlds with a failure."""
-        if not self.report.may_be_wrong:
-            return
-        model = self.model
-        inputs = [model.particle_world, self.report.trouble, *particles, *self._nothing]
-        outputs = [out.particle_q, out.particle_qd]
-        self._launch(PUT_BACK_PARTICLES, model.particle_count, inputs, outputs)
-        if self.others.has_bodies:
-            inputs = [model.body_world, self.report.trouble, *bodies, *self._kept_bodies]
-            self._launch(PUT_BACK_BODIES, model.body_count, inputs, [out.body_q, out.body_qd])
+    def _launch_undoing(self, out: newton.State, before: list[wp.array]) -> None:
+        """Restore particles in the worlds with a failure."""
+        if self.report.may_be_wrong:
+            inputs = [self.model.particle_world, self.report.trouble, *before, *self._nothing]
+            self._launch(FINISH_PARTICLES, self.model.particle_count, inputs, [out.particle_q, out.particle_qd])
 
     def _launch(self, kernel: wp.Kernel, dim: int, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
@@ -337,13 +331,3 @@ class Report:
             following.share *= 0.5
             hint += "; from now on steps have twice the substeps, recorded ones when they are recorded again"
         return f"the step's result is {wrong}{where}; that state was not changed{hint}"
-
-
-def _copy(to: list[wp.array], given: list[wp.array]) -> None:
-    for a, b in zip(to, given, strict=True):
-        wp.copy(a, b)
-
-
-def _overlap(a: list[wp.array], b: list[wp.array]) -> bool:
-    """Whether the two lists share an array."""
-    return bool({array.ptr for array in a} & {array.ptr for array in b})
