@@ -24,10 +24,10 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.device import checked_device
 from warp_corot.materials.isotropic import Isotropic
 from warp_corot.mesh import TetForest
-from warp_corot.mesh.surfaces.boundary import signed_volumes
+from warp_corot.mesh.topology import signed_volumes
 from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import SymplecticEuler
-from warp_corot.solvers.integrator import GRAPH_STEPS
+from warp_corot.solvers.system import GRAPH_STEPS
 
 Array = npt.NDArray[np.float64]
 

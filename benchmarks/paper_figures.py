@@ -16,7 +16,7 @@ from warp_corot.cli.verify import device_name
 from warp_corot.errors import InputError
 from warp_corot.io.files.whole import written_whole
 from warp_corot.io.pictures.drawing import Camera, draw_body
-from warp_corot.mesh.surfaces.boundary import boundary_faces
+from warp_corot.mesh.topology import boundary_faces
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -22,7 +22,7 @@ from warp_corot.elasticity import Corotated, ForceField
 from warp_corot.elasticity.corotated.model import CorotatedField
 from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import SymplecticEuler
-from warp_corot.solvers.steps.pace import Pace
+from warp_corot.solvers.pace import Pace
 from warp_corot.solvers.system import System
 
 #: Launches of one stage recorded in a graph.

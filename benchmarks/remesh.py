@@ -20,7 +20,7 @@ from measure import Case, Result, checked, finish, machine, measure, number, par
 
 import warp_corot as wc
 from warp_corot.discretization.changing.pools import DeviceForest
-from warp_corot.kernels.remesh.mark import ElementState
+from warp_corot.kernels.remesh.criteria import ElementState
 from warp_corot.mesh.lattice import volume_shares
 from warp_corot.simulation.simulation import Simulation
 

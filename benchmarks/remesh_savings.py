@@ -21,11 +21,10 @@ from warp_corot.body.soft_body import SoftBody
 from warp_corot.domain import Domain
 from warp_corot.errors import InputError
 from warp_corot.inputs.device import checked_device
-from warp_corot.kernels.remesh.criteria import nearness, strain
-from warp_corot.kernels.remesh.mark import elongation
+from warp_corot.kernels.remesh.criteria import elongation, nearness, strain
 from warp_corot.materials.isotropic import Isotropic
 from warp_corot.mesh import TetForest
-from warp_corot.remesh.online import OnlineRemesh
+from warp_corot.remesh.remeshing import OnlineRemesh
 from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import SymplecticEuler
 

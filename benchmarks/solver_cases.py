@@ -12,9 +12,9 @@ from measure import Case, kind
 from problem import SUBTREE_LEVELS, Problem, Sample, oracle, padded, relative_error
 
 import warp_corot as wc
-from warp_corot.body.worlds import World
+from warp_corot.body.soft_body import World
 from warp_corot.elasticity import ForceField, Model
-from warp_corot.solvers.steps.pace import Pace
+from warp_corot.solvers.pace import Pace
 from warp_corot.solvers.system import System
 
 #: Steps in one sample of a whole-step row; on CUDA, as many as a call makes at an interactive rate.

@@ -30,9 +30,8 @@ from scipy.sparse.linalg import spsolve
 
 import warp_corot as wc
 from warp_corot.inputs.device import checked_device
-from warp_corot.solvers.implicit.block_diagonal import BlockDiagonal
 from warp_corot.solvers.implicit.conjugate_gradients import ConjugateGradients
-from warp_corot.solvers.implicit.preconditioners import preconditioner_of
+from warp_corot.solvers.implicit.preconditioners import BlockDiagonal, preconditioner_of
 from warp_corot.solvers.implicit.tangent import TangentOperator
 
 YOUNG, DENSITY, DOWN = 50e3, 1000.0, np.array([0.0, -9.8, 0.0])

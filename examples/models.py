@@ -9,7 +9,7 @@ import argparse
 import numpy as np
 
 import warp_corot as wc
-from warp_corot.mesh.surfaces.boundary import signed_volumes
+from warp_corot.mesh.topology import signed_volumes
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--device", help="cpu or cuda:0")

@@ -1,11 +1,10 @@
 """The names that ``import warp_corot`` gives."""
 
-from warp_corot.body.activation import Activation
+from warp_corot.body.keyframes import Activation
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.grasp import Grasp
 from warp_corot.contact.options import Contact
-from warp_corot.contact.sampled import SignedDistance, TriangleMesh
-from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, Sphere
+from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, SignedDistance, Sphere, TriangleMesh
 from warp_corot.contact.tool import Tool
 from warp_corot.cutting.blade import Blade
 from warp_corot.cutting.plane import Plane
@@ -16,7 +15,7 @@ from warp_corot.io.write.animate import record
 from warp_corot.materials.anisotropic import Orthotropic, TransverselyIsotropic
 from warp_corot.materials.isotropic import Isotropic
 from warp_corot.materials.reinforced import FibreReinforced
-from warp_corot.remesh.online import OnlineRemesh
+from warp_corot.remesh.remeshing import OnlineRemesh
 from warp_corot.simulation.energy import Energy, WorldEnergies
 from warp_corot.simulation.progress import show_progress
 from warp_corot.simulation.simulation import Simulation

@@ -188,7 +188,7 @@ def find_due(
     is_first = visits.is_first[0] != 0
     n = int(begin)
     while n < end:
-        if not is_first and body.load_stride == 0:
+        if not is_first and body.load.shape[0] == 0:
             n = next_due(
                 n, end, part.shift, used, kick_of(pace, offset), damped, AHEAD * dt, body.gravity, part.nodes.node,
                 visits.budgets, body.inverse_mass, body.f, body.u, body.v,

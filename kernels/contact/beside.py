@@ -10,7 +10,7 @@ from .shapes import GROUND, distance_to, sure_distance
 from .sleep import end_search
 from .touches import Touches
 from .vertices import Rigid
-from .watch import ASKED, FARTHEST, Watch, fastest_motion
+from .watch import ASKED, FARTHEST, Watch, end_asking, fastest_motion
 
 wp.set_module_options({"enable_backward": False})
 
@@ -71,6 +71,7 @@ def find_triangle(
             return
     touches.shares[o, t] = wp.vec3()
     touches.force[o, t] = wp.vec3()
+    touches.more[o, t] = wp.vec3()
     touches.acts[o, t] = 0
 
 
@@ -128,6 +129,10 @@ def search_near(
                 begin_search(k, poses, surface, rigid.motions, watch, near)
                 k += threads
         elif phase == BESIDE_OBSTACLES:
+            while k < watch.drift.shape[0]:
+                end_asking(k, watch)
+                k += threads
+            k = start
             while obstacles > 0 and k < places + touches.force.shape[0] * touches.force.shape[1]:
                 if k < places:
                     find_node(k, watch, rigid, near)

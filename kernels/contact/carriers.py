@@ -21,7 +21,7 @@ class Carriers:
 
     entry: wp.array[wp.int32]  # of the node in the vectors of the step; -1: unused
     compliance: wp.array[wp.float32]  # of the node alone [m/N]; zero: it is held
-    crowd: wp.array[wp.float32]  # the sum of shares in contacts that push
+    crowd: wp.array2d[wp.float32]  # [2, C] the sum of weights in obstacles that push, and in pairs
     gone: wp.array[wp.vec3]  # how far a held node has gone in the step [m]
 
 
@@ -58,7 +58,6 @@ def begin_carriers(
     surface.d[s] = wp.vec3()
     surface.yielding[s] = 0.0
     carriers.compliance[c] = 0.0
-    carriers.crowd[c] = 0.0
     carriers.gone[c] = wp.vec3()
     carriers.entry[c] = -1
     if i < 0:
@@ -78,120 +77,98 @@ def begin_carriers(
 
 
 @wp.func
+def carriers_of(s: int, surface: Surface):
+    """The numbers of a place's carriers, and its weights, zero for none."""
+    if is_borne(s, surface):
+        first = surface.node.shape[0]
+        return surface.bearing.bearers[s] + wp.vec4i(first, first, first, first), surface.bearing.weights[s]
+    return wp.vec4i(s, s, s, s), wp.vec4(1.0, 0.0, 0.0, 0.0)
+
+
+@wp.func
 def motion_at(s: int, surface: Surface, carriers: Carriers, d: wp.array[wp.vec4]):
     """The motion of a place after motions d [m]."""
-    if is_borne(s, surface):
-        e = wp.vec3()
-        first = surface.node.shape[0]
-        b = surface.bearing.bearers[s]
-        w = surface.bearing.weights[s]
-        for k in range(4):
-            if w[k] != 0.0:
-                e += w[k] * load_node(d, carriers.entry[first + b[k]])
-        return e
-    return load_node(d, carriers.entry[s])
+    c, w = carriers_of(s, surface)
+    e = wp.vec3()
+    for k in range(4):
+        if w[k] != 0.0:
+            e += w[k] * load_node(d, carriers.entry[c[k]])
+    return e
 
 
 @wp.func
 def gone_at(s: int, surface: Surface, carriers: Carriers):
     """How far held nodes have moved a place in the step [m]."""
-    if is_borne(s, surface):
-        e = wp.vec3()
-        first = surface.node.shape[0]
-        b = surface.bearing.bearers[s]
-        w = surface.bearing.weights[s]
-        for k in range(4):
-            if w[k] != 0.0:
-                e += w[k] * carriers.gone[first + b[k]]
-        return e
-    return carriers.gone[s]
+    c, w = carriers_of(s, surface)
+    e = wp.vec3()
+    for k in range(4):
+        if w[k] != 0.0:
+            e += w[k] * carriers.gone[c[k]]
+    return e
 
 
 @wp.func
 def push_at(s: int, force: wp.vec3, surface: Surface, carriers: Carriers, y: wp.array[wp.vec4]):
     """Add a force at a place to its carriers that are free [N]."""
-    if is_borne(s, surface):
-        first = surface.node.shape[0]
-        b = surface.bearing.bearers[s]
-        w = surface.bearing.weights[s]
-        for k in range(4):
-            c = first + b[k]
-            if w[k] != 0.0 and carriers.compliance[c] > 0.0:
-                add_force(y, carriers.entry[c], w[k] * force)
-    elif carriers.compliance[s] > 0.0:
-        add_force(y, carriers.entry[s], force)
+    c, w = carriers_of(s, surface)
+    for k in range(4):
+        if w[k] != 0.0 and carriers.compliance[c[k]] > 0.0:
+            add_force(y, carriers.entry[c[k]], w[k] * force)
 
 
 @wp.func
-def couple_at(c: int, places: int, s: int, part: wp.vec3, surface: Surface, carriers: Carriers, couplings: Couplings):
-    """Add a place's free carriers to the c-th product of an assembled matrix, which has ``places`` nodes; returns how
-    many it has then."""
-    if is_borne(s, surface):
-        first = surface.node.shape[0]
-        b = surface.bearing.bearers[s]
-        w = surface.bearing.weights[s]
-        for k in range(4):
-            if w[k] != 0.0 and carriers.compliance[first + b[k]] > 0.0:
-                places = couple(c, places, carriers.entry[first + b[k]], w[k] * part, couplings)
-    elif carriers.compliance[s] > 0.0:
-        places = couple(c, places, carriers.entry[s], part, couplings)
+def couple_at(
+    number: int, places: int, s: int, part: wp.vec3, surface: Surface, carriers: Carriers, couplings: Couplings
+):
+    """Add a place's free carriers to a product of an assembled matrix with this number, which has ``places`` nodes;
+    returns how many it has then."""
+    c, w = carriers_of(s, surface)
+    for k in range(4):
+        if w[k] != 0.0 and carriers.compliance[c[k]] > 0.0:
+            places = couple(number, places, carriers.entry[c[k]], w[k] * part, couplings)
     return places
 
 
 @wp.func
-def crowd_at(s: int, share: float, surface: Surface, carriers: Carriers):
-    """Count a contact that pushes at a place with a share of its force."""
-    if is_borne(s, surface):
-        first = surface.node.shape[0]
-        b = surface.bearing.bearers[s]
-        w = surface.bearing.weights[s]
-        for k in range(4):
-            if w[k] != 0.0:
-                wp.atomic_add(carriers.crowd, first + b[k], wp.abs(w[k] * share))
-    else:
-        wp.atomic_add(carriers.crowd, s, wp.abs(share))
+def crowd_at(kind: int, s: int, share: float, surface: Surface, carriers: Carriers):
+    """Count a contact that pushes at a place with a share of its force; ``kind``: 1 for pairs, else 0."""
+    c, w = carriers_of(s, surface)
+    for k in range(4):
+        if w[k] != 0.0:
+            wp.atomic_add(carriers.crowd, kind, c[k], wp.abs(w[k] * share))
 
 
 @wp.func
-def ease_at(s: int, share: float, surface: Surface, carriers: Carriers):
+def ease_at(kind: int, s: int, share: float, surface: Surface, carriers: Carriers):
     """How far a contact moves with a place that has this share in it, for each unit of force, if all contacts around
     push alike [m/N].
     """
-    share = wp.abs(share)
-    if is_borne(s, surface):
-        total = float(0.0)
-        first = surface.node.shape[0]
-        b = surface.bearing.bearers[s]
-        w = surface.bearing.weights[s]
-        for k in range(4):
-            part = share * wp.abs(w[k])
-            c = first + b[k]
-            if part > 0.0:
-                total += part * wp.max(carriers.crowd[c], part) * carriers.compliance[c]
-        return total
-    return share * wp.max(carriers.crowd[s], share) * carriers.compliance[s]
+    c, w = carriers_of(s, surface)
+    total = float(0.0)
+    for k in range(4):
+        part = wp.abs(share * w[k])
+        if part > 0.0:
+            total += part * wp.max(carriers.crowd[kind, c[k]], part) * carriers.compliance[c[k]]
+    return total
 
 
 @wp.func
 def is_held_at(s: int, surface: Surface, carriers: Carriers):
     """Whether all carriers of a place are held."""
-    if is_borne(s, surface):
-        return surface.yielding[s] == 0.0
-    return carriers.compliance[s] == 0.0
+    c, w = carriers_of(s, surface)
+    free = bool(False)
+    for k in range(4):
+        free = free or (w[k] != 0.0 and carriers.compliance[c[k]] > 0.0)
+    return not free
 
 
 @wp.func
-def mark_carriers(s: int, surface: Surface, marked: wp.array[wp.int32]):
-    """Mark the carriers of a place."""
-    if is_borne(s, surface):
-        first = surface.node.shape[0]
-        b = surface.bearing.bearers[s]
-        w = surface.bearing.weights[s]
-        for k in range(4):
-            if w[k] != 0.0:
-                marked[first + b[k]] = 1
-    else:
-        marked[s] = 1
+def mark_carriers(s: int, mark: int, surface: Surface, marked: wp.array[wp.int32]):
+    """Add a mark to the carriers of a place."""
+    c, w = carriers_of(s, surface)
+    for k in range(4):
+        if w[k] != 0.0:
+            wp.atomic_or(marked, c[k], mark)
 
 
 @wp.kernel(enable_backward=False)

@@ -2,13 +2,15 @@
 
 import warp as wp
 
-from .shapes import Shapes, distance_to
+from .shapes import GRID, MESH, Shapes, distance_to
 
 wp.set_module_options({"enable_backward": False})
 
 #: In the search for the deepest point of a triangle: number of moves towards a corner, and of halvings of each move.
 TURNS = wp.constant(8)
 HALVINGS = wp.constant(6)
+#: The search ends if the deepest point is at most this fraction of the triangle's size deeper.
+CLOSE_ENOUGH = wp.constant(1.0e-4)
 
 
 @wp.func
@@ -171,19 +173,26 @@ def segment_to_triangle(p: wp.vec3, q: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.ve
 
 
 @wp.func
-def deepest_on_triangle(shapes: Shapes, o: int, pose: wp.transform, most: float, a: wp.vec3, b: wp.vec3, c: wp.vec3):
+def deepest_on_triangle(
+    shapes: Shapes, o: int, pose: wp.transform, most: float, far: float, a: wp.vec3, b: wp.vec3, c: wp.vec3
+):
     """Barycentric coordinates of the point of a triangle that is deepest in an obstacle, or closest to it.
 
     This is Frank and Wolfe's method: move towards the corner in whose direction the distance falls most steeply, as far
-    as it falls. It converges for convex obstacles, and often ends at that corner.
+    as it falls. It converges for convex obstacles, and often ends at that corner. The distance to a convex obstacle is
+    nowhere less than that corner's by the gradient (the method's duality gap): it ends early if that is no improvement,
+    or farther away than ``far``.
     """
     w = wp.vec3(1.0, 1.0, 1.0) / 3.0
     corners = wp.matrix_from_rows(a, b, c)
+    little = CLOSE_ENOUGH * wp.max(wp.length(b - a), wp.length(c - a))
+    is_convex = shapes.kind[o] != MESH and shapes.kind[o] != GRID
     # These loops are not unrolled: they would contain the distance function 64 times, which takes minutes to compile.
     turns = int(0)
     while turns < TURNS:
         turns += 1
-        _distance, n = distance_to(shapes, o, pose, point_of(w, a, b, c), most)
+        x = point_of(w, a, b, c)
+        distance, n = distance_to(shapes, o, pose, x, most)
         falls = corners * n
         k = int(0)
         if falls[1] < falls[k]:
@@ -198,7 +207,9 @@ def deepest_on_triangle(shapes: Shapes, o: int, pose: wp.transform, most: float,
         # Try the corner itself first.
         middle = float(1.0)
         halvings = int(0)
-        if w[k] == 1.0:
+        gains = wp.dot(n, x) - falls[k]
+        if w[k] == 1.0 or (is_convex and (gains <= little or distance - gains > far)):
+            middle = 0.0
             halvings = HALVINGS + 1
             turns = TURNS + 0
         while halvings <= HALVINGS:

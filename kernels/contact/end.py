@@ -4,8 +4,8 @@ import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
 from warp_corot.kernels.modules import INLINED
+from warp_corot.kernels.stepping.balance import count_constraint
 from warp_corot.kernels.stepping.pace import Pace
-from warp_corot.kernels.stepping.work import count_constraint
 
 from .begin import BLOCK as BLOCK
 from .mass_split import Sums, take_force

@@ -11,12 +11,28 @@ wp.set_module_options({"enable_backward": False})
 
 #: The largest cosine between the normals of two surfaces that face each other.
 FACING = wp.constant(-0.5)
+#: A node's surface faces a triangle if the cosine between the outward normals of both is below minus this.
+ACROSS = wp.constant(0.1)
+#: Triangles whose height is less than this fraction of the longest side are slivers.
+SLIVER = wp.constant(0.1)
 #: A node this far outside a triangle's border, relative to the triangle's size, still counts as being at the triangle.
 BORDER = wp.constant(0.02)
 #: Fraction of an edge at each end that is left to its nodes; and the least sine of the angle between edges that are not
 #: parallel.
 ENDS = wp.constant(1.0e-3)
 PARALLEL = wp.constant(0.05)
+
+
+@wp.func
+def firm_normal(surface: Surface, c: wp.vec3i):
+    """The normal of a triangle, shorter the more of a sliver that is: some slivers at rims of own surfaces are turned
+    over."""
+    a = surface.x[c[0]]
+    b = surface.x[c[1]] - a
+    d = surface.x[c[2]] - a
+    n = wp.cross(b, d)
+    longest = wp.max(wp.max(wp.length_sq(b), wp.length_sq(d)), wp.length_sq(d - b))
+    return n / wp.max(wp.length(n), SLIVER * longest)
 
 
 @wp.func
@@ -84,7 +100,7 @@ def faces(s: int, n: wp.vec3, surface: Surface, meeting: Meeting):
     """
     out = wp.vec3()
     for k in range(meeting.corner_starts[s], meeting.corner_starts[s + 1]):
-        each = triangle_normal(surface, meeting.triangles[meeting.corners[k] / 3])
+        each = firm_normal(surface, meeting.triangles[meeting.corners[k] / 3])
         if wp.dot(each, n) < FACING:
             return True
         out += each
@@ -222,8 +238,8 @@ def is_faced(row: int, s: int, surface: Surface, meeting: Meeting, rows: Rows):
     """
     out = wp.vec3()
     for k in range(meeting.corner_starts[s], meeting.corner_starts[s + 1]):
-        out += triangle_normal(surface, meeting.triangles[meeting.corners[k] / 3])
-    return wp.dot(out, rows.normal[row]) <= 0.0
+        out += firm_normal(surface, meeting.triangles[meeting.corners[k] / 3])
+    return wp.dot(out, rows.normal[row]) <= -ACROSS * wp.length(out)
 
 
 @wp.func

@@ -3,7 +3,7 @@
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node
-from warp_corot.kernels.stepping.integrate import symplectic_euler_velocity
+from warp_corot.kernels.stepping.integrate import Dynamics, force_at, symplectic_euler_velocity
 from warp_corot.kernels.stepping.pace import DT, Pace, length_before, time_after
 
 wp.set_module_options({"enable_backward": False})
@@ -67,31 +67,6 @@ class Foreseen:
     yielding: float
     loose: float  # share of the weights that free nodes have
     held: wp.vec3  # part of the displacement that comes from held nodes [m]
-
-
-@wp.struct
-class Dynamics:
-    """What moves the nodes of a body in an explicit step."""
-
-    damping: float  # [1/s]
-    gravity: wp.vec3  # [m/s^2]
-    inverse_mass: wp.array[wp.float32]  # [1/kg]; zero for held nodes
-    load: wp.array[wp.float32]  # external forces [N], so many numbers for each node; zero: there are none
-    load_stride: int
-    rest: wp.array[wp.vec4]  # [m]
-    f: wp.array[wp.vec4]  # all forces but loads and gravity [N]
-    u: wp.array[wp.vec4]  # [m]
-    v: wp.array[wp.vec4]  # [m/s]
-
-
-@wp.func
-def force_at(i: int, body: Dynamics):
-    """The force on a node besides gravity [N]."""
-    force = load_node(body.f, i)
-    if body.load_stride > 0:
-        k = body.load_stride * i
-        force += wp.vec3(body.load[k], body.load[k + 1], body.load[k + 2])
-    return force
 
 
 @wp.func

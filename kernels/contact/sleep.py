@@ -152,10 +152,11 @@ def end_search(sleeps: int, near: Near, watch: Watch):
     is_clear = near.count[0] == 0 and near.touch_count[0] == 0
     if sleeps != 0:
         meets = watch.most_calm > 0.0
-        needed = watch.spread * reserved(watch.fastest[0], 1.0, HIT, watch)
+        fastest = watch.fastest[0]
+        needed = watch.spread * reserved(fastest, fastest, 1.0, HIT, watch)
         room = 0.5 * watch.room[0]
         # Everything may move by what is reserved for something at rest, too.
-        reserve = wp.where(meets, watch.calm[0], reserved(0.0, 1.0, watch.hit, watch) + room)
+        reserve = wp.where(meets, watch.calm[0], reserved(0.0, fastest, 1.0, watch.hit, watch) + room)
         if is_clear and reserve >= needed:
             watch.free[0] = reserve / watch.spread
             watch.free[1] = room
@@ -164,6 +165,3 @@ def end_search(sleeps: int, near: Near, watch: Watch):
             wake(watch)
     watch.fastest[0] = 0.0
     watch.searches[0] = watch.searches[0] + 1
-    for world in range(watch.asked.shape[0]):
-        for k in range(4):
-            watch.asked[world, k] = wp.int64(0)

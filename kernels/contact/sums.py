@@ -183,16 +183,14 @@ def forget_places(
     triangles: wp.array[wp.vec3i],
     # In and out
     rigid: Rigid,
-    kinds: wp.array2d[wp.int32],
     touches: Touches,
 ):
     """Forget the last step's contact with obstacles, of places and triangles in chosen worlds."""
     o, k = wp.tid()
-    if k < kinds.shape[1] and rigid.surface.node[k] >= 0 and chosen[rigid.surface.world[k]] != 0:
+    if k < rigid.forces.shape[1] and rigid.surface.node[k] >= 0 and chosen[rigid.surface.world[k]] != 0:
         rigid.forces[o, k] = wp.vec3()
         rigid.anchors[o, k] = wp.vec4()
         rigid.allowance[o, k] = 0.0
-        kinds[o, k] = 0
     if k < touches.force.shape[1]:
         corner = triangles[k][0]
         if corner >= 0 and chosen[rigid.surface.world[corner]] != 0:

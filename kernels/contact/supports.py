@@ -28,20 +28,12 @@ class Support:
 
 
 @wp.func
-def add_support(support: Support, s: int, weight: float, yielding: wp.array[wp.float32], surface: Surface):
-    """Add a place with a positive weight.
-
-    Args:
-        support: The sums so far.
-        s: The place.
-        weight: Its weight.
-        yielding: As in ``Surface``, also for nodes that another process moves.
-        surface: The surface.
-    """
+def add_support(support: Support, s: int, weight: float, surface: Surface):
+    """Add a place with a positive weight to the sums so far."""
     out = weight * (surface.x[s] - surface.rest[s])
     support.total += weight
     support.out += out
-    if yielding[s] > 0.0:
+    if surface.yielding[s] > 0.0:
         support.loose += weight * loose_share(s, surface)
         if is_borne(s, surface):
             support.held += weight * surface.bearing.held[s]
@@ -79,39 +71,13 @@ def left_overlap(gap: float, loose: float, beyond: float):
 
 
 @wp.func
-def loose_at_triangle(w: wp.vec3, corners: wp.vec3i, yielding: wp.array[wp.float32], surface: Surface):
-    """The share of free nodes at a triangle's point. ``yielding``: see ``add_support``."""
-    loose = float(0.0)
-    for k in range(3):
-        if yielding[corners[k]] > 0.0:
-            loose += w[k] * loose_share(corners[k], surface)
-    return loose
-
-
-@wp.func
-def loose_at_pair(p: wp.vec4i, w: wp.vec4, surface: Surface):
-    """The sum of the shares of free nodes at both sides of a pair."""
+def loose_at(p: wp.vec4i, w: wp.vec4, surface: Surface):
+    """The sum of the shares of free nodes at places p with weights w."""
     loose = float(0.0)
     for k in range(4):
-        if surface.yielding[p[k]] > 0.0:
+        if w[k] != 0.0 and surface.yielding[p[k]] > 0.0:
             loose += wp.abs(w[k]) * loose_share(p[k], surface)
     return loose
-
-
-@wp.func
-def left_at_triangle(
-    w: wp.vec3, corners: wp.vec3i, gap: float, n: wp.vec3, yielding: wp.array[wp.float32], surface: Surface
-):
-    """How deep a triangle's point with the shares w may stay in an obstacle with the normal n [m]. ``yielding``: see
-    ``add_support``.
-    """
-    loose = loose_at_triangle(w, corners, yielding, surface)
-    if loose >= MOSTLY:
-        return 0.0
-    support = Support()
-    for k in range(3):
-        support = add_support(support, corners[k], w[k], yielding, surface)
-    return left_overlap(gap, loose, wp.dot(n, strayed(support)))
 
 
 @wp.func
@@ -123,16 +89,16 @@ def left_between(p: wp.vec4i, w: wp.vec4, gap: float, loose: float, n: wp.vec3, 
     second = Support()
     for k in range(4):
         if w[k] > 0.0:
-            first = add_support(first, p[k], w[k], surface.yielding, surface)
+            first = add_support(first, p[k], w[k], surface)
         elif w[k] < 0.0:
-            second = add_support(second, p[k], -w[k], surface.yielding, surface)
+            second = add_support(second, p[k], -w[k], surface)
     return left_overlap(gap, loose, wp.dot(n, strayed(first) - strayed(second)))
 
 
 @wp.func
-def left_at_pair(p: wp.vec4i, w: wp.vec4, gap: float, n: wp.vec3, surface: Surface):
-    """The same for a pair, whatever its share of free nodes is."""
-    loose = loose_at_pair(p, w, surface)
+def left_at(p: wp.vec4i, w: wp.vec4, gap: float, n: wp.vec3, surface: Surface):
+    """The same whatever the share of free nodes is."""
+    loose = loose_at(p, w, surface)
     if loose >= MOSTLY:
         return 0.0
     return left_between(p, w, gap, loose, n, surface)

@@ -38,8 +38,9 @@ class Touches:
 
 
 @wp.func
-def nearest(shapes: Shapes, o: int, pose: wp.transform, most: float, a: wp.vec3, b: wp.vec3, c: wp.vec3):
-    """Weights of the corners at the closest point, the gap there, and the direction out of the obstacle."""
+def nearest(shapes: Shapes, o: int, pose: wp.transform, most: float, far: float, a: wp.vec3, b: wp.vec3, c: wp.vec3):
+    """Weights of the corners at the closest point, the gap there, and the direction out of the obstacle; any point if
+    all are farther away than ``far``."""
     kind = shapes.kind[o]
     size = shapes.size[o]
     centre = wp.transform_get_translation(pose)
@@ -57,7 +58,7 @@ def nearest(shapes: Shapes, o: int, pose: wp.transform, most: float, a: wp.vec3,
             return w, length - size[0], d / length
         # The axis passes through the triangle: the obstacle came from outside.
         return w, -size[0], -wp.normalize(wp.cross(b - a, c - a))
-    w = deepest_on_triangle(shapes, o, pose, most, a, b, c)
+    w = deepest_on_triangle(shapes, o, pose, most, far, a, b, c)
     gap, n = distance_to(shapes, o, pose, point_of(w, a, b, c), most)
     return w, gap, n
 
@@ -69,10 +70,12 @@ def find_touch(o: int, t: int, rigid: Rigid, triangles: wp.array[wp.vec3i], touc
     """
     was = touches.force[o, t]
     side = touches.normal[o, t]
-    touches.shares[o, t] = wp.vec3()
-    touches.force[o, t] = wp.vec3()
-    touches.more[o, t] = wp.vec3()
-    touches.acts[o, t] = 0
+    # Most triangles that something is near have no contact: these are only read.
+    if wp.length_sq(touches.shares[o, t]) > 0.0 or wp.dot(was, was) > 0.0:
+        touches.shares[o, t] = wp.vec3()
+        touches.force[o, t] = wp.vec3()
+        touches.more[o, t] = wp.vec3()
+        touches.acts[o, t] = 0
     corners = triangles[t]
     pose = rigid.motions.now[rigid.surface.world[corners[0]], o]
     later = rigid.motions.later[rigid.surface.world[corners[0]], o]
@@ -89,7 +92,7 @@ def find_touch(o: int, t: int, rigid: Rigid, triangles: wp.array[wp.vec3i], touc
     distance, _away = distance_to(rigid.shapes, o, pose, middle, size + far)
     if distance > size + far:
         return False
-    w, gap, n = nearest(rigid.shapes, o, pose, size + far, a, b, c)
+    w, gap, n = nearest(rigid.shapes, o, pose, size + far, far, a, b, c)
     if wp.dot(was, was) > 0.0 and wp.dot(n, side) < 0.0 and rigid.shapes.kind[o] == CAPSULE:
         # The axis has passed through since the last step.
         n = -n

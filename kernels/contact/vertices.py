@@ -39,6 +39,16 @@ def across(a: wp.vec3, normal: wp.vec3):
 
 
 @wp.func
+def forget_place(s: int, o: int, acted: int, was: wp.vec3, rigid: Rigid):
+    """Leave a place without contact in this step. Most that something is near are so already, and are only read."""
+    if acted != OUT or wp.dot(was, was) > 0.0:
+        rigid.forces[o, s] = wp.vec3()
+        rigid.more[o, s] = wp.vec3()
+        rigid.acts[o, s] = OUT
+    return False
+
+
+@wp.func
 def begin_place(s: int, o: int, dt: float, rigid: Rigid):
     """Find where an obstacle is in this step, and the force with which it begins: that of the last step.
 
@@ -46,11 +56,9 @@ def begin_place(s: int, o: int, dt: float, rigid: Rigid):
     there may be a force.
     """
     was = rigid.forces[o, s]
-    rigid.forces[o, s] = wp.vec3()
-    rigid.more[o, s] = wp.vec3()
-    rigid.acts[o, s] = OUT
+    acted = rigid.acts[o, s]
     if rigid.surface.yielding[s] == 0.0:
-        return False
+        return forget_place(s, o, acted, was, rigid)
     world = rigid.surface.world[s]
     now = rigid.motions.now[world, o]
     x = rigid.surface.x[s]
@@ -64,7 +72,7 @@ def begin_place(s: int, o: int, dt: float, rigid: Rigid):
         rigid.allowance[o, s] = allowance
         gap += allowance
     if gap > far and not pushed:
-        return False
+        return forget_place(s, o, acted, was, rigid)
     anchor = rigid.anchors[o, s]
     if anchor[3] > 0.0:
         held = wp.transform_point(now, wp.vec3(anchor[0], anchor[1], anchor[2]))
@@ -72,9 +80,12 @@ def begin_place(s: int, o: int, dt: float, rigid: Rigid):
     rigid.acts[o, s] = WAITS
     rigid.away[o, s] = wp.vec4(n[0], n[1], n[2], gap)
     rigid.moved[o, s] = moved
+    rigid.more[o, s] = wp.vec3()
     push = wp.max(wp.dot(was, n), 0.0)
+    force = wp.vec3()
     if push > 0.0:
-        rigid.forces[o, s] = push * n + held_back(across(was, n), push, rigid.shapes.friction[o])
+        force = push * n + held_back(across(was, n), push, rigid.shapes.friction[o])
+    rigid.forces[o, s] = force
     return True
 
 

@@ -54,7 +54,7 @@ class Watch:
     # ``reach`` is what they may stray, and how far they have strayed [m]; else empty
     ahead: wp.array[wp.vec3]
     strayed: wp.array[wp.float32]
-    fastest: wp.array[wp.float32]  # [1] largest motion in the step of the search
+    fastest: wp.array[wp.float32]  # [1 + W] largest motion in the step of the search, in any world and in each
     due: wp.array[wp.int32]  # [1] whether a search is due
     awake: wp.array[wp.int32]  # [1] whether steps look for forces; otherwise nothing is near (see ``sleep``)
     room: wp.array[wp.float32]  # [1] least distance between nodes and obstacles beyond what is reserved [m]
@@ -85,13 +85,12 @@ def wake(watch: Watch):
 
 
 @wp.func
-def reserved(step: float, farther: float, hit: float, watch: Watch):
-    """How far an item may move, given its motion in the present step; ``farther``: so many times as far; ``hit``: how
-    many times the largest motion if it is hit."""
+def reserved(step: float, fastest: float, farther: float, hit: float, watch: Watch):
+    """How far an item may move, given its motion in the present step and the largest one in its world; ``farther``: so
+    many times as far; ``hit``: how many times the largest motion if it is hit."""
     farthest = wp.max(wp.min(farther, watch.most_alone) * watch.size, FAST * step)
     ahead = wp.min(farther * AHEAD * step, farthest)
-    hit *= watch.fastest[0]
-    return watch.least[0] + wp.min(ahead + hit, FARTHEST * watch.size)
+    return watch.least[0] + wp.min(ahead + hit * fastest, FARTHEST * watch.size)
 
 
 @wp.func
@@ -187,16 +186,40 @@ def move_obstacles(motions: Motions, pace: Pace, world_starts: wp.array[wp.float
 
 
 @wp.func
+def raise_world(world: int, motion: float, watch: Watch):
+    """Raise the largest motion in a world to at least this one; with one world that of any world serves [m]."""
+    if watch.fastest.shape[0] > 2 and motion > watch.fastest[1 + world]:
+        wp.atomic_max(watch.fastest, 1 + world, motion)
+
+
+@wp.func
 def fastest_motion(k: int, obstacles: int, surface: Surface, motions: Motions, watch: Watch):
-    """The motion in this step of a node or an obstacle with a number, whichever is faster [m]."""
+    """The motion in this step of a node or an obstacle with a number, whichever is faster [m]; those of their worlds
+    are raised to it."""
     fastest = float(0.0)
     if k < surface.node.shape[0] and surface.node[k] >= 0:
         fastest = wp.length(surface.d[k] - common_motion(surface.world[k], watch))
+        raise_world(surface.world[k], fastest, watch)
     if k < obstacles:
         world, o = pair_of(k, watch)
         motion = distance_between(motions.now[world, o], motions.later[world, o], motions.reach[o])
+        raise_world(world, motion, watch)
         fastest = wp.max(fastest, motion)
     return fastest
+
+
+@wp.func
+def fastest_in(world: int, watch: Watch):
+    """The largest motion in a world, after all have been found [m]."""
+    return watch.fastest[wp.where(watch.fastest.shape[0] > 2, 1 + world, 0)]
+
+
+@wp.func
+def end_asking(world: int, watch: Watch):
+    """Forget what was asked and found in a world for a search."""
+    watch.fastest[1 + world] = 0.0
+    for k in range(4):
+        watch.asked[world, k] = wp.int64(0)
 
 
 @wp.func
@@ -206,7 +229,7 @@ def reserve_obstacle(k: int, motions: Motions, watch: Watch):
     now = motions.now[world, o]
     watch.poses[world, o] = now
     step = distance_between(now, motions.later[world, o], motions.reach[o])
-    watch.reach_of[world, o] = reserved(step, 1.0, watch.hit, watch)
+    watch.reach_of[world, o] = reserved(step, fastest_in(world, watch), 1.0, watch.hit, watch)
 
 
 @wp.func
@@ -217,5 +240,6 @@ def reserve_node(s: int, farther: float, surface: Surface, watch: Watch):
         watch.ahead[s] = surface.d[s] - common_motion(surface.world[s], watch)
         watch.reach[s] = watch.least[0] + wp.min(watch.strayed[s], STRAYED * watch.size)
         return
-    step = wp.length(surface.d[s] - common_motion(surface.world[s], watch))
-    watch.reach[s] = wp.max(reserved(step, farther, watch.hit, watch), watch.calm[0])
+    world = surface.world[s]
+    step = wp.length(surface.d[s] - common_motion(world, watch))
+    watch.reach[s] = wp.max(reserved(step, fastest_in(world, watch), farther, watch.hit, watch), watch.calm[0])

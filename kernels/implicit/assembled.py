@@ -1,7 +1,7 @@
 """Linear solves with an assembled matrix: block rows of all bodies, and contacts as products of vectors beside them.
 
 A contact that pushes adds sums of c c^T to the matrix, where c couples the nodes that bear it. Entries of the matrix
-are stored transposed, as in ``multigrid.values``. Nodes that obstacles hold move in the range of a projector S only.
+are stored transposed, as in ``multigrid.values``.
 """
 
 import warp as wp
@@ -39,10 +39,7 @@ class Couplings:
     nodes: wp.array2d[wp.int32]  # in the vectors of all worlds; -1 where there is none
     parts: wp.array2d[wp.vec4]  # of c at each node [sqrt(N/m)]
     blocks: wp.array[wp.mat33]  # the diagonal blocks of the sum, by node [N/m]
-    projected: wp.array[wp.int32]  # whether an obstacle holds a node, by node
-    projectors: wp.array[wp.mat33]  # S, by node
-    drag: wp.array[wp.mat33]  # the derivative of friction at nodes that are held, by node [N/m]
-    first: int  # the first node of the body whose contacts are added
+    single: wp.array[wp.mat33]  # the derivatives of contacts of one node, which are no products, by node [N/m]
 
 
 @wp.struct
@@ -104,14 +101,13 @@ def finish_matrix(
     inverses: wp.array[wp.mat33],
     planes: wp.array[wp.float32],
 ):
-    """From the row ``begin`` on: the diagonal with friction; the same with contacts, in the range of S; and the inverse
-    of that there. Unless the matrix ``is_new``, only rows that contact changes, or has changed: ``marks`` says
-    which."""
+    """From the row ``begin`` on: the diagonal with contacts of one node; with all contacts; and the inverse of that.
+    Unless the matrix ``is_new``, only rows that contact changes, or has changed: ``marks`` says which."""
     world, k = wp.tid()
     k += begin
     i = world * count + k
     node = world * count + nodes[k]
-    touches = couplings.projected[node] != 0 or wp.trace(couplings.blocks[node]) > 0.0
+    touches = wp.trace(couplings.single[node]) > 0.0 or wp.trace(couplings.blocks[node]) > 0.0
     if is_new == 0 and not touches and marks[i] == 0:
         return
     marks[i] = wp.where(touches, 1, 0)
@@ -119,17 +115,10 @@ def finish_matrix(
     inverse = wp.mat33()
     whole = wp.mat33()
     if wp.trace(own) > 0.0:
-        if couplings.projected[node] != 0:
-            own += couplings.drag[node]
+        own += couplings.single[node]
         whole = own + couplings.blocks[node]
         whole = 0.5 * (whole + wp.transpose(whole))
-        if couplings.projected[node] != 0:
-            s = couplings.projectors[node]
-            away = (wp.trace(whole) / 3.0) * (wp.identity(n=3, dtype=float) - s)
-            whole = s * whole * s
-            inverse = s * inverse_block(whole + away) * s
-        else:
-            inverse = inverse_block(whole)
+        inverse = inverse_block(whole)
         blocks[world * entries + diagonal[k]] = own
         if planes.shape[0] > 1:
             write_planes(world, diagonal[k], entries, own, planes)
@@ -184,10 +173,15 @@ def begin_coupling(couplings: Couplings):
 
 
 @wp.func
-def couple(c: int, places: int, entry: int, part: wp.vec3, couplings: Couplings):
-    """Add a node of the body to a product that has ``places``; returns how many it has then."""
+def add_block(node: int, block: wp.mat33, couplings: Couplings):
+    """Add the derivative of a contact of one node."""
+    wp.atomic_add(couplings.single, node, block)
+
+
+@wp.func
+def couple(c: int, places: int, node: int, part: wp.vec3, couplings: Couplings):
+    """Add a node to a product that has ``places``; returns how many it has then."""
     at = int(0)
-    node = couplings.first + entry
     while at < places and couplings.nodes[c, at] != node:
         at += 1
     if at == places:

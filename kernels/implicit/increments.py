@@ -1,12 +1,18 @@
-"""Increments of an implicit step from linear solves, and when they are good enough."""
+"""Increments of an implicit step from linear solves, and the turn of a free body at which a step is linearised.
+
+A linearisation at the beginning of the step takes a turn by an angle a for a stretch of a^2 / 2. So the state is turned
+first as the body turns as a whole. Then strains are the same, and forces have the directions of the end of the step.
+"""
 
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
+from warp_corot.kernels.stepping.balance import sum_of_lanes
 
-from .conjugate_gradients import BROKEN, CONVERGED, LIMIT
+from .conjugate_gradients import BROKEN, CONVERGED, LIMIT, add_up
 
 wp.set_module_options({"enable_backward": False})
+
 
 #: Columns of sizes: the largest change of an increment, and the largest displacement [m].
 CHANGE, REACH = (wp.constant(k) for k in range(2))
@@ -117,3 +123,132 @@ def judge_increments(
         status[world] = LIMIT
         if iterations[world] < most:
             going[0] = 1
+
+
+#: The sums: mass, the number of held nodes, and from here on moments of mass, momenta and squares.
+MASS, HELD, FIRST, MOMENTUM, SPIN, SQUARES = (wp.constant(k) for k in (0, 1, 2, 5, 8, 11))
+MOTION_COLUMNS = 17
+Sums = wp.types.vector(length=MOTION_COLUMNS, dtype=wp.float64)
+#: A smaller turn is left out: its square is within the rounding of strains [rad].
+LEAST = wp.constant(wp.float64(1.0e-3))
+
+
+@wp.func
+def motion_of(m: wp.float64, is_held: bool, x: wp.vec3d, v: wp.vec3d):
+    """A node's share of the sums."""
+    one = Sums()
+    spin = wp.cross(x, v)
+    one[MASS] = m
+    if is_held:
+        one[HELD] = wp.float64(1.0)
+    for axis in range(3):
+        after = (axis + 1) % 3
+        one[FIRST + axis] = m * x[axis]
+        one[MOMENTUM + axis] = m * v[axis]
+        one[SPIN + axis] = m * spin[axis]
+        one[SQUARES + axis] = m * x[axis] * x[axis]
+        one[SQUARES + 3 + axis] = m * x[axis] * x[after]
+    return one
+
+
+@wp.kernel(enable_backward=False)
+def sum_motion(
+    # In
+    mass: wp.array[wp.float32],
+    inverse_mass: wp.array[wp.float32],
+    rest: wp.array[wp.vec4],
+    u: wp.array[wp.vec4],
+    v: wp.array[wp.vec4],
+    count: int,
+    threads: int,
+    lanes: int,
+    # Out
+    parts: wp.array3d[wp.float64],
+):
+    """Find parts of the sums of each world."""
+    world, thread = wp.tid()
+    total = Sums()
+    k = thread
+    while k < count:
+        i = world * count + k
+        if mass[i] > 0.0:
+            x = wp.vec3d(load_node(rest, i)) + wp.vec3d(load_node(u, i))
+            total += motion_of(wp.float64(mass[i]), inverse_mass[i] == 0.0, x, wp.vec3d(load_node(v, i)))
+        k += threads
+    for column in range(MOTION_COLUMNS):
+        part = sum_of_lanes(total[column])
+        if thread % lanes == 0:
+            parts[world, thread / lanes, column] = part
+
+
+@wp.func
+def skew(w: wp.vec3d):
+    zero = wp.float64(0.0)
+    return wp.mat33d(zero, -w[2], w[1], w[2], zero, -w[0], -w[1], w[0], zero)
+
+
+@wp.kernel(enable_backward=False)
+def find_turns(
+    # In
+    parts: wp.array3d[wp.float64],
+    lanes: int,
+    dt: wp.float64,
+    # Out
+    centres: wp.array[wp.vec3],
+    turns: wp.array[wp.mat33],
+    any_turns: wp.array[wp.int32],
+):
+    """Find the rotation Q - 1 of each world's body about its centre of mass in a step of backward Euler: that of
+    1 + dt [w] with the angular velocity w, by atan(dt |w|). It is zero for bodies with held nodes.
+    """
+    world, lane = wp.tid()
+    sums = Sums()
+    for column in range(MOTION_COLUMNS):
+        sums[column] = add_up(parts, world, lane, lanes, column)
+    if lane > 0:
+        return
+    centres[world] = wp.vec3()
+    turns[world] = wp.mat33()
+    m = sums[MASS]
+    if not m > wp.float64(0.0) or sums[HELD] > wp.float64(0.0):
+        return
+    first = wp.vec3d(sums[FIRST], sums[FIRST + 1], sums[FIRST + 2])
+    momentum = wp.vec3d(sums[MOMENTUM], sums[MOMENTUM + 1], sums[MOMENTUM + 2])
+    c = first / m
+    spin = wp.vec3d(sums[SPIN], sums[SPIN + 1], sums[SPIN + 2]) - wp.cross(c, momentum)
+    xx = sums[SQUARES] - first[0] * c[0]
+    yy = sums[SQUARES + 1] - first[1] * c[1]
+    zz = sums[SQUARES + 2] - first[2] * c[2]
+    xy = sums[SQUARES + 3] - first[0] * c[1]
+    yz = sums[SQUARES + 4] - first[1] * c[2]
+    zx = sums[SQUARES + 5] - first[2] * c[0]
+    w = dt * (wp.inverse(wp.mat33d(yy + zz, -xy, -zx, -xy, zz + xx, -yz, -zx, -yz, xx + yy)) * spin)
+    square = wp.dot(w, w)
+    # False if it is not finite.
+    if square > LEAST * LEAST and square < wp.float64(1.0e12):
+        s = wp.sqrt(wp.float64(1.0) + square)
+        k = skew(w)
+        turns[world] = wp.mat33(k / s + (k * k) / (s * (s + wp.float64(1.0))))
+        centres[world] = wp.vec3(c)
+        any_turns[0] = 1
+
+
+@wp.kernel(enable_backward=False)
+def turn_nodes(
+    # In
+    count: int,
+    rest: wp.array[wp.vec4],
+    u: wp.array[wp.vec4],
+    centres: wp.array[wp.vec3],
+    turns: wp.array[wp.mat33],
+    # Out
+    turned: wp.array[wp.vec4],
+    way: wp.array[wp.vec4],
+):
+    """Find the turned displacements, and the way to them."""
+    i = wp.tid()
+    world = i / count
+    place = load_node(u, i)
+    d = turns[world] * (load_node(rest, i) + place - centres[world])
+    store_node(turned, i, place + d)
+    store_node(way, i, d)

@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
 
-from .sums import add_up
+from .conjugate_gradients import add_up
 
 wp.set_module_options({"enable_backward": False})
 

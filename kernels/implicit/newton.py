@@ -10,8 +10,7 @@ import warp as wp
 from warp_corot.kernels.elements.elements import load_node, store_node
 from warp_corot.kernels.stepping.balance import most_of_lanes, sum_of_lanes
 
-from .conjugate_gradients import NEGATIVE, is_number
-from .sums import add_up, dot64
+from .conjugate_gradients import NEGATIVE, add_up, dot64, is_number
 
 wp.set_module_options({"enable_backward": False})
 

@@ -8,8 +8,8 @@ from warp_corot.kernels.elements.elements import load_node, store_node
 from warp_corot.kernels.stepping.balance import sum_of_lanes
 from warp_corot.kernels.stepping.integrate import by_vectors, vector_at
 
+from .conjugate_gradients import dot64
 from .newton import REFERENCE, SQUARE
-from .sums import dot64
 
 wp.set_module_options({"enable_backward": False})
 

@@ -15,19 +15,6 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 1})
 #: Search radius for the closest triangle [m]: unlimited.
 FAR = 1.0e15
 
-#: A group of triangles farther away than this many radii counts as one dipole in a winding number. At 1.5 no number was
-#: off by a quarter on closed surfaces (thin plates and shells included), at 1.0 a few were; 2.0 takes 1.5 times as
-#: long.
-ACCURACY = 1.5
-
-#: A closest point whose barycentric coordinate at a corner is below this is on the opposite edge.
-AT_EDGE = wp.constant(1.0e-4)
-
-# The sides of a triangle: the body is only behind it, or on both sides, or each point must be tested.
-UNSURE = wp.constant(0)
-BOUNDARY = wp.constant(1)
-BURIED = wp.constant(2)
-
 #: The most triangles through which a segment is followed, and how far beyond each it goes on, as a share of its length.
 MOST_PASSED = wp.constant(8)
 PASSED = wp.constant(1.0e-4)
@@ -130,37 +117,6 @@ def sampler(function: wp.Function) -> wp.Kernel:
     return evaluate_function
 
 
-@wp.func
-def pseudo_normal(
-    face: int,
-    u: float,
-    v: float,
-    indices: wp.array[wp.int32],
-    edge_normals: wp.array2d[wp.vec3],
-    corner_normals: wp.array[wp.vec3],
-    normal: wp.vec3,
-):
-    """The normal at a closest point that separates inside from outside: the triangle's own in its interior, on an edge
-    the sum of both triangles' normals, at a corner the angle-weighted sum (Baerentzen and Aanaes 2005)."""
-    w = 1.0 - u - v
-    near = wp.vec3(u, v, w)
-    count = int(0)
-    last = int(0)
-    kept = int(0)
-    for n in range(3):
-        if near[n] < AT_EDGE:
-            count += 1
-            last = n
-        else:
-            kept = n
-    found = normal
-    if count == 1:
-        found = edge_normals[face, last]
-    elif count == 2:
-        found = corner_normals[indices[3 * face + kept]]
-    return found
-
-
 @wp.kernel(enable_backward=False)
 def evaluate_surface(
     # In
@@ -168,46 +124,15 @@ def evaluate_surface(
     mesh: wp.uint64,
     indices: wp.array[wp.int32],
     lines: Lines,
-    sides: wp.array[wp.uint8],
-    edge_normals: wp.array2d[wp.vec3],
-    corner_normals: wp.array[wp.vec3],
     # Out
     phi: wp.array[wp.float32],
 ):
-    """Distance to the closest triangle, negative where the winding number is above one half. For a triangle with the
-    outside in front of it and the inside behind, its normal gives the sign twice as fast."""
+    """Distance to the closest triangle, negative where the winding number is above one half."""
     i = wp.tid()
     p = points[i]
     found = wp.mesh_query_point_no_sign(mesh, p, FAR)
-    apart = p - wp.mesh_eval_position(mesh, found.face, found.u, found.v)
-    side = int(sides[found.face])
-    sign = float(-1.0)
-    if side == UNSURE:
-        sign = wp.where(winding_number(mesh, indices, lines, p) > 0, -1.0, 1.0)
-    elif side == BOUNDARY:
-        normal = wp.mesh_eval_face_normal(mesh, found.face)
-        normal = pseudo_normal(found.face, found.u, found.v, indices, edge_normals, corner_normals, normal)
-        sign = wp.where(wp.dot(apart, normal) < 0.0, -1.0, 1.0)
-    phi[i] = sign * wp.length(apart)
-
-
-@unique_kernel()
-def count_windings(
-    # In
-    points: wp.array[wp.vec3],
-    mesh: wp.uint64,
-    thresholds: wp.array[wp.float32],
-    # Out
-    above: wp.array[wp.int32],
-):
-    """How many of the ascending thresholds the winding number at a point exceeds."""
-    i = wp.tid()
-    count = int(0)
-    for k in range(thresholds.shape[0]):
-        found = wp.mesh_query_point_sign_winding_number(mesh, points[i], FAR, ACCURACY, thresholds[k])
-        if found.sign < 0.0:
-            count += 1
-    above[i] = count
+    away = wp.length(p - wp.mesh_eval_position(mesh, found.face, found.u, found.v))
+    phi[i] = wp.where(winding_number(mesh, indices, lines, p) > 0, -away, away)
 
 
 @unique_kernel()
@@ -325,14 +250,13 @@ def evaluate_thickness(
     points: wp.array[wp.vec3],
     inward: wp.array[wp.vec3],
     reach: float,
-    side: float,
     mesh: wp.uint64,
     # Out
     thickness: wp.array[wp.float32],
 ):
-    """The distance along a direction to where a ray leaves the body (``side`` 1) or its surroundings (-1).
+    """The distance along a direction to where a ray leaves the body, ``reach`` if it is farther.
 
-    ``reach`` if it is farther. A triangle with the opposite orientation is an entry: an overlapping part.
+    A triangle with the opposite orientation is an entry: an overlapping part.
     """
     i = wp.tid()
     direction = inward[i]
@@ -343,7 +267,7 @@ def evaluate_thickness(
             found = wp.mesh_query_ray(mesh, points[i] + at * direction, direction, reach - at)
             if not found.result:
                 at = reach
-            elif side * wp.dot(wp.mesh_eval_face_normal(mesh, found.face), direction) > 0.0:
+            elif wp.dot(wp.mesh_eval_face_normal(mesh, found.face), direction) > 0.0:
                 thickness[i] = at + found.t
                 at = reach
             else:
@@ -356,35 +280,28 @@ def find_exits(
     starts: wp.array[wp.vec3],
     along: wp.array[wp.vec3],
     mesh: wp.uint64,
-    sides: wp.array[wp.uint8],
+    indices: wp.array[wp.int32],
+    lines: Lines,
     # Out
     shares: wp.array[wp.float32],
     normals: wp.array[wp.vec3],
 ):
-    """Where segments from inside to outside leave the body, as a share of their length, and the normal there.
-
-    The exit is at the first triangle that bounds the body, or at an unsure one if it is the only one; else -1.
-    """
+    """Where segments from inside to outside leave the body, as a share of their length, and the normal there; -1 for
+    segments with more triangles than are passed."""
     i = wp.tid()
     length = wp.length(along[i])
     direction = wp.normalize(along[i])
+    layers = winding_number(mesh, indices, lines, starts[i])
     at = float(0.0)
-    unsure = int(0)
-    share = float(-1.0)
+    shares[i] = -1.0
     for _ in range(MOST_PASSED):
-        if at < length:
+        if layers > 0 and at < length:
             found = wp.mesh_query_ray(mesh, starts[i] + at * direction, direction, length - at)
-            normal = wp.mesh_eval_face_normal(mesh, wp.max(found.face, 0))
-            at += found.t
-            if not found.result:
-                at = length
-            elif int(sides[found.face]) == BURIED:
-                at += PASSED * length
+            if found.result:
+                normals[i] = wp.mesh_eval_face_normal(mesh, found.face)
+                layers += wp.where(wp.dot(normals[i], direction) > 0.0, -1, 1)
+                if layers == 0:
+                    shares[i] = wp.min((at + found.t) / length, 1.0)
+                at += found.t + PASSED * length
             else:
-                leaves = wp.dot(normal, direction) > 0.0
-                share = wp.where(leaves and unsure == 0, wp.min(at / length, 1.0), -1.0)
-                normals[i] = normal
-                unsure += 1
-                at = wp.where(int(sides[found.face]) == BOUNDARY, length, at + PASSED * length)
-    # A segment with more triangles than can be passed is not followed to its end.
-    shares[i] = wp.where(at < length, -1.0, share)
+                at = length

@@ -27,18 +27,6 @@ vec6 = wp.types.vector(length=6, dtype=wp.float32)
 
 
 @wp.kernel(enable_backward=False)
-def flag_equal(
-    # In
-    states: wp.array[wp.int32],
-    state: int,
-    # Out
-    flags: wp.array[wp.int32],
-):
-    i = wp.tid()
-    flags[i] = wp.where(states[i] == state, 1, 0)
-
-
-@wp.kernel(enable_backward=False)
 def node_points(
     # In
     lattice: wp.array[wp.vec3i],
@@ -329,15 +317,3 @@ def judge_by_probes(
         state = SPLIT
     states[element - first] = state
     needs[element] = need
-
-
-@wp.kernel(enable_backward=False)
-def take_wishes(
-    # In
-    states: wp.array[wp.int32],
-    first: int,
-    # Out
-    wished: wp.array[wp.uint8],
-):
-    i = wp.tid()
-    wished[first + i] = wp.where(states[i] == SPLIT, wp.uint8(1), wp.uint8(0))

@@ -129,7 +129,6 @@ for (int world = team; world < worlds; world += teams) {
                     w.x += v.x; w.y += v.y; w.z += v.z;
                     *more = make_float4(0.0f, 0.0f, 0.0f, 0.0f);
                 }
-                if (couplings.projected.data[first + i]) w = times(&couplings.projectors.data[first + i].data[0][0], w);
                 *four_at(q, first + i) = w;
                 const float4 v = __ldcg(given + i), rest = *four_at(r, first + i);
                 gamma += (double)rest.x * v.x + (double)rest.y * v.y + (double)rest.z * v.z;

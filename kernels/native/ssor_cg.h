@@ -110,8 +110,6 @@ const auto sweep_back = [&](const auto& work) {
 const auto residual = [&]() {
     return for_rows([&](int i) {
         four v = below(half, i);
-        const long long node = first + node_of[i];
-        if (couplings.projected.data[node]) v = times(&couplings.projectors.data[node].data[0][0], v);
         v += times(pivot + 9ll * i, half[i]);
         return dot(v, v);
     });

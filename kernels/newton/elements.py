@@ -29,8 +29,8 @@ from warp_corot.kernels.elements.general_cuda import (
 from warp_corot.kernels.elements.simd8 import elastic, headers, scatter_simd8
 from warp_corot.kernels.math.rotation import byers_xu, cofactor, identity3, quick_rotation
 from warp_corot.kernels.modules import unique_kernel
-from warp_corot.kernels.stepping.gauge import TURNS, keep_largest
 from warp_corot.kernels.stepping.pace import GROWTH, LEAST, SAFE, STABLE, STRAIN, safe_step
+from warp_corot.kernels.stepping.stability import TURNS, keep_largest
 
 wp.set_module_options({"enable_backward": False})
 

@@ -29,8 +29,8 @@ from warp_corot.kernels.corotated.tangent import keep_gradients
 from warp_corot.kernels.elements.constitutive import hooke, symmetric
 from warp_corot.kernels.elements.elements import GeneralElements, add_force, load_node, store_node
 from warp_corot.kernels.implicit.assembled import root_columns
+from warp_corot.kernels.implicit.increments import COLUMNS, Sums, motion_of
 from warp_corot.kernels.implicit.line_search import TRIED
-from warp_corot.kernels.implicit.turning import COLUMNS, Sums, motion_of
 from warp_corot.kernels.math.rotation import byers_xu, identity3
 from warp_corot.kernels.stepping.balance import sum_of_lanes
 
@@ -238,7 +238,7 @@ def add_first(
     rounds[world] = solves[0] + 1
 
 
-# --- how free pieces turn in a step; see ``kernels.implicit.turning`` ------------------------------------------------
+# --- how free pieces turn in a step; see ``kernels.implicit.increments`` ----------------------------------------------
 #
 # A piece is all particles that tetrahedra connect. It is turned about its centre of mass, as it will turn in the step.
 

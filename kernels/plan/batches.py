@@ -10,8 +10,7 @@ from warp_corot.kernels.elements.elements import LEVEL_MASK
 from warp_corot.kernels.tables.shapes import MIRROR_BIT
 
 from .lists import LEAVES_OF_SUBTREE
-from .plan import Plan, extent, flat_row, places_t
-from .tree import Tree, code_above, padding, sink
+from .plan import Plan, Tree, code_above, extent, flat_row, padding, places_t, sink
 
 wp.set_module_options({"enable_backward": False})
 

@@ -17,8 +17,7 @@ from .batches import (
     share_place,
 )
 from .lists import LEAVES_OF_SUBTREE
-from .plan import Plan, extent, flat_row, places_t
-from .tree import Tree
+from .plan import Plan, Tree, extent, flat_row, places_t
 
 wp.set_module_options({"enable_backward": False})
 

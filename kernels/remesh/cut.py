@@ -5,14 +5,17 @@ leaves with centroids on either side, and strips that a blade sweeps one after t
 Both leaves keep a bit for the face in ``Pools.cut``; ``split`` then separates nodes.
 
 Leaves near the surface are listed, and their faces meet in a hash table: the second leaf to arrive finds the first.
-"""
+
+Tears: the stress across a face is N S N, with the face's normal N at rest and the second Piola-Kirchhoff stress S of
+St. Venant and Kirchhoff in the two leaves, in the mean; rotations do not change it. A face is cut if it is above a
+bound and no other face of its leaves is pulled harder, so that a tear runs instead of shattering what is around it."""
 
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node
 from warp_corot.kernels.meshing.growth import EMPTY, LIVE, claim_slot, edge_key
-
-from .cut_surface import (
+from warp_corot.kernels.remesh.criteria import Contents, green_strain, load_state
+from warp_corot.kernels.remesh.cut_surface import (
     NEAR,
     NEAR_DEFORMED,
     Surface,
@@ -25,8 +28,8 @@ from .cut_surface import (
     place_of,
     radius,
 )
-from .pools import ADDED, FRESH, FULL, LEAVES, REFINE, REMOVED, Pools
-from .state import Carried, doubled
+from warp_corot.kernels.remesh.pools import ADDED, FRESH, FULL, LEAVES, REFINE, REMOVED, Pools
+from warp_corot.kernels.remesh.state import Carried, doubled
 
 wp.set_module_options({"enable_backward": False})
 
@@ -423,3 +426,87 @@ def mark_bisected(
             for face in range(4):
                 if (pools.cut[e] >> face) % 2 == 1:
                     mark_face(pools.tets[e], face, carried, cuts)
+
+
+@wp.kernel(enable_backward=False)
+def list_all(
+    # In
+    threads: int,
+    # In and out
+    pools: Pools,
+    cuts: Cuts,
+):
+    """List all leaves."""
+    for i in range(wp.tid(), pools.counts[LEAVES], threads):
+        add_star(i, pools, cuts)
+
+
+@wp.kernel(enable_backward=False)
+def pull_faces(
+    # In
+    threads: int,
+    contents: Contents,
+    carried: Carried,
+    # In and out
+    pools: Pools,
+    cuts: Cuts,
+):
+    """Find the stress of each leaf across its faces, and the leaves on both sides of each."""
+    for s in range(wp.tid(), star_count(cuts), threads):
+        i = cuts.stars[s]
+        element = load_state(pools.leaves[i], carried.origin, carried.spacing, pools, contents, carried.u)
+        e = green_strain(element)
+        for face in range(4):
+            a = element.rest[face_node(face, 0)]
+            normal = wp.cross(element.rest[face_node(face, 1)] - a, element.rest[face_node(face, 2)] - a)
+            normal = wp.normalize(normal)
+            cuts.pull[4 * s + face] = element.lam * wp.trace(e) + 2.0 * element.mu * wp.dot(normal, e * normal)
+            meet(s, face, pools.leaf_tets[i], cuts)
+
+
+@wp.func
+def mean_pull(f: int, pools: Pools, cuts: Cuts):
+    """The mean stress across a face that holds two leaves together; zero across others."""
+    other = cuts.other[f]
+    if other < 0 or is_cut(f, pools, cuts):
+        return 0.0
+    return 0.5 * (cuts.pull[f] + cuts.pull[other])
+
+
+@wp.kernel(enable_backward=False)
+def choose_faces(
+    # In
+    threads: int,
+    surface: Surface,
+    pools: Pools,
+    # In and out
+    cuts: Cuts,
+):
+    """Choose the faces that tear: those above the bound, and above all others of both leaves."""
+    for f in range(wp.tid(), 4 * star_count(cuts), threads):
+        other = cuts.other[f]
+        cuts.link[f] = 0
+        if other > f:
+            pull = mean_pull(f, pools, cuts)
+            if pull > surface.stress:
+                most = float(0.0)
+                for n in range(4):
+                    most = wp.max(most, mean_pull(4 * (f / 4) + n, pools, cuts))
+                    most = wp.max(most, mean_pull(4 * (other / 4) + n, pools, cuts))
+                if pull >= most:
+                    cuts.link[f] = 1
+
+
+@wp.kernel(enable_backward=False)
+def tear_faces(
+    # In
+    threads: int,
+    # In and out
+    pools: Pools,
+    cuts: Cuts,
+):
+    """Cut the chosen faces."""
+    for f in range(wp.tid(), 4 * star_count(cuts), threads):
+        if cuts.link[f] == 1:
+            cut_side(f, 0, pools, cuts)
+            cut_side(cuts.other[f], 1, pools, cuts)

@@ -1,15 +1,207 @@
-"""Restores the tree order of the leaves after a pass.
+"""Renumbers nodes without gaps after a removal, and restores the tree order of the leaves after a pass.
 
-Each thread processes one stretch of the former list: a bisected leaf is replaced by its descendants, a merged one by
-its parent. A sum over the threads gives the start of each.
-"""
+With N' nodes left, the holes are the places of removed nodes below N', and the movers are the nodes from N' on; their
+numbers are equal. The k-th mover moves into the k-th hole, independently of the threads. Its number is changed in
+leaves and, upwards from these, in their ancestors, and in the ends of other nodes.
+
+Each thread processes one stretch of the former list of leaves: a bisected leaf is replaced by its descendants, a merged
+one by its parent. A sum over the threads gives the start of each."""
 
 import warp as wp
 
-from .dense import Moves, rename_upwards
-from .pools import ADDED, LEAVES, NEW_LEAVES, NODE_TOP, OLD_TOP, REMOVED, UNUSED, Pools, padding
+from warp_corot.kernels.remesh.pools import (
+    ADDED,
+    LEAVES,
+    NEW_LEAVES,
+    NODE_TOP,
+    OLD_TOP,
+    REMOVED,
+    UNUSED,
+    Pools,
+    padding,
+)
+from warp_corot.kernels.remesh.state import Carried, move_node
 
 wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Moves:
+    """The moves in the current pass."""
+
+    sums: wp.array[wp.int32]  # [2 * threads] holes in each thread's stretch of the nodes, then movers
+    ends: wp.array[wp.int32]  # inclusive sums of these
+    holes: wp.array[wp.int32]
+    movers: wp.array[wp.int32]
+    forward: wp.array[wp.int32]  # new numbers of movers by their old ones
+
+
+@wp.kernel(enable_backward=False)
+def count_moves(
+    # In
+    threads: int,
+    pools: Pools,
+    # Out
+    moves: Moves,
+):
+    t = wp.tid()
+    holes = int(0)
+    movers = int(0)
+    if pools.counts[REMOVED] > 0:
+        top = pools.counts[NODE_TOP] - pools.counts[REMOVED]
+        stretch = (pools.counts[NODE_TOP] + threads - 1) / threads
+        for i in range(t * stretch, wp.min((t + 1) * stretch, pools.counts[NODE_TOP])):
+            if i < top:
+                if pools.valence[i] == 0:
+                    holes += 1
+            elif pools.valence[i] > 0:
+                movers += 1
+    moves.sums[t] = holes
+    moves.sums[threads + t] = movers
+
+
+@wp.kernel(enable_backward=False)
+def list_moves(
+    # In
+    threads: int,
+    pools: Pools,
+    # In and out
+    moves: Moves,
+):
+    t = wp.tid()
+    if pools.counts[REMOVED] > 0:
+        hole = int(0)
+        if t > 0:
+            hole = moves.ends[t - 1]
+        mover = moves.ends[threads + t - 1] - moves.ends[threads - 1]
+        top = pools.counts[NODE_TOP] - pools.counts[REMOVED]
+        stretch = (pools.counts[NODE_TOP] + threads - 1) / threads
+        for i in range(t * stretch, wp.min((t + 1) * stretch, pools.counts[NODE_TOP])):
+            if i < top:
+                if pools.valence[i] == 0:
+                    moves.holes[hole] = i
+                    hole += 1
+            elif pools.valence[i] > 0:
+                moves.movers[mover] = i
+                mover += 1
+
+
+@wp.kernel(enable_backward=False)
+def lower_top(
+    # In and out
+    pools: Pools,
+):
+    counts = pools.counts
+    counts[OLD_TOP] = counts[NODE_TOP]
+    counts[NODE_TOP] = counts[NODE_TOP] - counts[REMOVED]
+
+
+@wp.kernel(enable_backward=False)
+def move_nodes(
+    # In
+    threads: int,
+    # In and out
+    pools: Pools,
+    carried: Carried,
+    moves: Moves,
+):
+    for k in range(wp.tid(), moves.ends[threads - 1], threads):
+        mover = moves.movers[k]
+        hole = moves.holes[k]
+        moves.forward[mover] = hole
+        pools.lattice[hole] = pools.lattice[mover]
+        pools.ends[hole] = pools.ends[mover]
+        pools.valence[hole] = pools.valence[mover]
+        pools.valence[mover] = 0
+        move_node(mover, hole, carried)
+
+
+@wp.func
+def present_name(node: int, top: int, old_top: int, moves: Moves):
+    """A node's current number; movers had numbers from ``top`` up to ``old_top``."""
+    if node >= top and node < old_top:
+        return moves.forward[node]
+    return node
+
+
+@wp.func
+def with_present_names(tet: wp.vec4i, top: int, old_top: int, moves: Moves):
+    return wp.vec4i(
+        present_name(tet[0], top, old_top, moves),
+        present_name(tet[1], top, old_top, moves),
+        present_name(tet[2], top, old_top, moves),
+        present_name(tet[3], top, old_top, moves),
+    )
+
+
+@wp.kernel(enable_backward=False)
+def rename_ends(
+    # In
+    threads: int,
+    moves: Moves,
+    # In and out
+    pools: Pools,
+):
+    """Rename ends if a node has moved; nodes that only void tetrahedra name may have ends that moved."""
+    top = pools.counts[NODE_TOP]
+    old_top = pools.counts[OLD_TOP]
+    count = top + pools.sink - pools.node_limit
+    if moves.ends[threads - 1] == 0:
+        count = 0
+    for i in range(wp.tid(), count, threads):
+        node = wp.where(i < top, i, pools.node_limit + i - top)
+        ends = pools.ends[node]
+        a = present_name(ends[0], top, old_top, moves)
+        b = present_name(ends[1], top, old_top, moves)
+        if a != ends[0] or b != ends[1]:
+            pools.ends[node] = wp.vec2i(wp.min(a, b), wp.max(a, b))
+
+
+@wp.func
+def rename_upwards(e: int, top: int, old_top: int, pools: Pools, moves: Moves):
+    """Write current numbers into a leaf, and into its ancestors as far as they share a mover with it.
+
+    Threads that meet in an ancestor write the same value, and each continues for its own movers.
+    """
+    before = pools.tets[e]
+    tet = with_present_names(before, top, old_top, moves)
+    moved = int(0)
+    for n in range(4):
+        if tet[n] != before[n]:
+            moved = 1
+    if moved == 1:
+        pools.tets[e] = tet
+        above = pools.parent[e]
+        while above >= 0:
+            whole = with_present_names(pools.tets[above], top, old_top, moves)
+            names = int(0)
+            for n in range(4):
+                for m in range(4):
+                    if tet[n] != before[n] and whole[m] == tet[n]:
+                        names = 1
+            if names == 1:
+                pools.tets[above] = whole
+                above = pools.parent[above]
+            else:
+                above = -1
+    return tet
+
+
+@wp.kernel(enable_backward=False)
+def rename_void(
+    # In
+    threads: int,
+    moves: Moves,
+    # In and out
+    pools: Pools,
+):
+    top = pools.counts[NODE_TOP]
+    old_top = pools.counts[OLD_TOP]
+    count = pools.void_count
+    if moves.ends[threads - 1] == 0:
+        count = 0
+    for i in range(wp.tid(), count, threads):
+        rename_upwards(pools.void_leaves[i], top, old_top, pools, moves)
 
 
 @wp.func

@@ -13,7 +13,7 @@ nodes without mass that stay at rest, and leaves whose four nodes are all one of
 
 import warp as wp
 
-from warp_corot.kernels.plan.tree import SINKS
+from warp_corot.kernels.plan.plan import SINKS
 
 wp.set_module_options({"enable_backward": False})
 
@@ -70,7 +70,7 @@ class Pools:
     code: wp.array[
         wp.int32
     ]  # level, mirrored or not, and which of ``frames``, as in ``elements.elements.ForestElements``
-    cut: wp.array[wp.int32]  # which faces of a leaf are cut, and TORN: see ``plan.tree``
+    cut: wp.array[wp.int32]  # which faces of a leaf are cut, and TORN: see ``plan.plan``
     next: wp.array[wp.int32]  # the next tetrahedron around the same edge, during bisection or merging
     free_pairs: wp.array[wp.int32]  # first children
     fresh: wp.array[wp.int32]  # first children made in this pass

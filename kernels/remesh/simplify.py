@@ -9,7 +9,7 @@ import warp as wp
 
 from warp_corot.kernels.meshing.bisection import refinement_end
 from warp_corot.kernels.meshing.growth import LIVE
-from warp_corot.kernels.plan.tree import TORN
+from warp_corot.kernels.plan.plan import TORN
 
 from .pools import CANDIDATES, FREE_PAIRS, LEAVES, NODES_GIVEN, PAIRS_GIVEN, SIMPLIFY, UNUSED, Pools
 from .state import Carried, average_children, quarter_mass, unmake_node

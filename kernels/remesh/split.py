@@ -14,7 +14,7 @@ import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
 from warp_corot.kernels.meshing.bisection import refinement_end
-from warp_corot.kernels.plan.tree import TORN
+from warp_corot.kernels.plan.plan import TORN
 
 from .cut import COPIES, MARKED, STAMP, STARS, Cuts, add_star, face_node, forget, is_cut, meet, star_count
 from .pools import ADDED, FULL, LEAVES, NODE_TOP, Pools

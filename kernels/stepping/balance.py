@@ -1,5 +1,7 @@
-"""What a check needs: the energies of each world in float64 and in a fixed order, the clock, and whether a user has
-written to the state; and two copies of the state, one of which is the last good one.
+"""The balance of energy: the energies of each world, the work of forces, and two copies of the state.
+
+``integrate.add_support_work`` counts the work of a support against all forces on its nodes. The part against forces
+that are not elastic is subtracted here, because the balance has no energy for them.
 
 A run begins with ``take_over``, which compares the state with the last good copy. It ends with ``sum_nodes``, which
 also writes the present state to the other copy, and ``report``, which writes all results for the host to one place.
@@ -11,10 +13,111 @@ import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
 
-from .integrate import by_vectors, vector_at
+from .integrate import Dynamics, by_vectors, force_at, load_at, symplectic_euler_velocity, vector_at
 from .pace import BEFORE, CONTROLS, DONE, DONE_THEN, DT, END, SLOT, THEN, Pace, length_before, time_after
 
 wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def add_work(account: wp.array2d[wp.float64], i: int, work: float):
+    account[0, i] = account[0, i] + wp.float64(work)
+    account[1, i] = account[1, i] + wp.abs(wp.float64(work))
+
+
+@wp.kernel(enable_backward=False)
+def separate_forces(elastic: wp.array[wp.vec4], f: wp.array[wp.vec4], others: wp.array[wp.vec4]):
+    """Find the forces that were added after the elastic ones."""
+    i = wp.tid()
+    store_node(others, i, load_node(f, i) - load_node(elastic, i))
+
+
+@wp.kernel(enable_backward=False)
+def count_work(
+    # In
+    body: Dynamics,
+    pace: Pace,
+    offset: int,
+    elastic: wp.array[wp.vec4],
+    # In and out
+    others: wp.array[wp.vec4],
+    account: wp.array2d[wp.float64],
+):
+    """Count the work of the other forces, each along half of the motion before it and half of the motion after it.
+
+    That is how symplectic Euler conserves energy. Afterwards ``others`` has all forces besides elasticity, constraints
+    included.
+    """
+    i = wp.tid()
+    force = load_node(others, i)
+    store_node(others, i, load_node(body.f, i) - load_node(elastic, i))
+    if wp.dot(force, force) == 0.0:
+        return
+    dt = float(pace.seconds[DT])
+    before = dt
+    if offset == 0:
+        before = float(length_before(pace))
+    w, velocity = body.inverse_mass[i], load_node(body.v, i)
+    later = velocity
+    if w > 0.0:
+        kick, damped = 0.5 * (before + dt), 1.0 / (1.0 + dt * body.damping)
+        later = symplectic_euler_velocity(velocity, force_at(i, body), w, body.gravity, kick, damped)
+    add_work(account, i, 0.5 * wp.dot(force, before * velocity + dt * later))
+
+
+@wp.func
+def count_constraint(
+    i: int,
+    force: wp.vec3,
+    all_forces: wp.vec3,
+    velocity: wp.vec3,
+    damping: float,
+    gravity: wp.vec3,
+    w: float,
+    pace: Pace,
+    offset: int,
+    account: wp.array2d[wp.float64],
+):
+    """Count the work of the force C of constraints on a node, which is part of all its forces but gravity.
+
+    Let b and d be the lengths of the last step and of this one, and v and w the velocities before and after the kick.
+    Let F be all other forces: elastic ones, gravity and loads. All forces act for (b + d) / 2, so they add the kinetic
+    energy (b + d) / 2 (F + C) . (v + w) / 2. The work of F is counted elsewhere, along half of the motion before and
+    half of the motion after: F . (b v + d w) / 2. Constraints decide where a node goes, so the rest is their work:
+    (b + d) / 2 C . (v + w) / 2 + (b - d) / 4 F . (w - v).
+    """
+    dt = float(pace.seconds[DT])
+    before = dt
+    if offset == 0:
+        before = float(length_before(pace))
+    kick = 0.5 * (before + dt)
+    if w == 0.0:
+        add_work(account, i, kick * wp.dot(force, velocity))
+        return
+    later = symplectic_euler_velocity(velocity, all_forces, w, gravity, kick, 1.0 / (1.0 + dt * damping))
+    others = all_forces - force + gravity / w
+    work = 0.5 * kick * wp.dot(force, velocity + later)
+    add_work(account, i, work + 0.25 * (before - dt) * wp.dot(others, later - velocity))
+
+
+@wp.kernel(enable_backward=False)
+def count_constraints(
+    # In
+    body: Dynamics,
+    pace: Pace,
+    offset: int,
+    constrained: wp.array[wp.vec4],
+    # In and out
+    account: wp.array2d[wp.float64],
+):
+    """Count the work of the forces of constraints, which are part of f."""
+    i = wp.tid()
+    force = load_node(constrained, i)
+    if wp.dot(force, force) == 0.0:
+        return
+    velocity, w = load_node(body.v, i), body.inverse_mass[i]
+    count_constraint(i, force, force_at(i, body), velocity, body.damping, body.gravity, w, pace, offset, account)
+
 
 #: Columns of ``sums``.
 KINETIC, AHEAD, GRAVITATIONAL, LOADS, SUPPORTS, REACH, ELASTIC, UNTIMELY, WORKED, WORKED_ABSOLUTE = (
@@ -118,17 +221,11 @@ def sum_nodes(
     # In
     pace: Pace,
     lag: wp.float64,
-    gravity: wp.vec3,
+    body: Dynamics,
+    mass: wp.array[wp.float32],
     count: int,
     threads: int,
     lanes: int,
-    mass: wp.array[wp.float32],
-    inverse_mass: wp.array[wp.float32],
-    has_load: int,
-    load: wp.array[Any],
-    f: wp.array[wp.vec4],
-    u: wp.array[wp.vec4],
-    v: wp.array[wp.vec4],
     pushed: int,
     others: wp.array[wp.vec4],
     constrained: int,
@@ -169,18 +266,18 @@ def sum_nodes(
     k = thread
     while k < count:
         i = world * count + k
-        x = load_node(u, i)
+        x = load_node(body.u, i)
         reach = wp.max(reach, dot64(x, x))
-        velocity = load_node(v, i)
-        force = load_node(f, i)
-        if inverse_mass[i] == 0.0:
+        velocity = load_node(body.v, i)
+        force = load_node(body.f, i)
+        if body.inverse_mass[i] == 0.0:
             supports -= wp.float64(0.5) * before * dot64(force, velocity)
         else:
             m = wp.float64(mass[i])
-            pull = wp.vec3d(force) + m * wp.vec3d(gravity)
-            power = dot64(force, velocity) + m * dot64(gravity, velocity)
-            if has_load != 0:
-                external = vector_at(load, i)
+            pull = wp.vec3d(force) + m * wp.vec3d(body.gravity)
+            power = dot64(force, velocity) + m * dot64(body.gravity, velocity)
+            if body.load.shape[0] > 0:
+                external = load_at(i, body)
                 pull += wp.vec3d(external)
                 power += dot64(external, velocity)
                 work += dot64(external, x) - dot64(external, load_node(kept_u[slot], i))
@@ -192,7 +289,7 @@ def sum_nodes(
                 ahead += wp.float64(0.5) * both * square
             untimely += square
             kinetic += wp.float64(0.5) * m * dot64(velocity, velocity)
-            gravitational -= m * dot64(gravity, x)
+            gravitational -= m * dot64(body.gravity, x)
         if keeps != 0:
             store_node(kept_u[1 - slot], i, x)
             store_node(kept_v[1 - slot], i, velocity)
@@ -220,39 +317,23 @@ def sum_nodes(
 
 
 @wp.kernel(enable_backward=False)
-def sum_elements(energies: wp.array[wp.float64], count: int, threads: int, lanes: int, sums: wp.array3d[wp.float64]):
-    """Add up the strain energies, ``count`` of each world."""
+def sum_rows(
+    rows: wp.array2d[wp.float64], count: int, threads: int, lanes: int, column: int, sums: wp.array3d[wp.float64]
+):
+    """Add up rows of numbers, ``count`` of each world, in one column each: strain energies, or the work of constraints
+    and its absolute value."""
     world, thread = wp.tid()
-    total = wp.float64(0.0)
-    k = thread
-    while k < count:
-        total += energies[world * count + k]
-        k += threads
-    if lanes > 1:
-        total = sum_of_lanes(total)
-    if thread % lanes == 0:
-        part = thread / lanes
-        sums[world, part, ELASTIC] = sums[world, part, ELASTIC] + total
-
-
-@wp.kernel(enable_backward=False)
-def sum_work(account: wp.array2d[wp.float64], count: int, threads: int, lanes: int, sums: wp.array3d[wp.float64]):
-    """Add up the work of constraints and its absolute value, from ``count`` places in each world."""
-    world, thread = wp.tid()
-    work = wp.float64(0.0)
-    absolute = wp.float64(0.0)
-    k = thread
-    while k < count:
-        work += account[0, world * count + k]
-        absolute += account[1, world * count + k]
-        k += threads
-    if lanes > 1:
-        work = sum_of_lanes(work)
-        absolute = sum_of_lanes(absolute)
-    if thread % lanes == 0:
-        part = thread / lanes
-        sums[world, part, WORKED] = sums[world, part, WORKED] + work
-        sums[world, part, WORKED_ABSOLUTE] = sums[world, part, WORKED_ABSOLUTE] + absolute
+    for row in range(rows.shape[0]):
+        total = wp.float64(0.0)
+        k = thread
+        while k < count:
+            total += rows[row, world * count + k]
+            k += threads
+        if lanes > 1:
+            total = sum_of_lanes(total)
+        if thread % lanes == 0:
+            part = thread / lanes
+            sums[world, part, column + row] = sums[world, part, column + row] + total
 
 
 @wp.kernel(enable_backward=False)
@@ -321,4 +402,3 @@ def report(
 
 
 TAKE_OVER = by_vectors(take_over, "positions")
-SUM_NODES = by_vectors(sum_nodes, "load")

@@ -58,7 +58,7 @@ from .block_memory import (
     shared_numbers,
     shared_vectors,
 )
-from .integrate import add_support_work, is_finite, symplectic_euler_velocity, vector_at
+from .integrate import Dynamics, add_support_work, is_finite, load_at, symplectic_euler_velocity
 from .pace import DONE, DT, Pace, length_before
 from .threads import bit_count, lowest_bit, number_in, shuffle_down, synchronize_any, synchronize_block
 
@@ -218,12 +218,11 @@ def _left_out_of(layout: Layout, displacement: wp.Function, slot: wp.Function) -
 
 
 @functools.cache
-def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
+def step_block(layout: Layout) -> wp.Kernel:
     """Symplectic Euler steps of the corotated model, a block a world; launch with blocks of ``layout.threads``.
 
     Args:
         layout: Which thread does what.
-        load_vectors: The element type of the array of loads, vec3 or vec4.
     """
     shape, uniform, parts, dilating = layout.shape, layout.uniform, layout.parts, layout.dilating
     capacity, threads, zero_slot = layout.subtrees, layout.threads, layout.slot_count
@@ -248,17 +247,10 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
         # In
         body: BlockBody,
         steps: int,
-        damping: float,
-        gravity: wp.vec3,
+        dynamics: Dynamics,
         material: IsotropicMaterial,
         mass: wp.array[wp.float32],
-        inverse_mass: wp.array[wp.float32],
-        has_load: int,
-        load: wp.array[load_vectors],
         pace: Pace,
-        # In and out
-        u: wp.array[wp.vec4],
-        v: wp.array[wp.vec4],
         # Out
         reactions: wp.array[wp.vec4],
         support_work: wp.array[wp.float64],
@@ -272,8 +264,8 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
         base = world * body.node_count
         place = thread
         while place < body.node_count:
-            displacement(wp.static(STORE), place, load_node(u, base + place))
-            velocity(wp.static(STORE), place, load_node(v, base + place))
+            displacement(wp.static(STORE), place, load_node(dynamics.u, base + place))
+            velocity(wp.static(STORE), place, load_node(dynamics.v, base + place))
             place += wp.static(threads)
         if thread == 0:
             slot(wp.static(STORE), wp.static(zero_slot), wp.vec3())
@@ -286,7 +278,7 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
         h, q, mirror = root_of(body.subtrees, mine)
         first_of_world = world * body.element_count * material.stride
         first = first_of_world + body.subtrees.first[mine] * material.stride
-        damped = 1.0 / (1.0 + dt * damping)
+        damped = 1.0 / (1.0 + dt * dynamics.damping)
         # Each thread keeps up to two nodes in registers from here on.
         words = vec3u()
         for word in range(wp.static(NODE_WORDS)):
@@ -365,17 +357,16 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
                     place = about & wp.static(NO_NODE)
                     i = base + place
                     elastic = force
-                    if has_load != 0:
-                        force += vector_at(load, i)
-                    w = inverse_mass[i]
+                    force += load_at(i, dynamics)
+                    w = dynamics.inverse_mass[i]
                     moving = velocity(wp.static(LOAD), place, force)
                     if w > 0.0:
-                        moving = symplectic_euler_velocity(moving, force, w, gravity, kick, damped)
+                        moving = symplectic_euler_velocity(moving, force, w, dynamics.gravity, kick, damped)
                         velocity(wp.static(STORE), place, moving)
                     else:
                         add_support_work(elastic, kick * moving, support_work)
                         if step == steps - 1:
-                            store_node(reactions, i, -(force + mass[i] * gravity))
+                            store_node(reactions, i, -(force + mass[i] * dynamics.gravity))
                     moved = displacement(wp.static(LOAD), place, force) + dt * moving
                     displacement(wp.static(STORE), place, moved)
                     if not is_finite(moved):
@@ -386,8 +377,8 @@ def step_block(layout: Layout, load_vectors: type) -> wp.Kernel:
             step += 1
         place = thread
         while place < body.node_count:
-            store_node(u, base + place, displacement(wp.static(LOAD), place, wp.vec3()))
-            store_node(v, base + place, velocity(wp.static(LOAD), place, wp.vec3()))
+            store_node(dynamics.u, base + place, displacement(wp.static(LOAD), place, wp.vec3()))
+            store_node(dynamics.v, base + place, velocity(wp.static(LOAD), place, wp.vec3()))
             place += wp.static(threads)
 
     return step_block

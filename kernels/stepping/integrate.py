@@ -1,10 +1,13 @@
-"""Time stepping of the nodes: symplectic Euler, prescribed motion, and the exchange of positions with users.
+"""The motion of nodes in explicit steps, prescribed motions, and changes that users make to held and loaded nodes.
 
 The state is the displacement from rest, because float32 positions would lose the digits that small strains need.
 Positions are published for users after each run of steps, and adopted before the next run if a user has changed them.
 
 Loads and positions may be arrays of other programs. Kernels that read them exist twice: for vec4 arrays, such as the
 solver's own, and for vec3 arrays with any stride.
+
+If there are fewer values than nodes, they are repeated: one value for all nodes, or the values of one world for every
+world.
 """
 
 from typing import Any
@@ -52,6 +55,37 @@ def by_vectors(kernel: wp.Kernel, argument: str) -> dict[type, wp.Kernel]:
 def is_finite(a: wp.vec3):
     """False if any component is NaN or infinite."""
     return wp.abs(a[0]) + wp.abs(a[1]) + wp.abs(a[2]) <= 3.0e38
+
+
+@wp.struct
+class Dynamics:
+    """What moves the nodes of a body in a step."""
+
+    damping: float  # [1/s]
+    gravity: wp.vec3  # [m/s^2]
+    inverse_mass: wp.array[wp.float32]  # [1/kg]; zero for held nodes
+    load: wp.array[wp.float32]  # external forces [N]; empty: there are none
+    load_stride: int  # numbers from one node to the next
+    rest: wp.array[wp.vec4]  # [m]
+    f: wp.array[wp.vec4]  # all forces but loads and gravity [N]
+    u: wp.array[wp.vec4]  # [m]
+    v: wp.array[wp.vec4]  # [m/s]
+
+
+@wp.func
+def load_at(i: int, body: Dynamics):
+    """The load on a node [N]."""
+    load = wp.vec3()
+    if body.load.shape[0] > 0:
+        k = body.load_stride * i
+        load = wp.vec3(body.load[k], body.load[k + 1], body.load[k + 2])
+    return load
+
+
+@wp.func
+def force_at(i: int, body: Dynamics):
+    """The force on a node besides gravity [N]."""
+    return load_node(body.f, i) + load_at(i, body)
 
 
 @wp.func
@@ -266,3 +300,107 @@ STEP_SYMPLECTIC_EULER = by_vectors(step_symplectic_euler, "load")
 PUBLISH_POSITIONS = by_vectors(publish_positions, "positions")
 ADOPT_POSITIONS = by_vectors(adopt_positions, "positions")
 RESET_NODES = by_vectors(reset_nodes, "positions")
+
+
+@wp.func
+def inverse_of(mass: float):
+    """The inverse mass of a free node, 1/m, or zero if it has no mass [1/kg]."""
+    if mass > 0.0:
+        return float(wp.float64(1.0) / wp.float64(mass))
+    return float(0.0)
+
+
+@wp.kernel(enable_backward=False)
+def free_nodes(
+    # In
+    mass: wp.array[wp.float32],
+    held: wp.array[wp.uint8],
+    # Out
+    inverse_mass: wp.array[wp.float32],
+):
+    """Give every free node its inverse mass, and held nodes zero."""
+    i = wp.tid()
+    inverse = float(0.0)
+    if held[i] == wp.uint8(0):
+        inverse = inverse_of(mass[i])
+    inverse_mass[i] = inverse
+
+
+@wp.kernel(enable_backward=False)
+def hold_nodes(
+    # In
+    nodes: wp.array[wp.int32],
+    velocities: wp.array[wp.vec3],
+    # Out
+    held: wp.array[wp.uint8],
+    inverse_mass: wp.array[wp.float32],
+    v: wp.array[wp.vec4],
+):
+    """Hold nodes; they move with the given velocities [m/s]. With zero they stay where they are."""
+    k = wp.tid()
+    i = nodes[k]
+    held[i] = wp.uint8(1)
+    inverse_mass[i] = 0.0
+    store_node(v, i, velocities[k % velocities.shape[0]])
+
+
+@wp.kernel(enable_backward=False)
+def release_nodes(
+    # In
+    nodes: wp.array[wp.int32],
+    mass: wp.array[wp.float32],
+    # Out
+    held: wp.array[wp.uint8],
+    inverse_mass: wp.array[wp.float32],
+    reactions: wp.array[wp.vec4],
+):
+    """Release nodes; they keep their present velocities."""
+    i = nodes[wp.tid()]
+    held[i] = wp.uint8(0)
+    inverse_mass[i] = inverse_of(mass[i])
+    store_node(reactions, i, wp.vec3())
+
+
+@wp.kernel(enable_backward=False)
+def load_nodes(
+    # In
+    nodes: wp.array[wp.int32],
+    forces: wp.array[wp.vec3],
+    # Out
+    loads: wp.array[Any],
+):
+    """Set the loads of nodes [N]."""
+    k = wp.tid()
+    write_vector(loads, nodes[k], forces[k % forces.shape[0]])
+
+
+LOAD_NODES = by_vectors(load_nodes, "loads")
+
+
+# --- active stress that follows keyframes ----------------------------------------------------------------------------
+
+
+@wp.kernel(enable_backward=False)
+def follow_activation(
+    # In
+    elements: wp.array[wp.int32],
+    times: wp.array[wp.float64],
+    stress: wp.array2d[wp.float32],
+    pace: Pace,
+    world_starts: wp.array[wp.float64],
+    world_element_count: int,
+    offset: int,
+    # Out
+    activation: wp.array[wp.float32],
+):
+    """Set the active stress [Pa] to the keyframes' value at the beginning of a step, ``offset`` steps after the last
+    counted one.
+    """
+    k = wp.tid()
+    t = elements[k]
+    start = world_starts[t // world_element_count]
+    now = time_after(pace, offset) - start
+    key, s = key_before(times, now)
+    row = wp.min(k, stress.shape[1] - 1)
+    a = stress[key, row]
+    activation[t] = a + s * (stress[key + 1, row] - a)

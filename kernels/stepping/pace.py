@@ -11,11 +11,10 @@ wp.set_module_options({"enable_backward": False})
 #: Places in ``Pace.counts`` and ``Pace.seconds``.
 DONE, DONE_THEN = wp.constant(0), wp.constant(1)
 DT, THEN, BEFORE = wp.constant(0), wp.constant(1), wp.constant(2)
-#: Places in ``control``: the step that the state allows, the fraction of it that is used, the longest step at rest, the
-#: shortest and longest steps used, how many checks in a row found the bodies calm, how often energies are checked, the
-#: number of steps done at the last check, and the step that the state allowed then.
-ALLOWED, SHARE, AT_REST, SHORTEST, LONGEST, CALM, CLOSENESS, FOLLOWED, CHECKED = (wp.constant(k) for k in range(9))
-CONTROLS = 9
+#: Places in ``control``: the step that the state allows, the fraction of it that is used, the longest step at rest, and
+#: the shortest and longest steps used.
+ALLOWED, SHARE, AT_REST, SHORTEST, LONGEST = (wp.constant(k) for k in range(5))
+CONTROLS = 5
 #: Places in ``orders``, the host's orders for a run: the time at which it ends [s], NEVER if it has no end; the number
 #: of steps done by then; and which of the two copies of the state is the last good one.
 END, STOP, SLOT = (wp.constant(k) for k in range(3))
@@ -169,21 +168,6 @@ def fit_step(orders: wp.array[wp.float64], control: wp.array[wp.float64], pace: 
     if left > wp.float64(0.0) and left <= steps * dt * wp.float64(1.0 + 1e-9):
         dt = left / steps
     change_step(pace, dt)
-
-
-@wp.kernel(enable_backward=False)
-def set_schedule(
-    calm: wp.float64,
-    closeness: wp.float64,
-    followed: wp.float64,
-    checked: wp.float64,
-    control: wp.array[wp.float64],
-):
-    """Store the result of the last check and when the next one is due; see ``CALM``."""
-    control[CALM] = calm
-    control[CLOSENESS] = closeness
-    control[FOLLOWED] = followed
-    control[CHECKED] = checked
 
 
 @wp.func

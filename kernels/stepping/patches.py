@@ -12,11 +12,12 @@ writes its dilatation to the row of its group, one thread for each group sums th
 of the pressure.
 
 All blocks of a launch, those of all worlds, must be resident at the same time, one on each multiprocessor. Sums have a
-fixed order, so runs are reproducible bit for bit. CUDA only; ``solvers.explicit.patch_layout`` divides the work among
+fixed order, so runs are reproducible bit for bit. CUDA only; ``solvers.explicit.patches`` divides the work among
 blocks.
 """
 
 import functools
+from dataclasses import dataclass
 
 import warp as wp
 
@@ -28,12 +29,128 @@ from warp_corot.kernels.modules import unique_kernel
 from warp_corot.kernels.tables.shapes import fingerprint
 
 from .block_memory import LOAD, STORE, numbers_at, vectors_at
-from .integrate import add_support_work, is_finite, symplectic_euler_velocity, vector_at
+from .integrate import Dynamics, add_support_work, is_finite, load_at, symplectic_euler_velocity
 from .pace import DONE, DT, Pace, length_before, time_after
-from .patch_body import VOLUME_ROW, Exchange, Layout, PatchBody, await_displacement, publish
 from .threads import lowest_bit, number_in, shuffle_down, synchronize_any, synchronize_block
 
 wp.set_module_options({"enable_backward": False})
+
+
+#: A column of ``PatchBody.rest`` has the inverse of the matrix of rest edges, row by row, then the volume.
+VOLUME_ROW = 9
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The numbers for which a kernel is generated.
+
+    Attributes:
+        threads: Threads of a block.
+        elements, halo: Number of elements that a thread computes, and of halo nodes that it waits for.
+        lanes: Threads that sum the forces on one node.
+        nodes, slots: Room for displacements and for forces in shared memory; one more slot takes forces that are not
+            used.
+        groups, members: Room for groups that share a dilatation and for the elements of each; zero if none do.
+        overlaps: Whether a block computes the elements that need no halo before it waits for the halo.
+    """
+
+    threads: int
+    elements: int
+    halo: int
+    lanes: int
+    nodes: int
+    slots: int
+    groups: int = 0
+    members: int = 0
+    overlaps: bool = True
+
+    @property
+    def vectors(self) -> int:
+        return self.nodes + self.slots + 1
+
+    @property
+    def floats(self) -> int:
+        """The shared memory of a block, in float32 numbers."""
+        return 3 * self.vectors + self.groups * (2 * self.members + 2)
+
+
+@wp.struct
+class PatchBody:
+    """The patches of each world of a body; see ``solvers.explicit.patches.Patches``."""
+
+    element_count: int  # of the mesh
+    own: wp.array[wp.int32]  # [N] of one world, as all that is not said to be of others
+    own_start: wp.array[wp.int32]  # [patches + 1], as the other starts
+    halo: wp.array[wp.int32]
+    halo_start: wp.array[wp.int32]
+    elements: wp.array[wp.int32]  # [E]
+    element_start: wp.array[wp.int32]
+    interior: wp.array[wp.int32]  # [patches] number of a patch's elements that need no halo; they come first
+    computed: wp.array[wp.int32]  # [patches] number of elements that it computes; it only measures the others
+    measures: wp.array[wp.int32]  # [E] where an element's dilatation goes: group by group, one row a member
+    corners: wp.array[wp.uint64]  # [E] the four corners' places among the patch's nodes, 16 bits each
+    slots: wp.array[wp.uint64]  # [E] the places of the corners' forces in the same form
+    bases: wp.array[wp.int32]
+    base_start: wp.array[wp.int32]
+    rest: wp.array2d[wp.float32]  # [10, E] see ``VOLUME_ROW``
+    # Keyframes of all trajectories, one after another.
+    trajectory: wp.array[wp.int32]  # [worlds N] the trajectory that a node follows, or -1
+    place: wp.array[wp.int32]  # [worlds N] the node's column there
+    key_start: wp.array[wp.int32]  # [trajectories + 1] into ``times``
+    value_start: wp.array[wp.int32]  # [trajectories] into ``values``, whose rows have ``columns`` entries
+    columns: wp.array[wp.int32]  # [trajectories]
+    times: wp.array[wp.float64]
+    values: wp.array[wp.vec3]
+
+
+# --- the exchange of displacements between blocks that run at the same time ------------------------------------------
+
+
+#: How often a block polls for a displacement before it gives up; this takes some seconds.
+MOST_LOOKS = 1 << 22
+
+
+@wp.struct
+class Exchange:
+    """The arrays through which blocks exchange displacements."""
+
+    nodes: int  # of all worlds
+    published: wp.array[
+        wp.vec4
+    ]  # [2 nodes] displacements of even and of odd steps; w holds the bits of the step's number
+    begun: wp.array[wp.uint32]  # [worlds patches] the number of the next launch's first state
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+    const unsigned long long low = ((unsigned long long)__float_as_uint(value[1]) << 32) | __float_as_uint(value[0]);
+    const unsigned long long high = ((unsigned long long)number << 32) | __float_as_uint(value[2]);
+    asm volatile("{ .reg .b128 all; mov.b128 all, {%1, %2}; st.relaxed.gpu.global.b128 [%0], all; }"
+        :: "l"(&wp::index(published, i)), "l"(low), "l"(high) : "memory");
+#endif
+""")
+def publish(published: wp.array[wp.vec4], i: int, value: wp.vec3, number: wp.uint32):
+    """Write a displacement and its number in one access."""
+    ...
+
+
+@wp.func_native(f"""
+#if defined(__CUDA_ARCH__)
+    unsigned long long low = 0, high = 0;
+    for (int look = 0; look < {MOST_LOOKS}; ++look) {{
+        asm volatile("{{ .reg .b128 all; ld.relaxed.gpu.global.b128 all, [%2]; mov.b128 {{%0, %1}}, all; }}"
+            : "=l"(low), "=l"(high) : "l"(&wp::index(published, i)) : "memory");
+        if ((unsigned)(high >> 32) == number)
+            return wp::vec_t<4, wp::float32>(__uint_as_float((unsigned)low), __uint_as_float((unsigned)(low >> 32)),
+                                             __uint_as_float((unsigned)high), 0.0f);
+    }}
+#endif
+    return wp::vec_t<4, wp::float32>(0.0f, 0.0f, 0.0f, 1.0f);
+""")
+def await_displacement(published: wp.array[wp.vec4], i: int, number: wp.uint32) -> wp.vec4:
+    """Wait for the displacement of the step ``number``; the last component is 0, or 1 if it did not arrive."""
+    ...
+
 
 WARP = 32
 #: The numbers that a thread keeps for an element: the inverse rest edges, the volume times mu and the volume times
@@ -60,12 +177,11 @@ def key_from(times: wp.array[wp.float64], key: int, last: int, t: wp.float64):
 
 
 @functools.cache
-def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
+def step_patches(layout: Layout) -> wp.Kernel:
     """Symplectic Euler steps of the corotated model with own rotations; launch ``layout.threads`` threads for each
     patch of each world.
 
     Args:
-        load_vectors: The element type of the array of loads, vec3 or vec4.
     """
     threads, each, halo_each, lanes = layout.threads, layout.elements, layout.halo, layout.lanes
     slot, displacement = vectors_at(0), vectors_at(layout.slots + 1)
@@ -133,21 +249,15 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
         # In
         body: PatchBody,
         steps: int,
-        damping: float,
-        gravity: wp.vec3,
+        dynamics: Dynamics,
         mu: wp.array[wp.float32],
         lam: wp.array[wp.float32],
         stride: int,
         mass: wp.array[wp.float32],
-        inverse_mass: wp.array[wp.float32],
-        has_load: int,
-        load: wp.array[load_vectors],
         pace: Pace,
         world_starts: wp.array[wp.float64],
         # In and out
         exchange: Exchange,
-        u: wp.array[wp.vec4],
-        v: wp.array[wp.vec4],
         # Out
         reactions: wp.array[wp.vec4],
         support_work: wp.array[wp.float64],
@@ -162,7 +272,7 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
         first_node = world * body.own.shape[0]
         dt = float(pace.seconds[DT])
         before = float(length_before(pace))
-        damped = 1.0 / (1.0 + dt * damping)
+        damped = 1.0 / (1.0 + dt * dynamics.damping)
         number = exchange.begun[block]
 
         # The node whose forces the thread sums together with its neighbours; the first of them moves the node.
@@ -171,12 +281,10 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
         place = thread // wp.static(lanes)
         moves = place < own_count and thread % wp.static(lanes) == 0
         i = first_node + body.own[first_own + wp.min(place, own_count - 1)]
-        x = load_node(u, i)
-        velocity = load_node(v, i)
-        w = inverse_mass[i]
-        load_here = wp.vec3()
-        if has_load != 0:
-            load_here = vector_at(load, i)
+        x = load_node(dynamics.u, i)
+        velocity = load_node(dynamics.v, i)
+        w = dynamics.inverse_mass[i]
+        load_here = load_at(i, dynamics)
         trajectory = body.trajectory[i]
         key = int(0)
         last_key = int(0)
@@ -351,11 +459,13 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
                     velocity = towards
                 force = elastic + load_here
                 if w > 0.0:
-                    velocity = symplectic_euler_velocity(velocity, force, w, gravity, 0.5 * (before + dt), damped)
+                    velocity = symplectic_euler_velocity(
+                        velocity, force, w, dynamics.gravity, 0.5 * (before + dt), damped
+                    )
                 else:
                     add_support_work(elastic, 0.5 * (before + dt) * velocity, support_work)
                     if step == steps - 1:
-                        store_node(reactions, i, -(force + mass[i] * gravity))
+                        store_node(reactions, i, -(force + mass[i] * dynamics.gravity))
                 x = x + dt * velocity
                 displacement(wp.static(STORE), place, x)
                 publish(exchange.published, int(number & wp.uint32(1)) * exchange.nodes + i, x, number)
@@ -369,8 +479,8 @@ def step_patches(layout: Layout, load_vectors: type) -> wp.Kernel:
             x = wp.vec3(wp.nan, wp.nan, wp.nan)
             wp.atomic_min(bad_step, 0, pace.counts[DONE] + wp.int64(step + 1))
         if moves:
-            store_node(u, i, x)
-            store_node(v, i, velocity)
+            store_node(dynamics.u, i, x)
+            store_node(dynamics.v, i, velocity)
         if thread == 0:
             exchange.begun[block] = exchange.begun[block] + wp.uint32(steps + 1)
 

@@ -11,7 +11,7 @@ from stages import TETS
 
 import warp_corot as wc
 from warp_corot.cli.input_file import open_input
-from warp_corot.mesh.surfaces.boundary import signed_volumes
+from warp_corot.mesh.topology import signed_volumes
 
 
 def bounds(said: str) -> str:

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 import warp_corot as wc
-from warp_corot.mesh.surfaces.locating import distances_from
+from warp_corot.mesh.surfaces.bound import distances_from
 
 SOFT = wc.Isotropic(young=5e3, poisson=0.4, density=1000.0)
 CALM = wc.SymplecticEuler(viscosity=1e-3)

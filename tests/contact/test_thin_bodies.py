@@ -5,7 +5,7 @@ import pytest
 
 import warp_corot as wc
 from warp_corot.contact.skin import own_surface
-from warp_corot.mesh.surfaces.locating import distances_from
+from warp_corot.mesh.surfaces.bound import distances_from
 
 SOFT = wc.Isotropic(young=2e4, poisson=0.4, density=1000.0)
 PLATE = wc.Domain.box((-0.03, -0.02, -0.001), (0.03, 0.02, 0.001))

@@ -7,7 +7,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 import warp_corot as wc
-from warp_corot.discretization.groups import MOST, SMALL, face_pairs, neighbour_groups
+from warp_corot.discretization.groups import MOST, SMALL, neighbour_groups
+from warp_corot.mesh.topology import face_pairs
 
 
 def general(level):

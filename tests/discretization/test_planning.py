@@ -6,9 +6,9 @@ import warp as wp
 from plan_oracle import OraclePlan, OracleUnits
 
 import warp_corot as wc
-from warp_corot.discretization.frames import all_frames
+from warp_corot.discretization.elements import all_frames
 from warp_corot.discretization.plan import GROUPED_LEAVES, Sharing
-from warp_corot.discretization.planning.fixed import ForcePlan, pays_in_groups
+from warp_corot.discretization.planner import ForcePlan, pays_in_groups
 from warp_corot.kernels.tables.shapes import FRAME_SHIFT
 
 MATERIAL = wc.Isotropic(young=1e4, poisson=0.4, density=1000.0)

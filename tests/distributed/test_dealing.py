@@ -14,7 +14,7 @@ from ranked import graded, jittered
 import warp_corot as wc
 from warp_corot.discretization.groups import group_numbers
 from warp_corot.discretization.plan import Awaited
-from warp_corot.discretization.planning.fixed import ForcePlan
+from warp_corot.discretization.planner import ForcePlan
 from warp_corot.distributed.divided_mesh import divide, pack_part, rejoined, whole_of
 from warp_corot.distributed.exchange import Places, reproducible_sums
 from warp_corot.distributed.meshes import dealt

@@ -5,8 +5,8 @@ from collections import defaultdict
 import numpy as np
 import pytest
 
-from warp_corot.domain.edges import Edges
-from warp_corot.mesh.sorting import FEW, sorted_keys
+from warp_corot.domain.closing import Edges
+from warp_corot.mesh.topology import FEW, sorted_keys
 
 
 def soup(seed: int) -> np.ndarray:

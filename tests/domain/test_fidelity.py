@@ -9,7 +9,7 @@ from warp_corot.domain.fidelity import fidelity, smallest_dihedral
 from warp_corot.domain.reference import reference_of, volume_along_lines
 from warp_corot.holding.choice import supports_of
 from warp_corot.mesh import TetForest, TetMesh
-from warp_corot.mesh.pieces import pieces_of
+from warp_corot.mesh.topology import pieces_of
 
 
 def surface_of(*parts: trimesh.Trimesh) -> Domain:

@@ -8,9 +8,8 @@ import warp as wp
 import warp.examples
 
 import warp_corot as wc
+from warp_corot.domain.closing import winding_number
 from warp_corot.domain.surface import lines_through, surface_mesh, windings_of
-from warp_corot.domain.winding import winding_number
-from warp_corot.kernels.meshing import domain as kernels
 
 
 def box(low, high) -> trimesh.Trimesh:
@@ -78,9 +77,6 @@ def test_a_part_that_crosses_itself_is_right_away_from_the_crossing(device):
     ring = trimesh.creation.torus(0.15, 0.3, major_sections=48, minor_sections=40)
     ring.apply_transform(trimesh.transformations.euler_matrix(0.3, 0.2, 0.1))
     domain = wc.Domain.from_surface((ring.vertices, ring.faces), device=device)
-    sides = np.bincount(domain.sides.known, minlength=3)
-    assert sides[kernels.UNSURE] > 0
-    assert sides[kernels.BOUNDARY] > 0.5 * len(ring.faces)
     rng = np.random.default_rng(0)
     points = ring.triangles_center[rng.integers(len(ring.faces), size=1500)]
     points = points + rng.standard_normal((1500, 3)) * 10.0 ** rng.uniform(-3.0, -1.0, (1500, 1))

@@ -7,7 +7,7 @@ from scipy.ndimage import gaussian_filter
 from volumes import SPACING, affine_of, ball, blobs, turned
 
 from warp_corot.domain import Domain, labels_from_probabilities
-from warp_corot.domain.voxels import signed_distance, steepest_slope
+from warp_corot.domain.labels import signed_distance, steepest_slope
 from warp_corot.errors import InputError
 
 ROUNDING = 3e-6

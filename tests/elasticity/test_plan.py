@@ -7,7 +7,7 @@ from plan_oracle import complete_subtrees
 
 import warp_corot as wc
 from warp_corot.discretization.plan import Sharing
-from warp_corot.discretization.planning.fixed import ForcePlan
+from warp_corot.discretization.planner import ForcePlan
 from warp_corot.kernels.elements.shapes import STIFFNESS_LAMBDA, STIFFNESS_MU
 from warp_corot.kernels.tables import subtree
 

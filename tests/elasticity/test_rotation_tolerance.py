@@ -7,7 +7,7 @@ import warp as wp
 from cases import edge_scale, oracle_mesh
 
 import warp_corot as wc
-from warp_corot.discretization.planning.fixed import ForcePlan
+from warp_corot.discretization.planner import ForcePlan
 from warp_corot.elasticity.corotated.model import AUTO_TOLERANCE
 from warp_corot.elasticity.model import isotropic_material
 from warp_corot.kernels.subtrees import cpu as subtree_cpu

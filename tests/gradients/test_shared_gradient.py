@@ -8,7 +8,7 @@ import warp as wp
 from cases import CUBE, jittered
 
 import warp_corot as wc
-from warp_corot.gradients.element_work import ElementWork
+from warp_corot.gradients.parameters import ElementWork
 
 GRAVITY = np.array([0.0, -9.8, 0.0])
 

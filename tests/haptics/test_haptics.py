@@ -9,9 +9,7 @@ import pytest
 
 import warp_corot as wc
 from warp_corot.haptics import DeviceError, HapticLoop, MouseDevice, ScriptedDevice
-from warp_corot.haptics.exchange import ToolState
-from warp_corot.haptics.local_model import LocalModel
-from warp_corot.haptics.passivity import PassivityControl
+from warp_corot.haptics.exchange import LocalModel, PassivityControl, ToolState
 
 SOFT = wc.Isotropic(young=2e4, poisson=0.4, density=1000.0)
 RADIUS, TOP = 0.01, 0.02

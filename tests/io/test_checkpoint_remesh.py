@@ -7,7 +7,7 @@ from remesh_cases import assert_conforming, leaf_list
 
 import warp_corot as wc
 from warp_corot.io.checkpoint.archive import load_checkpoint
-from warp_corot.kernels.remesh.mark import ElementState
+from warp_corot.kernels.remesh.criteria import ElementState
 
 END = 0.2
 

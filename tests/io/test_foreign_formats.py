@@ -22,7 +22,7 @@ from warp_corot.errors import InputError
 from warp_corot.io.read.files import read_mesh_file
 from warp_corot.io.read.surfaces import load_surface
 from warp_corot.io.read.tetrahedra import load_tets
-from warp_corot.mesh.surfaces.boundary import signed_volumes
+from warp_corot.mesh.topology import signed_volumes
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 from warp_corot.errors import InputError
 from warp_corot.io.read.assets import ASSETS
 from warp_corot.io.read.tetrahedra import load_tets
-from warp_corot.mesh.surfaces.boundary import boundary_faces, signed_volumes
+from warp_corot.mesh.topology import boundary_faces, signed_volumes
 
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]], dtype=np.float64)
 TETS = np.array([[0, 1, 2, 3], [1, 2, 3, 4]], dtype=np.int32)

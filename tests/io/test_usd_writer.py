@@ -20,7 +20,7 @@ from warp_corot.io.pictures.colors import color_index, stress_colors
 from warp_corot.io.read.tetrahedra import load_tets
 from warp_corot.io.write.usd import pieces as usd_pieces
 from warp_corot.io.write.usd.writer import SURFACE, TETS, UsdWriter
-from warp_corot.mesh.surfaces.boundary import signed_volumes
+from warp_corot.mesh.topology import signed_volumes
 
 
 class Material:

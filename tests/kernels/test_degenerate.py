@@ -12,7 +12,7 @@ from cases import edge_scale, mixed_forest, oracle_mesh
 from degenerate_launches import Launches
 
 import warp_corot as wc
-from warp_corot.discretization.planning.fixed import ForcePlan
+from warp_corot.discretization.planner import ForcePlan
 from warp_corot.elasticity.corotated.launches import DegenerateLeaves
 from warp_corot.elasticity.model import isotropic_material
 from warp_corot.kernels.subtrees.degenerate import COUNT_STRIDE, LISTS

@@ -14,7 +14,7 @@ from pairs import add_forces
 from thousands import FORESTS, TOLERANCE, materials, meshed, turned
 
 import warp_corot as wc
-from warp_corot.discretization.planning.fixed import ForcePlan
+from warp_corot.discretization.planner import ForcePlan
 from warp_corot.elasticity.anisotropic import AnisotropicField, active_material, as_bytes
 from warp_corot.elasticity.clusters import ClusterScatter, clustered
 from warp_corot.elasticity.model import isotropic_material

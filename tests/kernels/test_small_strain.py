@@ -12,7 +12,7 @@ from cases import edge_scale, mixed_forest, oracle_mesh, place, random_displacem
 from degenerate_launches import Launches
 
 import warp_corot as wc
-from warp_corot.discretization.planning.fixed import ForcePlan
+from warp_corot.discretization.planner import ForcePlan
 from warp_corot.elasticity.model import isotropic_material
 from warp_corot.kernels.subtrees.cuda import scatter_subtrees_shared
 from warp_corot.kernels.subtrees.degenerate import DegenerateList

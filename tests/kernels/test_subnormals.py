@@ -6,7 +6,7 @@ import warp as wp
 from cases import MATERIAL
 
 import warp_corot as wc
-from warp_corot.solvers.subnormals import FlushedSubnormals
+from warp_corot.solvers.recorded import FlushedSubnormals
 
 SUBNORMAL = np.float32(1e-40)
 

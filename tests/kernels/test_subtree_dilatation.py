@@ -9,7 +9,7 @@ from cases import CUBE
 
 import warp_corot as wc
 from warp_corot.discretization.discretization import deviatoric
-from warp_corot.discretization.planning.fixed import ForcePlan
+from warp_corot.discretization.planner import ForcePlan
 from warp_corot.elasticity.model import isotropic_material
 from warp_corot.kernels.elements.dilatation import VOLUME
 from warp_corot.kernels.subtrees.cuda import scatter_dilatation

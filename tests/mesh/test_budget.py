@@ -6,16 +6,10 @@ import trimesh
 
 import warp_corot as wc
 from warp_corot.domain.fidelity import fidelity
-from warp_corot.domain.thinness import elements_through
-from warp_corot.mesh.growing.cut import face_pairs
-from warp_corot.mesh.growing.slivers import without_slivers
-from warp_corot.mesh.growing.strays import strays
+from warp_corot.mesh.growing.slivers import strays, without_slivers
+from warp_corot.mesh.topology import face_pairs
 
 TURN = trimesh.transformations.rotation_matrix(0.4, (1.0, 2.0, 3.0))
-
-
-def sample(mesh: trimesh.Trimesh) -> np.ndarray:
-    return np.asarray(trimesh.sample.sample_surface(mesh, 2000, seed=0)[0])
 
 
 def turned(mesh: trimesh.Trimesh) -> wc.Domain:
@@ -173,22 +167,3 @@ def test_tips_of_crossing_parts_are_left_out_as_well():
     with pytest.warns(UserWarning, match="tips of the body"):
         mesh = wc.TetForest.from_domain(domain, target_elements=2000)
     assert fidelity(mesh, domain).pieces == 1
-
-
-def test_a_broken_wall_says_how_many_elements_it_takes():
-    """Flat walls of 1/500 of the length: seven elements for each square of two walls, as large as these are thick."""
-    inner = trimesh.creation.box((0.996, 0.996, 0.996))
-    inner.invert()
-    box = trimesh.util.concatenate([trimesh.creation.box((1.0, 1.0, 1.0)), inner])
-    domain = wc.Domain.from_surface((box.vertices, box.faces))
-    assert elements_through(domain.kind, sample(box), 0.1) == pytest.approx(7.0 * 12.0 / 0.002**2, rel=0.03)
-    solid = trimesh.creation.box((1.0, 1.0, 1.0))
-    assert elements_through(wc.Domain.from_surface((solid.vertices, solid.faces)).kind, sample(solid), 0.1) == 0
-
-
-def test_a_part_with_a_hundredth_of_the_surface_counts_for_nothing():
-    cube, plate = trimesh.creation.box((1.0, 1.0, 1.0)), trimesh.creation.box((0.1, 0.1, 0.002))
-    plate.apply_translation((0.0, 0.0, 1.0))
-    both = trimesh.util.concatenate([cube, plate])
-    points = np.concatenate([sample(cube), sample(plate)[:20]])
-    assert elements_through(wc.Domain.from_surface((both.vertices, both.faces)).kind, points, 0.1) == 0

@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 
 import warp_corot as wc
-from warp_corot.mesh.surfaces.bound import SurfaceMesh
-from warp_corot.mesh.surfaces.clustering import Clusters
-from warp_corot.mesh.surfaces.locating import distances_from
-from warp_corot.mesh.surfaces.splitting import longest_edge, split
+from warp_corot.mesh.surfaces.bound import SurfaceMesh, distances_from
+from warp_corot.mesh.surfaces.clustering import Clusters, longest_edge, split
 
 BALL = 0.02
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import warp_corot as wc
-from warp_corot.mesh.growing.adapt import grow
-from warp_corot.mesh.growing.judging import Wishes
-from warp_corot.mesh.growing.resolved import BELOW, Coarsening, Resolved
+from warp_corot.mesh.growing.fine_classification import BELOW, Coarsening, Resolved
+from warp_corot.mesh.growing.growth import Growing
+from warp_corot.mesh.growing.refinement_criteria import Wishes
 from warp_corot.mesh.tree import LIVE
 
 
@@ -15,8 +15,9 @@ def resolved(request):
     import warp as wp
 
     domain = wc.Domain.torus(0.35, 0.12, device="cpu") | wc.Domain.sphere(0.2, (0.3, 0.0, 0.1), device="cpu")
-    grown = grow(domain, 0.25, Wishes(0.002, 0, 7), wp.get_device("cpu"))
-    return Resolved(grown, 0.25, domain)
+    growing = Growing(domain, 0.25, Wishes(0.002, 0, 7), wp.get_device("cpu"))
+    growing.run()
+    return Resolved(growing.grown(), 0.25, domain)
 
 
 def bisected(resolved: Resolved, needs: np.ndarray, least: float) -> np.ndarray:

@@ -7,11 +7,10 @@ import pytest
 import trimesh
 
 import warp_corot as wc
+from warp_corot.domain.closing import net_edges
 from warp_corot.domain.fidelity import fidelity
-from warp_corot.domain.winding import net_edges
 from warp_corot.io.checkpoint.archive import joined, split
 from warp_corot.io.checkpoint.contents import pack_mesh, unpack_mesh
-from warp_corot.mesh.surfaces import creases
 
 TURN = trimesh.transformations.euler_matrix(np.radians(20.0), np.radians(30.0), 0.0)
 
@@ -67,22 +66,3 @@ def test_a_checkpoint_keeps_the_surface():
     again = unpack_mesh(joined(*split(pack_mesh(forest)))).surface()
     assert np.array_equal(again.points, forest.surface().points)
     assert np.array_equal(again.triangles, forest.surface().triangles)
-
-
-@pytest.mark.parametrize("angles", [(20.0, 30.0, 0.0), (36.5, 23.2, 3.5), (80.1, 5.0, 64.0)])
-def test_corners_of_a_cube_are_met(angles, monkeypatch):
-    """Each by a vertex, on a closed surface that is nearer to the cube's volume than one without them."""
-    turn = trimesh.transformations.euler_matrix(*np.radians(angles))
-    shape = trimesh.creation.box((0.1, 0.1, 0.1)).apply_transform(turn)
-    domain = wc.Domain.from_surface((shape.vertices, shape.faces))
-    assert len(domain.corners()) == 8
-    forest = wc.TetForest.from_domain(domain, target_elements=1500)
-    surface = forest.surface()
-    away = np.linalg.norm(surface.points[:, None] - shape.vertices[None], axis=2).min(axis=0)
-    assert away.max() < 1e-5
-    assert not len(net_edges(surface.triangles.astype(np.int64))[0])
-    assert surface.euler_characteristic == 2
-    monkeypatch.setattr(creases, "with_corners", lambda x, triangles, _: (x, triangles))
-    blunt = forest.detail.sharpened(domain).surface()
-    assert np.linalg.norm(blunt.points[:, None] - shape.vertices[None], axis=2).min(axis=0).max() > 1e-4
-    assert abs(surface.volume - 1e-3) < abs(blunt.volume - 1e-3)

@@ -6,8 +6,9 @@ from meshes import PAIRS, SHAPES, as_trimesh, assert_bound, held
 from scipy.spatial import ConvexHull
 
 import warp_corot as wc
-from warp_corot.mesh.growing.cut import face_pairs, inside_shares, label_shares
+from warp_corot.mesh.growing.fine_classification import inside_shares, label_shares
 from warp_corot.mesh.growing.slivers import merged
+from warp_corot.mesh.topology import face_pairs
 
 
 def test_share_inside_is_the_volume_of_the_convex_hull():

@@ -9,7 +9,7 @@ from bodies import ball, ring, united
 from meshes import as_trimesh, assert_conforming, held
 
 import warp_corot as wc
-from warp_corot.mesh.growing.cut import inside_shares
+from warp_corot.mesh.growing.fine_classification import inside_shares
 
 
 @pytest.fixture(scope="module")

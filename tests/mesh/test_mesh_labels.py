@@ -8,7 +8,7 @@ from meshes import as_trimesh, assert_balanced, assert_bound, held
 
 import warp_corot as wc
 from warp_corot.domain.fidelity import fidelity, held_volumes
-from warp_corot.mesh.surfaces.separating import separated
+from warp_corot.mesh.surfaces.marching import separated
 
 
 def layered():
@@ -112,16 +112,3 @@ def test_each_label_has_its_share_of_elements_and_its_volume():
         assert label.volume == pytest.approx(held_volumes(mesh)[mesh.elements_of(label.name)].sum())
     assert sum("label" in line for line in found.report()) == 5
     assert found.doubts() == []
-
-
-def test_the_number_of_elements_that_a_warning_names_is_enough():
-    scan = five_labels()
-    few = fidelity(wc.TetForest.from_domain(scan, target_elements=700, device="cpu"), scan, samples=500)
-    off = [label for label in few.labels if abs(label.error) > 0.05]
-    assert off
-    for label in off:
-        said = f"label {label.name}: its volume is {label.error:+.1%} off in its {label.elements} tetrahedra; "
-        assert f"{said}about {label.needed} tetrahedra in all would do" in few.doubts()
-    needed = max(label.needed for label in off)
-    more = fidelity(wc.TetForest.from_domain(scan, target_elements=needed, device="cpu"), scan, samples=500)
-    assert not any("label" in doubt for doubt in more.doubts())

@@ -6,7 +6,7 @@ from bodies import Body, ball, box_distance, turned_box, united, without
 from meshes import HALF, SHAPES, TURN, as_trimesh, assert_balanced, farthest, off_surface, on_ball, on_box
 
 import warp_corot as wc
-from warp_corot.mesh.growing.cut import inside_shares
+from warp_corot.mesh.growing.fine_classification import inside_shares
 from warp_corot.mesh.surfaces.marching import marched
 
 LEVELS = (9, 12, 15)

@@ -7,7 +7,7 @@ import pytest
 from foreign_meshes import VOLUME, grid
 
 from warp_corot.io.read.filemesh import Block, fan, split_polyhedron, split_solids, triangles_of
-from warp_corot.mesh.surfaces.boundary import boundary_faces, signed_volumes
+from warp_corot.mesh.topology import boundary_faces, signed_volumes
 
 
 def faces_by_count(tets: np.ndarray) -> dict[int, int]:

@@ -17,7 +17,7 @@ from scene_stages import (
 )
 from scipy.linalg import polar
 
-from warp_corot.mesh.surfaces.boundary import signed_volumes
+from warp_corot.mesh.topology import signed_volumes
 
 G = 9.81
 HEIGHT, AREA = 3 * CELL, (2 * CELL) ** 2

@@ -8,7 +8,7 @@ from remesh_cases import CUBE, DENSITY, PAIRS, assert_sound, leaf_list, momentum
 import warp_corot as wc
 from warp_corot.discretization.changing.passes import RemeshPass
 from warp_corot.discretization.changing.pools import DeviceForest
-from warp_corot.kernels.remesh.mark import ElementState
+from warp_corot.kernels.remesh.criteria import ElementState
 
 
 def longest_edges(forest, tets, moved):

@@ -8,7 +8,7 @@ import warp as wp
 
 import warp_corot as wc
 from warp_corot.kernels.remesh import criteria as remesh_criteria
-from warp_corot.kernels.remesh import mark as remesh_mark
+from warp_corot.kernels.remesh import criteria as remesh_mark
 
 SIZE = 0.064
 

@@ -6,8 +6,13 @@ from remesh_cases import CUBE, DENSITY, assert_sound, leaf_list, moving, random_
 
 import warp_corot as wc
 from warp_corot.discretization.changing.passes import RemeshPass
-from warp_corot.discretization.changing.pools import DeviceForest
-from warp_corot.discretization.changing.snapshot import CARRIED_BY_NODES, CARRIED_BY_TETRAHEDRA, OF_NODES, OF_TETRAHEDRA
+from warp_corot.discretization.changing.pools import (
+    CARRIED_BY_NODES,
+    CARRIED_BY_TETRAHEDRA,
+    OF_NODES,
+    OF_TETRAHEDRA,
+    DeviceForest,
+)
 
 
 def points_of(device):
@@ -102,7 +107,6 @@ def test_nodes_at_the_rim_of_a_void_move_and_virtual_ones_stay(device, rng):
         remesh.apply(random_marks(adaptive, rng, refine, simplify))
         assert_sound(adaptive)
         moved += sum(p in at_void and n != number.get(p, n) for n, p in enumerate(points_of(adaptive)))
-        adaptive.compact()
         assert np.array_equal(adaptive.pools.lattice.numpy()[places], virtual)
     assert moved > 20
 
@@ -208,13 +212,12 @@ def test_restarting_leads_back_and_recorded_passes_go_on(kind, device, rng):
 
 @pytest.mark.parametrize("kind", ["box", "sphere"])
 def test_a_mesh_restarts_at_what_it_began_as(kind, device, rng):
-    """Even if its pools were full and it was compacted in between."""
+    """Even if its pools were full."""
     forest = START[kind]()
     adaptive = DeviceForest(forest, len(forest.tets) + 300, density=DENSITY, device=device)
     remesh, first = RemeshPass(adaptive), in_use(adaptive)
     for _ in range(4):
         remesh.apply(np.ones(adaptive.leaf_count, int))
-    adaptive.compact()
     assert adaptive.is_full
     adaptive.restart()
     assert_same_state(adaptive, first)

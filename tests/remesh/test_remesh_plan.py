@@ -12,7 +12,7 @@ from warp_corot.discretization.changing.plan import DevicePlan, launch_size
 from warp_corot.discretization.changing.pools import DeviceForest
 from warp_corot.discretization.elements import device_elements
 from warp_corot.discretization.plan import Sharing
-from warp_corot.discretization.planning.fixed import ForcePlan, units_of
+from warp_corot.discretization.planner import ForcePlan, units_of
 from warp_corot.kernels.remesh.pools import SINKS
 from warp_corot.kernels.tables.shapes import FRAME_SHIFT
 
@@ -181,9 +181,6 @@ def test_the_plan_is_that_of_the_present_mesh(mesh, grouped, rotation_level, dev
         check(plan, forest, rotation_level, grouped)
         counts.append(forest.leaf_count)
     assert counts[0] < counts[1] > counts[3]
-    forest.compact()
-    plan.derive()
-    check(plan, forest, rotation_level, grouped)
 
 
 def test_a_pass_that_changes_nothing_leaves_the_plan_alone(device):

@@ -5,8 +5,7 @@ import warp as wp
 from remeshed import SOFT, bar, near
 
 import warp_corot as wc
-from warp_corot.kernels.remesh.criteria import nearness, strain, von_mises_stress
-from warp_corot.kernels.remesh.mark import ElementState
+from warp_corot.kernels.remesh.criteria import ElementState, nearness, strain, von_mises_stress
 
 
 @wp.func

@@ -6,7 +6,7 @@ import warp as wp
 from remeshed import SOFT, near, twin
 
 import warp_corot as wc
-from warp_corot.kernels.remesh.mark import ElementState
+from warp_corot.kernels.remesh.criteria import ElementState
 
 
 @wp.func

@@ -7,12 +7,9 @@ import pytest
 import trimesh
 
 import warp_corot as wc
-from warp_corot.holding.choice import supports_of
-from warp_corot.holding.regions import BodyShape, flat_region
-from warp_corot.holding.sag import CoarseBody
-from warp_corot.holding.sag_mesh import MeshBody
-from warp_corot.mesh.pieces import pieces_of
-from warp_corot.mesh.surfaces.boundary import boundary_faces
+from warp_corot.holding.choice import BodyShape, flat_region, supports_of
+from warp_corot.holding.sag import CoarseBody, MeshBody
+from warp_corot.mesh.topology import boundary_faces, pieces_of
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 DENSITY = 1000.0

@@ -10,8 +10,7 @@ from cases import CUBE, jittered, mixed_forest, oracle_mesh
 
 import warp_corot as wc
 from warp_corot.discretization.groups import group_numbers, neighbour_groups
-from warp_corot.solvers.explicit.patch_layout import NO_SLOT, WARP, Patches
-from warp_corot.solvers.explicit.patches import PatchSteps, layout_of, rest_rows
+from warp_corot.solvers.explicit.patches import NO_SLOT, WARP, Patches, PatchSteps, layout_of, rest_rows
 
 THREADS = 256
 ROOM = 200 * 1024

@@ -13,7 +13,7 @@ import warp as wp
 from cases import CUBE, jittered, oracle_mesh, random_displacement
 
 import warp_corot as wc
-from warp_corot.discretization.planning.fixed import ForcePlan
+from warp_corot.discretization.planner import ForcePlan
 
 YOUNG, POISSON, DENSITY, DAMPING = 2e3, 0.4, 500.0, 15.0
 GRAVITY = (0.3, -9.8, 0.1)

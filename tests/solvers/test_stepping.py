@@ -8,7 +8,7 @@ import pytest
 from beams import beam, stretched
 
 import warp_corot as wc
-from warp_corot.solvers.steps.safe_step import INTERVAL
+from warp_corot.solvers.stability import INTERVAL
 
 
 def energy_range(sim, seconds, looks):

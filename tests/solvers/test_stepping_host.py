@@ -9,7 +9,7 @@ import warp as wp
 from beams import beam, stretched
 
 import warp_corot as wc
-from warp_corot.solvers.steps.safe_step import INTERVAL
+from warp_corot.solvers.stability import INTERVAL
 
 
 @pytest.fixture

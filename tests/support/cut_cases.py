@@ -5,7 +5,7 @@ from remesh_cases import assert_padding
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from warp_corot.mesh.surfaces.boundary import boundary_faces
+from warp_corot.mesh.topology import boundary_faces
 
 FACES = [[m for m in range(4) if m != n] for n in range(4)]
 

@@ -3,7 +3,7 @@
 import numpy as np
 import warp as wp
 
-from warp_corot.discretization.planning.fixed import ForcePlan
+from warp_corot.discretization.planner import ForcePlan
 from warp_corot.elasticity.corotated.launches import DegenerateLeaves
 from warp_corot.elasticity.model import isotropic_material
 from warp_corot.kernels.subtrees.cuda import FLAT, WorkRange, scatter_body

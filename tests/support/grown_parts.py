@@ -6,7 +6,7 @@ import numpy as np
 
 import warp_corot as wc
 from warp_corot.distributed import mpi
-from warp_corot.mesh.surfaces.boundary import boundary_faces
+from warp_corot.mesh.topology import boundary_faces
 
 
 def blobs() -> wc.Domain:

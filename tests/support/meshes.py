@@ -8,7 +8,7 @@ from bodies import ball, ring, turned_box
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from warp_corot.mesh.surfaces.locating import nearest_faces
+from warp_corot.mesh.surfaces.bound import nearest_faces
 
 PAIRS = list(itertools.combinations(range(4), 2))
 TURN = Rotation.from_rotvec([0.3, 0.5, 0.7]).as_matrix()

@@ -5,7 +5,7 @@ import functools
 import numpy as np
 
 import warp_corot as wc
-from warp_corot.mesh.surfaces.locating import nearest_faces
+from warp_corot.mesh.surfaces.bound import nearest_faces
 
 BALL = 0.02  # radius [m]
 SOFT = wc.Isotropic(young=2e4, poisson=0.4, density=1000.0)

@@ -5,7 +5,7 @@ from PIL import Image
 
 from warp_corot.io.pictures.drawing import checked_surface, value_limits
 from warp_corot.io.pictures.preview import Picture, Strip, save_picture
-from warp_corot.mesh.surfaces.boundary import boundary_faces
+from warp_corot.mesh.topology import boundary_faces
 
 # A cube of side 1 about the origin.
 CUBE = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float) - 0.5

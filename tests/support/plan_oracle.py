@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from warp_corot.discretization.elements import in_worlds
-from warp_corot.discretization.frames import frame_keys, frame_table
+from warp_corot.discretization.elements import frame_keys, frame_table, in_worlds
 from warp_corot.discretization.plan import Sharing
-from warp_corot.discretization.planning.planner import subtree_nodes
+from warp_corot.discretization.planner import subtree_nodes
 from warp_corot.kernels.tables.subtree import GROUP_NODES, LEAVES, group_leaves, group_nodes
 
 SUBTREE_LEVELS = 3

@@ -7,8 +7,7 @@ import pytest
 from plan_oracle import shape_codes
 from sequential import Bisection
 
-from warp_corot.discretization.changing.pools import DeviceForest
-from warp_corot.discretization.changing.snapshot import CARRIED_BY_NODES
+from warp_corot.discretization.changing.pools import CARRIED_BY_NODES, DeviceForest
 from warp_corot.discretization.sizes import padded
 from warp_corot.kernels.tables.shapes import FRAME_SHIFT
 from warp_corot.mesh.lattice import LATTICE_BITS

@@ -3,7 +3,7 @@
 import warp as wp
 
 import warp_corot as wc
-from warp_corot.kernels.remesh.mark import ElementState
+from warp_corot.kernels.remesh.criteria import ElementState
 
 SOFT = wc.Isotropic(young=3e4, poisson=0.4, density=1000.0)
 

@@ -10,7 +10,7 @@ newton = pytest.importorskip("newton")
 pytest.importorskip("newton_usd_schemas")
 
 import warp_corot as wc  # noqa: E402
-from warp_corot.mesh.surfaces.boundary import signed_volumes  # noqa: E402
+from warp_corot.mesh.topology import signed_volumes  # noqa: E402
 from warp_corot.newton import StageOptions, StageSimulation  # noqa: E402
 
 YOUNG, DENSITY, CELL = 2e5, 1000.0, 0.1

@@ -8,7 +8,7 @@ import trimesh
 from pxr import Usd, UsdGeom, UsdValidation
 
 import warp_corot as wc
-from warp_corot.mesh.surfaces.boundary import signed_volumes
+from warp_corot.mesh.topology import signed_volumes
 
 SURFACE, TETS = "/SoftBody/surface", "/SoftBody/tetrahedra"
 

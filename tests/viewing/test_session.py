@@ -332,7 +332,7 @@ def test_closed_the_simulation_is_free():
 def test_stresses_are_averages_of_the_elements_around(device, rng):
     """As the pictures of ``simulate`` have them."""
     from warp_corot.io.pictures.colors import VertexAverage
-    from warp_corot.mesh.surfaces.boundary import signed_volumes
+    from warp_corot.mesh.topology import signed_volumes
 
     page = session(device)
     body, shown = page.sim.body, page.shown[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from os import PathLike
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -21,18 +22,13 @@ from warp_corot.inputs.simulation_lock import SIMULATION_LOCK, under_lock
 from warp_corot.kernels.stepping.integrate import RESET_NODES
 from warp_corot.materials.isotropic import Material
 from warp_corot.mesh import TetForest
-from warp_corot.mesh.pieces import pieces_of
 from warp_corot.mesh.surfaces.bodies import boundary_surface
 from warp_corot.mesh.surfaces.bound import NOT_OPENED
-from warp_corot.mesh.surfaces.boundary import boundary_faces
+from warp_corot.mesh.topology import boundary_faces, pieces_of
 
-from .conditions import Conditions
+from .arrays import NodeArrays, SharedArrays, Views
 from .controls import Controls
-from .node_arrays import NodeArrays
-from .shared_arrays import SharedArrays
-from .state import State
-from .views import Views
-from .worlds import World
+from .state import Conditions, State
 
 if TYPE_CHECKING:
     from warp_corot.discretization.changing.transfer import FollowingBinding
@@ -356,6 +352,59 @@ class SoftBody(Controls, SharedArrays, NodeArrays):
         if len(bad):
             raise InputError(f"{name} of node {bad[0]} are {given[bad[0]].tolist()}; they must be finite")
         return given
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """One copy's part of a body's arrays, as views: writing to them changes the body's state.
+
+    Attributes:
+        body: The body.
+        index: Index of the copy, from 0.
+    """
+
+    body: SoftBody
+    index: int
+
+    @property
+    def nodes(self) -> slice:
+        """The range of the copy's nodes among the body's."""
+        count = self.body.world_node_count
+        return slice(self.index * count, (self.index + 1) * count)
+
+    @property
+    def elements(self) -> slice:
+        """The range of the copy's elements among the body's."""
+        count = self.body.world_element_count
+        return slice(self.index * count, (self.index + 1) * count)
+
+    @property
+    def positions(self) -> wp.array:
+        """As ``SoftBody.positions`` [m], vec3 [N] of one copy."""
+        return self._own(self.body.positions)
+
+    @property
+    def displacements(self) -> wp.array:
+        """As ``SoftBody.displacements`` [m], vec3 [N] of one copy: a copy of the values, not a view."""
+        return self._own(self.body.displacements)
+
+    @property
+    def velocities(self) -> wp.array:
+        """As ``SoftBody.velocities`` [m/s], vec3 [N] of one copy."""
+        return self._own(self.body.velocities)
+
+    @property
+    def reactions(self) -> wp.array:
+        """As ``SoftBody.reactions`` [N], vec3 [N] of one copy."""
+        return self._own(self.body.reactions)
+
+    @property
+    def loads(self) -> wp.array:
+        """As ``SoftBody.loads`` [N], vec3 [N] of one copy."""
+        return self._own(self.body.loads)
+
+    def _own(self, array: wp.array) -> wp.array:
+        return array if self.body.worlds == 1 else array[self.nodes]
 
 
 def _check_made_of(mesh: Any, material: Any) -> None:

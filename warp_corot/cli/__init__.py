@@ -15,8 +15,8 @@ from types import ModuleType
 from typing import NoReturn
 
 from warp_corot.errors import InputError, UnstableError
+from warp_corot.inputs.arguments import meant
 from warp_corot.inputs.importing import uncollected
-from warp_corot.inputs.likely import meant
 from warp_corot.inputs.stopwatch import WATCH
 
 from .options import COMMANDS, EXIT_CODES, StrictParser, add_command
@@ -177,7 +177,7 @@ def _run(argv: Sequence[str] | None) -> int:
         args = make_parser(tuple(named)).parse_args(words)
         args.command_line = shlex.join(["warp-corot", *words])
         configure_warp()
-        from warp_corot.inputs.starting import start_warp
+        from warp_corot.inputs.processes import start_warp
 
         logging.basicConfig(format="warp-corot: warning: %(message)s", level=logging.WARNING)
         try:

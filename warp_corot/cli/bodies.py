@@ -15,7 +15,7 @@ from warp_corot.elasticity import MODELS, Corotated, Model
 from warp_corot.errors import InputError
 from warp_corot.holding.choice import supports_of
 from warp_corot.materials.isotropic import Isotropic
-from warp_corot.remesh.online import OnlineRemesh
+from warp_corot.remesh.remeshing import OnlineRemesh
 from warp_corot.simulation.parts import checked_gravity
 
 from .input_file import InputFile, bodies_in, open_input, refuse_options, with_unit

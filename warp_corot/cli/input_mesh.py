@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from warp_corot.body.places import named_nodes
+from warp_corot.body.controls import named_nodes
 from warp_corot.domain.units import in_units
 from warp_corot.errors import InputError
 from warp_corot.inputs.stopwatch import WATCH
@@ -371,13 +371,9 @@ def _measured(args: argparse.Namespace, mesh: TetForest, domain: Domain, surface
     from warp_corot.domain.units import length
 
     found = fidelity(mesh, domain, surface=surface)
-    more, through = 2 * len(mesh.tets), ""
-    if found.needed > more:
-        more = int(float(f"{found.needed:.1e}"))
-        through = ", of which one fits through the thinnest walls"
     for doubt in found.doubts():
-        said = doubt.replace("more tetrahedra", f"more tetrahedra (--tets {more}{through})")
-        warnings.warn(said.replace("tetrahedra in all", "tetrahedra in all (--tets)"), stacklevel=2)
+        said = doubt.replace("more tetrahedra", f"more tetrahedra (--tets {2 * len(mesh.tets)})")
+        warnings.warn(said, stacklevel=2)
     off = max(found.distance_95)
     if args.surface_error is not None and off > args.surface_error:
         helps = (

@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from warp_corot.body.places import TAKEN, named_nodes
+from warp_corot.body.controls import TAKEN, named_nodes
 from warp_corot.domain.units import in_units
 from warp_corot.errors import InputError
-from warp_corot.holding.regions import LOWEST, BodyShape, flat_region
+from warp_corot.holding.choice import LOWEST, BodyShape, flat_region
 from warp_corot.inputs.checks import checked_times
 from warp_corot.inputs.selection import select_nodes
 from warp_corot.mesh.surfaces.bodies import boundary_surface
-from warp_corot.mesh.surfaces.boundary import boundary_faces
+from warp_corot.mesh.topology import boundary_faces
 
 from .options import LOADS
 

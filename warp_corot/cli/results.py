@@ -224,7 +224,7 @@ class DrawnBodies:
     def _stress(self, k: int, sim: Simulation) -> np.ndarray:
         """Von Mises stress at the nodes of a body [Pa], [N]."""
         from warp_corot.io.pictures.colors import VertexAverage
-        from warp_corot.mesh.surfaces.boundary import signed_volumes
+        from warp_corot.mesh.topology import signed_volumes
 
         mesh = self._soft[k].mesh
         if k not in self._averages or self._averages[k][0] is not mesh:

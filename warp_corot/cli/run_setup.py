@@ -30,7 +30,7 @@ from warp_corot.inputs.loading import (
 )
 from warp_corot.inputs.stopwatch import WATCH
 from warp_corot.mesh import TetForest
-from warp_corot.simulation.beginning import bring_to_rest
+from warp_corot.simulation.resting import bring_to_rest
 from warp_corot.simulation.simulation import Simulation
 from warp_corot.simulation.static import solve_static
 from warp_corot.solvers import INTEGRATORS, BackwardEuler, Integrator, QuasiStatic, SymplecticEuler

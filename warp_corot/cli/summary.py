@@ -14,8 +14,8 @@ from warp_corot.holding.choice import NAMED
 from warp_corot.inputs.processes import process_count
 from warp_corot.inputs.stopwatch import KERNELS, WATCH
 from warp_corot.mesh import TetForest
+from warp_corot.simulation.energy import Solves
 from warp_corot.simulation.simulation import Simulation
-from warp_corot.simulation.solves import Solves
 from warp_corot.solvers import INTEGRATORS
 
 from . import terminal

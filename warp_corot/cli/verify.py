@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 
 from warp_corot.errors import InputError
-from warp_corot.inputs.likely import meant
+from warp_corot.inputs.arguments import meant
 from warp_corot.io.files.whole import check_output, written_whole
 
 from .terminal import complain

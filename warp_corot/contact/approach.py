@@ -18,9 +18,8 @@ from warp_corot.kernels.contact.visits import Part, Visits
 from warp_corot.solvers.system import System
 
 from .mass_split import MassSplit
-from .obstacles import Obstacles
+from .obstacles import Obstacles, RigidForces
 from .pairs import Pairs
-from .rigid_forces import RigidForces
 from .search import Search
 from .surface import ContactSurface
 

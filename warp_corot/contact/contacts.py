@@ -17,24 +17,19 @@ from warp_corot.kernels.contact.law import SETTLING, Law
 from warp_corot.solvers.halo import ALONE
 from warp_corot.solvers.system import System
 
-from .active_set import ActiveSet
 from .approach import Approach
-from .borne_set import BorneSet
 from .carried import CarriedForces
-from .joined_rows import JoinedRows
+from .implicit import ImplicitContact
 from .mass_split import MassSplit
-from .obstacles import Obstacles
+from .obstacles import Obstacles, RigidForces
 from .options import SURFACE, Contact, may_meet
 from .pairs import Pairs, smallest_size
-from .rigid_forces import RigidForces
-from .search import Search
+from .search import Search, Sleep
 from .skin import has_own_surface
-from .sleep import Sleep
 from .surface import ContactSurface
-from .surface_halo import SurfaceHalo
 from .tool import Obstacle
 from .warned import OVERLAP, warn_of_crushed, warn_of_overlaps
-from .whole_surface import WholeSurface
+from .whole_surface import SurfaceHalo, WholeSurface
 
 #: Gaps that come from rounding, in roundings of the largest coordinate.
 ROUNDINGS = 16.0
@@ -240,15 +235,11 @@ class Contacts:
         if self.obstacles.count:
             self.obstacles.launch_motion(offset, self.search.watch)
 
-    def active_set(self, k: int) -> ActiveSet | BorneSet | None:
-        """The contact of a body with obstacles in implicit steps; None without obstacles."""
-        if self.rigid is None:
+    def implicit(self) -> ImplicitContact | None:
+        """Contact in implicit steps, if anything may touch."""
+        if self.rigid is None and self.pairs is None:
             return None
-        return BorneSet(self.system, self.rigid, self.law, k) if self.surface.parts[k].bearers else ActiveSet(self, k)
-
-    def joined_rows(self) -> JoinedRows | None:
-        """The contact of soft surfaces in implicit steps, if they may touch."""
-        return None if self.pairs is None else JoinedRows(self.system, self.pairs, self.law)
+        return ImplicitContact(self.system, self.surface, self.obstacles, self.law, self.rigid, self.pairs)
 
     def measure(self) -> None:
         thinnest = self.obstacles.thinnest

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.body.places import Nodes, chosen_nodes, nodes_at
+from warp_corot.body.controls import Nodes, chosen_nodes, nodes_at
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.errors import InputError, StabilityWarning, depth_of_user
 from warp_corot.inputs.checks import checked_number, shown

@@ -19,24 +19,23 @@ from warp_corot.kernels.contact.vertices import Rigid
 from warp_corot.kernels.stepping.pace import Pace
 from warp_corot.kernels.stepping.threads import LINE
 
-from .obstacles import have_edges
+from .obstacles import RigidForces, have_edges
 from .options import Contact, may_meet
 from .pairs import Pairs
-from .rigid_forces import RigidForces
 from .search import Search
 from .surface import ContactSurface
-from .surface_halo import SurfaceHalo
 from .tool import Obstacle
+from .whole_surface import SurfaceHalo
 
 #: Number of iterations if contacts share nodes, and otherwise: then the first one is exact.
 ITERATIONS, EXACT = 4, 1
 BLOCK = int(kernels.BLOCK)
 #: The most contacts that the CPU keeps ready during the iterations.
 RECORDS = 1 << 14
-#: On CUDA one launch makes all phases if there is room for so many blocks of contacts for each multiprocessor. Its
-#: blocks of threads are resident: one on each multiprocessor for few contacts, else so many; and the most blocks of
-#: other launches.
-FEW_TURNS, MOST_TURNS, BLOCKS_EACH, MOST_BLOCKS = 4, 64, 4, 4096
+#: On CUDA one launch makes all phases. Its blocks of threads are resident: one on each multiprocessor if there is room
+#: for at most so many blocks of contacts for each, else so many. Contacts that share no node wait for none; the most
+#: blocks for them.
+FEW_TURNS, BLOCKS_EACH, MOST_BLOCKS = 4, 4, 4096
 
 
 def solver_of(
@@ -114,12 +113,8 @@ class MassSplit:
         self.sums.is_shared = int(self._regions.team.parts > 1)
         if device.is_cuda:
             blocks, each = max(-(-contacts // BLOCK), 1), device.sm_count
-            self._is_one = self._are_separate or blocks <= MOST_TURNS * each
-            if self._is_one and not self._are_separate:
-                most = each if blocks <= FEW_TURNS * each else BLOCKS_EACH * each
-            else:
-                most = MOST_BLOCKS
-            self._threads = BLOCK * min(blocks, most)
+            most = each if blocks <= FEW_TURNS * each else BLOCKS_EACH * each
+            self._is_one, self._threads = True, BLOCK * min(blocks, MOST_BLOCKS if self._are_separate else most)
 
     @property
     def grain(self) -> float:

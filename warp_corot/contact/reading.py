@@ -1,4 +1,4 @@
-"""The contacts of the last step, one by one, for the host."""
+"""The contacts of the last step for the host: one by one, and at nodes."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.kernels.contact import sums
+from warp_corot.mesh.surfaces.bound import SurfaceMesh
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
 
     from .contacts import Contacts
+    from .obstacles import RigidForces
     from .pairs import Pairs
-    from .rigid_forces import RigidForces
     from .tool import Obstacle
 
 Floats = npt.NDArray[np.float64]
@@ -60,20 +61,23 @@ class ContactPoint:
         return self.normal_force * self.normal + self.friction_force
 
 
-class Touch(NamedTuple):
-    """A place at which an obstacle pushed in the last step.
+class ActingRow(NamedTuple):
+    """A contact that pushed in the last step.
 
     Attributes:
-        obstacle: Its number.
-        places: Numbers of places of the contact surface: one, or a triangle's three.
-        shares: The weight of each in the point.
-        point, normal, gap: As of a ``ContactPoint``.
-        force: The force on the body [N], [3].
+        obstacle: The number of the obstacle; -1 for a pair of soft surfaces.
+        first: Number of places on the first side, which has the normal: all of them at an obstacle.
+        places: Numbers of places of the contact surface: one, a triangle's three, or a pair's four.
+        weights: The weight of each in the gap, negative on the second side.
+        point: The place on the first side [m], [3].
+        normal, gap: As of a ``ContactPoint``.
+        force: The force on the first side [N], [3].
     """
 
     obstacle: int
+    first: int
     places: npt.NDArray[np.integer]
-    shares: Floats
+    weights: Floats
     point: Floats
     normal: Floats
     gap: float
@@ -81,90 +85,108 @@ class Touch(NamedTuple):
 
 
 def contact_points(contacts: Contacts) -> list[ContactPoint]:
+    """All contacts of the last step, pairs of soft surfaces once; waits for the device."""
+    return [_point(contacts, row) for row in acting_rows(contacts)]
+
+
+def acting_rows(contacts: Contacts) -> Iterator[ActingRow]:
     """All contacts of the last step; waits for the device."""
-    found = [] if contacts.pairs is None else _of_pairs(contacts, contacts.pairs)
-    return found + [_point(contacts, touch) for touch in obstacle_touches(contacts)]
-
-
-def obstacle_touches(contacts: Contacts) -> Iterator[Touch]:
-    """All contacts of the last step with obstacles; waits for the device."""
+    x = contacts.surface.arrays.x.numpy().astype(float)
+    if contacts.pairs is not None:
+        yield from _of_pairs(contacts.pairs, x, contacts.surface.count)
     if contacts.rigid is not None:
-        yield from _at_nodes(contacts, contacts.rigid)
+        yield from _at_places(contacts, contacts.rigid, x)
         if contacts.rigid.have_edges:
-            yield from _at_triangles(contacts, contacts.rigid)
+            yield from _at_triangles(contacts.rigid, contacts.surface.triangles.numpy(), x)
 
 
-def _of_pairs(contacts: Contacts, pairs: Pairs) -> list[ContactPoint]:
-    """Each pair once: the force on the node, or on the first edge."""
-    rows, x = pairs.rows, contacts.surface.arrays.x.numpy().astype(float)
-    nodes, bodies = contacts.surface.count, contacts.system.bodies
+def _of_pairs(pairs: Pairs, x: Floats, nodes: int) -> Iterator[ActingRow]:
+    rows = pairs.rows
     count = min(int(rows.total.numpy()[0]), len(rows.owner))
-    acts, owner = rows.acts.numpy()[:count], rows.owner.numpy()[:count]
-    force, normal = (array.numpy()[:count].astype(float) for array in (rows.force, rows.normal))
-    places, shares, gap = rows.places.numpy(), rows.shares.numpy().astype(float), rows.gap.numpy()
-    found = []
-    for row in np.flatnonzero((acts != 0) & force.any(axis=1)):
-        size = 1 if owner[row] < nodes else 2
-        w = shares[row, :size]
-        k, world, own, own_shares = contacts.surface.nodes_at(places[row, :size], w)
-        m, _, others, _ = contacts.surface.nodes_at(places[row, size:], shares[row, size:])
-        along = float(force[row] @ normal[row])
-        found.append(
-            ContactPoint(
-                bodies[k],
-                bodies[m],
-                world,
-                own,
-                own_shares,
-                w @ x[places[row, :size]],
-                normal[row],
-                float(gap[row]),
-                along,
-                force[row] - along * normal[row],
-                others,
-            )
-        )
-    return found
+    acts, owner, gap = (each.numpy()[:count] for each in (rows.acts, rows.owner, rows.gap))
+    force, normal, weights = (each.numpy()[:count].astype(float) for each in (rows.force, rows.normal, rows.shares))
+    places = rows.places.numpy()
+    for k in np.flatnonzero((acts != 0) & force.any(axis=1)):
+        first = 1 if owner[k] < nodes else 2
+        point = weights[k, :first] @ x[places[k, :first]]
+        yield ActingRow(-1, first, places[k], weights[k], point, normal[k], float(gap[k]), force[k])
 
 
-def _at_nodes(contacts: Contacts, rigid: RigidForces) -> Iterator[Touch]:
-    surface, obstacles = contacts.surface, contacts.obstacles
+def _at_places(contacts: Contacts, rigid: RigidForces, x: Floats) -> Iterator[ActingRow]:
+    obstacles = contacts.obstacles
     gaps = wp.zeros(rigid.forces.shape, dtype=wp.float32, device=contacts.device)
     normals = wp.zeros(rigid.forces.shape, dtype=wp.vec3, device=contacts.device)
-    inputs = [obstacles.shapes, obstacles.motions, surface.arrays, rigid.forces]
+    inputs = [obstacles.shapes, obstacles.motions, contacts.surface.arrays, rigid.forces]
     wp.launch(sums.describe_touches, rigid.forces.shape, inputs, [gaps, normals], device=contacts.device)
-    forces = rigid.forces.numpy().astype(float)
-    gap, normal, x = gaps.numpy(), normals.numpy().astype(float), surface.arrays.x.numpy().astype(float)
-    for o, s in np.argwhere(forces.any(axis=2)):
-        yield Touch(int(o), np.array([s]), np.ones(1), x[s], normal[o, s], float(gap[o, s]), forces[o, s])
+    gap, (force, normal) = gaps.numpy(), (each.numpy().astype(float) for each in (rigid.forces, normals))
+    for o, s in np.argwhere(force.any(axis=2)):
+        yield ActingRow(int(o), 1, np.array([s]), np.ones(1), x[s], normal[o, s], float(gap[o, s]), force[o, s])
 
 
-def _at_triangles(contacts: Contacts, rigid: RigidForces) -> Iterator[Touch]:
-    touches, surface = rigid.touches, contacts.surface
-    acts, force = touches.acts.numpy(), touches.force.numpy().astype(float)
-    shares, normal, gap = (
-        touches.shares.numpy().astype(float),
-        touches.normal.numpy().astype(float),
-        touches.gap.numpy(),
-    )
-    corners, x = surface.triangles.numpy(), surface.arrays.x.numpy().astype(float)
+def _at_triangles(rigid: RigidForces, corners: npt.NDArray[np.integer], x: Floats) -> Iterator[ActingRow]:
+    touches = rigid.touches
+    acts, gap = touches.acts.numpy(), touches.gap.numpy()
+    force, weights, normal = (each.numpy().astype(float) for each in (touches.force, touches.shares, touches.normal))
     for o, t in np.argwhere((acts != 0) & force.any(axis=2)):
-        w, places = shares[o, t], corners[t]
-        yield Touch(int(o), places, w, w @ x[places], normal[o, t], float(gap[o, t]), force[o, t])
+        w, places = weights[o, t], corners[t]
+        yield ActingRow(int(o), 3, places, w, w @ x[places], normal[o, t], float(gap[o, t]), force[o, t])
 
 
-def _point(contacts: Contacts, touch: Touch) -> ContactPoint:
-    k, world, nodes, shares = contacts.surface.nodes_at(touch.places, touch.shares)
-    along = float(touch.force @ touch.normal)
-    return ContactPoint(
-        contacts.system.bodies[k],
-        contacts.obstacles.given[touch.obstacle],
-        world,
-        nodes,
-        shares,
-        touch.point,
-        touch.normal,
-        touch.gap,
-        along,
-        touch.force - along * touch.normal,
-    )
+def _point(contacts: Contacts, row: ActingRow) -> ContactPoint:
+    surface, bodies = contacts.surface, contacts.system.bodies
+    k, world, nodes, shares = surface.nodes_at(row.places[: row.first], row.weights[: row.first])
+    other: Obstacle | SoftBody
+    others: tuple[int, ...] = ()
+    if row.obstacle >= 0:
+        other = contacts.obstacles.given[row.obstacle]
+    else:
+        m, _, others, _ = surface.nodes_at(row.places[row.first :], row.weights[row.first :])
+        other = bodies[m]
+    push = float(row.force @ row.normal)
+    across = row.force - push * row.normal
+    return ContactPoint(bodies[k], other, world, nodes, shares, row.point, row.normal, row.gap, push, across, others)
+
+
+# --- at nodes ---------------------------------------------------------------------------------------------------------
+
+
+def contact_at_nodes(
+    contacts: Contacts, k: int, body: SoftBody, world: int
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    """Contact of a body in the last step; waits for the device. Zero if the mesh has changed since.
+
+    Args:
+        contacts: Contact of the simulation.
+        k: The number of the body there.
+        body: The body; on several ranks the whole one, of which ``contacts`` has this rank's part.
+        world: The world.
+
+    Returns:
+        The forces on the nodes of one world [N], float32 [N, 3], and the pressure averaged at them [Pa], float32 [N].
+    """
+    count = body.world_node_count
+    if contacts.surface.bodies[k].version != contacts.surface.parts[k].version:
+        return np.zeros((count, 3), np.float32), np.zeros(count, np.float32)
+    forces = body.contact_forces.numpy()[world * count : (world + 1) * count]
+    pressures = body.contact_pressure.numpy().reshape(body.worlds, -1)[world]
+    nodal = pressure_at_nodes(body.contact_surface, count, pressures)
+    return forces.astype(np.float32), nodal.astype(np.float32)
+
+
+def pressure_at_nodes(surface: SurfaceMesh, count: int, pressures: npt.NDArray[np.float32]) -> Floats:
+    """Pressures of triangles [Pa], averaged at nodes by areas at rest, [N]; zero at nodes that carry no surface.
+
+    Args:
+        surface: The surface, F triangles.
+        count: Number of nodes N.
+        pressures: [F], or more, of which the first ones count.
+    """
+    triangles = surface.triangles
+    a, b, c = np.moveaxis(surface.points[triangles], 1, 0)
+    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    corners, points = triangles.ravel(), len(surface.points)
+    around = np.bincount(corners, np.repeat(areas, 3), points)
+    loads = np.bincount(corners, np.repeat(areas * pressures[: len(triangles)], 3), points)
+    nodes, weights = surface.nodes.ravel(), np.abs(surface.weights)
+    weighted = np.bincount(nodes, (weights * loads[:, None]).ravel(), count)
+    return weighted / np.maximum(np.bincount(nodes, (weights * around[:, None]).ravel(), count), 1e-300)

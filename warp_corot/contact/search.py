@@ -11,16 +11,18 @@ import warp as wp
 from warp_corot.errors import UnstableError
 from warp_corot.kernels.contact import beside
 from warp_corot.kernels.contact import near as near_kernels
+from warp_corot.kernels.contact import sleep as sleeping
 from warp_corot.kernels.contact import watch as kernels
 from warp_corot.kernels.contact.touches import Touches
 from warp_corot.kernels.contact.vertices import Rigid
-from warp_corot.solvers.guarding.mapped import Mapped
+from warp_corot.solvers.pace import Mapped
 
-from .obstacles import Obstacles
 from .surface import ContactSurface
 
 if TYPE_CHECKING:
-    from .rigid_forces import RigidForces
+    from warp_corot.solvers.system import System
+
+    from .obstacles import Obstacles, RigidForces
 
 #: The least motion that is reserved for anything between two searches, as a fraction of the smallest element's size,
 #: and how many times as much after something that was hit has moved farther in one step than was reserved.
@@ -64,7 +66,7 @@ class Search:
         self.most = wp.zeros(1, dtype=wp.int32, device=self.device)
         watch, device = kernels.Watch(), self.device
         watch.least = wp.full(1, LEAST * size, dtype=wp.float32, device=device)
-        watch.fastest = wp.zeros(1, dtype=wp.float32, device=device)
+        watch.fastest = wp.zeros(1 + surface.worlds, dtype=wp.float32, device=device)
         watch.size, watch.most_alone, watch.hit = size, float(kernels.ALONE), float(kernels.HIT_BESIDE)
         watch.due, watch.missed, watch.searches = (wp.zeros(1, dtype=wp.int32, device=device) for _ in range(3))
         self._arrived = wp.zeros(1, dtype=wp.uint32, device=device)
@@ -228,3 +230,58 @@ class Search:
 
     def _on_nodes(self, kernel: wp.Kernel, inputs: list) -> None:
         wp.launch(kernel, self.surface.count, inputs, device=self.device)
+
+
+# --- sleep ------------------------------------------------------------------------------------------------------------
+
+
+class Sleep:
+    """What steps of awake and of sleeping contact launch.
+
+    Args:
+        system: The bodies.
+        surface: Their surfaces.
+        obstacles: The obstacles.
+        search: The search for nearby surfaces.
+    """
+
+    def __init__(self, system: System, surface: ContactSurface, obstacles: Obstacles, search: Search):
+        self._system, self._surface, self._obstacles = system, surface, obstacles
+        self._watch, self._device = search.watch, search.device
+
+    @property
+    def is_framed(self) -> bool:
+        """Whether margins count motion relative to frames; see ``Search.launch``."""
+        return not self._obstacles.count
+
+    def launch(self, offset: int, act: Callable[[], None]) -> None:
+        """Launch the motion of obstacles, and what contact does in a step while it is awake.
+
+        Args:
+            offset: The number of steps since the clock was last advanced.
+            act: Launches that.
+        """
+        obstacles = self._obstacles
+        obstacles.launch_targets()
+        for k, body in enumerate(self._system.bodies):
+            start, count, nodes = self._surface.nodes_of(k)
+            moved = self._system.worlds * obstacles.count if k == 0 else 0
+            threads = max(count, moved)
+            inputs = [threads, start, count, nodes, int(self.is_framed), moved, obstacles.motions]
+            inputs += [body.conditions.world_starts, self._system.pace.arrays, offset]
+            inputs += [*self._places(k), body.state.velocities]
+            wp.launch(sleeping.rouse, threads, inputs, [self._watch], device=self._device)
+        # A branch takes longer than launches that end at once.
+        act()
+
+    def launch_check(self) -> None:
+        """Launch the test after a run whether anything moved too far in its last step."""
+        for k in range(len(self._system.bodies)):
+            start, count, nodes = self._surface.nodes_of(k)
+            inputs = [start, nodes, int(self.is_framed), self._system.pace.arrays, *self._places(k)]
+            wp.launch(sleeping.check_sleep, count, inputs, [self._watch], device=self._device)
+
+    def _places(self, k: int) -> list[wp.array]:
+        """Rest positions and displacements of a body."""
+        state = self._system.bodies[k].state
+        return [state.rest, state.displacements]

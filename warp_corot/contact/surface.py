@@ -12,8 +12,7 @@ import warp as wp
 
 from warp_corot.kernels.contact.motion import Bearing, Surface
 
-from .followed import FollowedSurface
-from .skin import Skin, has_own_surface
+from .skin import FollowedSurface, Skin, has_own_surface
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody

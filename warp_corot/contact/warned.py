@@ -18,8 +18,7 @@ from warp_corot.kernels.contact.motion import Motions
 from warp_corot.kernels.contact.sums import find_gaps
 from warp_corot.solvers.halo import ALONE
 
-from .sampled import SignedDistance, TriangleMesh
-from .shapes import Capsule, Cylinder, Ground
+from .shapes import Capsule, Cylinder, Ground, SignedDistance, TriangleMesh
 from .tool import FITTING
 
 if TYPE_CHECKING:

@@ -10,13 +10,19 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.discretization.elements import ElementKind, Elements, Mesh, device_elements, element_kind, with_targets
-from warp_corot.discretization.frames import parts
+from warp_corot.discretization.elements import (
+    ElementKind,
+    Elements,
+    Mesh,
+    device_elements,
+    element_kind,
+    parts,
+    with_targets,
+)
 from warp_corot.discretization.levels import Levels, TreeNodes
-from warp_corot.discretization.plan import Awaited, FlatLeaves, Plan
-from warp_corot.discretization.planning.fixed import ForcePlan, pays_in_groups, units_of
+from warp_corot.discretization.plan import Awaited, FlatLeaves, Plan, Slots
+from warp_corot.discretization.planner import ForcePlan, pays_in_groups, units_of
 from warp_corot.discretization.sizes import Clock, Sizes
-from warp_corot.discretization.slots import Slots
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import check_float32
 from warp_corot.inputs.cpu_threads import Team, team_of

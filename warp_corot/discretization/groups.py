@@ -11,8 +11,9 @@ import warp as wp
 
 from warp_corot.kernels.elements import mean_dilatation_rows as kernels
 from warp_corot.kernels.elements.dilatation import Dilatation
-from warp_corot.kernels.plan.tree import TORN
+from warp_corot.kernels.plan.plan import TORN
 from warp_corot.mesh import TetForest, TetMesh
+from warp_corot.mesh.topology import face_pairs
 
 #: Groups in the form of ``kernels.elements.dilatation.share_in_groups``: starts, members, the number of groups
 #: if launches cover more, and the number in launches.
@@ -113,15 +114,6 @@ def neighbour_groups(points: Numbers, tets: Integers) -> npt.NDArray[np.int32]:
         joined[second] = first
         group, centre, size, pairs = _joined(joined, group, centre, size, pairs)
     return group.astype(np.int32)
-
-
-def face_pairs(tets: Integers) -> npt.NDArray[np.int64]:
-    """Pairs of elements that share a face, int64 [P, 2]."""
-    corners = np.sort(np.asarray(tets, np.int64), axis=1)
-    faces = corners[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3)
-    order = np.lexsort(faces.T)
-    same = (faces[order[1:]] == faces[order[:-1]]).all(axis=1)
-    return np.stack([order[:-1][same] // 4, order[1:][same] // 4], axis=1)
 
 
 def mutual_neighbours(pairs: Integers, centre: Numbers) -> tuple[Integers, Integers]:

@@ -17,7 +17,7 @@ from warp_corot.errors import InputError
 from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.meshing.growth import gather_flagged
 from warp_corot.kernels.plan import levels as kernels
-from warp_corot.kernels.plan.transfer import average_ends, gather_midpoints
+from warp_corot.kernels.plan.levels import average_ends, gather_midpoints
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.lattice import LATTICE_BITS, MAX_LEVEL
 

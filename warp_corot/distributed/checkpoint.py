@@ -21,12 +21,12 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
+from warp_corot.contact.carried import keep_again, kept_arrays
 from warp_corot.contact.contacts import Contacts
-from warp_corot.contact.keeping import keep_again, kept_arrays
 from warp_corot.elasticity import Corotated
 from warp_corot.inputs.checks import checked_path
 from warp_corot.io.checkpoint.archive import joined, load_checkpoint, pack_body, rebuilt_body, save_checkpoint, split
-from warp_corot.remesh.online import OnlineRemesh
+from warp_corot.remesh.remeshing import OnlineRemesh
 from warp_corot.simulation.simulation import Simulation as OnOne
 from warp_corot.solvers.system import System
 
@@ -42,7 +42,7 @@ Arrays = dict[str, npt.NDArray[Any]]
 Longs = npt.NDArray[np.int64]
 
 #: The beginnings of the names of kept nodal arrays; other kept arrays are the same on all ranks.
-DIRECTIONS, VELOCITIES, HISTORY, MEETINGS, SETUP = "directions", "velocities.", "history.", "meetings.", "setup."
+DIRECTIONS, VELOCITIES, HISTORY, TOUCHED, SETUP = "directions", "velocities.", "history.", "touched.", "setup."
 #: What a simulation continues from, besides arrays.
 RESUMED = ("stable_dt", "steps_before_reset", "time_before_reset")
 #: What a checkpoint has of a simulation, besides its bodies, their contact and kept arrays.
@@ -55,7 +55,7 @@ KEYFRAMES = (("trajectories", "nodes", "displacements"), ("activations", "elemen
 #: Arrays of a body with an entry for each node of all worlds, by the ends of their names.
 NODAL = ("displacements", "velocities", "reactions", "constrained", "loads")
 #: Arrays of obstacles and surface places, and of triangles, that one step leaves for the next.
-OF_PLACES, OF_TRIANGLES = ("anchors", "kinds", "forces"), ("normal", "force")
+OF_PLACES, OF_TRIANGLES = ("anchors", "forces"), ("normal", "force")
 #: Arrays of obstacles and numbers of the law, which are the same on all ranks.
 MOTIONS, LAW = ("now", "later", "target"), ("tolerance", "recovery", "whole", "grain")
 
@@ -139,7 +139,7 @@ def _body_of(name: str, sim: OnOne) -> int | None:
     if name.startswith(HISTORY):
         count = sum(each.startswith(HISTORY) for each in sim.kept)
         return int(name.removeprefix(HISTORY)) * len(sim.bodies) // count
-    for first in (DIRECTIONS, VELOCITIES, MEETINGS):
+    for first in (DIRECTIONS, VELOCITIES, TOUCHED):
         if name.startswith(first):
             return int(name.removeprefix(first))
     if name.startswith(SETUP) and name.endswith(".at"):

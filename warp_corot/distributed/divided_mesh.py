@@ -13,8 +13,7 @@ from warp_corot.contact.skin import has_own_surface
 from warp_corot.discretization.elements import Mesh
 from warp_corot.errors import InputError
 from warp_corot.mesh import TetForest, TetMesh, Tree
-from warp_corot.mesh.numbering import in_order_of_leaves, live_or_void, pruned, renumbered, with_virtual
-from warp_corot.mesh.tree import LIVE, VOID
+from warp_corot.mesh.tree import LIVE, VOID, in_order_of_leaves, live_or_void, pruned, renumbered, with_virtual
 
 from .partition import Partition
 

@@ -21,16 +21,23 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, shown
 from warp_corot.inputs.device import checked_device
 from warp_corot.mesh import TetForest
-from warp_corot.mesh.growing.adapt import TETS_OF_CUBE, Growing, grid_around
+from warp_corot.mesh.growing.fine_classification import Resolved
 from warp_corot.mesh.growing.from_domain import checked_wishes, empty_error, filled_tree
-from warp_corot.mesh.growing.judging import Field, Wishes
+from warp_corot.mesh.growing.growth import TETS_OF_CUBE, Growing, grid_around
 from warp_corot.mesh.growing.labelling import Growers, labels_of
-from warp_corot.mesh.growing.resolved import Resolved
-from warp_corot.mesh.growing.slivers import without_slivers
-from warp_corot.mesh.growing.strays import strays
+from warp_corot.mesh.growing.refinement_criteria import Field, Wishes
+from warp_corot.mesh.growing.slivers import strays, without_slivers
 from warp_corot.mesh.lattice import LATTICE_BITS, checked_cell_size
-from warp_corot.mesh.numbering import by_levels, in_order_of_leaves, live_or_void, pruned, renumbered, with_virtual
-from warp_corot.mesh.tree import LIVE, VOID
+from warp_corot.mesh.tree import (
+    LIVE,
+    VOID,
+    by_levels,
+    in_order_of_leaves,
+    live_or_void,
+    pruned,
+    renumbered,
+    with_virtual,
+)
 from warp_corot.mesh.uniform import halvings
 
 from . import mpi

@@ -16,11 +16,9 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.checks import shown
 from warp_corot.io.checkpoint.contents import box_level
 from warp_corot.mesh import TetForest, TetMesh
-from warp_corot.mesh.around import subtrees_around
 from warp_corot.mesh.lattice import LATTICE_BITS, checked_box
 from warp_corot.mesh.tree import Tree
-from warp_corot.mesh.uniform import halvings
-from warp_corot.mesh.uniform_part import SUBTREE_DEPTH, uniform_part, vertices_of
+from warp_corot.mesh.uniform import SUBTREE_DEPTH, halvings, subtrees_around, uniform_part, vertices_of
 
 from . import mpi
 from .divided_mesh import DividedForest, DividedTetMesh, Numbers, divide, whole_of

@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_corot.body.keyframes import Followed
 from warp_corot.body.soft_body import SoftBody
-from warp_corot.body.trajectory import Followed
 from warp_corot.discretization.discretization import Discretization
 from warp_corot.discretization.elements import Mesh
 from warp_corot.errors import InputError

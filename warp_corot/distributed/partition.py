@@ -14,7 +14,7 @@ from warp_corot.discretization.groups import group_numbers, neighbour_groups
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_numbers, shown
 from warp_corot.mesh import TetForest, TetMesh
-from warp_corot.mesh.growing.cut import linked
+from warp_corot.mesh.topology import linked
 from warp_corot.mesh.tree import UniformTree
 
 Ints = npt.NDArray[np.int32]
@@ -163,7 +163,7 @@ def _dealt_general(mesh: TetMesh, ranks: int, shares: npt.NDArray[np.float64]) -
         import pymetis
     except ImportError:
         return _along_curve(mesh, ranks, shares)
-    from warp_corot.mesh.growing.cut import face_pairs
+    from warp_corot.mesh.topology import face_pairs
 
     pairs = face_pairs(mesh.tets)
     both = np.concatenate([pairs, pairs[:, ::-1]])

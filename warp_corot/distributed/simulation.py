@@ -27,16 +27,15 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_count
 from warp_corot.inputs.device import checked_device
 from warp_corot.mesh import TetForest
-from warp_corot.mesh.uniform_part import SUBTREE_DEPTH
-from warp_corot.remesh.online import OnlineRemesh
-from warp_corot.remesh.remeshing import Remeshing
+from warp_corot.mesh.uniform import SUBTREE_DEPTH
+from warp_corot.remesh.remeshing import OnlineRemesh, Remeshing
 from warp_corot.simulation import simulation as on_one
 from warp_corot.simulation.energy import WorldEnergies
-from warp_corot.simulation.hooks import Hooks
 from warp_corot.simulation.parts import checked_bodies, checked_integrator, checked_models, chosen_worlds
+from warp_corot.simulation.running import Hooks
 from warp_corot.solvers import Integrator, SymplecticEuler
-from warp_corot.solvers.steps.pace import Pace
-from warp_corot.solvers.steps.safe_step import ANY_STEP
+from warp_corot.solvers.pace import Pace
+from warp_corot.solvers.stability import ANY_STEP
 
 from . import checkpoint, mpi
 from .divided_mesh import DividedForest, DividedMesh

@@ -29,7 +29,7 @@ import warp as wp
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_count, checked_path, shown
 from warp_corot.inputs.cpu_threads import core_count, share_cores
-from warp_corot.inputs.starting import start_warp
+from warp_corot.inputs.processes import start_warp
 from warp_corot.io.files.whole import written_whole
 
 Row = dict[str, Any]

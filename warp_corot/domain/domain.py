@@ -8,15 +8,24 @@ from typing import TYPE_CHECKING, Any
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.inputs.forwarding import forwards
+from warp_corot.inputs.arguments import forwards
 
-from .combined import DifferenceDomain, IntersectionDomain, NamedDomain, UnionDomain
-from .function import Function, FunctionDomain
-from .shapes import BoxDomain, CapsuleDomain, SphereDomain, TorusDomain
+from .shapes import (
+    BoxDomain,
+    CapsuleDomain,
+    DifferenceDomain,
+    Function,
+    FunctionDomain,
+    IntersectionDomain,
+    NamedDomain,
+    SphereDomain,
+    TorusDomain,
+    UnionDomain,
+)
 from .signed import SignedFunction
 
 if TYPE_CHECKING:
-    from .grid import Volume
+    from .labels import Volume
     from .surface import Surface
 
 
@@ -224,7 +233,7 @@ class Domain(SignedFunction):
         return _Made(CapsuleDomain(start, end, radius, **options))
 
 
-@forwards("kind", "has_pieces", "holds", "exits", "corners", "points_in", "label_volumes")
+@forwards("kind", "holds", "exits", "points_in", "label_volumes")
 @forwards("kind", "_phi", "_labels", "_thickness", "_details")
 class _Made(Domain):
     """A signed function of any kind, as a user holds it."""

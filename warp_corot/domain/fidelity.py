@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from warp_corot.domain.closing import net_edges
+from warp_corot.domain.domain import Domain
+from warp_corot.domain.reference import reference_of, spread_points
+from warp_corot.domain.units import length, volume
 from warp_corot.mesh.surfaces.bodies import boundary_surface
-from warp_corot.mesh.surfaces.locating import distances_from
-
-from .domain import Domain
-from .reference import reference_of, spread_points
-from .thinness import elements_through
-from .units import length, volume
-from .winding import net_edges
+from warp_corot.mesh.surfaces.bound import distances_from
 
 if TYPE_CHECKING:
     from warp_corot.mesh import SurfaceMesh, TetForest, TetMesh
@@ -25,8 +23,6 @@ if TYPE_CHECKING:
 SAMPLES = 20_000
 #: A relative error of the volume, or of a label's, above this draws a warning.
 LARGEST_VOLUME_ERROR, LARGEST_LABEL_ERROR = 0.03, 0.05
-#: Labels with this many elements have their volume, whatever their shape, unless they are thinner than the elements.
-ENOUGH_ELEMENTS = 64
 
 
 @dataclass(frozen=True)
@@ -38,14 +34,12 @@ class LabelFidelity:
         volume: Volume of the body inside its elements [m^3].
         input_volume: Volume of its voxels [m^3].
         elements: Number of its elements.
-        needed: About the number of elements of the whole mesh with which the volumes would agree; 0 if they do.
     """
 
     name: str
     volume: float
     input_volume: float
     elements: int
-    needed: int = 0
 
     @property
     def error(self) -> float:
@@ -71,8 +65,6 @@ class Fidelity:
         watertight: Whether every edge of the mesh's surface is used once in each direction.
         smallest_dihedral: The sharpest angle between two faces of an element.
         elements: Number of elements.
-        needed: About the number of elements of which one fits through the body wherever it is thin; 0 if the mesh holds
-            the body well, so that nobody asks.
     """
 
     volume: float
@@ -87,7 +79,6 @@ class Fidelity:
     watertight: bool
     smallest_dihedral: float
     elements: int
-    needed: int = 0
 
     @property
     def volume_error(self) -> float:
@@ -130,10 +121,10 @@ class Fidelity:
                 "for each piece, which then is a body of its own"
             )
         for label in self.labels:
-            if label.needed:
+            if abs(label.error) > LARGEST_LABEL_ERROR:
                 found.append(
                     f"label {label.name}: its volume is {label.error:+.1%} off in its {label.elements} tetrahedra; "
-                    f"about {label.needed} tetrahedra in all would do"
+                    "more tetrahedra would help"
                 )
         if self.lost_labels:
             found.append(
@@ -162,7 +153,7 @@ def fidelity(
         InputError: The surface encloses nothing.
     """
     domain = surface_or_domain if isinstance(surface_or_domain, Domain) else Domain.from_surface(surface_or_domain)
-    from warp_corot.mesh.pieces import pieces_of
+    from warp_corot.mesh.topology import pieces_of
 
     given = reference_of(domain, samples)
     if surface is None:
@@ -170,7 +161,7 @@ def fidelity(
     forth = np.abs(np.asarray(domain.phi(spread_points(surface.points, surface.triangles, samples)[0]), np.float64))
     back = distances_from(surface.points, surface.triangles, given.points, 1.0e15, domain.device).astype(np.float64)
     lost = tuple(n for n in domain.label_names if not (n in _labels(mesh) and mesh.elements_of(n).any()))
-    found = Fidelity(
+    return Fidelity(
         volume=float(held_volumes(mesh).sum()),
         input_volume=given.volume,
         distance_mean=(float(forth.mean()), float(back.mean())),
@@ -184,16 +175,11 @@ def fidelity(
         smallest_dihedral=smallest_dihedral(mesh),
         elements=len(mesh.tets),
     )
-    broken = found.pieces > found.input_pieces - found.lost_pieces
-    if not broken and abs(found.volume_error) <= LARGEST_VOLUME_ERROR:
-        return found
-    length = float(np.cbrt(12.0 * np.median(np.abs(mesh_volumes(mesh)))))
-    return replace(found, needed=elements_through(domain.kind, given.points, length))
 
 
 def mesh_volumes(mesh: TetForest | TetMesh) -> np.ndarray:
     """Volumes of a mesh's elements [m^3]."""
-    from warp_corot.mesh.surfaces.boundary import signed_volumes
+    from warp_corot.mesh.topology import signed_volumes
 
     volumes = getattr(mesh, "volumes", None)
     return np.abs(signed_volumes(mesh.points, mesh.tets)) if volumes is None else volumes
@@ -211,17 +197,7 @@ def _of_labels(mesh: TetForest | TetMesh, domain: Domain) -> Iterator[LabelFidel
         own = mesh.elements_of(name) if name in _labels(mesh) and wanted > 0.0 else np.zeros(len(volumes), bool)
         if not own.any():
             continue
-        found = LabelFidelity(name, float(volumes[own].sum()), wanted, int(own.sum()))
-        off, all_of_its_size = abs(found.error) / LARGEST_LABEL_ERROR, found.elements * volumes.sum() / wanted
-        if off > 1.0:
-            # A label gets its elements first, but none smaller than a voxel. Then it gets more when the others are as
-            # small as its own, and the error falls with the square of their size. Most are at the surface.
-            few, few_voxels = (n < ENOUGH_ELEMENTS for n in (found.elements, len(domain.points_in(name, 512))))
-            more = len(volumes) * (ENOUGH_ELEMENTS / found.elements) ** 0.5 if few else all_of_its_size * off**1.5
-            if few_voxels:
-                more = 4.0 * all_of_its_size * ENOUGH_ELEMENTS / found.elements
-            found = replace(found, needed=int(float(f"{max(more, 2 * len(volumes)):.1e}")))
-        yield found
+        yield LabelFidelity(name, float(volumes[own].sum()), wanted, int(own.sum()))
 
 
 def smallest_dihedral(mesh: TetForest | TetMesh) -> float:

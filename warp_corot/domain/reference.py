@@ -8,13 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.ndimage
 
-from warp_corot.kernels.meshing.domain import BOUNDARY
-
 from .closing import areas
-from .labels import LabelDomain
+from .labels import LabelDomain, piece_of_voxels
 from .signed import SignedFunction
 from .surface import SurfaceDomain
-from .voxels import piece_of_voxels
 
 #: Number of points along the longest side at which a function is first evaluated, and of halvings of cells at the
 #: surface.
@@ -65,7 +62,7 @@ def _of_surface(domain: SurfaceDomain, count: int) -> Reference:
     spread, chosen = spread_points(points, triangles, count, np.unique(piece, return_index=True)[1])
     corners, own = points[triangles[chosen]], piece[chosen]
     volume = domain.closed.volume
-    if crossing or (domain.sides.known != BOUNDARY).any():
+    if crossing or domain.overlapping or domain.reversed:
         held = volume_along_lines(domain)
         crossing |= abs(held - volume) > COUNTED_TWICE * volume
         volume = held if crossing else volume

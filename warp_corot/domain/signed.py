@@ -19,6 +19,8 @@ from .units import check_float32, length
 #: The shortest step inwards in the search for a body's thickness, relative to its range, and the number of steps.
 SPHERE_STEP = 0.04
 SPHERES = 25
+#: Four directions whose differences give a gradient.
+_AROUND = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]]) / np.sqrt(3.0)
 
 
 class SignedFunction:
@@ -57,6 +59,15 @@ class SignedFunction:
             return self._phi(_checked_vec3(points))
         return self._phi(self._on_device(points)).numpy()
 
+    def sampled(self, points: np.ndarray) -> np.ndarray:
+        """The signed function [m] at points [..., 3], float64 [...]."""
+        return np.asarray(self.phi(points.reshape(-1, 3)), np.float64).reshape(points.shape[:-1])
+
+    def normals(self, points: np.ndarray, apart: np.ndarray) -> np.ndarray:
+        """Unit normals at points [..., 3] from differences over lengths [...] [m], outwards, float64 [..., 3]."""
+        slopes = self.sampled(points[..., None, :] + apart[..., None, None] * _AROUND) @ _AROUND
+        return slopes / np.maximum(np.linalg.norm(slopes, axis=-1, keepdims=True), 1e-300)
+
     def holds(self, points: npt.ArrayLike) -> np.ndarray:
         """Whether points [n, 3] [m] are inside, bool [n]."""
         return np.asarray(self.phi(points)) < 0.0
@@ -85,30 +96,21 @@ class SignedFunction:
         """The function itself, an object of the class of its kind; for a ``Domain``, the function that it contains."""
         return self
 
-    @property
-    def has_pieces(self) -> bool:
-        """Whether the body has, or may have, several pieces, which must not be joined by the mesh."""
-        return False
-
-    def thickness(
-        self, points: npt.ArrayLike, inward: npt.ArrayLike, reach: float, *, outside: bool = False
-    ) -> np.ndarray:
+    def thickness(self, points: npt.ArrayLike, inward: npt.ArrayLike, reach: float) -> np.ndarray:
         """The thickness of the body at points of its surface: the distance inwards until one leaves it again.
 
         Args:
             points: Points on or near the surface [n, 3] [m].
             inward: Unit vectors [n, 3].
             reach: The largest thickness that is measured [m].
-            outside: Measure outwards instead: the widths of gaps.
 
         Returns:
             float64 [n] [m].
         """
-        side = -1.0 if outside else 1.0
-        given, directions = self._on_device(points), self._on_device(side * checked_numbers(inward, "inward", "[n, 3]"))
+        given, directions = self._on_device(points), self._on_device(inward)
         if len(given) != len(directions):
             raise InputError(f"inward has {len(directions)} vectors; there must be one for each of {len(given)} points")
-        return self._thickness(given, directions, checked_length(reach, "reach"), side).astype(np.float64)
+        return self._thickness(given, directions, checked_length(reach, "reach")).astype(np.float64)
 
     def exits(self, starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """Where segments from inside to outside leave the body, by its triangles; None if it has none.
@@ -121,10 +123,6 @@ class SignedFunction:
             unit normals there [n, 3].
         """
         return None
-
-    def corners(self) -> np.ndarray:
-        """The known points where three or more sharp edges of the body meet, float64 [n, 3] [m]."""
-        return np.empty((0, 3))
 
     def part(self, name: str) -> SignedFunction:
         """The domain of a single label.
@@ -164,8 +162,8 @@ class SignedFunction:
         """Labels int32 [n] on the points' device; outside the body the labels of the nearest part."""
         raise NotImplementedError
 
-    def _thickness(self, points: wp.array, along: wp.array, reach: float, side: float) -> np.ndarray:
-        """The thickness of the body for a ``side`` of 1, of the space around it for -1: float32 [n] [m].
+    def _thickness(self, points: wp.array, along: wp.array, reach: float) -> np.ndarray:
+        """The thickness of the body, float32 [n] [m].
 
         By sphere tracing: each step is the distance within which there can be no surface.
         """
@@ -173,7 +171,7 @@ class SignedFunction:
         gone = np.full(len(start), SPHERE_STEP * reach, np.float32)
         going = np.arange(len(start))
         for _ in range(SPHERES):
-            phi = side * self.phi(start[going] + gone[going, None] * along[going])
+            phi = self.phi(start[going] + gone[going, None] * along[going])
             inside = phi < 0.0
             going, step = going[inside], np.abs(phi[inside]) / self.lipschitz
             gone[going] += np.maximum(step, SPHERE_STEP * reach)

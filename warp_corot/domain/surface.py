@@ -1,4 +1,5 @@
-"""Domains that a triangle surface encloses."""
+"""Domains that a triangle surface encloses, and the pieces of the body: parts of the surface that touch, cross or
+contain one another."""
 
 from __future__ import annotations
 
@@ -12,20 +13,19 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_corot.domain.closing import SurfaceParts, part_volumes
+from warp_corot.domain.signed import SignedFunction
+from warp_corot.domain.units import length, metres_per_unit, unlikely_size, volume
 from warp_corot.errors import InputError
 from warp_corot.inputs.cpu_threads import launch_side_by_side
 from warp_corot.inputs.loading import SURFACES, load
 from warp_corot.io.read.surfaces import UP_AXES, LoadedSurface, load_surface
 from warp_corot.kernels.meshing import domain as kernels
 from warp_corot.kernels.meshing import windings
-
-from .joined import joined_parts
-from .sides import corner_points, sides_of
-from .signed import SignedFunction
-from .units import length, metres_per_unit, unlikely_size, volume
+from warp_corot.mesh.topology import linked
 
 if TYPE_CHECKING:
-    from .closing import ClosedSurface
+    from warp_corot.domain.closing import ClosedSurface
 
 #: A file, the result of ``load_surface``, or points and triangles.
 Surface = str | PathLike[str] | LoadedSurface | tuple[npt.ArrayLike, npt.ArrayLike]
@@ -36,8 +36,6 @@ SAMPLES = 16
 LARGEST_REVERSED = 0.05
 #: Rays into the body start this far inside, over their length.
 START = 0.01
-#: If more than this share of the triangles does not tell inside from outside, winding numbers alone do.
-UNSURE = 0.5
 #: Holes above this share of the area draw a warning.
 LARGE_HOLES = 0.01
 
@@ -62,58 +60,45 @@ class SurfaceDomain(SignedFunction):
         self.closed = closed
         self.notes = list(notes)
         self._on: dict[str, wp.Mesh] = {}
-        self._sides: dict[str, list[wp.array]] = {}
         self.lines = lines_through(bounds)
-        self.reversed, self.overlapping, self.undecided = self._windings()
+        self.reversed, self.overlapping = self._windings()
         if self.reversed > LARGEST_REVERSED:
             raise InputError(
                 f"the surface crosses itself so that {self.reversed:.0%} of what it encloses is inside out; it must be "
                 f"wound outwards throughout (at most {LARGEST_REVERSED:.0%})"
             )
-        self.sides = sides_of(closed, self._mesh(self.device), self.lines)
 
     def _phi(self, points: wp.array) -> wp.array:
         phi = wp.empty(points.size, wp.float32, device=points.device)
         mesh = self._mesh(points.device)
-        inputs = [mesh.id, mesh.indices, self.lines, *self._sides_on(points.device)]
+        inputs = [mesh.id, mesh.indices, self.lines]
         launch_side_by_side(
             kernels.evaluate_surface, points.size, lambda own: ([own(points), *inputs], [own(phi)]), points.device
         )
         return phi
 
     def holds(self, points: npt.ArrayLike) -> np.ndarray:
-        # Where signs take winding numbers anyway, the distance is not needed.
-        if np.count_nonzero(self.sides.known == kernels.UNSURE) < UNSURE * len(self.sides.known):
-            return super().holds(points)
         return windings_of(self._mesh(self.device), self.lines, self._on_device(points)) > 0
 
     def exits(self, starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         given, along = self._on_device(starts), self._on_device(ends - starts)
         shares, normals = (wp.empty(given.size, kind, device=self.device) for kind in (wp.float32, wp.vec3))
-        mesh, sides = self._mesh(self.device), self._sides_on(self.device)[0]
+        mesh = self._mesh(self.device)
         launch_side_by_side(
             kernels.find_exits,
             given.size,
-            lambda own: ([own(given), own(along), mesh.id, sides], [own(shares), own(normals)]),
+            lambda own: ([own(given), own(along), mesh.id, mesh.indices, self.lines], [own(shares), own(normals)]),
             self.device,
         )
         found = shares.numpy().astype(np.float64)
         return np.where(found < 0.0, np.nan, found), normals.numpy().astype(np.float64)
-
-    def corners(self) -> np.ndarray:
-        points, triangles = self.closed.points, self.closed.triangles.astype(np.int64)
-        return points[corner_points(points, triangles, self.closed.edges, self.sides.known == kernels.BOUNDARY)]
 
     @cached_property
     def joined(self) -> tuple[int, np.ndarray, bool]:
         """The body's pieces; see `joined_parts`."""
         return joined_parts(self.closed, self.device)
 
-    @property
-    def has_pieces(self) -> bool:
-        return self.closed.pieces > 1
-
-    def _thickness(self, points: wp.array, along: wp.array, reach: float, side: float) -> np.ndarray:
+    def _thickness(self, points: wp.array, along: wp.array, reach: float) -> np.ndarray:
         found = wp.empty(points.size, wp.float32, device=points.device)
         # A little inside, so that a ray does not hit the surface on which it starts.
         start = wp.array(points.numpy() + START * reach * along.numpy(), dtype=wp.vec3, device=points.device)
@@ -121,7 +106,7 @@ class SurfaceDomain(SignedFunction):
         launch_side_by_side(
             kernels.evaluate_thickness,
             points.size,
-            lambda own: ([own(start), own(along), reach, side, mesh.id], [own(found)]),
+            lambda own: ([own(start), own(along), reach, mesh.id], [own(found)]),
             points.device,
         )
         return np.minimum(found.numpy() + START * reach, reach)
@@ -138,33 +123,21 @@ class SurfaceDomain(SignedFunction):
         )
         return lengths.numpy()
 
-    def _sides_on(self, device: wp.Device) -> list[wp.array]:
-        key = str(device)
-        if key not in self._sides:
-            self._sides[key] = self.sides.arrays(device)
-        return self._sides[key]
-
     def _mesh(self, device: wp.Device) -> wp.Mesh:
         key = str(device)
         if key not in self._on:
             self._on[key] = surface_mesh(self.closed.points, self.closed.triangles, device)
         return self._on[key]
 
-    def _windings(self) -> tuple[float, float, float]:
-        """Share of the enclosed space that is inside out, that counts twice, and share of all space in which the
-        surface, before its holes were closed, left open whether it is inside."""
+    def _windings(self) -> tuple[float, float]:
+        """Share of the enclosed space that is inside out, and that counts twice."""
         rng = np.random.default_rng(0)
         cells = np.stack(np.meshgrid(*[np.arange(SAMPLES)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
         places = (cells + rng.random(cells.shape)) / SAMPLES
         points = self._on_device(self.bounds[0] + places * np.ptp(self.bounds, axis=0))
         winding = windings_of(self._mesh(self.device), self.lines, points)
         enclosed = max(int(np.count_nonzero(winding)), 1)
-        backward, twice = np.count_nonzero(winding < 0) / enclosed, np.count_nonzero(winding > 1) / enclosed
-        if not self.closed.caps:
-            return backward, twice, 0.0
-        given = surface_mesh(self.closed.points, self.closed.triangles[: -self.closed.caps], self.device, is_open=True)
-        # Between 0.1 and 0.9: neither nearly 0 nor nearly 1.
-        return backward, twice, float(np.mean(count_windings(given, points, [0.1, 0.9]) == 1))
+        return np.count_nonzero(winding < 0) / enclosed, np.count_nonzero(winding > 1) / enclosed
 
     def _details(self) -> list[str]:
         closed = self.closed
@@ -172,7 +145,7 @@ class SurfaceDomain(SignedFunction):
         if closed.open_edges:
             lines.append(
                 f"open: {closed.open_edges} edges in {closed.holes} hole{'s'[: closed.holes != 1]}, closed with "
-                f"{closed.cap_share:.2%} of the area; before that undecided in {self.undecided:.1%} of its box"
+                f"{closed.cap_share:.2%} of the area"
             )
         else:
             lines.append("closed")
@@ -231,12 +204,11 @@ def checked_triangles(
     return x.astype(np.float64), t.astype(np.int64)
 
 
-def surface_mesh(points: np.ndarray, triangles: np.ndarray, device: wp.Device, *, is_open: bool = False) -> wp.Mesh:
-    """A Warp mesh; for an open surface, one that supports winding numbers."""
+def surface_mesh(points: np.ndarray, triangles: np.ndarray, device: wp.Device) -> wp.Mesh:
+    """A Warp mesh of points [N, 3] and triangles [T, 3]."""
     return wp.Mesh(
         wp.array(np.ascontiguousarray(points, dtype=np.float32), dtype=wp.vec3, device=device),
         wp.array(np.ascontiguousarray(triangles, dtype=np.int32).ravel(), dtype=wp.int32, device=device),
-        support_winding_number=is_open,
     )
 
 
@@ -259,14 +231,6 @@ def windings_of(mesh: wp.Mesh, lines: windings.Lines, points: wp.array) -> np.nd
         points.device,
     )
     return found.numpy()
-
-
-def count_windings(mesh: wp.Mesh, points: wp.array, thresholds: Sequence[float]) -> np.ndarray:
-    """The number of thresholds that the winding number of an open surface exceeds at each point, int32 [n]."""
-    above = wp.empty(points.size, wp.int32, device=points.device)
-    limits = wp.array(thresholds, dtype=wp.float32, device=points.device)
-    wp.launch(kernels.count_windings, points.size, [points, mesh.id, limits], [above], device=points.device)
-    return above.numpy()
 
 
 def _given(
@@ -292,3 +256,69 @@ def _given(
     if not (up_axis or loaded.up_axis):
         notes.append(f"{axis} taken as up: the file names no up axis")
     return loaded.points, loaded.triangles, metres, axis, f"{loaded.source}: ", notes
+
+
+def joined_parts(closed: ClosedSurface, device: wp.Device) -> tuple[int, np.ndarray, bool]:
+    """Pieces of the body that a closed surface encloses: its parts, joined if they touch, cross or contain one another.
+
+    Returns:
+        The number of pieces, the piece of each triangle [T] (a cavity belongs to its surroundings), and whether parts
+        overlap.
+    """
+    points, triangles, part = closed.points, closed.triangles.astype(np.int64), closed.parts.astype(np.int64)
+    count = int(part.max()) + 1
+    if count == 1:
+        return 1, np.zeros(len(triangles), np.int32), False
+    # Parts that share a point.
+    last = np.empty(len(points), np.int64)
+    last[triangles] = part[:, None]
+    links = [_different(np.repeat(part, 3), last[triangles].ravel())]
+    crossings = _crossings(closed, device)
+    links.append(crossings)
+    # Parts inside the body of others: a cavity in its surroundings, or a part buried in it.
+    groups, outward = SurfaceParts(points, triangles, part), part_volumes(points, triangles, part) > 0.0
+    holders = [groups.holders(groups.corners[groups.slices[own]][0, 0], own) for own in range(count)]
+    overlap = len(crossings) > 0
+    for own in range(count):
+        around = _bounds_around(own, holders, outward)
+        links.append(np.stack([np.full(len(around), own), around], axis=1))
+        overlap |= len(around) > 0 and bool(outward[own])
+    pairs = np.concatenate(links)
+    of_part = linked(pairs, count)
+    return int(of_part.max()) + 1, of_part[part].astype(np.int32), overlap
+
+
+def _bounds_around(own: int, holders: list[np.ndarray], outward: np.ndarray) -> np.ndarray:
+    """The parts that bound the body just outside a part: from the innermost one around it outwards, as far as the body
+    reaches.
+    """
+    inmost_first = sorted(holders[own], key=lambda holder: -len(holders[holder]))
+    depth = np.cumsum([0, *(1 if outward[holder] else -1 for holder in reversed(inmost_first))])[::-1]
+    ends = np.flatnonzero(depth <= 0)
+    return np.array(inmost_first[: ends[0]], np.int64)
+
+
+def _crossings(closed: ClosedSurface, device: wp.Device) -> np.ndarray:
+    """Pairs of parts where an edge of one passes through a triangle of the other [n, 2]."""
+    edges, own = closed.edges.ends, closed.parts[closed.edges.order[closed.edges.starts] // 3]
+    middle = closed.points.mean(axis=0)
+    placed = wp.array(closed.points - middle, dtype=wp.vec3, device=device)
+    mesh = wp.Mesh(placed, wp.array(closed.triangles.ravel(), dtype=wp.int32, device=device))
+    crossed = wp.empty(len(edges), dtype=wp.int32, device=device)
+    of_edges = [wp.array(edges.astype(np.int32), dtype=wp.vec2i, device=device)]
+    of_edges += [wp.array(own, dtype=wp.int32, device=device)]
+    of_triangles = [mesh.id, wp.array(closed.parts, dtype=wp.int32, device=device)]
+    launch_side_by_side(
+        windings.find_crossed_parts,
+        len(edges),
+        lambda own: ([placed, *map(own, of_edges), *of_triangles], [own(crossed)]),
+        device,
+    )
+    other = crossed.numpy()
+    return _different(own[other >= 0], other[other >= 0])
+
+
+def _different(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Pairs of different numbers, each once [n, 2]."""
+    differ = one != other
+    return np.unique(np.stack([one[differ], other[differ]], axis=1), axis=0).astype(np.int64)

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from warp_corot.errors import InputError
+from warp_corot.inputs.arguments import meant
 from warp_corot.inputs.checks import checked_number, shown
-from warp_corot.inputs.likely import meant
 
 #: Units that a user may have meant.
 USUAL = (

@@ -18,8 +18,8 @@ from warp_corot.elasticity.corotated.model import Corotated
 from warp_corot.elasticity.cpu import ByElements
 from warp_corot.elasticity.model import ElementMaterial, ElementTangent, ForceField, Model, SmallForces, Tangent
 from warp_corot.errors import InputError
+from warp_corot.inputs.arguments import forwards
 from warp_corot.inputs.checks import checked_number, checked_numbers, shown
-from warp_corot.inputs.forwarding import forwards
 from warp_corot.kernels.elements import added as kernels
 from warp_corot.kernels.elements.added import ViscousMaterial, relax_simd8, viscosity_stress
 from warp_corot.kernels.elements.forces import element_energies

@@ -17,9 +17,9 @@ from warp_corot.elasticity.cpu import Dilating
 from warp_corot.elasticity.groups import ClusteredGroups, ElementGroups, elements_of, group_numbers
 from warp_corot.elasticity.model import ElementTangent, ForceField, SmallForces, Tangent
 from warp_corot.errors import InputError
+from warp_corot.inputs.arguments import forwards
 from warp_corot.inputs.checks import checked_choice, shown
 from warp_corot.inputs.choices import AUTO, ELEMENT, SHARED
-from warp_corot.inputs.forwarding import forwards
 from warp_corot.inputs.loading import LoadedKernel, load
 from warp_corot.kernels.elements import dilatation as kernels
 from warp_corot.kernels.elements import mean_dilatation_rows as rows

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 import warp as wp
 
-from warp_corot.discretization.slots import Slots
+from warp_corot.discretization.plan import Slots
 from warp_corot.inputs.cpu_threads import Regions, Team
 
 

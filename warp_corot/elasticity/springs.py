@@ -9,8 +9,7 @@ import warp as wp
 
 from warp_corot.discretization.discretization import Discretization, Discretized, discretization_of
 from warp_corot.discretization.elements import in_worlds, repeated
-from warp_corot.discretization.plan import Plan
-from warp_corot.discretization.slots import Slots
+from warp_corot.discretization.plan import Plan, Slots
 from warp_corot.elasticity.dilatation import ELEMENT, refuse_shared
 from warp_corot.elasticity.laws import StVenantKirchhoff
 from warp_corot.elasticity.model import ElementField, ForceField, Model, StressLaw, Tangent, isotropic_material

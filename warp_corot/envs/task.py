@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.body.places import Nodes
+from warp_corot.body.controls import Nodes
 from warp_corot.contact.shapes import Shape, Vector
 from warp_corot.contact.tool import Tool
 from warp_corot.mesh.forest import TetForest

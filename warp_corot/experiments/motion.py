@@ -7,15 +7,14 @@ import numpy.typing as npt
 
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.options import Contact
-from warp_corot.contact.sampled import SignedDistance
-from warp_corot.contact.shapes import Capsule, Ground
+from warp_corot.contact.shapes import Capsule, Ground, SignedDistance
 from warp_corot.contact.tool import Tool
 from warp_corot.elasticity import Linear
 from warp_corot.materials.isotropic import Isotropic
 from warp_corot.mesh import TetForest
 from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import BackwardEuler, SymplecticEuler
-from warp_corot.solvers.integrator import Integrator
+from warp_corot.solvers.system import Integrator
 
 from .case import Row, Setup, case
 from .elastic import faces_where, mapped_grid, spread

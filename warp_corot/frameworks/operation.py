@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.errors import InputError
-from warp_corot.gradients.given import REPLACED, with_values
-from warp_corot.gradients.solved import solved_state
+from warp_corot.gradients.objective import REPLACED, with_values
+from warp_corot.gradients.static import solved_state
 from warp_corot.inputs.checks import shown
 
 Array = npt.NDArray[np.floating]

@@ -16,7 +16,7 @@ from warp_corot.solvers.implicit.operator import LinearOperator
 from warp_corot.solvers.implicit.preconditioners import preconditioner_of
 from warp_corot.solvers.implicit.tangent import TangentOperator
 
-from .touching import RestingContact, RestingOperator, RestingPreconditioner
+from .contact import RestingContact, RestingOperator, RestingPreconditioner
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody

@@ -1,16 +1,19 @@
-"""A user's objective: its value and its derivative with respect to positions."""
+"""A user's objective, and copies of a body with some of its input replaced."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_corot.body.soft_body import SoftBody
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import shown
+from warp_corot.mesh import TetMesh
 
 #: Positions [m] to a value that a tape differentiates, or to value and derivative.
 Objective = Callable[[wp.array], Any]
@@ -63,3 +66,77 @@ def _given(found: Any, count: int) -> tuple[float, npt.NDArray[np.float64]]:
     if derivative.size != 3 * count:
         raise InputError(f"the gradient that objective gives has shape {derivative.shape}; it must be [{count}, 3]")
     return value, derivative.reshape(count, 3)
+
+
+#: Names of the input that may be replaced; "gravity" does not belong to a body.
+REPLACED = ("young", "poisson", "density", "loads", "boundary", "rest", "activation", "gravity")
+
+Values = Mapping[str, npt.NDArray[Any]]
+
+
+def with_values(body: SoftBody, values: Values) -> SoftBody:
+    """A copy of a body: its mesh, material, displacements, supports, loads and active stress, or these values in their
+    place.
+
+    Args:
+        body: The body, which does not change.
+        values: The values by name: "young", "poisson" and "density" as a material takes them; "loads" [N],
+            [worlds * N, 3]; "boundary", positions, of which only those of held nodes are read, [worlds * N, 3]; "rest",
+            rest positions [N, 3], with which the mesh is a general one; "activation" [worlds, T] or as ``activate``
+            takes it.
+
+    Raises:
+        InputError: A value cannot be used, or the rest shape of a mesh with cut elements is replaced.
+    """
+    moduli = {name: given(values[name]) for name in ("young", "poisson", "density") if name in values}
+    material = replace(body.material, **moduli) if moduli else body.material
+    copy = SoftBody(
+        _mesh(body, values.get("rest")), material, worlds=body.worlds, device=body.device, threads=body.threads
+    )
+    conditions, count = copy.conditions, body.sizes.nodes
+    wp.copy(conditions.held, body.conditions.held, count=count)
+    conditions.find_inverse_masses()
+    if "loads" in values:
+        copy.load(np.arange(body.world_node_count), _nodal(body, values["loads"], "loads").reshape(body.worlds, -1, 3))
+    elif body.conditions.has_loads:
+        loads = body.conditions.loads.numpy()[:count, :3].reshape(body.worlds, -1, 3)
+        copy.load(np.arange(body.world_node_count), loads)
+    if "activation" in values:
+        copy.activate(np.asarray(values["activation"], np.float64))
+    elif body.discretization.has_activation:
+        conditions.make_activation()
+        wp.copy(copy.discretization.activation, body.discretization.activation, count=body.sizes.elements)
+    body.state.adopt_positions()
+    displacements = body.state.displacements.numpy()[:count, :3].astype(np.float64)
+    if "boundary" in values:
+        held = body.conditions.held_mask()[:, None]
+        displacements = np.where(
+            held, _nodal(body, values["boundary"], "boundary") - copy.rest_positions, displacements
+        )
+    copy.state.set_displacements(displacements)
+    return copy
+
+
+def given(values: npt.ArrayLike) -> float | npt.NDArray[np.float64]:
+    """A material's value: float64, a number if it has no dimensions."""
+    array = np.asarray(values, np.float64)
+    return array if array.ndim else float(array)
+
+
+def _mesh(body: SoftBody, rest: npt.ArrayLike | None) -> Any:
+    mesh = body.mesh
+    if rest is None:
+        return mesh
+    if body.discretization.fill is not None:
+        raise InputError("the mesh has cut elements, which belong to one rest shape; rest cannot be replaced")
+    points = np.asarray(rest, np.float64)
+    if points.shape != mesh.points.shape:
+        raise InputError(f"rest has shape {points.shape}; it must be [{len(mesh.points)}, 3]")
+    return TetMesh(points, mesh.tets, up_axis=mesh.up_axis)
+
+
+def _nodal(body: SoftBody, values: npt.ArrayLike, name: str) -> npt.NDArray[np.float64]:
+    array = np.asarray(values, np.float64)
+    if array.shape != (body.sizes.nodes, 3):
+        raise InputError(f"{name} has shape {array.shape}; it must be [{body.sizes.nodes}, 3]")
+    return array

@@ -2,41 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
-
 import numpy as np
 import numpy.typing as npt
 from scipy.sparse import coo_array, csr_array
 
-from warp_corot.contact.reading import Touch
 from warp_corot.contact.shapes import Ground, Shape, Sphere
 from warp_corot.errors import InputError
 
-if TYPE_CHECKING:
-    from .touching import RestingContact
+from .contact import Column, RestingContact
 
 Array = npt.NDArray[np.float64]
-
-
-class Row(NamedTuple):
-    """A direction in which a place cannot move.
-
-    Attributes:
-        obstacle: The number of the obstacle.
-        shape: The shape, or None if friction holds the place.
-        direction: The direction in float32's answer, [3].
-        nodes, shares: The nodes of one world that carry the place, and their shares.
-        at: The place where friction holds it [m], [3].
-        push: The force along the direction in float32's answer [N].
-    """
-
-    obstacle: int
-    shape: Shape | None
-    direction: Array
-    nodes: npt.NDArray[np.integer]
-    shares: Array
-    at: Array
-    push: float
 
 
 class PreciseContact:
@@ -54,72 +29,72 @@ class PreciseContact:
 
     def __init__(self, resting: RestingContact, shapes: tuple[Shape, ...], rest: Array, world: int):
         self._rest, self._shapes = rest, shapes
-        self.rows = [row for found, row in self._all_rows(resting) if found == world]
-        self.count = len(self.rows)
-        self.pushes = np.array([row.push for row in self.rows])
-
-    def _all_rows(self, resting: RestingContact) -> list[tuple[int, Row]]:
-        found, count = [], len(self._rest)
-        for touch, direction, yields, (numbers, weights) in resting.described():
-            if not isinstance(touch, Touch) or len(touch.places) > 1:
+        for column in resting.columns:
+            if column.row.obstacle < 0 or len(column.row.places) > 1:
                 raise InputError("precision is 'float64'; contact must be at nodes, with obstacles")
-            shape = self._shapes[touch.obstacle] if yields else None
-            if not isinstance(shape, Ground | Sphere | None):
+            shape = shapes[column.row.obstacle]
+            if column.yields and not isinstance(shape, Ground | Sphere):
                 raise InputError(
-                    f"precision is 'float64'; obstacles must be Ground or Sphere, and {touch.obstacle} is {shape!r}"
+                    f"precision is 'float64'; obstacles must be Ground or Sphere, and {column.row.obstacle} is "
+                    f"{shape!r}"
                 )
-            push = float(touch.force @ direction)
-            row = Row(touch.obstacle, shape, direction, numbers % count, weights[0], touch.point, push)
-            found.append((int(numbers[0]) // count, row))
-        return found
+        self._columns = [column for column in resting.columns if int(column.nodes[0]) // len(rest) == world]
+        self.count = len(self._columns)
+        self.pushes = np.array([float(column.row.force @ column.normal) for column in self._columns])
 
     def gaps(self, u: Array) -> Array:
         """The gaps at displacements u [m], [m]."""
-        return np.array([self._at(row, u)[0] for row in self.rows])
+        return np.array([self._at(column, u)[0] for column in self._columns])
 
     def normals(self, u: Array) -> csr_array:
         """N, [3 N, m]."""
-        entries = [
-            ((3 * row.nodes[:, None] + np.arange(3)).ravel(), i, np.outer(row.shares, self._at(row, u)[1]).ravel())
-            for i, row in enumerate(self.rows)
-        ]
-        lines, columns, values = (
-            np.concatenate([np.broadcast_to(each[k], each[0].shape) for each in entries]) for k in range(3)
-        )
-        return coo_array((values, (lines, columns)), shape=(u.size, self.count)).tocsr()
+        blocks = [np.outer(column.weights[0], self._at(column, u)[1]).ravel() for column in self._columns]
+        lines = [self._entries(column) for column in self._columns]
+        which = np.repeat(np.arange(self.count), [len(each) for each in lines])
+        places = (np.concatenate(lines), which)
+        return coo_array((np.concatenate(blocks), places), shape=(u.size, self.count)).tocsr()
 
     def turning(self, u: Array, pushes: Array) -> csr_array:
         """G, [3 N, 3 N]."""
         lines, columns, values = [], [], []
-        for row, push in zip(self.rows, pushes, strict=True):
-            own = (3 * row.nodes[:, None] + np.arange(3)).ravel()
-            block = np.kron(np.outer(row.shares, row.shares), -push * self._at(row, u)[2])
+        for column, push in zip(self._columns, pushes, strict=True):
+            own, w = self._entries(column), column.weights[0]
             lines.append(np.repeat(own, len(own)))
             columns.append(np.tile(own, len(own)))
-            values.append(block.ravel())
+            values.append(np.kron(np.outer(w, w), -push * self._at(column, u)[2]).ravel())
         lines_, columns_, values_ = (np.concatenate(each) for each in (lines, columns, values))
         return coo_array((values_, (lines_, columns_)), shape=(u.size, u.size)).tocsr()
 
     def of_obstacles(self, u: Array, pushes: Array, motion: Array, multipliers: Array) -> Array:
         """The derivative with respect to the places of obstacles, [obstacles, 3], from an adjoint motion [N, 3]."""
         found = np.zeros((len(self._shapes), 3))
-        for row, push, multiplier in zip(self.rows, pushes, multipliers, strict=True):
-            _, normal, bend = self._at(row, u)
-            found[row.obstacle] += multiplier * normal - push * bend @ (row.shares @ motion[row.nodes])
+        for column, push, multiplier in zip(self._columns, pushes, multipliers, strict=True):
+            _, normal, bend = self._at(column, u)
+            moved = column.weights[0] @ motion[self._nodes(column)]
+            found[column.row.obstacle] += multiplier * normal - push * bend @ moved
         return found
 
-    def _at(self, row: Row, u: Array) -> tuple[float, Array, Array]:
-        """The gap of a row, and its first and second derivative with respect to the place."""
-        x = row.shares @ (self._rest + u)[row.nodes]
-        if row.shape is None:
-            return float(row.direction @ (x - row.at)), row.direction, np.zeros((3, 3))
-        away = x - row.shape.position
-        if isinstance(row.shape, Ground):
-            up = _axis(row.shape)
+    def _nodes(self, column: Column) -> npt.NDArray[np.int64]:
+        """The nodes that bear its place, numbered within the world."""
+        return column.nodes % len(self._rest)
+
+    def _entries(self, column: Column) -> npt.NDArray[np.int64]:
+        return np.asarray((3 * self._nodes(column)[:, None] + np.arange(3)).ravel())
+
+    def _at(self, column: Column, u: Array) -> tuple[float, Array, Array]:
+        """The gap of a contact, and its first and second derivative with respect to the place; if friction holds this,
+        the distance along the direction from where that is."""
+        x = column.weights[0] @ (self._rest + u)[self._nodes(column)]
+        if not column.yields:
+            return float(column.normal @ (x - column.row.point)), column.normal, np.zeros((3, 3))
+        shape = self._shapes[column.row.obstacle]
+        away = x - shape.position
+        if isinstance(shape, Ground):
+            up = _axis(shape)
             return float(up @ away), up, np.zeros((3, 3))
         distance = float(np.linalg.norm(away))
         normal = away / distance
-        return distance - row.shape.size[0], normal, (np.eye(3) - np.outer(normal, normal)) / distance
+        return distance - shape.size[0], normal, (np.eye(3) - np.outer(normal, normal)) / distance
 
 
 def _axis(shape: Shape) -> Array:

@@ -1,10 +1,11 @@
-"""Gradients of runs of time steps."""
+"""Gradients of runs of time steps, forwards and backwards."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,27 +16,190 @@ from warp_corot.body.soft_body import SoftBody
 from warp_corot.contact.options import Contact
 from warp_corot.contact.shapes import Shape
 from warp_corot.discretization.sizes import padded
-from warp_corot.elasticity import Corotated, Model
+from warp_corot.elasticity import Corotated, ForceField, Model
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.checks import checked_count, refuse_tape, shown
 from warp_corot.inputs.simulation_lock import under_lock
+from warp_corot.kernels.gradients import steps as kernels
+from warp_corot.kernels.implicit import steps as rows
 from warp_corot.simulation.parts import checked_gravity, checked_models
 from warp_corot.simulation.resting import checked_obstacles
 from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import BackwardEuler, QuasiStatic, SymplecticEuler
 from warp_corot.solvers.implicit.schemes import ImplicitIntegrator
-from warp_corot.solvers.integrator import Integrator
+from warp_corot.solvers.recorded import Replays
+from warp_corot.solvers.system import Integrator
 
 from . import parameters
-from .explicit import ExplicitRun
-from .implicit import ImplicitRun
+from .adjoint import Adjoint
+from .contact import RestingContact, rows_after
 from .objective import Objective, value_and_derivative
-from .rest_state import bound, friction_of
-from .sums import StepSums
-from .touches import touches_after
-from .touching import RestingContact
+from .parameters import StepSums
+from .static import bound, friction_of
+
+
+class ExplicitRun:
+    """Steps of symplectic Euler of one body, from its present state.
+
+    Only states at the beginnings of segments are kept. The other states of a segment are computed again when it is run
+    backwards. So there are two runs forwards in all, and memory for the states of one segment and for one state of each
+    segment.
+
+    Args:
+        body, field: The body and its elastic forces.
+        integrator: The integrator, with a given step.
+        gravity: [m/s^2].
+        sums: The sums over steps.
+        ends: The numbers of steps at which segments end, increasing; the last one is the end of the run.
+
+    Attributes:
+        displacements, velocities: At the beginning, and at each of the ends, vec4 each.
+        of_displacements, of_velocities: The adjoint of the state that the run backwards has reached, vec4.
+    """
+
+    def __init__(
+        self,
+        body: SoftBody,
+        field: ForceField,
+        integrator: SymplecticEuler,
+        gravity: Sequence[float],
+        sums: StepSums,
+        ends: Sequence[int],
+    ):
+        self.body, self.field, self.sums, self.device = body, field, sums, body.device
+        self.lengths = np.diff([0, *ends]).tolist()
+        assert integrator.dt is not None
+        self._dt, self._damped = integrator.dt, 1.0 / (1.0 + integrator.dt * integrator.damping)
+        self._gravity, self._tangent = wp.vec3(*gravity), field.tangent(exact=True)
+        state = body.state
+        self._u, self._v = wp.clone(state.displacements), wp.clone(state.velocities)
+        self.of_displacements, self.of_velocities, self._p, self._product, self._f = (
+            wp.zeros_like(self._u) for _ in range(5)
+        )
+        self._kept = [wp.zeros_like(self._u) for _ in range(max(self.lengths))]
+        self.displacements, self.velocities = [wp.clone(self._u)], [wp.clone(self._v)]
+        self._replays = Replays(self.device)
+        self._tangent.prepare(self._u)
+
+    def forward(self) -> None:
+        """Run to the end, and leave the body in that state."""
+        for length in self.lengths:
+            self._replays.launch(("forward", length), partial(self._forward, length))
+            self.displacements.append(wp.clone(self._u))
+            self.velocities.append(wp.clone(self._v))
+        state = self.body.state
+        wp.copy(state.displacements, self._u)
+        wp.copy(state.velocities, self._v)
+        state.publish_positions()
+
+    def backward(self, segment: int) -> None:
+        """Run a segment backwards, after the segments that follow it."""
+        length = self.lengths[segment]
+        wp.copy(self._u, self.displacements[segment])
+        wp.copy(self._v, self.velocities[segment])
+        self._replays.launch(("forward", length), partial(self._forward, length))
+        self._replays.launch(("backward", length), partial(self._backward, length))
+
+    def _forward(self, length: int) -> None:
+        conditions = self.body.conditions
+        inputs = [self._dt, self._damped, self._gravity, conditions.inverse_mass, self.sums.loads]
+        for step in range(length):
+            wp.copy(self._kept[step], self._u)
+            self.field.add_forces(self._u, self._f)
+            self._launch(kernels.take_explicit_step, inputs, [self._f, self._u, self._v])
+
+    def _backward(self, length: int) -> None:
+        inputs = [self._dt, self._damped, self.body.conditions.inverse_mass, self.of_displacements]
+        outputs = [self.of_velocities, self.sums.of_loads, self._p]
+        for step in reversed(range(length)):
+            u = self._kept[step]
+            self._launch(kernels.begin_explicit_adjoint, inputs, outputs)
+            self.sums.add(u, self._p)
+            self._product.zero_()
+            self._tangent.take(u)
+            self._tangent.add_product(self._p, self._product)
+            self._launch(kernels.subtract, [self._product], [self.of_displacements])
+
+    def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, self.body.sizes.launch_nodes, inputs, outputs, device=self.device)
+
 
 Array = npt.NDArray[np.float64]
+
+
+class ImplicitRun:
+    """The adjoints of implicit steps of one body.
+
+    A step finds its increment d at the stage u + d from M (A0 d + A1 v + A2 h1 + A3 h2) + damping M (R0 d + R1 v + …) =
+    f(u + d) + loads, and leaves u + d / share and sums of d, v, h1 and h2; see ``kernels.implicit.steps``.
+
+    Args:
+        body, field: The body and its elastic forces.
+        integrator: The integrator of the steps.
+        sums: The sums over steps.
+        displacements: The displacements before the first step and after each step, vec4.
+        tolerance: Tolerance of the adjoint solves.
+        contacts: What obstacles have pushed in each step, if there are any obstacles.
+
+    Attributes:
+        of_obstacles: The derivative with respect to the places of the obstacles, or 0.
+        of_displacements, of_velocities: The adjoint of the state that the run backwards has reached, float64
+            [worlds * N, 3].
+    """
+
+    def __init__(
+        self,
+        body: SoftBody,
+        field: ForceField,
+        integrator: ImplicitIntegrator,
+        sums: StepSums,
+        displacements: list[wp.array],
+        tolerance: float,
+        contacts: Sequence[RestingContact] = (),
+    ):
+        self._contacts, self.of_obstacles = contacts, np.zeros(1)
+        self.body, self.sums, self.displacements = body, sums, displacements
+        self._adjoint = Adjoint(body, field, integrator.preconditioner, tolerance)
+        self._dt, self._damping = integrator.dt, integrator.damping
+        self._tables = [np.asarray(table(integrator.dt), np.float64) for table in (integrator.start, integrator.scheme)]
+        self._held = body.conditions.held_mask()[:, None]
+        self._masses = body.masses[:, None]
+        self.of_displacements, self.of_velocities, self._of_first, self._of_second = (
+            np.zeros((body.sizes.nodes, 3)) for _ in range(4)
+        )
+
+    def backward(self, step: int) -> None:
+        """Run a step backwards, 0 for the first one, after the steps that follow it."""
+        table = self._tables[min(step, 1)]
+        stage_share = table[int(rows.STAGE), 0]
+        before, after = (self.displacements[k].numpy()[:, :3].astype(np.float64) for k in (step, step + 1))
+        stage = wp.array(padded(before + stage_share * (after - before)), dtype=wp.vec4, device=self.body.device)
+        inertia = table[int(rows.ACCELERATION)] + self._damping * table[int(rows.RATE)]
+        made = [table[int(row)] for row in (rows.VELOCITY, rows.FIRST, rows.SECOND)]
+        of_made = (self.of_velocities, self._of_first, self._of_second)
+        right = self.of_displacements / stage_share + sum(row[0] * of for row, of in zip(made, of_made, strict=True))
+        contact = self._contacts[step] if self._contacts and self._contacts[step].pushes else None
+        self._adjoint.keep_to(contact)
+        self._adjoint.take(stage, inertia[0])
+        motion, product = self._adjoint.solve(np.where(self._held, 0.0, right))
+        p = motion.numpy()[:, :3].astype(np.float64)
+        if contact is not None:
+            self.of_obstacles = self.of_obstacles + contact.of_obstacles(p, self._adjoint.multipliers)
+        of_u = self.of_displacements - product
+        # Held nodes keep their velocity and move with it; at the stage they have made the stage's fraction of that
+        # motion.
+        moved = self._dt * (self.of_displacements - stage_share * product)
+        of_v = np.where(self._held, self.of_velocities + moved, 0.0)
+        parts = []
+        for column in (1, 2, 3):
+            part = sum(row[column] * of for row, of in zip(made, of_made, strict=True))
+            parts.append(np.where(self._held, 0.0, part - inertia[column] * self._masses * p))
+        self.of_displacements, self.of_velocities = of_u, of_v + parts[0]
+        self._of_first, self._of_second = parts[1], parts[2]
+        self.sums.add(stage, motion)
+        added = wp.array(padded(self.sums.of_loads.numpy()[:, :3] + p), dtype=wp.vec4, device=self.body.device)
+        wp.copy(self.sums.of_loads, added)
+
 
 #: Names of the derivatives of runs.
 NAMES = (
@@ -190,7 +354,7 @@ def _implicit(
         sim.step()
         states.append(wp.clone(body.state.displacements))
         if sim.contact is not None:
-            contacts.append(RestingContact(body, sim.contact, touches_after(body, sim.contact), friction))
+            contacts.append(RestingContact(body, sim.contact, rows_after(body, sim.contact), friction))
     check_finite(body)
     run = ImplicitRun(body, sums.field, integrator, sums, states, tolerance, contacts)
     for step in reversed(range(given.steps)):

@@ -1,8 +1,6 @@
 """Forces for the hand: a loop with its own clock between a haptic device and a tool of a simulation."""
 
-from .devices import Device, MouseDevice, ScriptedDevice
-from .loop import HapticLoop
-from .poses import DeviceError
-from .report import Report
+from .devices import Device, DeviceError, MouseDevice, ScriptedDevice
+from .loop import HapticLoop, Report
 
 __all__ = ["Device", "DeviceError", "HapticLoop", "MouseDevice", "Report", "ScriptedDevice"]

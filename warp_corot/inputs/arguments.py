@@ -1,15 +1,36 @@
-"""Calls of constructors with arguments that they do not have, or without those that they need."""
+"""Names that are not known, arguments that do not fit, and attributes of wrapped objects."""
 
 from __future__ import annotations
 
+import difflib
 import functools
 import inspect
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterable
+from operator import attrgetter
+from typing import Any, TypeVar
 
 from warp_corot.errors import InputError
 
-from .likely import meant
+
+def meant(name: str, known: Iterable[str]) -> str:
+    """The words " (did you mean NAME?)" if a known name is similar, else none; case does not matter."""
+    lower = {each.lower(): each for each in known}
+    near = difflib.get_close_matches(name.lower(), lower, n=1, cutoff=0.6)
+    return f" (did you mean {lower[near[0]]}?)" if near else ""
+
+
+C = TypeVar("C")
+
+
+def forwards(to: str, *names: str) -> Callable[[type[C]], type[C]]:
+    """Decorate a class whose attributes of these names are those of its attribute ``to``."""
+
+    def decorate(cls: type[C]) -> type[C]:
+        for name in names:
+            setattr(cls, name, property(attrgetter(f"{to}.{name}")))
+        return cls
+
+    return decorate
 
 
 @functools.cache

@@ -20,25 +20,21 @@ from .cpu_threads import core_count
 from .stopwatch import KERNELS, WATCH
 
 #: Modules of ``warp_corot.kernels`` for closed surfaces and for meshes of domains, the slowest to compile first.
-SURFACES = ("meshing.domain", "meshing.measuring", "meshing.windings")
-MESHING = (
-    *("meshing.domain", "meshing.elements", "meshing.embedding", "meshing.growth"),
-    *("meshing.coarsening", "meshing.surface_points", "meshing.leaves"),
-)
+SURFACES = ("meshing.domain", "meshing.windings")
+MESHING = ("meshing.domain", "meshing.elements", "meshing.embedding", "meshing.growth")
 #: Modules for bodies, for all steps, and for explicit ones whose length is chosen.
-BODY = ("plan.lists", "plan.batches", "stepping.team", "elements.cpu", "stepping.conditions")
-STEPS = ("stepping.integrate", "stepping.balance", "stepping.pace")
+BODY = ("plan.lists", "plan.batches", "stepping.team", "elements.cpu", "stepping.integrate")
+STEPS = ("stepping.balance", "stepping.pace")
 STEPS_ON_CPU = ("subtrees.degenerate", *STEPS, "stepping.subnormals")
-EXPLICIT = ("stepping.lanczos", "stepping.gauge")
+EXPLICIT = ("stepping.stability",)
 #: Modules for implicit steps, and for those of bodies on forests.
 IMPLICIT = (
-    *("implicit.steps", "implicit.residual", "elements.mean_dilatation_rows", "implicit.tangent", "implicit.turning"),
-    *("implicit.conjugate_gradients", "implicit.sums", "implicit.increments", "elements.elements"),
+    *("implicit.steps", "implicit.residual", "elements.mean_dilatation_rows", "implicit.tangent"),
+    *("implicit.conjugate_gradients", "implicit.increments", "elements.elements"),
 )
 IMPLICIT_ON_FORESTS = (
-    *("implicit.multigrid.values", "implicit.multigrid.pattern", "plan.levels", "implicit.multigrid.shared"),
-    *("implicit.assembled", "implicit.multigrid.sweeps", "implicit.multigrid.cycle", "implicit.lagged"),
-    "implicit.chosen",
+    *("implicit.multigrid.values", "implicit.multigrid.pattern", "plan.levels"),
+    *("implicit.assembled", "implicit.multigrid.cycle", "implicit.lagged"),
 )
 #: Modules for explicit contact, besides its solver; and those for soft surfaces on the CPU.
 CONTACT = (

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from warp_corot.errors import InputError
 
-from .likely import meant
+from .arguments import meant
 
 CONSTANTS: dict[str, float | bool] = {"pi": math.pi, "all": True, "none": False}
 

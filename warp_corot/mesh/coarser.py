@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .bisection import corner_leaves
-from .numbering import renumbered, with_virtual
-from .tree import LIVE, VOID, Tree, UniformTree
+from .tree import LIVE, VOID, Tree, UniformTree, renumbered, with_virtual
 
 if TYPE_CHECKING:
     from .forest import TetForest

@@ -7,6 +7,7 @@ lattice. The tree has every ancestor; the leaves are the mesh. Everything is bui
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from os import PathLike
 from typing import TYPE_CHECKING
 
@@ -18,20 +19,18 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_indices, shown
 
 from .forest_arrays import ForestArrays
-from .growing.refined import refined
 from .lattice import LATTICE_BITS, checked_box
 from .lattice import MAX_LEVEL as MAX_LEVEL
-from .pieces import pieces_of
 from .surfaces.bodies import largest_piece, separating_surface, summary, surface
-from .surfaces.bound import SurfaceMesh
-from .surfaces.embedding import embed
-from .tree import UniformTree
+from .surfaces.bound import SurfaceMesh, embed
+from .topology import pieces_of
+from .tree import VOID, Tree, UniformTree, renumbered, with_virtual
 from .uniform import halvings, uniform_leaves
 
 if TYPE_CHECKING:
     from warp_corot.domain import Domain
 
-    from .growing.judging import Field
+    from .growing.refinement_criteria import Field
 
 #: Leaves are numbered in 32 bits.
 MAX_LEAVES = 2**31 - 1
@@ -217,3 +216,64 @@ class TetForest(ForestArrays):
     def summary(self) -> list[str]:
         """A summary of the mesh, line by line: counts by level and type, volume, labels, pieces."""
         return summary(self)
+
+
+def refined(forest: TetForest, leaves: np.ndarray) -> TetForest:
+    """See `TetForest.refine`; leaves by their indices."""
+    from .growing.growth import Growth
+
+    tree = forest.tree
+    growth = Growth(forest.lattice, forest.node_ends, tree, wp.get_device("cpu"))
+    wished = np.zeros(growth.element_count, np.uint8)
+    wished[tree.leaves[leaves]] = 1
+    growth.wished.assign(wished)
+    if forest.phi is not None:
+        # Leaves that were given up as nearly empty still contain a part of the surface.
+        growth.bound.assign((tree.first_child == VOID) & (forest.phi[tree.tets] < 0).any(axis=1))
+    growth.close()
+    lattice, ends = growth.nodes()
+    grown = growth.tree()
+    named = np.zeros(len(lattice), bool)
+    named[grown.leaf_tets] = True
+    named[: forest.node_count] = False
+    real = np.concatenate([np.arange(forest.node_count), np.flatnonzero(named)])
+    order = with_virtual(real, grown, lattice)
+    new_ends, new_tree = renumbered(order, ends, grown)
+    whose = _leaves_before(forest.tree, grown)
+    return replace(
+        forest,
+        lattice=lattice[order],
+        node_ends=new_ends,
+        tree=new_tree,
+        phi=None if forest.phi is None else _interpolated(forest.phi, ends)[order],
+        node_labels=None if forest.node_labels is None else _first_ends(forest.node_labels, ends)[order],
+        fill=None if forest.fill is None else forest.fill[whose],
+        labels=None if forest.labels is None else forest.labels[whose],
+    )
+
+
+def _leaves_before(before: Tree, after: Tree) -> np.ndarray:
+    """For each leaf, the leaf of the former tree that it is or comes from."""
+    found = after.leaves.copy()
+    while (new := found >= len(before.level)).any():
+        found[new] = after.parent[found[new]]
+    number = np.full(len(before.level), -1, np.int32)
+    number[before.leaves] = np.arange(len(before.leaves), dtype=np.int32)
+    return number[found]
+
+
+def _interpolated(values: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Values of the first nodes, and at every later one the mean of its two ends."""
+    found = np.full(len(ends), np.nan, values.dtype)
+    found[: len(values)] = values
+    while len(missing := np.flatnonzero(np.isnan(found))):
+        found[missing] = found[ends[missing]].mean(axis=1)
+    return found
+
+
+def _first_ends(values: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Values of the first nodes, and at every later one that of the end with the lower number."""
+    origin = np.arange(len(ends))
+    while (new := origin >= len(values)).any():
+        origin[new] = ends[origin[new], 0]
+    return values[origin]

@@ -16,6 +16,11 @@ MAX_LEVEL = 3 * LATTICE_BITS
 MAX_CELLS = 2 ** (31 - LATTICE_BITS) - 1
 
 
+def lattice_spacing(cell_size: float) -> float:
+    """Length of one lattice interval [m]."""
+    return cell_size / 2**LATTICE_BITS
+
+
 def volume_shares(level: np.ndarray | int) -> np.ndarray:
     """Volume of tetrahedra of these levels over the volume of a root cube."""
     all_levels = np.arange(MAX_LEVEL + 1)

@@ -21,9 +21,9 @@ from warp_corot.inputs.checks import (
 )
 from warp_corot.kernels.tables.shapes import EDGES
 
-from .labelled import LabelledMesh
-from .surfaces.boundary import signed_volumes
-from .surfaces.locating import embed_in_tets
+from .forest_arrays import LabelledMesh
+from .surfaces.bound import embed_in_tets
+from .topology import signed_volumes
 
 #: A tetrahedron with less volume than this times the cube of its longest edge is flat in float32.
 FLAT = 1e-7

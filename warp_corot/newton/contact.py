@@ -18,8 +18,7 @@ from warp_corot.elasticity.model import Kept
 from warp_corot.errors import InputError
 from warp_corot.kernels.newton import explicit, rows
 from warp_corot.kernels.newton.particles import NO_ROW, UNKNOWN_BEFORE, Bodies, Particles
-from warp_corot.mesh.growing.cut import linked, node_pairs
-from warp_corot.mesh.surfaces.boundary import boundary_faces
+from warp_corot.mesh.topology import boundary_faces, linked, node_pairs
 
 from .checks import Step
 from .library import newton

@@ -15,19 +15,17 @@ from warp_corot.kernels.corotated.tangent import PLACES, KeptGradients, add_kept
 from warp_corot.kernels.elements.elements import GeneralElements
 from warp_corot.kernels.elements.forces import add_stiffness_product
 from warp_corot.kernels.elements.simd8 import LANES
-from warp_corot.kernels.implicit import conjugate_gradients, turning
+from warp_corot.kernels.implicit import conjugate_gradients, increments
 from warp_corot.kernels.implicit.steps import count_solves
 from warp_corot.kernels.implicit.tangent import add_vectors, find_rest, finish_blocks, finish_rows
 from warp_corot.kernels.newton import implicit as kernels
 from warp_corot.kernels.newton.particles import Particles
-from warp_corot.mesh.growing.cut import connected
-from warp_corot.solvers.implicit.block_diagonal import BlockDiagonal
+from warp_corot.mesh.topology import connected
 from warp_corot.solvers.implicit.block_system import BlockSystem
+from warp_corot.solvers.implicit.conjugate_gradients import LineSearch, WorldSums
 from warp_corot.solvers.implicit.contact_solve import ContactSolve
-from warp_corot.solvers.implicit.line_search import LineSearch
-from warp_corot.solvers.implicit.operator import Springs
-from warp_corot.solvers.implicit.sums import WorldSums
-from warp_corot.solvers.steps.repeated import Replays
+from warp_corot.solvers.implicit.preconditioners import BlockDiagonal
+from warp_corot.solvers.recorded import Replays
 
 from .checks import Step
 from .contact import Contacts
@@ -95,7 +93,7 @@ class Unknowns:
 
 
 class TurnedPieces:
-    """A model whose free pieces are turned as they will turn in a step; see ``solvers.implicit.turning``.
+    """A model whose free pieces are turned as they will turn in a step; see ``solvers.implicit.body_steps``.
 
     Pieces with held particles are not turned.
 
@@ -117,7 +115,7 @@ class TurnedPieces:
         first = np.cumsum(np.bincount(piece + 1))
         first -= first[0]
         count = len(first) - 1
-        self._sums = WorldSums(count, int(np.diff(first).max(initial=0)), turning.COLUMNS, device)
+        self._sums = WorldSums(count, int(np.diff(first).max(initial=0)), increments.MOTION_COLUMNS, device)
         self._piece, self._members, self._first = (
             wp.array(values, dtype=wp.int32, device=device) for values in (piece, members, first)
         )
@@ -134,27 +132,22 @@ class TurnedPieces:
         inputs = [self._first, self._members, particles, q, state.particle_qd, threads, lanes]
         wp.launch(kernels.sum_motion, sums.shape, inputs, [sums.parts], device=sums.device)
         outputs = [self._centres, self._turns, self._any_turns]
-        sums.launch_scalars(turning.find_turns, [wp.float64(dt)], outputs)
+        sums.launch_scalars(increments.find_turns, [wp.float64(dt)], outputs)
         inputs = [self._piece, q, self._centres, self._turns, self._entry]
         outputs = [tets.u, self.positions, self.way]
         wp.launch(kernels.turn_particles, len(self.positions), inputs, outputs, device=sums.device)
 
 
 class RowForces:
-    """Forces and stiffness of rows as functions of the motions in a step: what ``ContactSolve`` asks of an
-    ``ObstacleContact`` of springs only, which explains the members.
+    """Forces and stiffness of rows as functions of the motions in a step: a ``SolvedContact`` of ``ContactSolve``.
 
     Args:
         contacts: The model's contacts.
         unknowns: The entries of vectors.
 
     Attributes:
-        springs: What the preconditioner takes into account.
         solves: Number of linear solves of the last step after the first one, int32 [1].
     """
-
-    #: No node is held.
-    nodes = None
 
     def __init__(self, contacts: Contacts, unknowns: Unknowns):
         self.device, self._contacts, self._unknowns = contacts.device, contacts, unknowns
@@ -191,33 +184,39 @@ class RowForces:
     def add_blocks(self, blocks: wp.array) -> None:
         self._launch(kernels.add_row_blocks, [self._rows], [blocks])
 
-    def launch_imposed(self, d: wp.array) -> None:
+    # --- as a contact of solves, see ``SolvedContact`` ---------------------------------------------------------------
+
+    def locate(self, d: wp.array) -> None:
         pass
 
-    def launch_drag(self, x: wp.array, y: wp.array) -> None:
+    def update(self, d: wp.array, *, is_solved: bool = False) -> None:
+        self._launch(kernels.update_springs, [*self._law, int(is_solved), d], [self._rows])
+
+    def add_forces(self, y: wp.array) -> None:
+        self._launch(kernels.add_row_forces, [self._rows, self._no_motion], [y])
+
+    def add_products(self, x: wp.array, y: wp.array) -> None:
         self._launch(kernels.add_row_forces, [self._rows, x], [y])
 
-    def launch_friction(self, d: wp.array, r: wp.array) -> None:
-        self._update(d, is_solved=False)
-        self._launch(kernels.add_row_forces, [self._rows, self._no_motion], [r])
+    def update_springs(self) -> None:
+        pass
+
+    def find_reached(self, d: wp.array, change: wp.array) -> None:
+        pass
 
     def add_slopes(
-        self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array, *, apart: bool = False
+        self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array, *, apart: int | None = None
     ) -> None:
         inputs = [*self._law, self._rows, self._unknowns.count, d, change, search]
         self._launch(kernels.add_row_slopes, inputs, [slopes])
 
-    def launch_judgement(self, b: wp.array, q: wp.array, d: wp.array) -> None:
-        self._update(d, is_solved=True)
-
-    def launch_going(self, d: wp.array, locates: wp.array, rounds: wp.array, most: int, going: wp.array) -> None:
+    def launch_going(self, d: wp.array, rounds: wp.array, most: int, going: wp.array) -> None:
         wp.copy(self.solves, rounds)
 
     def launch_end(self, d: wp.array) -> None:
-        self._update(d, is_solved=True)
+        self.update(d, is_solved=True)
 
-    def _update(self, d: wp.array, *, is_solved: bool) -> None:
-        self._launch(kernels.update_springs, [*self._law, int(is_solved), d], [self._rows])
+    # --- pieces ------------------------------------------------------------------------------------------------------
 
     def _make_room(self) -> None:
         self._rows = made = kernels.RowSprings()
@@ -226,7 +225,6 @@ class RowForces:
         for name, variable in fields.vars.items():
             if name not in ("mass", "solves"):
                 setattr(made, name, wp.zeros(self.count, dtype=variable.type.dtype, device=self.device))
-        self.springs = Springs(made.nodes, made.weights, made.stiffness, update=lambda: None)
 
     def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
         if self.count:
@@ -351,7 +349,7 @@ class ImplicitSteps(Steps):
         self._operator = StepOperator(model, tetrahedra, unknowns, self._rows)
         operator: Any = self._operator
         contact: Any = self._rows
-        self._system = BlockSystem([operator], [RowBlocks(operator)], contacts=[contact], most=ITERATIONS)
+        self._system = BlockSystem([operator], [RowBlocks(operator)], contact=contact, most=ITERATIONS)
         self._system.solver.tolerance.fill_(TOLERANCE)
         self._solve = ContactSolve(self._system, [])
         self._motions = [unknowns.particle, self._system.x]
@@ -394,12 +392,13 @@ class ImplicitSteps(Steps):
         """Launch the solve for the motions: with the contacts that act, and then until these are the right ones."""
         operator, system, rows, x = self._operator, self._system, self._rows, self._system.x
         operator.take_diagonal()
-        rows.launch_judgement(system.b, self._product, x)
+        rows.update(x, is_solved=True)
         system.update()
         operator.apply(x, self._product)
         self._launch(find_rest, len(x), [system.b, self._product], [self._rest])
         wp.copy(self._r, self._rest)
-        rows.launch_friction(x, self._r)
+        rows.update(x)
+        rows.add_forces(self._r)
         system.solve(self._r, self._change, guessed=True, like=system.b)
         wp.copy(self._first, system.solver.iterations)
         if rows.count:

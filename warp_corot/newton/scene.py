@@ -16,7 +16,7 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_indices, checked_number, checked_numbers, checked_vector, shown
 from warp_corot.materials.isotropic import Isotropic
 from warp_corot.mesh import TetForest, TetMesh
-from warp_corot.mesh.surfaces.boundary import boundary_faces, right_handed, signed_volumes
+from warp_corot.mesh.topology import boundary_faces, right_handed, signed_volumes
 
 from .library import newton
 

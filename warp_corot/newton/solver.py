@@ -12,7 +12,7 @@ import warp as wp
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import refuse_tape
 from warp_corot.kernels.newton.rows import sum_by_shape
-from warp_corot.simulation.solves import Solves
+from warp_corot.simulation.energy import Solves
 
 from .checks import Recordings, Step, check_options, check_step, checked_dt, checked_mask
 from .contact import Contacts

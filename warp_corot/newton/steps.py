@@ -11,9 +11,8 @@ import warp as wp
 
 from warp_corot.errors import InputError, UnstableError
 from warp_corot.kernels.newton import particles as kernels
-from warp_corot.solvers.guarding.mapped import Mapped
-from warp_corot.solvers.steps.repeated import Replays
-from warp_corot.solvers.subnormals import FlushedSubnormals
+from warp_corot.solvers.pace import Mapped
+from warp_corot.solvers.recorded import FlushedSubnormals, Replays
 
 from .checks import Step
 from .contact import Contacts

@@ -1,5 +1,5 @@
-"""Substeps: the largest stable time step of a model (see ``solvers.steps.stable_step``), and how many the current state
-needs (see ``kernels.stepping.gauge``)."""
+"""Substeps: the largest stable time step of a model (see ``solvers.stability``), and how many the current state
+needs (see ``kernels.stepping.stability``)."""
 
 from __future__ import annotations
 
@@ -13,12 +13,11 @@ import warp as wp
 from warp_corot.elasticity import Corotated
 from warp_corot.errors import InputError
 from warp_corot.kernels.newton import elements as of_elements
-from warp_corot.kernels.stepping import gauge
-from warp_corot.kernels.stepping.lanczos import add_scaled
-from warp_corot.mesh.growing.cut import linked, node_pairs
-from warp_corot.solvers.guarding.mapped import Mapped
-from warp_corot.solvers.steps.gauge import Curvature
-from warp_corot.solvers.steps.stable_step import largest_eigenvalue
+from warp_corot.kernels.stepping import stability
+from warp_corot.kernels.stepping.stability import add_scaled
+from warp_corot.mesh.topology import linked, node_pairs
+from warp_corot.solvers.pace import Mapped
+from warp_corot.solvers.stability import Curvature, largest_eigenvalue
 
 from .contact import Contacts
 from .library import newton
@@ -225,7 +224,7 @@ class Following:
         self._curvature.find(tets.add_elastic_forces, self._inverse_mass, tets.u, self._f, model.particle_count)
         ahead = max(dt, INTERVAL * substep)
         inputs = [tets.elements, state.particle_q, state.particle_qd, ahead, model.tet_count, self._turn]
-        looked_at = -(-model.tet_count // int(gauge.TURNS))
+        looked_at = -(-model.tet_count // int(stability.TURNS))
         self._launch(of_elements.find_posed_strains, inputs, [self._found], looked_at)
         recorded = substep if self.device.is_capturing else 0.0
         inputs = [self._at_rest, wp.float64(recorded)]

@@ -40,16 +40,17 @@ zero.
 """
 
 from warp_corot.kernels.remesh.criteria import (
+    ElementState,
     displacement_gradient,
+    elongation,
     green_strain,
     longest_edge,
     nearness,
     strain,
     von_mises_stress,
 )
-from warp_corot.kernels.remesh.mark import ElementState, elongation
 
-from .online import OnlineRemesh
+from .remeshing import OnlineRemesh
 
 __all__ = [
     "ElementState",

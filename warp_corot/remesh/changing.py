@@ -11,25 +11,22 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.discretization.changing.cutting import CutPass
-from warp_corot.discretization.changing.passes import RemeshPass
+from warp_corot.discretization.changing.passes import RemeshPass, Survey
 from warp_corot.discretization.changing.plan import DevicePlan, launch_size
 from warp_corot.discretization.changing.pools import DeviceForest, PassCounts
-from warp_corot.discretization.changing.survey import Survey
 from warp_corot.discretization.changing.transfer import Column
 from warp_corot.discretization.sizes import Clock
 from warp_corot.errors import InputError
-from warp_corot.kernels.remesh.criteria import nearness
+from warp_corot.kernels.remesh.criteria import elongation, marking_kernel, nearness
 from warp_corot.kernels.remesh.cut_surface import Surface
-from warp_corot.kernels.remesh.mark import elongation, marking_kernel
 from warp_corot.kernels.remesh.state import MEAN_OF_CONTENTS
 from warp_corot.kernels.stepping.integrate import set_start
 from warp_corot.mesh import TetForest
 from warp_corot.mesh.lattice import volume_shares
 
-from .carried_material import carried_material
-from .changing_mesh import ChangingMesh
+from .carried_material import ChangingMesh, carried_material
 from .conditions import CarriedConditions
-from .online import OnlineRemesh
+from .remeshing import OnlineRemesh
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody

@@ -20,14 +20,13 @@ from warp_corot.errors import InputError, StabilityWarning, depth_of_user
 from warp_corot.inputs.checks import checked_number
 from warp_corot.inputs.simulation_lock import under_lock
 from warp_corot.kernels.remesh.cut_surface import Surface
-from warp_corot.remesh.online import OnlineRemesh
-from warp_corot.remesh.remeshing import Remeshing
+from warp_corot.remesh.remeshing import OnlineRemesh, Remeshing
 from warp_corot.solvers import Integrator, largest_frequency
-from warp_corot.solvers.guarding.guard import Guard
+from warp_corot.solvers.guard import Guard
 from warp_corot.solvers.halo import ALONE, Halo
 from warp_corot.solvers.system import System
 
-from .clock import Clock
+from .energy import Clock
 from .parts import check_implicit
 
 #: No element of an isotropic material alone vibrates faster than the square root of this many times its modulus

@@ -18,7 +18,7 @@ from warp_corot.cutting.blade import Blade
 from warp_corot.elasticity import Model
 from warp_corot.errors import InputError
 from warp_corot.materials.isotropic import Material
-from warp_corot.remesh.online import OnlineRemesh
+from warp_corot.remesh.remeshing import OnlineRemesh
 
 from .simulation import Simulation
 

@@ -1,23 +1,110 @@
-"""The state of rest of bodies on obstacles: steps so long that inertia hardly matters, each from rest."""
+"""The state of rest of bodies on obstacles, and simulations that begin there, by long steps."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from warp_corot.body.soft_body import SoftBody
+from warp_corot.contact.carried import take_state
 from warp_corot.contact.contacts import Contacts
 from warp_corot.contact.options import Contact
 from warp_corot.contact.shapes import Shape
+from warp_corot.contact.tool import Tool
 from warp_corot.elasticity import ForceField, Model
-from warp_corot.errors import UnstableError
+from warp_corot.errors import InputError, UnstableError
 from warp_corot.inputs.checks import checked_things
+from warp_corot.mesh.topology import linked, node_pairs
 from warp_corot.solvers import BackwardEuler
 
 from .simulation import Simulation
+
+#: Loads on a free body balance if their sum is less than this share of the sum of their magnitudes.
+LOADS_BALANCED = 1e-5
+#: Held nodes are on one line if they are within this share of their distances.
+ON_A_LINE = 1e-6
+
+
+class LoadedBody:
+    """A body that is brought to rest.
+
+    Args:
+        body: The body.
+        field: Its elastic forces.
+        gravity: [m/s^2].
+
+    Attributes:
+        loads: Loads and weight [N], float64 [worlds * N, 3].
+    """
+
+    def __init__(self, body: SoftBody, field: ForceField, gravity: tuple[float, float, float]):
+        self.body, self.field = body, field
+        self.loads = body.conditions.loads_and_weights(gravity)
+
+    def falls(self) -> bool:
+        """Whether nothing holds the body, and its loads do not balance."""
+        worlds = self.body.worlds
+        held = self.body.conditions.held_mask().reshape(worlds, -1).any(axis=1)
+        of_worlds = self.loads.reshape(worlds, -1, 3)
+        sums = np.linalg.norm(of_worlds.sum(axis=1), axis=1)
+        return bool((~held & (sums > LOADS_BALANCED * np.linalg.norm(of_worlds, axis=2).sum(axis=1))).any())
+
+    def turns(self) -> bool:
+        """Whether loads at the rest shape do work in a rigid motion of a whole part of the mesh that leaves all held
+        nodes where they are, because in some world they are on one line; parts that share no node move separately.
+        """
+        body = self.body
+        part, points = _parts(body.mesh.tets, body.node_count // body.worlds), body.mesh.points
+        held = body.conditions.held_mask().reshape(body.worlds, -1)
+        loads = self.loads.reshape(body.worlds, -1, 3)
+        for number in range(int(part.max()) + 1):
+            nodes = np.flatnonzero(part == number)
+            x = points[nodes] - points[nodes].mean(axis=0)
+            motions = _rigid_motions(x / max(float(np.abs(x).max()), 1e-30))
+            for world in range(body.worlds):
+                kept = motions[held[world, nodes]].reshape(-1, 6)
+                sizes, axes = np.linalg.eigh(kept.T @ kept)
+                left = axes[:, sizes <= ON_A_LINE**2 * max(float(sizes[-1]), 1e-30)]
+                forces = loads[world, nodes]
+                work = np.linalg.norm(np.einsum("nci,nc->i", motions, forces) @ left)
+                if work > LOADS_BALANCED * np.linalg.norm(forces, axis=1).sum():
+                    return True
+        return False
+
+    def finish(self) -> None:
+        """Let the body rest: no velocity, reactions at held nodes, positions published."""
+        body, state = self.body, self.body.state
+        state.velocities.zero_()
+        elastic = self.field.elastic_forces(state.displacements).numpy()[: body.sizes.nodes, :3]
+        held = body.conditions.held_mask()[:, None]
+        reactions = np.zeros((body.sizes.nodes, 4), np.float32)
+        reactions[:, :3] = np.where(held, -(elastic + self.loads), 0.0)
+        state.reactions[: body.sizes.nodes].assign(reactions)
+        state.publish_positions()
+
+
+def _rigid_motions(x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Three translations and three turns about the axes at points [n, 3], [n, 3, 6]."""
+    found = np.zeros((len(x), 3, 6))
+    for axis in range(3):
+        found[:, axis, axis] = 1.0
+        found[:, :, 3 + axis] = np.cross(np.eye(3)[axis], x)
+    return found
+
+
+def _parts(tets: npt.NDArray[np.integer], count: int) -> npt.NDArray[np.int32]:
+    """The part of each node, -1 if it is in no element: elements that share a node belong to one part."""
+    label = linked(node_pairs(tets), count)
+    used = np.zeros(count, bool)
+    used[tets.ravel()] = True
+    part = np.full(count, -1, np.int32)
+    part[used] = np.unique(label[used], return_inverse=True)[1]
+    return part
+
 
 #: Lengths of steps that are tried, over the time of a wave through the body, and the share of an overlap by which
 #: surfaces are pushed apart in one of them.
@@ -187,10 +274,63 @@ def _rolls(body: SoftBody) -> bool:
     held = body.conditions.held_mask().reshape(body.worlds, -1).any(axis=1)
     x, v = (array.numpy().reshape(body.worlds, -1, 3).astype(np.float64) for array in (body.positions, body.velocities))
     for world in np.flatnonzero(~held):
-        turns = np.stack([np.cross(axis, x[world] - x[world].mean(axis=0)) for axis in np.eye(3)])
-        shifts = np.broadcast_to(np.eye(3)[:, None], turns.shape)
-        modes = np.concatenate([shifts, turns]).reshape(6, -1).T
+        modes = _rigid_motions(x[world] - x[world].mean(axis=0)).reshape(-1, 6)
         rest = v[world].ravel() - modes @ np.linalg.lstsq(modes, v[world].ravel(), rcond=None)[0]
         if np.linalg.norm(rest) < 0.5 * np.linalg.norm(v[world]):
             return True
     return False
+
+
+#: The largest motion of the last step over the largest displacement, and the most steps of each search.
+TOLERANCE, STEPS = 1e-6, 100
+
+
+def bring_to_rest(sim: Simulation) -> Rest:
+    """Move all bodies to where they rest together on the obstacles and on one another, before the first step.
+
+    Obstacles and tools stay where they begin. The simulation goes on from the contact of this state: forces, wrenches
+    and pressures are those at rest. If the search fails, the bodies stay where they were.
+
+    Args:
+        sim: The simulation, with contact.
+
+    Raises:
+        InputError: Meshes change, or several ranks have parts of the bodies.
+    """
+    if not sim.ranks.is_alone:
+        raise InputError("several ranks cannot bring bodies to rest in contact; one process can")
+    if sim.remeshing.every:
+        raise InputError("a body is remeshed; to begin at rest, all meshes must stay as they are")
+    assert sim.contact is not None
+    loaded = [LoadedBody(body, field, sim.gravity) for body, field in zip(sim.bodies, sim.fields, strict=True)]
+    for each in loaded:
+        each.body.state.adopt_positions()
+        each.field.relax_fully()
+    found = rest_on(
+        sim.bodies,
+        sim.models,
+        sim.fields,
+        [each.loads for each in loaded],
+        sim.gravity,
+        _standing(sim),
+        sim.contact.options,
+        tolerance=TOLERANCE,
+        most=STEPS,
+        preconditioner=None,
+    )
+    for each in loaded:
+        each.finish()
+    if found.contact is not None:
+        take_state(sim.contact, found.contact)
+    return found
+
+
+def _standing(sim: Simulation) -> list[Shape]:
+    """Copies of all obstacles, at rest where they are."""
+    assert sim.contact is not None
+    found = []
+    for obstacle, pose in zip(sim.obstacles, sim.contact.obstacles.poses()[0], strict=True):
+        shape = copy(obstacle.shape if isinstance(obstacle, Tool) else obstacle)
+        shape.position, shape.quaternion, shape.felt = pose[:3].astype(float), pose[3:].astype(float), None
+        found.append(shape)
+    return found

@@ -1,8 +1,8 @@
-"""Runs of a simulation: how many steps come before something else is due, and the repair of a state that went wrong.
+"""Runs of a simulation: how many steps come before something else is due, the repair of a state that went wrong.
 
 ``Simulation.advance`` makes steps until a time. It makes them in runs, which end where a check, a hook or a pass of
 remeshing is due. The host plans a run from the device's last report, launches it (``solvers.recorded``), and waits
-once, for the report at its end (``solvers.guarding``). Most calls of ``advance`` are one run.
+once, for the report at its end (``solvers.guard``). Most calls of ``advance`` are one run.
 """
 
 from __future__ import annotations
@@ -11,23 +11,127 @@ import math
 import warnings
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from warp_corot.errors import StabilityWarning, UnstableError, depth_of_user
+from warp_corot.elasticity import StVenantKirchhoff
+from warp_corot.errors import InputError, StabilityWarning, UnstableError, depth_of_user
+from warp_corot.inputs.checks import checked_count, shown
 from warp_corot.inputs.simulation_lock import SIMULATION_LOCK
 from warp_corot.kernels.stepping.pace import GROWTH
-from warp_corot.solvers.guarding.energy_control import EnergyControl
-from warp_corot.solvers.guarding.guard import Fault
+from warp_corot.solvers.guard import EnergyControl, Fault
+from warp_corot.solvers.pace import Schedule
 from warp_corot.solvers.recorded import Segment
 
-from .fault_messages import fault_message
 from .progress import bar_of
 
 if TYPE_CHECKING:
+    from warp_corot.solvers.pace import Pace
+
     from .simulation import Simulation
+
+
+class Stepped(Protocol):
+    """The part of a simulation that a message reads."""
+
+    worlds: int
+    models: tuple[Any, ...]
+    pace: Pace
+    stable_dt: float
+    safe_step: Any
+    integrator: Any
+
+    @property
+    def steps(self) -> int: ...
+
+    @property
+    def time(self) -> float: ...
+
+
+def fault_message(sim: Stepped, fault: Fault, returns: int) -> str:
+    """What went wrong, when, and what would help; after the step was halved this many times."""
+    more = f" and {len(fault.worlds) - 3} more" if len(fault.worlds) > 3 else ""
+    where = f" in world {', '.join(map(str, fault.worlds[:3]))}{more}" if sim.worlds > 1 else ""
+    if fault.step is None:
+        when = f"at step {sim.steps} (t = {sim.time:.4g} s)"
+    else:
+        when = f"since step {fault.step} (t = {sim.pace.time_at(fault.step):.4g} s)"
+    steps = f"dt is {sim.pace.dt:.3g} s"
+    if math.isfinite(sim.stable_dt):
+        steps += f", the largest stable step at rest about {sim.stable_dt:.3g} s"
+    return f"{fault.what} {when}{where}; {steps}{_advice(sim, returns)}"
+
+
+def _advice(sim: Stepped, returns: int) -> str:
+    if any(getattr(model, "rotation_level", None) is not None for model in sim.models):
+        return "; shared rotations have no energy, so that strong bending may need rotation_level=None"
+    if any(isinstance(model, StVenantKirchhoff) for model in sim.models):
+        return "; StVenantKirchhoff has no energy barrier against being crushed: take NeoHookean or Corotated"
+    if sim.integrator.is_implicit:
+        return ": take a shorter step, or a tolerance, so that steps are solved by more than one iteration"
+    if sim.safe_step is None:
+        return ": take a shorter step, or dt=None, which follows the state"
+    return f"; {returns} times half the step did not help: look for loads or motions that crush the body"
+
+
+#: A hook that advances the simulation is called within its own call, at most this often.
+MOST_NESTED = 50
+
+
+@dataclass(frozen=True)
+class _Hook:
+    callback: Callable[[Any], None]
+    every: int
+
+
+class Hooks:
+    """The functions and the numbers of steps between their calls."""
+
+    def __init__(self) -> None:
+        self._hooks: list[_Hook] = []
+        self._nested = 0
+
+    @property
+    def intervals(self) -> list[int]:
+        """Steps between the calls of each function."""
+        return [hook.every for hook in self._hooks]
+
+    def add(self, callback: Callable[[Any], None], every: int) -> None:
+        """Call a function after every ``every``-th step.
+
+        Raises:
+            InputError: ``every`` is not a positive whole number, or the callback is not callable.
+        """
+        if not callable(callback):
+            raise InputError(f"callback is {shown(callback)}; it must be a function of the simulation")
+        self._hooks.append(_Hook(callback, checked_count(every, "every", least=1)))
+
+    def call(self, sim: Any) -> None:
+        """Call the functions that are due now, with the simulation.
+
+        Raises:
+            InputError: A function advances the simulation, which calls it again, without end.
+        """
+        steps = sim.steps if self._hooks else 0
+        for hook in tuple(self._hooks):
+            if steps % hook.every == 0:
+                self._call(hook.callback, sim)
+
+    def _call(self, callback: Callable[[Any], None], sim: Any) -> None:
+        if self._nested >= MOST_NESTED:
+            name = getattr(callback, "__qualname__", shown(callback))
+            raise InputError(
+                f"the hook {name} advances the simulation, which calls it again and again; "
+                "let it return, and advance the simulation outside"
+            )
+        self._nested += 1
+        try:
+            callback(sim)
+        finally:
+            self._nested -= 1
+
 
 #: How often the step is halved to get past one time.
 MOST_RETURNS = 6
@@ -87,11 +191,15 @@ class Running:
     def state(self) -> dict[str, float]:
         """What a run needs besides the guard's state to continue."""
         until = self._wrong_until if self._returns else 0.0
-        return {"returns": self._returns, "wrong_until": until, "judged": self._judged}
+        schedule = self._sim.pace.schedule._asdict()
+        return {"returns": self._returns, "wrong_until": until, "judged": self._judged} | schedule
 
-    def resume(self, *, returns: float, wrong_until: float, judged: float) -> None:
+    def resume(self, *, returns: float, wrong_until: float, judged: float, **schedule: Any) -> None:
         """Continue from what ``state`` gave."""
         self._returns, self._wrong_until, self._judged = int(returns), float(wrong_until), int(judged)
+        self._sim.pace.schedule = Schedule(
+            **{name: type(of)(schedule[name]) for name, of in Schedule()._asdict().items()}
+        )
 
     def begin_again(self) -> None:
         """Go on with other launches and another guard, at the same time."""

@@ -42,20 +42,18 @@ from warp_corot.inputs.simulation_lock import SIMULATION_LOCK, under_lock
 from warp_corot.kernels.contact.crushed import count_crushed
 from warp_corot.kernels.contact.search import find_pairs
 from warp_corot.kernels.elements.elements import ForestElements
-from warp_corot.kernels.stepping.gauge import find_strains
 from warp_corot.kernels.stepping.integrate import STEP_SYMPLECTIC_EULER
-from warp_corot.remesh.online import OnlineRemesh
-from warp_corot.remesh.remeshing import Remeshing
+from warp_corot.kernels.stepping.stability import find_strains
+from warp_corot.remesh.remeshing import OnlineRemesh, Remeshing
 from warp_corot.solvers import Integrator, SymplecticEuler
-from warp_corot.solvers.guarding.guard import Guard
+from warp_corot.solvers.guard import Guard
+from warp_corot.solvers.pace import Pace
 from warp_corot.solvers.recorded import RecordedSteps, Segment
-from warp_corot.solvers.steps.pace import Pace
-from warp_corot.solvers.steps.safe_step import ANY_STEP, SafeStep
+from warp_corot.solvers.stability import ANY_STEP, SafeStep
 from warp_corot.solvers.system import NEVER, Forces, System
 
 from .cutting import Cutting
-from .energy import Energy, WorldEnergies, find_energies
-from .hooks import Hooks
+from .energy import Energy, Solves, WorldEnergies, find_energies
 from .parts import (
     check_constraints,
     check_implicit,
@@ -67,8 +65,7 @@ from .parts import (
     checked_models,
     chosen_worlds,
 )
-from .running import Running
-from .solves import Solves
+from .running import Hooks, Running
 
 
 class Simulation(Cutting):

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,17 +16,15 @@ from warp_corot.contact.contacts import Contacts
 from warp_corot.contact.options import Contact
 from warp_corot.contact.reading import ContactPoint, contact_points
 from warp_corot.contact.shapes import Shape
-from warp_corot.elasticity import Corotated, Model
+from warp_corot.elasticity import Corotated, ForceField, Model
 from warp_corot.errors import ConvergenceError, InputError
 from warp_corot.inputs.checks import checked_count, checked_number, refuse_tape, shown
 from warp_corot.inputs.simulation_lock import under_lock
-from warp_corot.solvers.implicit.nested import nested_start
 from warp_corot.solvers.implicit.preconditioners import check_preconditioner
-from warp_corot.solvers.implicit.static import StaticSolver, status_words
+from warp_corot.solvers.implicit.static import StaticSolver, nested_start, status_words
 
-from .loaded import LoadedBody
 from .parts import check_whole, checked_gravity, checked_models
-from .resting import checked_obstacles, rest_on
+from .resting import LoadedBody, Rest, checked_obstacles, rest_on
 
 #: Rounding of float32 displacements and forces hides what is smaller: Newton's method would stop without an answer.
 LEAST_TOLERANCE = 1e-6
@@ -164,19 +163,21 @@ def static_answer(
     body.state.adopt_positions()
     forces = law.bind(body)
     forces.relax_fully()
-    answer = _Answer(body, forces, down)
+    answer = _Answer(body, forces, down, began)
     things = checked_obstacles(obstacles)
     _check_precision(precision, body, law, touches=bool(things) or contact is not None)
     if things or contact is not None:
         if steps != 1:
             raise InputError(f"load_steps is {steps}; with obstacles or contact it must be 1")
-        return _rest_on(answer, law, down, things, contact, tolerance, most, preconditioner, began)
+        options: dict[str, Any] = {"tolerance": tolerance, "most": most, "preconditioner": preconditioner}
+        rest = rest_on([body], [law], [forces], [answer.loads], down, things, contact, **options)
+        return answer.resting(rest), rest.contact
     if answer.falls():
-        message = "no node is held, and the loads do not balance: the body has no state of rest; fix some nodes"
-        return answer.report(began, message), None
+        return answer.report(
+            "no node is held, and the loads do not balance: the body has no state of rest; fix some nodes"
+        ), None
     if forces.is_linear and answer.turns():
-        message = f"{LOADS_TURN}: under a linear law it has no state of rest; {FIX_MORE}"
-        return answer.report(began, message), None
+        return answer.report(f"{LOADS_TURN}: under a linear law it has no state of rest; {FIX_MORE}"), None
     solver = StaticSolver(
         body, forces, down, tolerance=tolerance, most=most, load_steps=steps, preconditioner=preconditioner
     )
@@ -184,9 +185,8 @@ def static_answer(
     answer.finish()
     converged = found.converged
     if precision == FLOAT64 and converged.all():
-        return _precise(answer, law, solver, began), None
+        return _precise(answer, law, solver), None
     report = answer.report(
-        began,
         "the body is at rest" if converged.all() else _what_stopped(answer, solver, status_words(found), converged),
         iterations=solver.iterations,
         linear_iterations=solver.linear_iterations,
@@ -217,108 +217,70 @@ def _check_precision(precision: str, body: SoftBody, law: Model, *, touches: boo
         raise InputError("precision is 'float64'; it needs held nodes in each world")
 
 
-def _precise(answer: _Answer, law: Model, solver: StaticSolver, began: float) -> StaticReport:
+def _precise(answer: _Answer, law: Model, solver: StaticSolver) -> StaticReport:
     """The answer in float64, from that in float32."""
     from warp_corot.solvers.implicit.precise import PreciseRest
 
     body = answer.body
-    everywhere = np.ones(body.worlds, bool)
-    linear = solver.linear_iterations
+    solves: dict[str, Any] = {"linear_iterations": solver.linear_iterations, "load_share": 1.0}
     try:
         found = PreciseRest(body, answer.field, law, answer.loads)
     except ConvergenceError as error:
         message = f"not converged: {error}; the body is at rest in float32"
-        return answer.report(began, message, iterations=solver.iterations, linear_iterations=linear, load_share=1.0)
+        return answer.report(message, iterations=solver.iterations, **solves)
     body.state.adopt_positions()
     answer.finish()
     report = answer.report(
-        began,
         "the body is at rest",
         iterations=solver.iterations + found.iterations,
         residual=found.residual,
         correction=found.correction,
-        linear_iterations=linear,
-        load_share=1.0,
-        world_converged=everywhere,
+        world_converged=np.ones(body.worlds, bool),
+        **solves,
     )
     return replace(report, displacements=found.u.reshape(-1, 3))
 
 
-def _rest_on(
-    answer: _Answer,
-    law: Model,
-    gravity: tuple[float, float, float],
-    obstacles: tuple[Shape, ...],
-    contact: Contact | None,
-    tolerance: float,
-    most: int,
-    preconditioner: str | None,
-    began: float,
-) -> tuple[StaticReport, Contacts | None]:
-    """The answer in contact."""
-    found = rest_on(
-        [answer.body],
-        [law],
-        [answer.field],
-        [answer.loads],
-        gravity,
-        obstacles,
-        contact,
-        tolerance=tolerance,
-        most=most,
-        preconditioner=preconditioner,
-    )
-    answer.finish()
-    report = answer.report(
-        began,
-        found.message,
-        iterations=found.iterations,
-        linear_iterations=found.linear_iterations,
-        residual=found.residual,
-        correction=found.correction,
-        load_share=1.0 if found.converged.all() else 0.0,
-        world_converged=found.converged,
-    )
-    points = () if found.contact is None else tuple(contact_points(found.contact))
-    return replace(report, contacts=points), found.contact
-
-
 class _Answer(LoadedBody):
-    """A body and the state that a solve ends in."""
+    """A body and the state that a solve ends in, which began at a time [s]."""
 
-    def report(
-        self,
-        began: float,
-        message: str,
-        *,
-        iterations: int = 0,
-        linear_iterations: int = 0,
-        residual: float = math.inf,
-        correction: float = math.inf,
-        load_share: float = 0.0,
-        world_converged: npt.NDArray[np.bool_] | None = None,
-    ) -> StaticReport:
+    def __init__(self, body: SoftBody, field: ForceField, gravity: tuple[float, float, float], began: float):
+        super().__init__(body, field, gravity)
+        self._began = began
+
+    def report(self, message: str, **known: Any) -> StaticReport:
+        """The report, with what is known of the solve, if there was one."""
         body = self.body
         u = body.state.displacements.numpy()[: body.sizes.nodes, :3].astype(np.float64)
         energy = self.field.elastic_energy(body.state.displacements) - float(np.sum(self.loads * u))
-        converged = np.zeros(body.worlds, bool) if world_converged is None else world_converged
-        return StaticReport(
-            converged=bool(converged.all()),
-            message=message,
-            iterations=iterations,
-            linear_iterations=linear_iterations,
-            residual=residual,
-            correction=correction,
-            energy=energy,
-            time=time.perf_counter() - began,
-            load_share=load_share,
-            world_converged=converged,
+        nothing: dict[str, Any] = {
+            "iterations": 0,
+            "linear_iterations": 0,
+            "residual": math.inf,
+            "correction": math.inf,
+        }
+        known = nothing | {"load_share": 0.0, "world_converged": np.zeros(body.worlds, bool)} | known
+        converged, took = bool(known["world_converged"].all()), time.perf_counter() - self._began
+        return StaticReport(converged=converged, message=message, energy=energy, time=took, **known)
+
+    def resting(self, found: Rest) -> StaticReport:
+        """The report on an answer in contact."""
+        self.finish()
+        report = self.report(
+            found.message,
+            iterations=found.iterations,
+            linear_iterations=found.linear_iterations,
+            residual=found.residual,
+            correction=found.correction,
+            load_share=1.0 if found.converged.all() else 0.0,
+            world_converged=found.converged,
         )
+        return replace(report, contacts=() if found.contact is None else tuple(contact_points(found.contact)))
 
 
 def _what_stopped(answer: _Answer, solver: StaticSolver, why: str, converged: npt.NDArray[np.bool_]) -> str:
     """The message of a solve that did not converge in all worlds."""
-    from warp_corot.mesh.pieces import pieces_of
+    from warp_corot.mesh.topology import pieces_of
 
     body = answer.body
     piece = pieces_of(body.mesh.tets)

@@ -10,9 +10,9 @@ from warp_corot.solvers.implicit.schemes import (
     Newmark,
     QuasiStatic,
 )
-from warp_corot.solvers.steps.stable_step import largest_frequency
+from warp_corot.solvers.stability import largest_frequency
 
-from .integrator import Integrator, Stepper
+from .system import Integrator, Stepper
 
 INTEGRATORS: dict[str, type[Integrator]] = {name: globals()[kind] for name, kind in choices.INTEGRATORS.items()}
 

@@ -1,23 +1,105 @@
-"""The system that steps together: bodies, their elastic forces, other forces, and the clock."""
+"""The system that steps together: bodies, their forces and the work of these; and the interface of integrators."""
 
 from __future__ import annotations
 
+import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, ClassVar, Protocol
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
 from warp_corot.elasticity import ForceField
-from warp_corot.kernels.contact.motion import Dynamics
-from warp_corot.solvers.steps.pace import Pace
+from warp_corot.kernels.stepping.balance import count_constraints, count_work, separate_forces
+from warp_corot.kernels.stepping.integrate import Dynamics
 
-from .forces_work import ForcesWork
 from .halo import ALONE, Halo
+from .pace import Pace
 
 if TYPE_CHECKING:
     from warp_corot.body.soft_body import SoftBody
+
+
+class ForcesWork:
+    """Counts the work of a system's forces and constraints.
+
+    Args:
+        bodies, pace, gravity: The system's.
+
+    Attributes:
+        accounts: The work of forces on the nodes of each body, and the sum of its absolute values [J]: float64 [2, n],
+            world after world.
+        of_constraints: The work of constraints on bodies that were touched, by the number of the body. It stays when a
+            constraint is removed.
+        others: All forces besides elasticity in the last step [N], vec4, for each body.
+    """
+
+    def __init__(self, bodies: Sequence[SoftBody], pace: Pace, gravity: wp.vec3):
+        self._bodies, self._pace, self._gravity = bodies, pace, gravity
+        self.accounts: list[wp.array] = []
+        self.others: list[wp.array] = []
+        self.of_constraints: dict[int, wp.array] = {}
+        self._elastic: list[wp.array] = []
+
+    def prepare(self, counted: bool) -> None:
+        """Make room for the present arrays of nodes; not while launches are recorded.
+
+        Args:
+            counted: Whether there are forces whose work is counted.
+        """
+        lengths = [len(body.state.displacements) for body in self._bodies]
+        for k, (body, length) in enumerate(zip(self._bodies, lengths, strict=True)):
+            if body.state.is_touched and (k not in self.of_constraints or self.of_constraints[k].shape[1] != length):
+                self.of_constraints[k] = wp.zeros((2, length), dtype=wp.float64, device=body.device)
+        if not counted:
+            return
+        if lengths == [len(array) for array in self.others]:
+            return
+        device = self._bodies[0].device
+        self.others, self._elastic = ([wp.zeros(n, dtype=wp.vec4, device=device) for n in lengths] for _ in range(2))
+        self.accounts = [wp.zeros((2, n), dtype=wp.float64, device=device) for n in lengths]
+
+    def launch_begin(self) -> None:
+        """Launch the copy of the forces so far, which are elastic."""
+        for body, elastic in zip(self._bodies, self._elastic, strict=True):
+            wp.copy(elastic, body.state.forces)
+
+    def launch_separation(self) -> None:
+        """Launch the difference since then: the other forces."""
+        for body, elastic, others in zip(self._bodies, self._elastic, self.others, strict=True):
+            inputs = [elastic, body.state.forces]
+            wp.launch(separate_forces, body.sizes.launch_nodes, inputs, [others], device=body.device)
+
+    def launch_count(self, offset: int, damping: float) -> None:
+        """Launch the sum of their work, after the forces of constraints, which change the motion."""
+        for k, body in enumerate(self._bodies):
+            inputs = [dynamics_of(body, self._gravity, damping), self._pace.arrays, offset, self._elastic[k]]
+            outputs = [self.others[k], self.accounts[k]]
+            wp.launch(count_work, body.sizes.launch_nodes, inputs, outputs, device=body.device)
+
+    def launch_constraints(self, offset: int, damping: float) -> None:
+        """Launch the sum of the constraints' work, after all of them have added their forces."""
+        for k, account in self.of_constraints.items():
+            body = self._bodies[k]
+            inputs = [dynamics_of(body, self._gravity, damping), self._pace.arrays, offset, body.state.contact_forces]
+            wp.launch(count_constraints, body.sizes.launch_nodes, inputs, [account], device=body.device)
+
+
+def dynamics_of(body: SoftBody, gravity: wp.vec3, damping: float) -> Dynamics:
+    """What moves the nodes of a body in a step with this damping [1/s], as a struct for kernels."""
+    conditions, state, found = body.conditions, body.state, Dynamics()
+    found.damping, found.gravity, found.inverse_mass = damping, gravity, conditions.inverse_mass
+    found.rest, found.f, found.u, found.v = state.rest, state.forces, state.displacements, state.velocities
+    if conditions.has_loads:
+        loads = conditions.loads
+        found.load_stride = loads.strides[0] // 4
+        # Another program's array may have any stride, also zero.
+        size = 3 + abs(found.load_stride) * (len(loads) - 1)
+        found.load = wp.array(ptr=loads.ptr, dtype=wp.float32, shape=size, device=body.device, copy=False)
+    return found
+
 
 #: No step: a number after all steps.
 NEVER = np.iinfo(np.int64).max
@@ -223,15 +305,7 @@ class System:
 
     def dynamics(self, body: SoftBody, damping: float) -> Dynamics:
         """What moves the nodes of a body in an explicit step with this damping [1/s], as a struct for kernels."""
-        conditions, state, found = body.conditions, body.state, Dynamics()
-        found.damping, found.gravity, found.inverse_mass = damping, self.gravity, conditions.inverse_mass
-        found.rest, found.f, found.u, found.v = state.rest, state.forces, state.displacements, state.velocities
-        if conditions.has_loads:
-            loads = conditions.loads
-            found.load_stride = loads.strides[0] // 4
-            size = found.load_stride * len(loads)
-            found.load = wp.array(ptr=loads.ptr, dtype=wp.float32, shape=size, device=self.device, copy=False)
-        return found
+        return dynamics_of(body, self.gravity, damping)
 
     def support_work_of(self, body: SoftBody) -> wp.array:
         """Where steps add up the work of a body's supports: ``support_work``, or two places for each node, which add up
@@ -289,3 +363,69 @@ class System:
 def _counts_itself(forces: Forces) -> bool:
     """Whether forces see to the balance of energy themselves."""
     return getattr(forces, "is_dissipative", False) or hasattr(forces, "complete_work")
+
+
+#: Steps recorded in one graph where a launch is not many steps.
+GRAPH_STEPS = 64
+
+
+class Stepper(ABC):
+    """Time steps of all bodies of a system as launches that can be recorded."""
+
+    #: Whether steps launch the forces of the system's constraints.
+    resolves_constraints = False
+    #: The most steps of one recording.
+    graph_steps = GRAPH_STEPS
+
+    @property
+    def kept(self) -> dict[str, wp.array]:
+        """Arrays that a step leaves for the next one besides the state of bodies and fields, by name."""
+        return {}
+
+    @property
+    def many_a_launch(self) -> bool:
+        """Whether many steps are one launch, for every body."""
+        return False
+
+    def prepare(self) -> None:  # noqa: B027 (most need nothing)
+        """Copy what launches read of the bodies' conditions to the device; called before steps are recorded."""
+
+    def continue_from(self, other: Stepper) -> None:  # noqa: B027 (most need nothing)
+        """Take over what another stepper of the same integrator has counted, in whose place this one is."""
+
+    def fall_back(self) -> bool:
+        """Make steps sturdier until ``recover`` is called; whether they can be."""
+        return False
+
+    def recover(self) -> None:  # noqa: B027 (most need nothing)
+        """Make steps as usual again."""
+
+    @abstractmethod
+    def forces(self, offset: int = 0) -> None:
+        """Launch the elastic forces of the ``offset``-th step since the clock was last advanced."""
+
+    @abstractmethod
+    def steps(self, count: int, *, forces_known: bool = False) -> None:
+        """Launch steps, the first ones since the clock was last advanced.
+
+        Args:
+            count: Number of steps.
+            forces_known: Whether ``forces`` has been launched for the first of them.
+        """
+
+
+class Integrator(ABC):
+    """The description of a time integrator: a frozen dataclass of plain values with a step ``dt`` [s] or None."""
+
+    dt: float | None
+    #: Whether steps of any length are stable.
+    is_implicit: ClassVar[bool] = False
+
+    def stable_step(self, frequency: float) -> float:
+        """The largest stable step [s] of a body whose largest angular frequency at rest is this [rad/s]; infinite for
+        zero."""
+        return 2.0 / frequency if frequency > 0.0 else math.inf
+
+    @abstractmethod
+    def bind(self, system: System) -> Stepper:
+        """The stepper of a system."""

@@ -11,11 +11,11 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.body.soft_body import SoftBody
-from warp_corot.contact.nodal import pressure_at_nodes
+from warp_corot.contact.reading import pressure_at_nodes
 from warp_corot.io.pictures.colors import round_limit
 from warp_corot.kernels.viewing import values as kernels
 from warp_corot.mesh import TetForest
-from warp_corot.mesh.surfaces.boundary import signed_volumes
+from warp_corot.mesh.topology import signed_volumes
 from warp_corot.simulation.simulation import Simulation
 
 from .shown import Shown

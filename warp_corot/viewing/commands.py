@@ -8,7 +8,7 @@ from typing import Any
 
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_choice, checked_count, checked_flag, checked_number, checked_vector, shown
-from warp_corot.remesh.online import OnlineRemesh
+from warp_corot.remesh.remeshing import OnlineRemesh
 
 from .hands import HANDS
 from .saving import Saving

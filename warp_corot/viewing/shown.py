@@ -12,8 +12,7 @@ import warp as wp
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.io.write.skins import BoundSkins, OwnSurface, has_domain, joined_surfaces
 from warp_corot.mesh.surfaces.bodies import boundary_surface
-from warp_corot.mesh.surfaces.bound import BoundPoints, DeviceBinding, SurfaceMesh
-from warp_corot.mesh.surfaces.locating import nearest_faces
+from warp_corot.mesh.surfaces.bound import BoundPoints, DeviceBinding, SurfaceMesh, nearest_faces
 from warp_corot.mesh.surfaces.marching import marched
 
 #: The names of surfaces that a body may have. At first the page shows the first of them that the body has.

@@ -12,8 +12,32 @@ together, and a small level takes no longer than its longest sum.
 import warp as wp
 
 from warp_corot.kernels.elements.elements import load_node, store_node
+from warp_corot.kernels.elements.simd8 import constants, on_cpu
 
 wp.set_module_options({"enable_backward": False})
+
+
+#: Native code: four floats that are added and multiplied at once.
+FOUR = """
+#if defined(__CUDA_ARCH__)
+    struct alignas(16) four {
+        float v[4];
+        __device__ float operator[](int i) const { return v[i]; }
+        __device__ four operator+(const four& b) const {
+            return {v[0] + b.v[0], v[1] + b.v[1], v[2] + b.v[2], v[3] + b.v[3]};
+        }
+        __device__ four operator*(const four& b) const {
+            return {v[0] * b.v[0], v[1] * b.v[1], v[2] * b.v[2], v[3] * b.v[3]};
+        }
+        __device__ four operator*(float s) const { return {s * v[0], s * v[1], s * v[2], s * v[3]}; }
+        __device__ void operator+=(const four& b) { *this = *this + b; }
+        __device__ void operator*=(float s) { *this = *this * s; }
+    };
+#else
+    #pragma clang fp contract(fast)
+    typedef float four __attribute__((vector_size(16), aligned(4)));
+#endif
+"""
 
 
 @wp.func_native("""
@@ -90,40 +114,52 @@ class Rows:
     blocks: wp.array[wp.mat33]  # transposed
 
 
+@wp.struct
+class LevelArrays:
+    """A level's matrix, smoother and residual."""
+
+    ranks: int  # nodes of all levels in one world
+    count: int  # its own
+    entries: int
+    lanes: int  # threads that share a row
+    free: wp.array[wp.uint8]  # by rank
+    rows: Rows
+    diagonal: wp.array[wp.int32]
+    inverses: wp.array[wp.mat33]  # of diagonal blocks
+    r: wp.array[wp.vec4]
+
+
 @wp.func
-def product_of(rows: Rows, world: int, i: int, lane: int, lanes: int, count: int, entries: int, z: wp.array[wp.vec4]):
+def row_of(level: LevelArrays, world: int, i: int, lane: int, z: wp.array[wp.vec4]):
     """Row i of A z, in the first lane."""
-    begin, end, first, first_node = rows.starts[i], rows.starts[i + 1], world * entries, world * count
-    part = row_product(lane, lanes, begin, end, first, first_node, rows.columns, rows.blocks, z)
-    return sum_over_lanes(part, lanes)
+    begin, end = level.rows.starts[i], level.rows.starts[i + 1]
+    first, first_node = world * level.entries, world * level.count
+    columns, blocks = level.rows.columns, level.rows.blocks
+    part = row_product(lane, level.lanes, begin, end, first, first_node, columns, blocks, z)
+    return sum_over_lanes(part, level.lanes)
 
 
 #: Native code of transfers: the vectors of one world, and its flags of free nodes. Warp's own loops over vec4 arrays
 #: take two to three times as long on a CPU.
-_MOVES = """
-#if defined(__CUDA_ARCH__)
-    struct alignas(16) four {
-        float x, y, z, w;
-        __device__ four operator+(const four& b) const { return {x + b.x, y + b.y, z + b.z, w + b.w}; }
-        __device__ four operator*(float s) const { return {s * x, s * y, s * z, s * w}; }
-    };
-#else
-    typedef float four __attribute__((vector_size(16)));
-#endif
+_MOVES = (
+    FOUR
+    + """
     const auto vectors = [&](const auto& all, int nodes) {
         return reinterpret_cast<four*>(all.data) + (long long)world * nodes;
     };
-    const unsigned char* is_free = free.data + (long long)world * ranks;
+    const unsigned char* is_free = level.free.data + (long long)world * level.ranks;
     const four zero = {0.0f, 0.0f, 0.0f, 0.0f};
+    const int count = level.count;
 """
+)
 
 
 @wp.func_native(
     _MOVES
     + """
     const four* from = vectors(given, mesh_nodes);
-    four* to = vectors(r, ranks);
-    for (int i = thread; i < ranks; i += threads) {
+    four* to = vectors(level.r, count);
+    for (int i = thread; i < count; i += threads) {
         const int node = nodes.data[i];
         to[i] = node < mesh_nodes && is_free[i] ? from[node] : zero;
     }
@@ -133,21 +169,19 @@ def take_nodes(
     world: int,
     thread: int,
     threads: int,
-    ranks: int,
+    level: LevelArrays,
     mesh_nodes: int,
     nodes: wp.array[wp.int32],
-    free: wp.array[wp.uint8],
     given: wp.array[wp.vec4],
-    r: wp.array[wp.vec4],
 ): ...
 
 
 @wp.func_native(
     _MOVES
     + """
-    const four *from = vectors(z, ranks), *held = vectors(given, mesh_nodes);
+    const four *from = vectors(z, count), *held = vectors(given, mesh_nodes);
     four* to = vectors(result, mesh_nodes);
-    for (int i = thread; i < ranks; i += threads) {
+    for (int i = thread; i < count; i += threads) {
         const int node = nodes.data[i];
         if (node < mesh_nodes) to[node] = is_free[i] ? from[i] : held[node];
     }
@@ -157,10 +191,9 @@ def hand_nodes(
     world: int,
     thread: int,
     threads: int,
-    ranks: int,
+    level: LevelArrays,
     mesh_nodes: int,
     nodes: wp.array[wp.int32],
-    free: wp.array[wp.uint8],
     given: wp.array[wp.vec4],
     z: wp.array[wp.vec4],
     result: wp.array[wp.vec4],
@@ -171,8 +204,8 @@ def hand_nodes(
     _MOVES
     + """
     const four* from = vectors(residual, fine);
-    four* to = vectors(r, coarse);
-    for (int i = thread; i < coarse; i += threads) {
+    four* to = vectors(level.r, count);
+    for (int i = thread; i < count; i += threads) {
         four total = zero;
         if (is_free[i]) {
             for (int p = starts.data[i]; p < starts.data[i + 1]; ++p) total = total + from[midpoints.data[p]];
@@ -186,14 +219,11 @@ def restrict_nodes(
     world: int,
     thread: int,
     threads: int,
-    ranks: int,
-    coarse: int,
+    level: LevelArrays,
     fine: int,
-    free: wp.array[wp.uint8],
     starts: wp.array[wp.int32],
     midpoints: wp.array[wp.int32],
     residual: wp.array[wp.vec4],
-    r: wp.array[wp.vec4],
 ): ...
 
 
@@ -201,8 +231,8 @@ def restrict_nodes(
     _MOVES
     + """
     const four* from = vectors(correction, coarse);
-    four* to = vectors(z, fine);
-    for (int i = thread; i < fine; i += threads)
+    four* to = vectors(z, count);
+    for (int i = thread; i < count; i += threads)
         if (is_free[i]) to[i] = to[i] + (i < coarse ? from[i] : (from[ends.data[i][0]] + from[ends.data[i][1]]) * 0.5f);
 """
 )
@@ -210,10 +240,8 @@ def prolongate_nodes(
     world: int,
     thread: int,
     threads: int,
-    ranks: int,
+    level: LevelArrays,
     coarse: int,
-    fine: int,
-    free: wp.array[wp.uint8],
     ends: wp.array[wp.vec2i],
     correction: wp.array[wp.vec4],
     z: wp.array[wp.vec4],
@@ -221,52 +249,39 @@ def prolongate_nodes(
 
 
 @wp.func
-def make_first_step(
-    world: int,
-    thread: int,
-    threads: int,
-    count: int,
-    alpha: float,
-    inverses: wp.array[wp.mat33],
-    r: wp.array[wp.vec4],
-    z: wp.array[wp.vec4],
-):
+def make_first_step(world: int, thread: int, threads: int, alpha: float, level: LevelArrays, z: wp.array[wp.vec4]):
     """The smoother's first step from zero, unless alpha is zero."""
     if alpha != 0.0:
-        for i in range(thread, count, threads):
-            at = world * count + i
-            store_node(z, at, alpha * (inverses[at] * load_node(r, at)))
+        for i in range(thread, level.count, threads):
+            at = world * level.count + i
+            store_node(z, at, alpha * (level.inverses[at] * load_node(level.r, at)))
 
 
 @wp.kernel(enable_backward=False)
 def take_in(
     # In
     threads: int,
-    ranks: int,
+    level: LevelArrays,
     mesh_nodes: int,
     alpha: float,
     nodes: wp.array[wp.int32],
-    free: wp.array[wp.uint8],
-    inverses: wp.array[wp.mat33],
     given: wp.array[wp.vec4],
     # Out
-    r: wp.array[wp.vec4],
     z: wp.array[wp.vec4],
 ):
     """Sort the residual by rank, zero at held nodes, and make the first step from zero."""
     world, thread = wp.tid()
-    take_nodes(world, thread, threads, ranks, mesh_nodes, nodes, free, given, r)
-    make_first_step(world, thread, threads, ranks, alpha, inverses, r, z)
+    take_nodes(world, thread, threads, level, mesh_nodes, nodes, given)
+    make_first_step(world, thread, threads, alpha, level, z)
 
 
 @wp.kernel(enable_backward=False)
 def hand_out(
     # In
     threads: int,
-    ranks: int,
+    level: LevelArrays,
     mesh_nodes: int,
     nodes: wp.array[wp.int32],
-    free: wp.array[wp.uint8],
     given: wp.array[wp.vec4],
     z: wp.array[wp.vec4],
     # Out
@@ -274,21 +289,16 @@ def hand_out(
 ):
     """Sort the result by node; held nodes have the identity."""
     world, thread = wp.tid()
-    hand_nodes(world, thread, threads, ranks, mesh_nodes, nodes, free, given, z, result)
+    hand_nodes(world, thread, threads, level, mesh_nodes, nodes, given, z, result)
 
 
 @wp.kernel(enable_backward=False)
 def smooth(
     # In
-    lanes: int,
-    count: int,
-    entries: int,
+    level: LevelArrays,
     alpha: float,
     beta: float,
     from_zero: bool,
-    rows: Rows,
-    inverses: wp.array[wp.mat33],
-    r: wp.array[wp.vec4],
     z: wp.array[wp.vec4],
     # In and out
     other: wp.array[wp.vec4],
@@ -297,13 +307,13 @@ def smooth(
     it.
     """
     world, thread = wp.tid()
-    i, lane = thread / lanes, thread % lanes
-    at = world * count + i
-    product = product_of(rows, world, i, lane, lanes, count, entries, z)
+    i, lane = thread / level.lanes, thread % level.lanes
+    at = world * level.count + i
+    product = row_of(level, world, i, lane, z)
     if lane > 0:
         return
     now = load_node(z, at)
-    step = alpha * (inverses[at] * (load_node(r, at) - product))
+    step = alpha * (level.inverses[at] * (load_node(level.r, at) - product))
     if beta != 0.0:
         before = wp.vec3()
         if not from_zero:
@@ -313,58 +323,41 @@ def smooth(
 
 
 @wp.kernel(enable_backward=False)
-def find_residual(
-    # In
-    lanes: int,
-    count: int,
-    entries: int,
-    rows: Rows,
-    r: wp.array[wp.vec4],
-    z: wp.array[wp.vec4],
-    # Out
-    residual: wp.array[wp.vec4],
-):
+def find_residual(level: LevelArrays, z: wp.array[wp.vec4], residual: wp.array[wp.vec4]):
     """r - A z."""
     world, thread = wp.tid()
-    i, lane = thread / lanes, thread % lanes
-    at = world * count + i
-    product = product_of(rows, world, i, lane, lanes, count, entries, z)
-    if lane > 0:
-        return
-    store_node(residual, at, load_node(r, at) - product)
+    i, lane = thread / level.lanes, thread % level.lanes
+    at = world * level.count + i
+    product = row_of(level, world, i, lane, z)
+    if lane == 0:
+        store_node(residual, at, load_node(level.r, at) - product)
 
 
 @wp.kernel(enable_backward=False)
 def restrict_residual(
     # In
     threads: int,
-    ranks: int,
-    coarse: int,
+    level: LevelArrays,
     fine: int,
     alpha: float,
-    free: wp.array[wp.uint8],
     starts: wp.array[wp.int32],
     midpoints: wp.array[wp.int32],
-    inverses: wp.array[wp.mat33],
     residual: wp.array[wp.vec4],
     # Out
-    r: wp.array[wp.vec4],
     z: wp.array[wp.vec4],
 ):
     """P^T of the finer level's residual, zero at held nodes, and the first step from zero."""
     world, thread = wp.tid()
-    restrict_nodes(world, thread, threads, ranks, coarse, fine, free, starts, midpoints, residual, r)
-    make_first_step(world, thread, threads, coarse, alpha, inverses, r, z)
+    restrict_nodes(world, thread, threads, level, fine, starts, midpoints, residual)
+    make_first_step(world, thread, threads, alpha, level, z)
 
 
 @wp.kernel(enable_backward=False)
 def prolongate_correction(
     # In
     threads: int,
-    ranks: int,
+    level: LevelArrays,
     coarse: int,
-    fine: int,
-    free: wp.array[wp.uint8],
     ends: wp.array[wp.vec2i],
     correction: wp.array[wp.vec4],
     # In and out
@@ -372,4 +365,69 @@ def prolongate_correction(
 ):
     """z += P of the coarser level's correction, at free nodes."""
     world, thread = wp.tid()
-    prolongate_nodes(world, thread, threads, ranks, coarse, fine, free, ends, correction, z)
+    prolongate_nodes(world, thread, threads, level, coarse, ends, correction, z)
+
+
+#: What a sweep over the rows does: z = (D + L)^-1 r, with r - L z in ``other``; a sweep forward or backward; and
+#: ``other`` = r - A z, at once or from the part that a sweep from zero has left there.
+FROM_ZERO, FORWARD, BACKWARD, RESIDUAL, RESIDUAL_LEFT = range(5)
+
+
+@wp.func_native(
+    on_cpu(
+        constants(FROM_ZERO=FROM_ZERO, BACKWARD=BACKWARD, RESIDUAL=RESIDUAL, RESIDUAL_LEFT=RESIDUAL_LEFT),
+        """
+    const int *starts = level.rows.starts.data, *columns = level.rows.columns.data, *diagonal = level.diagonal.data;
+    const int count = level.count;
+    const float* blocks = &level.rows.blocks.data[(long long)world * level.entries].data[0][0];
+    const float* inverse = &level.inverses.data[(long long)world * count].data[0][0];
+    const four* right = reinterpret_cast<const four*>(level.r.data) + (long long)world * count;
+    four* x = reinterpret_cast<four*>(z.data) + (long long)world * count;
+    four* rest = reinterpret_cast<four*>(other.data) + (long long)world * count;
+    // Blocks are transposed; of the last column a number past its end is read.
+    const auto product = [&](int begin, int end) {
+        four a = {0.0f, 0.0f, 0.0f, 0.0f}, b = a, c = a;
+        const float* m = blocks + 9ll * begin;
+        for (int p = begin; p < end; ++p, m += 9) {
+            const four v = x[columns[p]];
+            a += *reinterpret_cast<const four*>(m) * v[0];
+            b += *reinterpret_cast<const four*>(m + 3) * v[1];
+            c += *reinterpret_cast<const four*>(m + 6) * v[2];
+        }
+        a += b + c;
+        return four{a[0], a[1], a[2], 0.0f};
+    };
+    const auto solved = [&](int i, const four& v) {
+        const float* m = inverse + 9ll * i;
+        const four a = {m[0], m[3], m[6], 0.0f}, b = {m[1], m[4], m[7], 0.0f}, c = {m[2], m[5], m[8], 0.0f};
+        return a * v[0] + b * v[1] + c * v[2];
+    };
+    if (kind == FROM_ZERO)
+        for (int i = 0; i < count; ++i) {
+            rest[i] = right[i] - product(starts[i], diagonal[i]);
+            x[i] = solved(i, rest[i]);
+        }
+    else if (kind == RESIDUAL)
+        for (int i = 0; i < count; ++i) rest[i] = right[i] - product(starts[i], starts[i + 1]);
+    else if (kind == RESIDUAL_LEFT)
+        for (int i = 0; i < count; ++i) rest[i] -= product(diagonal[i], starts[i + 1]);
+    else
+        for (int k = 0; k < count; ++k) {
+            const int i = kind == BACKWARD ? count - 1 - k : k;
+            x[i] += solved(i, right[i] - product(starts[i], starts[i + 1]));
+        }
+""",
+    )
+)
+def sweep_rows(world: int, kind: int, level: LevelArrays, z: wp.array[wp.vec4], other: wp.array[wp.vec4]): ...
+
+
+@wp.kernel(enable_backward=False)
+def sweep(kind: int, level: LevelArrays, z: wp.array[wp.vec4], other: wp.array[wp.vec4]):
+    """Go over the rows of each world by block Gauss-Seidel, in one thread.
+
+    A forward sweep from zero reads the lower half of the matrix, and its residual needs only the upper half. So one
+    sweep before the coarser level and its mirror image after it cost as much as two products, and smooth as well as
+    Chebyshev's iteration of degree 2, which costs four.
+    """
+    sweep_rows(wp.tid(), kind, level, z, other)

@@ -7,7 +7,7 @@ import warp as wp
 from warp_corot.kernels.elements.elements import load_node, store_node
 from warp_corot.kernels.elements.simd8 import native
 
-from .cycle import sum_over_lanes
+from .cycle import LevelArrays, sum_over_lanes
 
 wp.set_module_options({"enable_backward": False})
 
@@ -20,28 +20,21 @@ SWEEPERS = 320
 @wp.kernel(enable_backward=False)
 def fill_dense(
     # In
-    lanes: int,
-    entries: int,
-    starts: wp.array[wp.int32],
-    columns: wp.array[wp.int32],
-    diagonal: wp.array[wp.int32],
-    blocks: wp.array[wp.mat33],
+    level: LevelArrays,
     # In and out
     matrix: wp.array3d[wp.float64],
     # Out
     scale: wp.array2d[wp.float64],
 ):
-    """Write the matrix, scaled to a diagonal of ones, where it was zero; rows without an entry have scale zero.
-
-    ``lanes`` threads share a node's entries.
-    """
+    """Write the matrix, scaled to a diagonal of ones, where it was zero; rows without an entry have scale zero."""
     world, thread = wp.tid()
-    i, lane = thread / lanes, thread % lanes
-    first = world * entries
-    own = blocks[first + diagonal[i]]
-    for p in range(starts[i] + lane, starts[i + 1], lanes):
-        j = columns[p]
-        other = blocks[first + diagonal[j]]
+    i, lane = thread / level.lanes, thread % level.lanes
+    first = world * level.entries
+    blocks = level.rows.blocks
+    own = blocks[first + level.diagonal[i]]
+    for p in range(level.rows.starts[i] + lane, level.rows.starts[i + 1], level.lanes):
+        j = level.rows.columns[p]
+        other = blocks[first + level.diagonal[j]]
         for a in range(3):
             for b in range(3):
                 value = wp.float64(0.0)
@@ -100,24 +93,16 @@ def store_inverse(
 
 
 @wp.kernel(enable_backward=False)
-def apply_dense(
-    # In
-    lanes: int,
-    count: int,
-    inverse: wp.array3d[float],
-    r: wp.array[wp.vec4],
-    # Out
-    z: wp.array[wp.vec4],
-):
-    """z = inverse r; ``lanes`` neighbouring threads share the three rows of a node."""
+def apply_dense(level: LevelArrays, inverse: wp.array3d[float], z: wp.array[wp.vec4]):
+    """z = inverse r."""
     world, thread = wp.tid()
-    i, lane = thread / lanes, thread % lanes
+    i, lane = thread / level.lanes, thread % level.lanes
     total = wp.vec3()
-    for j in range(lane, count, lanes):
-        value = load_node(r, world * count + j)
+    for j in range(lane, level.count, level.lanes):
+        value = load_node(level.r, world * level.count + j)
         for a in range(3):
             for b in range(3):
                 total[a] += inverse[world, 3 * i + a, 3 * j + b] * value[b]
-    total = sum_over_lanes(total, lanes)
+    total = sum_over_lanes(total, level.lanes)
     if lane == 0:
-        store_node(z, world * count + i, total)
+        store_node(z, world * level.count + i, total)

@@ -1,13 +1,40 @@
-"""Neighbouring nodes of each level, and the contributions to each entry of its matrix.
+"""Neighbouring nodes of each level, and the contributions to each entry of its matrix, also of shared dilatations.
 
 An entry in the upper triangle, or on the diagonal, is a sum of contributions: of leaves on the finest level, of the
 next finer level's entries on the others (Galerkin). Contributions are listed with their pair of ranks as a key, and
 sorted.
+
+A group of elements that share their dilatation adds r r^T with r = sqrt(c) g of
+``kernels.elements.mean_dilatation_rows``, so each pair of its nodes contributes to an entry. Rows belong to the present
+state, because lambda may be thousands of times mu.
+
+A group of k nodes couples all of them: r r^T may be k times its own diagonal blocks. It is at most 4 times these with
+weights w_n = sum of |r_m| / (4 |r_n|), since (sum of r_n . p_n)^2 <= sum of |r_m| times sum of (r_n . p_n)^2 / |r_n|.
+Smoothing takes the diagonal with these weights, and so keeps its bound. On coarser levels, where most groups have four
+nodes and few have more, ``bound_diagonal`` keeps it.
 """
 
 import warp as wp
 
+from warp_corot.kernels.elements.dilatation import Dilatation
+from warp_corot.kernels.elements.elements import ForestElements, nodal_forces, rest_volume
+from warp_corot.kernels.elements.forces import in_local_frame, own_gradient
+from warp_corot.kernels.elements.mean_dilatation_rows import GroupNodes, first_entry
+from warp_corot.kernels.modules import Family
+
+from .cycle import LevelArrays
+
 wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class EntrySums:
+    """The contributions to the entries of a matrix; the host's ``Pattern`` explains the arrays."""
+
+    upper: wp.array[wp.vec2i]
+    starts: wp.array[wp.int32]
+    codes: wp.array[wp.int32]
+    places: wp.array[wp.vec2i]
 
 
 @wp.func
@@ -237,3 +264,189 @@ def list_midpoints(
     for n in range(2):
         keys[2 * i + n] = key_of(ends[node][n], node, bits)
         midpoints[2 * i + n] = node
+
+
+OF_MATRIX = Family(__name__)
+
+
+@wp.kernel(enable_backward=False)
+def count_pairs(groups: GroupNodes, counts: wp.array[wp.int32]):
+    """Count the pairs of a group's nodes, including each node with itself."""
+    g = wp.tid()
+    nodes = groups.ends[g] - first_entry(groups.ends, g)
+    counts[g] = nodes * (nodes + 1) / 2
+
+
+@wp.kernel(enable_backward=False)
+def list_pairs(
+    # In
+    first: int,
+    bits: int,
+    groups: GroupNodes,
+    rank: wp.array[wp.int32],
+    sums: wp.array[wp.int32],
+    # Out
+    pairs: wp.array[wp.vec2i],
+    keys: wp.array[wp.int64],
+    codes: wp.array[wp.int32],
+):
+    """List each pair's places in the rows, that of the lower rank first; its key; and its code, -2 minus its number.
+    ``first`` keys come before.
+    """
+    g = wp.tid()
+    at = first_entry(sums, g)
+    for k in range(first_entry(groups.ends, g), groups.ends[g]):
+        for m in range(k, groups.ends[g]):
+            i = rank[groups.nodes[k]]
+            j = rank[groups.nodes[m]]
+            if i <= j:
+                pairs[at] = wp.vec2i(k, m)
+                keys[first + at] = key_of(i, j, bits)
+            else:
+                pairs[at] = wp.vec2i(m, k)
+                keys[first + at] = key_of(j, i, bits)
+            codes[first + at] = -2 - at
+            at += 1
+
+
+@wp.func
+def row_at(rows: wp.array[wp.vec4], place: int):
+    row = rows[place]
+    return wp.vec3(row[0], row[1], row[2])
+
+
+@wp.func
+def add_row(rows: wp.array[wp.vec4], place: int, part: wp.vec3):
+    rows[place] = rows[place] + wp.vec4(part[0], part[1], part[2], 0.0)
+
+
+@wp.func
+def kept_share(lam: float, mu: float, most: float):
+    """The share of a group's lambda that is left if it is ``most`` mu at most."""
+    share = float(1.0)
+    if lam > most * mu:
+        share = most * mu / lam
+    return share
+
+
+@OF_MATRIX.member
+def write_rows(of: Dilatation) -> wp.Kernel:
+    """Write the rows of groups from ``begin`` on at displacements u, with w - 1 in the fourth lane; lambda counts as
+    ``most`` mu at most."""
+    measure, curvature_of = of.measure, of.curvature
+
+    @OF_MATRIX.kernel()
+    def write_rows(
+        # In
+        begin: int,
+        world_elements: int,
+        entries: int,
+        groups: GroupNodes,
+        elements: ForestElements,
+        u: wp.array[wp.vec4],
+        mu: wp.array[float],
+        lam: wp.array[float],
+        stride: int,
+        most: float,
+        # Out
+        rows: wp.array[wp.vec4],
+    ):
+        world, g = wp.tid()
+        g += begin
+        first = world * entries + first_entry(groups.ends, g)
+        end = world * entries + groups.ends[g]
+        for k in range(first, end):
+            rows[k] = wp.vec4()
+        sum = float(0.0)
+        total = float(0.0)
+        shear = float(0.0)
+        for i in range(groups.ranges[g][0], groups.ranges[g][1]):
+            t = world * world_elements + groups.members[i]
+            theta, slope = measure(own_gradient(elements, t, u))
+            modulus = lam[t * stride]
+            weight = modulus * rest_volume(elements, t)
+            sum += weight * theta
+            total += weight
+            shear += mu[t * stride] * rest_volume(elements, t)
+            f0, f1, f2, f3 = nodal_forces(elements, t, in_local_frame(elements, t, -modulus * slope))
+            corners = groups.corners[i]
+            add_row(rows, first + (corners & 255), f0)
+            add_row(rows, first + ((corners >> 8) & 255), f1)
+            add_row(rows, first + ((corners >> 16) & 255), f2)
+            add_row(rows, first + ((corners >> 24) & 255), f3)
+        factor = float(0.0)
+        if total > 0.0:
+            factor = wp.sqrt(kept_share(total, shear, most) * wp.max(curvature_of(sum / total), 0.0) / total)
+        size = float(0.0)
+        for k in range(first, end):
+            row = factor * row_at(rows, k)
+            rows[k] = wp.vec4(row[0], row[1], row[2], 0.0)
+            size += wp.length(row)
+        for k in range(first, end):
+            row = row_at(rows, k)
+            own = wp.length(row)
+            weight = float(1.0)
+            if own > 0.0:
+                weight = 0.25 * size / own
+            rows[k] = wp.vec4(row[0], row[1], row[2], weight - 1.0)
+
+    return write_rows
+
+
+@OF_MATRIX.member
+def add_held_blocks(of: Dilatation) -> wp.Kernel:
+    """Add the stiffness of elements that are held from turning over, off the diagonal; see ``elements.dilatation``."""
+    measure, holding = of.measure, of.holding
+
+    @OF_MATRIX.kernel()
+    def add_held_blocks(
+        # In
+        world_elements: int,
+        count: int,
+        entries: int,
+        elements: ForestElements,
+        u: wp.array[wp.vec4],
+        lam: wp.array[float],
+        stride: int,
+        scales: wp.array[float],
+        rank: wp.array[wp.int32],
+        starts: wp.array[wp.int32],
+        columns: wp.array[wp.int32],
+        # In and out
+        blocks: wp.array[wp.mat33],
+    ):
+        t = wp.tid()
+        theta, slope = measure(own_gradient(elements, t, u))
+        curvature = holding(theta)[2]
+        if curvature == 0.0:
+            return
+        world = t / world_elements
+        f0, f1, f2, f3 = nodal_forces(elements, t, in_local_frame(elements, t, slope))
+        f = wp.matrix_from_rows(f0, f1, f2, f3)
+        factor = scales[2] * curvature * lam[t * stride] / rest_volume(elements, t)
+        nodes = elements.nodes[t]
+        for m in range(4):
+            i = rank[nodes[m] - world * count]
+            for n in range(4):
+                if n != m:
+                    j = rank[nodes[n] - world * count]
+                    for k in range(starts[i], starts[i + 1]):
+                        if columns[k] == j:
+                            wp.atomic_add(blocks, world * entries + k, factor * wp.outer(f[n], f[m]))
+
+    return add_held_blocks
+
+
+@wp.kernel(enable_backward=False)
+def bound_diagonal(level: LevelArrays, given: wp.array[wp.mat33]):
+    """Find the inverses of diagonal blocks, and divide each by a quarter of its row's sum of |D^-1/2 A D^-1/2| if that
+    is more than one. Then A is at most 4 D, because 4 D - A is diagonally dominant.
+    """
+    world, i = wp.tid()
+    first = world * level.count
+    own = given[first + i]
+    sum = float(0.0)
+    for p in range(level.rows.starts[i], level.rows.starts[i + 1]):
+        block = wp.transpose(level.rows.blocks[world * level.entries + p])
+        sum += wp.sqrt(wp.max(wp.ddot(own * block, block * given[first + level.rows.columns[p]]), 0.0))
+    level.inverses[first + i] = own / wp.max(0.25 * sum, 1.0)

@@ -13,21 +13,23 @@ import functools
 import warp as wp
 
 from warp_corot.kernels.elements.elements import (
+    LEVEL_MASK,
     ForestElements,
     edge_length,
     frame,
     local_gradient,
     mirror_sign,
     rest_volume,
-    shape_of,
 )
+from warp_corot.kernels.elements.simd8 import constants
 from warp_corot.kernels.math.rotation import quick_rotation
 from warp_corot.kernels.modules import unique_kernel
 
-from .cycle import sum_over_lanes
-from .shared import row_at
+from .cycle import FOUR, LevelArrays, sum_over_lanes
+from .pattern import EntrySums
 
 wp.set_module_options({"enable_backward": False})
+
 
 #: A block whose determinant over the cube of a third of its trace is smaller is changed before it is inverted.
 LEAST_DETERMINANT = wp.constant(1.0e-8)
@@ -88,7 +90,7 @@ def write_frames(is_turned: bool) -> wp.Kernel:
 @wp.struct
 class Leaves:
     """What the entries of the finest matrix come from. ``gradients`` come from ``tables.shapes``, [shape, node]; pairs
-    and rows come from ``shared``."""
+    and rows come from ``pattern``."""
 
     elements: ForestElements
     world_elements: int
@@ -97,10 +99,7 @@ class Leaves:
     mu: wp.array[float]
     lam: wp.array[float]
     stride: int
-    upper: wp.array[wp.vec2i]
-    starts: wp.array[wp.int32]
-    codes: wp.array[wp.int32]
-    places: wp.array[wp.vec2i]
+    sums: EntrySums
     entries: int
     ranks: int
     row_entries: int
@@ -108,9 +107,85 @@ class Leaves:
     rows: wp.array[wp.vec4]
 
 
+@wp.func_native(
+    FOUR
+    + constants(LEVELS=int(LEVEL_MASK))
+    + """
+    const auto &upper = leaves.sums.upper, &places = leaves.sums.places, &pairs = leaves.pairs;
+    const auto &starts = leaves.sums.starts, &codes = leaves.sums.codes;
+    const auto &mu = leaves.mu, &lam = leaves.lam;
+    const int stride = leaves.stride;
+    const float scale = scales.data[2] + scales.data[1] * stiffening;
+    const long long first = (long long)world * leaves.world_elements, first_row = (long long)world * leaves.row_entries;
+    const auto row = [&](int place) { return *reinterpret_cast<const four*>(&leaves.rows.data[first_row + place]); };
+    const auto turned = [](const float* q, const float* g) {
+        const four x = {q[0], q[3], q[6], 0.0f}, y = {q[1], q[4], q[7], 0.0f}, z = {q[2], q[5], q[8], 0.0f};
+        return x * g[0] + y * g[1] + z * g[2];
+    };
+    const long long count = upper.shape[0];
+    const int last = count * (number + 1) / parts;
+    for (int u = count * number / parts; u < last; ++u) {
+        four c[3] = {};
+        if (upper.data[u][0] == upper.data[u][1]) {
+            if (more.shape[0] <= 1) continue;
+            for (int at = starts.data[u]; at < starts.data[u + 1]; ++at) {
+                if (codes.data[at] >= -1) continue;
+                const four a = row(pairs.data[-2 - codes.data[at]][0]), b = a * a[3];
+                for (int j = 0; j < 3; ++j) c[j] += a * b[j];
+            }
+            float* to = &more.data[(long long)world * leaves.ranks + upper.data[u][0]].data[0][0];
+            for (int j = 0; j < 3; ++j)
+                for (int i = 0; i < 3; ++i) to[3 * j + i] = scale * c[j][i];
+            continue;
+        }
+        for (int at = starts.data[u]; at < starts.data[u + 1]; ++at) {
+            const int code = codes.data[at];
+            if (code < 0) {
+                const four a = row(pairs.data[-2 - code][0]), b = row(pairs.data[-2 - code][1]);
+                for (int j = 0; j < 3; ++j) c[j] += a * b[j];
+                continue;
+            }
+            const long long t = first + (code >> 4);
+            const float* g = &leaves.gradients.data[4 * ((leaves.elements.code.data[t] & LEVELS) % 3)][0];
+            const float* q = &leaves.frames.data[t].data[0][0];
+            const four a = turned(q, g + 3 * ((code >> 2) & 3)), b = turned(q, g + 3 * (code & 3));
+            const float m = mu.data[t * stride], l = lam.data[t * stride], most = most_lambda * m;
+            const four la = a * (l < most ? l : most), mb = b * m, ab = a * mb;
+            const float d = ab[0] + ab[1] + ab[2];
+            c[0] += la * b[0] + mb * a[0] + four{d, 0.0f, 0.0f, 0.0f};
+            c[1] += la * b[1] + mb * a[1] + four{0.0f, d, 0.0f, 0.0f};
+            c[2] += la * b[2] + mb * a[2] + four{0.0f, 0.0f, d, 0.0f};
+        }
+        float* own = &blocks.data[(long long)world * leaves.entries + places.data[u][0]].data[0][0];
+        float* mirrored = &blocks.data[(long long)world * leaves.entries + places.data[u][1]].data[0][0];
+        for (int j = 0; j < 3; ++j) {
+            c[j] *= scale;
+            for (int i = 0; i < 3; ++i) {
+                own[3 * j + i] = c[j][i];
+                mirrored[3 * i + j] = c[j][i];
+            }
+        }
+    }
+"""
+)
+def gather_entries(
+    number: int,
+    parts: int,
+    world: int,
+    leaves: Leaves,
+    scales: wp.array[float],
+    stiffening: float,
+    most_lambda: float,
+    blocks: wp.array[wp.mat33],
+    more: wp.array[wp.mat33],
+): ...
+
+
 @unique_kernel()
 def gather_leaves(
     # In
+    number: int,
+    parts: int,
     leaves: Leaves,
     scales: wp.array[float],
     stiffening: float,
@@ -121,42 +196,12 @@ def gather_leaves(
 ):
     """Find the entries off the diagonal. Viscous damping counts as ``stiffening`` b K, and lambda as ``most_lambda`` mu
     at most. ``more`` is the addition of the rows' weights to the diagonal, by rank, or one entry if there are none.
+
+    A thread finds one of so many ``parts`` of the entries, from ``number`` on: one entry on CUDA. A column of a block
+    is four lanes, so that a contribution takes some forty instructions on a CPU.
     """
-    world, u = wp.tid()
-    scale = scales[2] + scales[1] * stiffening
-    if leaves.upper[u][0] == leaves.upper[u][1]:
-        if more.shape[0] > 1:
-            weighted = wp.mat33()
-            for at in range(leaves.starts[u], leaves.starts[u + 1]):
-                if leaves.codes[at] < -1:
-                    place = world * leaves.row_entries + leaves.pairs[-2 - leaves.codes[at]][0]
-                    weighted += wp.outer(leaves.rows[place][3] * row_at(leaves.rows, place), row_at(leaves.rows, place))
-            more[world * leaves.ranks + leaves.upper[u][0]] = scale * weighted
-        return
-    first = world * leaves.world_elements
-    total = wp.mat33()
-    for at in range(leaves.starts[u], leaves.starts[u + 1]):
-        code = leaves.codes[at]
-        if code < 0:
-            pair = leaves.pairs[-2 - code]
-            first_row = world * leaves.row_entries
-            total += wp.outer(row_at(leaves.rows, first_row + pair[0]), row_at(leaves.rows, first_row + pair[1]))
-            continue
-        t = first + (code >> 4)
-        row = 4 * shape_of(leaves.elements.code[t])
-        q = leaves.frames[t]
-        a = q * leaves.gradients[row + ((code >> 2) & 3)]
-        b = q * leaves.gradients[row + (code & 3)]
-        m = leaves.mu[t * leaves.stride]
-        total += wp.outer(wp.min(leaves.lam[t * leaves.stride], most_lambda * m) * a, b) + wp.outer(m * b, a)
-        d = m * wp.dot(a, b)
-        total[0, 0] += d
-        total[1, 1] += d
-        total[2, 2] += d
-    total = scale * total
-    where = leaves.places[u]
-    blocks[world * leaves.entries + where[0]] = wp.transpose(total)
-    blocks[world * leaves.entries + where[1]] = total
+    world, thread = wp.tid()
+    gather_entries(number + thread, parts, world, leaves, scales, stiffening, most_lambda, blocks, more)
 
 
 @wp.func
@@ -250,18 +295,10 @@ def matrix_over_lanes(part: wp.mat33, lanes: int):
 def gather_products(
     # In
     lanes: int,
-    ranks: int,
-    level_nodes: int,
-    entries: int,
-    fine_entries: int,
-    free: wp.array[wp.uint8],
-    upper: wp.array[wp.vec2i],
-    starts: wp.array[wp.int32],
-    codes: wp.array[wp.int32],
-    places: wp.array[wp.vec2i],
-    fine_blocks: wp.array[wp.mat33],
+    level: LevelArrays,
+    sums: EntrySums,
+    fine: LevelArrays,
     # Out
-    blocks: wp.array[wp.mat33],
     inverses: wp.array[wp.mat33],
 ):
     """Find P^T A P of a coarser level and the inverses of its diagonal blocks.
@@ -271,22 +308,22 @@ def gather_products(
     """
     world, thread = wp.tid()
     u, lane = thread // lanes, thread % lanes
-    i = upper[u][0]
-    j = upper[u][1]
+    i = sums.upper[u][0]
+    j = sums.upper[u][1]
     total = wp.mat33()
-    if free[world * ranks + i] != wp.uint8(0) and free[world * ranks + j] != wp.uint8(0):
+    if level.free[world * level.ranks + i] != wp.uint8(0) and level.free[world * level.ranks + j] != wp.uint8(0):
         weights = wp.vec3(1.0, 0.5, 0.25)
-        for at in range(starts[u] + lane, starts[u + 1], lanes):
-            code = codes[at]
-            total += weights[code & 3] * fine_blocks[world * fine_entries + (code >> 2)]
+        for at in range(sums.starts[u] + lane, sums.starts[u + 1], lanes):
+            code = sums.codes[at]
+            total += weights[code & 3] * fine.rows.blocks[world * fine.entries + (code >> 2)]
     total = matrix_over_lanes(total, lanes)
     if lane > 0:
         return
-    where = places[u]
-    first = world * entries
+    where = sums.places[u]
+    first = world * level.entries
     if i == j:
         total = 0.5 * (total + wp.transpose(total))
-        inverses[world * level_nodes + i] = inverse_block(total)
+        inverses[world * level.count + i] = inverse_block(total)
     else:
-        blocks[first + where[1]] = wp.transpose(total)
-    blocks[first + where[0]] = total
+        level.rows.blocks[first + where[1]] = wp.transpose(total)
+    level.rows.blocks[first + where[0]] = total

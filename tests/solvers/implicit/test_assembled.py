@@ -11,14 +11,14 @@ from soft_blocks import DOWN, block
 from tangents import on_device
 
 import warp_corot as wc
-from warp_corot.kernels.implicit import chosen
+from warp_corot.kernels.implicit import lagged
 from warp_corot.kernels.implicit.assembled import Couplings
-from warp_corot.kernels.implicit.chosen import COUNTS
+from warp_corot.kernels.implicit.lagged import CHOICE_COUNTS
 from warp_corot.solvers.implicit import assembled
 from warp_corot.solvers.implicit.assembled import AssembledSolve, suits
 from warp_corot.solvers.implicit.block_system import VectorBlocks
-from warp_corot.solvers.implicit.chosen import WORTH
 from warp_corot.solvers.implicit.conjugate_gradients import ConjugateGradients
+from warp_corot.solvers.implicit.preconditioners import WORTH
 from warp_corot.solvers.implicit.tangent import TangentOperator
 
 FORESTS = {"uniform": uniform, "mixed": lambda: mixed_forest(level=5), "ball": ball_mesh}
@@ -277,7 +277,7 @@ def test_the_choice_and_resumed_runs(young, length, ends_assembled, device, tmp_
 def test_a_resumed_run_keeps_its_choice_although_a_new_one_would_begin_otherwise(device, monkeypatch, tmp_path):
     sim = swinging(device)
     sim.save(tmp_path / "state.npz")
-    monkeypatch.setattr("warp_corot.solvers.implicit.chosen.STIFF", 0.0)
+    monkeypatch.setattr("warp_corot.solvers.implicit.preconditioners.STIFF", 0.0)
     later = wc.Simulation.load(tmp_path / "state.npz")
     later.step()
     assert is_assembled(later)
@@ -286,7 +286,7 @@ def test_a_resumed_run_keeps_its_choice_although_a_new_one_would_begin_otherwise
 
 def test_a_beam_that_takes_too_many_iterations_is_solved_for_with_multigrid(device, monkeypatch):
     """Its first step is unfinished, and no other one, if its stiffness is not known before."""
-    monkeypatch.setattr("warp_corot.solvers.implicit.chosen.STIFF", np.inf)
+    monkeypatch.setattr("warp_corot.solvers.implicit.preconditioners.STIFF", np.inf)
     sim = swinging(device, 1e8, 24, linear_iterations=300)
     assert not is_assembled(sim)
     assert sim.solves.unfinished == 1
@@ -307,12 +307,12 @@ def test_contacts_for_which_there_is_no_room_are_solved_for_with_multigrid(devic
 def test_the_choice_costs_little_in_a_long_run(assembled, multigrid):
     """Over 20,000 steps with the same iterations in each, at most a twentieth more than the better way."""
     cost, total, steps = 32, 0, 20_000
-    counts, choice, taken, status = (wp.zeros(n, dtype=wp.int32, device="cpu") for n in (COUNTS, 1, 1, 1))
+    counts, choice, taken, status = (wp.zeros(n, dtype=wp.int32, device="cpu") for n in (CHOICE_COUNTS, 1, 1, 1))
     choice.fill_(1)
     couplings = Couplings()
     couplings.count, couplings.nodes = (wp.zeros(n, dtype=wp.int32, device="cpu") for n in (1, (1, 1)))
     for _ in range(steps):
         total += assembled if choice.numpy()[0] else cost * multigrid
         taken.fill_(assembled if choice.numpy()[0] else multigrid)
-        wp.launch(chosen.choose, 1, [taken, status, 1, WORTH, cost, couplings], [counts, choice], device="cpu")
+        wp.launch(lagged.choose, 1, [taken, status, 1, WORTH, cost, couplings], [counts, choice], device="cpu")
     assert total < 1.05 * steps * min(assembled, cost * multigrid)

@@ -8,8 +8,8 @@ from cases import MATERIAL, MODELS, mixed_forest, oracle_mesh, random_displaceme
 from tangents import on_device
 
 import warp_corot as wc
-from warp_corot.solvers.implicit.block_diagonal import BlockDiagonal
 from warp_corot.solvers.implicit.conjugate_gradients import ConjugateGradients
+from warp_corot.solvers.implicit.preconditioners import BlockDiagonal
 from warp_corot.solvers.implicit.tangent import TangentOperator
 
 MASS = 2.0e3  # a of A = a M + K [1/s^2]

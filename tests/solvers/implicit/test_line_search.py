@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from warp_corot.kernels.implicit import line_search as kernels
-from warp_corot.solvers.implicit.line_search import LineSearch
+from warp_corot.solvers.implicit.conjugate_gradients import LineSearch
 
 
 class Springs:

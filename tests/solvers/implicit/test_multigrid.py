@@ -11,10 +11,9 @@ from tangents import on_device
 from tree_levels import TreeLevels
 
 import warp_corot as wc
-from warp_corot.solvers.implicit.block_diagonal import BlockDiagonal
 from warp_corot.solvers.implicit.conjugate_gradients import ConjugateGradients
 from warp_corot.solvers.implicit.multigrid import Multigrid
-from warp_corot.solvers.implicit.preconditioners import preconditioner_of
+from warp_corot.solvers.implicit.preconditioners import BlockDiagonal, preconditioner_of
 from warp_corot.solvers.implicit.tangent import TangentOperator
 
 
@@ -74,13 +73,12 @@ def test_finest_matrix_is_the_operators(name, model, device, rng):
         assert not dense(level, world).reshape(level.count, 3, -1)[named][fixed[world][nodes[named]]].any()
 
 
-@pytest.mark.parametrize("stride", [1, 3])
 @pytest.mark.parametrize("name", FORESTS)
-def test_coarse_matrices_are_the_products(name, stride, device, rng):
+def test_coarse_matrices_are_the_products(name, device, rng):
     """P^T A P with the prolongation that walking down the tree gives, without the nodes that are held."""
     mesh = FORESTS[name]()
     operator = operator_of(mesh, device, fixed=rng.random(len(mesh.points)) < 0.1, mass=MASS)
-    multigrid = multigrid_of(operator, u=random_displacement(mesh, rng, 0.2), stride=stride)
+    multigrid = multigrid_of(operator, u=random_displacement(mesh, rng, 0.2))
     levels = multigrid.discretization.levels()
     places = np.concatenate([np.arange(levels.mesh_nodes), levels.others.numpy()])
     tree, nodes = TreeLevels.of(mesh.tree, len(mesh.lattice)), mesh_nodes(multigrid)
@@ -125,7 +123,7 @@ def test_smoothing_bound_holds(device, rng):
     mesh = ball(5)
     young = np.where(rng.random(len(mesh.tets)) < 0.5, 1e3, 1e7)
     operator = operator_of(mesh, device, young=young, poisson=0.49)
-    for level in multigrid_of(operator, stride=1).levels:
+    for level in multigrid_of(operator).levels:
         assert largest_eigenvalue(level) < 4.0
 
 
@@ -358,8 +356,6 @@ def test_general_meshes_and_wrong_options_are_refused(device):
     with pytest.raises(wc.InputError, match="only a TetForest has levels; this mesh is a TetMesh"):
         Multigrid(body)
     body = wc.SoftBody(forest, wc.Isotropic(5e3, 0.3, 1e3), device=device)
-    with pytest.raises(wc.InputError, match="stride is 4; it must be 1, 2 or 3"):
-        Multigrid(body, stride=4)
     with pytest.raises(wc.InputError, match="degree is 0; it must be 1 or more"):
         Multigrid(body, degree=0)
 

@@ -6,7 +6,7 @@ from cases import CUBE
 
 import warp_corot as wc
 from warp_corot.mesh.coarser import coarser
-from warp_corot.solvers.implicit import nested
+from warp_corot.solvers.implicit import static
 from warp_corot.solvers.implicit.static import StaticSolver
 
 GRAVITY = (0.0, -9.8, 0.0)
@@ -60,10 +60,10 @@ def answer(monkeypatch, make, fewest, model=PLAIN):
     starts = []
 
     def spied(*arguments):
-        starts.append(nested.nested_start(*arguments))
+        starts.append(static.nested_start(*arguments))
         return starts[-1]
 
-    monkeypatch.setattr(nested, "FEWEST", fewest)
+    monkeypatch.setattr(static, "FEWEST_NESTED", fewest)
     monkeypatch.setattr("warp_corot.simulation.static.nested_start", spied)
     body = make()
     report = wc.solve_static(body, model=model, gravity=GRAVITY)
@@ -96,22 +96,22 @@ def test_same_answer_in_fewer_iterations(make, model, monkeypatch):
 
 def test_supports_and_starts_that_it_does_not_suit(monkeypatch):
     """Bodies that do not begin at rest begin where they are; cut elements and free bodies have no such start."""
-    monkeypatch.setattr(nested, "FEWEST", 10)
+    monkeypatch.setattr(static, "FEWEST_NESTED", 10)
     body = clamped(box(3))
     field = PLAIN.bind(body)
     loads = np.zeros((body.node_count, 3))
     body.displacements = 1e-3 * body.mesh.points
     body.state.adopt_positions()
-    assert nested.nested_start(body, PLAIN, field, loads) is None
+    assert static.nested_start(body, PLAIN, field, loads) is None
     free = wc.SoftBody(box(3), wc.Isotropic(50e3, 0.4, 1000.0), device="cpu")
-    assert nested.nested_start(free, PLAIN, PLAIN.bind(free), loads) is None
+    assert static.nested_start(free, PLAIN, PLAIN.bind(free), loads) is None
     cut = wc.SoftBody(
         wc.TetForest.from_domain(wc.Domain.sphere(0.03, device="cpu"), 0.08, max_level=5),
         wc.Isotropic(50e3, 0.4, 1000.0),
         device="cpu",
     )
     cut.fix("y < ymin + 0.01")
-    assert nested.nested_start(cut, PLAIN, PLAIN.bind(cut), np.zeros((cut.node_count, 3))) is None
+    assert static.nested_start(cut, PLAIN, PLAIN.bind(cut), np.zeros((cut.node_count, 3))) is None
 
 
 def test_starts_that_are_no_better_are_left_out():

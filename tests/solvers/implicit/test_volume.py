@@ -5,7 +5,7 @@ import pytest
 from cases import CUBE
 
 import warp_corot as wc
-from warp_corot.solvers.implicit.volume import limited, limits
+from warp_corot.solvers.implicit.static import limited, limits
 
 GRAVITY = (0.0, -9.8, 0.0)
 

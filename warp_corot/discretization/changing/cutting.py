@@ -10,9 +10,8 @@ import warp as wp
 
 from warp_corot.kernels.remesh import cut as cut_kernels
 from warp_corot.kernels.remesh import split as split_kernels
-from warp_corot.kernels.remesh import tear as tear_kernels
+from warp_corot.kernels.remesh.criteria import Contents
 from warp_corot.kernels.remesh.cut_surface import Surface
-from warp_corot.kernels.remesh.mark import Contents
 
 from .pools import DeviceForest
 
@@ -72,10 +71,10 @@ class CutPass:
         surface = Surface()
         surface.stress = stress
         self._once(cut_kernels.begin_cut, 0, pools, cuts)
-        self._many(tear_kernels.list_all, pools, cuts)
-        self._many(tear_kernels.pull_faces, contents, carried, pools, cuts)
-        self._many(tear_kernels.choose_faces, surface, pools, cuts)
-        self._many(tear_kernels.tear_faces, pools, cuts)
+        self._many(cut_kernels.list_all, pools, cuts)
+        self._many(cut_kernels.pull_faces, contents, carried, pools, cuts)
+        self._many(cut_kernels.choose_faces, surface, pools, cuts)
+        self._many(cut_kernels.tear_faces, pools, cuts)
         self._launch_end(surface)
 
     def launch_marks(self, surface: Surface) -> None:

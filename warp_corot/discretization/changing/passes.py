@@ -1,28 +1,100 @@
-"""One pass over a changing forest: mark, refine, simplify, sort the leaves. The host reads nothing."""
+"""One pass over a changing forest: mark, refine, simplify, sort the leaves. The host reads nothing.
+
+Also checks of the options of remeshing, whose messages have one form, NAME is VALUE; it must be …, with Python's names
+(``cli.bodies`` puts the options' names in their place); and the decision when the stable step must be found again."""
 
 from __future__ import annotations
 
+import inspect
+import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
+from warp_corot.discretization.changing.pools import DeviceForest
 from warp_corot.errors import InputError
-from warp_corot.kernels.remesh import bisect as remesh_bisect
-from warp_corot.kernels.remesh import blocks as remesh_blocks
-from warp_corot.kernels.remesh import dense as remesh_dense
-from warp_corot.kernels.remesh import edges as remesh_edges
-from warp_corot.kernels.remesh import order as remesh_order
+from warp_corot.inputs.checks import checked_number, shown
+from warp_corot.kernels.plan.changing import begin_counts
+from warp_corot.kernels.remesh import derived as kernels
+from warp_corot.kernels.remesh import order, refine, simplify, state
 from warp_corot.kernels.remesh import pools as pool_kernels
-from warp_corot.kernels.remesh import simplify as remesh_simplify
-from warp_corot.kernels.remesh import state as remesh_state
-from warp_corot.kernels.remesh.mark import Contents, elongation, marking_kernel
-from warp_corot.mesh.growing.growth import lattice_spacing
-from warp_corot.mesh.lattice import MAX_LEVEL, check_levels
+from warp_corot.kernels.remesh.criteria import PARAMETER_COUNTS, Contents, elongation, marking_kernel
+from warp_corot.mesh.lattice import MAX_LEVEL, check_levels, lattice_spacing
 
-from .checks import checked_criterion, checked_thresholds
-from .pools import DeviceForest
+
+def checked_thresholds(refine_above: Any, simplify_below: Any) -> tuple[float, float]:
+    """Both thresholds, in the criterion's unit.
+
+    Raises:
+        InputError: One of them is not a finite number, or the second is not below the first.
+    """
+    above, below = (
+        _finite(given, name) for name, given in (("refine_above", refine_above), ("simplify_below", simplify_below))
+    )
+    if below >= above:
+        raise InputError(
+            f"simplify_below is {below:g}; it must be below refine_above, which is {above:g}, "
+            "or an element could be refined and simplified at once"
+        )
+    return above, below
+
+
+def checked_capacity(capacity: int, count: int) -> int:
+    """The largest number of elements, for a mesh that begins with ``count``.
+
+    Raises:
+        InputError: Fewer than that.
+    """
+    if capacity < count:
+        raise InputError(f"capacity is {capacity}; it must be at least {count}, as many elements as the mesh has")
+    return capacity
+
+
+def checked_criterion(criterion: Any) -> Any:
+    """A criterion: a Warp function of an ``ElementState`` and an array of numbers.
+
+    Raises:
+        InputError: It is something else, or takes another number of arguments.
+    """
+    if not isinstance(criterion, wp.Function) or criterion.func is None:
+        raise InputError(f"criterion is {shown(criterion)}; it must be a Warp function (@wp.func) of an ElementState")
+    count = len(inspect.signature(criterion.func).parameters)
+    if count != 2:
+        raise InputError(
+            f"criterion is {criterion.func.__name__!r}, which takes {count} arguments; "
+            "it must take two, an ElementState and an array of float32"
+        )
+    return criterion
+
+
+def checked_parameters(parameters: Any, criterion: Any) -> wp.array | None:
+    """The numbers that a criterion reads, float32 [n], or None.
+
+    Args:
+        parameters: The numbers.
+        criterion: The criterion; the length is checked for the package's own criteria.
+
+    Raises:
+        InputError: They are something else, or too few.
+    """
+    is_array = isinstance(parameters, wp.array) and parameters.dtype == wp.float32 and parameters.ndim == 1
+    if parameters is not None and not (is_array and len(parameters) > 0):
+        raise InputError(f"parameters is {shown(parameters)}; it must be a Warp array of float32, [n], not empty")
+    given, needed = 0 if parameters is None else len(parameters), PARAMETER_COUNTS.get(criterion, 0)
+    if given < needed:
+        name = criterion.func.__name__
+        raise InputError(f"parameters has {given} numbers; it must have {needed}, which the criterion {name!r} reads")
+    return parameters
+
+
+def _finite(given: Any, name: str) -> float:
+    number = checked_number(given, name)
+    if not math.isfinite(number):
+        raise InputError(f"{name} is {number:g}; it must be a finite number")
+    return number
 
 
 class RemeshPass:
@@ -33,8 +105,8 @@ class RemeshPass:
 
     Args:
         forest: The forest to change.
-        criterion: A Warp function of a ``kernels.remesh.mark.ElementState`` and an array of numbers; the elongation of
-            the longest edge, deformed over rest, if none is given.
+        criterion: A Warp function of a ``kernels.remesh.criteria.ElementState`` and an array of numbers; the elongation
+            of the longest edge, deformed over rest, if none is given.
         refine_above, simplify_below: Thresholds, in the criterion's unit; the first is the larger one.
         min_level, max_level: Leaves of these levels are not simplified and not refined. Without a ``min_level``, the
             mesh is nowhere coarser than it was at the beginning.
@@ -42,7 +114,7 @@ class RemeshPass:
         lame: Lamé's parameters for the criterion [Pa], or the names under which elements carry them.
 
     Attributes:
-        contents: The material of leaves, ``kernels.remesh.mark.Contents``.
+        contents: The material of leaves, ``kernels.remesh.criteria.Contents``.
 
     Raises:
         InputError: The thresholds contradict each other, or the levels are out of order or beyond the lattice's depth.
@@ -116,45 +188,45 @@ class RemeshPass:
             refine_above, simplify_below = self.thresholds
             inputs = [refine_above, simplify_below, self._origin, self._spacing, carried.u, self.parameters]
             self._many(self._mark, *inputs, self.contents, pools)
-        self._many(remesh_edges.want_marked, self.levels[1], pools, edges)
-        self._many(remesh_blocks.clear_blocks, pools, self._blocks)
-        self._many(remesh_blocks.list_blocks, pools, self._blocks)
-        self._many(remesh_edges.heat_wanted, pools, edges, self._blocks)
-        self._once(remesh_bisect.begin_rounds, pools, self._goes_on)
+        self._many(refine.want_marked, self.levels[1], pools, edges)
+        self._many(refine.clear_blocks, pools, self._blocks)
+        self._many(refine.list_blocks, pools, self._blocks)
+        self._many(refine.heat_wanted, pools, edges, self._blocks)
+        self._once(refine.begin_rounds, pools, self._goes_on)
         wp.capture_while(self._goes_on, self._launch_round)
-        self._many(remesh_simplify.offer_nodes, self.levels[0], self._kept, carried, pools, removal)
-        self._many(remesh_simplify.remove_nodes, pools, carried, removal)
+        self._many(simplify.offer_nodes, self.levels[0], self._kept, carried, pools, removal)
+        self._many(simplify.remove_nodes, pools, carried, removal)
         self._once(pool_kernels.give_back, pools)
-        self._many(remesh_state.settle_ends, pools, carried)
+        self._many(state.settle_ends, pools, carried)
         self._launch_moves()
-        self._many(remesh_state.refresh_masses, pools, carried)
-        self._many(remesh_order.count_leaves, pools, self._sums)
+        self._many(state.refresh_masses, pools, carried)
+        self._many(order.count_leaves, pools, self._sums)
         wp.utils.array_scan(self._sums, self._ends, inclusive=True)
-        self._many(remesh_order.list_leaves, self._ends, pools)
-        self._many(remesh_order.adopt_list, self._moves, pools)
-        self._many(remesh_dense.rename_void, self._moves, pools)
-        self._once(remesh_order.adopt_count, pools)
-        self._many(remesh_edges.clear_edges, pools, edges)
+        self._many(order.list_leaves, self._ends, pools)
+        self._many(order.adopt_list, self._moves, pools)
+        self._many(order.rename_void, self._moves, pools)
+        self._once(order.adopt_count, pools)
+        self._many(refine.clear_edges, pools, edges)
 
     # --- pieces ----------------------------------------------------------------------------------------------------
 
     def _launch_round(self) -> None:
         pools, edges, carried = self.forest.pools, self._edges, self.forest.carriage.arrays
-        self._once(remesh_edges.begin_round, pools, self._demand)
-        self._many(remesh_edges.visit_leaves, pools, edges, self._blocks)
-        self._many(remesh_edges.visit_fresh, pools, edges, self._blocks)
-        self._many(remesh_bisect.admit_edges, pools, edges, self._demand)
-        self._many(remesh_bisect.bisect_edges, pools, edges, carried)
-        self._once(remesh_bisect.end_round, pools, self._goes_on)
+        self._once(refine.begin_round, pools, self._demand)
+        self._many(refine.visit_leaves, pools, edges, self._blocks)
+        self._many(refine.visit_fresh, pools, edges, self._blocks)
+        self._many(refine.admit_edges, pools, edges, self._demand)
+        self._many(refine.bisect_edges, pools, edges, carried)
+        self._once(refine.end_round, pools, self._goes_on)
 
     def _launch_moves(self) -> None:
         pools, moves = self.forest.pools, self._moves
-        self._many(remesh_dense.count_moves, pools, moves)
+        self._many(order.count_moves, pools, moves)
         wp.utils.array_scan(moves.sums, moves.ends, inclusive=True)
-        self._many(remesh_dense.list_moves, pools, moves)
-        self._once(remesh_dense.lower_top, pools)
-        self._many(remesh_dense.move_nodes, pools, self.forest.carriage.arrays, moves)
-        self._many(remesh_dense.rename_ends, moves, pools)
+        self._many(order.list_moves, pools, moves)
+        self._once(order.lower_top, pools)
+        self._many(order.move_nodes, pools, self.forest.carriage.arrays, moves)
+        self._many(order.rename_ends, moves, pools)
 
     def _replay(self, *, marked: bool) -> None:
         if self.device.is_cuda and not wp.is_conditional_graph_supported():
@@ -187,11 +259,11 @@ class RemeshPass:
         contents.fill_column = column("fill")
         return contents
 
-    def _make_edges(self) -> remesh_edges.WantedEdges:
+    def _make_edges(self) -> refine.WantedEdges:
         size = 1 << (2 * (self.forest.node_capacity + self.forest.threads)).bit_length()
-        edges = remesh_edges.WantedEdges()
+        edges = refine.WantedEdges()
         edges.keys = wp.full(size, wp.int64(-1), dtype=wp.int64, device=self.device)
-        edges.born = wp.full(size, int(remesh_edges.NEVER), dtype=wp.int32, device=self.device)
+        edges.born = wp.full(size, int(refine.NEVER), dtype=wp.int32, device=self.device)
         edges.ring, edges.agreed, edges.pairs = (wp.zeros(size, dtype=wp.int32, device=self.device) for _ in range(3))
         edges.head, edges.node = (wp.full(size, -1, dtype=wp.int32, device=self.device) for _ in range(2))
         # Threads that add an edge at the same time may exceed the limit, but never fill the table.
@@ -199,28 +271,111 @@ class RemeshPass:
         edges.wanted = wp.empty(size, dtype=wp.int32, device=self.device)
         return edges
 
-    def _make_blocks(self) -> remesh_blocks.Blocks:
-        blocks = remesh_blocks.Blocks()
-        shape = (self.forest.node_capacity, remesh_blocks.KEPT)
-        blocks.of_node = wp.full(shape, int(remesh_blocks.NONE), dtype=wp.int32, device=self.device)
-        blocks.latest = wp.full(shape[0], int(remesh_blocks.NONE), dtype=wp.int32, device=self.device)
-        blocks.hot = wp.zeros(self.forest.capacity // int(remesh_blocks.BLOCK) + 1, dtype=wp.int32, device=self.device)
+    def _make_blocks(self) -> refine.Blocks:
+        blocks = refine.Blocks()
+        shape = (self.forest.node_capacity, refine.KEPT)
+        blocks.of_node = wp.full(shape, int(refine.NONE), dtype=wp.int32, device=self.device)
+        blocks.latest = wp.full(shape[0], int(refine.NONE), dtype=wp.int32, device=self.device)
+        blocks.hot = wp.zeros(self.forest.capacity // int(refine.BLOCK) + 1, dtype=wp.int32, device=self.device)
         blocks.all_hot = wp.zeros(1, dtype=wp.int32, device=self.device)
         return blocks
 
-    def _make_removal(self) -> remesh_simplify.Removal:
+    def _make_removal(self) -> simplify.Removal:
         count = self.forest.node_capacity
-        removal = remesh_simplify.Removal()
+        removal = simplify.Removal()
         removal.willing = wp.zeros(count, dtype=wp.int32, device=self.device)
         removal.head = wp.full(count, -1, dtype=wp.int32, device=self.device)
         removal.candidates = wp.empty(count, dtype=wp.int32, device=self.device)
         return removal
 
-    def _make_moves(self) -> remesh_dense.Moves:
-        moves = remesh_dense.Moves()
+    def _make_moves(self) -> order.Moves:
+        moves = order.Moves()
         nodes, threads = self.forest.node_capacity, self.forest.threads
         moves.sums, moves.ends = (wp.zeros(2 * threads, dtype=wp.int32, device=self.device) for _ in range(2))
         moves.holes, moves.movers, moves.forward = (
             wp.empty(nodes, dtype=wp.int32, device=self.device) for _ in range(3)
         )
         return moves
+
+
+#: A longer step is searched for only after the stiffest element has been softer for this many passes.
+PATIENCE = 10
+#: Growth of the number of finest elements, and number of passes with changes, after which the step is always found
+#: again. An element among equal ones vibrates up to 1.5 times as fast as one among larger ones.
+GROWTH = 1.5
+MOST_CHANGES = 50
+#: Stiffnesses with a smaller relative difference count as equal.
+ALIKE = 1e-3
+
+
+@dataclass
+class Findings:
+    """The mesh when its step was found last, and the passes since then.
+
+    Attributes:
+        stiffness: Of the stiffest element, (2 mu + lambda) / (density volume^(2/3)) [1/s^2].
+        finest: Number of elements of the finest level.
+        softer_for: Passes in which the stiffest element was softer.
+        changes: Passes that changed something.
+    """
+
+    stiffness: float = 0.0
+    finest: int = 0
+    softer_for: int = 0
+    changes: int = 0
+
+
+class Survey:
+    """Measures the elements after each pass.
+
+    Args:
+        forest: The pools.
+        modulus: 2 mu + lambda [Pa], if all elements have the same; else elements carry "mu" and "lam".
+
+    Attributes:
+        found: The launches' results, int32, for ``read``.
+        last: The mesh when its step was found last.
+        finest_level: The finest level of the present mesh.
+        stiffness: Of its stiffest element; see ``Findings``.
+    """
+
+    def __init__(self, forest: DeviceForest, modulus: float):
+        self._forest = forest
+        self._modulus = modulus
+        self.found = wp.zeros(kernels.SURVEY_PLACES, dtype=wp.int32, device=forest.device)
+        self.last = Findings()
+        self.finest_level = 0
+        self.stiffness, self._finest = 0.0, 0
+
+    def launch(self, goes: wp.array) -> None:
+        """Launch the measurement of the elements if ``goes`` [1] is not zero; may be recorded."""
+        forest = self._forest
+        device, threads = forest.device, forest.threads
+        wp.launch(begin_counts, dim=kernels.SURVEY_PLACES, inputs=[goes], outputs=[self.found], device=device)
+        inputs = [threads, goes, self._modulus, forest.pools, forest.carriage.arrays]
+        wp.launch(kernels.find_stiffest, dim=threads, inputs=inputs, outputs=[self.found], device=device)
+        inputs = [threads, goes, forest.pools]
+        wp.launch(kernels.count_finest, dim=threads, inputs=inputs, outputs=[self.found], device=device)
+
+    def read(self, found: npt.NDArray[np.int32]) -> None:
+        """Take a copy of ``found`` of a mesh that has changed."""
+        self.stiffness = float(found[: int(kernels.STIFFEST) + 1].view(np.float32)[-1])
+        self.finest_level = int(found[kernels.FINEST_LEVEL])
+        self._finest = int(found[kernels.FINEST_COUNTS :].sum())
+        self.last.changes += 1
+
+    def step_may_change(self) -> bool:
+        """Whether the stable step must be found again; call it once a pass."""
+        last = self.last
+        softer = self.stiffness < (1.0 - ALIKE) * last.stiffness
+        last.softer_for = last.softer_for + 1 if softer else 0
+        stiffer = self.stiffness > (1.0 + ALIKE) * last.stiffness
+        grown = not softer and self._finest > GROWTH * last.finest
+        if not (stiffer or grown or last.softer_for > PATIENCE or last.changes > MOST_CHANGES):
+            return False
+        self.settle()
+        return True
+
+    def settle(self) -> None:
+        """Record that the step has been found for the present mesh."""
+        self.last = Findings(self.stiffness, self._finest)

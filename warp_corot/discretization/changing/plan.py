@@ -10,17 +10,14 @@ import numpy.typing as npt
 import warp as wp
 
 from warp_corot.discretization.changing.pools import DeviceForest
-from warp_corot.discretization.elements import edge_lengths
-from warp_corot.discretization.frames import device_frames
+from warp_corot.discretization.elements import device_frames, edge_lengths
 from warp_corot.discretization.groups import cubes_of
 from warp_corot.discretization.plan import LeafCounts, Sharing, Units
-from warp_corot.discretization.planning.planner import GRANULE, PlanArrays, Planner, Room
+from warp_corot.discretization.planner import GRANULE, PlanArrays, Planner, Room
 from warp_corot.kernels.elements.cpu import rest_matrices
 from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.plan import changing as kernels
-from warp_corot.kernels.plan import groups as group_kernels
-from warp_corot.kernels.plan.plan import Plan
-from warp_corot.kernels.plan.tree import Tree
+from warp_corot.kernels.plan.plan import Plan, Tree
 from warp_corot.kernels.remesh.pools import LEAF_PADDING, LEAVES, NODE_TOP
 from warp_corot.kernels.tables.shapes import MIRROR_BIT
 from warp_corot.mesh.lattice import MAX_LEVEL
@@ -285,7 +282,7 @@ class ChangingGroups:
         _, cube_of_root = np.unique(
             cubes_of(source, source.tree.tets[: self._pools.roots]), axis=0, return_inverse=True
         )
-        groups = self._groups = group_kernels.Groups()
+        groups = self._groups = kernels.Groups()
         groups.count = self._zeros(1)
         groups.starts, groups.size = self._zeros(most + 1), self._zeros(most + 1)
         groups.members, groups.filled = self._zeros(most), self._zeros(most)
@@ -300,14 +297,14 @@ class ChangingGroups:
         """Launch the search for groups if the plan has just been derived; may be recorded."""
         pools, plan, groups = self._pools, self._plan, self._groups
         most, tetrahedra, cubes = len(groups.filled), len(groups.tally), len(groups.cube_tally)
-        self._launch(group_kernels.begin_groups, max(most, tetrahedra, cubes), pools, plan)
-        self._launch(group_kernels.mark_flat, most, pools, plan)
-        self._launch(group_kernels.climb, tetrahedra, pools, plan)
-        self._launch(group_kernels.number_cubes, cubes, plan)
-        self._launch(group_kernels.count_members, most, pools, plan)
+        self._launch(kernels.begin_groups, max(most, tetrahedra, cubes), pools, plan)
+        self._launch(kernels.mark_flat, most, pools, plan)
+        self._launch(kernels.climb, tetrahedra, pools, plan)
+        self._launch(kernels.number_cubes, cubes, plan)
+        self._launch(kernels.count_members, most, pools, plan)
         wp.utils.array_scan(groups.size, groups.starts, inclusive=True)
-        self._launch(group_kernels.place_members, most, pools, plan)
-        self._launch(group_kernels.order_members, most, plan)
+        self._launch(kernels.place_members, most, pools, plan)
+        self._launch(kernels.order_members, most, plan)
 
     @property
     def _pools(self) -> Any:

@@ -11,12 +11,11 @@ import warp as wp
 
 from warp_corot.discretization.sizes import padded
 from warp_corot.errors import InputError
-from warp_corot.kernels.remesh.follow import bind_points
+from warp_corot.kernels.remesh.derived import bind_points
 from warp_corot.kernels.remesh.pools import SINKS, Pools
 from warp_corot.kernels.remesh.state import MEAN, NO_ROW, Carried
 from warp_corot.mesh import TetForest
-from warp_corot.mesh.growing.growth import lattice_spacing
-from warp_corot.mesh.lattice import MAX_LEVEL, volume_shares
+from warp_corot.mesh.lattice import MAX_LEVEL, lattice_spacing, volume_shares
 from warp_corot.mesh.surfaces.bound import BoundPoints, DeviceBinding
 
 

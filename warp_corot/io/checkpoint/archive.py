@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from warp_corot.body.activation import Activation, followed_stress
+from warp_corot.body.keyframes import Activation, followed_stress
 from warp_corot.body.soft_body import SoftBody
 from warp_corot.elasticity import MODELS, ForceField, Model
 from warp_corot.errors import InputError, StabilityWarning
@@ -23,7 +23,7 @@ from warp_corot.materials.anisotropic import Orthotropic, TransverselyIsotropic
 from warp_corot.materials.isotropic import Isotropic
 from warp_corot.materials.reinforced import FibreReinforced
 from warp_corot.mesh import TetForest, TetMesh
-from warp_corot.remesh.online import OnlineRemesh
+from warp_corot.remesh.remeshing import OnlineRemesh
 from warp_corot.simulation.simulation import Simulation
 from warp_corot.solvers import INTEGRATORS
 
@@ -89,7 +89,7 @@ Remesh = OnlineRemesh | Sequence[OnlineRemesh | None] | None
 
 FORMAT = "warp-corot checkpoint"
 #: The version of checkpoints that is written, and the only one that is read.
-VERSION = 12
+VERSION = 13
 
 MATERIALS = {kind.__name__: kind for kind in (Isotropic, TransverselyIsotropic, Orthotropic, FibreReinforced)}
 

@@ -11,24 +11,22 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
+from warp_corot.contact.carried import keep_again, kept_arrays
 from warp_corot.contact.contacts import Contacts
 from warp_corot.contact.grasp import Grasp
-from warp_corot.contact.keeping import keep_again, kept_arrays
 from warp_corot.contact.options import Contact
-from warp_corot.contact.sampled import SignedDistance, TriangleMesh
-from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, Shape, Sphere
+from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, Shape, SignedDistance, Sphere, TriangleMesh
 from warp_corot.contact.tool import Obstacle, Tool
 from warp_corot.cutting.blade import Blade, Edge
-from warp_corot.discretization.changing.snapshot import Piece, Snapshot, array_of, check_places
-from warp_corot.discretization.changing.survey import Findings
+from warp_corot.discretization.changing.passes import Findings
+from warp_corot.discretization.changing.pools import Piece, Snapshot, array_of, check_places
 from warp_corot.errors import InputError
 from warp_corot.mesh import TetForest, TetMesh, Tree
-from warp_corot.mesh.growing.detail import Detail
+from warp_corot.mesh.surfaces.marching import Detail
 from warp_corot.mesh.tree import UniformTree
-from warp_corot.remesh.carried_activation import Keys
-from warp_corot.remesh.conditions import KEPT
-from warp_corot.remesh.keyframes import Row
-from warp_corot.remesh.online import OnlineRemesh
+from warp_corot.remesh.carried_material import Keys
+from warp_corot.remesh.conditions import KEPT, Row
+from warp_corot.remesh.remeshing import OnlineRemesh
 
 if TYPE_CHECKING:
     from warp_corot.contact.tool import Tool

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 import warp as wp
 
-from warp_corot.contact.nodal import contact_at_nodes
+from warp_corot.contact.reading import contact_at_nodes
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number, checked_path, shown
 from warp_corot.inputs.simulation_lock import under_lock

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from warp_corot.elasticity.float64 import cauchy_stress, displacement_gradients, green_strain, has_tensor
 from warp_corot.errors import InputError
 from warp_corot.io.files.whole import check_output, writing, written_whole
-from warp_corot.mesh.surfaces.boundary import right_handed, signed_volumes
+from warp_corot.mesh.topology import right_handed, signed_volumes
 
 if TYPE_CHECKING:
     from warp_corot.simulation.simulation import Simulation

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from warp_corot.contact.sampled import TriangleMesh
-from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, Shape, Sphere
+from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, Shape, Sphere, TriangleMesh
 from warp_corot.contact.tool import Obstacle, Tool
 from warp_corot.cutting.blade import Edge
 

@@ -1,9 +1,16 @@
-"""The mesh of a domain: grown, cut at the surface, numbered."""
+"""The mesh of a domain: grown, cut at the surface, numbered; with a given number of tetrahedra or by given criteria.
+
+With a number, the size of the cubes and the number of bisections are chosen together. The body is sampled once, in a
+forest that is finer than the mesh. There every tetrahedron of every level has a need: the error of its piece of the
+surface if it were not bisected [m], or a tenth of its edge if the body is thinner than a few elements. All tetrahedra
+with a need above a threshold are bisected. The threshold is chosen to give the requested number, without another
+evaluation of the body."""
 
 from __future__ import annotations
 
+import math
 import warnings
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,21 +21,265 @@ from warp_corot.inputs.checks import checked_count, checked_number, shown
 from warp_corot.inputs.device import checked_device
 from warp_corot.inputs.loading import MESHING, load
 from warp_corot.mesh.forest import TetForest
+from warp_corot.mesh.growing.fine_classification import Coarsening, Resolved
+from warp_corot.mesh.growing.growth import Growing
+from warp_corot.mesh.growing.labelling import labels_of, labels_of_nodes
+from warp_corot.mesh.growing.refinement_criteria import THIN_NEED, Field, Wishes
+from warp_corot.mesh.growing.slivers import strays, without_slivers
 from warp_corot.mesh.lattice import check_levels, checked_cell_size, checked_level
-from warp_corot.mesh.numbering import in_order_of_leaves, live_or_void, pruned, renumbered, with_virtual
-from warp_corot.mesh.tree import LIVE, Tree
-
-from .adapt import Closer, grow
-from .budget import NEAR, NEAR_ENOUGH, Budget, chosen_meshes
-from .detail import Detail
-from .judging import Field, Wishes
-from .labelling import labels_of, labels_of_nodes
-from .resolved import Resolved
-from .slivers import without_slivers
-from .strays import strays
+from warp_corot.mesh.surfaces.bound import leaves_at
+from warp_corot.mesh.surfaces.marching import Detail
+from warp_corot.mesh.tree import LIVE, Tree, in_order_of_leaves, live_or_void, pruned, renumbered, with_virtual
 
 if TYPE_CHECKING:
+    import warp as wp
+
     from warp_corot.domain import Domain
+
+#: The fractions of the requested number that are aimed at and that are enough; and the number of sizes of cubes after
+#: which any is enough.
+NEAR, NEAR_ENOUGH = 0.985, 0.905
+MOST_CUBES = 4
+#: Along flat sides nothing is bisected; then more sizes are tried, which takes little time.
+MOST_CUBES_OF_BOXES = 7
+#: Where many elements need bisection alike, so that there are meshes of too few and of too many, the farther ones along
+#: the longest side need it more, by up to this share; a mesh with less than that share of the elements asked for gets
+#: other cubes first.
+FARTHER_FIRST, FEW = 0.05, 0.6
+#: The drawn surface is closer to the body's than the mesh's threshold by this factor, for which the forest must be
+#: finer still; with many elements it is the mesh's own. Thin parts have no finer elements than the mesh may need.
+FINER_SURFACE, FINER_FOREST, FINER_THIN = 0.3, 0.2, 0.4
+#: The size of cubes gives this fraction of the elements when none is bisected: about six in a cube inside, four at the
+#: surface. With more elements the surface needs a smaller fraction, so the fraction rises between two numbers of
+#: elements.
+UNBISECTED, UNBISECTED_OF_MANY = 1.0 / 6.0, 0.5
+FEWER, MORE = 50_000, 1_000_000
+#: If a forest of many elements has nothing left to bisect, smaller cubes should give this many times the requested
+#: elements; half the size gives less than four times as many.
+AMPLE, SLOW = 1.3, 2.0
+#: How often cubes are bisected for the surface. Elements at the largest curvature are a fifth of a cube long; finer
+#: ones would improve the rest of the surface little and shorten the time step. From this many elements on, too few are
+#: at the surface for that. Thin parts may have finer ones.
+MAX_LEVEL, MANY, MAX_LEVEL_THIN = 7, 300_000, 13
+#: Each label of a scan gets at least this many elements, but none smaller than a voxel, before the surface gets any;
+#: of all elements at most this share is for that.
+LABEL_ELEMENTS, OF_LABELS = 64, 0.5
+#: How finely the body is sampled: the first and the last surface error over a cube's edge, and the number of tetrahedra
+#: of all levels for each requested one, or a fixed number if that is larger.
+FIRST_ERROR, CLOSE_ERROR, CLOSE_LEVEL = 0.25, 0.01, 8
+CLOSER_LEVELS, CLOSER_ERROR = 6, 0.2
+CLOSE_ELEMENTS, CLOSE_ELEMENTS_OF_MANY = 5, 2
+#: If there is room for fewer more elements than this, the body is not sampled finely, because the choice of places
+#: would take too long.
+LEAST_CLOSER = 1000
+
+
+@dataclass(frozen=True)
+class Budget:
+    """The limits of a mesh with a given number of elements.
+
+    Attributes:
+        target: The largest number of elements.
+        cell_size: Edge of a cube [m]; None: chosen.
+        min_level, max_level: The range of levels; a largest level of None is chosen.
+        surface_error: The error below which the surface is not followed more closely [m]; 0: as the number allows.
+        min_layers: Number of elements through the thickness, if the total number allows.
+        wishes: The user's functions.
+    """
+
+    target: int
+    cell_size: float | None
+    min_level: int
+    max_level: int | None
+    surface_error: float
+    min_layers: float
+    wishes: Wishes
+
+
+class Meshes:
+    """The meshes in one forest, ordered by number of elements.
+
+    Attributes:
+        resolved: The forest.
+        count: Number of elements of the present mesh that contain enough of the body.
+        child: The present mesh, see `Coarsening`.
+    """
+
+    def __init__(self, resolved: Resolved, needs: np.ndarray, least: float, sliver: float):
+        self.resolved = resolved
+        self._needs, self._least, self._sliver = needs, least, sliver
+        self._coarsening = Coarsening(resolved, needs, sliver)
+        self.count, self.threshold = 0, 0.0
+        self.child = np.empty(0, np.int32)
+
+    def choose(self, target: int) -> int:
+        """Make the present mesh the largest one with at most this many elements, or the coarsest; return its number of
+        elements.
+        """
+        self.threshold = self._coarsening.threshold(target, self._least)
+        self.count, self.child = self._coarsening.mesh(self.threshold)
+        return self.count
+
+    def told_apart(self, target: int) -> Meshes:
+        """The meshes in the same forest if no two elements need bisection alike: more so the farther along the body's
+        longest side; the present one is the mesh of at most so many elements."""
+        grown = self.resolved.grown
+        axis = int(np.argmax(grown.cells))
+        along = grown.lattice[grown.tree.tets, axis].mean(axis=1)
+        needs = self._needs * (1.0 + FARTHER_FIRST * along / along.max())
+        needs = self.resolved.largest(needs).astype(np.float32)
+        found = Meshes(self.resolved, needs, self._least, self._sliver)
+        found.choose(target)
+        return found
+
+    @property
+    def has_more(self) -> bool:
+        """Whether there are meshes with more elements than the present one."""
+        return self.threshold > self._least
+
+    def surface(self, threshold: float) -> np.ndarray:
+        """A mesh of the same forest, finer than that of a threshold, for the drawn surface; in the form of `child`."""
+        resolved, need = self.resolved, self.resolved.grown.need
+        # Thin parts that are flat need no finer surface.
+        curved = (resolved.held > 0.0) & ~np.isclose(need, THIN_NEED * resolved.lengths, rtol=1.0e-5)
+        needs = resolved.largest(np.where(curved, need, 0.0)).astype(np.float32)
+        needs = np.maximum(needs, np.where(self._needs > threshold, self._needs, 0.0))
+        return Coarsening(resolved, needs, self._sliver).mesh(FINER_SURFACE * threshold)[1]
+
+
+def chosen_meshes(domain: Domain, budget: Budget, sliver: float, device: wp.Device) -> Meshes | None:
+    """The forest that contains a mesh with nearly the allowed number of elements, and this mesh.
+
+    None if the coarsest has more.
+    """
+    best: Meshes | None = None
+    largest = 1.001 * float(np.ptp(domain.bounds, axis=0).max())
+    suits = min(predicted_cell_size(domain, budget.target), largest)
+    size = budget.cell_size or suits
+    for trial in range(MOST_CUBES_OF_BOXES):
+        last = trial >= MOST_CUBES - 1
+        meshes = _of_cubes(domain, budget, size, suits, sliver, device)
+        if meshes.has_more and (last or FEW * budget.target <= meshes.count < NEAR_ENOUGH * budget.target):
+            meshes = meshes.told_apart(int(NEAR * budget.target))
+        count = meshes.count
+        if count <= budget.target and (best is None or count > best.count):
+            best = meshes
+        if budget.cell_size or NEAR_ENOUGH * budget.target <= count <= budget.target:
+            break
+        if budget.surface_error and count <= budget.target:
+            break
+        if last and meshes.has_more and count <= budget.target:
+            break
+        ratio = count / (NEAR * budget.target)
+        exhausted = budget.target > MANY and not meshes.has_more
+        factor = (ratio / AMPLE) ** (1.0 / SLOW) if exhausted else ratio ** (1.0 / 2.5)
+        # A cube larger than the body would contain all of it.
+        size = min(size * float(np.clip(factor, 0.5, 2.0)), largest)
+    return best
+
+
+def predicted_cell_size(domain: Domain, target: int) -> float:
+    """The edge [m] of cubes that fill a body with about this number of elements."""
+    from warp_corot.domain.reference import extent_of
+
+    volume, area = extent_of(domain)
+    way = float(np.clip(np.log(target / FEWER) / np.log(MORE / FEWER), 0.0, 1.0))
+    unbisected = target * (UNBISECTED + way * (UNBISECTED_OF_MANY - UNBISECTED))
+    low, high = 1e-6, 1.0
+    longest = float(np.ptp(domain.bounds, axis=0).max())
+    for _ in range(60):
+        share = np.sqrt(low * high)
+        size = share * longest
+        if 6.0 * volume / size**3 + 4.0 * area / size**2 > unbisected:
+            low = share
+        else:
+            high = share
+    return float(high) * longest
+
+
+def _of_cubes(
+    domain: Domain,
+    budget: Budget,
+    size: float,
+    suits: float,
+    sliver: float,
+    device: wp.Device,
+) -> Meshes:
+    """The meshes of one size of cubes, with the largest allowed one chosen; if cubes are larger than the number needs,
+    they have this many more levels.
+    """
+    target, wishes = budget.target, budget.wishes
+    more = max(math.ceil(3.0 * math.log2(size / suits) - 0.5), 0)
+    most = more + MAX_LEVEL + (target > MANY) if budget.max_level is None else budget.max_level
+    deepest = more + MAX_LEVEL_THIN if budget.max_level is None else budget.max_level
+    looked = max(min(most + 1, CLOSE_LEVEL + more), min(deepest, budget.min_level))
+    error = max(CLOSE_ERROR * min(size, suits), 0.5 * budget.surface_error)
+    looking = replace(
+        wishes,
+        surface_error=error,
+        min_level=min(budget.min_level, looked),
+        max_level=looked,
+        layers=budget.min_layers,
+        thin_level=min(deepest, looked + CLOSER_LEVELS),
+    )
+    growing = Growing(domain, size, looking, device)
+    growing.run_until(target, FIRST_ERROR * min(size, suits))
+    growing.run_finer(FINER_FOREST if target <= MANY else 1.0, FINER_THIN)
+    room = (CLOSE_ELEMENTS if target <= MANY else CLOSE_ELEMENTS_OF_MANY) * target + 40_000
+    if growing.growth.element_count + LEAST_CLOSER < room:
+        growing.look_closer(CLOSER_LEVELS, CLOSER_ERROR, room)
+    points, largest = label_floor(domain, target)
+    growing.run_around(points, largest)
+    resolved = Resolved(growing.grown(), size, domain)
+    needs = needs_of(resolved, domain, budget.min_layers, most, deepest)
+    needs = resolved.largest(np.maximum(needs, floor_needs(resolved, points, largest, deepest))).astype(np.float32)
+    found = Meshes(resolved, needs, budget.surface_error, sliver)
+    found.choose(int(NEAR * target))
+    return found
+
+
+def label_floor(domain: Domain, target: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points in the labels of a scan [n, 3] [m], and the largest element at each that gives its label enough [m^3]."""
+    count = max(int(min(LABEL_ELEMENTS, OF_LABELS * target / max(len(domain.label_names), 1))), 1)
+    found, largest = [np.empty((0, 3))], [np.empty(0)]
+    for name, volume in zip(domain.label_names, domain.label_volumes, strict=True):
+        found.append(domain.points_in(name, 8 * count))
+        largest.append(np.full(len(found[-1]), volume / min(count, len(found[-1])) if len(found[-1]) else 0.0))
+    return np.concatenate(found), np.concatenate(largest)
+
+
+def floor_needs(resolved: Resolved, points: np.ndarray, largest: np.ndarray, deepest: int) -> np.ndarray:
+    """The need of tetrahedra that hold points and are larger than their limits, the more so the larger: more than any
+    other need [m], float64 [M]."""
+    grown, needs = resolved.grown, np.zeros(len(resolved.held))
+    tree, size = grown.tree, resolved.cell_size
+    at = leaves_at(tree, grown.cells, grown.origin, size, points)
+    while (at >= 0).any():
+        at, largest = at[at >= 0], largest[at >= 0]
+        ratio = size**3 * resolved.volume[at] / largest
+        chosen = (ratio > 1.0) & (tree.level[at] < deepest)
+        np.maximum.at(needs, at[chosen], size * np.cbrt(ratio[chosen]))
+        at = tree.parent[at]
+    return needs
+
+
+def needs_of(resolved: Resolved, domain: Domain, layers: float, most: int, deepest: int) -> np.ndarray:
+    """The need of each tetrahedron to be bisected [m], never less than that of its descendants; float32 [M].
+
+    Args:
+        resolved: The forest.
+        domain: The body.
+        layers: Number of elements through the thickness.
+        most: Level below which the surface needs no more bisections.
+        deepest: Level below which thickness needs none either.
+    """
+    level, length = resolved.grown.tree.level, resolved.lengths
+    needs = np.where(level < most, resolved.grown.need, 0.0)
+    if layers > 0:
+        thin = (resolved.thin(domain, layers) < layers * length) & (level < deepest)
+        needs[thin] = np.maximum(needs[thin], THIN_NEED * length[thin])
+    return resolved.largest(np.where(resolved.held > 0.0, needs, 0.0)).astype(np.float32)
+
 
 #: How often a cube is bisected by default.
 MAX_LEVEL_BY_DEFAULT = 12
@@ -38,9 +289,8 @@ MOST_ELEMENTS = 100_000_000
 CUBES_PER_ELEMENT = 1000
 #: Number of meshes after which one with nearly the requested elements is good enough.
 MOST_MESHES = 4
-#: How finely a body is sampled below the mesh's levels: surface error over an element's edge, and tetrahedra of all
-#: levels.
-CLOSER_ERROR, CLOSER_ELEMENTS = 0.2, 4_000_000
+#: Without a number: the most tetrahedra of all levels in which a body is sampled below the mesh's levels.
+CLOSER_ELEMENTS = 4_000_000
 
 
 def mesh_domain(
@@ -71,8 +321,12 @@ def mesh_domain(
         return _of_size(domain, budget, sliver, where)
     if cell_size is None:
         raise InputError("cell_size is None; it must be a length in metres where target_elements is not given")
-    closer = Closer(detail, CLOSER_ERROR, CLOSER_ELEMENTS) if detail else None
-    grown = grow(domain, float(cell_size), wishes, where, closer)
+    growing = Growing(domain, float(cell_size), wishes, where)
+    growing.run()
+    wished = growing.growth.first_child[: growing.growth.element_count].numpy().copy()
+    if detail:
+        growing.look_closer(detail, CLOSER_ERROR, CLOSER_ELEMENTS)
+    grown = growing.grown(wished)
     resolved = Resolved(grown, float(cell_size), domain if detail else None)
     forest, left_out = _finished(resolved, resolved.as_wished(), domain, sliver)
     _say(left_out)

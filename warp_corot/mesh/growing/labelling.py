@@ -12,14 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from warp_corot.mesh.forest_arrays import ForestArrays
 from warp_corot.mesh.scattered import combined, weights_within
 
-from .cut import label_shares
-from .resolved import LEAST, MOST_POINTS, Resolved
+from .fine_classification import LEAST, MOST_POINTS, Resolved, label_shares
 
 if TYPE_CHECKING:
     from warp_corot.domain import Domain
+    from warp_corot.mesh.forest_arrays import ForestArrays
 
 Ints = npt.NDArray[np.int32]
 Longs = npt.NDArray[np.int64]

@@ -4,27 +4,25 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_array
 
 from warp_corot.errors import InputError
-from warp_corot.mesh.forest_arrays import ForestArrays
-from warp_corot.mesh.growing.detail import Detail
 from warp_corot.mesh.lattice import LATTICE_BITS
-from warp_corot.mesh.numbering import in_order_of_leaves, live_or_void, renumbered, with_virtual
-from warp_corot.mesh.pieces import pieces_of
-from warp_corot.mesh.tree import VOID
+from warp_corot.mesh.surfaces.marching import Detail
+from warp_corot.mesh.topology import boundary_faces, pieces_of
+from warp_corot.mesh.tree import VOID, in_order_of_leaves, live_or_void, renumbered, with_virtual
 
-from .bound import SurfaceMesh
-from .boundary import boundary_faces
-from .embedding import barycentric, embed
-from .marching import marched, marched_cut
-from .separating import separated
+from .bound import SurfaceMesh, barycentric, embed
+from .marching import marched, marched_cut, separated
 
-Forest = TypeVar("Forest", bound=ForestArrays)
+if TYPE_CHECKING:
+    from warp_corot.mesh.forest_arrays import ForestArrays
+
+Forest = TypeVar("Forest", bound="ForestArrays")
 
 #: Nodes stay where they are if a cut is so nearly parallel to the face of a box: the square of the sine of the angle.
 LEAST = 0.1

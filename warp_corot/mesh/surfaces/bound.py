@@ -1,10 +1,12 @@
-"""Points and surfaces that follow a mesh: each point is bound to up to four of its nodes."""
+"""Points and surfaces that follow a mesh: the element that holds each point, and the nodes to which it is bound.
+
+A walk down the tree finds the element of a forest, a tree of bounding boxes that of other meshes."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,8 +15,188 @@ import warp as wp
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_indices, checked_numbers
 from warp_corot.kernels.meshing import embedding as kernels
+from warp_corot.kernels.meshing.embedding import find_holders
+from warp_corot.kernels.meshing.windings import find_nearest
+from warp_corot.mesh.lattice import LATTICE_BITS
+from warp_corot.mesh.topology import boundary_faces
+from warp_corot.mesh.tree import VOID, Tree
 
-from .locating import checked_points
+if TYPE_CHECKING:
+    from warp_corot.mesh.forest_arrays import ForestArrays
+
+#: Points farther away than this many lengths of the mesh are moved to that distance; float32 cannot resolve more.
+FARTHEST = 1.0e3
+
+
+def checked_points(points: npt.ArrayLike) -> np.ndarray:
+    """Points float64 [n, 3].
+
+    Raises:
+        InputError: They have another shape, or are not finite.
+    """
+    points = checked_numbers(points, "points", "[n, 3]")
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"points has shape {points.shape}; it must be [n, 3]")
+    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+    if len(bad):
+        raise InputError(f"point {bad[0]} is {points[bad[0]].tolist()}; its coordinates must be finite")
+    return points
+
+
+def embed_in_tets(nodes: np.ndarray, tets: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The tetrahedron that holds each point, or the one behind the nearest face, and the point's coordinates in it.
+
+    Args:
+        nodes: float64 [N, 3].
+        tets: int32 [T, 4].
+        points: [n, 3].
+
+    Returns:
+        Tetrahedra int32 [n], and barycentric coordinates float64 [n, 4]; some are negative for points outside.
+
+    Raises:
+        InputError: The points are not [n, 3], or not finite.
+    """
+    points = checked_points(points)
+    device = wp.get_device("cpu")
+    # Relative to the centre of the mesh, because float32 keeps few digits far from zero.
+    middle = nodes[tets].reshape(-1, 3).mean(axis=0)
+    placed, moved = nodes - middle, points - middle
+    size = float(np.ptp(placed, axis=0).max())
+    corners = placed[tets]
+    low, high = corners.min(axis=1) - 1e-6 * size, corners.max(axis=1) + 1e-6 * size
+    lowers, uppers = (wp.array(x.astype(np.float32), dtype=wp.vec3, device=device) for x in (low, high))
+    tree = wp.Bvh(lowers, uppers)
+    moved = moved * (FARTHEST * size / np.maximum(np.abs(moved).max(axis=1, keepdims=True), FARTHEST * size))
+    at = wp.array(moved, dtype=wp.vec3d, device=device)
+    inverse = np.linalg.inv(np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2))
+    inputs = [
+        tree.id,
+        at,
+        wp.array(corners[:, 0], dtype=wp.vec3d, device=device),
+        wp.array(inverse, dtype=wp.mat33d, device=device),
+    ]
+    found = wp.empty(len(points), dtype=wp.int32, device=device)
+    wp.launch(find_holders, len(points), inputs, [found], device=device)
+    elements = found.numpy()
+    outside = np.flatnonzero(elements < 0)
+    if len(outside):
+        faces, parents = boundary_faces(tets, nodes)
+        elements[outside] = parents[nearest_faces(placed, faces, moved[outside], 10.0 * FARTHEST * size)]
+    later = np.einsum("nij,nj->ni", inverse[elements], points - middle - corners[elements, 0])
+    return elements, np.column_stack([1.0 - later.sum(axis=1), later])
+
+
+def nearest_faces(nodes: np.ndarray, faces: np.ndarray, points: np.ndarray, far: float) -> np.ndarray:
+    """The triangle closest to each point, int32 [n]; -1 if none is closer than ``far`` [m]."""
+    return _nearest(nodes, faces, points, far, "cpu")[0]
+
+
+def distances_from(
+    nodes: np.ndarray, faces: np.ndarray, points: np.ndarray, far: float, device: wp.Device | str = "cpu"
+) -> np.ndarray:
+    """The distance of each point from a surface, at most ``far`` [m], float32 [n]."""
+    middle = nodes.mean(axis=0)  # float32 keeps few digits far from zero
+    return _nearest(nodes - middle, faces, points - middle, far, device)[1]
+
+
+def _nearest(
+    nodes: np.ndarray, faces: np.ndarray, points: np.ndarray, far: float, device: wp.Device | str
+) -> tuple[np.ndarray, np.ndarray]:
+    mesh = wp.Mesh(
+        wp.array(nodes, dtype=wp.vec3, device=device),
+        wp.array(np.ascontiguousarray(faces, dtype=np.int32).ravel(), dtype=wp.int32, device=device),
+    )
+    given = wp.array(points, dtype=wp.vec3, device=device)
+    found = [wp.empty(len(points), dtype=dtype, device=device) for dtype in (wp.int32, wp.float32)]
+    wp.launch(find_nearest, len(points), [given, mesh.id, far], found, device=device)
+    return found[0].numpy(), found[1].numpy()
+
+
+#: The path from one corner of a cube to the opposite one, by the axes in descending order of a point's coordinates.
+_WALKS = np.array([[0, 1, 2], [0, 2, 1], [1, 0, 2], [1, 2, 0], [2, 0, 1], [2, 1, 0]])
+
+
+def embed(forest: ForestArrays, points: npt.ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """See `TetForest.embed`."""
+    points = checked_points(points)
+    found = leaves_at(forest.tree, forest.cells, forest.origin, forest.cell_size, points)
+    number = np.full(len(forest.tree.level) + 1, -1, np.int32)
+    number[forest.tree.leaves] = np.arange(len(forest.tree.leaves), dtype=np.int32)
+    elements = number[found]
+    outside = np.flatnonzero(elements < 0)
+    if len(outside):
+        elements[outside] = _nearest_leaves(forest, points[outside])
+    return elements, barycentric(forest, elements, points)
+
+
+def barycentric(forest: ForestArrays, elements: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Barycentric coordinates of points in leaves, float64 [n, 4]; some are negative for points outside."""
+    x = forest.points[forest.tets[elements]]
+    edges = np.swapaxes(x[:, 1:] - x[:, :1], 1, 2)
+    later = np.linalg.solve(edges, (points - x[:, 0])[..., None])[..., 0]
+    return np.column_stack([1 - later.sum(axis=1), later])
+
+
+def leaves_at(
+    tree: Tree, grid: tuple[int, int, int], origin: npt.ArrayLike, cell_size: float, points: np.ndarray
+) -> np.ndarray:
+    """The live leaf of a tree, by its number there, that contains each point, int32 [n], -1 if there is none."""
+    cells = np.array(grid)
+    scaled = (points - np.asarray(origin)) / cell_size
+    within = np.flatnonzero(((scaled >= 0) & (scaled <= cells)).all(axis=1))
+    found = np.full(len(points), -1, np.int32)
+    if not len(within):
+        return found
+    scaled = scaled[within]
+    cube = np.minimum(scaled.astype(np.int64), cells - 1)
+    rest = scaled - cube
+    order = np.argsort(-rest, axis=1, kind="stable")
+    walk = np.argmax((order[:, None] == _WALKS).all(axis=2), axis=1)
+    down = np.take_along_axis(rest, order, axis=1)
+    weights = np.column_stack([1 - down[:, 0], down[:, 0] - down[:, 1], down[:, 1] - down[:, 2], down[:, 2]])
+    roots = 6 * np.ravel_multi_index(tuple(cube.T), grid) + walk
+    device = wp.get_device("cpu")
+    inputs = [
+        wp.array(roots, dtype=wp.int32, device=device),
+        wp.array(weights, dtype=wp.vec4d, device=device),
+        wp.array(tree.level, dtype=wp.int32, device=device),
+        wp.array(tree.first_child, dtype=wp.int32, device=device),
+    ]
+    leaves = wp.empty(len(within), dtype=wp.int32, device=device)
+    wp.launch(kernels.descend, len(within), inputs, [leaves], device=device)
+    found[within] = leaves.numpy()
+    return found
+
+
+def _nearest_leaves(forest: ForestArrays, points: np.ndarray) -> np.ndarray:
+    """The element behind the boundary face that is closest to each point, int32 [n]."""
+    faces, parents = _boundary_faces(forest)
+    # Relative to the centre of the mesh, because float32 keeps few digits far from zero.
+    middle = forest.points.mean(axis=0)
+    moved = points - middle
+    limit = FARTHEST * np.ptp(forest.points, axis=0).max()
+    moved *= limit / np.maximum(np.abs(moved).max(axis=1, keepdims=True), limit)
+    return parents[nearest_faces(forest.points - middle, faces, moved, 10.0 * limit)]
+
+
+def _boundary_faces(forest: ForestArrays) -> tuple[np.ndarray, np.ndarray]:
+    """Boundary faces and their leaves; the nodes of these faces are on void tetrahedra or on the border of the grid."""
+    tree = forest.tree
+    lattice = forest.lattice[: forest.node_count]
+    on_rim = ((lattice == 0) | (lattice == np.array(forest.cells) << LATTICE_BITS)).any(axis=1)
+    if forest.phi is not None:
+        # Void tetrahedra far outside may be non-conforming, but then no node on their faces is inside.
+        on_rim |= forest.phi[: forest.node_count] >= 0
+        of_void = tree.tets[tree.first_child == VOID]
+        of_void = of_void[(forest.phi[of_void] < 0).any(axis=1)]
+        on_rim[of_void[of_void < forest.node_count]] = True
+    near = np.flatnonzero(on_rim[forest.tets].sum(axis=1) >= 3)
+    faces, parents = boundary_faces(forest.tets[near], forest.points)
+    # Faces between near leaves and others only look like boundary faces.
+    real = on_rim[faces].all(axis=1)
+    return faces[real], near[parents[real]].astype(np.int32)
+
 
 #: The length of the mean of the normals at the points that a node bears, below which they lie on opposite sides; at a
 #: corner of a cube it is 0.58.

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from warp_corot.discretization.plan import Batch
-from warp_corot.discretization.planning.fixed import ForcePlan
+from warp_corot.discretization.planner import ForcePlan
 from warp_corot.elasticity.corotated.fields import SubtreeField
 from warp_corot.elasticity.dilatation import law_of
 from warp_corot.kernels.stepping.block import BlockBody, step_block
@@ -85,22 +85,16 @@ class BlockSteps:
         """Launch ``count`` steps, the first ones since the clock was last advanced."""
         body = self.body
         wp.launch(
-            step_block(self._layout, body.conditions.loads.dtype),
+            step_block(self._layout),
             dim=body.worlds * self._layout.threads,
             block_dim=self._layout.threads,
             inputs=[
                 self._block,
                 count,
-                damping,
-                system.gravity,
+                system.dynamics(body, damping),
                 self._field.isotropic,
                 body.conditions.mass,
-                body.conditions.inverse_mass,
-                int(body.conditions.has_loads),
-                body.conditions.loads,
                 system.pace.arrays,
-                body.state.displacements,
-                body.state.velocities,
             ],
             outputs=[body.state.reactions, system.support_work, system.bad_step],
             device=body.device,

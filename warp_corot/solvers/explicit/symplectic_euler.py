@@ -16,7 +16,7 @@ from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_number
 from warp_corot.inputs.cpu_threads import Regions
 from warp_corot.kernels.stepping.integrate import STEP_SYMPLECTIC_EULER, take_in_work
-from warp_corot.solvers.integrator import Integrator, Stepper
+from warp_corot.solvers.system import Integrator, Stepper
 
 from .block import BlockSteps
 from .patches import PatchSteps

@@ -21,14 +21,14 @@ from warp_corot.kernels.implicit.multigrid.cycle import Rows
 from warp_corot.materials.directional import Directional
 
 from .dissection import dissected
-from .multigrid.leaf_matrix import LeafMatrix
+from .multigrid.level import LeafMatrix
 from .multigrid.pattern import Pattern, PatternFinder
 from .tangent import TangentOperator
 
 if TYPE_CHECKING:
     from .block_system import VectorBlocks
     from .conjugate_gradients import ConjugateGradients
-    from .contact_constraints import ObstacleContact, SoftContact
+    from .contact_constraints import Contact
 
 #: Threads of a block on CUDA, and the lanes that share a row: as many as leave no thread idle, within these bounds.
 THREADS, FEWEST_LANES, MOST_LANES = 512, 4, 16
@@ -180,9 +180,7 @@ class AssembledSolve:
             ("nodes", wp.int32, (room, kernels.PLACES)),
             ("parts", wp.vec4, (room, kernels.PLACES)),
             ("blocks", wp.mat33, nodes),
-            ("projected", wp.int32, nodes),
-            ("projectors", wp.mat33, nodes + 1),
-            ("drag", wp.mat33, nodes),
+            ("single", wp.mat33, nodes),
         ):
             setattr(self.couplings, name, wp.zeros(size, dtype=dtype, device=self.device))
         entries = kernels.ContactEntries()
@@ -192,13 +190,6 @@ class AssembledSolve:
         entries.blocks = wp.zeros(many, dtype=wp.mat33, device=self.device)
         entries.beside = wp.zeros(room, dtype=wp.int32, device=self.device)
         self._of_contacts, self._marks = entries, wp.zeros(nodes, dtype=wp.int32, device=self.device)
-        self._couplings = []
-        for start in self.blocks.starts:
-            own = kernels.Couplings()
-            for name in ("count", "nodes", "parts", "blocks", "projected", "projectors", "drag"):
-                setattr(own, name, getattr(self.couplings, name))
-            own.first = start
-            self._couplings.append(own)
 
     def _find_launch(self, count: int, worlds: int) -> None:
         """Find how blocks share the worlds, and threads the rows."""
@@ -250,14 +241,10 @@ class AssembledSolve:
         self._empty()
         self._finish(is_new=True)
 
-    def take_contact(self, contacts: Sequence[ObstacleContact | None], soft: SoftContact | None) -> None:
+    def take_contact(self, contact: Contact) -> None:
         """Launch the exchange of the contacts in the matrix for the present ones."""
         self._empty()
-        for contact, couplings in zip(contacts, self._couplings, strict=True):
-            if contact is not None:
-                contact.launch_couplings(couplings)
-        if soft is not None:
-            soft.launch_couplings(self.couplings)
+        contact.add_couplings(self.couplings)
         self._finish(is_new=False)
         if self.device.is_cpu:
             self._of_contacts.heads.fill_(-1)
@@ -298,7 +285,7 @@ class AssembledSolve:
 
     def _empty(self) -> None:
         couplings, entries = self.couplings, self._of_contacts
-        for each in (couplings.count, couplings.blocks, couplings.projected, entries.count, entries.beside_count):
+        for each in (couplings.count, couplings.blocks, couplings.single, entries.count, entries.beside_count):
             each.zero_()
 
     def _finish(self, *, is_new: bool) -> None:

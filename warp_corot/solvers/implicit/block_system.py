@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import accumulate
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
@@ -14,8 +14,8 @@ from .conjugate_gradients import ConjugateGradients
 from .operator import Preconditioner
 
 if TYPE_CHECKING:
-    from .chosen import ChosenSolve
-    from .contact_constraints import ObstacleContact, SoftContact
+    from .contact_constraints import Contact
+    from .preconditioners import ChosenSolve
     from .tangent import TangentOperator
 
 
@@ -44,17 +44,16 @@ class VectorBlocks:
 
 
 class BlockSystem:
-    """S (A + D + R) x = b: A of each body, the drag D and the projector S of its contact with obstacles, and the
-    derivative R of contact between soft surfaces.
+    """(A + R) x = b: A of each body, and the derivative R of contact.
 
-    All vectors are in the range of S. The preconditioner is block diagonal: S T B T S of each body's own B, where T
-    takes the stiffness of friction into account; or the whole matrix is assembled, see ``choice``.
+    The preconditioner is block diagonal: each body's own B, which takes the stiffness of obstacles into account, or G B
+    G^T where G does; or the whole matrix is assembled, see ``choice``.
 
     Args:
         operators: A of each body.
         preconditioners: B of each body.
-        contacts: The contact of each body with obstacles, or None.
-        soft: The contact of soft surfaces, or None. With it all bodies and worlds are solved for together.
+        contact: The contact of all bodies, or None.
+        couples: Whether all bodies and worlds are solved for together.
         choice: Another way of solving, and which of the two is taken; or None.
         most: Maximum number of iterations of a linear solve.
         ranks: The ranks with other nodes of the same worlds.
@@ -71,34 +70,30 @@ class BlockSystem:
         operators: Sequence[TangentOperator],
         preconditioners: Sequence[Preconditioner],
         *,
-        contacts: Sequence[ObstacleContact | None] = (),
-        soft: SoftContact | None = None,
+        contact: Contact | None = None,
+        couples: bool = False,
         choice: ChosenSolve | None = None,
         most: int = 1000,
         ranks: Halo = ALONE,
     ):
-        self.operators, self.preconditioners, self.soft = list(operators), list(preconditioners), soft
-        self.contacts = list(contacts) or [None] * len(self.operators)
+        self.operators, self.preconditioners, self.contact = list(operators), list(preconditioners), contact
+        self.couples = couples
         self.choice, self.ranks, self.device = choice, ranks, self.operators[0].device
         self.blocks = VectorBlocks([len(operator.inverse_mass) for operator in operators])
         self.worlds, self.node_count = 1, self.blocks.count
-        if soft is None:
+        if not couples:
             (operator,) = self.operators
             self.worlds, self.node_count = operator.worlds, operator.node_count
         self.x, self.b = (wp.zeros(self.blocks.count, dtype=wp.vec4, device=self.device) for _ in range(2))
-        holds = any(each is not None and each.nodes is not None for each in self.contacts)
-        self._r = wp.zeros(self.blocks.count if holds else 0, dtype=wp.vec4, device=self.device)
+        self._r = wp.zeros(0 if contact is None else self.blocks.count, dtype=wp.vec4, device=self.device)
         self.solver = ConjugateGradients(self, self.blocks.count, most=most, ranks=ranks)
 
     # --- as an operator ----------------------------------------------------------------------------------------------
 
     def apply(self, x: wp.array, y: wp.array) -> None:
         self.apply_bodies(x, y)
-        if self.soft is not None:
-            self.soft.add_products(x, y)
-        for contact, a, b in zip(self.contacts, self.blocks.of(x), self.blocks.of(y), strict=True):
-            if contact is not None:
-                contact.launch_drag(a, b)
+        if self.contact is not None:
+            self.contact.add_products(x, y)
 
     def apply_bodies(self, x: wp.array, y: wp.array) -> None:
         """Launch y = A x, without contact."""
@@ -131,25 +126,27 @@ class BlockSystem:
 
     def take_springs(self) -> None:
         """Launch the same in the bodies' own preconditioners."""
-        for contact, preconditioner in zip(self.contacts, self.preconditioners, strict=True):
-            springs = None if contact is None else contact.springs
-            if springs is not None and hasattr(preconditioner, "take_springs"):
-                springs.update()
-                preconditioner.take_springs()
+        assert self.contact is not None
+        self.contact.update_springs()
+        preconditioners: list[Any] = [each for each in self.preconditioners if self._knows_springs(each)]
+        for preconditioner in preconditioners:
+            preconditioner.take_springs()
+
+    def _knows_springs(self, preconditioner: Preconditioner) -> bool:
+        return hasattr(preconditioner, "take_springs") and self.ranks.is_alone
 
     def apply_inverse(self, r: wp.array, z: wp.array) -> None:
-        """Launch z = S T B T S r."""
-        each = zip(self.preconditioners, self.contacts, self.blocks.of(r), self.blocks.of(z), strict=True)
-        for k, (preconditioner, contact, a, b) in enumerate(each):
-            nodes = None if contact is None else contact.nodes
-            if nodes is None:
+        """Launch z = B r, or z = G B G^T r where B knows no contact."""
+        each = zip(self.preconditioners, self.blocks.of(r), self.blocks.of(z), strict=True)
+        for k, (preconditioner, a, b) in enumerate(each):
+            if self.contact is None or self._knows_springs(preconditioner):
                 preconditioner.apply(a, b)
                 continue
             own = self.blocks.of(self._r)[k]
             wp.copy(own, a)
-            nodes.launch_yielding(own)
+            self.contact.scale(k, own, is_after=False)
             preconditioner.apply(own, b)
-            nodes.launch_yielding(b)
+            self.contact.scale(k, b, is_after=True)
 
     # --- solves ------------------------------------------------------------------------------------------------------
 

@@ -16,18 +16,17 @@ from warp_corot.kernels.implicit import steps as kernels
 from warp_corot.solvers.halo import ALONE
 
 from .block_system import BlockSystem
-from .contact_constraints import Hold, ObstacleContact, Touching
-from .lagged import Lagged
+from .contact_constraints import Contact, Hold, Touching
 from .multigrid import Multigrid
 from .newton import Newton
-from .preconditioners import preconditioner_of
-from .tangent import TangentOperator
-from .turning import TurnedState
+from .preconditioners import Lagged, preconditioner_of
+from .tangent import TangentOperator, TurnedState
 
 if TYPE_CHECKING:
     from warp_corot.solvers.system import System
 
     from .schemes import ImplicitIntegrator
+
 
 #: The search for soft surfaces leaves room for this many times what a body that is let go falls in a step.
 FALLS = 0.25
@@ -59,7 +58,8 @@ class SharedSteps:
         totals: Steps, iterations of Newton's method and of linear solves, and steps that did not come within the
             tolerance, of all bodies, int64 [4].
         touching: The constraints that implicit steps resolve.
-        rows: The contact of bodies with one another, or None.
+        contact: The contact of all bodies, or None.
+        couples: Whether all bodies are solved for together, because they may touch one another.
         begins: Nonzero if all bodies that are solved for together begin again with a first step, int32 [1].
         sturdy: Nonzero while each step is a first step, of backward Euler, int32 [1].
     """
@@ -67,10 +67,12 @@ class SharedSteps:
     def __init__(self, system: System, integrator: ImplicitIntegrator):
         self.system, self.integrator = system, integrator
         self.totals = wp.zeros(4, dtype=wp.int64, device=system.device)
-        self.touching = cast("list[Touching]", [each for each in system.constraints if hasattr(each, "active_set")])
-        self.rows = next((rows for each in self.touching if (rows := each.joined_rows()) is not None), None)
-        if self.rows is not None:
-            self.rows.reserve(FALLS * float(np.linalg.norm(system.gravity)) * integrator.dt**2)
+        self.touching = cast("list[Touching]", [each for each in system.constraints if hasattr(each, "implicit")])
+        found = (each.implicit() for each in self.touching)
+        self.contact: Contact | None = next((each for each in found if each is not None), None)
+        self.couples = self.contact is not None and self.contact.couples
+        if self.contact is not None:
+            self.contact.reserve(FALLS * float(np.linalg.norm(system.gravity)) * integrator.dt**2)
         self.begins, self.sturdy = (wp.zeros(1, dtype=wp.int32, device=system.device) for _ in range(2))
 
     @property
@@ -109,13 +111,11 @@ class BodySteps:
         k: The number of the body in the system.
 
     Attributes:
-        held: What holds nodes, or None.
         history: The vectors that a step keeps for the next one, and the body's state after it, vec4 each.
         before: Velocities before the last step, for the guess of the next one, vec4; NaN before the first.
-        met: A number for the obstacles that each node touched when the last step began, in schemes of second order,
-            else empty, int32.
-        touched: What each node has touched of soft surfaces, in schemes of second order, else empty, int32; see
-            ``kernels.contact.meetings``.
+        begins: Nonzero if this is a first step, int32 [1].
+        touched: What each node has touched, in schemes of second order, else empty, int32; see
+            ``kernels.contact.onsets``.
         preconditioner: That of its own matrix.
         newton: Newton's method, or the residual of a linearisation.
     """
@@ -126,9 +126,7 @@ class BodySteps:
         self.body, self.field, self.system = system.bodies[k], system.fields[k], system
         self.device = self.body.device
         self.viscosity = Viscosity(self.body, self.field, options.viscosity) if options.viscosity else None
-        sets = [each.active_set(k) for each in shared.touching]
-        self.held: ObstacleContact | None = next((each for each in sets if each is not None), None)
-        touches = self.held is not None or shared.rows is not None
+        touches = shared.contact is not None
         # Contact needs a matrix that is positive definite.
         exact = options.tolerance is not None and not touches
         self.operator = TangentOperator(
@@ -148,14 +146,13 @@ class BodySteps:
         self._left = [wp.full_like(like, np.nan) if wanted else self._none for _ in range(2)]
         self.history = [*self._h[:wanted], *(self._left if wanted else [])]
         self.before = wp.full_like(like, np.nan)
-        kept = [len(like) if wanted and each is not None else 0 for each in (self.held, shared.rows)]
-        self.met, self.touched = (wp.zeros(length, dtype=wp.int32, device=self.device) for length in kept)
+        self.touched = wp.zeros(len(like) if wanted and touches else 0, dtype=wp.int32, device=self.device)
         self._drift, self._rates = (self._none if self.viscosity is None else wp.zeros_like(like) for _ in range(2))
         if self.viscosity is not None and options.turns:
             # Halfway through a turn, where the motion of the step has no strain.
             self.operator.frame = wp.zeros_like(like)
         self._moves = wp.zeros(1, dtype=wp.int32, device=self.device)
-        self._begins = wp.zeros(1, dtype=wp.int32, device=self.device) if shared.rows is None else shared.begins
+        self.begins = shared.begins if shared.couples else wp.zeros(1, dtype=wp.int32, device=self.device)
         tables = np.stack([options.scheme(options.dt), options.start(options.dt)])
         if touches:
             # The increments of a step with contact begin with zero.
@@ -190,10 +187,9 @@ class BodySteps:
             self.preconditioner.prepare()
         elif isinstance(self.preconditioner, Multigrid):
             self.preconditioner.follow()
-        if self.held is not None:
-            self.held.prepare()
-            if self.held.springs is not None and hasattr(self.preconditioner, "follow_springs"):
-                self.preconditioner.follow_springs(self.held.springs)
+        contact, alone = self.shared.contact, self.system.ranks.is_alone
+        if contact is not None and alone and hasattr(self.preconditioner, "follow_springs"):
+            self.preconditioner.follow_springs(contact.springs(self.k))
         if self.shared.holds and self.shared.integrator.is_at_stage:
             raise InputError("GeneralizedAlpha supports grasps only with spectral_radius=0")
         self.operator.stiff_forces = (
@@ -210,17 +206,13 @@ class BodySteps:
         self.body.conditions.follow_activations(self.system.pace, offset + 1)
         body, system = self.body, self.system
         body.conditions.follow_trajectories(system.pace, offset, system.support_work_of(body))
-        if self.shared.rows is None:
-            wp.copy(self._begins, self.shared.sturdy)
+        if not self.shared.couples:
+            wp.copy(self.begins, self.shared.sturdy)
         if not self.history:
             return
         state = self.body.state
         inputs = [self.body.conditions.inverse_mass, state.displacements, state.velocities, *self._left]
-        self._launch(kernels.find_changes, inputs, [self._begins])
-        if self.held is not None:
-            # Velocities jump when nodes meet obstacles, so schemes of second order begin again.
-            self.held.launch_meetings(self.met, self._begins)
-        self.system.ranks.max(self._begins)
+        self._launch(kernels.find_changes, inputs, [self.begins])
 
     def launch_end(self, offset: int, counts: StepCounts, *, is_last: bool) -> None:
         """Launch the state after the step, and the count of its iterations.
@@ -249,13 +241,13 @@ class BodySteps:
             self.newton,
             self.shared.integrator,
         )
-        inputs = [self._begins, self._table, options.damping]
+        inputs = [self.begins, self._table, options.damping]
         outputs = [self.operator.scales, newton.inertia, newton.share]
         wp.launch(kernels.choose_scales, 1, inputs, outputs, device=self.device)
         if self.field.elapsed is not None:
-            inputs = [self._begins, self._table, int(kernels.STAGE), options.dt]
+            inputs = [self.begins, self._table, int(kernels.STAGE), options.dt]
             wp.launch(set_elapsed, 1, inputs, [self.field.elapsed], device=self.device)
-        inputs = [self._begins, self._table, options.dt, options.damping, conditions.inverse_mass]
+        inputs = [self.begins, self._table, options.dt, options.damping, conditions.inverse_mass]
         inputs += [state.velocities, *self._h]
         outputs = [state.displacements, self.before, newton.base, newton.increment, newton.pull]
         outputs += [newton.step, self._drift]
@@ -279,8 +271,8 @@ class BodySteps:
         """Launch the state after the step, and the work of forces."""
         body, system, newton = self.body, self.system, self.newton
         state, conditions = body.state, body.conditions
-        inputs = [self._begins, self._table, self.operator.node_count, status, conditions.inverse_mass]
-        rests = self.shared.integrator.settles_contact and (self.held is not None or self.shared.rows is not None)
+        inputs = [self.begins, self._table, self.operator.node_count, status, conditions.inverse_mass]
+        rests = self.shared.integrator.settles_contact and self.shared.contact is not None
         inputs += [newton.base, newton.increment, state.contact_forces if rests else self._none]
         inputs += [system.pace.arrays, offset]
         outputs = [state.velocities, *self._h, state.displacements, *self._left, system.bad_step, self._moves]

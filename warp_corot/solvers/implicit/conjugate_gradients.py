@@ -1,19 +1,95 @@
-"""Preconditioned conjugate gradients as launches: the host reads no scalar, so that a solve can be recorded."""
+"""Preconditioned conjugate gradients and line searches as launches: the host reads no scalar."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import numpy.typing as npt
 import warp as wp
 
 from warp_corot.kernels.implicit import conjugate_gradients as kernels
+from warp_corot.kernels.implicit import line_search as searches
+from warp_corot.kernels.implicit.conjugate_gradients import sum_products
 from warp_corot.solvers.halo import ALONE, Halo
 
 from .operator import Preconditioner, Product
-from .sums import WorldSums
+
+if TYPE_CHECKING:
+    from .contact_constraints import Contact
+
+#: Number of lanes in a warp, minimum number of nodes of a thread, and maximum number of warps of all worlds.
+WARP, NODES, WARPS = 32, 4, 512
+
+
+class WorldSums:
+    """Arrays for sums, and the sizes of their launches.
+
+    Args:
+        worlds: Number of worlds.
+        count: Number of nodes in each.
+        columns: Number of sums.
+        device: The device.
+        ranks: The ranks with other nodes of the same worlds.
+        most: Maximum number of warps of all worlds.
+
+    Attributes:
+        parts: Parts of the sums, float64 [worlds, parts, columns].
+        shape: The threads of a launch over all nodes [2].
+        sizes: The arguments count, threads and lanes of its kernel.
+    """
+
+    def __init__(
+        self, worlds: int, count: int, columns: int, device: wp.Device, ranks: Halo = ALONE, most: int = WARPS
+    ):
+        self.device, self.worlds, self._ranks = device, worlds, ranks
+        self.lanes = 1 if device.is_cpu or ranks.is_reproducible else WARP
+        wanted = -(-count // (NODES * WARP))
+        warps = 1 if device.is_cpu else max(min(wanted, most // worlds), 1)
+        if ranks.is_reproducible:
+            # Every node is an addend, because their sums are the same in any order.
+            warps = count
+        threads = warps * self.lanes
+        self.parts = wp.zeros((worlds, warps, columns), dtype=wp.float64, device=device)
+        self.shape, self.sizes = (worlds, threads), [count, threads, self.lanes]
+
+    def launch_products(self, a: wp.array, b: wp.array, column: int) -> None:
+        """Launch a . b of each world, vec4."""
+        inputs = [a, b, *self.sizes, column]
+        wp.launch(sum_products, self.shape, inputs, [self.parts], device=self.device)
+        self.take_in(column)
+
+    def take_in(self, *columns: int, most: bool = False) -> None:
+        """Launch the replacement of columns of new parts by those of all ranks.
+
+        Args:
+            columns: The numbers of the columns.
+            most: Whether their largest parts are asked for, not their sums.
+        """
+        if not self._ranks.is_alone:
+            take_in(self.parts, list(columns), self._ranks, most=most)
+
+    def launch_scalars(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
+        """Launch a kernel that adds the parts up, with the lanes of a warp for each world."""
+        dim = (self.worlds, self.lanes)
+        wp.launch(kernel, dim, [self.parts, self.lanes, *inputs], outputs, device=self.device)
+
+
+def take_in(parts: wp.array, columns: list[int], ranks: Halo, *, most: bool = False) -> None:
+    """Launch the replacement of columns of partial sums, float64 [worlds, parts, columns], by those of all ranks: their
+    sums, or the largest values with ``most``, are in the first part."""
+    values = parts.numpy()
+    own = values[:, :, columns]
+    if most:
+        total = ranks.max(own.max(axis=1))
+    else:
+        total = ranks.sum(own.sum(axis=1), np.moveaxis(own, 1, 0) if ranks.is_reproducible else None)
+    values[:, :, columns] = 0.0
+    values[:, 0, columns] = total
+    if parts.device.is_cuda:
+        parts.assign(values)
 
 
 @dataclass(frozen=True)
@@ -143,3 +219,90 @@ class ConjugateGradients:
             negative=status == int(kernels.NEGATIVE),
             broken=status == int(kernels.BROKEN),
         )
+
+
+class Contacts(Protocol):
+    """Forces of contacts as functions of the motions in a step."""
+
+    def add_slopes(self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array) -> None:
+        """Launch the addition of the contacts' power along a change from motions d, at the share in ``search``, to
+        ``slopes``, float64 [worlds]."""
+        ...
+
+
+class LineSearch:
+    """Finds how much of a change of the motions to take, in each world.
+
+    Args:
+        worlds: Number of worlds.
+        count: Number of entries of each world.
+        contacts: The contacts that open and close.
+        device: The device.
+    """
+
+    _ranks: Halo = ALONE
+
+    def __init__(self, worlds: int, count: int, contacts: Contacts, device: wp.Device):
+        self._worlds, self._count, self._contacts, self.device = worlds, count, contacts, device
+        self._power, self._loss = (WorldSums(worlds, count, 1, device, self._ranks) for _ in range(2))
+        self._search = wp.zeros((worlds, searches.COLUMNS), dtype=wp.float64, device=device)
+        self._slopes = wp.zeros(worlds, dtype=wp.float64, device=device)
+        self._searching = wp.zeros(1, dtype=wp.int32, device=device)
+
+    def _add_slopes(self, d: wp.array, change: wp.array) -> None:
+        self._contacts.add_slopes(d, change, self._search, self._slopes)
+
+    def launch(
+        self, rest: wp.array, product: wp.array, change: wp.array, d: wp.array, image: wp.array | None = None
+    ) -> None:
+        """Launch d += share of the change.
+
+        Args:
+            rest: b - A d, where A has no contacts.
+            product: A times the change.
+            change: The change, zero at entries that are not free.
+            d: Motions.
+            image: A d, which follows.
+        """
+        self._power.launch_products(change, rest, 0)
+        self._loss.launch_products(change, product, 0)
+        lanes = self._power.lanes
+        inputs = [self._power.parts, self._loss.parts, lanes]
+        outputs = [self._search, self._slopes, self._searching]
+        wp.launch(searches.begin_search, (self._worlds, lanes), inputs, outputs, device=self.device)
+        wp.capture_while(self._searching, self._try, d=d, change=change)
+        for increase, grown in ((change, d), (product, image)):
+            if grown is not None:
+                inputs = [self._search, self._count, increase, grown]
+                self._launch(searches.add_share, self._worlds * self._count, inputs)
+
+    def _try(self, d: wp.array, change: wp.array) -> None:
+        self._add_slopes(d, change)
+        self._launch(searches.take_trial, self._worlds, [self._search, self._slopes, self._searching])
+
+    def _launch(self, kernel: wp.Kernel, dim: int, inputs: list) -> None:
+        wp.launch(kernel, dim, inputs, device=self.device)
+
+
+class SharedLineSearch(LineSearch):
+    """A line search of several ranks, all of which find the same share.
+
+    Args:
+        worlds, count, contacts, device: As for ``LineSearch``.
+        body: The number of the body.
+        ranks: The ranks with the other entries of each world.
+    """
+
+    def __init__(self, worlds: int, count: int, contacts: Contact, body: int, device: wp.Device, ranks: Halo):
+        self._ranks, self._apart, self._body = ranks, contacts, body
+        super().__init__(worlds, count, contacts, device)
+        # The sums of worlds are in the first places.
+        self._addends = wp.zeros(
+            (worlds, max(contacts.places_of(body) // worlds, 1), 1), dtype=wp.float64, device=device
+        )
+        self._slopes = self._addends[:, 0, 0]
+
+    def _add_slopes(self, d: wp.array, change: wp.array) -> None:
+        self._addends.zero_()
+        self._apart.add_slopes(d, change, self._search, self._addends.flatten(), apart=self._body)
+        take_in(self._addends, [0], self._ranks)

@@ -14,8 +14,8 @@ from warp_corot.kernels.implicit.increments import move_held
 from warp_corot.kernels.implicit.residual import FIND_RESIDUAL
 
 from .block_system import BlockSystem
-from .sums import WorldSums
-from .turning import TurnedState
+from .conjugate_gradients import WorldSums
+from .tangent import TurnedState
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

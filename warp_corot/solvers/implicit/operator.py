@@ -7,11 +7,13 @@ that take vectors launch kernels and do not wait for the device, so that a solve
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import warp as wp
+
+if TYPE_CHECKING:
+    pass
 
 
 class Product(Protocol):
@@ -95,10 +97,8 @@ class Springs:
         nodes: The nodes that bear each place, numbered in all worlds, -1 for none, vec4i [S].
         weights: Their shares, vec4 [S].
         stiffness: Of the springs there, zero where there is none, mat33 [S] [N/m].
-        update: Launches the stiffness of the present springs.
     """
 
     nodes: wp.array
     weights: wp.array
     stiffness: wp.array
-    update: Callable[[], None]

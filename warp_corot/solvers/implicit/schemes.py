@@ -13,7 +13,7 @@ import numpy.typing as npt
 from warp_corot.errors import InputError
 from warp_corot.inputs.checks import checked_count, checked_number
 from warp_corot.kernels.implicit import steps as kernels
-from warp_corot.solvers.integrator import Integrator, Stepper
+from warp_corot.solvers.system import Integrator, Stepper
 
 from .preconditioners import check_preconditioner
 

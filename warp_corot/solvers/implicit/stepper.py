@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -9,20 +10,118 @@ import warp as wp
 
 from warp_corot.inputs.loading import load
 from warp_corot.kernels.implicit import conjugate_gradients
+from warp_corot.kernels.implicit import increments as kernels
 from warp_corot.kernels.implicit import newton as kernels_of_newton
-from warp_corot.solvers.integrator import Stepper
+from warp_corot.solvers.system import Stepper
 
 from .assembled import AssembledSolve, suits
 from .block_system import BlockSystem, VectorBlocks
 from .body_steps import BodySteps, SharedSteps, StepCounts
-from .chosen import ChosenSolve
-from .lagged import Lagged
-from .linearised_step import LinearisedStep
+from .contact_solve import ContactSolve
+from .preconditioners import ChosenSolve, Lagged
 
 if TYPE_CHECKING:
     from warp_corot.solvers.system import System
 
+    from .newton import Newton
     from .schemes import ImplicitIntegrator
+
+
+class LinearisedStep:
+    """Solves for the increments of all bodies of a system.
+
+    Without contact there is one linearisation, and its unknown is what increments change by. With contact they begin
+    with zero at free nodes, and the unknown of each linear problem is the whole motion d of the step: A d = r(d0) + A
+    d0 + contact, with the residual r and its derivative -A at the motion d0 so far. So contact has the same unknowns in
+    each of them. Where a scheme balances forces at a stage before the end of the step, increments are those of the
+    stage, a share of d. Contact is that of the end of the step, with its whole force in the balance.
+
+    Args:
+        system: The linear system.
+        newtons: Newton's method of each body, whose residuals are used.
+        tolerance: The iteration ends once no increment changes by more than this share of the largest displacement.
+        most: Maximum number of linearisations.
+
+    Attributes:
+        iterations, linear_iterations, status: Of the step, as in ``kernels.implicit.conjugate_gradients``, int32
+            [worlds].
+    """
+
+    def __init__(self, system: BlockSystem, newtons: list[Newton], *, tolerance: float | None, most: int):
+        self._system, self._newtons, self.device = system, newtons, system.device
+        self._tolerance, self._most = math.inf if tolerance is None else tolerance, 1 if tolerance is None else most
+        self._contact = None if system.contact is None else ContactSolve(system, newtons)
+        self.iterations = wp.ones(system.worlds, dtype=wp.int32, device=self.device)
+        self.linear_iterations, self.status = system.solver.iterations, system.solver.status
+        if self._contact is not None:
+            self.linear_iterations = self._contact.iterations
+        repeats = self._most > 1
+        self._sizes = wp.zeros((system.worlds * repeats, kernels.COLUMNS), dtype=wp.float32, device=self.device)
+        if repeats:
+            self._product = wp.zeros_like(system.x)
+            self.iterations, self.linear_iterations, self.status = (
+                wp.zeros(system.worlds, dtype=wp.int32, device=self.device) for _ in range(3)
+            )
+            self._going = wp.zeros(1, dtype=wp.int32, device=self.device)
+
+    def launch(self, offset: int) -> None:
+        """Launch the increments and displacements of the ``offset``-th step, from a guess of the unknowns."""
+        self._linearise()
+        if self._contact is None:
+            self._system.solve(guessed=True)
+            self._take_increments()
+            return
+        self._contact.launch_begin(offset)
+        self._contact.launch()
+        self._take_increments()
+        if self._most > 1:
+            self.iterations.zero_()
+            self.linear_iterations.zero_()
+            self._judge()
+            wp.capture_while(self._going, self._go_on)
+        self._contact.launch_end()
+
+    def _linearise(self) -> None:
+        for newton in self._newtons:
+            newton.launch_residual()
+        for newton in self._newtons:
+            newton.linearise()
+        self._system.update()
+
+    def _go_on(self) -> None:
+        assert self._contact is not None
+        self._linearise()
+        system = self._system
+        for newton in self._newtons:
+            inputs = [newton.body.conditions.inverse_mass, newton.share, newton.increment]
+            self._launch(kernels.take_free, inputs, [newton.step])
+        system.apply_bodies(system.x, self._product)
+        self._launch(kernels.add_product, [self._product], [system.b])
+        self._contact.launch()
+        self._take_increments()
+        self._judge()
+
+    def _take_increments(self) -> None:
+        self._sizes.zero_()
+        ranks = self._system.ranks
+        for newton in self._newtons:
+            body = newton.body
+            inputs = [int(self._contact is None), newton.operator.node_count, body.conditions.inverse_mass]
+            inputs += [newton.base, newton.share, newton.step]
+            self._launch(kernels.take_increments, inputs, [newton.increment, body.state.displacements, self._sizes])
+            ranks.exchange(newton.operator.number, body.state.displacements)
+
+    def _judge(self) -> None:
+        """Launch the decision whether another linearisation follows."""
+        assert self._contact is not None
+        self._system.ranks.max(self._sizes.flatten())
+        self._going.zero_()
+        inputs = [self._sizes, self._contact.iterations, self._system.solver.status, self._tolerance, self._most]
+        outputs = [self.iterations, self.linear_iterations, self.status, self._going]
+        wp.launch(kernels.judge_increments, len(self.status), inputs, outputs, device=self.device)
+
+    def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, len(outputs[0]), inputs, outputs, device=self.device)
 
 
 class ImplicitStepper(Stepper):
@@ -47,7 +146,7 @@ class ImplicitStepper(Stepper):
         self.totals = self.shared.totals
         self._is_sturdy = False
         self._bodies = [BodySteps(self.shared, k) for k in range(len(system.bodies))]
-        coupled = [[body] for body in self._bodies] if self.shared.rows is None else [self._bodies]
+        coupled = [self._bodies] if self.shared.couples else [[body] for body in self._bodies]
         self._solves = [StepSolve(self.shared, bodies) for bodies in coupled]
 
     @property
@@ -55,7 +154,6 @@ class ImplicitStepper(Stepper):
         arrays = enumerate(array for body in self._bodies for array in body.history)
         kept = {f"history.{number}": array for number, array in arrays}
         kept |= {f"velocities.{k}": body.before for k, body in enumerate(self._bodies)}
-        kept |= {f"meetings.{k}": body.met for k, body in enumerate(self._bodies) if body.met.size}
         kept |= {f"touched.{k}": body.touched for k, body in enumerate(self._bodies) if body.touched.size}
         states = [
             (k, body.preconditioner.state)
@@ -66,10 +164,10 @@ class ImplicitStepper(Stepper):
         return kept | {f"setup.{k}.{name}": array for k, state in states for name, array in state.items()}
 
     def prepare(self) -> None:
+        if self.shared.contact is not None:
+            self.shared.contact.prepare()
         for solve in self._solves:
             solve.prepare()
-        if self.shared.rows is not None:
-            self.shared.rows.prepare()
 
     def continue_from(self, other: Stepper) -> None:
         assert isinstance(other, ImplicitStepper)
@@ -117,8 +215,7 @@ class StepSolve:
 
     def __init__(self, shared: SharedSteps, bodies: Sequence[BodySteps]):
         self._shared, self._bodies, self._versions = shared, list(bodies), [-1]
-        self._soft = shared.rows
-        self._touches = shared.rows is not None or bodies[0].held is not None
+        self._touches = shared.contact is not None
         self.choice = self._made_choice()
 
     def _made_choice(self) -> ChosenSolve | None:
@@ -128,7 +225,7 @@ class StepSolve:
         if options.preconditioner is not None or len(lagged) < len(bodies) or not all(map(suits, operators)):
             return None
         blocks = VectorBlocks([len(operator.inverse_mass) for operator in operators])
-        assembled = AssembledSolve(operators, blocks, together=self._soft is not None, touches=self._touches)
+        assembled = AssembledSolve(operators, blocks, together=self._shared.couples, touches=self._touches)
         load((), assembled.device, assembled.kernels)
         shares = any(body.field.shares_dilatation for body in bodies)
         return ChosenSolve(assembled, operators, lagged, shares=shares, dt=options.dt)
@@ -158,8 +255,8 @@ class StepSolve:
         self._system = BlockSystem(
             [body.operator for body in bodies],
             [body.preconditioner for body in bodies],
-            contacts=[body.held for body in bodies],
-            soft=self._soft,
+            contact=self._shared.contact,
+            couples=self._shared.couples,
             choice=self.choice,
             most=options.linear_iterations,
             ranks=self._shared.system.ranks,
@@ -182,19 +279,21 @@ class StepSolve:
     def launch(self, offset: int, *, is_last: bool) -> None:
         """Launch the ``offset``-th step since the clock was last advanced; ``is_last`` as for ``BodySteps``."""
         bodies, shared = self._bodies, self._shared
-        if self._soft is not None:
+        if shared.couples:
             wp.copy(shared.begins, shared.sturdy)
         for body in bodies:
             body.launch_changes(offset)
-        touched = [body.touched for body in bodies]
-        keeps = self._soft is not None and shared.integrator.history > 0
-        if self._soft is not None and keeps:
-            self._soft.launch_meetings(offset, touched, shared.begins)
+        # Velocities jump when bodies meet things, so schemes of second order begin again.
+        touched, contact = [body.touched for body in bodies], shared.contact if shared.integrator.history else None
+        if contact is not None:
+            contact.launch_onsets(offset, touched, bodies[0].begins)
+        if shared.integrator.history:
+            shared.system.ranks.max(bodies[0].begins)
         for body in bodies:
             body.launch_begin()
         self._solve(offset)
-        if self._soft is not None and keeps:
-            self._soft.launch_touched(touched)
+        if contact is not None:
+            contact.launch_touched(touched)
         for body in bodies:
             body.launch_end(offset, self._counts, is_last=is_last)
 

@@ -16,7 +16,7 @@ from warp_corot.io.files.usd import reason, usd_name
 from warp_corot.io.files.whole import sync
 from warp_corot.io.pictures.colors import VertexAverage, color_index
 from warp_corot.io.read.usd.scene import Scene, TetPrim
-from warp_corot.mesh.surfaces.boundary import boundary_faces, signed_volumes
+from warp_corot.mesh.topology import boundary_faces, signed_volumes
 
 from .pieces import ColoredStage, Samples
 from .prims import declare_moving, declare_tet_stress, drawn_material, extent

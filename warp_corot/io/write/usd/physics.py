@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 
-from warp_corot.contact.sampled import TriangleMesh
-from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, Shape, Sphere
+from warp_corot.contact.shapes import Box, Capsule, Cylinder, Ground, Shape, Sphere, TriangleMesh
 from warp_corot.contact.tool import Obstacle, Tool
 from warp_corot.io.files.usd import free_name
 from warp_corot.io.pictures.colors import STEEL, srgb_to_linear

@@ -15,7 +15,7 @@ from warp_corot.io.files.usd import free_name
 from warp_corot.io.pictures.colors import TISSUE, VertexAverage, color_index, srgb_to_linear, stress_colors
 from warp_corot.io.write.skins import Skin
 from warp_corot.mesh.surfaces.bound import vertex_normals
-from warp_corot.mesh.surfaces.boundary import boundary_faces, signed_volumes
+from warp_corot.mesh.topology import boundary_faces, signed_volumes
 
 from .pieces import Samples
 

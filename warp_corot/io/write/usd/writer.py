@@ -13,7 +13,7 @@ from warp_corot.errors import InputError
 from warp_corot.io.pictures.colors import VertexAverage
 from warp_corot.io.write.animate import KEY
 from warp_corot.io.write.skins import Skin
-from warp_corot.mesh.surfaces.boundary import right_handed, signed_volumes
+from warp_corot.mesh.topology import right_handed, signed_volumes
 
 from .physics import ObstaclePrim, declare_physics, obstacle_prims
 from .pieces import ColoredStage, Samples

@@ -1,14 +1,24 @@
-"""One level: its matrix, the vectors of the cycle, and the launches from it to the next coarser one."""
+"""The levels of multigrid: matrices, the vectors of the cycle, smoothers, and the launches from one to the next."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Hashable
+from typing import Any, cast
 
+import numpy as np
 import warp as wp
 
-from warp_corot.kernels.implicit.multigrid import cycle, shared, values
+from warp_corot.discretization.discretization import Discretization
+from warp_corot.discretization.groups import Members
+from warp_corot.inputs.cpu_threads import Regions, launch
+from warp_corot.kernels.elements.dilatation import not_held
+from warp_corot.kernels.elements.elements import ForestElements
+from warp_corot.kernels.implicit.multigrid import cycle, dense, values
+from warp_corot.kernels.implicit.multigrid import pattern as kernels
+from warp_corot.kernels.tables.shapes import GRADIENT
+from warp_corot.solvers.implicit.operator import LinearOperator
 
-from .pattern import Midpoints, Pattern
+from .pattern import Midpoints, Pattern, PatternFinder
 
 #: A bound on the eigenvalues of D^-1 A: every part of A is positive semidefinite and couples four nodes.
 LARGEST_EIGENVALUE = 4.0
@@ -51,6 +61,7 @@ class SmoothedLevel:
         inverses: Inverses of the diagonal blocks, mat33 [worlds * n].
         r, z, other: Residual, correction, and a vector to work with, vec4 [worlds * n].
         factors: The factors of the smoother's steps; none: the level only passes its residual on.
+        arrays: The arguments of kernels.
     """
 
     def __init__(self, count: int, worlds: int, ranks: int, free: wp.array, degree: int):
@@ -58,6 +69,9 @@ class SmoothedLevel:
         self.inverses = wp.zeros(worlds * count, dtype=wp.mat33, device=self.device)
         self.r, self.z, self.other = (wp.zeros(worlds * count, dtype=wp.vec4, device=self.device) for _ in range(3))
         self.factors = smoothing_factors(degree)
+        self.arrays = cycle.LevelArrays()
+        self.arrays.count, self.arrays.ranks, self.arrays.free = count, ranks, free
+        self.arrays.inverses, self.arrays.r = self.inverses, self.r
 
     def take_in(self, mesh_nodes: int, nodes: wp.array, given: wp.array) -> None:
         """Launch the finest level's residual, and the smoother's first step.
@@ -67,13 +81,11 @@ class SmoothedLevel:
             nodes: The node number of each rank, int32.
             given: The residual by number, vec4.
         """
-        inputs = [self.count, mesh_nodes, self._first_factor, nodes, self.free, self.inverses, given]
-        self._move(cycle.take_in, self.count, inputs, [self.r, self.z])
+        self._move(cycle.take_in, [mesh_nodes, self._first_factor, nodes, given], self.z)
 
     def hand_out(self, mesh_nodes: int, nodes: wp.array, given: wp.array, result: wp.array) -> None:
         """Launch the finest level's correction by number; held nodes have what is given."""
-        inputs = [self.count, mesh_nodes, nodes, self.free, given, self.z]
-        self._move(cycle.hand_out, self.count, inputs, [result])
+        self._move(cycle.hand_out, [mesh_nodes, nodes, given, self.z], result)
 
     def smooth_before(self) -> None:
         """Smooth from zero; ``z`` already has the first step."""
@@ -101,24 +113,22 @@ class SmoothedLevel:
         if fine.factors:
             fine.find_residual()
         residual = fine.other if fine.factors else fine.r
-        inputs: list[Any] = [self.ranks, self.count, fine.count, self._first_factor, self.free]
-        inputs += [midpoints.starts, midpoints.midpoints, self.inverses, residual]
-        self._move(cycle.restrict_residual, self.count, inputs, [self.r, self.z])
+        inputs = [fine.count, self._first_factor, midpoints.starts, midpoints.midpoints, residual]
+        self._move(cycle.restrict_residual, inputs, self.z)
 
     def take_correction(self, coarse: SmoothedLevel, ends: wp.array) -> None:
         """Add the correction of the coarser level to this one's."""
-        inputs = [self.ranks, coarse.count, self.count, self.free, ends, coarse.z]
-        self._move(cycle.prolongate_correction, self.count, inputs, [self.z])
+        self._move(cycle.prolongate_correction, [coarse.count, ends, coarse.z], self.z)
 
     @property
     def _first_factor(self) -> float:
         """The factor of the smoother's first step from zero; zero: none is made."""
         return self.factors[0][0] if self.factors else 0.0
 
-    def _move(self, kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any]) -> None:
-        """Launch a kernel whose threads share ``count`` nodes of each world; on a CPU there is one."""
-        threads = 1 if self.device.is_cpu else count
-        self.launch(kernel, threads, [threads, *inputs], outputs)
+    def _move(self, kernel: wp.Kernel, inputs: list[Any], output: wp.array) -> None:
+        """Launch a kernel whose threads share the nodes of each world; on a CPU there is one."""
+        threads = 1 if self.device.is_cpu else self.count
+        self.launch(kernel, threads, [threads, self.arrays, *inputs], [output])
 
     def launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any]) -> None:
         """Launch a kernel with ``count`` threads for each world."""
@@ -136,7 +146,6 @@ class Level(SmoothedLevel):
 
     Attributes:
         blocks: Values of the entries, transposed, mat33 [worlds * entries + 1].
-        lanes: Number of threads that share a row.
     """
 
     def __init__(
@@ -149,42 +158,218 @@ class Level(SmoothedLevel):
         is_bounded: bool = False,
     ):
         super().__init__(pattern.count, worlds, ranks, free, degree)
-        self.pattern = pattern
+        self.pattern, arrays = pattern, self.arrays
         # One more, since products read past the last.
         self.blocks = wp.zeros(worlds * pattern.entries + 1, dtype=wp.mat33, device=self.device)
-        self.rows = cycle.Rows()
-        self.rows.starts, self.rows.columns, self.rows.blocks = pattern.starts, pattern.columns, self.blocks
-        self._unbounded = wp.zeros_like(self.inverses) if is_bounded else None
         rows = worlds * self.count
-        self.lanes = next((lanes for most, lanes in LANES if rows > most), MOST_LANES)
+        lanes = next((lanes for most, lanes in LANES if rows > most), MOST_LANES)
+        arrays.entries, arrays.lanes, arrays.diagonal = pattern.entries, lanes, pattern.diagonal
         if self.device.is_cpu:
-            self.lanes = 1
+            arrays.lanes = 1
+        arrays.rows.starts, arrays.rows.columns, arrays.rows.blocks = pattern.starts, pattern.columns, self.blocks
+        self._unbounded = wp.zeros_like(self.inverses) if is_bounded else None
 
     def find_residual(self) -> None:
-        inputs = [self.lanes, self.count, self.pattern.entries, self.rows, self.r, self.z]
-        self.launch(cycle.find_residual, self.count * self.lanes, inputs, [self.other])
+        self.launch_rows(cycle.find_residual, [self.z], [self.other])
 
     def _make_step(self, step: int, *, is_first: bool) -> None:
         alpha, beta = self.factors[step]
-        inputs: list[Any] = [self.lanes, self.count, self.pattern.entries]
-        inputs += [alpha, beta if step else 0.0, is_first, self.rows, self.inverses, self.r, self.z]
-        self.launch(cycle.smooth, self.count * self.lanes, inputs, [self.other])
+        self.launch_rows(cycle.smooth, [alpha, beta if step else 0.0, is_first, self.z], [self.other])
         self.z, self.other = self.other, self.z
+
+    def launch_rows(self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any]) -> None:
+        """Launch a kernel with the threads of each row."""
+        self.launch(kernel, self.count * self.arrays.lanes, [self.arrays, *inputs], outputs)
 
     def gather_from(self, fine: SmoothedLevel) -> None:
         """Compute the matrix P^T A P from the finer level's matrix A."""
-        assert isinstance(fine, Level)
-        pattern = self.pattern
         lanes = 1 if self.device.is_cpu else GATHERING_LANES
-        inputs = [lanes, self.ranks, self.count, pattern.entries, fine.pattern.entries, self.free, pattern.upper]
-        inputs += [pattern.sum_starts, pattern.codes, pattern.places, fine.blocks]
-        self.gather(values.gather_products, inputs, lanes)
+        self.gather(values.gather_products, [lanes, self.arrays, self.pattern.sums, fine.arrays], lanes)
 
     def gather(self, kernel: wp.Kernel, inputs: list[Any], lanes: int = 1) -> None:
         """Launch a kernel that computes blocks and inverses, with some threads for each entry of the upper triangle."""
-        pattern = self.pattern
         inverses = self.inverses if self._unbounded is None else self._unbounded
-        self.launch(kernel, lanes * len(pattern.upper), inputs, [self.blocks, inverses])
+        self.launch(kernel, lanes * len(self.pattern.sums.upper), inputs, [inverses])
         if self._unbounded is not None:
-            inputs = [self.count, pattern.entries, pattern.starts, pattern.columns, self.blocks, inverses]
-            self.launch(shared.bound_diagonal, self.count, inputs, [self.inverses])
+            self.launch(kernels.bound_diagonal, self.count, [self.arrays, inverses], [])
+
+
+class SweptLevel(Level):
+    """A level with sweeps in place of Chebyshev's iteration. Smoothing after is the transpose of smoothing before.
+
+    Args:
+        pattern, worlds, ranks, free: As for every level.
+        sweeps: With one, a sweep forward before and one back after; with more, so many pairs of a sweep forward and one
+            back, before and after.
+    """
+
+    def __init__(self, pattern: Pattern, worlds: int, ranks: int, free: wp.array, sweeps: int):
+        super().__init__(pattern, worlds, ranks, free, degree=1)
+        self._is_one = sweeps == 1
+        self._ways = [cycle.BACKWARD] if self._is_one else [cycle.FORWARD, cycle.BACKWARD] * sweeps
+
+    def smooth_before(self) -> None:
+        self._sweep(cycle.FROM_ZERO, *([] if self._is_one else self._ways[1:]))
+
+    def smooth_after(self) -> None:
+        self._sweep(*self._ways)
+
+    def find_residual(self) -> None:
+        self._sweep(cycle.RESIDUAL_LEFT if self._is_one else cycle.RESIDUAL)
+
+    @property
+    def _first_factor(self) -> float:
+        """Zero: sweeps begin by themselves."""
+        return 0.0
+
+    def _sweep(self, *kinds: int) -> None:
+        for kind in kinds:
+            inputs = [kind, self.arrays, self.z, self.other]
+            wp.launch(cycle.sweep, self.worlds, inputs, device=self.device)
+
+
+class DenseInverse:
+    """The inverse of a level's matrix, float32 [worlds, 3 n, 3 n]."""
+
+    def __init__(self, level: Level):
+        self.level = level
+        size, worlds, device = 3 * level.count, level.worlds, level.device
+        self._matrix = wp.zeros((worlds, size, size), dtype=wp.float64, device=device)
+        self._scale, self._rows = (wp.zeros((worlds, size), dtype=wp.float64, device=device) for _ in range(2))
+        self.inverse = wp.zeros((worlds, size, size), dtype=wp.float32, device=device)
+
+    def update(self) -> None:
+        """Launch the inversion of the present matrix."""
+        level = self.level
+        self._matrix.zero_()
+        level.launch_rows(dense.fill_dense, [], [self._matrix, self._scale])
+        if level.device.is_cuda:
+            kernel, block = dense.invert_in_registers, dense.SWEEPERS
+            wp.launch(kernel, level.worlds * block, [self._matrix], device=level.device, block_dim=block)
+        else:
+            wp.launch(dense.invert_dense, level.worlds, [self._matrix, self._rows], device=level.device)
+        shape = self.inverse.shape
+        inputs = [self._matrix, self._scale]
+        wp.launch(dense.store_inverse, dim=shape, inputs=inputs, outputs=[self.inverse], device=level.device)
+
+    def solve(self) -> None:
+        """Launch z = inverse r."""
+        self.level.launch_rows(dense.apply_dense, [self.inverse], [self.level.z])
+
+
+class LeafMatrix:
+    """What the matrix is computed from, and the launches that compute it.
+
+    Args:
+        discretization: The mesh and the material.
+        finder: Finds the pattern.
+        nodes: The number of each row's node, int32 [rows].
+        rank: The row of each node number, int32.
+        mesh_nodes: Number of nodes of the mesh.
+        free: Nonzero for free nodes, by row, uint8 [worlds * rows].
+        members: The groups of elements that share their dilatation, or None.
+        is_turned: Whether elements turn; False: linear elasticity.
+        is_bounded: Whether the inverses of diagonal blocks keep the bound of ``kernels.implicit.multigrid.pattern``.
+
+    Attributes:
+        pattern: Where entries are.
+    """
+
+    def __init__(
+        self,
+        discretization: Discretization,
+        finder: PatternFinder,
+        nodes: wp.array,
+        rank: wp.array,
+        mesh_nodes: int,
+        free: wp.array,
+        members: Members | None,
+        *,
+        is_turned: bool = True,
+        is_bounded: bool = False,
+    ):
+        self._discretization, self.device, sizes = discretization, discretization.device, discretization.sizes
+        self._nodes, self._rank, self._mesh_nodes, self._free, self._members = nodes, rank, mesh_nodes, free, members
+        self._write_frames = values.write_frames(is_turned)
+        self._regions = Regions(discretization.team, self.device)
+        self.pattern, self._pairs = finder.of_leaves(self._elements.nodes, sizes.world_elements, rank, members)
+        self._frames = wp.zeros(sizes.elements, dtype=wp.mat33, device=self.device)
+        weights = np.swapaxes(np.array(GRADIENT), 1, 2).reshape(12, 3)
+        self._gradients = wp.array(weights, dtype=wp.vec3, device=self.device)
+        rows = 0 if members is None else sizes.worlds * members.entries
+        self._rows = wp.zeros(rows, dtype=wp.vec4, device=self.device)
+        more = sizes.worlds * len(nodes) if is_bounded else 1
+        self._more = wp.zeros(more, dtype=wp.mat33, device=self.device)
+
+    @property
+    def kernels(self) -> list[wp.Kernel]:
+        """Kernels that it launches, beside those of ``loading.IMPLICIT_ON_FORESTS``."""
+        found = [self._write_frames, values.gather_leaves]
+        return found if self._members is None else [*found, kernels.write_rows(self._members.law)]
+
+    @property
+    def _elements(self) -> ForestElements:
+        return cast("ForestElements", self._discretization.elements)
+
+    def gather(
+        self,
+        operator: LinearOperator,
+        blocks: wp.array,
+        inverses: wp.array,
+        *,
+        stiffening: float = 0.0,
+        most_lambda: float = 1e30,
+        most_shared: float = 1e30,
+        holds: bool = False,
+    ) -> None:
+        """Launch the matrix at the operator's displacements and scales; its ``other_blocks`` are on the diagonal.
+
+        Args:
+            operator: The operator.
+            blocks: The entries, transposed, mat33 [worlds * entries].
+            inverses: The inverses of the diagonal blocks, mat33 [worlds * rows].
+            stiffening: Viscous over elastic stress at one strain [s].
+            most_lambda, most_shared: Lambda is at most this many times mu, and that of groups.
+            holds: Whether the stiffness of elements that are held from turning over counts.
+        """
+        body, members, found, count = self._discretization, self._members, self.pattern, len(self._nodes)
+        sizes, elements, u, scales = body.sizes, self._elements, operator.displacements, operator.scales
+        others = operator.other_blocks()
+        self._regions.launch_over(
+            self._write_frames, sizes.elements, lambda _, own: ([own(elements), u], [own(self._frames)]), u.ptr
+        )
+        if members is not None:
+            inputs: list[Any] = [sizes.world_elements, members.entries, members.arrays, elements, u]
+            inputs += [body.mu, body.lam, body.material_stride, most_shared]
+            self._launch(kernels.write_rows(members.law), members.count, inputs, [self._rows], u.ptr, most_shared)
+        inputs = [self._leaves(), scales, stiffening, most_lambda if members is None else 0.0]
+        threads = 1 if self.device.is_cpu else len(found.sums.upper)
+        parts, outputs = threads * self._regions.team.parts, [blocks, self._more]
+        self._regions.launch(
+            (blocks.ptr, scales.ptr, stiffening, most_lambda),
+            lambda part: launch(
+                values.gather_leaves, (sizes.worlds, threads), [part, parts, *inputs], outputs, device=self.device
+            ),
+        )
+        if holds and members is not None and members.law.holding is not not_held:
+            inputs = [sizes.world_elements, count, found.entries, elements, u, body.lam, body.material_stride]
+            inputs += [scales, self._rank, found.starts, found.columns]
+            wp.launch(kernels.add_held_blocks(members.law), sizes.elements, inputs, [blocks], device=self.device)
+        inputs = [count, self._mesh_nodes, found.entries, self._nodes, operator.inverse_mass, scales, self._free]
+        inputs += [found.starts, found.columns, found.diagonal, others, self._more]
+        key = [blocks.ptr, others.ptr, scales.ptr, operator.inverse_mass.ptr]
+        self._launch(values.finish_leaves, count, inputs, [blocks, inverses], *key)
+
+    def _leaves(self) -> values.Leaves:
+        body, found, leaves = self._discretization, self.pattern, values.Leaves()
+        leaves.elements, leaves.world_elements = self._elements, body.sizes.world_elements
+        leaves.frames, leaves.gradients = self._frames, self._gradients
+        leaves.mu, leaves.lam, leaves.stride = body.mu, body.lam, body.material_stride
+        leaves.sums, leaves.entries, leaves.ranks = found.sums, found.entries, len(self._nodes)
+        leaves.row_entries = 0 if self._members is None else self._members.entries
+        leaves.pairs, leaves.rows = self._pairs, self._rows
+        return leaves
+
+    def _launch(self, kernel: wp.Kernel, count: int, inputs: list[Any], outputs: list[Any], *key: Hashable) -> None:
+        """Launch a kernel with ``count`` threads for each world, in parts."""
+        self._regions.launch_from(kernel, (self._discretization.sizes.worlds, count), [0, *inputs], outputs, *key)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import warp as wp
@@ -16,18 +16,75 @@ from warp_corot.discretization.plan import Batch
 from warp_corot.errors import InputError
 from warp_corot.kernels.elements.elements import ForestElements
 from warp_corot.kernels.implicit.multigrid import pattern, values
+from warp_corot.kernels.implicit.multigrid import springs as kernels
 from warp_corot.solvers.implicit.operator import LinearOperator, Springs
 
-from .coarsest import DenseInverse
-from .leaf_matrix import LeafMatrix
-from .level import Level, SmoothedLevel
+from .level import DenseInverse, LeafMatrix, Level, SmoothedLevel, SweptLevel
 from .pattern import Midpoints, Pattern, PatternFinder
-from .springs import SpringsOnLevels
 from .subtrees import RootLevel, SubtreeLevel, suitable_batches
-from .swept import SweptLevel
+
+
+class SpringsOnLevels:
+    """The springs that come and go while the matrices of multigrid stay.
+
+    Args:
+        multigrid: The cycle, with its present levels.
+        springs: Where springs may be.
+        rank: The rank of each node number, int32.
+        ends: The ends of each node by rank, vec2i.
+    """
+
+    def __init__(self, multigrid: Multigrid, springs: Springs, rank: wp.array, ends: wp.array):
+        self.device, self._count, self._stiffness = multigrid.device, len(springs.nodes), springs.stiffness
+        self._kept = wp.zeros(self._count, dtype=wp.mat33, device=self.device)
+        sizes = [multigrid.discretization.sizes.world_nodes, multigrid.count]
+        self._levels = [self._level(level, springs, sizes, rank, ends) for level in multigrid.levels]
+
+    def keep_plain(self) -> None:
+        """Launch the record of matrices without springs, after these were computed."""
+        self._kept.zero_()
+        for level, _rows, matrix in self._levels:
+            if isinstance(level, Level):
+                wp.copy(matrix.plain_blocks, level.blocks)
+            wp.copy(matrix.plain_inverses, level.inverses)
+            matrix.added.zero_()
+
+    def take(self) -> None:
+        """Launch the exchange of the springs in the matrices for the present ones."""
+        for _level, rows, matrix in self._levels:
+            self._launch(kernels.remove_springs, [self._kept, rows, matrix])
+        wp.copy(self._kept, self._stiffness)
+        for _level, rows, matrix in self._levels:
+            self._launch(kernels.add_springs, [self._kept, rows, matrix])
+            self._launch(kernels.invert_with_springs, [self._kept, rows, matrix])
+
+    def _level(
+        self, level: SmoothedLevel, springs: Springs, sizes: list[int], rank: wp.array, ends: wp.array
+    ) -> tuple[SmoothedLevel, kernels.SpringRows, kernels.LevelMatrix]:
+        has_matrix, device = isinstance(level, Level), self.device
+        rows, matrix = kernels.SpringRows(), kernels.LevelMatrix()
+        rows.nodes = wp.zeros(self._count, dtype=wp.vec4i, device=device)
+        rows.weights = wp.zeros(self._count, dtype=wp.vec4, device=device)
+        rows.entries = wp.zeros((self._count, 16 if has_matrix else 0), dtype=wp.int32, device=device)
+        inputs: list[Any] = [*sizes, level.count, springs.nodes, springs.weights, rank, ends]
+        self._launch(kernels.find_spring_nodes, [*inputs, rows])
+        matrix.inverses, matrix.plain_inverses = level.inverses, wp.zeros_like(level.inverses)
+        matrix.added = wp.zeros_like(level.inverses)
+        if isinstance(level, Level):
+            pattern = level.pattern
+            matrix.blocks, matrix.plain_blocks = level.blocks, wp.zeros_like(level.blocks)
+            inputs = [level.count, pattern.entries, pattern.starts, pattern.columns, rows]
+            self._launch(kernels.find_spring_entries, inputs)
+        return level, rows, matrix
+
+    def _launch(self, kernel: wp.Kernel, inputs: list[Any]) -> None:
+        wp.launch(kernel, self._count, inputs, device=self.device)
+
 
 #: The largest coarsest level that is inverted [nodes].
 MOST_DENSE = 64
+#: The increase of the degree from a level to the next coarser one, which costs little.
+RISE = 2
 #: By how much degrees are smaller if the second level has more than half as many nodes as the finest one.
 STEPS_LESS = 2
 #: By how much the degree on the finest level is larger if the level of the roots of subtrees does not smooth.
@@ -55,9 +112,7 @@ class Multigrid:
     Args:
         body: A body on a forest, or its discretization.
         is_turned: Whether elements turn; False: linear elasticity.
-        stride: Number of bisections from one level to the next, 1 to 3.
         degree: The degree of the smoother on the finest level, before and after.
-        rise: The increase of the degree from a level to the next coarser one, which costs little.
         few_nodes: Levels with more nodes than this get a coarser one, if there is one.
         stiffening: Viscous over elastic stress at one strain [s], as in the operator's D.
         most_lambda: Lambda is at most this many times mu.
@@ -71,7 +126,7 @@ class Multigrid:
         revision: Changes whenever its launches do, so that they must be recorded again.
 
     Raises:
-        InputError: The mesh is not a forest, or a stride or degree is out of its range.
+        InputError: The mesh is not a forest, or the degree is not positive.
     """
 
     def __init__(
@@ -79,9 +134,7 @@ class Multigrid:
         body: Discretized | Discretization,
         *,
         is_turned: bool = True,
-        stride: int = 3,
         degree: int = 5,
-        rise: int = 2,
         few_nodes: int = MOST_DENSE,
         stiffening: float = 0.0,
         most_lambda: float = np.inf,
@@ -90,14 +143,12 @@ class Multigrid:
         sweeps: int = 0,
         assembled: bool = True,
     ):
-        if stride not in (1, 2, 3):
-            raise InputError(f"stride is {stride!r}; it must be 1, 2 or 3")
         if degree < 1:
             raise InputError(f"degree is {degree!r}; it must be 1 or more")
         self.discretization = discretization_of(body)
-        self.is_turned, self.stride, self.degree, self.stiffening = is_turned, stride, degree, stiffening
+        self.is_turned, self.degree, self.stiffening = is_turned, degree, stiffening
         self.most_shared = min(most_shared, 1e30)
-        self.most_lambda, self.rise, self.few_nodes = most_lambda, rise, few_nodes
+        self.most_lambda, self.few_nodes = most_lambda, few_nodes
         self._find_members = members
         self.sweeps, self._assembled = sweeps, assembled
         self.revision, self._version = -1, -1
@@ -226,7 +277,7 @@ class Multigrid:
 
     def _subtrees(self, members: Members | None) -> tuple[Batch, ...] | None:
         """The subtrees of which the finest level consists, if it goes without its matrix."""
-        if self._assembled or self.sweeps or self.stride != 3 or self.count <= self.few_nodes:
+        if self._assembled or self.sweeps or self.count <= self.few_nodes:
             return None
         batches = suitable_batches(self.discretization)
         if members is not None and members.count != sum(batch.count for batch in batches or ()):
@@ -283,7 +334,7 @@ class Multigrid:
     def _find_degrees(self, counts: list[int], roots_depth: int | None) -> list[int]:
         """The degree of each level's smoother. ``roots_depth`` is the level of the roots of subtrees, if the finest
         level goes over these."""
-        degrees = [self.degree + self.rise * k for k in range(len(counts))]
+        degrees = [self.degree + RISE * k for k in range(len(counts))]
         if roots_depth is not None and roots_depth % 3:
             # Steps on the finest level are cheap there, and take the place of those on the level of roots.
             coarser = degrees[1:-1] if self._members is None else degrees[2:]
@@ -299,9 +350,7 @@ class Multigrid:
         counts, level = [levels.node_count], levels.depth
         while level > 0 and counts[-1] > self.few_nodes:
             # Coarser levels are multiples of three: with others conjugate gradients take 10 iterations in place of 6.
-            stride = (level % 3 or 3) if self.stride == 3 else self.stride
-            if on_roots and len(counts) == 1:
-                stride = 3
+            stride = 3 if on_roots and len(counts) == 1 else level % 3 or 3
             level = max(level - stride, 0)
             counts.append(levels.starts[level + 1])
         return counts

@@ -11,8 +11,7 @@ import warp as wp
 from warp_corot.discretization.groups import Members
 from warp_corot.discretization.plan import Batch
 from warp_corot.kernels.implicit.multigrid import pattern as kernels
-from warp_corot.kernels.implicit.multigrid import roots as roots_kernels
-from warp_corot.kernels.implicit.multigrid import shared
+from warp_corot.kernels.implicit.multigrid import subtrees as roots_kernels
 from warp_corot.kernels.meshing.growth import gather_flagged
 from warp_corot.kernels.plan.levels import flag_first
 
@@ -28,10 +27,10 @@ class Pattern:
         columns: int32 [entries], ascending in a row.
         pairs: Row and column of each entry, vec2i [entries].
         diagonal: The place of each row's diagonal entry, int32 [n].
-        upper: Rank and higher or equal rank of each entry in the upper triangle, vec2i [U].
-        places: The places of each of these and of its mirror image among the entries, vec2i [U].
-        sum_starts: The beginning of the contributions to each of these, and the end of the last ones, int32 [U + 1].
-        codes: The contributions, int32: see ``kernels.implicit.multigrid.pattern``.
+        sums: The entries in the upper triangle and the contributions to them: ``upper``, rank and higher or equal rank
+            of each, vec2i [U]; ``places`` of each and of its mirror image among the entries, vec2i [U]; ``starts``, the
+            beginning of the contributions to each, and the end of the last ones, int32 [U + 1]; and these as ``codes``,
+            int32: see ``kernels.implicit.multigrid.pattern``.
     """
 
     count: int
@@ -40,10 +39,7 @@ class Pattern:
     columns: wp.array
     pairs: wp.array
     diagonal: wp.array
-    upper: wp.array
-    places: wp.array
-    sum_starts: wp.array
-    codes: wp.array
+    sums: kernels.EntrySums
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,13 +79,13 @@ class PatternFinder:
             members: Groups whose nodes are all coupled, if there are any.
 
         Returns:
-            The pattern, and the pairs of the groups' nodes as ``kernels.implicit.multigrid.shared`` has them, vec2i.
+            The pattern, and the pairs of the groups' nodes as ``kernels.implicit.multigrid.pattern`` has them, vec2i.
         """
         nodes = len(rank)
         before, pairs = 6 * leaves + nodes, 0
         if members is not None:
             sums = self._ints(members.count)
-            self._launch(shared.count_pairs, members.count, [members.arrays], [sums])
+            self._launch(kernels.count_pairs, members.count, [members.arrays], [sums])
             wp.utils.array_scan(sums, sums, inclusive=True)
             pairs = int(sums[-1:].numpy()[0])
         keys, codes = self._keys(before + pairs)
@@ -98,7 +94,7 @@ class PatternFinder:
         found = wp.empty(pairs, dtype=wp.vec2i, device=self.device)
         if members is not None:
             inputs = [before, self.bits, members.arrays, rank, sums]
-            self._launch(shared.list_pairs, members.count, inputs, [found, keys, codes])
+            self._launch(kernels.list_pairs, members.count, inputs, [found, keys, codes])
         return self._pattern(nodes, before + pairs, keys, codes), found
 
     def of_roots(self, count: int, batches: Sequence[Batch], roots: int, nodes: wp.array, rank: wp.array) -> Pattern:
@@ -125,8 +121,8 @@ class PatternFinder:
     def middles(self, pattern: Pattern, fine: int) -> wp.array:
         """The node of the next finer level, of ``fine`` nodes, between the nodes of each entry in the upper triangle;
         -1: none; int32."""
-        found = wp.full(len(pattern.upper), -1, dtype=wp.int32, device=self.device)
-        inputs = [pattern.count, self.ends, pattern.upper]
+        found = wp.full(len(pattern.sums.upper), -1, dtype=wp.int32, device=self.device)
+        inputs = [pattern.count, self.ends, pattern.sums.upper]
         self._launch(roots_kernels.find_middles, fine - pattern.count, inputs, [found])
         return found
 
@@ -153,13 +149,13 @@ class PatternFinder:
 
     def _pattern(self, nodes: int, contributions: int, keys: wp.array, codes: wp.array) -> Pattern:
         self._sort(keys, codes, contributions)
-        flags, sums = self._ints(contributions), self._ints(contributions)
+        flags, numbers = self._ints(contributions), self._ints(contributions)
         self._launch(flag_first, contributions, [keys], [flags])
-        wp.utils.array_scan(flags, sums, inclusive=True)
-        count = int(sums[-1:].numpy()[0])
+        wp.utils.array_scan(flags, numbers, inclusive=True)
+        count = int(numbers[-1:].numpy()[0])
         starts = self._ints(count + 1)
         starts.fill_(contributions)
-        self._launch(gather_flagged, contributions, [flags, sums, 0], [starts])
+        self._launch(gather_flagged, contributions, [flags, numbers, 0], [starts])
         upper = wp.empty(count, dtype=wp.vec2i, device=self.device)
         full, sources = self._keys(2 * count)
         self._launch(kernels.name_upper, count, [nodes, self.bits, keys, starts], [upper, full, sources])
@@ -169,18 +165,10 @@ class PatternFinder:
         columns, diagonal, places = self._ints(entries), self._ints(nodes), self._ints(2 * count)
         inputs = [self.bits, full, sources]
         self._launch(kernels.name_entries, entries, inputs, [pairs, columns, diagonal, places])
-        return Pattern(
-            nodes,
-            entries,
-            self._row_starts(nodes, entries, full),
-            columns,
-            pairs,
-            diagonal,
-            upper,
-            places.reshape((count, 2)).view(wp.vec2i),
-            starts,
-            _first(codes, contributions),
-        )
+        sums = kernels.EntrySums()
+        sums.upper, sums.starts, sums.codes = upper, starts, _first(codes, contributions)
+        sums.places = places.reshape((count, 2)).view(wp.vec2i)
+        return Pattern(nodes, entries, self._row_starts(nodes, entries, full), columns, pairs, diagonal, sums)
 
     def _row_starts(self, rows: int, count: int, keys: wp.array) -> wp.array:
         starts = self._ints(rows + 1)

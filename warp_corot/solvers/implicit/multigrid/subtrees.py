@@ -1,7 +1,7 @@
 """The finest level without a matrix, for bodies all of whose leaves are in subtrees of one level (CUDA).
 
 Products go over the subtrees, with the rotations of their leaves, and the next level of the cycle is that of the
-subtrees' roots; see ``kernels.implicit.multigrid.subtrees`` and ``roots``.
+subtrees' roots; see ``kernels.implicit.multigrid.subtrees``.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from warp_corot.discretization.plan import Batch
 from warp_corot.inputs.loading import load
 from warp_corot.kernels.corotated import turned_subtrees
 from warp_corot.kernels.elements.elements import ForestElements, Subtrees
-from warp_corot.kernels.implicit.multigrid import diagonals, roots, subtrees
+from warp_corot.kernels.implicit.multigrid import subtrees
 from warp_corot.kernels.implicit.multigrid.values import rest_frame, turned_frame
 from warp_corot.kernels.subtrees.memory import BLOCK
 from warp_corot.mesh import TetForest
@@ -35,7 +35,7 @@ def suitable_batches(discretization: Discretization) -> tuple[Batch, ...] | None
     if not isinstance(mesh, TetForest) or np.ptp(mesh.levels) > 0:
         return None
     plan = discretization.plan()
-    if len(plan.flat) or any(batch.shape not in roots.TYPES for batch in plan.batches):
+    if len(plan.flat) or any(batch.shape not in subtrees.TYPES for batch in plan.batches):
         return None
     return tuple(plan.batches)
 
@@ -54,7 +54,7 @@ class SubtreeLevel(SmoothedLevel):
 
     Attributes:
         roots: Number of subtrees in one world.
-        root_blocks: The matrices of all roots, mat33; see ``kernels.implicit.multigrid.roots``.
+        root_blocks: The matrices of all roots, mat33; see ``kernels.implicit.multigrid.subtrees``.
         own: What nodes add to the diagonal.
         scales: Scales of the operator, float32 [3].
     """
@@ -86,7 +86,7 @@ class SubtreeLevel(SmoothedLevel):
         self._places = [self._ranked(batch, rank) for batch in batches]
         self._load_kernels(members is not None)
         self.roots = sum(batch.count for batch in batches) // worlds
-        self.root_blocks = wp.zeros(worlds * self.roots * roots.ROOT_BLOCKS, dtype=wp.mat33, device=device)
+        self.root_blocks = wp.zeros(worlds * self.roots * subtrees.ROOT_BLOCKS, dtype=wp.mat33, device=device)
         self._turns = [wp.zeros(8 * batch.count, dtype=wp.vec4, device=device) for batch in batches]
         rows = [0 if members is None else 10 * batch.count for batch in batches]
         self._rows = [wp.zeros(count, dtype=wp.vec4, device=device) for count in rows]
@@ -110,14 +110,14 @@ class SubtreeLevel(SmoothedLevel):
         self.own.blocks = self._blocks if len(others) > 1 else self._no_blocks
         inputs = [self.ranks, mesh_nodes, nodes, self.free, operator.inverse_mass, operator.scales, others]
         self.launch(subtrees.find_own, self.count, inputs, [self.own])
-        wp.launch(roots.mark_free, len(self.r), [self.free], [self.other], device=self.device)
+        wp.launch(subtrees.mark_free, len(self.r), [self.free], [self.other], device=self.device)
         first = 0
         for k, batch in enumerate(self._batches):
             self._update_batch(k, batch, operator.displacements, first)
             first += batch.count // self.worlds
         inputs = [self.stiffening, self.scales, self.own]
         outputs = [self._products, self._mixed, self.inverses]
-        wp.launch(diagonals.invert_diagonals, len(self.r), inputs, outputs, device=self.device)
+        wp.launch(subtrees.invert_diagonals, len(self.r), inputs, outputs, device=self.device)
 
     def _make_step(self, step: int, *, is_first: bool) -> None:
         alpha, beta = self.factors[step]
@@ -148,7 +148,7 @@ class SubtreeLevel(SmoothedLevel):
         wp.launch(self._keep_turns, (8, count), inputs, [self._turns[k]], device=self.device)
         if self._law is not None:
             inputs += [discretization.mu, discretization.lam, discretization.material_stride, self._most_shared]
-            kernel = diagonals.keep_rows(batch.shape, self._law)
+            kernel = subtrees.keep_rows(batch.shape, self._law)
             wp.launch(kernel, count, inputs, [self._rows[k]], device=self.device)
         given = [self._material, self._turns[k], self._rows[k]]
         for is_mixed, parts in ((False, self._products), (True, self._mixed)):
@@ -160,8 +160,8 @@ class SubtreeLevel(SmoothedLevel):
         uniform = self._discretization.material_stride == 0
         kinds = [(batch.shape, batch.grouped, uniform, shares) for batch in self._batches]
         self._product = [turned_subtrees.add_subtree_products(*kind) for kind in kinds]
-        self._diagonal = [diagonals.add_diagonals(*kind) for kind in kinds]
-        self._roots = [roots.write_roots(*kind) for kind in kinds]
+        self._diagonal = [subtrees.add_diagonals(*kind) for kind in kinds]
+        self._roots = [subtrees.write_roots(*kind) for kind in kinds]
         load((), self.device, [(kernel, self._block) for kernel in self._product + self._diagonal + self._roots])
 
     def _launch_subtrees(self, kernel: wp.Kernel, batch: Batch, inputs: list[Any], outputs: list[Any]) -> None:
@@ -212,17 +212,6 @@ class RootLevel(Level):
 
     def gather_from(self, fine: SmoothedLevel) -> None:
         assert isinstance(fine, SubtreeLevel)
-        pattern = self.pattern
-        inputs = [
-            self.ranks,
-            self.count,
-            pattern.entries,
-            fine.roots,
-            fine.stiffening,
-            fine.scales,
-            self.free,
-            fine.own,
-        ]
-        inputs += [self._midpoints.starts, self._midpoints.midpoints, self._middles]
-        inputs += [pattern.upper, pattern.sum_starts, pattern.codes, pattern.places, fine.root_blocks]
-        self.gather(roots.gather_roots, inputs)
+        inputs = [self.arrays, self.pattern.sums, fine.roots, fine.stiffening, fine.scales, fine.own]
+        inputs += [self._midpoints.starts, self._midpoints.midpoints, self._middles, fine.root_blocks]
+        self.gather(subtrees.gather_roots, inputs)

@@ -1,0 +1,258 @@
+"""What is derived from a changed mesh: points bound to it, nodes that follow keyframes, materials of its leaves, and
+limits of the time step.
+
+The limits are those of the stiffest elements for their size and mass, and their number: an element among elements of
+its size vibrates faster than one among larger ones, so the finest level alone is not enough."""
+
+from typing import Any
+
+import warp as wp
+
+from warp_corot.kernels.corotated.anisotropic import vec9
+from warp_corot.kernels.math.rotation import identity3
+from warp_corot.kernels.meshing.bisection import refinement_end
+from warp_corot.kernels.plan.plan import Plan, extent, leaf_row
+from warp_corot.kernels.remesh.pools import LEAVES, NODE_TOP, Pools
+from warp_corot.kernels.remesh.state import MIXED_ROWS, NO_ROW, Carried, modulus_of
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def in_child(w: wp.vec4d, k: int, second: bool):
+    """Barycentric coordinates in a child from those in its parent, whose refinement edge is x0-xk."""
+    lower = w[0]
+    upper = w[k]
+    child = w
+    if second:
+        for n in range(3):
+            if n + 1 <= k:
+                child[n] = w[n + 1]
+        child[k - 1] = upper - lower
+        child[k] = wp.float64(2.0) * lower
+    else:
+        child[0] = lower - upper
+        child[k] = wp.float64(2.0) * upper
+    return child
+
+
+@wp.kernel(enable_backward=False)
+def bind_points(
+    # In
+    roots: wp.array[wp.int32],
+    inside: wp.array[wp.vec4d],
+    points: wp.array[wp.vec4d],
+    pools: Pools,
+    # Out
+    nodes: wp.array[wp.vec4i],
+    weights: wp.array[wp.vec4],
+):
+    """The leaf below each root that contains the point ``inside``, and the coordinates of ``points`` in it.
+
+    Both are barycentric in the root. A point outside the mesh follows the nearest leaf.
+    """
+    i = wp.tid()
+    element = roots[i]
+    way = inside[i]
+    w = points[i]
+    while pools.first_child[element] >= 0:
+        k = refinement_end(pools.level[element])
+        second = way[0] < way[k]
+        element = pools.first_child[element] + wp.where(second, 1, 0)
+        way = in_child(way, k, second)
+        w = in_child(w, k, second)
+    nodes[i] = pools.tets[element]
+    weights[i] = wp.vec4(float(w[0]), float(w[1]), float(w[2]), float(w[3]))
+
+
+@wp.kernel(enable_backward=False)
+def find_node_levels(pools: Pools, levels: wp.array[wp.int32]):
+    """The largest level of the leaves around each node; ``levels`` is zero before."""
+    i = wp.tid()
+    if i >= pools.counts[LEAVES]:
+        return
+    leaf = pools.leaves[i]
+    for k in range(4):
+        wp.atomic_max(levels, pools.tets[leaf][k], pools.level[leaf])
+
+
+@wp.kernel(enable_backward=False)
+def find_point_levels(
+    nodes: wp.array[wp.vec4i], weights: wp.array[wp.vec4], of_nodes: wp.array[wp.int32], levels: wp.array[wp.int32]
+):
+    """The level of the node with the largest weight at each point."""
+    i = wp.tid()
+    largest = int(0)
+    for k in range(4):
+        if weights[i][k] > weights[i][largest]:
+            largest = k
+    levels[i] = of_nodes[nodes[i][largest]]
+
+
+#: Counts: nodes that follow keyframes, and those among them whose row is not known yet.
+FOLLOWERS = wp.constant(0)
+MIXED = wp.constant(1)
+FOLLOWER_PLACES = 2
+
+
+@wp.kernel(enable_backward=False)
+def list_followers(
+    # In
+    threads: int,
+    goes: wp.array[wp.int32],
+    pools: Pools,
+    carried: Carried,
+    # Out
+    nodes: wp.array[wp.int32],
+    rows: wp.array[wp.int32],
+    found: wp.array[wp.int32],
+):
+    """List nodes with their rows, in any order, if ``goes`` [1] is not zero."""
+    count = pools.counts[NODE_TOP]
+    if goes[0] == 0:
+        count = 0
+    for i in range(wp.tid(), count, threads):
+        row = carried.row[i]
+        if row != NO_ROW:
+            place = wp.atomic_add(found, FOLLOWERS, 1)
+            nodes[place] = i
+            rows[place] = row
+            if row == MIXED_ROWS:
+                wp.atomic_add(found, MIXED, 1)
+
+
+@wp.func
+def gathered_axes(plan: Plan, row: int, i: int):
+    return wp.mat33(
+        plan.values[row, i], plan.values[row + 1, i], plan.values[row + 2, i],
+        plan.values[row + 3, i], plan.values[row + 4, i], plan.values[row + 5, i],
+        plan.values[row + 6, i], plan.values[row + 7, i], plan.values[row + 8, i],
+    )  # fmt: skip
+
+
+@wp.kernel(enable_backward=False)
+def assemble_materials(
+    # In
+    threads: int,
+    pools: Pools,
+    plan: Plan,
+    axes_row: int,
+    stiffness_row: int,
+    # Out
+    axes: wp.array[wp.mat33],
+    stiffness: wp.array[vec9],
+):
+    """Axes and stiffness of each leaf, each from nine rows of values from a first row on; a negative row: none.
+
+    Padding has the identity and zero.
+    """
+    for i in range(wp.tid(), extent(leaf_row(plan), plan), threads):
+        is_leaf = i < pools.counts[LEAVES]
+        if axes_row >= 0:
+            m = identity3()
+            if is_leaf:
+                m = gathered_axes(plan, axes_row, i)
+            axes[i] = m
+        if stiffness_row >= 0:
+            c = vec9()
+            for n in range(9):
+                c[n] = plan.values[stiffness_row + n, i]
+            stiffness[i] = c
+
+
+@wp.kernel(enable_backward=False)
+def write_leaves(
+    # In
+    leaves: wp.array[wp.int32],
+    given: wp.array[Any],
+    column: int,
+    # Out
+    columns: wp.array2d[Any],
+):
+    """Write values given by places in the list into the leaves' data."""
+    i = wp.tid()
+    columns[leaves[i], column] = given[i]
+
+
+@wp.kernel(enable_backward=False)
+def read_leaves(
+    # In
+    leaves: wp.array[wp.int32],
+    columns: wp.array2d[Any],
+    column: int,
+    # Out
+    found: wp.array[Any],
+):
+    i = wp.tid()
+    found[i] = columns[leaves[i], column]
+
+
+def _by_type(kernel: wp.Kernel, of_leaves: str) -> dict[type, wp.Kernel]:
+    """The kernel for values and for whole numbers, chosen once and not at every launch."""
+    return {
+        kind: wp.overload(kernel, {of_leaves: wp.array(dtype=kind), "columns": wp.array2d(dtype=kind)})
+        for kind in (wp.float32, wp.int32)
+    }
+
+
+WRITE_LEAVES = _by_type(write_leaves, "given")
+READ_LEAVES = _by_type(read_leaves, "found")
+
+
+# Places in the result; from FINEST_COUNTS on there are partial sums.
+STIFFEST = wp.constant(0)
+FINEST_LEVEL = wp.constant(1)
+FINEST_COUNTS = wp.constant(2)
+PARTIAL_SUMS = wp.constant(256)
+SURVEY_PLACES = 258
+
+
+@wp.kernel(enable_backward=False)
+def find_stiffest(
+    # In
+    threads: int,
+    goes: wp.array[wp.int32],
+    modulus: float,
+    pools: Pools,
+    carried: Carried,
+    # Out
+    found: wp.array[wp.int32],
+):
+    """Largest (2 mu + lambda) / (density volume^(2/3)) [1/s^2] of the leaves, as a float's bits, and the finest level.
+
+    ``modulus`` is 2 mu + lambda [Pa] if all elements have the same.
+    """
+    count = wp.where(goes[0] != 0, pools.counts[LEAVES], 0)
+    most = float(0.0)
+    finest = int(0)
+    for i in range(wp.tid(), count, threads):
+        e = pools.leaves[i]
+        level = pools.level[e]
+        size = carried.size[level]
+        most = wp.max(most, modulus_of(e, modulus, carried) / float(carried.density[e] * size * size))
+        finest = wp.max(finest, level)
+    # Positive floats have the order of their bits. Few threads reach the write.
+    bits = wp.cast(most, wp.int32)
+    if bits > found[STIFFEST]:
+        wp.atomic_max(found, STIFFEST, bits)
+    if finest > found[FINEST_LEVEL]:
+        wp.atomic_max(found, FINEST_LEVEL, finest)
+
+
+@wp.kernel(enable_backward=False)
+def count_finest(
+    # In
+    threads: int,
+    goes: wp.array[wp.int32],
+    pools: Pools,
+    # In and out
+    found: wp.array[wp.int32],
+):
+    """Number of leaves at the finest level, in partial sums."""
+    count = wp.where(goes[0] != 0, pools.counts[LEAVES], 0)
+    own = int(0)
+    for i in range(wp.tid(), count, threads):
+        if pools.level[pools.leaves[i]] == found[FINEST_LEVEL]:
+            own += 1
+    if own > 0:
+        wp.atomic_add(found, FINEST_COUNTS + wp.tid() % PARTIAL_SUMS, own)

@@ -1,0 +1,488 @@
+"""Edges that must be bisected, "wanted" edges: a hash table, filled again in each pass, keyed by the edges' nodes.
+
+An edge is bisected once it is the refinement edge of all leaves around it. If a leaf has a wanted edge that is
+not its refinement edge, its refinement edge becomes wanted, too. So requests spread outwards to ever larger leaves,
+bisection comes back inwards, and each bisection leaves the mesh conforming: it may stop at any time, for example when
+the pools are full.
+
+Consecutive leaves in tree order are close in space, so a node is named in only a few blocks of the list, and a round
+visits only the blocks that contain a wanted edge."""
+
+import warp as wp
+
+from warp_corot.kernels.meshing.bisection import first_half, halfway, refinement_end, second_half
+from warp_corot.kernels.meshing.growth import EMPTY, LIVE, claim_slot, edge_key, find_slot
+from warp_corot.kernels.remesh.pools import (
+    ADDED,
+    BIRTHS,
+    FIRST_NEW,
+    FREE_PAIRS,
+    FRESH,
+    FRESH_NEW,
+    FRESH_SEEN,
+    FULL,
+    LAST_BIRTHS,
+    LEAVES,
+    NODE_TOP,
+    NODES_TAKEN,
+    PAIRS_TAKEN,
+    PASS_STAMP,
+    REFINE,
+    STAMP,
+    WANTED,
+    Pools,
+)
+from warp_corot.kernels.remesh.state import Carried, copy_to_children, make_node, quarter_mass
+from warp_corot.kernels.tables.shapes import FIRST_NODE, FRAME_SHIFT, SECOND_NODE
+
+wp.set_module_options({"enable_backward": False})
+
+#: Leaves in a block, and those that one thread visits.
+BLOCK = wp.constant(512)
+STRETCH = wp.constant(16)
+#: Number of blocks that are kept for a node. For a node in more blocks, the last entry says so.
+KEPT = 8
+LAST = wp.constant(KEPT - 1)
+NONE = wp.constant(-1)
+MORE = wp.constant(-2)
+
+
+@wp.struct
+class Blocks:
+    """The blocks that name each node, in the list at the beginning of the pass."""
+
+    of_node: wp.array2d[wp.int32]  # [nodes, KEPT]
+    latest: wp.array[wp.int32]
+    hot: wp.array[wp.int32]  # the last round in which an edge in the block became wanted
+    all_hot: wp.array[wp.int32]  # [1] the same for an edge whose blocks are not known
+
+
+@wp.func
+def add_block(node: int, block: int, blocks: Blocks):
+    # Usually it is the one that was added last.
+    if blocks.latest[node] == block:
+        return
+    blocks.latest[node] = block
+    for n in range(LAST):
+        before = wp.atomic_cas(blocks.of_node, node, n, NONE, block)
+        if before == NONE or before == block:
+            return
+    blocks.of_node[node, LAST] = MORE
+
+
+@wp.kernel(enable_backward=False)
+def clear_blocks(
+    # In
+    threads: int,
+    pools: Pools,
+    # Out
+    blocks: Blocks,
+):
+    count = pools.counts[NODE_TOP]
+    if pools.counts[BIRTHS] == 0:
+        count = 0
+    for i in range(wp.tid(), count, threads):
+        blocks.latest[i] = NONE
+        for n in range(KEPT):
+            blocks.of_node[i, n] = NONE
+
+
+@wp.kernel(enable_backward=False)
+def list_blocks(
+    # In
+    threads: int,
+    pools: Pools,
+    # In and out
+    blocks: Blocks,
+):
+    """List the blocks of nodes, if any edge is wanted."""
+    count = pools.counts[LEAVES]
+    if pools.counts[BIRTHS] == 0:
+        count = 0
+    for i in range(wp.tid(), count, threads):
+        tet = pools.leaf_tets[i]
+        for n in range(4):
+            add_block(tet[n], i // BLOCK, blocks)
+
+
+@wp.func
+def heat_blocks(a: int, b: int, stamp: int, first_new: int, blocks: Blocks):
+    """Mark the blocks that name both ends of an edge; nodes made in this pass are in none."""
+    if a >= first_new or b >= first_new:
+        return
+    more_a = blocks.of_node[a, LAST] == MORE
+    more_b = blocks.of_node[b, LAST] == MORE
+    if more_a and more_b:
+        blocks.all_hot[0] = stamp
+        return
+    one = int(a)
+    other = int(b)
+    if more_a:
+        one = b
+        other = a
+    for n in range(LAST):
+        block = blocks.of_node[one, n]
+        if block != NONE:
+            found = more_a or more_b
+            for m in range(LAST):
+                if blocks.of_node[other, m] == block:
+                    found = True
+            if found:
+                blocks.hot[block] = stamp
+
+
+@wp.func
+def is_hot(i: int, pools: Pools, blocks: Blocks):
+    """Whether an edge in the i-th leaf's block became wanted in the last round, or in this one."""
+    since = pools.counts[STAMP] - 1
+    return blocks.hot[i // BLOCK] >= since or blocks.all_hot[0] >= since
+
+
+NEVER = wp.constant(0x7FFFFFFF)
+LOW_HALF = wp.constant(wp.int64((1 << 32) - 1))
+
+
+@wp.struct
+class WantedEdges:
+    """The table: for each edge the leaves around it, counted in rounds."""
+
+    keys: wp.array[wp.int64]
+    born: wp.array[wp.int32]  # the round in which the edge became wanted; NEVER
+    ring: wp.array[wp.int32]  # number of leaves around it
+    agreed: wp.array[wp.int32]  # number of these whose refinement edge it is
+    head: wp.array[wp.int32]  # the first of the latter, or -1
+    node: wp.array[wp.int32]  # its midpoint after bisection, or -1
+    pairs: wp.array[wp.int32]  # start of its pairs among those taken in a round
+    wanted: wp.array[wp.int32]  # slots of all wanted edges
+    most: int  # maximum number of wanted edges in a pass
+
+
+@wp.func
+def want_edge(a: int, b: int, pools: Pools, edges: WantedEdges):
+    """Want an edge; returns whether it is new. Beyond the maximum it is left out: that loses a refinement, never
+    conformity."""
+    if pools.counts[WANTED] >= edges.most:
+        wp.atomic_max(pools.counts, FULL, 1)
+        return False
+    slot = claim_slot(edge_key(a, b), edges.keys)
+    if slot < 0:
+        slot = -slot - 1
+        edges.born[slot] = pools.counts[STAMP]
+        pools.touched[a] = pools.counts[STAMP]
+        pools.touched[b] = pools.counts[STAMP]
+        edges.wanted[wp.atomic_add(pools.counts, WANTED, 1)] = slot
+        wp.atomic_add(pools.counts, BIRTHS, 1)
+        return True
+    return False
+
+
+@wp.kernel(enable_backward=False)
+def want_marked(
+    # In
+    threads: int,
+    max_level: int,
+    # In and out
+    pools: Pools,
+    edges: WantedEdges,
+):
+    """Want the refinement edges of marked leaves."""
+    for i in range(wp.tid(), pools.counts[LEAVES], threads):
+        if pools.marks[i] == REFINE:
+            level = pools.level[pools.leaves[i]]
+            if level < max_level:
+                tet = pools.leaf_tets[i]
+                want_edge(tet[0], tet[refinement_end(level)], pools, edges)
+
+
+@wp.kernel(enable_backward=False)
+def heat_wanted(
+    # In
+    threads: int,
+    pools: Pools,
+    edges: WantedEdges,
+    # In and out
+    blocks: Blocks,
+):
+    """Mark blocks with the first wanted edges, once it is known which blocks name which nodes."""
+    for i in range(wp.tid(), pools.counts[WANTED], threads):
+        key = edges.keys[edges.wanted[i]]
+        a = int(key >> wp.int64(32))
+        b = int(key & LOW_HALF)
+        heat_blocks(a, b, pools.counts[STAMP], pools.counts[FIRST_NEW], blocks)
+
+
+@wp.kernel(enable_backward=False)
+def begin_round(
+    # In and out
+    pools: Pools,
+    demand: wp.array[wp.int64],
+):
+    counts = pools.counts
+    counts[STAMP] = counts[STAMP] + 1
+    counts[LAST_BIRTHS] = counts[BIRTHS]
+    counts[BIRTHS] = 0
+    counts[FRESH_SEEN] = counts[FRESH_NEW]
+    counts[FRESH_NEW] = counts[FRESH]
+    counts[NODES_TAKEN] = 0
+    counts[PAIRS_TAKEN] = 0
+    demand[0] = wp.int64(0)
+
+
+@wp.func
+def count_at_edges(e: int, tet: wp.vec4i, is_new: bool, pools: Pools, edges: WantedEdges, blocks: Blocks):
+    """Count a leaf at its wanted edges, each once: an old leaf at those of the last round, a new one at all."""
+    stamp = pools.counts[STAMP]
+    since = stamp - 1
+    if is_new:
+        since = pools.counts[PASS_STAMP]
+    end = refinement_end(pools.level[e])
+    hangs = int(0)
+    for n in range(6):
+        a = tet[FIRST_NODE[n]]
+        b = tet[SECOND_NODE[n]]
+        if pools.touched[a] >= since and pools.touched[b] >= since:
+            slot = find_slot(a, b, edges.keys)
+            if slot >= 0:
+                born = edges.born[slot]
+                if born >= since and born < stamp:
+                    wp.atomic_add(edges.ring, slot, 1)
+                    if FIRST_NODE[n] == 0 and SECOND_NODE[n] == end:
+                        pools.next[e] = wp.atomic_exch(edges.head, slot, e)
+                        wp.atomic_add(edges.agreed, slot, 1)
+                    else:
+                        hangs = 1
+    if hangs == 1 and want_edge(tet[0], tet[end], pools, edges):
+        heat_blocks(tet[0], tet[end], stamp, pools.counts[FIRST_NEW], blocks)
+
+
+@wp.func
+def visit_leaf(i: int, pools: Pools, edges: WantedEdges, blocks: Blocks):
+    """Count a leaf at new wanted edges, if it has two recently touched nodes: often three nodes rule it out."""
+    tet = pools.leaf_tets[i]
+    since = pools.counts[STAMP] - 1
+    near = int(0)
+    for n in range(3):
+        if pools.touched[tet[n]] >= since:
+            near += 1
+    if near == 1 and pools.touched[tet[3]] >= since:
+        near = 2
+    if near >= 2:
+        e = pools.leaves[i]
+        if pools.first_child[e] == LIVE:
+            count_at_edges(e, tet, False, pools, edges, blocks)
+
+
+@wp.kernel(enable_backward=False)
+def visit_leaves(
+    # In
+    threads: int,
+    # In and out
+    pools: Pools,
+    edges: WantedEdges,
+    blocks: Blocks,
+):
+    """Visit the leaves from before the pass, if there is a new edge to count at."""
+    count = (pools.counts[LEAVES] + STRETCH - 1) // STRETCH
+    if pools.counts[LAST_BIRTHS] == 0:
+        count = 0
+    for stretch in range(wp.tid(), count, threads):
+        first = stretch * STRETCH
+        if is_hot(first, pools, blocks):
+            for i in range(first, wp.min(first + STRETCH, pools.counts[LEAVES])):
+                visit_leaf(i, pools, edges, blocks)
+
+
+@wp.kernel(enable_backward=False)
+def visit_fresh(
+    # In
+    threads: int,
+    # In and out
+    pools: Pools,
+    edges: WantedEdges,
+    blocks: Blocks,
+):
+    """Visit the leaves that this pass made."""
+    for i in range(wp.tid(), 2 * pools.counts[FRESH_NEW], threads):
+        e = pools.fresh[i // 2] + i % 2
+        if pools.first_child[e] == LIVE:
+            count_at_edges(e, pools.tets[e], i // 2 >= pools.counts[FRESH_SEEN], pools, edges, blocks)
+
+
+@wp.kernel(enable_backward=False)
+def clear_edges(
+    # In
+    threads: int,
+    pools: Pools,
+    # In and out
+    edges: WantedEdges,
+):
+    for i in range(wp.tid(), pools.counts[WANTED], threads):
+        slot = edges.wanted[i]
+        edges.keys[slot] = EMPTY
+        edges.born[slot] = NEVER
+        edges.ring[slot] = 0
+        edges.agreed[slot] = 0
+        edges.head[slot] = -1
+        edges.node[slot] = -1
+
+
+# The upper half of ``demand`` counts nodes, the lower half pairs.
+ONE_NODE = wp.constant(wp.int64(1 << 32))
+
+
+@wp.kernel(enable_backward=False)
+def admit_edges(
+    # In
+    threads: int,
+    # In and out
+    pools: Pools,
+    edges: WantedEdges,
+    demand: wp.array[wp.int64],
+):
+    """Reserve a node and pairs for each edge that can be bisected.
+
+    One atomic sum of nodes and pairs gives every edge its places; edges whose places do not exist are refused, and
+    since the sum only grows, so are all later ones.
+    """
+    for i in range(wp.tid(), pools.counts[WANTED], threads):
+        slot = edges.wanted[i]
+        ring = edges.ring[slot]
+        if edges.node[slot] < 0 and edges.born[slot] < pools.counts[STAMP] and ring > 0 and ring == edges.agreed[slot]:
+            before = wp.atomic_add(demand, 0, ONE_NODE + wp.int64(ring))
+            nodes = int(before >> wp.int64(32))
+            pairs = int(before & LOW_HALF)
+            if pools.counts[NODE_TOP] + nodes < pools.node_limit and pairs + ring <= pools.counts[FREE_PAIRS]:
+                edges.node[slot] = pools.counts[NODE_TOP] + nodes
+                edges.pairs[slot] = pools.counts[FREE_PAIRS] - 1 - pairs
+                wp.atomic_max(pools.counts, NODES_TAKEN, nodes + 1)
+                wp.atomic_max(pools.counts, PAIRS_TAKEN, pairs + ring)
+            else:
+                wp.atomic_max(pools.counts, FULL, 1)
+
+
+@wp.func
+def leave_edges(tet: wp.vec4i, end: int, pools: Pools, edges: WantedEdges):
+    """Remove a bisected leaf from the counts of its other wanted edges."""
+    since = pools.counts[PASS_STAMP]
+    for n in range(6):
+        a = tet[FIRST_NODE[n]]
+        b = tet[SECOND_NODE[n]]
+        if (FIRST_NODE[n] != 0 or SECOND_NODE[n] != end) and pools.touched[a] >= since and pools.touched[b] >= since:
+            slot = find_slot(a, b, edges.keys)
+            if slot >= 0 and edges.born[slot] < pools.counts[STAMP]:
+                wp.atomic_add(edges.ring, slot, -1)
+
+
+@wp.func
+def halved_cuts(cut: int, end: int):
+    """Which faces of the two halves of a leaf are cut; the face between them is not."""
+    first = int(0)
+    second = int(0)
+    for n in range(1, 4):
+        if n != end and (cut >> n) % 2 == 1:
+            first += wp.lshift(1, n)
+            second += wp.lshift(1, wp.where(n < end, n - 1, n))
+    first += wp.lshift((cut >> end) % 2, end)
+    second += wp.lshift(cut % 2, end)
+    return first, second
+
+
+@wp.func
+def bisect_leaf(e: int, child: int, z: int, pools: Pools, edges: WantedEdges):
+    tet = pools.tets[e]
+    level = pools.level[e]
+    end = refinement_end(level)
+    leave_edges(tet, end, pools, edges)
+    pools.tets[child] = first_half(tet, z, level)
+    pools.tets[child + 1] = second_half(tet, z, level)
+    frame = pools.code[e] >> FRAME_SHIFT
+    for n in range(2):
+        pools.code[child + n] = pools.child_code[frame, level % 3, n] | (level + 1)
+        pools.level[child + n] = level + 1
+        pools.parent[child + n] = e
+        pools.first_child[child + n] = LIVE
+    first_cut, second_cut = halved_cuts(pools.cut[e], end)
+    pools.cut[child] = first_cut
+    pools.cut[child + 1] = second_cut
+    pools.first_child[e] = child
+    for n in range(1, 4):
+        if n != end:
+            wp.atomic_add(pools.valence, tet[n], 1)
+
+
+@wp.func
+def bisect_edge(slot: int, pools: Pools, edges: WantedEdges, carried: Carried):
+    """Bisect the leaves around an edge and pass on what they and its ends carry."""
+    z = edges.node[slot]
+    first = edges.head[slot]
+    ring = edges.ring[slot]
+    tet = pools.tets[first]
+    a = tet[0]
+    b = tet[refinement_end(pools.level[first])]
+    loss_a = wp.float64(0.0)
+    loss_b = wp.float64(0.0)
+    place = wp.atomic_add(pools.counts, FRESH, ring)
+    e = int(first)
+    for i in range(ring):
+        following = pools.next[e]
+        child = pools.free_pairs[edges.pairs[slot] - i]
+        level = pools.level[e]
+        bisect_leaf(e, child, z, pools, edges)
+        copy_to_children(e, child, carried)
+        whole = quarter_mass(e, level, carried)
+        at_first = whole - quarter_mass(child, level + 1, carried)
+        at_second = whole - quarter_mass(child + 1, level + 1, carried)
+        if pools.tets[e][0] == a:
+            loss_a += at_first
+            loss_b += at_second
+        else:
+            loss_a += at_second
+            loss_b += at_first
+        pools.fresh[place + i] = child
+        e = following
+    pools.ends[z] = wp.vec2i(wp.min(a, b), wp.max(a, b))
+    pools.lattice[z] = halfway(pools.lattice[a], pools.lattice[b])
+    pools.valence[z] = 2 * ring
+    make_node(z, a, b, pools.lattice[z], loss_a, loss_b, carried)
+    # Its ring is bisected: no leaf counts at it any more.
+    edges.ring[slot] = 0
+    edges.agreed[slot] = 0
+
+
+@wp.kernel(enable_backward=False)
+def bisect_edges(
+    # In
+    threads: int,
+    # In and out
+    pools: Pools,
+    edges: WantedEdges,
+    carried: Carried,
+):
+    for i in range(wp.tid(), pools.counts[WANTED], threads):
+        slot = edges.wanted[i]
+        if edges.node[slot] >= 0 and edges.agreed[slot] > 0:
+            bisect_edge(slot, pools, edges, carried)
+
+
+@wp.kernel(enable_backward=False)
+def end_round(
+    # In and out
+    pools: Pools,
+    # Out
+    goes_on: wp.array[wp.int32],
+):
+    counts = pools.counts
+    counts[NODE_TOP] = counts[NODE_TOP] + counts[NODES_TAKEN]
+    counts[FREE_PAIRS] = counts[FREE_PAIRS] - counts[PAIRS_TAKEN]
+    counts[ADDED] = counts[ADDED] + counts[NODES_TAKEN]
+    goes_on[0] = wp.where(counts[BIRTHS] + counts[NODES_TAKEN] > 0, 1, 0)
+
+
+@wp.kernel(enable_backward=False)
+def begin_rounds(
+    # In
+    pools: Pools,
+    # Out
+    goes_on: wp.array[wp.int32],
+):
+    goes_on[0] = wp.where(pools.counts[BIRTHS] > 0, 1, 0)

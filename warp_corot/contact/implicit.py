@@ -1,0 +1,360 @@
+"""Contact in implicit steps and static answers: one table of rows; see ``kernels.contact.implicit_rows``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+
+from warp_corot.kernels.contact import bearing, onsets
+from warp_corot.kernels.contact import carriers as of_carriers
+from warp_corot.kernels.contact import implicit_rows as kernels
+from warp_corot.kernels.contact.contact_curvature import Rolling
+from warp_corot.kernels.contact.law import Law
+from warp_corot.kernels.contact.motion import Surface
+from warp_corot.kernels.contact.obstacle_rows import locate_obstacles
+from warp_corot.kernels.contact.pair_rows import find_strays, locate_pairs
+from warp_corot.kernels.contact.rows import Meeting, Rows
+from warp_corot.kernels.contact.touches import Touches
+from warp_corot.kernels.implicit.assembled import Couplings
+from warp_corot.solvers.implicit.operator import Springs
+from warp_corot.solvers.system import System
+
+from .obstacles import Obstacles, RigidForces
+from .pairs import Pairs
+from .surface import ContactSurface
+
+#: Types of the arrays of ``ImplicitRows``: of all rows, of triangles, of pairs, and of one number.
+OF_ROWS = {
+    **dict.fromkeys(("listed", "near", "pushing", "reached"), wp.int32),
+    **dict.fromkeys(("gap", "opened", "target", "friction", "stiffness", "most"), wp.float32),
+    **dict.fromkeys(("normal", "moved", "multiplier", "force"), wp.vec3),
+    "places": wp.vec4i,
+    "weights": wp.vec4,
+    "derivative": wp.mat33,
+}
+OF_TRIANGLES = {"rolling": Rolling, "bend": wp.float32, "tilt": wp.vec3, "moment": wp.vec3}
+OF_PAIRS = dict.fromkeys(("pushed", "begun"), wp.int32)
+NUMBERS = ("due", "locates", "solves")
+#: Maximum number of threads of launches over those that are listed.
+MOST_THREADS = 1 << 14
+
+
+class ImplicitContact:
+    """The contact of all bodies with obstacles and with one another in implicit steps.
+
+    Args:
+        system: The bodies.
+        surface: Their surfaces.
+        obstacles: The obstacles.
+        law: How fast things that overlap are pushed apart.
+        rigid: Forces of obstacles; None without.
+        pairs: Soft surfaces against one another; None if they cannot touch.
+
+    Attributes:
+        couples: Whether bodies may touch one another, so that all of them are solved for together.
+        changed: Whether obstacles were missing after the last solve, int32 [1].
+        locates: Whether pairs are located in the next round, int32 [1].
+        solves: Number of linear solves that the step has had so far, int32 [1].
+        total: Number of pairs, int32 [1].
+    """
+
+    def __init__(
+        self,
+        system: System,
+        surface: ContactSurface,
+        obstacles: Obstacles,
+        law: Law,
+        rigid: RigidForces | None,
+        pairs: Pairs | None,
+    ):
+        self._system, self._surface, self._obstacles, self._law = system, surface, obstacles, law
+        self._rigid, self._pairs, self.device = rigid, pairs, system.device
+        self.couples = self._pairs is not None
+        self.changed, self._searches, self._none = (wp.zeros(1, dtype=wp.int32, device=self.device) for _ in range(3))
+        self._rows = kernels.ImplicitRows()
+        for name in NUMBERS:
+            setattr(self._rows, name, wp.zeros(1, dtype=wp.int32, device=self.device))
+        self._rows.counts = wp.zeros(4, dtype=wp.int32, device=self.device)
+        self.locates, self.solves = self._rows.locates, self._rows.solves
+        self._made: tuple[int, int] = (-1, -1)
+        self.prepare()
+
+    @property
+    def total(self) -> wp.array:
+        return self._none if self._pairs is None else self._pairs.rows.total
+
+    def prepare(self) -> None:
+        """Update to the present surfaces and the room for pairs; not while launches are recorded."""
+        surface, rows = self._surface, self._rows
+        obstacles = self._obstacles.count
+        room = 0 if self._pairs is None else self._pairs.room
+        if (surface.revision, room) == self._made:
+            return
+        self._made = (surface.revision, room)
+        # On several ranks, obstacles touch nodes only.
+        edges = self._rigid is not None and self._rigid.have_edges and self._system.ranks.is_alone
+        triangles = obstacles * surface.triangle_count if edges else 0
+        rows.first_triangle = obstacles * surface.count
+        rows.first_pair = rows.first_triangle + triangles
+        self._length, carriers = rows.first_pair + room, surface.count + surface.bearer_count
+        self._items = surface.count + (surface.triangle_count if edges else 0)
+        for fields, size in ((OF_ROWS, self._length), (OF_TRIANGLES, triangles), (OF_PAIRS, room)):
+            for name, dtype in fields.items():
+                setattr(rows, name, self._zeros(size, dtype))
+        self._carriers = of_carriers.Carriers()
+        for name, dtype in {"entry": wp.int32, "compliance": wp.float32, "gone": wp.vec3}.items():
+            setattr(self._carriers, name, self._zeros(carriers, dtype))
+        self._carriers.crowd = self._zeros((2, carriers), wp.float32)
+        self._marked, self._added = self._zeros(carriers, wp.int32), self._zeros(surface.count, wp.vec3)
+        # Places of their own, where pairs are located: obstacles find the places where they are when a step begins.
+        self._located = Surface()
+        for name in ("node", "world", "rest", "d", "yielding", "f", "bearing"):
+            setattr(self._located, name, getattr(surface.arrays, name))
+        self._located.x = self._zeros(surface.count if room else 0, wp.vec3)
+        self._stiffness = self._zeros(surface.count, wp.mat33)
+        self._springs: dict[int, Springs] = {}
+
+    def springs(self, k: int) -> Springs:
+        """The places of a body and the stiffness of obstacles there, for a preconditioner; not while launches are
+        recorded."""
+        if k not in self._springs:
+            part, count = self._surface.parts[k], self.places_of(k)
+            nodes, weights = self._zeros(count, wp.vec4i), self._zeros(count, wp.vec4)
+            inputs = [part.start, self._surface.arrays, self._surface.bearers]
+            wp.launch(kernels.find_bearers, count, inputs, [nodes, weights], device=self.device)
+            self._springs[k] = Springs(nodes, weights, self._stiffness[part.start : part.start + count])
+        return self._springs[k]
+
+    def places_of(self, k: int) -> int:
+        """Number of places of a body in all worlds."""
+        return self._surface.worlds * self._surface.parts[k].nodes
+
+    def reserve(self, motion: float) -> None:
+        """Search for pairs along the way that is expected, from which anything may stray so far in a step [m]."""
+        if self._pairs is not None:
+            bounds = [self._system.ranks.owned(body).bounds for body in self._system.bodies]
+            self._pairs.search.serve_implicit(motion, max(float(np.linalg.norm(high - low)) for low, high in bounds))
+            self._pairs.meeting.ahead = self._pairs.search.watch.ahead
+
+    # --- before a step -----------------------------------------------------------------------------------------------
+
+    def launch_onsets(self, offset: int, touched: Sequence[wp.array], begins: wp.array) -> None:
+        """Launch the test whether contacts have begun or ceased to push in the last step, or will begin in this one.
+
+        Args:
+            offset: The number of the step since the clock was last advanced.
+            touched: What the nodes of each body have touched, int32 [worlds * nodes]; see ``launch_touched``.
+            begins: Nonzero afterwards if so, int32 [1].
+        """
+        pace, surface, law = self._system.pace.arrays, self._surface.arrays, self._law
+        for k, body in enumerate(self._system.bodies):
+            start, _, count, own = self._nodes_of(k)
+            state = body.state
+            inputs = [start, state.rest, state.displacements, state.velocities, pace, touched[k]]
+            wp.launch(onsets.foresee_places, count, inputs, [own, begins], device=self.device)
+            self._launch_places(k)
+        if self._rigid is not None:
+            obstacles = self._obstacles
+            inputs = [obstacles.shapes, obstacles.motions, law, surface, self._carriers, self._rigid.forces]
+            wp.launch(onsets.find_onsets, self._surface.count, inputs, [begins], device=self.device)
+        if self._pairs is not None:
+            self._launch_search(offset)
+            inputs = [law, surface, self._pairs.meeting, self._pairs.rows]
+            self._on_pairs(onsets.find_pair_onsets, [*inputs, begins])
+
+    def launch_touched(self, touched: Sequence[wp.array]) -> None:
+        """Launch the record, after a step, of what the nodes of each body have touched."""
+        inputs = [max(self._obstacles.count, 1), self._surface.arrays, self._rows, self._marked]
+        self._on_rows(kernels.mark_acting, inputs)
+        for k, array in enumerate(touched):
+            start, offset, count, own = self._nodes_of(k)
+            wp.launch(onsets.note_touched, count, [start, offset, own, self._marked, array], device=self.device)
+
+    def launch_begin(self, k: int, first: int, blocks: wp.array, increment: wp.array, guess: wp.array) -> None:
+        """Launch the state of the k-th body at the beginning of a step.
+
+        Args:
+            k: The number of the body.
+            first: Its first entry in vectors of all bodies.
+            blocks: The blocks on the diagonal of its matrix, mat33.
+            increment: How far held nodes have gone in the step [m], vec4.
+            guess: How far free nodes may go [m], vec4.
+        """
+        body = self._system.bodies[k]
+        start, offset, count, own = self._nodes_of(k)
+        inputs = [start, offset, first, body.conditions.inverse_mass, blocks]
+        inputs += [body.state.rest, body.state.displacements, increment, guess]
+        wp.launch(of_carriers.begin_carriers, count, inputs, [own, self._carriers], device=self.device)
+        self._launch_places(k)
+
+    def launch_first(self, offset: int, d: wp.array) -> None:
+        """Launch the search for pairs, if it is due, and the location of rows when the step begins, with a guess d of
+        the motions [m], vec4."""
+        if self._pairs is not None:
+            self._launch_search(offset)
+        self._locate(kernels.FIRST, d)
+
+    # --- in a round of solves ----------------------------------------------------------------------------------------
+
+    def locate(self, d: wp.array) -> None:
+        """Launch the location of rows after motions d, if it is due."""
+        self._locate(kernels.AGAIN, d)
+
+    def update(self, d: wp.array, *, is_solved: bool = False) -> None:
+        """Launch forces and their derivatives after motions d, which are those of a solve if ``is_solved``."""
+        self._on_rows(kernels.update_rows, [int(is_solved), d, *self._table])
+
+    def add_forces(self, y: wp.array) -> None:
+        """Launch the addition of forces on free nodes [N]."""
+        self._on_rows(kernels.add_row_forces, [*self._table, y])
+
+    def add_products(self, x: wp.array, y: wp.array) -> None:
+        """Launch the addition of the derivative times x."""
+        self._on_rows(kernels.add_row_products, [*self._table, x, y])
+
+    def add_couplings(self, couplings: Couplings) -> None:
+        """Launch the addition of the derivative to an assembled matrix."""
+        self._on_rows(kernels.couple_rows, [*self._table, couplings])
+
+    def update_springs(self) -> None:
+        """Launch the stiffness of ``springs``, from the derivatives of the last ``update``."""
+        self._stiffness.zero_()
+        self._on_rows(kernels.gather_stiffness, [self._rows, self._stiffness])
+
+    def scale(self, k: int, v: wp.array, *, is_after: bool) -> None:
+        """Launch v = G v with the springs at a body's nodes, or G^T v; see ``scale_nodes``."""
+        inputs = [self._surface.parts[k].start, int(is_after), self._surface.arrays, self._carriers]
+        wp.launch(kernels.scale_nodes, self.places_of(k), [*inputs, self._stiffness, v], device=self.device)
+
+    def find_reached(self, d: wp.array, change: wp.array) -> None:
+        """Launch the list of rows that may push along a change of the motions d; ``add_slopes`` visits only these."""
+        self._on_rows(kernels.find_reached, [d, change, *self._table])
+
+    def add_slopes(
+        self, d: wp.array, change: wp.array, search: wp.array, slopes: wp.array, *, apart: int | None = None
+    ) -> None:
+        """Launch the power along a change; see ``solvers.implicit.line_search``. If there is only one slope, it is that
+        of all worlds together. With ``apart``, a body, there is one for each of its places, [worlds * places]."""
+        first = -1 if apart is None else self._surface.parts[apart].start
+        inputs = [int(len(search) == 1), first, *self._table, d, change, search, slopes]
+        self._on_rows(kernels.add_row_slopes, inputs)
+
+    def launch_going(self, d: wp.array, rounds: wp.array, most: int, going: wp.array) -> None:
+        """Launch the search for missing obstacles if the step would end with motions d, which sets ``changed``, and the
+        decision whether another solve follows for that.
+
+        Args:
+            d: Motions [m], vec4.
+            rounds, most: The number of solves in the step, int32 [1], and its maximum.
+            going: Whether another solve follows, int32 [1].
+        """
+        if self._rigid is not None:
+            self.changed.zero_()
+            self._locate_obstacles(kernels.MISSING, d, going)
+        inputs = [self.changed, rounds, most, self._rows, going]
+        wp.launch(kernels.judge_rows, 1, inputs, device=self.device)
+
+    def launch_searched_again(self, d: wp.array, rounds: wp.array, most: int, again: wp.array) -> None:
+        """Launch another search for pairs along the way of motions d if they have strayed from that of the last one.
+
+        Args:
+            d, rounds, most: As for ``launch_going``.
+            again: Nonzero afterwards if so; then it must be solved again, int32 [1].
+        """
+        assert self._pairs is not None
+        again.zero_()
+        inputs = [d, self._carriers, self._searches, rounds, most]
+        outputs = [self._pairs.search.watch, self._surface.arrays, again]
+        wp.launch(find_strays, self._surface.count, inputs, outputs, device=self.device)
+        wp.capture_if(again, self._search_again, d=d)
+
+    def launch_end(self, d: wp.array) -> None:
+        """Launch the update of what users read about contact, and of whether a new search is due."""
+        surface, forces, touches = self._surface, self._zeros((0, 0), wp.vec3), Touches()
+        if self._rigid is not None:
+            forces, touches = self._rigid.forces, self._rigid.touches
+        self.update(d)
+        self._launch(kernels.end_rows, self._length, [self._rows, forces, touches, self._of_pairs[1], self._added])
+        inputs = [d, self._carriers, self._added, surface.arrays]
+        wp.launch(kernels.end_places, surface.count, inputs, device=self.device)
+        for k, body in enumerate(self._system.bodies):
+            start, _, count, own = self._nodes_of(k)
+            inputs = [start, int(surface.parts[k].bearers > 0), own, surface.arrays]
+            wp.launch(of_carriers.end_carriers, count, inputs, [body.state.contact_forces], device=self.device)
+        if self._pairs is not None:
+            self._pairs.search.launch_after()
+
+    # --- pieces ------------------------------------------------------------------------------------------------------
+
+    def _launch_search(self, offset: int) -> None:
+        assert self._pairs is not None
+        self._searches.zero_()
+        self._pairs.search.launch(offset, follows=True)
+
+    def _search_again(self, d: wp.array) -> None:
+        assert self._pairs is not None
+        self._on_pairs(kernels.keep_pair_forces, [self._rows, self._pairs.rows, self._searches])
+        self._pairs.search.launch(1, follows=True)
+        self.solves.zero_()
+        self.locates.fill_(1)
+        self._locate(kernels.REPEATED, d)
+
+    def _locate(self, which: int, d: wp.array) -> None:
+        surface, law, pace = self._surface, self._law, self._system.pace.arrays
+        inputs = [int(which), d, surface.arrays, self._located, self._carriers, self._rows]
+        wp.launch(kernels.begin_location, len(self._marked), inputs, device=self.device)
+        if self._rigid is not None and which != kernels.REPEATED:
+            self._locate_obstacles(which, d, self._none)
+        if self._pairs is not None:
+            meeting, pairs = self._of_pairs
+            inputs = [int(which), law, pace, d, self._located, meeting, self._carriers, pairs, self._rows]
+            self._on_pairs(locate_pairs, inputs)
+        self._on_rows(kernels.stiffen_rows, [int(which), self.changed, *self._table])
+
+    def _locate_obstacles(self, which: int, d: wp.array, going: wp.array) -> None:
+        assert self._rigid is not None
+        surface, rigid, obstacles, pace = self._surface, self._rigid, self._obstacles, self._system.pace.arrays
+        inputs = [int(which), obstacles.shapes, obstacles.motions, self._law, pace, surface.arrays]
+        inputs += [surface.triangles, d, rigid.forces, rigid.touches, going, self._carriers, self._rows, self.changed]
+        self._launch(locate_obstacles, self._items, inputs, most=self._items)
+
+    @property
+    def _of_pairs(self) -> tuple[Meeting, Rows]:
+        return (Meeting(), Rows()) if self._pairs is None else (self._pairs.meeting, self._pairs.rows)
+
+    @property
+    def _table(self) -> list:
+        return [self._surface.arrays, self._carriers, self._rows]
+
+    def _nodes_of(self, k: int) -> tuple[int, int, int, Surface]:
+        """The carriers of a body as nodes: the first, the number of carriers before these nodes, how many there are,
+        and the struct of all these nodes."""
+        surface, part = self._surface, self._surface.parts[k]
+        if part.bearers:
+            return part.bearer_start, surface.count, surface.worlds * part.bearers, surface.bearers
+        return part.start, 0, self.places_of(k), surface.arrays
+
+    def _launch_places(self, k: int) -> None:
+        """Launch the positions and motions of the places between nodes of a body, from those of the nodes."""
+        surface, part = self._surface, self._surface.parts[k]
+        if part.bearers:
+            inputs = [part.start, surface.bearers, surface.arrays]
+            wp.launch(bearing.place_borne, self.places_of(k), inputs, device=self.device)
+
+    def _on_rows(self, kernel: wp.Kernel, inputs: list) -> None:
+        self._launch(kernel, self._length, inputs)
+
+    def _on_pairs(self, kernel: wp.Kernel, inputs: list) -> None:
+        assert self._pairs is not None
+        threads = self._pairs.search.threads(self._pairs.room)
+        wp.launch(kernel, threads, [threads, *inputs], device=self.device)
+
+    def _launch(self, kernel: wp.Kernel, count: int, inputs: list, most: int = MOST_THREADS) -> None:
+        """Launch a kernel over so many rows; one thread of the CPU sees at once that there is nothing to do."""
+        threads = 1 if self.device.is_cpu else max(min(count, most), 1)
+        wp.launch(kernel, threads, [threads, *inputs], device=self.device)
+
+    def _zeros(self, shape: int | tuple[int, ...], dtype: type) -> wp.array:
+        return wp.zeros(shape, dtype=dtype, device=self.device)

@@ -1,1 +1,0 @@
-"""Force plans, derived by launches: for fixed forests and, with ``changing``, for forests that change."""

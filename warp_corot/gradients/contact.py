@@ -1,0 +1,398 @@
+"""Adjoint motions of bodies that rest on obstacles or on themselves: they keep to the surfaces that they touch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+import warp as wp
+
+from warp_corot.contact.contacts import Contacts
+from warp_corot.contact.reading import ActingRow, acting_rows
+from warp_corot.errors import InputError
+from warp_corot.kernels.gradients import contact as kernels
+from warp_corot.solvers.implicit.operator import LinearOperator, Preconditioner
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
+    from warp_corot.body.soft_body import SoftBody
+
+Array = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+#: The largest number of contacts: the inverse of their matrix is dense.
+MOST_ROWS = 4000
+#: Eigenvalues of the contacts' matrix below this share of the largest one are of contacts that others contain.
+DEPENDENT = 1e-7
+#: The step of differences of obstacles' normals, over the size of the body, and that of pairs' over theirs.
+STEP, STEP_OF_PAIRS = 1e-3, 1e-5
+#: Curvature times the size of the body, below which an obstacle is flat.
+FLAT = 1e-2
+#: The share of Coulomb's bound from which on a contact slips.
+SLIPS = 0.999
+#: Weights below this are zero: the contact is on an edge or a corner.
+LEAST_SHARE = 1e-5
+
+
+@dataclass(frozen=True)
+class Column:
+    """A direction in which a contact keeps its nodes.
+
+    Attributes:
+        row: The contact.
+        normal: The direction, [3].
+        yields: Whether the contact may slide across it: friction does not hold it.
+        nodes: The nodes that bear its places, numbered over all worlds.
+        weights: Their weights in each place, [places, nodes].
+    """
+
+    row: ActingRow
+    normal: Array
+    yields: bool
+    nodes: Ints
+    weights: Array
+
+
+class RestingContact:
+    """The contacts of a body at rest, without friction or with friction that holds them where they are.
+
+    In an equilibrium, forces f(x) + sum_i l_i grad d_i = 0 and gaps d_i(x) = 0. With the stiffness K, the normals
+    N = grad d, and the turning of the normals G = -sum_i l_i grad grad d_i, a change of forces by q moves the nodes by
+    dx with (K + G) dx - N dl = q and N^T dx = 0. A contact on a triangle or an edge slides there to where the gap is
+    least, which is part of G. A place that friction holds does not move: N has three columns for it, and G nothing.
+
+    Args:
+        body: The body.
+        contacts: Its contact in the last step.
+        rows: What pushes it.
+        friction: The coefficient of each obstacle.
+
+    Attributes:
+        columns: Those of N.
+
+    Raises:
+        InputError: There are more than ``MOST_ROWS`` columns, contacts that slip, or pairs at borders of triangles.
+    """
+
+    def __init__(self, body: SoftBody, contacts: Contacts, rows: Sequence[ActingRow], friction: Sequence[float]):
+        self._body, self._contacts = body, contacts
+        _check_borders(rows)
+        self.columns: list[Column] = []
+        for row, sticks in zip(rows, sticking(rows, friction), strict=True):
+            nodes, weights = self._borne(row)
+            directions = np.eye(3) if sticks else unit_normal(row)[None]
+            self.columns += [Column(row, each, not sticks, nodes, weights) for each in directions]
+        if len(self.columns) > MOST_ROWS:
+            raise InputError(f"contact has {len(self.columns)} unknowns; gradients take up to {MOST_ROWS}")
+        if not self.columns:
+            return
+        self.obstacle = np.array([column.row.obstacle for column in self.columns])
+        self._assemble()
+        free = np.repeat(~body.conditions.held_mask(), 3)
+        self._free_normals = self._all_normals.multiply(free[:, None]).tocsc()
+        self._inverse = _inverse((self._free_normals.T @ self._free_normals).toarray())
+        self._upload()
+
+    @property
+    def pushes(self) -> bool:
+        """Whether there are any contacts."""
+        return bool(self.columns)
+
+    def _assemble(self) -> None:
+        """The sparse matrices: ``_all_normals`` N [3n, m], ``_turning`` G [3n, 3n], and the sums of G's columns over
+        the nodes of each contact, ``_moved`` [m, 3n, 3] as a list."""
+        from scipy.sparse import coo_array
+
+        count, m = 3 * self._body.sizes.nodes, len(self.columns)
+        x = self._contacts.surface.arrays.x.numpy().astype(float)
+        entries, blocks, self._moved = [], [], []
+        for i, (column, curvature) in enumerate(zip(self.columns, self._curvatures(), strict=True)):
+            row, normal = column.row, column.normal
+            lines = (3 * column.nodes[:, None] + np.arange(3)).ravel()
+            entries.append((lines, np.full(len(lines), i), (column.weights.T @ row.weights)[:, None] * normal))
+            push = float(row.force @ normal) if column.yields else 0.0
+            at = x[row.places]
+            bends = pair_hessian(row, at) if row.obstacle < 0 else self._hessian(row, at, normal, curvature)
+            spread = np.kron(column.weights, np.eye(3))
+            block = spread.T @ (-push * bends) @ spread
+            blocks.append((np.repeat(lines, len(lines)), np.tile(lines, len(lines)), block))
+            self._moved.append((lines, block.reshape(len(lines), -1, 3).sum(axis=1)))
+        lines, which, values = (np.concatenate([np.ravel(e[k]) for e in entries]) for k in range(3))
+        self._all_normals = coo_array((values, (lines, which)), shape=(count, m)).tocsc()
+        first, second, values = (np.concatenate([np.ravel(b[k]) for b in blocks]) for k in range(3))
+        self._turning: csr_array = coo_array((values, (first, second)), shape=(count, count)).tocsr()
+
+    def _borne(self, row: ActingRow) -> tuple[Ints, Array]:
+        """The nodes that bear a contact's places, numbered over all worlds, and their weights [places, nodes]."""
+        surface, count = self._contacts.surface, self._body.sizes.nodes // self._body.worlds
+        found = [surface.nodes_at(np.array([place]), np.ones(1)) for place in row.places]
+        nodes = np.unique(np.concatenate([each[2] for each in found]))
+        weights = np.zeros((len(found), len(nodes)))
+        for line, (_, _, those, shares) in enumerate(found):
+            weights[line, np.searchsorted(nodes, those)] = shares
+        return nodes + found[0][1] * count, weights
+
+    def _curvatures(self) -> Array:
+        """The second derivatives of obstacles' distances at contacts [1/m], [m, 3, 3], by central differences of
+        normals; zero for pairs."""
+        curvatures = np.zeros((len(self.columns), 3, 3))
+        columns = [column for column in self.columns if column.row.obstacle >= 0]
+        step = STEP * float(np.ptp(self._body.mesh.points, axis=0).max())
+        points = np.array([column.row.point for column in columns]).reshape(-1, 1, 3)
+        worlds = [int(column.nodes[0]) * self._body.worlds // self._body.sizes.nodes for column in columns]
+        steps = step * np.concatenate([np.eye(3), -np.eye(3)])
+        found = normals_at(self._contacts, [column.row.obstacle for column in columns], worlds, points + steps)
+        slopes = (found[:, :3] - found[:, 3:]) / (2.0 * step)
+        curvatures[self.obstacle >= 0] = 0.5 * (slopes + np.swapaxes(slopes, 1, 2))
+        return curvatures
+
+    def _hessian(self, row: ActingRow, x: Array, normal: Array, curvature: Array) -> Array:
+        """The second derivative of the gap with respect to its places x [1/m], [3 places, 3 places]."""
+        count = len(row.places)
+        found = np.zeros((count, 3, count, 3))
+        used = np.flatnonzero(row.weights > LEAST_SHARE)
+        shares = row.weights[used]
+        inner = np.einsum("a,b,ij->aibj", shares, shares, curvature)
+        if len(used) > 1:
+            along = (x[used[1:]] - x[used[0]]).T
+            slide = along.T @ curvature @ along
+            values, vectors = np.linalg.eigh(slide)
+            size = float(np.ptp(self._body.mesh.points, axis=0).max())
+            least = FLAT / size * float((along**2).sum(axis=0).max())
+            bent = values > least
+            mixed = np.einsum("a,is->ais", shares, curvature @ along)
+            mixed[0] -= normal[:, None]
+            mixed[1:] += np.eye(len(used) - 1)[:, None] * normal[:, None]
+            turned = mixed @ (vectors[:, bent] / np.sqrt(values[bent]))
+            inner = inner - np.einsum("aik,bjk->aibj", turned, turned)
+        axes = np.arange(3)
+        found[np.ix_(used, axes, used, axes)] = inner
+        return found.reshape(3 * count, 3 * count)
+
+    def _upload(self) -> None:
+        """The same for kernels."""
+        device, rows = self._body.device, kernels.Rows()
+        by_row = self._by_nodes(self._free_normals)
+        rows.starts, rows.nodes = _starts(by_row[0], len(self.obstacle), device), _ints(by_row[1], device)
+        rows.parts = wp.array(by_row[2], dtype=wp.vec3, device=device)
+        touched = np.unique(by_row[1])
+        order = np.argsort(by_row[1], kind="stable")
+        rows.touched, rows.of_node, rows.row = (_ints(each, device) for each in (touched, order, by_row[0]))
+        rows.node_starts = _starts(np.searchsorted(touched, by_row[1][order]), len(touched), device)
+        rows.inverse = wp.array(self._inverse, dtype=wp.float64, device=device)
+        blocks = self._turning.tobsr((3, 3))
+        starts = np.concatenate([[0], np.cumsum(np.diff(blocks.indptr)[touched])])
+        picked = np.concatenate([np.arange(blocks.indptr[n], blocks.indptr[n + 1]) for n in touched]).astype(int)
+        rows.block_starts, rows.block_nodes = _ints(starts, device), _ints(blocks.indices[picked], device)
+        rows.blocks = wp.array(blocks.data[picked], dtype=wp.mat33, device=device)
+        self._rows = rows
+        self._along, self._shared = (wp.zeros(len(self.obstacle), dtype=wp.float64, device=device) for _ in range(2))
+
+    @staticmethod
+    def _by_nodes(normals: csr_array) -> tuple[Ints, Ints, Array]:
+        """The contact, the node and the part of each entry of N, contact by contact."""
+        entries = normals.tocoo()
+        count = normals.shape[0] // 3
+        keys, which = np.unique(entries.col.astype(np.int64) * count + entries.row // 3, return_inverse=True)
+        parts = np.zeros((len(keys), 3))
+        parts[which.ravel(), entries.row % 3] = entries.data
+        return keys // count, keys % count, parts
+
+    # --- on the device -----------------------------------------------------------------------------------------------
+
+    def launch_free(self, x: wp.array) -> None:
+        """Launch the removal of what moves nodes off obstacles or into them."""
+        device, rows = self._body.device, self._rows
+        count = len(self.obstacle)
+        wp.launch(kernels.measure_rows, count, [rows, x, self._along], device=device)
+        wp.launch(kernels.share_rows, count, [rows, self._along, self._shared], device=device)
+        wp.launch(kernels.remove_rows, len(rows.touched), [rows, self._shared, x], device=device)
+
+    def launch_turning(self, x: wp.array, y: wp.array) -> None:
+        """Launch y + G x."""
+        wp.launch(kernels.add_turning, len(self._rows.touched), [self._rows, x, y], device=self._body.device)
+
+    # --- on the host -------------------------------------------------------------------------------------------------
+
+    def free(self, x: Array) -> Array:
+        """x [worlds * N, 3] without what moves nodes off obstacles or into them; see ``multipliers``."""
+        return x - (self._free_normals @ self.multipliers(x)).reshape(-1, 3)
+
+    def multipliers(self, x: Array) -> Array:
+        """The shares m of the normals N in x, [m]."""
+        return self._inverse @ (self._free_normals.T @ x.ravel())
+
+    def turning(self, x: Array) -> Array:
+        """G x, [worlds * N, 3]."""
+        return (self._turning @ x.ravel()).reshape(-1, 3)
+
+    def reactions(self, multipliers: Array) -> Array:
+        """N m, held nodes included, [worlds * N, 3]."""
+        return (self._all_normals @ multipliers).reshape(-1, 3)
+
+    def of_obstacles(self, motion: Array, multipliers: Array) -> Array:
+        """The derivative with respect to the places of obstacles, [obstacles, 3], from an adjoint motion and its
+        multipliers."""
+        found = np.zeros((self._contacts.obstacles.count, 3))
+        flat = motion.ravel()
+        for i, (lines, moved) in enumerate(self._moved):
+            if self.obstacle[i] < 0:
+                continue
+            found[self.obstacle[i]] += multipliers[i] * self.columns[i].normal + flat[lines] @ moved
+        return found
+
+
+class RestingOperator:
+    """S (A + G) of an operator A, for vectors in the range of the projector S that keeps to obstacles."""
+
+    def __init__(self, operator: LinearOperator, contact: RestingContact):
+        self._operator, self._contact = operator, contact
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._operator, name)
+
+    def apply(self, x: wp.array, y: wp.array) -> None:
+        self._operator.apply(x, y)
+        self._contact.launch_turning(x, y)
+        self._contact.launch_free(y)
+
+
+class RestingPreconditioner:
+    """S B S of a preconditioner B; ``update`` is B's."""
+
+    def __init__(self, preconditioner: Preconditioner, contact: RestingContact):
+        self._preconditioner, self._contact = preconditioner, contact
+        self._r: wp.array | None = None
+
+    def update(self, operator: LinearOperator) -> None:
+        self._preconditioner.update(operator)
+
+    def apply(self, r: wp.array, z: wp.array) -> None:
+        if self._r is None:
+            self._r = wp.zeros_like(r)
+        # Rounding moves residuals out of the range of S.
+        wp.copy(self._r, r)
+        self._contact.launch_free(self._r)
+        self._preconditioner.apply(self._r, z)
+        self._contact.launch_free(z)
+
+
+# --- rows -------------------------------------------------------------------------------------------------------------
+
+
+def pair_hessian(row: ActingRow, x: Array) -> Array:
+    """The second derivative of a pair's gap with respect to its four places x [1/m], [12, 12], by central differences
+    of the first."""
+    step = STEP_OF_PAIRS * float(np.abs(x - x[0]).max())
+    slopes = np.zeros((12, 12))
+    for k in range(12):
+        by = np.zeros(12)
+        by[k] = step
+        ahead, behind = (_pair_slope(row, x + sign * by.reshape(4, 3)) for sign in (1.0, -1.0))
+        slopes[k] = (ahead - behind) / (2.0 * step)
+    return np.asarray(0.5 * (slopes + slopes.T))
+
+
+def _pair_slope(row: ActingRow, x: Array) -> Array:
+    """The derivative of a pair's gap with respect to its four places, [12]."""
+    if row.first == 2:
+        along, across = x[1] - x[0], x[3] - x[2]
+        normal = np.cross(along, across)
+        s, t, _ = np.linalg.solve(np.stack([along, -across, normal], axis=1), x[2] - x[0])
+        shares = np.array([1.0 - s, s, t - 1.0, -t])
+    else:
+        first, second = x[2] - x[1], x[3] - x[1]
+        normal = np.cross(first, second)
+        s, t, _ = np.linalg.solve(np.stack([first, second, normal], axis=1), x[0] - x[1])
+        shares = np.array([1.0, s + t - 1.0, -s, -t])
+    normal = normal * np.sign(normal @ row.normal) / np.linalg.norm(normal)
+    return np.asarray((shares[:, None] * normal).ravel())
+
+
+def unit_normal(row: ActingRow) -> Array:
+    """A contact's normal, [3]."""
+    return np.asarray(row.normal / np.linalg.norm(row.normal))
+
+
+def sticking(rows: Sequence[ActingRow], friction: Sequence[float]) -> list[bool]:
+    """Whether friction holds each contact.
+
+    Args:
+        rows: The contacts.
+        friction: The coefficient of each obstacle.
+
+    Raises:
+        InputError: It does not hold a contact that has friction.
+    """
+    sticks, slipping = [], 0
+    for row in rows:
+        normal, bound = unit_normal(row), 0.0 if row.obstacle < 0 else friction[row.obstacle]
+        push = float(row.force @ normal)
+        across = float(np.linalg.norm(row.force - push * normal))
+        sticks.append(bound > 0.0)
+        slipping += bound > 0.0 and across > SLIPS * bound * push
+    if slipping:
+        raise InputError(
+            f"{slipping} of {len(rows)} contacts slip; gradients need friction that sticks, or friction=0.0"
+        )
+    return sticks
+
+
+def _check_borders(rows: Sequence[ActingRow]) -> None:
+    """Check that no pairs push at the border of a triangle or at the end of an edge."""
+    pairs = [row for row in rows if row.obstacle < 0]
+    borders = sum(float(np.abs(row.weights).min()) < LEAST_SHARE for row in pairs)
+    if borders:
+        raise InputError(
+            f"{borders} of {len(pairs)} contacts of the body with itself are at borders of triangles, where gradients "
+            "jump"
+        )
+
+
+def rows_after(body: SoftBody, contacts: Contacts) -> list[ActingRow]:
+    """The nodes that obstacles have pushed in the last step, where they are at its end.
+
+    Raises:
+        InputError: Obstacles push something else: triangles, or places of the body's own surface.
+    """
+    if contacts.rigid is None:
+        return []
+    part = contacts.surface.parts[0]
+    if part.skin.own is not None:
+        raise InputError("obstacles touch the body's own surface; runs need contact at nodes: Contact(on='tetrahedra')")
+    rows = list(acting_rows(contacts))
+    if any(len(row.places) > 1 for row in rows):
+        raise InputError("an obstacle touches triangles between the nodes; runs with gradients need contact at nodes")
+    world, at = np.divmod(np.array([int(row.places[0]) for row in rows], int) - part.start, part.nodes)
+    nodes = part.skin.nodes[at] + world * body.world_node_count
+    x = (body.rest_positions + body.state.displacements.numpy()[: body.sizes.nodes, :3])[nodes]
+    normals = normals_at(contacts, [row.obstacle for row in rows], world, x[:, None])[:, 0]
+    return [row._replace(point=p, normal=n) for row, p, n in zip(rows, x, normals, strict=True)]
+
+
+def normals_at(contacts: Contacts, obstacles: npt.ArrayLike, worlds: npt.ArrayLike, points: Array) -> Array:
+    """Normals of obstacles in their worlds at points [m], [n, k, 3]; waits for the device."""
+    device = contacts.device
+    inputs = [contacts.obstacles.shapes, contacts.obstacles.motions, _ints(obstacles, device), _ints(worlds, device)]
+    inputs.append(wp.array(points, dtype=wp.vec3, device=device))
+    found = wp.zeros(points.shape[:2], dtype=wp.vec3, device=device)
+    wp.launch(kernels.find_normals, found.shape, inputs, [found], device=device)
+    return found.numpy().astype(float)
+
+
+def _inverse(matrix: Array) -> Array:
+    """The inverse of N^T N; contacts that others contain share their forces with these."""
+    return np.asarray(np.linalg.pinv(matrix, rcond=DEPENDENT, hermitian=True), np.float64)
+
+
+def _ints(values: npt.ArrayLike, device: wp.Device) -> wp.array:
+    return wp.array(values, dtype=wp.int32, device=device)
+
+
+def _starts(owners: npt.NDArray[np.integer], count: int, device: wp.Device) -> wp.array:
+    """Where the entries of each owner begin, for sorted owners."""
+    return _ints(np.searchsorted(owners, np.arange(count + 1)), device)

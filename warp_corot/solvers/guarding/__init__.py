@@ -1,1 +1,0 @@
-"""Checks of the state, and the return to the last good one."""
